@@ -1,0 +1,38 @@
+#!/usr/bin/env bash
+# setup_venv.sh PYTHON FOLDER: create the environment and install the package into it, versions pinned.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+python=$1 venv=$2
+
+say() { echo "setup: $*" >&2; }
+
+if ! command -v "$python" >/dev/null; then
+    tools/apt_install.sh python3 || { say "no $python found: install Python 3.11 or newer."; exit 1; }
+fi
+recent() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; }
+if ! recent "$python"; then
+    # Ubuntu 22.04 has 3.10 as python3 and 3.11 beside it.
+    for candidate in python3.13 python3.12 python3.11; do
+        recent "$candidate" && break
+    done
+    if ! recent "$candidate"; then
+        candidate=python3.11
+        tools/apt_install.sh python3.11 && recent $candidate || {
+            say "$("$python" --version) is too old: install Python 3.11 or newer and run make PYTHON=/path/to/it."
+            exit 1
+        }
+    fi
+    python=$candidate
+fi
+
+if [ ! -x "$venv/bin/python" ] || ! "$venv/bin/python" -c 'import pip' 2>/dev/null; then
+    if ! "$python" -c 'import venv, ensurepip' 2>/dev/null; then
+        version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
+        tools/apt_install.sh "python$version-venv" python3-venv || {
+            say "$python cannot create environments: install the package python$version-venv (apt-get install python$version-venv)."
+            exit 1
+        }
+    fi
+    "$python" -m venv --clear "$venv"
+fi
+"$venv/bin/python" -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev,notebooks]'
