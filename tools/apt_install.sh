@@ -15,7 +15,8 @@ fi
 first_known() {
     for package in "$@"; do
         # `apt-cache show` succeeds for what is only mentioned; a candidate is what can be installed.
-        if LC_ALL=C apt-cache policy "$package" 2>/dev/null | grep -q 'Candidate: [^(]'; then
+        policy=$(LC_ALL=C apt-cache policy "$package" 2>/dev/null)
+        if [[ $policy == *"Candidate: "[^\(]* ]]; then
             echo "$package"
             return
         fi
