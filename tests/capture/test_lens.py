@@ -1,0 +1,85 @@
+"""Undistortion against OpenCV's own projection through the lens."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.capture.camera import Camera
+from morgs_mi.capture.lens import Lens, lens_and_intrinsics, undistortion
+
+WIDTH, HEIGHT = 160, 120
+LENSES = {
+    "SIMPLE_RADIAL": (-0.1,),
+    "RADIAL": (0.08, -0.02),
+    "OPENCV": (-0.1, 0.02, 0.004, -0.003),
+    "OPENCV_FISHEYE": (0.05, -0.01, 0.002, 0.0),
+    "FULL_OPENCV": (-0.1, 0.02, 0.004, -0.003, 0.01, 0.02, -0.01, 0.005),
+}
+
+
+def camera(focal: float = 110.0) -> Camera:
+    K = np.array([[focal, 0, 71.3], [0, 1.05 * focal, 66.8], [0, 0, 1]])
+    return Camera(K, np.eye(4), WIDTH, HEIGHT, "cam")
+
+
+def dots(centres: np.ndarray) -> np.ndarray:
+    """Draw a blob at each centre [N, 2], in pixels with centres at +0.5."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    image = sum(np.exp(-((x - u) ** 2 + (y - v) ** 2) / 8) for u, v in centres)
+    return np.repeat((250 * np.clip(image, 0, 1))[..., None], 3, -1).astype(np.uint8)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_a_point_seen_through_the_lens_lands_where_the_pinhole_says(model: str) -> None:
+    cam, lens = camera(), Lens(model, LENSES[model])
+    points = np.array([[x, y, 2.0] for x in (-0.9, -0.1, 0.8) for y in (-0.7, 0.05, 0.6)])
+    K = cam.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    zero, coefficients = np.zeros(3), lens.opencv_coefficients
+    if model == "OPENCV_FISHEYE":
+        seen, _ = cv2.fisheye.projectPoints(points[:, None], zero, zero, K, coefficients)
+    else:
+        seen, _ = cv2.projectPoints(points, zero, zero, K, coefficients)
+    expected = (points @ cam.K.T)[:, :2] / 2
+    shift = np.abs(seen[:, 0] + 0.5 - expected).max()
+    assert shift > 1, "the case must bend rays by more than a pixel"
+
+    undo = undistortion(cam, lens)
+    assert undo is not None
+    image = undo(dots(seen[:, 0] + 0.5)).astype(float)[..., 0]
+    y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    for u, v in expected:
+        near = image * ((np.abs(x - u) < 7) & (np.abs(y - v) < 7))
+        centre = np.array([(near * x).sum(), (near * y).sum()]) / near.sum()
+        # 1/32 px of the maps, and the blob's own bending.
+        np.testing.assert_allclose(centre, (u, v), atol=0.15)
+
+
+def test_no_distortion_needs_no_maps() -> None:
+    assert undistortion(camera(), Lens()) is None
+    assert undistortion(camera(), Lens("OPENCV", (0.0, 0.0, 0.0, 0.0))) is None
+
+
+def test_the_mask_marks_what_a_pincushion_leaves_empty() -> None:
+    undo = undistortion(camera(), Lens("SIMPLE_RADIAL", (0.3,)))
+    assert undo is not None
+    assert undo.mask.shape == (HEIGHT, WIDTH)
+    assert undo.mask.dtype == bool
+    assert undo.mask[HEIGHT // 2, WIDTH // 2]
+    assert not undo.mask[0, 0]
+    barrel = undistortion(camera(), Lens("SIMPLE_RADIAL", (-0.1,)))
+    assert barrel is not None
+    assert barrel.mask.all()
+
+
+@pytest.mark.parametrize(
+    ("model", "params", "message"),
+    [
+        ("FOV", (1, 2, 3), "must be one of SIMPLE_PINHOLE.*got FOV.*image_undistorter"),
+        ("OPENCV", (1, 2, 3, 4), "OPENCV takes 8 parameters, got 4"),
+    ],
+)
+def test_bad_input(model: str, params: tuple[float, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        lens_and_intrinsics(model, params)
