@@ -1,0 +1,27 @@
+"""Multi-view video in, cameras in. The only place where axes flip and lenses are undone."""
+
+from morgs_mi.capture.camera import Camera
+from morgs_mi.capture.capture import Capture, Frame, load_capture
+from morgs_mi.capture.colmap import ColmapModel, read_colmap, write_colmap
+from morgs_mi.capture.lens import Lens, Undistortion, undistortion
+from morgs_mi.capture.poses_bounds import read_poses_bounds, write_poses_bounds
+from morgs_mi.capture.video import FolderReader, VideoReader, open_frames, write_video
+
+__all__ = [
+    "Camera",
+    "Capture",
+    "ColmapModel",
+    "FolderReader",
+    "Frame",
+    "Lens",
+    "Undistortion",
+    "VideoReader",
+    "load_capture",
+    "open_frames",
+    "read_colmap",
+    "read_poses_bounds",
+    "undistortion",
+    "write_colmap",
+    "write_poses_bounds",
+    "write_video",
+]

@@ -1,0 +1,251 @@
+"""Whole capture folders: layouts, order, downscaling by reprojection, and broken ones."""
+
+from __future__ import annotations
+
+import json
+import logging
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi.capture import Camera, Lens, load_capture, write_colmap, write_poses_bounds, write_video
+
+WIDTH, HEIGHT, COUNT = 62, 46, 3
+
+
+def camera(i: int, name: str, width: int = WIDTH, shift: float = 0.0) -> Camera:
+    view = Camera.look_at((np.cos(i), np.sin(i), 0.5), (0, 0, 0), (0, 0, 1), 60, width, HEIGHT, name)
+    return Camera(
+        view.K + np.array([[0, 0, shift], [0, 0, -shift], [0, 0, 0]]), view.viewmat, width, HEIGHT, name
+    )
+
+
+def clip(value: int, count: int = COUNT, width: int = WIDTH) -> list[np.ndarray]:
+    """Frame t of camera `value` is filled with (value, t, 0)."""
+    return [np.full((HEIGHT, width, 3), (value, t, 0), np.uint8) for t in range(count)]
+
+
+def n3dv(path: Path, names: tuple[str, ...] = ("cam00", "cam01", "cam02")) -> Path:
+    for i, name in enumerate(names):
+        write_video(path / f"{name}.mp4", clip(i), 30)
+    write_poses_bounds(
+        path / "poses_bounds.npy", [camera(i, n) for i, n in enumerate(names)], [[1, 9]] * len(names)
+    )
+    return path
+
+
+def colmap(path: Path, names: tuple[str, ...] = ("cam01", "cam02"), **kwargs) -> Path:
+    cameras = [camera(i, n, shift=3.0) for i, n in enumerate(names)]
+    write_colmap(path / "sparse" / "0", cameras, **kwargs)
+    for i, name in enumerate(names):
+        write_video(path / f"{name}.mp4", clip(i), 30)
+    return path
+
+
+def test_n3dv(tmp_path: Path) -> None:
+    capture = load_capture(n3dv(tmp_path))
+    assert capture.names == ("cam00", "cam01", "cam02")
+    assert (capture.num_frames, capture.fps, capture.test_view, capture.truth) == (COUNT, 30, None, None)
+    assert capture.points.shape == capture.point_colors.shape == (0, 3)
+    assert capture.masks == (None,) * 3
+    np.testing.assert_allclose(capture.cameras[1].viewmat, camera(1, "cam01").viewmat, atol=1e-12)
+    for t, frame in enumerate(capture.frames()):
+        assert frame.index == t
+        assert [tuple(image[5, 5]) for image in frame.images] == [(0, t, 0), (1, t, 0), (2, t, 0)]
+    assert [f.index for f in capture.frames(1, 2)] == [1]
+
+
+def test_cameras_are_ordered_by_number(tmp_path: Path) -> None:
+    names = ("cam_0", "cam_2", "cam_10")
+    capture = load_capture(n3dv(tmp_path, names))
+    assert capture.names == names
+    assert [image[0, 0, 0] for image in next(capture.frames()).images] == [0, 1, 2]
+
+
+def test_the_colmap_model_wins_and_is_ordered_by_number(tmp_path: Path) -> None:
+    points = np.arange(6.0).reshape(2, 3)
+    names = ("cam10", "cam2", "cam1")  # a model lists its images in any order
+    colmap(tmp_path, names, points=points, point_colors=points / 5)
+    write_poses_bounds(tmp_path / "poses_bounds.npy", [camera(7, n) for n in names], [[1, 9]] * 3)
+    capture = load_capture(tmp_path)
+    assert capture.names == ("cam1", "cam2", "cam10")
+    assert [image[0, 0, 0] for image in next(capture.frames()).images] == [2, 1, 0]
+    np.testing.assert_allclose(capture.cameras[0].viewmat, camera(2, "cam1").viewmat, atol=1e-12)
+    assert capture.cameras[0].K[0, 2] == WIDTH / 2 + 3
+    np.testing.assert_allclose(capture.points, points)
+    np.testing.assert_allclose(capture.point_colors, points / 5, atol=1 / 255)
+
+
+@pytest.mark.parametrize("downscale", [2, 3, 4.5])
+def test_downscaling_moves_projections_with_the_pixels(tmp_path: Path, downscale: float) -> None:
+    full = camera(0, "cam01", shift=3.0)
+    write_colmap(tmp_path / "sparse", [full])
+    x, y, z = full.viewmat[:3, :3] @ (0.03, 0.05, 0.02) + full.viewmat[:3, 3]
+    u, v = full.K[0, 0] * x / z + full.K[0, 2], full.K[1, 1] * y / z + full.K[1, 2]
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    blob = 250 * np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / 50)
+    write_video(tmp_path / "cam01", [np.repeat(blob[..., None], 3, -1).astype(np.uint8)], 30)
+
+    capture = load_capture(tmp_path, downscale)
+    small = capture.cameras[0]
+    assert (small.width, small.height) == (round(WIDTH / downscale), round(HEIGHT / downscale))
+    image = next(capture.frames()).images[0][..., 0].astype(float)
+    assert image.shape == (small.height, small.width)
+    rows, columns = np.mgrid[: small.height, : small.width] + 0.5
+    centre = np.array([(image * columns).sum(), (image * rows).sum()]) / image.sum()
+    expected = (small.K @ (x / z, y / z, 1))[:2]
+    np.testing.assert_allclose(centre, expected, atol=0.05)
+
+
+def test_lenses_are_undone_and_masked(tmp_path: Path) -> None:
+    colmap(tmp_path, lenses=[Lens("SIMPLE_RADIAL", (0.3,)), Lens()])
+    full, small = load_capture(tmp_path), load_capture(tmp_path, 2)
+    assert full.masks[1] is None
+    assert full.masks[0] is not None
+    assert small.masks[0] is not None
+    assert full.masks[0].shape == (HEIGHT, WIDTH)
+    assert small.masks[0].shape == (HEIGHT // 2, WIDTH // 2)
+    # A small pixel is valid exactly where its four large ones are.
+    blocks = full.masks[0].reshape(HEIGHT // 2, 2, WIDTH // 2, 2).all(axis=(1, 3))
+    np.testing.assert_array_equal(small.masks[0], blocks)
+
+
+def test_lossless_frames_are_preferred(tmp_path: Path) -> None:
+    n3dv(tmp_path)
+    write_video(tmp_path / "frames" / "cam01", clip(77), 30)
+    images = next(load_capture(tmp_path).frames()).images
+    assert [image[0, 0, 0] for image in images] == [0, 77, 2]
+
+
+def test_folders_of_frames_named_in_the_model(tmp_path: Path) -> None:
+    names = ("cam01", "cam02")
+    write_colmap(tmp_path / "sparse", [camera(i, f"{n}/0000.png") for i, n in enumerate(names)])
+    for i, name in enumerate(names):
+        write_video(tmp_path / name, clip(i), 30)
+    (tmp_path / "capture.json").write_text('{"fps": 24}')
+    capture = load_capture(tmp_path)
+    assert (capture.names, capture.fps) == (names, 24)
+
+
+def test_the_held_out_view(tmp_path: Path) -> None:
+    n3dv(tmp_path, tuple(f"cam{i:02}" for i in range(6)))
+    capture = load_capture(tmp_path)
+    assert capture.test_view == 0
+    assert capture.train_views == (1, 2, 3, 4, 5)
+    assert load_capture(tmp_path, test_view=None).test_view is None
+    (tmp_path / "capture.json").write_text('{"test_view": 4}')
+    assert load_capture(tmp_path).test_view == 4
+    assert load_capture(tmp_path, test_view=2).test_view == 2
+    (tmp_path / "capture.json").write_text('{"test_view": null}')
+    assert load_capture(tmp_path).test_view is None
+
+
+def test_truth_and_max_frames(tmp_path: Path) -> None:
+    (n3dv(tmp_path) / "truth").mkdir()
+    capture = load_capture(tmp_path, max_frames=2)
+    assert capture.truth == tmp_path / "truth"
+    assert capture.num_frames == len(list(capture.frames())) == 2
+
+
+def test_a_clip_without_calibration_is_left_out_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_video(colmap(tmp_path) / "cam03.mp4", clip(3), 30)
+    with caplog.at_level(logging.WARNING):
+        assert load_capture(tmp_path).names == ("cam01", "cam02")
+    assert "does not calibrate cam03" in caplog.text
+
+
+def no_folder(path: Path) -> None:
+    shutil.rmtree(path)
+
+
+def no_videos(path: Path) -> None:
+    [video.unlink() for video in path.glob("*.mp4")]
+
+
+def no_calibration(path: Path) -> None:
+    shutil.rmtree(path / "sparse")
+
+
+def no_clip(path: Path) -> None:
+    (path / "cam02.mp4").unlink()
+
+
+def other_size(path: Path) -> None:
+    write_video(path / "cam02.mp4", clip(1, width=WIDTH - 2), 30)
+
+
+def other_length(path: Path) -> None:
+    write_video(path / "cam02.mp4", clip(1, count=COUNT + 2), 30)
+
+
+def other_rate(path: Path) -> None:
+    write_video(path / "cam02.mp4", clip(1), 60)
+
+
+def empty_clip(path: Path) -> None:
+    (path / "cam02.mp4").write_bytes(b"")
+
+
+def two_images_of_a_camera(path: Path) -> None:
+    write_colmap(path / "sparse/0", [camera(0, "cam01"), camera(1, "cam01/0001.png")])
+
+
+def missing_video_of_a_row(path: Path) -> None:
+    no_calibration(path)
+    write_poses_bounds(path / "poses_bounds.npy", [camera(i, "") for i in range(3)], [[1, 9]] * 3)
+
+
+def bad_settings(path: Path) -> None:
+    (path / "capture.json").write_text(json.dumps({"test_view": "cam01"}))
+
+
+def broken_settings(path: Path) -> None:
+    (path / "capture.json").write_text("{")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "error", "message"),
+    [
+        (no_folder, FileNotFoundError, "expected a capture folder, found none"),
+        (no_videos, FileNotFoundError, r"expected videos \(.mp4"),
+        (
+            no_calibration,
+            FileNotFoundError,
+            r"expected a calibration \(sparse/0, sparse or poses_bounds.npy\)",
+        ),
+        (no_clip, FileNotFoundError, "its image 'cam02.png' needs a clip called cam02, found cam01"),
+        (other_size, ValueError, "cam02.mp4: expected 62x46 as the calibration of cam02 says, got 60x46"),
+        (other_length, ValueError, "got cam01.mp4 3, cam02.mp4 5; .*max_frames=3"),
+        (other_rate, ValueError, r"the same frame rate, got \[30.0, 60.0\]"),
+        (empty_clip, ValueError, "cam02.mp4: expected a video, got an empty file"),
+        (two_images_of_a_camera, ValueError, "one image per camera, got 2 images of 1 cameras"),
+        (missing_video_of_a_row, ValueError, r"got 3 rows for 2 videos \(cam01, cam02\)"),
+        (bad_settings, ValueError, "capture.json: `test_view` must be a camera's index or null, got 'cam01'"),
+        (broken_settings, ValueError, "capture.json: expected JSON"),
+    ],
+)
+def test_broken_captures(tmp_path: Path, spoil, error: type[Exception], message: str) -> None:
+    path = colmap(tmp_path / "capture")
+    spoil(path)
+    with pytest.raises(error, match=message):
+        load_capture(path)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"downscale": 0.5}, "`downscale` must be at least 1, got 0.5"),
+        ({"downscale": float("nan")}, "`downscale` must be at least 1, got nan"),
+        ({"max_frames": 0}, "`max_frames` must be at least 1 or None, got 0"),
+        ({"test_view": 2}, r"`test_view` must be in 0..1, or None .* got 2"),
+        ({"test_view": -1}, r"`test_view` must be in 0..1, or None .* got -1"),
+    ],
+)
+def test_bad_arguments(tmp_path: Path, arguments: dict, message: str) -> None:
+    path = colmap(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        load_capture(path, **arguments)
