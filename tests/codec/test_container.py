@@ -1,0 +1,228 @@
+"""The stream file: exact round trips, and no damage that goes unnoticed."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi.capture.camera import Camera
+from morgs_mi.codec.container import (
+    Packet,
+    PacketKind,
+    StreamReader,
+    StreamWriter,
+    TruncatedStreamError,
+    decode_packet,
+    encode_packet,
+)
+
+RNG = np.random.default_rng(5)
+PACKETS = [
+    Packet(
+        PacketKind.KEYFRAME,
+        0,
+        {"means": RNG.normal(size=(4, 3)).astype(np.float32), "ids": np.arange(4, dtype=np.uint32)},
+    ),
+    Packet(PacketKind.RESIDUAL, 1, {"empty": np.zeros((0, 3), np.float32), "code": np.arange(7, dtype=np.uint8)}),
+    Packet(PacketKind.RESIDUAL, 2**32 - 1, {"scalar": np.array(np.nan, np.float32)}),
+    Packet(PacketKind.RESIDUAL, 3),
+]
+METADATA = {"seed": 3, "parent": "äé", "preset": {"epochs": [1, 2.5, None]}}
+
+
+def cameras() -> list[Camera]:
+    view = Camera.look_at((1, 2, 3), (0, 0, 0), (0, 0, 1), 55, 40, 30, "cam00", near=0.2)
+    return [view, Camera(view.K + np.eye(3) / 3, view.viewmat, 41, 31, "cam01")]
+
+
+def write(path: Path, packets: list[Packet] = PACKETS) -> list[int]:
+    """Write a stream and return its length after the header and after each packet."""
+    with StreamWriter(path, cameras(), 29.97, METADATA) as stream:
+        ends = [stream.num_bytes]
+        for packet in packets:
+            ends.append(ends[-1] + stream.write(packet))
+            assert path.stat().st_size == ends[-1], "readable while written"
+    return ends
+
+
+def assert_equal(got: Packet, expected: Packet) -> None:
+    assert (got.kind, got.frame, list(got.arrays)) == (expected.kind, expected.frame, list(expected.arrays))
+    for name, array in expected.arrays.items():
+        assert got.arrays[name].dtype == array.dtype
+        np.testing.assert_array_equal(got.arrays[name], array)
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    write(tmp_path / "s")
+    stream = StreamReader(tmp_path / "s")
+    assert stream.fps == 29.97
+    assert stream.metadata == METADATA
+    for got, expected in zip(stream.cameras, cameras(), strict=True):
+        np.testing.assert_array_equal(got.K, expected.K)
+        np.testing.assert_array_equal(got.viewmat, expected.viewmat)
+        assert (got.name, got.width, got.height, got.near) == (
+            expected.name,
+            expected.width,
+            expected.height,
+            expected.near,
+        )
+    for _ in range(2):
+        for got, expected in zip(stream, PACKETS, strict=True):
+            assert_equal(got, expected)
+
+
+@pytest.mark.parametrize("packet", PACKETS)
+def test_a_packet_stands_alone(packet: Packet) -> None:
+    assert_equal(decode_packet(encode_packet(packet)), packet)
+
+
+def test_arrays_in_any_memory_order_arrive_in_theirs() -> None:
+    array = RNG.normal(size=(3, 5)).astype(np.float32)
+    arrays = {"fortran": np.asfortranarray(array), "slice": array[::2, 1:], "swapped": array.astype(">f4")}
+    got = decode_packet(encode_packet(Packet(PacketKind.RESIDUAL, 0, arrays))).arrays
+    for name, expected in arrays.items():
+        np.testing.assert_array_equal(got[name], expected)
+        assert got[name].flags.writeable
+
+
+def test_a_growing_file_can_be_read_up_to_its_last_whole_packet(tmp_path: Path) -> None:
+    with StreamWriter(tmp_path / "s", cameras(), 30) as writer:
+        reader = StreamReader(tmp_path / "s")
+        for i, packet in enumerate(PACKETS):
+            assert len(list(reader)) == i
+            writer.write(packet)
+        assert len(list(reader)) == len(PACKETS)
+
+
+def test_every_truncation_is_noticed_or_leaves_whole_packets(tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    ends = write(path)
+    whole = path.read_bytes()
+    for length in range(len(whole)):
+        path.write_bytes(whole[:length])
+        intact = sum(end <= length for end in ends)
+        got: list[Packet] = []
+        if length in ends:
+            got.extend(StreamReader(path))
+        else:
+            with pytest.raises(TruncatedStreamError, match=rf"s: packet {intact} at byte \d+: .*; {intact} packets"):
+                got.extend(StreamReader(path))
+        assert len(got) == max(intact - 1, 0)
+
+
+def test_every_flipped_bit_is_noticed(tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    write(path)
+    whole = path.read_bytes()
+    for at in np.random.default_rng(0).choice(8 * len(whole), 500, replace=False):
+        damaged = bytearray(whole)
+        damaged[at // 8] ^= 1 << at % 8
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=str(path)):
+            list(StreamReader(path))
+
+
+def sealed(payload: bytes, kind: int = 2) -> bytes:
+    head = struct.pack("<IIQ", kind, 0, len(payload))
+    return head + struct.pack("<I", zlib.crc32(head + payload)) + payload
+
+
+def with_table(table: bytes, rest: bytes = b"") -> bytes:
+    return sealed(struct.pack("<I", len(table)) + table + rest)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"", "at least 20 bytes, got 0"),
+        (sealed(b"")[:-1], "at least 20 bytes, got 19"),
+        (sealed(b"\0" * 9)[:-1], "should have 9 bytes, got 8"),
+        (sealed(b"", kind=7), r"1 \(keyframe\) or 2 \(residual\), got 7"),
+        (sealed(b"", kind=0), r"1 \(keyframe\) or 2 \(residual\), got 0"),
+        (sealed(b"\xff\xff\xff\xff"), "table of arrays is broken"),
+        (with_table(b"no"), "table of arrays is broken"),
+        (with_table(b"[" * 100000), "table of arrays is broken"),
+        (with_table(b"[1]"), "table of arrays is broken"),
+        (with_table(b'[["a", "object", [1]]]', bytes(8)), "`a` is said to be object"),
+        (with_table(b'[["a", "uint8", [-1]]]', bytes(8)), r"`a` is said to be uint8 \[-1\]"),
+        (
+            with_table(b'[["a", "float32", [1000000000000]]]', bytes(8)),
+            "would end at byte 4000000000039 of 47",
+        ),
+        (with_table(b'[["a", "uint8", [0, 10000000000000000000000]]]'), "table of arrays is broken"),
+        (with_table(b'[["a", "uint8", [10000000000000000000000]]]'), "table of arrays is broken"),
+        (with_table(b'[["a", "uint8", [7]]]', bytes(8)), "describes 32 bytes of 33"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_packets_that_lie_are_refused(data: bytes, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        decode_packet(data)
+
+
+@pytest.mark.parametrize(
+    ("packet", "message"),
+    [
+        (Packet(PacketKind.HEADER, 0), "`kind` must be KEYFRAME or RESIDUAL"),
+        (Packet(PacketKind.RESIDUAL, -1), r"`frame` must be in 0..2\^32-1, got -1"),
+        (Packet(PacketKind.RESIDUAL, 0, {"a": np.zeros(3)}), "`a` must be one of float32, .* got float64"),
+        (Packet(PacketKind.RESIDUAL, 0, {"a": np.array([None])}), "got object"),
+    ],
+)
+def test_packets_that_do_not_fit_are_refused_and_leave_no_trace(tmp_path: Path, packet: Packet, message: str) -> None:
+    with StreamWriter(tmp_path / "s", cameras(), 30) as stream:
+        with pytest.raises(ValueError, match=message):
+            stream.write(packet)
+        stream.write(PACKETS[0])
+    assert len(list(StreamReader(tmp_path / "s"))) == 1
+
+
+def test_files_that_are_no_stream(tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    path.write_bytes(b"ply\nformat ascii")
+    with pytest.raises(ValueError, match=r"expected a stream that starts with .* got b'ply"):
+        StreamReader(path)
+    path.write_bytes(struct.pack("<8sI", b"MORGS-MI", 9))
+    with pytest.raises(ValueError, match="expected format version 1, got 9"):
+        StreamReader(path)
+    preamble = struct.pack("<8sI", b"MORGS-MI", 1)
+    path.write_bytes(preamble + sealed(b"{}", kind=1))
+    with pytest.raises(ValueError, match="packet 0 at byte 12: the first packet must be the header, got kind 1"):
+        StreamReader(path)
+    path.write_bytes(preamble + sealed(b"{}", kind=0))
+    with pytest.raises(ValueError, match="packet 0 at byte 12: the header's JSON is broken"):
+        StreamReader(path)
+    with pytest.raises(FileNotFoundError):
+        StreamReader(tmp_path / "none")
+    with pytest.raises(ValueError, match="`metadata` and `fps` must fit into JSON"):
+        StreamWriter(tmp_path / "t", cameras(), 30, {"a": object()})
+    assert not (tmp_path / "t").exists()
+
+
+def test_a_full_disk_leaves_whole_packets_and_the_writer_usable(tmp_path: Path) -> None:
+    path = tmp_path / "s"
+    # A limit on the size of files fails a write in its middle, as a full disk does.
+    program = f"""
+import resource
+import numpy as np
+from morgs_mi.codec.container import Packet, PacketKind, StreamWriter
+with StreamWriter({str(path)!r}, [], 30) as stream:
+    stream.write(Packet(PacketKind.KEYFRAME, 0, {{"a": np.zeros(50, np.float32)}}))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (stream.num_bytes + 100, resource.RLIM_INFINITY))
+    try:
+        stream.write(Packet(PacketKind.RESIDUAL, 1, {{"a": np.zeros(500, np.float32)}}))
+    except OSError as error:
+        print(error)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY,) * 2)
+    stream.write(Packet(PacketKind.RESIDUAL, 2))
+"""
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert f"{path}: 2" in result.stdout
+    assert "bytes of whole packets; free space on the disk" in result.stdout
+    assert [packet.frame for packet in StreamReader(path)] == [0, 2]
