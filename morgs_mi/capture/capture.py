@@ -152,9 +152,7 @@ def load_capture(
                 f"{reader.path}: expected {camera.width}x{camera.height} as the calibration of {camera.name} "
                 f"says, got {reader.width}x{reader.height}; calibrate at the recorded size."
             )
-    sources = tuple(
-        _Source(r, undistortion(c, lens)) for r, c, lens in zip(readers, cameras, lenses, strict=True)
-    )
+    sources = tuple(_Source(r, undistortion(c, lens)) for r, c, lens in zip(readers, cameras, lenses, strict=True))
     cameras = tuple(_resized(camera, downscale) for camera in cameras)
     return Capture(
         path=path,
@@ -177,8 +175,7 @@ def _calibration(
     views = _find_views(path)
     if not views:
         raise FileNotFoundError(
-            f"{path}: expected videos ({', '.join(VIDEO_SUFFIXES)}) or folders of frames, found none; "
-            "check the path."
+            f"{path}: expected videos ({', '.join(VIDEO_SUFFIXES)}) or folders of frames, found none; check the path."
         )
     if folder := find_colmap(path):
         model = read_colmap(folder)

@@ -176,9 +176,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _broken(path: Path, number: int, expected: str, line: str) -> ValueError:
-    return ValueError(
-        f"{path}, line {number}: expected `{expected}`, got {line[:80]!r}; export the model again."
-    )
+    return ValueError(f"{path}, line {number}: expected `{expected}`, got {line[:80]!r}; export the model again.")
 
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]:

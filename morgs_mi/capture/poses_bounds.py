@@ -36,17 +36,13 @@ def read_poses_bounds(path: str | Path, names: Sequence[str]) -> tuple[tuple[Cam
             f"{path}: expected a NumPy array [C, 17], got a broken file ({error}); export it again."
         ) from None
     if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
-        raise ValueError(
-            f"{path}: expected a float array [C, 17], got {rows.dtype} {rows.shape}; export it again."
-        )
+        raise ValueError(f"{path}: expected a float array [C, 17], got {rows.dtype} {rows.shape}; export it again.")
     if len(rows) != len(names):
         raise ValueError(
             f"{path}: expected one row per camera, got {len(rows)} rows for {len(names)} videos "
             f"({', '.join(names)}); remove the rows of the videos that are missing."
         )
-    cameras = tuple(
-        _camera(path, i, row, name) for i, (row, name) in enumerate(zip(rows, names, strict=True))
-    )
+    cameras = tuple(_camera(path, i, row, name) for i, (row, name) in enumerate(zip(rows, names, strict=True)))
     return cameras, rows[:, 15:].astype(np.float64)
 
 
@@ -81,9 +77,7 @@ def write_poses_bounds(path: str | Path, cameras: Sequence[Camera], bounds: np.n
     """
     bounds = np.asarray(bounds, dtype=np.float64)
     if bounds.shape != (len(cameras), 2):
-        raise ValueError(
-            f"write_poses_bounds(): `bounds` must be [C, 2] with C={len(cameras)}, got {bounds.shape}."
-        )
+        raise ValueError(f"write_poses_bounds(): `bounds` must be [C, 2] with C={len(cameras)}, got {bounds.shape}.")
     rows = []
     for camera, near_far in zip(cameras, bounds, strict=True):
         K, size = camera.K, np.array([camera.width, camera.height])

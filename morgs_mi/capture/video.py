@@ -259,7 +259,5 @@ def _read_image(file: Path) -> np.ndarray:
     # The stored pixels, not turned by EXIF: calibrations are made on those.
     image = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
-        raise ValueError(
-            f"{file}: expected an image, got {file.stat().st_size} bytes that cannot be decoded."
-        )
+        raise ValueError(f"{file}: expected an image, got {file.stat().st_size} bytes that cannot be decoded.")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

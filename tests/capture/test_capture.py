@@ -17,9 +17,7 @@ WIDTH, HEIGHT, COUNT = 62, 46, 3
 
 def camera(i: int, name: str, width: int = WIDTH, shift: float = 0.0) -> Camera:
     view = Camera.look_at((np.cos(i), np.sin(i), 0.5), (0, 0, 0), (0, 0, 1), 60, width, HEIGHT, name)
-    return Camera(
-        view.K + np.array([[0, 0, shift], [0, 0, -shift], [0, 0, 0]]), view.viewmat, width, HEIGHT, name
-    )
+    return Camera(view.K + np.array([[0, 0, shift], [0, 0, -shift], [0, 0, 0]]), view.viewmat, width, HEIGHT, name)
 
 
 def clip(value: int, count: int = COUNT, width: int = WIDTH) -> list[np.ndarray]:
@@ -30,9 +28,7 @@ def clip(value: int, count: int = COUNT, width: int = WIDTH) -> list[np.ndarray]
 def n3dv(path: Path, names: tuple[str, ...] = ("cam00", "cam01", "cam02")) -> Path:
     for i, name in enumerate(names):
         write_video(path / f"{name}.mp4", clip(i), 30)
-    write_poses_bounds(
-        path / "poses_bounds.npy", [camera(i, n) for i, n in enumerate(names)], [[1, 9]] * len(names)
-    )
+    write_poses_bounds(path / "poses_bounds.npy", [camera(i, n) for i, n in enumerate(names)], [[1, 9]] * len(names))
     return path
 
 

@@ -23,9 +23,7 @@ def cameras() -> list[Camera]:
         Camera.look_at((np.cos(a), np.sin(a), 0.5), (0, 0, 0), (0, 0, 1), 60 + a, 64, 48, f"cam0{i}")
         for i, a in enumerate((0.0, 0.7, 2.0))
     ]
-    return [
-        Camera(v.K + np.array([[0, 0, 3], [0, 0, -2], [0, 0, 0]]), v.viewmat, 64, 48, v.name) for v in views
-    ]
+    return [Camera(v.K + np.array([[0, 0, 3], [0, 0, -2], [0, 0, 0]]), v.viewmat, 64, 48, v.name) for v in views]
 
 
 def write(folder: Path, kind: str = "txt") -> Path:
@@ -71,9 +69,7 @@ def test_the_models_are_numbered_as_in_colmap() -> None:
     for i, name in enumerate(MODELS):
         # INVALID is -1 and not every later id is public; the first seven are fixed by the file format.
         assert int(getattr(pycolmap.CameraModelId, name)) == i
-        assert (
-            len(pycolmap.Camera.create_from_model_name(1, name, 50.0, 64, 48).params) == sum(MODELS[name]) + 2
-        )
+        assert len(pycolmap.Camera.create_from_model_name(1, name, 50.0, 64, 48).params) == sum(MODELS[name]) + 2
 
 
 def test_blank_lines_and_no_points(tmp_path: Path) -> None:

@@ -21,10 +21,7 @@ def clip(height: int = HEIGHT, width: int = WIDTH, count: int = COUNT) -> list[n
 
 def smooth_clip() -> list[np.ndarray]:
     y, x = np.mgrid[:HEIGHT, :WIDTH]
-    return [
-        np.stack([120 + 80 * np.sin((x + t) / 9), 100 + 2 * y, 90 + x], -1).astype(np.uint8)
-        for t in range(COUNT)
-    ]
+    return [np.stack([120 + 80 * np.sin((x + t) / 9), 100 + 2 * y, 90 + x], -1).astype(np.uint8) for t in range(COUNT)]
 
 
 @pytest.mark.parametrize("name", ["cam.mp4", "cam.mkv", "cam"])
