@@ -1,0 +1,129 @@
+"""The camera value that every other room speaks.
+
+Notation: x_cam = R x_world + t with `viewmat = [R t; 0 1]` (OpenCV: x right, y down, z forward), and a
+pixel is (fx x/z + cx, fy y/z + cy). Pixel centres lie at +0.5, so the image spans [0, width] x [0, height].
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+__all__ = ["Camera"]
+
+# Mitsuba's camera looks along +z with x to the left and y up; OpenCV's has x right and y down.
+_OPENCV_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera in OpenCV's convention.
+
+    Attributes:
+        K: intrinsics [3, 3] in pixels; an off-centre principal point is honoured.
+        viewmat: extrinsics [4, 4], world -> camera. NumPy as a rule; a Dr.Jit tensor [4, 4] where the
+            gradient of the pose is wanted.
+        width: image width in pixels.
+        height: image height in pixels.
+        name: what the capture calls it, e.g. ``cam00``.
+        near: Gaussians whose centre has a depth below this (world units) are not drawn.
+    """
+
+    K: np.ndarray
+    viewmat: Any
+    width: int
+    height: int
+    name: str = ""
+    near: float = 0.01
+
+    def __post_init__(self) -> None:
+        where = f"Camera({self.name!r})" if self.name else "Camera()"
+        if self.width < 1 or self.height < 1:
+            raise ValueError(
+                f"{where}: the image size must be at least 1x1, got {self.width}x{self.height}; check width and height."
+            )
+        K = np.asarray(self.K, dtype=np.float64)
+        if K.shape != (3, 3):
+            raise ValueError(f"{where}: `K` must be [3, 3], got {K.shape}; pass one camera's intrinsics.")
+        if tuple(self.viewmat.shape) != (4, 4):
+            raise ValueError(
+                f"{where}: `viewmat` must be [4, 4], got {tuple(self.viewmat.shape)}; pass one world-to-camera matrix."
+            )
+        if not np.isfinite(K).all() or not K[0, 0] > 0 or not K[1, 1] > 0:
+            raise ValueError(
+                f"{where}: `K` must be finite with positive focal lengths, got {K.tolist()}; check the calibration."
+            )
+        if isinstance(self.viewmat, np.ndarray) and not np.isfinite(self.viewmat).all():
+            raise ValueError(f"{where}: `viewmat` must be finite, got {self.viewmat.tolist()}; check the calibration.")
+        object.__setattr__(self, "K", K)
+
+    @classmethod
+    def look_at(
+        cls,
+        origin: Any,
+        target: Any,
+        up: Any,
+        fov_x: float,
+        width: int,
+        height: int,
+        name: str = "",
+        near: float = 0.01,
+    ) -> Camera:
+        """Return the camera at `origin` [3] that looks at `target` [3]; `fov_x` in degrees across."""
+        forward = np.asarray(target, float) - np.asarray(origin, float)
+        forward /= np.linalg.norm(forward)
+        right = np.cross(forward, np.asarray(up, float))
+        right /= np.linalg.norm(right)
+        R = np.stack([right, np.cross(forward, right), forward])
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = R, -R @ np.asarray(origin, float)
+        f = 0.5 * width / np.tan(np.deg2rad(0.5 * fov_x))
+        K = np.array([[f, 0, 0.5 * width], [0, f, 0.5 * height], [0, 0, 1.0]])
+        return cls(K, viewmat, width, height, name, near)
+
+    @property
+    def position(self) -> np.ndarray:
+        """The camera's centre [3] in world units."""
+        V = np.asarray(self.viewmat, dtype=np.float64)
+        return -V[:3, :3].T @ V[:3, 3]
+
+    @property
+    def to_world(self) -> np.ndarray:
+        """Mitsuba's `to_world` matrix [4, 4]: camera -> world with x to the left and y up."""
+        return np.linalg.inv(np.asarray(self.viewmat, dtype=np.float64)) @ _OPENCV_FROM_MITSUBA
+
+    def resized(self, width: int, height: int) -> Camera:
+        """Return the same view on a grid of width x height pixels (intrinsics scaled to match)."""
+        K = np.diag([width / self.width, height / self.height, 1.0]) @ self.K
+        return replace(self, K=K, width=width, height=height)
+
+    def sensor(self, **film: Any) -> dict[str, Any]:
+        """Return a Mitsuba `perspective` sensor dictionary of this view.
+
+        Keyword arguments override entries of the film (e.g. ``rfilter``, ``pixel_format``).
+        Mitsuba's sensor has one focal length: where fx and fy differ, fx is used.
+        """
+        import mitsuba as mi
+
+        f, cx, cy = self.K[0, 0], self.K[0, 2], self.K[1, 2]
+        # Mitsuba adds its offset to the pixel's position, so the principal point moves the other way.
+        return {
+            "type": "perspective",
+            "to_world": mi.ScalarTransform4f(self.to_world),
+            "fov": float(np.rad2deg(2 * np.arctan(0.5 * self.width / f))),
+            "fov_axis": "x",
+            "principal_point_offset_x": float(0.5 - cx / self.width),
+            "principal_point_offset_y": float(0.5 - cy / self.height),
+            "near_clip": self.near,
+            "far_clip": 1e4,
+            "film": {
+                "type": "hdrfilm",
+                "width": self.width,
+                "height": self.height,
+                "rfilter": {"type": "box"},
+                "component_format": "float32",
+                **film,
+            },
+        }
