@@ -1,0 +1,96 @@
+"""An articulated robot arm that swings through a room: up to about 10 pixels a frame at 320x240.
+
+Every link is rigid; its pose is its parent's pose times a joint, so the hand adds up all the motion.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from morgs_mi.capture.scene import Object, Rig, Scene, rotate, translate
+from morgs_mi.capture.textures import lights, pattern, room, textured
+
+UPPER, FORE = 0.70, 0.60
+
+
+def build(seed: int = 0) -> Scene:
+    """Return the scene; `seed` chooses its textures."""
+    steel = textured(pattern(seed + 20, (0.24, 0.26, 0.30), (0.44, 0.42, 0.38), 4, 20))
+    orange = textured(pattern(seed + 21, (0.76, 0.34, 0.08), (0.70, 0.56, 0.20), 4, 16))
+    blue = textured(pattern(seed + 22, (0.14, 0.32, 0.66), (0.60, 0.66, 0.70), 4, 16), roughness=0.3)
+    green = textured(pattern(seed + 23, (0.20, 0.58, 0.30), (0.76, 0.70, 0.36), 2, 12))
+    objects = {
+        **room(seed),
+        "base": Object({"block": _box(0, 0.15, 0, 0.36, 0.15, 0.36, steel)}),
+        "turntable": Object({"drum": _rod(0, 0.25, 0.30, steel), "lid": _lid(0.25, 0.30, steel)}, turntable),
+        "upper_arm": Object(
+            {
+                "beam": _box(0, 0.5 * UPPER, 0, 0.16, 0.5 * UPPER, 0.16, orange),
+                "shoulder": _ball(0.26, steel),
+            },
+            upper_arm,
+        ),
+        "forearm": Object(
+            {"beam": _box(0, 0.5 * FORE, 0, 0.13, 0.5 * FORE, 0.13, blue), "elbow": _ball(0.21, orange)},
+            forearm,
+        ),
+        "hand": Object(
+            {
+                "palm": _box(0, 0.10, 0, 0.24, 0.07, 0.16, green),
+                "finger": _box(-0.17, 0.30, 0, 0.07, 0.15, 0.13, orange),
+                "thumb": _box(0.17, 0.30, 0, 0.07, 0.15, 0.13, blue),
+            },
+            hand,
+        ),
+    }
+    return Scene("arm", objects, lights(), Rig(center=(0, 1.05, 0), distance=4.6))
+
+
+def turntable(time: float) -> np.ndarray:
+    """Turn about the vertical."""
+    return translate(0, 0.30, 0) @ rotate("y", 1.0 * np.sin(2.2 * time - 0.3))
+
+
+def upper_arm(time: float) -> np.ndarray:
+    """Lean at the shoulder."""
+    return turntable(time) @ translate(0, 0.32, 0) @ rotate("z", 0.35 + 0.45 * np.sin(2.4 * time + 2.5))
+
+
+def forearm(time: float) -> np.ndarray:
+    """Bend at the elbow."""
+    return upper_arm(time) @ translate(0, UPPER, 0) @ rotate("z", -1.3 + 0.7 * np.sin(2.8 * time + 2.1))
+
+
+def hand(time: float) -> np.ndarray:
+    """Twist at the wrist."""
+    return forearm(time) @ translate(0, FORE, 0) @ rotate("y", 2.4 * time)
+
+
+def _box(x: float, y: float, z: float, dx: float, dy: float, dz: float, bsdf: dict[str, Any]) -> dict[str, Any]:
+    """Return a box about (x, y, z) with half-widths (dx, dy, dz)."""
+    return {
+        "type": "cube",
+        "to_world": _transform(translate(x, y, z) @ np.diag([dx, dy, dz, 1])),
+        "bsdf": bsdf,
+    }
+
+
+def _rod(bottom: float, top: float, radius: float, bsdf: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "cylinder", "p0": [0, bottom, 0], "p1": [0, top, 0], "radius": radius, "bsdf": bsdf}
+
+
+def _lid(y: float, radius: float, bsdf: dict[str, Any]) -> dict[str, Any]:
+    facing_up = translate(0, y, 0) @ rotate("x", -np.pi / 2) @ np.diag([radius, radius, 1, 1])
+    return {"type": "disk", "to_world": _transform(facing_up), "bsdf": bsdf}
+
+
+def _ball(radius: float, bsdf: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "sphere", "radius": radius, "bsdf": bsdf}
+
+
+def _transform(matrix: np.ndarray) -> Any:
+    import mitsuba as mi
+
+    return mi.ScalarTransform4f(matrix)

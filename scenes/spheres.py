@@ -1,0 +1,65 @@
+"""Textured balls that roll without slipping, bounce and spin in a room: 2 to 6 pixels a frame at 320x240."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from morgs_mi.capture.scene import Object, Scene, rotate, translate
+from morgs_mi.capture.textures import RGB, lights, pattern, room, textured
+
+TOP = translate(0.15, 0.5, -0.75) @ rotate("x", -np.pi / 2) @ np.diag([0.34, 0.34, 1, 1])
+
+
+def build(seed: int = 0) -> Scene:
+    """Return the scene; `seed` chooses its textures."""
+    import mitsuba as mi
+
+    balls = {
+        "roller": _ball(seed + 10, 0.38, (0.75, 0.20, 0.12), (0.80, 0.70, 0.30), rolling),
+        "circler": _ball(seed + 11, 0.28, (0.14, 0.30, 0.70), (0.70, 0.74, 0.78), circling),
+        "bouncer": _ball(seed + 12, 0.30, (0.20, 0.62, 0.24), (0.78, 0.72, 0.20), bouncing),
+        "spinner": _ball(seed + 13, 0.48, (0.60, 0.22, 0.58), (0.66, 0.62, 0.56), spinning, roughness=0.3),
+    }
+    stone = textured(pattern(seed + 14, (0.40, 0.36, 0.30), (0.24, 0.20, 0.18), 8, 28))
+    plinth = {
+        "side": {
+            "type": "cylinder",
+            "p0": [0.15, 0, -0.75],
+            "p1": [0.15, 0.5, -0.75],
+            "radius": 0.34,
+            "bsdf": stone,
+        },
+        "top": {"type": "disk", "to_world": mi.ScalarTransform4f(TOP), "bsdf": stone},
+    }
+    objects = {**room(seed), "plinth": Object(plinth), **balls}
+    return Scene("spheres", objects, lights())
+
+
+def rolling(time: float) -> np.ndarray:
+    """Roll to and fro along x: the ball turns by minus the distance over its radius."""
+    x = 0.8 * np.sin(1.1 * time - 1.0)
+    return translate(x, 0.38, 0.85) @ rotate("z", -x / 0.38)
+
+
+def circling(time: float) -> np.ndarray:
+    """Roll around a circle of radius 0.62: a wheel on an axle that points at the circle's centre."""
+    angle = 1.4 * time + 0.4
+    wheel = translate(0, 0.28, 0.62) @ rotate("z", -0.62 * angle / 0.28)
+    return translate(-1.25, 0, -0.35) @ rotate("y", angle) @ wheel
+
+
+def bouncing(time: float) -> np.ndarray:
+    """Bounce on parabolas 0.42 high, 1 s each, while drifting sideways and tumbling."""
+    phase = (time + 0.2) % 1.0
+    height = 0.30 + 0.42 * (1 - (2 * phase - 1) ** 2)
+    return translate(1.35 + 0.3 * np.sin(1.3 * time), height, -0.3) @ rotate("x", 1.4 * time) @ rotate("z", time)
+
+
+def spinning(time: float) -> np.ndarray:
+    """Spin in place on the plinth about an axis leaning towards the cameras."""
+    return translate(0.15, 0.98, -0.75) @ rotate("x", 0.4) @ rotate("y", 2.2 * time)
+
+
+def _ball(seed: int, radius: float, first: RGB, second: RGB, pose, roughness: float | None = None) -> Object:
+    material = textured(pattern(seed, first, second, 8, 24), roughness)
+    return Object({"ball": {"type": "sphere", "radius": radius, "bsdf": material}}, pose)
