@@ -56,9 +56,7 @@ def test_major_follows_links(libraries, tmp_path):
 
 
 def test_newest_first(libraries):
-    folders = libraries(
-        "libLLVM-9.so.1", "libLLVM-15.so.1", "libLLVM.so.22.1", "libLLVM.so.19.1", "libLLVMx.so"
-    )
+    folders = libraries("libLLVM-9.so.1", "libLLVM-15.so.1", "libLLVM.so.22.1", "libLLVM.so.19.1", "libLLVMx.so")
     assert [llvm.llvm_major(path) for path in llvm.find_llvm(folders)] == [22, 19, 15, 9]
     assert llvm.choose_llvm(folders=folders) == (folders[0] / "libLLVM.so.22.1", "")
 
@@ -107,9 +105,7 @@ def test_import_survives_a_bad_choice(tmp_path):
     bad = next((p for p in llvm.find_llvm() if (llvm.llvm_major(p) or 99) < 17), tmp_path / "libLLVM-15.so.1")
     if llvm.usable(bad):
         pytest.skip(f"{bad} works on this CPU")
-    code = (
-        "import morgs_mi; import drjit as dr; from drjit.llvm import Float; print(dr.minimum(Float(1, 3), 2))"
-    )
+    code = "import morgs_mi; import drjit as dr; from drjit.llvm import Float; print(dr.minimum(Float(1, 3), 2))"
     environment = llvm.os.environ | {llvm.VARIABLE: str(bad)}
     run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr

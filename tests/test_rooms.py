@@ -57,6 +57,4 @@ def test_imports_go_left(path):
     wrong = [target for target in inside if target in ROOMS and target not in allowed]
     assert not wrong, f"{path.relative_to(ROOT)} imports from {wrong}, right of `{room}`"
     # Names that the front door gathers would hide which room they come from.
-    assert set(inside) <= set(ROOMS), (
-        f"{path.relative_to(ROOT)} imports {set(inside) - set(ROOMS)} from morgs_mi"
-    )
+    assert set(inside) <= set(ROOMS), f"{path.relative_to(ROOT)} imports {set(inside) - set(ROOMS)} from morgs_mi"

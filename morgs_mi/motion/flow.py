@@ -56,9 +56,7 @@ def optical_flow(image: np.ndarray, previous: np.ndarray, method: str = "dis-med
         ValueError: an unknown method, images that are not RGB or differ in size.
     """
     if method not in FLOW_METHODS:
-        raise ValueError(
-            f"optical_flow(): `method` must be one of {', '.join(FLOW_METHODS)}, got {method!r}."
-        )
+        raise ValueError(f"optical_flow(): `method` must be one of {', '.join(FLOW_METHODS)}, got {method!r}.")
     image, previous = np.asarray(image), np.asarray(previous)
     if image.ndim != 3 or image.shape[2] != 3 or image.shape != previous.shape:
         raise ValueError(
@@ -70,9 +68,7 @@ def optical_flow(image: np.ndarray, previous: np.ndarray, method: str = "dis-med
     return FLOW_METHODS[method](_gray(image), _gray(previous))
 
 
-def motion_cue(
-    image: np.ndarray, previous: np.ndarray, method: str = "dis-medium"
-) -> tuple[np.ndarray, np.ndarray]:
+def motion_cue(image: np.ndarray, previous: np.ndarray, method: str = "dis-medium") -> tuple[np.ndarray, np.ndarray]:
     """Return the motion [H, W, 2] in pixels, x_t - x_{t-1} = -F, and where it can be trusted [H, W], bool.
 
     A pixel is reliable if the flow back from where it came from returns to it, |F + B|^2 < 0.01 (|F|^2 +

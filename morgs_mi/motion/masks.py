@@ -63,9 +63,7 @@ def refine_mask(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
         ValueError: the sizes of image and mask differ.
     """
     if image.shape != (*mask.shape, 3):
-        raise ValueError(
-            f"refine_mask(): `image` must be [H, W, 3] with H, W = {mask.shape}, got {image.shape}."
-        )
+        raise ValueError(f"refine_mask(): `image` must be [H, W, 3] with H, W = {mask.shape}, got {image.shape}.")
     clean = _cleaned(mask)
     height, width = mask.shape
     scale = min(1.0, GRABCUT_WIDTH / width)
@@ -79,9 +77,7 @@ def refine_mask(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     labels = np.where(near > 0, np.where(seed > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD).astype(np.uint8)
     cv2.setRNGSeed(0)  # its k-means starts at random
     small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    labels, _, _ = cv2.grabCut(
-        small, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK
-    )
+    labels, _, _ = cv2.grabCut(small, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK)
     objects = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.uint8)
     objects = cv2.resize(objects, (width, height), interpolation=cv2.INTER_NEAREST)
     return _cleaned(objects > 0)

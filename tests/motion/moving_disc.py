@@ -10,10 +10,7 @@ def texture(height: int, width: int, seed: int) -> np.ndarray:
     """Return a random texture [H, W, 3] in [0, 1] with detail of 2 to 8 pixels."""
     rng = np.random.default_rng(seed)
     octaves = [
-        cv2.resize(
-            rng.random((height // s + 4, width // s + 4, 3)), (width, height), interpolation=cv2.INTER_CUBIC
-        )
-        * s
+        cv2.resize(rng.random((height // s + 4, width // s + 4, 3)), (width, height), interpolation=cv2.INTER_CUBIC) * s
         for s in (2, 4, 8)
     ]
     return np.clip(sum(octaves) / 14, 0, 1)

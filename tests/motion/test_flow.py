@@ -44,9 +44,7 @@ def test_float_and_bytes_agree():
 
 
 @pytest.mark.parametrize("method", FLOW_METHODS)
-@pytest.mark.parametrize(
-    "size", [(1, 1), (1, 40), (15, 15), (16, 16), (16, 90), (90, 16), (24, 24), (31, 70)]
-)
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (15, 15), (16, 16), (16, 90), (90, 16), (24, 24), (31, 70)])
 def test_any_size_gives_a_finite_flow(method, size):
     rng = np.random.default_rng(0)
     image, previous = rng.integers(0, 255, (2, *size, 3), dtype=np.uint8)

@@ -1,0 +1,87 @@
+"""Metrics against what they say they are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from morgs_mi.evaluate.metrics import endpoint_error, psnr, ssim
+
+rng = np.random.default_rng(0)
+TRUTH = rng.random((24, 31, 3))
+NOISY = np.clip(TRUTH + rng.normal(0, 0.1, TRUTH.shape), 0, 1)
+
+
+def ssim_by_windows(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """SSIM of one channel, one window at a time, as the paper writes it."""
+    i = np.arange(-5, 6)
+    w = np.exp(-(i[:, None] ** 2 + i**2) / (2 * 1.5**2))
+    w /= w.sum()
+    out = np.empty((image.shape[0] - 10, image.shape[1] - 10))
+    for r, c in np.ndindex(out.shape):
+        x, y = image[r : r + 11, c : c + 11], truth[r : r + 11, c : c + 11]
+        mx, my = (w * x).sum(), (w * y).sum()
+        vx, vy, cov = (w * (x - mx) ** 2).sum(), (w * (y - my) ** 2).sum(), (w * (x - mx) * (y - my)).sum()
+        out[r, c] = (2 * mx * my + 1e-4) * (2 * cov + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
+    return out
+
+
+def test_psnr_of_a_known_error():
+    assert psnr(TRUTH + 0.1, TRUTH) == pytest.approx(20)
+    assert psnr(TRUTH, TRUTH) == float("inf")
+    black = np.zeros((4, 4, 3), np.uint8)
+    assert psnr(black + np.uint8(255), black) == pytest.approx(0)
+
+
+def test_psnr_counts_the_mask_alone():
+    image = TRUTH.copy()
+    image[:12] += 0.1
+    mask = np.zeros(TRUTH.shape[:2], bool)
+    mask[:12] = True
+    assert psnr(image, TRUTH, mask) == pytest.approx(20)
+    assert psnr(image, TRUTH, ~mask) == float("inf")
+    assert np.isnan(psnr(image, TRUTH, mask & ~mask))
+
+
+def test_ssim_equals_its_definition():
+    maps = np.stack([ssim_by_windows(NOISY[..., c], TRUTH[..., c]) for c in range(3)], -1)
+    assert ssim(NOISY, TRUTH) == pytest.approx(maps.mean(), abs=1e-12)
+    mask = rng.random(TRUTH.shape[:2]) < 0.3
+    assert ssim(NOISY, TRUTH, mask) == pytest.approx(maps[mask[5:-5, 5:-5]].mean(), abs=1e-12)
+    assert ssim(NOISY[..., 0], TRUTH[..., 0]) == pytest.approx(maps[..., 0].mean(), abs=1e-12)
+
+
+def test_ssim_is_symmetric_and_one_only_for_equals():
+    assert ssim(TRUTH, TRUTH) == pytest.approx(1, abs=1e-12)
+    assert ssim(NOISY, TRUTH) == pytest.approx(ssim(TRUTH, NOISY), abs=1e-14)
+    assert ssim(1 - TRUTH, TRUTH) < 0 < ssim(NOISY, TRUTH) < 1
+
+
+def test_bytes_and_floats_agree():
+    a, b = ((x * 255 + 0.5).astype(np.uint8) for x in (NOISY, TRUTH))
+    assert psnr(a, b) == pytest.approx(psnr(a / 255, b / 255))
+    assert ssim(a, b) == pytest.approx(ssim(a / 255, b / 255))
+
+
+def test_endpoint_error_is_a_mean_length():
+    truth = rng.normal(0, 3, (6, 7, 2))
+    assert endpoint_error(truth + np.array([3, 4]), truth) == pytest.approx(5)
+    motion = truth.copy()
+    motion[0] += (0, 2)
+    mask = np.zeros((6, 7), bool)
+    mask[:2] = True
+    assert endpoint_error(motion, truth, mask) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: psnr(TRUTH, TRUTH[:5]), r"psnr\(\): .* \(5, 31, 3\)"),
+        (lambda: psnr(TRUTH, TRUTH, np.ones((24, 31))), "must be bool .* float64"),
+        (lambda: ssim(TRUTH[:10], TRUTH[:10]), "at least 11x11"),
+        (lambda: endpoint_error(TRUTH, TRUTH), r"\[H, W, 2\]"),
+    ],
+)
+def test_bad_input_is_named(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
