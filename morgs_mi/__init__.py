@@ -4,3 +4,10 @@ from morgs_mi.llvm import ensure_llvm
 
 # Before anything imports Dr.Jit, which looks for LLVM at that moment.
 ensure_llvm()
+
+from morgs_mi.capture.camera import Camera  # noqa: E402
+from morgs_mi.gaussians.gaussians import Gaussians  # noqa: E402
+from morgs_mi.render.config import RenderConfig  # noqa: E402
+from morgs_mi.render.rasterize import Image, rasterize  # noqa: E402
+
+__all__ = ["Camera", "Gaussians", "Image", "RenderConfig", "rasterize"]

@@ -1,0 +1,187 @@
+"""The `Gaussians` value: what a scene is made of.
+
+A bare name (`scales`, `opacities`, `confidence`) is activated, what the optimiser holds says so in its name
+(`log_scales`, `logit_opacities`, `logit_confidence`). N is the number of Gaussians, K = (degree + 1)^2.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Protocol
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+__all__ = ["ActivatedGaussians", "Gaussians", "sigmoid"]
+
+
+class ActivatedGaussians(Protocol):
+    """What the renderer reads: activated attributes as Dr.Jit tensors."""
+
+    @property
+    def means(self) -> Any:
+        """Centres [N, 3], world units."""
+        ...
+
+    @property
+    def scales(self) -> Any:
+        """Standard deviations [N, 3], world units."""
+        ...
+
+    @property
+    def quats(self) -> Any:
+        """Rotations [N, 4], wxyz, not necessarily unit."""
+        ...
+
+    @property
+    def opacities(self) -> Any:
+        """Opacities [N] in [0, 1]."""
+        ...
+
+    @property
+    def sh_coeffs(self) -> Any:
+        """Spherical harmonics [N, K, 3] of the display-referred colour."""
+        ...
+
+    @property
+    def motion(self) -> Any:
+        """Displacement [N, 3] since the last frame, world units, or None."""
+        ...
+
+    @property
+    def confidence(self) -> Any:
+        """Motion confidence [N] in [0, 1], or None."""
+        ...
+
+
+def sigmoid(x: Any) -> Any:
+    """Return 1 / (1 + exp(-x)); finite with a finite gradient for every finite x."""
+    return 0.5 + 0.5 * dr.tanh(0.5 * x)
+
+
+def _aligned_tensor(value: Any) -> Any:
+    """Return a NumPy array as a float tensor in memory of Dr.Jit's own.
+
+    Dr.Jit borrows NumPy's memory where it can. Packets of floats cannot be read from it unless it happens to
+    be aligned, and kernels would be compiled for both cases; multiplying by an opaque one makes a copy.
+    """
+    tensor = mi.TensorXf(np.ascontiguousarray(value, dtype=np.float32))
+    if tensor.array.shape[0]:
+        tensor = tensor * dr.opaque(mi.Float, 1)
+        dr.eval(tensor)
+    return tensor
+
+
+@dataclass(frozen=True)
+class Gaussians:
+    """N Gaussians as raw (optimisable) Dr.Jit tensors of the active Mitsuba variant.
+
+    NumPy arrays are converted. Quaternions are wxyz and need not be unit.
+
+    Attributes:
+        means: centres [N, 3], world units.
+        log_scales: logarithms of the standard deviations [N, 3].
+        quats: rotations [N, 4], wxyz.
+        logit_opacities: [N].
+        sh_coeffs: [N, K, 3] with K = (degree + 1)^2; colour = max(0.5 + SH(mean - camera), 0) as in 3DGS.
+        motion: displacement since the last frame [N, 3] in world units, or None.
+        logit_confidence: motion confidence [N] before the sigmoid, or None.
+
+    Raises:
+        ValueError: a shape that does not agree with `means`, or K that is no square of 1 to 4.
+    """
+
+    means: Any
+    log_scales: Any
+    quats: Any
+    logit_opacities: Any
+    sh_coeffs: Any
+    motion: Any = None
+    logit_confidence: Any = None
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if value is not None and not dr.is_tensor_v(value):
+                object.__setattr__(self, f.name, _aligned_tensor(value))
+        N = len(self)
+        tails = {"means": (3,), "log_scales": (3,), "quats": (4,), "logit_opacities": ()}
+        tails |= {"motion": (3,), "logit_confidence": ()}
+        for name, tail in tails.items():
+            value = getattr(self, name)
+            if value is not None and tuple(value.shape) != (N, *tail):
+                expected = ", ".join(["N", *map(str, tail)])
+                raise ValueError(
+                    f"Gaussians(): `{name}` must be [{expected}] with N={N}, got {tuple(value.shape)}; "
+                    "all attributes describe the same Gaussians."
+                )
+        shape = tuple(self.sh_coeffs.shape)
+        if len(shape) != 3 or shape[0] != N or shape[2] != 3 or shape[1] not in (1, 4, 9, 16):
+            raise ValueError(
+                f"Gaussians(): `sh_coeffs` must be [N, K, 3] with N={N} and K in 1, 4, 9, 16, got {shape}; "
+                "K is (degree + 1)^2 for degree 0 to 3."
+            )
+
+    def __len__(self) -> int:
+        return int(self.means.shape[0])
+
+    @classmethod
+    def from_activated(
+        cls, means: Any, scales: Any, quats: Any, opacities: Any, sh_coeffs: Any, **more: Any
+    ) -> Gaussians:
+        """Build from activated NumPy arrays: `scales` [N, 3] > 0 and `opacities` [N] in [0, 1].
+
+        Opacities are kept 1e-6 away from 0 and 1, where the logit is infinite.
+        """
+        opacities = np.clip(np.asarray(opacities, np.float64), 1e-6, 1 - 1e-6)
+        log_scales = np.log(np.maximum(np.asarray(scales, np.float64), 1e-30))
+        logits = np.log(opacities / (1 - opacities))
+        return cls(means, log_scales, quats, logits, sh_coeffs, **more)
+
+    @property
+    def scales(self) -> Any:
+        """Standard deviations [N, 3]."""
+        return dr.exp(self.log_scales)
+
+    @property
+    def opacities(self) -> Any:
+        """Opacities [N] in (0, 1)."""
+        return sigmoid(self.logit_opacities)
+
+    @property
+    def confidence(self) -> Any:
+        """Motion confidence [N] in (0, 1), or None."""
+        return None if self.logit_confidence is None else sigmoid(self.logit_confidence)
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return round(int(self.sh_coeffs.shape[1]) ** 0.5) - 1
+
+    def items(self) -> dict[str, Any]:
+        """Return the raw attributes that are present, by name."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """Return the raw attributes that are present as NumPy arrays."""
+        return {name: np.asarray(dr.detach(value)) for name, value in self.items().items()}
+
+    def detached(self) -> Gaussians:
+        """Return the same values cut off from the gradient graph."""
+        return replace(self, **{name: dr.detach(value) for name, value in self.items().items()})
+
+    def select(self, index: Any) -> Gaussians:
+        """Return the Gaussians at `index` [M] (integers, or a mask [N]); gradients are not carried."""
+        return Gaussians(**{name: value[index] for name, value in self.numpy().items()})
+
+    @staticmethod
+    def concatenate(parts: list[Gaussians]) -> Gaussians:
+        """Return all Gaussians of `parts` in order; every part must carry the same attributes."""
+        columns = [part.numpy() for part in parts]
+        if any(column.keys() != columns[0].keys() for column in columns):
+            raise ValueError(
+                "Gaussians.concatenate(): all parts must carry the same attributes, got "
+                f"{[sorted(column) for column in columns]}; drop or add `motion` and `logit_confidence`."
+            )
+        return Gaussians(**{k: np.concatenate([column[k] for column in columns]) for k in columns[0]})

@@ -1,0 +1,40 @@
+"""The renderer's cut-offs and block shape: their one home."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+__all__ = ["RenderConfig"]
+
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """Settings of the rasteriser. The defaults are those of 3DGS, so that its models look right."""
+
+    eps2d: float = 0.3
+    """Low-pass filter in px^2 added to the projected covariance, so that no splat falls between pixels."""
+    alpha_min: float = 1.0 / 255.0
+    """A Gaussian whose alpha at a pixel is below this is skipped there: it cannot change an 8-bit image."""
+    alpha_max: float = 0.99
+    """Alpha is capped here, so that 1 / (1 - alpha) in the adjoint stays bounded."""
+    stop_transmittance: float = 1e-4
+    """A block ends when its most transparent pixel falls below this; bounds the error of the colour."""
+    block_width: int | None = None
+    """Pixels across in the block that one SIMD lane owns; None: 8 on the CPU, 4 on the GPU."""
+    block_height: int | None = None
+    """Pixels down in that block; None: 4."""
+    tile_size: int = 32
+    """Edge in pixels of the coarse tiles; a multiple of the block's width and height."""
+
+    def __post_init__(self) -> None:
+        for name in ("block_width", "block_height"):
+            edge = getattr(self, name)
+            if edge is not None and (edge < 1 or self.tile_size % edge):
+                raise ValueError(
+                    f"RenderConfig(): `{name}` must divide tile_size={self.tile_size}, got {edge}; "
+                    "use a power of two up to the tile's size."
+                )
+
+    def block_shape(self, cuda: bool) -> tuple[int, int]:
+        """Return (width, height) in pixels of one lane's block on this backend."""
+        return self.block_width or (4 if cuda else 8), self.block_height or 4

@@ -1,0 +1,187 @@
+"""From Gaussians in the world to splats on the screen, differentiated by Dr.Jit.
+
+Notation: x = R mean + t in camera space, z its depth, J the Jacobian of the projection at x, and
+U = J R Q diag(s) [2, 3], so that the screen covariance is U U' + eps2d I (EWA splatting, Zwicker 2001).
+A pixel at offset d = (dx, dy) from the splat's centre gets alpha = 2^p with
+
+    p = log2(opacity) - u^2 - v^2,    u = a dx + b dy,    v = c dy,
+
+where [a b; 0 c] is the Cholesky factor of the conic times log2(e) / 2. Written so, p never exceeds
+log2(opacity), however thin the needle, and the pixel loop needs no exponential but 2^p.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import log2, sqrt
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ..capture.camera import Camera
+from ..gaussians.gaussians import ActivatedGaussians
+from .config import RenderConfig
+
+__all__ = ["CHANNEL_SIZES", "Splats", "project"]
+
+# What a channel blends, and how many numbers that takes; `alpha` is blended with every call.
+CHANNEL_SIZES = {"color": 3, "depth": 1, "motion": 2, "confidence": 1}
+
+_HALF_LOG2E = 0.5 * log2(2.718281828459045)
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Projected Gaussians, one Dr.Jit float [N] per number.
+
+    Attributes:
+        shape: (mean_x, mean_y, a, b, c, log2_opacity), the differentiable geometry (see module docstring).
+        channels: what is blended, by channel name.
+        depths: camera-space z in world units, detached.
+        extent: (half width, half height) in px of the region where alpha >= alpha_min, detached; 0 if culled.
+        slopes: (dx/dy, dy/dx) along which p is largest for given dy or dx, detached.
+        valid: False where culled: behind the near plane, too faint, or not finite.
+        finite: False where something in front of the camera is not finite.
+    """
+
+    shape: tuple[Any, ...]
+    channels: dict[str, tuple[Any, ...]]
+    depths: Any
+    extent: tuple[Any, Any]
+    slopes: tuple[Any, Any]
+    valid: Any
+    finite: Any
+
+    def __len__(self) -> int:
+        return dr.width(self.depths)
+
+
+def project(gaussians: ActivatedGaussians, camera: Camera, channels: tuple[str, ...], config: RenderConfig) -> Splats:
+    """Project every Gaussian to the screen of `camera` and evaluate the channels asked for.
+
+    Args:
+        gaussians: N Gaussians with activated attributes.
+        camera: the view; a Dr.Jit `viewmat` receives gradients.
+        channels: names out of `CHANNEL_SIZES`.
+        config: cut-offs.
+
+    Returns:
+        Splats of length N, differentiable in every attribute and in the camera's pose.
+    """
+    N = dr.prod(gaussians.means.shape[:1])
+    means, quats = _rows(mi.Point3f, gaussians.means, N), _rows(mi.Vector4f, gaussians.quats, N)
+    scales, opacities = _rows(mi.Vector3f, gaussians.scales, N), gaussians.opacities.array
+    R, t = _pose(camera.viewmat)
+    fx, fy, cx, cy, near, *limits = _intrinsics(camera)
+
+    x, y, z = (dr.fma(R[i][0], means.x, dr.fma(R[i][1], means.y, dr.fma(R[i][2], means.z, t[i]))) for i in range(3))
+    front = dr.detach(z) >= near
+    rz = dr.rcp(dr.select(front, z, 1))
+    mean_x, mean_y = dr.fma(fx, x * rz, cx), dr.fma(fy, y * rz, cy)
+
+    u0, u1 = _screen_axes(x * rz, y * rz, fx * rz, fy * rz, R, quats, scales, limits)
+    eps = config.eps2d
+    xx, yy, xy = dr.dot(u0, u0), dr.dot(u1, u1), dr.dot(u0, u1)
+    # Lagrange's identity: det(U U' + eps I) without the cancellation that xx yy - xy^2 has for needles.
+    det = dr.squared_norm(dr.cross(u0, u1)) + eps * (xx + yy) + eps * eps
+    xx, yy = xx + eps, yy + eps
+    r_det, r_yy = dr.rsqrt(det), dr.rsqrt(yy)
+    s = sqrt(_HALF_LOG2E)
+    a, b, c = s * yy * r_yy * r_det, -s * xy * r_yy * r_det, s * r_yy
+    log2_opacity = dr.log2(dr.maximum(opacities, 1e-9))
+    shape = (mean_x, mean_y, a, b, c, log2_opacity)
+
+    blended: dict[str, tuple[Any, ...]] = {}
+    for name in channels:
+        if name == "color":
+            blended[name] = _colors(means, gaussians.sh_coeffs, R, t, N)
+        elif name == "depth":
+            blended[name] = (z,)
+        elif name == "motion":
+            blended[name] = _screen_motion(_rows(mi.Vector3f, gaussians.motion, N), x * rz, y * rz, fx * rz, fy * rz, R)
+        elif name == "confidence":
+            blended[name] = (gaussians.confidence.array,)
+
+    # alpha >= alpha_min  <=>  u^2 + v^2 <= reach, an ellipse with these half axes along x and y
+    reach = dr.maximum(dr.detach(log2_opacity) - log2(config.alpha_min), 0)
+    xx, yy, xy = dr.detach(xx), dr.detach(yy), dr.detach(xy)
+    probe = sum(dr.detach(v) for v in (*shape, *(v for values in blended.values() for v in values)))
+    finite = dr.isfinite(probe) | ~(front | dr.isnan(z))
+    # Beyond this a float cannot tell one pixel from the next.
+    near_screen = (dr.abs(dr.detach(mean_x)) < 1e7) & (dr.abs(dr.detach(mean_y)) < 1e7)
+    valid = front & (reach > 0) & finite & near_screen
+    extent = (dr.sqrt(reach * xx) / s, dr.sqrt(reach * yy) / s)
+    return Splats(shape, blended, dr.detach(z), extent, (xy / yy, xy / xx), valid, finite)
+
+
+def _rows(dtype: Any, tensor: Any, N: int) -> Any:
+    """Return a tensor [N, D] as D arrays [N]; every element is read once, so its adjoint needs no atomics."""
+    return dr.gather(dtype, tensor.array, dr.arange(mi.UInt32, N), mode=dr.ReduceMode.NoConflicts)
+
+
+def _pose(viewmat: Any) -> tuple[list[list[Any]], list[Any]]:
+    """Return (R [3][3], t [3]) as width-1 Dr.Jit floats that keep the gradient of a Dr.Jit `viewmat`."""
+    flat = viewmat.array if dr.is_tensor_v(viewmat) else mi.Float(np.float32(viewmat).ravel())
+    entry = [[dr.gather(mi.Float, flat, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
+    return [row[:3] for row in entry], [row[3] for row in entry]
+
+
+def _intrinsics(camera: Camera) -> list[Any]:
+    """Return fx, fy, cx, cy, near and the bounds (low, high) of x/z and of y/z as width-1 Dr.Jit floats.
+
+    They are read from memory: as Python numbers, every camera would compile kernels of its own.
+    """
+    K, bounds = camera.K, []
+    for axis, size in enumerate((camera.width, camera.height)):
+        f, c = K[axis, axis], K[axis, 2]
+        margin = 0.15 * size / f  # 30 % of the half view on every side
+        bounds += [-c / f - margin, (size - c) / f + margin]
+    values = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.near, *bounds]
+    memory = mi.Float(np.float32(values))
+    return [dr.gather(mi.Float, memory, mi.UInt32(i)) for i in range(len(values))]
+
+
+def _rotation(quats: Any) -> list[Any]:
+    """Return the columns of the rotation matrix of wxyz quaternions of any non-zero length."""
+    largest = dr.maximum(dr.max(dr.abs(dr.detach(quats))), 1e-30)  # so that squaring cannot overflow
+    w, x, y, z = dr.normalize(quats / largest + mi.Vector4f(1e-30, 0, 0, 0))
+    return [
+        mi.Vector3f(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
+        mi.Vector3f(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
+        mi.Vector3f(2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
+    ]
+
+
+def _screen_axes(
+    tan_x: Any, tan_y: Any, jx: Any, jy: Any, R: list[list[Any]], quats: Any, scales: Any, limits: list[Any]
+) -> tuple[Any, Any]:
+    """Return the rows of U = J R Q diag(s), two vectors [3] in px."""
+    # Outside the view the linearisation blows up: its point is clamped to 1.3 times the half view, as in 3DGS.
+    lo_x, hi_x, lo_y, hi_y = limits
+    tan_x, tan_y = dr.clip(tan_x, lo_x, hi_x), dr.clip(tan_y, lo_y, hi_y)
+    J0 = mi.Vector3f(*(jx * (R[0][k] - tan_x * R[2][k]) for k in range(3)))
+    J1 = mi.Vector3f(*(jy * (R[1][k] - tan_y * R[2][k]) for k in range(3)))
+    Q = _rotation(quats)
+    u0, u1 = (mi.Vector3f(*(dr.dot(J, Q[k]) * scales[k] for k in range(3))) for J in (J0, J1))
+    return u0, u1
+
+
+def _colors(means: Any, sh_coeffs: Any, R: list[list[Any]], t: list[Any], N: int) -> tuple[Any, ...]:
+    """Return max(0.5 + SH(direction), 0) per colour component (3DGS's convention)."""
+    K = int(sh_coeffs.shape[1])
+    lane = dr.arange(mi.UInt32, N) * (3 * K)
+    coeff = [dr.gather(mi.Float, sh_coeffs.array, lane + j, mode=dr.ReduceMode.NoConflicts) for j in range(3 * K)]
+    if K == 1:
+        basis = [0.28209479177387814]
+    else:
+        position = mi.Point3f(*(-sum(R[i][k] * t[i] for i in range(3)) for k in range(3)))
+        basis = dr.sh_eval(dr.normalize(means - position), int(sqrt(K)) - 1)
+    return tuple(dr.maximum(sum(B * coeff[3 * k + c] for k, B in enumerate(basis)) + 0.5, 0) for c in range(3))
+
+
+def _screen_motion(motion: Any, tan_x: Any, tan_y: Any, jx: Any, jy: Any, R: list[list[Any]]) -> tuple[Any, Any]:
+    """Return pi(motion) in px: the first-order projection of a displacement (eq. 6), J R motion."""
+    mx, my, mz = (sum(R[i][k] * motion[k] for k in range(3)) for i in range(3))
+    return jx * (mx - tan_x * mz), jy * (my - tan_y * mz)

@@ -1,0 +1,147 @@
+"""Slow, obvious float64 twins of the package's mathematics.
+
+They loop over everything, know no blocks, no early stop and no rounding tricks. All of them are analytic in
+their floating-point inputs apart from the documented cut-offs, which are taken on real parts, so that
+`complex_step` returns derivatives that are exact to rounding.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+SH_C0, SH_C1 = 0.28209479177387814, 0.4886025119029199
+SH_C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
+SH_C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
+
+
+def sh_basis(d: NDArray, degree: int) -> list:
+    """Real spherical harmonics with 3DGS's signs, up to degree 3, of a unit direction [3]."""
+    x, y, z = d
+    basis = [SH_C0 + 0 * x]
+    if degree > 0:
+        basis += [-SH_C1 * y, SH_C1 * z, -SH_C1 * x]
+    if degree > 1:
+        basis += [
+            SH_C2[0] * x * y,
+            -SH_C2[0] * y * z,
+            SH_C2[1] * (2 * z * z - x * x - y * y),
+            -SH_C2[0] * x * z,
+            SH_C2[2] * (x * x - y * y),
+        ]
+    if degree > 2:
+        basis += [
+            -SH_C3[0] * y * (3 * x * x - y * y),
+            SH_C3[1] * x * y * z,
+            -SH_C3[2] * y * (4 * z * z - x * x - y * y),
+            SH_C3[3] * z * (2 * z * z - 3 * x * x - 3 * y * y),
+            -SH_C3[2] * x * (4 * z * z - x * x - y * y),
+            SH_C3[4] * z * (x * x - y * y),
+            -SH_C3[0] * x * (x * x - 3 * y * y),
+        ]
+    return basis
+
+
+def rotation(q: NDArray) -> NDArray:
+    """Rotation matrix of a wxyz quaternion of any length."""
+    w, x, y, z = q / np.sqrt(np.sum(q * q))
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def rasterize(
+    raw: dict[str, NDArray],
+    K: NDArray,
+    viewmat: NDArray,
+    width: int,
+    height: int,
+    background: tuple[float, float, float] | None = None,
+    near: float = 0.01,
+    eps2d: float = 0.3,
+    alpha_min: float = 1 / 255,
+    alpha_max: float = 0.99,
+) -> dict[str, NDArray]:
+    """Blend raw Gaussian attributes (as `Gaussians.numpy()` returns them) over every pixel, nearest first.
+
+    Returns all five channels [H, W, D], and `margin`: how near any alpha came to a cut-off, relative.
+    """
+    means, quats = raw["means"], raw["quats"]
+    scales, opacities = np.exp(raw["log_scales"]), 1 / (1 + np.exp(-raw["logit_opacities"]))
+    degree = int(np.sqrt(raw["sh_coeffs"].shape[1])) - 1
+    dtype = np.result_type(np.float64, *(np.asarray(v).dtype for v in raw.values()), viewmat.dtype)
+    R, t = viewmat[:3, :3], viewmat[:3, 3]
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    eye = -R.T @ t
+
+    gx, gy = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    light = np.ones((height, width), dtype)
+    sums = {"color": 3, "depth": 1, "motion": 2, "confidence": 1}
+    sums = {name: np.zeros((height, width, size), dtype) for name, size in sums.items()}
+    margin = np.inf
+    cam = means @ R.T + t
+    for i in np.argsort(cam[:, 2].real, kind="stable"):
+        x, y, z = cam[i]
+        if z.real < near or opacities[i].real <= alpha_min:
+            continue
+
+        def clamp(value, size, f, c):
+            low, high = -c / f - 0.15 * size / f, (size - c) / f + 0.15 * size / f
+            return low if value.real < low else high if value.real > high else value
+
+        tx, ty = clamp(x / z, width, fx, cx), clamp(y / z, height, fy, cy)
+        J = np.array([[fx / z, 0, -fx * tx / z], [0, fy / z, -fy * ty / z]])
+        M = J @ R @ rotation(quats[i]) @ np.diag(scales[i])
+        cov = M @ M.T + eps2d * np.eye(2)
+        det = cov[0, 0] * cov[1, 1] - cov[0, 1] ** 2
+        dx, dy = gx - (fx * x / z + cx), gy - (fy * y / z + cy)
+        sigma = 0.5 * (cov[1, 1] * dx * dx - 2 * cov[0, 1] * dx * dy + cov[0, 0] * dy * dy) / det
+        full = opacities[i] * np.exp(-sigma)
+        drawn, capped = full.real >= alpha_min, full.real > alpha_max
+        margin = min(margin, np.abs(full.real / alpha_min - 1).min(), np.abs(full.real / alpha_max - 1).min())
+        alpha = np.where(drawn, np.where(capped, alpha_max, full), 0)
+
+        direction = means[i] - eye
+        direction = direction / np.sqrt(np.sum(direction * direction))
+        color = 0.5 + sum(B * raw["sh_coeffs"][i, k] for k, B in enumerate(sh_basis(direction, degree)))
+        values = {"color": np.where(color.real > 0, color, 0), "depth": np.array([z])}
+        if "motion" in raw:
+            mx, my, mz = R @ raw["motion"][i]
+            values["motion"] = np.array([fx / z * (mx - x / z * mz), fy / z * (my - y / z * mz)])
+        if "logit_confidence" in raw:
+            values["confidence"] = np.array([1 / (1 + np.exp(-raw["logit_confidence"][i]))])
+        for name, value in values.items():
+            sums[name] += (light * alpha)[..., None] * value
+        light = light * (1 - alpha)
+
+    alpha = (1 - light)[..., None]
+    covered = alpha.real > 0
+    for name in ("depth", "motion"):
+        sums[name] = np.where(covered, sums[name] / np.where(covered, alpha, 1), 0)
+    if background is not None:
+        sums["color"] = sums["color"] + (1 - alpha) * np.asarray(background)
+    return {**sums, "alpha": alpha, "margin": np.float64(margin)}
+
+
+def complex_step(function, inputs: dict[str, NDArray], names: list[str], step: float = 1e-30) -> dict[str, NDArray]:
+    """Gradient of a real-valued `function(inputs)` with respect to `inputs[name]`, exact to rounding."""
+    grads = {}
+    for name in names:
+        value = inputs[name].astype(np.complex128)
+        grad = np.zeros(value.shape)
+        for index in np.ndindex(*value.shape):
+            nudged = value.copy()
+            nudged[index] += 1j * step
+            grad[index] = function({**inputs, name: nudged}).imag / step
+        grads[name] = grad
+    return grads
+
+
+def directional(function, inputs: dict[str, NDArray], direction: dict[str, NDArray], step: float = 1e-30):
+    """Derivative of `function(inputs)` along `direction`, exact to rounding; any output shape."""
+    nudged = {k: v + 1j * step * direction[k] if k in direction else v for k, v in inputs.items()}
+    return function(nudged).imag / step

@@ -1,0 +1,309 @@
+"""The renderer against its float64 twin: image and derivatives, every attribute and every channel."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from tests import reference
+from tests import tolerances as tol
+
+CHANNELS = ("color", "alpha", "depth", "motion", "confidence")
+RAW = ("means", "log_scales", "quats", "logit_opacities", "sh_coeffs", "motion", "logit_confidence")
+
+
+def make_scene(degree: int = 1, n: int = 10, seed: int = 5) -> dict[str, np.ndarray]:
+    """A cloud that overlaps, spans several blocks and stays clear of cap and stop."""
+    rng = np.random.default_rng(seed)
+    return {
+        "means": rng.uniform((-1.0, -0.8, -0.5), (1.0, 0.8, 0.5), (n, 3)),
+        "log_scales": rng.uniform(np.log(0.1), np.log(0.4), (n, 3)),
+        "quats": rng.normal(size=(n, 4)) * rng.uniform(0.5, 2, (n, 1)),
+        "logit_opacities": rng.uniform(-1.5, 1.5, n),
+        "sh_coeffs": rng.normal(size=(n, (degree + 1) ** 2, 3)) * 0.3 + 0.2,
+        "motion": rng.normal(size=(n, 3)) * 0.1,
+        "logit_confidence": rng.normal(size=n),
+    }
+
+
+def make_camera(width: int = 21, height: int = 18) -> Camera:
+    """Neither size divides a block; the principal point is off centre; fx and fy differ."""
+    camera = Camera.look_at((0.3, -0.4, -3.0), (0, 0, 0), (0, -1, 0), 45.0, width, height)
+    K = camera.K + np.array([[0, 0, 1.3], [0, 2.0, -0.7], [0, 0, 0]])
+    return Camera(K, camera.viewmat, width, height)
+
+
+def as_float32(raw):
+    return {k: np.float32(v).astype(np.float64) for k, v in raw.items()}
+
+
+def to_gaussians(raw, grad=False):
+    gaussians = Gaussians(**raw)
+    if grad:
+        dr.enable_grad(*gaussians.items().values())
+    return gaussians
+
+
+def twin(raw, camera, background=None, viewmat=None):
+    viewmat = np.float32(camera.viewmat).astype(np.float64) if viewmat is None else viewmat
+    K = np.float32(camera.K).astype(np.float64)
+    return reference.rasterize(raw, K, viewmat, camera.width, camera.height, background)
+
+
+def relative(found, expected):
+    return np.abs(np.asarray(found) - expected).max() / max(np.abs(expected).max(), 1e-12)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    raw, camera = as_float32(make_scene()), make_camera()
+    assert twin(raw, camera)["margin"] > 1e-5, "the scene must stay clear of the cut-offs"
+    return raw, camera
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_image_agrees_with_twin_at_every_sh_degree(degree):
+    raw, camera = as_float32(make_scene(degree)), make_camera()
+    image, expected = rasterize(to_gaussians(raw), camera, ("color", "alpha")), twin(raw, camera)
+    for name in ("color", "alpha"):
+        assert np.abs(np.asarray(getattr(image, name)) - expected[name]).max() < tol.IMAGE_ABS
+
+
+def test_every_channel_agrees_with_twin(scene):
+    raw, camera = scene
+    image, expected = rasterize(to_gaussians(raw), camera, CHANNELS), twin(raw, camera)
+    for name in CHANNELS:
+        found = np.asarray(getattr(image, name))
+        # Where almost nothing is, a normalised channel divides rounding by a small alpha.
+        solid = np.broadcast_to(expected["alpha"] > 0.02, found.shape)
+        scale = max(1.0, np.abs(expected[name]).max())
+        assert np.abs(found - expected[name])[solid].max() < tol.IMAGE_ABS * scale, name
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+def test_backward_agrees_with_twin_for_every_attribute(scene, channel):
+    raw, camera = scene
+    rng = np.random.default_rng(1)
+    size = {"color": 3, "motion": 2}.get(channel, 1)
+    weight = rng.normal(size=(camera.height, camera.width, size)) * (twin(raw, camera)["alpha"] > 0.02)
+    background = (0.2, 0.5, 0.9) if channel == "color" else None
+
+    gaussians = to_gaussians(raw, grad=True)
+    image = rasterize(gaussians, camera, (channel,), background)
+    dr.backward(dr.sum(getattr(image, channel) * mi.TensorXf(np.float32(weight)), axis=None))
+    expected = reference.complex_step(
+        lambda values: np.sum(twin(values, camera, background)[channel] * weight), raw, list(RAW)
+    )
+    for name in RAW:
+        found = np.asarray(dr.grad(getattr(gaussians, name)))
+        assert np.isfinite(found).all()
+        if np.abs(expected[name]).max() == 0:
+            assert np.abs(found).max() == 0, f"{channel} must not depend on {name}"
+        else:
+            assert relative(found, expected[name]) < tol.GRADIENT_REL, name
+
+
+def test_forward_mode_agrees_with_twin(scene):
+    raw, camera = scene
+    rng = np.random.default_rng(2)
+    direction = {name: np.float32(rng.normal(size=raw[name].shape)).astype(np.float64) for name in RAW}
+    gaussians = to_gaussians(raw, grad=True)
+    image = rasterize(gaussians, camera, CHANNELS)
+    for name in RAW:
+        dr.set_grad(getattr(gaussians, name), mi.TensorXf(np.float32(direction[name])))
+    outputs = [getattr(image, name) for name in CHANNELS]
+    dr.forward_to(outputs)
+    for name, output in zip(CHANNELS, outputs, strict=True):
+        expected = reference.directional(lambda v, name=name: twin(v, camera)[name], raw, direction)
+        solid = np.broadcast_to(twin(raw, camera)["alpha"] > 0.02, expected.shape)
+        found = np.asarray(dr.grad(output))
+        assert relative(found[solid], expected[solid]) < tol.GRADIENT_REL, name
+
+
+def test_forward_and_reverse_mode_are_dual(scene):
+    """<g, J v> = <J' g, v> for random g and v over all channels and attributes at once."""
+    raw, camera = scene
+    rng = np.random.default_rng(3)
+    directions = {name: np.float32(rng.normal(size=raw[name].shape)) for name in RAW}
+
+    def loss(gaussians):
+        image = rasterize(gaussians, camera, ("color", "confidence"), (0.1, 0.2, 0.3))
+        return dr.sum(dr.square(image.color), axis=None) + dr.sum(dr.sin(3 * image.confidence), axis=None)
+
+    gaussians = to_gaussians(raw, grad=True)
+    dr.backward(loss(gaussians))
+    reverse = sum(np.vdot(np.asarray(dr.grad(getattr(gaussians, n)), np.float64), v) for n, v in directions.items())
+    gaussians = to_gaussians(raw, grad=True)
+    value = loss(gaussians)
+    for name, v in directions.items():
+        dr.set_grad(getattr(gaussians, name), mi.TensorXf(v))
+    dr.forward_to(value)
+    forward = float(np.asarray(dr.grad(value)).ravel()[0])
+    assert forward == pytest.approx(reverse, rel=tol.DUALITY_REL)
+
+
+def test_backward_agrees_with_central_differences_of_the_renderer_itself(scene):
+    raw, camera = scene
+
+    def loss(values):
+        return dr.sum(dr.square(rasterize(to_gaussians(values), camera, ("color",)).color), axis=None)
+
+    gaussians = to_gaussians(raw, grad=True)
+    dr.backward(dr.sum(dr.square(rasterize(gaussians, camera, ("color",)).color), axis=None))
+    rng = np.random.default_rng(4)
+    for name in RAW[:5]:
+        # The sign of the gradient as direction: no cancellation hides an error.
+        grad = np.asarray(dr.grad(getattr(gaussians, name)), np.float64)
+        v = np.sign(grad) * rng.uniform(0.5, 1, grad.shape)
+        h = 2e-3
+        up, down = ({**raw, name: raw[name] + s * h * v} for s in (1, -1))
+        difference = (np.asarray(loss(up)).item() - np.asarray(loss(down)).item()) / (2 * h)
+        assert difference == pytest.approx(np.vdot(grad, v), rel=tol.CENTRAL_DIFFERENCE_REL), name
+
+
+def test_gradient_of_the_pose(scene):
+    raw, camera = scene
+    viewmat = np.float32(camera.viewmat).astype(np.float64)
+    posed = Camera(camera.K, mi.TensorXf(np.float32(viewmat)), camera.width, camera.height)
+    dr.enable_grad(posed.viewmat)
+    image = rasterize(to_gaussians(raw), posed, ("color", "alpha"))
+    dr.backward(dr.sum(dr.square(image.color), axis=None) + dr.sum(image.alpha, axis=None))
+
+    def loss(values):
+        image = twin(raw, camera, viewmat=values["viewmat"])
+        return np.sum(image["color"] ** 2) + np.sum(image["alpha"])
+
+    expected = reference.complex_step(loss, {"viewmat": viewmat}, ["viewmat"])["viewmat"]
+    assert relative(np.asarray(dr.grad(posed.viewmat))[:3], expected[:3]) < tol.GRADIENT_REL
+
+
+def test_detached_weights_keep_geometry_out(scene):
+    raw, camera = scene
+    gaussians = to_gaussians(raw, grad=True)
+    image = rasterize(gaussians, camera, ("color", "motion"), detach_weights=("motion",))
+    dr.backward(dr.sum(image.motion, axis=None))
+    assert np.abs(np.asarray(dr.grad(gaussians.motion))).max() > 0
+    for name in ("log_scales", "quats", "logit_opacities", "sh_coeffs"):
+        assert np.abs(np.asarray(dr.grad(getattr(gaussians, name)))).max() == 0, name
+
+
+@pytest.mark.parametrize("shape", [(8, 4), (4, 4), (8, 8), (16, 2)])
+def test_block_shape_changes_speed_not_the_image(scene, shape):
+    raw, camera = scene
+    config = RenderConfig(block_width=shape[0], block_height=shape[1])
+    found = rasterize(to_gaussians(raw), camera, ("color",), config=config).color
+    assert np.abs(np.asarray(found) - twin(raw, camera)["color"]).max() < tol.IMAGE_ABS
+
+
+def test_dense_opaque_scene_stops_early_within_bound():
+    """Hundreds of nearly opaque layers: the lists are cut, the image moves by no more than the stop value."""
+    rng = np.random.default_rng(6)
+    raw = as_float32(make_scene(0, 300, seed=6))
+    raw["logit_opacities"] = rng.uniform(2, 8, 300)
+    raw = as_float32(raw)
+    camera = make_camera(70, 45)
+    found, expected = rasterize(to_gaussians(raw), camera), twin(raw, camera)
+    assert expected["alpha"].max() > 1 - 1e-5
+    assert np.abs(np.asarray(found.color) - expected["color"]).max() < tol.STOPPED_IMAGE_ABS
+
+
+def test_gradients_of_a_dense_scene():
+    raw = as_float32(make_scene(0, 60, seed=7))
+    camera = make_camera(40, 33)
+    weight = np.random.default_rng(8).normal(size=(33, 40, 3))
+    gaussians = to_gaussians(raw, grad=True)
+    dr.backward(dr.sum(rasterize(gaussians, camera, ("color",)).color * mi.TensorXf(np.float32(weight)), axis=None))
+    names = ["means", "log_scales", "logit_opacities"]
+    expected = reference.complex_step(lambda v: np.sum(twin(v, camera)["color"] * weight), raw, names)
+    for name in names:
+        assert relative(np.asarray(dr.grad(getattr(gaussians, name))), expected[name]) < 10 * tol.GRADIENT_REL, name
+
+
+def test_equal_depths_keep_the_order_of_the_input():
+    raw = as_float32(make_scene(0, 2))
+    raw["means"][:] = 0
+    raw["quats"][:] = (1, 0, 0, 0)
+    raw["sh_coeffs"][:] = np.array([1.0, -1.0])[:, None, None]
+    camera = make_camera()
+    assert (
+        np.abs(np.asarray(rasterize(to_gaussians(raw), camera).color) - twin(raw, camera)["color"]).max()
+        < tol.IMAGE_ABS
+    )
+
+
+def test_no_gaussians_leave_the_background():
+    empty = Gaussians(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 1, 3)))
+    image = rasterize(empty, make_camera(5, 3), background=(0.1, 0.2, 0.3))
+    assert np.allclose(np.asarray(image.color), (0.1, 0.2, 0.3))
+    assert np.asarray(image.alpha).max() == 0
+
+
+def test_gaussians_out_of_view_leave_the_background(scene):
+    raw, camera = scene
+    behind = {**raw, "means": raw["means"] - np.array([0, 0, 50.0])}
+    gaussians = to_gaussians(behind, grad=True)
+    image = rasterize(gaussians, camera, CHANNELS)
+    dr.backward(dr.sum(image.color, axis=None))
+    for name in CHANNELS:
+        assert np.asarray(getattr(image, name)).max() == 0
+    assert np.abs(np.asarray(dr.grad(gaussians.means))).max() == 0
+
+
+def test_one_pixel_image(scene):
+    raw, _ = scene
+    camera = make_camera(1, 1)
+    found = rasterize(to_gaussians(raw), camera, ("color",)).color
+    assert np.abs(np.asarray(found) - twin(raw, camera)["color"]).max() < tol.IMAGE_ABS
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"means": np.nan}, r"`means` must be finite, got nan at \[3"),
+        ({"log_scales": np.inf}, r"`scales` must be finite, got inf at \[3"),
+        ({"sh_coeffs": -np.inf}, r"`sh_coeffs` must be finite, got -inf at \[3"),
+        ({"quats": np.nan}, r"`quats` must be finite"),
+        ({"logit_opacities": np.nan}, r"`opacities` must be finite"),
+    ],
+)
+def test_non_finite_attributes_are_refused_by_name_and_index(scene, change, message):
+    raw, camera = scene
+    raw = {k: v.copy() for k, v in raw.items()}
+    for name, value in change.items():
+        raw[name][3] = value
+    with pytest.raises(ValueError, match=message):
+        rasterize(to_gaussians(raw), camera)
+
+
+def test_bad_calls_say_what_was_expected(scene):
+    raw, camera = scene
+    with pytest.raises(ValueError, match="`channels` must be out of color, alpha"):
+        rasterize(to_gaussians(raw), camera, ("colour",))
+    bare = {k: v for k, v in raw.items() if k not in ("motion", "logit_confidence")}
+    with pytest.raises(ValueError, match="channel 'motion' needs Gaussians that carry it"):
+        rasterize(to_gaussians(bare), camera, ("motion",))
+    with pytest.raises(ValueError, match=r"`quats` must be \[N, 4\] with N=10, got \(9, 4\)"):
+        Gaussians(**{**raw, "quats": raw["quats"][:9]})
+    with pytest.raises(ValueError, match="must divide tile_size=32, got 7"):
+        RenderConfig(block_width=7)
+
+
+def test_kernels_are_compiled_once_for_all_cameras_and_sizes():
+    """No camera, image size or number of Gaussians may end up as a literal in a kernel."""
+
+    def step(gaussians, camera):
+        image = rasterize(gaussians, camera, ("color",))
+        dr.backward(dr.sum(image.color, axis=None))
+        dr.eval(dr.grad(gaussians.means), dr.grad(gaussians.quats))
+        dr.sync_thread()
+
+    small, large = (to_gaussians(make_scene(0, n, seed=n), grad=True) for n in (40, 70))
+    step(small, make_camera(50, 41))
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        step(large, make_camera(90, 61))
+        compiled = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and not k["cache_hit"]]
+    assert not compiled

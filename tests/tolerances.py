@@ -1,0 +1,12 @@
+"""Every numerical bound of the tests, with its reason."""
+
+# The traced renderer works in float32 with a 2^p of relative error 2e-6 and sums some tens of layers.
+IMAGE_ABS = 2e-5
+# A stop at transmittance 1e-4 hides at most that much of a colour of 1, per channel; colours reach 1.5.
+STOPPED_IMAGE_ABS = 2e-4
+# Gradients add the rounding of sums over some hundred pixels; relative to the largest entry of an attribute.
+GRADIENT_REL = 2e-4
+# Forward and reverse mode take different roundings of the same sums.
+DUALITY_REL = 2e-4
+# Central differences of a float32 image at the best step are good to the cube root of its rounding.
+CENTRAL_DIFFERENCE_REL = 2e-2
