@@ -214,6 +214,6 @@ def _folder_at_once(out: Path, overwrite: bool) -> Iterator[Path]:
         else:
             partial.rename(out)
     except OSError as error:
-        raise OSError(f"synthesize(): cannot write {out}: {error} Check permissions and free disk space.") from error
+        raise OSError(f"synthesize(): cannot write {out}, of which nothing is left: {error}") from error
     finally:
         shutil.rmtree(partial, ignore_errors=True)
