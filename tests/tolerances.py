@@ -10,3 +10,7 @@ GRADIENT_REL = 2e-4
 DUALITY_REL = 2e-4
 # Central differences of a float32 image at the best step are good to the cube root of its rounding.
 CENTRAL_DIFFERENCE_REL = 2e-2
+# SSIM subtracts squares of float32 means; the loss averages that over the picture.
+LOSS_REL = 1e-4
+# The derivative of a float32 SSIM map against float64 differences.
+LOSS_GRADIENT_REL = 5e-3

@@ -88,7 +88,7 @@ class _Blend(dr.CustomOp):
         self.set_grad_in("values", _adjoint(self.records, self.image, self.grad_out(), self.plan))
 
     def forward(self) -> None:
-        grads = [dr.zeros(mi.Float, 1) + g for g in self.grad_in("values")]
+        grads = [dr.zeros(mi.Float, 1) + g for g in list(self.grad_in("values"))]  # type: ignore[call-overload]
         tangents = pack_records(grads, self.plan.lists.by_rank)
         self.set_grad_out(_tangent(self.records, tangents, self.plan))
 

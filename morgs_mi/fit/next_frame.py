@@ -1,0 +1,90 @@
+"""Every later frame: the gated residual, under all four losses (eq. 13)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.capture.camera import Camera
+from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.losses import Target, flow_loss, mask_loss, offset_loss, recon_loss
+from morgs_mi.fit.optimise import optimise, view_order
+from morgs_mi.gaussians.gaussians import Gaussians
+from morgs_mi.motion.config import MotionConfig
+from morgs_mi.motion.cues import MotionCue
+from morgs_mi.motion.residual import apply_residual, residual_parameters
+from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.rasterize import rasterize
+
+__all__ = ["fit_next_frame"]
+
+
+def fit_next_frame(
+    previous: Gaussians,
+    cameras: Sequence[Camera],
+    targets: Sequence[Target],
+    cues: Mapping[int, MotionCue],
+    extent: float,
+    config: FitConfig,
+    motion: MotionConfig,
+    render: RenderConfig,
+    rng: np.random.Generator,
+    on_step: Callable[[int], None] | None = None,
+) -> tuple[Gaussians, dict[str, float]]:
+    """Fit one frame's residual (eq. 12) by L_recon + L_mask + L_flow + L_off (eq. 13).
+
+    Args:
+        previous: N Gaussians of the frame before, detached.
+        cameras: V views.
+        targets: their pictures.
+        cues: flow on key views, by view, with masks at keyframes; empty without motion reasoning.
+        extent: of the scene in world units.
+        config: epochs and rates.
+        motion: which modules are on, and their weights.
+        render: cut-offs.
+        rng: draws the views.
+        on_step: called with the number of steps done.
+
+    Returns:
+        The Gaussians of this frame and the final losses.
+    """
+    evidence = {view: _Evidence(cue, motion) for view, cue in cues.items()}
+
+    def losses_of(values: Mapping[str, Any], view: int) -> dict[str, Any]:
+        gaussians, seen = apply_residual(previous, values, motion), evidence.get(view)
+        maps = seen.channels if seen else ()
+        detached = maps if motion.detach_weights else ()
+        image = rasterize(gaussians, cameras[view], ("color", *maps), detach_weights=detached, config=render)
+        losses = {"recon": recon_loss(image.color, targets[view], config.dssim_weight)}
+        if seen and "motion" in maps:
+            losses["flow"] = flow_loss(image.motion, seen.motion, seen.reliable)
+        if seen and "confidence" in maps:
+            losses["mask"] = mask_loss(image.confidence, seen.mask)
+        if "offset" in values:
+            losses["offset"] = offset_loss(values["offset"], extent)
+        return losses
+
+    weights = {"flow": motion.weight_flow, "mask": motion.weight_mask, "offset": motion.weight_offset}
+    views = view_order(len(cameras), config.epochs * len(cameras), rng)
+    start = residual_parameters(previous, motion)
+    fitted, losses = optimise(start, config.rates(extent), views, losses_of, weights, on_step=on_step)
+    with dr.suspend_grad():
+        return apply_residual(previous, fitted, motion), losses
+
+
+class _Evidence:
+    """A key view's cue as tensors, and the channels that it supervises."""
+
+    def __init__(self, cue: MotionCue, config: MotionConfig) -> None:
+        self.channels: tuple[str, ...] = ()
+        if config.learn_motion:
+            self.channels += ("motion",)
+            self.motion = mi.TensorXf(cue.motion)
+            self.reliable = mi.TensorXf(cue.reliable.astype(np.float32))
+        if config.learn_confidence and cue.mask is not None:
+            self.channels += ("confidence",)
+            self.mask = mi.TensorXf(cue.mask.astype(np.float32))

@@ -1,0 +1,46 @@
+"""Which motion reasoning is done, and how much it weighs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from morgs_mi.motion.flow import FLOW_METHODS
+
+__all__ = ["MotionConfig"]
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Settings of the motion modules; the first three are the rows of the paper's ablation.
+
+    With all three off, what is left is the residual-only baseline (eq. 3).
+    """
+
+    learn_motion: bool = True
+    """ML: optical flow on key views guides each Gaussian's motion (eq. 7)."""
+    learn_offset: bool = True
+    """MO: a learned offset corrects the flow-guided motion (eq. 8)."""
+    learn_confidence: bool = True
+    """MC: a learned confidence gates all residuals (eq. 12)."""
+    flow_method: str = "dis-medium"
+    """Optical flow, a key of `FLOW_METHODS`."""
+    key_views: int = 4
+    """Cameras that get optical flow and masks."""
+    keyframe_interval: int = 5
+    """Every how many frames the masks supervise the confidence."""
+    weight_flow: float = 0.01
+    """lambda_flow of eq. 13, per px of endpoint error."""
+    weight_mask: float = 0.5
+    """lambda_mask of eq. 13."""
+    weight_offset: float = 0.01
+    """lambda_off of eq. 13; the offset counts in scene extents."""
+    detach_weights: bool = True
+    """Keep the flow and mask losses from moving opacity and geometry: they are about motion and confidence."""
+
+    def __post_init__(self) -> None:
+        if self.flow_method not in FLOW_METHODS:
+            known = ", ".join(FLOW_METHODS)
+            raise ValueError(f"MotionConfig(): `flow_method` must be one of {known}, got {self.flow_method!r}.")
+        for name in ("key_views", "keyframe_interval"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"MotionConfig(): `{name}` must be at least 1, got {getattr(self, name)}.")

@@ -1,0 +1,323 @@
+"""Door B: the causal loop that turns the frames of fixed cameras into a stream of residuals.
+
+It reads like the method: the first frame is reconstructed, its confidence is learned from the second; every
+later frame is a gated residual guided by the flow of a few key views. The mathematics is in `motion/` and
+`fit/`. What the next frame starts from is always the decoded packet, so encoder and decoder cannot drift.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.capture.camera import Camera
+from morgs_mi.capture.capture import Capture
+from morgs_mi.codec.container import Packet, StreamWriter, encode_packet
+from morgs_mi.codec.gaussians import decode_gaussians, keyframe_packet, residual_packet
+from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
+from morgs_mi.fit.losses import Target
+from morgs_mi.fit.next_frame import fit_next_frame
+from morgs_mi.gaussians.gaussians import Gaussians
+from morgs_mi.gaussians.initialise import from_points, resample_points, scene_extent, seed_points
+from morgs_mi.motion.config import MotionConfig
+from morgs_mi.motion.cues import choose_key_views, motion_cues
+from morgs_mi.render.config import RenderConfig
+
+__all__ = ["FrameReport", "StreamConfig", "StreamLoop", "StreamState", "step", "stream_capture"]
+
+_LOG = logging.getLogger(__name__)
+
+# Fewer points than this are no scene: random points in the views are the better start.
+_MIN_POINTS = 100
+
+
+@dataclass(frozen=True)
+class StreamConfig:
+    """Everything that the loop can be told, room by room."""
+
+    fit: FitConfig = field(default_factory=FitConfig)
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    render: RenderConfig = field(default_factory=RenderConfig)
+    seed: int = 0
+    """Of every random choice: order of the views, points that are added."""
+
+
+@dataclass(frozen=True)
+class FrameReport:
+    """What happened at one frame.
+
+    Attributes:
+        frame: its index.
+        seconds: wall time from the pictures to the packet, optimisation and flow included.
+        num_bytes: size of the packet in the stream.
+        losses: means over the last steps, by name.
+        num_gaussians: how many the frame has.
+        status: "ok", or a sentence about what was done instead.
+    """
+
+    frame: int
+    seconds: float
+    num_bytes: int
+    losses: dict[str, float]
+    num_gaussians: int
+    status: str = "ok"
+
+
+@dataclass(frozen=True, eq=False)
+class StreamState:
+    """What one frame leaves to the next.
+
+    Attributes:
+        frame: index of the next frame.
+        gaussians: the decoded Gaussians of the last frame; None before the first.
+        images: the pictures of the last frame.
+        rng: state of the random choices.
+    """
+
+    frame: int
+    gaussians: Gaussians | None
+    images: tuple[np.ndarray, ...]
+    rng: np.random.Generator
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What all frames share: the training views, the points of the first frame, and the settings."""
+
+    cameras: tuple[Camera, ...]
+    masks: tuple[np.ndarray | None, ...]
+    points: np.ndarray
+    point_colors: np.ndarray
+    key_views: tuple[int, ...]
+    extent: float
+    config: StreamConfig
+
+
+def step(
+    setup: Setup,
+    state: StreamState,
+    images: Sequence[np.ndarray],
+    on_step: Callable[[int, int], None] | None = None,
+) -> tuple[StreamState, Packet, FrameReport]:
+    """Take in one frame of all training views and return (state, packet, report)."""
+    start = time.perf_counter()
+    config, render = setup.config.fit, setup.config.render
+    targets = [Target(image, mask) for image, mask in zip(images, setup.masks, strict=True)]
+    if state.gaussians is None:
+        gaussians, status = _first_gaussians(setup, images, state.rng)
+        tick = _ticker(on_step, config.first_frame_steps)
+        gaussians, losses = fit_first_frame(
+            gaussians, setup.cameras, targets, setup.extent, config, render, state.rng, tick
+        )
+        packet = keyframe_packet(gaussians, state.frame)
+        decoded = decode_gaussians(None, packet)
+    else:
+        previous, status = state.gaussians, "ok"
+        if state.frame == 1 and setup.config.motion.learn_confidence:
+            previous = _first_confidence(setup, state, images)
+        cues = _cues(setup, state, images)
+        gaussians, losses = fit_next_frame(
+            previous,
+            setup.cameras,
+            targets,
+            cues,
+            setup.extent,
+            config,
+            setup.config.motion,
+            render,
+            state.rng,
+            _ticker(on_step, config.epochs * len(setup.cameras)),
+        )
+        packet = residual_packet(state.gaussians, gaussians, state.frame)
+        decoded = decode_gaussians(state.gaussians, packet)
+    seconds = time.perf_counter() - start
+    report = FrameReport(state.frame, seconds, len(encode_packet(packet)), losses, len(decoded), status)
+    return StreamState(state.frame + 1, decoded, tuple(images), state.rng), packet, report
+
+
+def _first_gaussians(setup: Setup, images: Sequence[np.ndarray], rng: np.random.Generator) -> tuple[Gaussians, str]:
+    """Place the Gaussians of the first frame, and say so if there was nothing to place them on."""
+    count, status = setup.config.fit.num_gaussians, "ok"
+    points, colors = setup.points, setup.point_colors
+    if len(points) < _MIN_POINTS:
+        status = f"the capture has {len(points)} points, too few: seeded {count} random ones inside the views"
+        _LOG.warning("frame 0: %s", status)
+        points, colors = seed_points(setup.cameras, images, count, rng)
+    points, colors = resample_points(points, colors, count, rng)
+    return from_points(points, colors, setup.config.fit.sh_degree), status
+
+
+def _first_confidence(setup: Setup, state: StreamState, images: Sequence[np.ndarray]) -> Gaussians:
+    """Learn who moves from the first frame's masks, which the second frame alone can tell."""
+    assert state.gaussians is not None
+    cues = motion_cues(state.images, images, setup.key_views, setup.config.motion, True, setup.masks)
+    masks = {view: cue.mask for view, cue in cues.items() if cue.mask is not None}
+    fitted, _ = fit_confidence(state.gaussians, setup.cameras, masks, setup.config.fit, setup.config.render, state.rng)
+    return fitted
+
+
+def _cues(setup: Setup, state: StreamState, images: Sequence[np.ndarray]) -> Any:
+    """Compute flow on the key views if anything uses it, and masks at keyframes."""
+    motion = setup.config.motion
+    with_masks = motion.learn_confidence and state.frame % motion.keyframe_interval == 0
+    if not motion.learn_motion and not with_masks:
+        return {}
+    return motion_cues(images, state.images, setup.key_views, motion, with_masks, setup.masks)
+
+
+def _ticker(on_step: Callable[[int, int], None] | None, steps: int) -> Callable[[int], None] | None:
+    return None if on_step is None else lambda done: on_step(done, steps)
+
+
+class StreamLoop:
+    """The causal loop as an object: push frames, get packets.
+
+    Nothing looks ahead: the packet of a frame is final when `push` returns.
+
+    Args:
+        cameras: the training views.
+        points: SfM points [P, 3], world units; fewer than 100 are replaced by random ones inside the views.
+        point_colors: [P, 3] in [0, 1].
+        config: settings.
+        masks: per view [H, W] bool of valid pixels, or None.
+
+    Raises:
+        ValueError: no cameras, or points that do not fit their colours.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[Camera],
+        points: np.ndarray,
+        point_colors: np.ndarray,
+        config: StreamConfig | None = None,
+        masks: Sequence[np.ndarray | None] | None = None,
+    ) -> None:
+        config = config or StreamConfig()
+        if not cameras:
+            raise ValueError("StreamLoop(): `cameras` must hold at least one view, got none.")
+        points, point_colors = np.reshape(points, (-1, 3)), np.reshape(point_colors, (-1, 3))
+        if points.shape != point_colors.shape:
+            raise ValueError(
+                f"StreamLoop(): `point_colors` must be {points.shape} like `points`, got {point_colors.shape}."
+            )
+        if not np.isfinite(points).all():
+            raise ValueError(
+                f"StreamLoop(): `points` must be finite, point {np.argwhere(~np.isfinite(points))[0][0]} is not; "
+                "clean the model."
+            )
+        self.setup = Setup(
+            tuple(cameras),
+            tuple(masks) if masks is not None else (None,) * len(cameras),
+            points,
+            point_colors,
+            choose_key_views(cameras, config.motion.key_views),
+            scene_extent(cameras),
+            config,
+        )
+        self.state = StreamState(0, None, (), np.random.default_rng(config.seed))
+
+    @property
+    def gaussians(self) -> Gaussians | None:
+        """The decoded Gaussians of the last frame, None before the first."""
+        return self.state.gaussians
+
+    def push(
+        self, images: Sequence[np.ndarray], on_step: Callable[[int, int], None] | None = None
+    ) -> tuple[Packet, FrameReport]:
+        """Take in the next frame.
+
+        Args:
+            images: per training view uint8 [H, W, 3], RGB.
+            on_step: called with (steps done, steps of this frame).
+
+        Returns:
+            The packet for the stream, and the frame's report.
+
+        Raises:
+            ValueError: a picture is missing or has another size or type than its camera says.
+        """
+        _check_images(self.setup.cameras, images, self.state.frame)
+        self.state, packet, report = step(self.setup, self.state, images, on_step)
+        return packet, report
+
+
+def _check_images(cameras: Sequence[Camera], images: Sequence[np.ndarray], frame: int) -> None:
+    if len(images) != len(cameras):
+        raise ValueError(
+            f"push(): frame {frame} must have one picture for each of {len(cameras)} views, got {len(images)}."
+        )
+    for camera, image in zip(cameras, images, strict=True):
+        if image.shape != (camera.height, camera.width, 3) or image.dtype != np.uint8:
+            raise ValueError(
+                f"push(): frame {frame} of view {camera.name!r} must be uint8 [{camera.height}, {camera.width}, 3], "
+                f"got {image.dtype} {list(image.shape)}."
+            )
+
+
+def stream_capture(
+    capture: Capture,
+    out: str | Path,
+    config: StreamConfig | None = None,
+    on_step: Callable[[int, int, int], None] | None = None,
+) -> list[FrameReport]:
+    """Fit a whole capture and write OUT/stream.morgs packet by packet, and OUT/report.json after every frame.
+
+    Args:
+        capture: cameras and frames; its test view is not trained on, but stands in the stream's header.
+        out: folder, made if missing.
+        config: settings.
+        on_step: called with (frame, steps done, steps of that frame).
+
+    Raises:
+        OSError: the disk is full or not writable; what stands in the stream up to then is whole.
+        ValueError: as `StreamLoop`.
+    """
+    config, out = config or StreamConfig(), Path(out)
+    train = capture.train_views
+    loop = StreamLoop(
+        [capture.cameras[v] for v in train],
+        capture.points,
+        capture.point_colors,
+        config,
+        [capture.masks[v] for v in train],
+    )
+    metadata = {
+        "capture": str(Path(capture.path).resolve()),
+        "test_view": capture.test_view,
+        "train_views": list(train),
+        "num_frames": capture.num_frames,
+        "key_views": [train[v] for v in loop.setup.key_views],
+        "config": asdict(config),
+        "versions": {"mitsuba": mi.__version__},
+        "variant": mi.variant(),
+    }
+    out.mkdir(parents=True, exist_ok=True)
+    reports: list[FrameReport] = []
+    with StreamWriter(out / "stream.morgs", capture.cameras, capture.fps, metadata) as writer:
+        for frame in capture.frames():
+            tick = None if on_step is None else _frame_ticker(on_step, frame.index)
+            packet, report = loop.push([frame.images[v] for v in train], tick)
+            reports.append(replace(report, num_bytes=writer.write(packet)))
+            _write_json(out / "report.json", {**metadata, "frames": [asdict(r) for r in reports]})
+    return reports
+
+
+def _frame_ticker(on_step: Callable[[int, int, int], None], frame: int) -> Callable[[int, int], None]:
+    return lambda done, steps: on_step(frame, done, steps)
+
+
+def _write_json(path: Path, value: Any) -> None:
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(value, indent=2) + "\n")
+    os.replace(partial, path)
