@@ -6,8 +6,9 @@ from morgs_mi.llvm import ensure_llvm
 ensure_llvm()
 
 from morgs_mi.capture.camera import Camera  # noqa: E402
+from morgs_mi.gaussian_integrator import ellipsoids  # noqa: E402  (registers the integrator `gaussian_splat`)
 from morgs_mi.gaussians.gaussians import Gaussians  # noqa: E402
 from morgs_mi.render.config import RenderConfig  # noqa: E402
 from morgs_mi.render.rasterize import Image, rasterize  # noqa: E402
 
-__all__ = ["Camera", "Gaussians", "Image", "RenderConfig", "rasterize"]
+__all__ = ["Camera", "Gaussians", "Image", "RenderConfig", "ellipsoids", "rasterize"]

@@ -1,0 +1,76 @@
+"""CUDA against LLVM: the same kernels, compiled for another machine. Run with `pytest -m gpu`."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi import rasterize
+from tests import tolerances as tol
+from tests.render.test_rasterize import CHANNELS, RAW, make_camera, make_scene, relative, to_gaussians
+from tests.test_gaussian_integrator import AOVS, make_mitsuba_scene, make_raw
+
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.skipif(not dr.has_backend(dr.JitBackend.CUDA), reason="needs an NVIDIA GPU"),
+]
+
+
+def on(variant, function):
+    """Run `function` with this variant; what it returns must be NumPy arrays by name."""
+    mi.set_variant(variant)
+    return {name: np.array(value, np.float64) for name, value in function().items()}
+
+
+def assert_variants_agree(function):
+    cpu, gpu = on("llvm_ad_rgb", function), on("cuda_ad_rgb", function)
+    assert cpu.keys() == gpu.keys()
+    for name in cpu:
+        assert np.isfinite(gpu[name]).all(), name
+        assert relative(gpu[name], cpu[name]) < tol.GRADIENT_REL, name
+
+
+@pytest.mark.parametrize("n", [10, 300])
+def test_rasterize(n):
+    camera = make_camera(70, 45)
+    raw = make_scene(n=n)
+    weight = np.float32(np.random.default_rng(1).normal(size=(45, 70, 3)))
+
+    def run():
+        gaussians = to_gaussians(raw, grad=True)
+        image = rasterize(gaussians, camera, CHANNELS)
+        solid = np.asarray(image.alpha) > 0.02  # elsewhere normalised channels divide by almost nothing
+        images = {name: np.asarray(dr.detach(getattr(image, name))) * solid for name in CHANNELS}
+        dr.backward(dr.sum(image.color * mi.TensorXf(weight), axis=None) + dr.sum(image.confidence, axis=None))
+        return images | {f"gradient of {name}": dr.grad(getattr(gaussians, name)) for name in RAW}
+
+    assert_variants_agree(run)
+
+
+def test_plugin():
+    raw = make_raw()
+
+    def run():
+        scene = make_mitsuba_scene(
+            to_gaussians(raw), {"pixel_format": "rgba", "rfilter": {"type": "gaussian"}}, aovs=AOVS
+        )
+        params = mi.traverse(scene)
+        names = [f"gaussians.{name}" for name in ("data", "opacities", "sh_coeffs")]
+        dr.enable_grad([params[name] for name in names])
+        image = mi.render(scene, params)
+        dr.backward(dr.sum(dr.square(image[..., :4]), axis=None))
+        return {"image": dr.detach(image)[..., :4]} | {f"gradient of {name}": dr.grad(params[name]) for name in names}
+
+    assert_variants_agree(run)
+
+
+def test_switching_back_and_forth_keeps_the_plugin():
+    raw = make_raw()
+    images = [
+        on(variant, lambda: {"image": mi.render(make_mitsuba_scene(to_gaussians(raw)))})["image"]
+        for variant in ("cuda_ad_rgb", "llvm_ad_rgb", "cuda_ad_rgb")
+    ]
+    np.testing.assert_array_equal(images[0], images[2])
+    assert np.abs(images[0] - images[1]).max() < tol.IMAGE_ABS
