@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
@@ -43,13 +42,14 @@ def optimise(
     """
     # Gradients of means over a million pixels are tiny: Adam's usual epsilon of 1e-8 would drown them.
     optimizer = Adam(lr=1.0, params=dict(parameters), epsilon=1e-15)
-    scale = {name: rates[name] for name in parameters}
-    optimizer.set_learning_rate({name: dr.opaque(mi.Float, rate) for name, rate in scale.items()})
+    scale = {name: float(rates[name]) for name in parameters}
+    # As Python numbers: Dr.Jit 1.5 multiplies a rate that is an array in place, once per step.
+    optimizer.set_learning_rate(scale)
     history: dict[str, list[Any]] = {}
     for step, view in enumerate(views):
         if decay is not None:
             factor = decay(step)
-            optimizer.set_learning_rate({n: dr.opaque(mi.Float, factor * rate) for n, rate in scale.items()})
+            optimizer.set_learning_rate({name: factor * rate for name, rate in scale.items()})
         losses = losses_of(optimizer, view)
         dr.backward(sum(weights.get(name, 1.0) * loss for name, loss in losses.items()))
         optimizer.step()
