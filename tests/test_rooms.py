@@ -22,6 +22,7 @@ ROOMS = (
     "stream_loop",
     "evaluate",
     "viewer",
+    "demo",
     "cli",
 )
 # The package's front door gathers what the rooms offer, `python -m morgs_mi` opens the command line.

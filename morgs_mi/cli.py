@@ -1,0 +1,378 @@
+"""The command line: `morgs-mi synth`, `info`, `fit`, `render`, `eval` and `demo`. The only argument parser.
+
+Results go to standard output; progress, warnings and complaints to standard error. What the user can set right is
+one sentence and exit status 1, an interruption 130; `--debug` shows where it came from.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.logging import RichHandler
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+from tyro.conf import Positional, arg
+
+from morgs_mi.demo import DemoConfig
+from morgs_mi.stream_loop import StreamConfig
+
+__all__ = ["main"]
+
+# Rich would wrap paths and sentences at 80 columns where there is no terminal.
+_OUT, _ERR = Console(soft_wrap=True, highlight=False), Console(stderr=True, soft_wrap=True, highlight=False)
+Report = Callable[[str, float, float], None]
+
+
+@dataclass(frozen=True)
+class Synth:
+    """Path-trace a moving scene into a multi-view capture with exact ground truth."""
+
+    scene: Positional[str]
+    """Name of a scene (spheres, arm) or the path of its Python file."""
+    out: Positional[Path]
+    """Folder to make."""
+    cameras: int = 10
+    """Number of cameras; cam00 is the one to hold out."""
+    frames: int = 12
+    """Number of frames per camera."""
+    width: int = 320
+    """Of the images in pixels, even."""
+    height: int = 240
+    """Of the images in pixels, even."""
+    spp: int = 16
+    """Samples per pixel; 16 leaves noise at 42 dB."""
+    fps: float = 30.0
+    """Frames per second."""
+    lossless: bool = False
+    """Also write the frames as PNG files."""
+    seed: int = 0
+    """Of textures, sampling noise and the choice of points."""
+    overwrite: bool = False
+    """Replace an earlier capture."""
+
+    def run(self) -> None:
+        from morgs_mi.capture.synth import synthesize
+
+        with _progress() as report:
+            synthesize(
+                self.scene,
+                self.out,
+                num_cameras=self.cameras,
+                num_frames=self.frames,
+                width=self.width,
+                height=self.height,
+                spp=self.spp,
+                fps=self.fps,
+                lossless=self.lossless,
+                seed=self.seed,
+                overwrite=self.overwrite,
+                progress=lambda done, total: report("Path-tracing", done, total),
+            )
+        _say(f"{self.out}: {self.cameras} cameras, {self.frames} frames of {self.width}x{self.height}.")
+
+
+@dataclass(frozen=True)
+class Info:
+    """Say what a capture holds: cameras, sizes, frames, points."""
+
+    capture: Positional[Path]
+    """Folder of the capture."""
+
+    def run(self) -> None:
+        from morgs_mi.capture.capture import load_capture
+
+        capture = load_capture(self.capture)
+        table = Table(title=str(self.capture))
+        for column in ("index", "camera", "size", "focal lengths, px", "centre, px", "seen", "use"):
+            table.add_column(column)
+        for index, (camera, mask) in enumerate(zip(capture.cameras, capture.masks, strict=True)):
+            K = camera.K
+            table.add_row(
+                str(index),
+                camera.name,
+                f"{camera.width}x{camera.height}",
+                f"{K[0, 0]:.1f}, {K[1, 1]:.1f}",
+                f"{K[0, 2]:.1f}, {K[1, 2]:.1f}",
+                "100 %" if mask is None else f"{100 * mask.mean():.0f} %",
+                "held out" if index == capture.test_view else "training",
+            )
+        _OUT.print(table)
+        truth = "with ground truth" if capture.truth else "without ground truth"
+        _say(f"{capture.num_frames} frames at {capture.fps:g} fps, {len(capture.points)} points, {truth}.")
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Reconstruct a capture, frame after frame, into OUT/stream.morgs."""
+
+    capture: Positional[Path]
+    """Folder of the capture."""
+    out: Positional[Path]
+    """Folder for stream.morgs and report.json; an earlier stream there is replaced."""
+    frames: int | None = None
+    """Use at most this many frames from the start."""
+    downscale: float = 1
+    """Average the images down by this factor."""
+    test_view: int | Literal["auto"] | None = "auto"
+    """Index of the camera to hold out; auto takes the capture's own choice, or camera 0 of six or more."""
+    config: Annotated[StreamConfig, arg(name="")] = field(default_factory=StreamConfig)
+
+    def run(self) -> None:
+        from morgs_mi.capture.capture import load_capture
+        from morgs_mi.stream_loop import stream_capture
+
+        capture = load_capture(self.capture, self.downscale, self.test_view, self.frames)
+        count = capture.num_frames
+        with _progress() as report:
+            reports = stream_capture(
+                capture,
+                self.out,
+                self.config,
+                lambda frame, step, steps: report("Fitting frames", frame + step / steps, count),
+            )
+        seconds = [row.seconds for row in reports[1:]]
+        later = f", {sum(seconds) / len(seconds):.1f} s for each later one" if seconds else ""
+        stream = self.out / "stream.morgs"
+        _say(
+            f"{stream}: {len(reports)} frames, {stream.stat().st_size / 1e6:.1f} MB, "
+            f"{reports[0].seconds:.1f} s for the first frame{later}."
+        )
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a stream for one camera into a video, EXR files or PNG files."""
+
+    out: Positional[Path]
+    """Folder of a fit, or a stream file."""
+    camera: str
+    """Camera of the stream, by index or name."""
+    channels: tuple[Literal["color", "motion", "confidence", "depth", "alpha"], ...] | None = None
+    """What to render; by default the colour, in EXR files all that the stream holds."""
+    output: Path | None = None
+    """FILE.mp4, a folder for PNG files whose name ends in png, or another new folder for multichannel EXR files (R, G,
+    B in linear light, motion.X, motion.Y in pixels, confidence.Y, depth.Y); by default OUT/CAMERA.mp4."""
+
+    def run(self) -> None:
+        from morgs_mi.evaluate.frames import write_frames
+        from morgs_mi.evaluate.stream import find_camera, open_stream
+
+        stream = open_stream(self.out)
+        camera = find_camera(stream, self.camera)
+        output = self.output or stream.path.with_name(f"{camera.name}.mp4")
+        total = stream.metadata.get("num_frames", 0)
+        with _progress() as report:
+            write_frames(
+                stream, camera, output, self.channels, lambda done: report("Rendering", done, max(total, done))
+            )
+        _say(f"{output}: camera {camera.name}, {camera.width}x{camera.height}.")
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Measure a stream against its capture: quality, motion, bytes and seconds."""
+
+    out: Positional[Path]
+    """Folder of a fit, or a stream file."""
+    capture: Path | None = None
+    """Folder of the capture, if it is no longer where it was fitted from."""
+    json: Path | None = None
+    """File for all figures; - prints them in place of the tables."""
+
+    def run(self) -> None:
+        from morgs_mi.evaluate.report import finite, machine, versions, write_json
+        from morgs_mi.evaluate.stream import evaluate_stream
+
+        with _progress() as report:
+            result = evaluate_stream(self.out, self.capture, lambda done, total: report("Judging frames", done, total))
+        result |= {"machine": machine(), "versions": versions()}
+        if self.json == Path("-"):
+            _say(json.dumps(finite(result), indent=2))
+            return
+        _show(result)
+        if self.json is not None:
+            write_json(self.json, result)
+            _say(f"All figures: {self.json}")
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Make a clip, reconstruct it with and without learned motion, and leave pictures and figures in OUT."""
+
+    out: Positional[Path]
+    """Folder for everything."""
+    config: Annotated[DemoConfig, arg(name="")] = field(default_factory=DemoConfig)
+
+    def run(self) -> None:
+        from morgs_mi.demo import run_demo
+
+        with _progress() as report:
+            result = run_demo(self.out, self.config, report)
+        full, compared = result["full"], result["comparison"]
+        table = Table(title=f"held-out view, frames {_span(compared['frames'])}")
+        for column in ("", "PSNR, dB", "SSIM", "flow error, px", "moving, px", "still, px"):
+            table.add_column(column, justify="right" if column else "left")
+        for name, title in (("full", "with motion"), ("plain", "without")):
+            figures = compared[name]
+            motion = (_figure(figures[key], 2) for key in ("motion_error", "motion_error_moving", "motion_error_still"))
+            table.add_row(title, _figure(figures["psnr"], 2), _figure(figures["ssim"], 4), *motion)
+        _OUT.print(table)
+        _say(
+            f"Held-out PSNR {_figure(full['psnr']['first'], 2)} dB in the first frame, "
+            f"{_figure(full['psnr']['last'], 2)} dB in the last of {full['num_frames']}; "
+            f"{_figure(full['seconds']['per_later_frame'], 1)} s and "
+            f"{_figure(full['bytes']['per_residual'] / 1e6, 2)} MB per later frame; "
+            f"{result['seconds']['total']:.0f} s in all."
+        )
+        _say(f"Look at {self.out / 'side_by_side.mp4'} and {self.out / 'contact_sheet.png'};")
+        _say(f"all figures are in {self.out / 'report.json'}.")
+
+
+Command = (
+    Annotated[Synth, tyro.conf.subcommand("synth")]
+    | Annotated[Info, tyro.conf.subcommand("info")]
+    | Annotated[Fit, tyro.conf.subcommand("fit")]
+    | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[Eval, tyro.conf.subcommand("eval")]
+    | Annotated[Demo, tyro.conf.subcommand("demo")]
+)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Dynamic Gaussian splatting in Mitsuba 3: a multi-view clip goes in, a stream of moving Gaussians comes out."""
+
+    command: Annotated[Command, arg(name="")]
+    variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
+    """Mitsuba's variant: llvm_ad_rgb runs on any processor, cuda_ad_rgb on an NVIDIA GPU."""
+    debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Show where an error came from, and more of what happens."""
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit status; `args` default to those of the process."""
+    args = sys.argv[1:] if args is None else list(args)
+    try:
+        options = tyro.cli(
+            Options,
+            prog="morgs-mi",
+            args=args,
+            config=(tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes),
+        )
+        _set_up(options)
+        options.command.run()
+        return 0
+    except KeyboardInterrupt:
+        _warn("Interrupted; what stands in a stream file is whole up to its last frame.")
+        status = 130
+    except (ValueError, OSError, MemoryError) as error:
+        _warn(" ".join(str(error).split()) or f"{type(error).__name__}.")
+        status = 1
+    # A setting may be refused before there are options to ask.
+    if "--debug" in args:
+        _ERR.print_exception()
+    return status
+
+
+def _set_up(options: Options) -> None:
+    """Send warnings to standard error and choose Mitsuba's variant."""
+    import mitsuba as mi
+
+    level = logging.DEBUG if options.debug else logging.WARNING
+    logging.basicConfig(level=level, format="%(message)s", handlers=[RichHandler(console=_ERR, show_path=False)])
+    try:
+        mi.set_variant(options.variant)
+    except ImportError as error:
+        raise ValueError(f"--variant {options.variant} cannot be used here ({error}); try llvm_ad_rgb.") from error
+
+
+@contextmanager
+def _progress() -> Iterator[Report]:
+    """Show a bar per stage; give a function to be called with (stage, done, total)."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    tasks: dict[str, Any] = {}
+    with Progress(*columns, console=_ERR) as progress:
+
+        def report(stage: str, done: float, total: float) -> None:
+            if stage not in tasks:
+                tasks[stage] = progress.add_task(stage)
+            progress.update(tasks[stage], completed=done, total=total)
+
+        yield report
+
+
+def _show(result: Mapping[str, Any]) -> None:
+    """Print what `evaluate_stream` has found."""
+    views = ", ".join(result["views"])
+    table = Table(title=f"{'held-out view' if result['held_out'] else 'training views'} {views}")
+    titles = ("frame", "PSNR, dB", "SSIM", "flow error, px", "moving, px", "still, px", "kB", "s")
+    for title in titles:
+        table.add_column(title, justify="right")
+    motion = ("motion_error", "motion_error_moving", "motion_error_still")
+    for row in result["frames"]:
+        table.add_row(
+            str(row["frame"]),
+            _figure(row["psnr"], 2),
+            _figure(row["ssim"], 4),
+            *(_figure(row[name], 2) for name in motion),
+            _figure(row["num_bytes"] / 1e3, 1),
+            _figure(row["seconds"], 1),
+            end_section=row is result["frames"][-1],
+        )
+    means = (_figure(result[name], 2) for name in motion)
+    size, seconds = result["bytes"], result["seconds"]
+    table.add_row(
+        "mean",
+        _figure(result["psnr"]["mean"], 2),
+        _figure(result["ssim"]["mean"], 4),
+        *means,
+        _figure(size["file"] / result["num_frames"] / 1e3, 1),
+        _figure(seconds["per_later_frame"], 1),
+    )
+    _OUT.print(table)
+    if not result["held_out"]:
+        scores = (f"{name} {_figure(score['psnr'], 2)}" for name, score in result["views"].items())
+        _say(f"PSNR by view, dB: {', '.join(scores)}")
+    _say(
+        f"PSNR {_figure(result['psnr']['first'], 2)} dB in the first frame, {_figure(result['psnr']['last'], 2)} dB in "
+        f"the last; {size['file'] / 1e6:.2f} MB, {_figure(size['per_keyframe'] / 1e3, 1)} kB per keyframe, "
+        f"{_figure(size['per_residual'] / 1e3, 1)} kB per residual; {_figure(seconds['first'], 1)} s for the first "
+        f"frame, {_figure(seconds['per_later_frame'], 1)} s per later one."
+    )
+    if not result["complete"]:
+        _warn(f"{result['stream']}: the fit was not finished, its stream holds {result['num_frames']} frames.")
+
+
+def _figure(value: float | None, digits: int) -> str:
+    return "-" if value is None or value != value else f"{value:.{digits}f}"
+
+
+def _span(frames: Sequence[int]) -> str:
+    return f"{frames[0]} to {frames[-1]}" if frames else "none"
+
+
+def _say(text: str) -> None:
+    _OUT.print(text, markup=False)
+
+
+def _warn(text: str) -> None:
+    _ERR.print(text, markup=False)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
