@@ -1,7 +1,8 @@
 """The command line: `morgs-mi synth`, `info`, `fit`, `render`, `eval` and `demo`. The only argument parser.
 
 Results go to standard output; progress, warnings and complaints to standard error. What the user can set right is
-one sentence and exit status 1, an interruption 130; `--debug` shows where it came from.
+one sentence and exit status 1, an interruption 130; `--debug` shows where it came from. Arguments that the parser
+refuses give status 2.
 """
 
 from __future__ import annotations
@@ -271,16 +272,14 @@ def main(args: Sequence[str] | None = None) -> int:
         _set_up(options)
         options.command.run()
         return 0
-    except KeyboardInterrupt:
-        _warn("Interrupted; what stands in a stream file is whole up to its last frame.")
-        status = 130
-    except (ValueError, OSError, MemoryError) as error:
-        _warn(" ".join(str(error).split()) or f"{type(error).__name__}.")
-        status = 1
-    # A setting may be refused before there are options to ask.
-    if "--debug" in args:
-        _ERR.print_exception()
-    return status
+    except (KeyboardInterrupt, ValueError, OSError, MemoryError) as error:
+        interrupted = isinstance(error, KeyboardInterrupt)
+        sentence = "Interrupted; a stream file is whole up to its last frame." if interrupted else str(error)
+        _warn(" ".join(sentence.split()) or f"{type(error).__name__}.")
+        # A setting may be refused before there are options to ask.
+        if "--debug" in args:
+            _ERR.print_exception()
+        return 130 if interrupted else 1
 
 
 def _set_up(options: Options) -> None:

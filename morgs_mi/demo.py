@@ -156,7 +156,9 @@ def _draw(out: Path, capture: Capture, tell: Callable[[float, float], None]) -> 
     last = len(plain) - 1
     chosen = [full[t] for t in sorted({min(1, len(full) - 1), last, len(full) - 1})]
     sheet = [list(panels.values()) for panels in chosen]
-    sheet.append([*plain[last].values(), motion_legend(scale)])
+    # A confidence that was never learned says nothing.
+    without = [panel for name, panel in plain[last].items() if name != "confidence"]
+    sheet.append([*without, motion_legend(scale)])
     write_png(out / "contact_sheet.png", contact_sheet(sheet))
     tell(2, 2)
 
