@@ -16,6 +16,7 @@ from morgs_mi.fit.optimise import optimise, view_order
 from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.motion.config import MotionConfig
 from morgs_mi.motion.cues import MotionCue
+from morgs_mi.motion.lift import lift_flow
 from morgs_mi.motion.residual import apply_residual, residual_parameters
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
@@ -70,7 +71,8 @@ def fit_next_frame(
 
     weights = {"flow": motion.weight_flow, "mask": motion.weight_mask, "offset": motion.weight_offset}
     views = view_order(len(cameras), config.epochs * len(cameras), rng)
-    start = residual_parameters(previous, motion)
+    lifted = lift_flow(previous, cameras, cues, render) if motion.learn_motion and motion.lift_flow else None
+    start = residual_parameters(previous, motion, lifted)
     fitted, losses = optimise(start, config.rates(extent), views, losses_of, weights, on_step=on_step)
     with dr.suspend_grad():
         return apply_residual(previous, fitted, motion), losses

@@ -22,6 +22,8 @@ class MotionConfig:
     """MO: a learned offset corrects the flow-guided motion (eq. 8)."""
     learn_confidence: bool = True
     """MC: a learned confidence gates all residuals (eq. 12)."""
+    lift_flow: bool = True
+    """Start each Gaussian's motion from the key views' flow in closed form; False: from zero, as in the paper."""
     flow_method: str = "dis-medium"
     """Optical flow, a key of `FLOW_METHODS`."""
     key_views: int = 4

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from morgs_mi.capture.camera import Camera
 from morgs_mi.motion.config import MotionConfig
-from morgs_mi.motion.flow import motion_cue
+from morgs_mi.motion.flow import consistent, optical_flow
 from morgs_mi.motion.masks import motion_mask
 
-__all__ = ["MotionCue", "choose_key_views", "motion_cues"]
+__all__ = ["MotionCue", "choose_key_views", "motion_cue", "motion_cues"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,12 +21,16 @@ class MotionCue:
 
     Attributes:
         motion: x_t - x_{t-1} [H, W, 2] in px on frame t's grid.
-        reliable: [H, W] bool, where forward and backward flow agree.
+        reliable: [H, W] bool, where the flow there and back agree.
+        onward: x_t - x_{t-1} again, but on frame t - 1's grid [H, W, 2].
+        onward_reliable: [H, W] bool, likewise.
         mask: what moves [H, W] bool (eq. 10), or None where it was not asked for.
     """
 
     motion: np.ndarray
     reliable: np.ndarray
+    onward: np.ndarray
+    onward_reliable: np.ndarray
     mask: np.ndarray | None = None
 
 
@@ -40,6 +44,33 @@ def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
     return tuple(sorted(chosen))
 
 
+def motion_cue(
+    image: np.ndarray,
+    previous: np.ndarray,
+    method: str = "dis-medium",
+    with_mask: bool = False,
+    valid: np.ndarray | None = None,
+) -> MotionCue:
+    """Return one view's cue (eq. 4, and 9 and 10 for the mask), from optical flow both ways.
+
+    Args:
+        image: I_t [H, W, 3], RGB, uint8 or float in [0, 1].
+        previous: I_{t-1}, likewise.
+        method: a key of `FLOW_METHODS`; it runs twice.
+        with_mask: whether the mask is wanted.
+        valid: [H, W] bool, False where undistortion left nothing; None: valid everywhere.
+
+    Raises:
+        ValueError: as `optical_flow`.
+    """
+    flow, onward = optical_flow(image, previous, method), optical_flow(previous, image, method)
+    reliable, onward_reliable = consistent(flow, onward), consistent(onward, flow)
+    if valid is not None:
+        reliable, onward_reliable = reliable & valid, onward_reliable & valid
+    mask = motion_mask(image, -flow, reliable) if with_mask else None
+    return MotionCue(-flow, reliable, onward, onward_reliable, mask)
+
+
 def motion_cues(
     images: Sequence[np.ndarray],
     previous: Sequence[np.ndarray],
@@ -47,23 +78,8 @@ def motion_cues(
     config: MotionConfig,
     with_masks: bool,
     valid: Sequence[np.ndarray | None],
-) -> Mapping[int, MotionCue]:
-    """Return the cue of every key view (eq. 4, and 9 and 10 for the masks).
-
-    Args:
-        images: frame t of all views, uint8 [H, W, 3].
-        previous: frame t - 1 of all views; frame t + 1 with the sign of motion reversed is the caller's affair.
-        views: the key views.
-        config: flow method.
-        with_masks: whether masks are wanted.
-        valid: per view [H, W] bool, False where undistortion left nothing; None: valid everywhere.
-    """
-    cues = {}
-    for view in views:
-        motion, reliable = motion_cue(images[view], previous[view], config.flow_method)
-        inside = valid[view]
-        if inside is not None:
-            reliable = reliable & inside
-        mask = motion_mask(images[view], motion, reliable) if with_masks else None
-        cues[view] = MotionCue(motion, reliable, mask)
-    return cues
+) -> dict[int, MotionCue]:
+    """Return the cue of every key view, by view; `images`, `previous` and `valid` hold all views."""
+    return {
+        view: motion_cue(images[view], previous[view], config.flow_method, with_masks, valid[view]) for view in views
+    }

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-__all__ = ["FLOW_METHODS", "motion_cue", "optical_flow"]
+__all__ = ["FLOW_METHODS", "consistent", "optical_flow"]
 
 # DIS needs patches of 8 pixels on its coarsest level; below this no method has anything to match.
 MIN_SIDE = 16
@@ -68,31 +68,24 @@ def optical_flow(image: np.ndarray, previous: np.ndarray, method: str = "dis-med
     return FLOW_METHODS[method](_gray(image), _gray(previous))
 
 
-def motion_cue(image: np.ndarray, previous: np.ndarray, method: str = "dis-medium") -> tuple[np.ndarray, np.ndarray]:
-    """Return the motion [H, W, 2] in pixels, x_t - x_{t-1} = -F, and where it can be trusted [H, W], bool.
+def consistent(flow: np.ndarray, back: np.ndarray) -> np.ndarray:
+    """Return where a flow can be trusted [H, W], bool: where the way back returns to where it began.
 
-    A pixel is reliable if the flow back from where it came from returns to it, |F + B|^2 < 0.01 (|F|^2 +
-    |B|^2) + 0.5 px^2 (Sundaram, Brox and Keutzer, ECCV 2010): what was hidden or outside fails.
+    |F + B|^2 < 0.01 (|F|^2 + |B|^2) + 0.5 px^2, with B read where F leads (Sundaram, Brox and Keutzer, ECCV
+    2010): what gets hidden or leaves the picture fails.
 
     Args:
-        image: I_t [H, W, 3], RGB, uint8 or float in [0, 1].
-        previous: I_{t-1}, likewise.
-        method: a key of `FLOW_METHODS`; it runs twice.
-
-    Raises:
-        ValueError: as `optical_flow`.
+        flow: F [H, W, 2] in pixels, from one frame to another.
+        back: B [H, W, 2], from that one to the first, on its own grid.
     """
-    forward = optical_flow(image, previous, method)
-    backward = optical_flow(previous, image, method)
-    height, width = forward.shape[:2]
+    height, width = flow.shape[:2]
     y, x = np.mgrid[:height, :width].astype(np.float32)
-    x, y = x + forward[..., 0], y + forward[..., 1]
-    back = cv2.remap(backward, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    mismatch = _squared(forward + back)
-    reliable = mismatch < 0.01 * (_squared(forward) + _squared(back)) + 0.5
+    x, y = x + flow[..., 0], y + flow[..., 1]
+    back = cv2.remap(back, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    mismatch = _squared(flow + back)
+    agrees = mismatch < 0.01 * (_squared(flow) + _squared(back)) + 0.5
     # Half a pixel of slack keeps the border itself inside in spite of the flow's own error.
-    inside = (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
-    return -forward, reliable & inside
+    return agrees & (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
 
 
 def _gray(image: np.ndarray) -> np.ndarray:

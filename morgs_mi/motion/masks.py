@@ -89,7 +89,7 @@ def motion_mask(image: np.ndarray, motion: np.ndarray, reliable: np.ndarray | No
     Args:
         image: frame t [H, W, 3], RGB, uint8 or float in [0, 1].
         motion: [H, W, 2] in pixels on frame t's grid.
-        reliable: [H, W] bool, see `motion_cue`.
+        reliable: [H, W] bool, see `consistent`.
 
     Raises:
         ValueError: as `flow_mask` and `refine_mask`.

@@ -14,17 +14,26 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from morgs_mi.gaussians.gaussians import Gaussians, sigmoid
 from morgs_mi.motion.config import MotionConfig
 
 __all__ = ["apply_residual", "join_sh", "residual_parameters", "split_sh"]
 
+# Below this gate a lifted motion is not scaled up to pass it whole.
+_LEAST_GATE = 0.1
 _STATIC = ("log_scales", "quats", "logit_opacities")
 
 
-def residual_parameters(previous: Gaussians, config: MotionConfig) -> dict[str, Any]:
-    """Return the parameters of a frame's residual at their start: no change, confidence as before."""
+def residual_parameters(previous: Gaussians, config: MotionConfig, lifted: np.ndarray | None = None) -> dict[str, Any]:
+    """Return the parameters of a frame's residual at their start: no change, confidence as before.
+
+    Args:
+        previous: N Gaussians of the frame before.
+        config: which modules are on.
+        lifted: displacement [N, 3] to start from (see `lift_flow`), or None.
+    """
     sh_dc, sh_rest = split_sh(previous.sh_coeffs)
     shapes = {"motion": previous.means, **{name: getattr(previous, name) for name in _STATIC}, "sh_dc": sh_dc}
     if sh_rest is not None:
@@ -34,6 +43,12 @@ def residual_parameters(previous: Gaussians, config: MotionConfig) -> dict[str, 
     parameters = {name: dr.zeros(mi.TensorXf, tuple(value.shape)) for name, value in shapes.items()}
     if config.learn_confidence:
         parameters["logit_confidence"] = previous.logit_confidence
+    if lifted is not None:
+        start = lifted
+        if config.learn_confidence:
+            # The gate would shrink what the flow says; who hardly moves may stay shrunk.
+            start = lifted / np.maximum(np.asarray(previous.confidence), _LEAST_GATE)[:, None]
+        parameters["motion"] = mi.TensorXf(start.astype(np.float32))
     return parameters
 
 

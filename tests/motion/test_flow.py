@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.motion.flow import FLOW_METHODS, motion_cue, optical_flow
+from morgs_mi.motion.cues import motion_cue
+from morgs_mi.motion.flow import FLOW_METHODS, optical_flow
 from tests.motion.moving_disc import moving_disc, texture
 
 
@@ -23,7 +24,8 @@ def test_translation_is_recovered_with_its_sign(method, shift):
 
 def test_motion_is_the_shift_on_frame_ts_grid():
     previous, image, disc = moving_disc(240, 320, shift=(6, -4))
-    motion, reliable = motion_cue(image, previous)
+    cue = motion_cue(image, previous)
+    motion, reliable = cue.motion, cue.reliable
     # 0.25 px: DIS smooths over 8x8 patches.
     assert np.abs(motion[disc & reliable] - (6, -4)).mean() < 0.25
     assert np.linalg.norm(motion[~disc & reliable], axis=-1).mean() < 0.25
@@ -32,7 +34,7 @@ def test_motion_is_the_shift_on_frame_ts_grid():
 
 def test_what_was_hidden_is_not_reliable():
     previous, image, disc = moving_disc(240, 320, shift=(10, 0))
-    _, reliable = motion_cue(image, previous)
+    reliable = motion_cue(image, previous).reliable
     uncovered = np.roll(disc, (0, -10), (0, 1)) & ~disc
     assert reliable[uncovered].mean() < 0.5 < 0.95 < reliable.mean()
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.motion.flow import motion_cue
-from morgs_mi.motion.masks import flow_mask, flow_threshold, motion_mask, refine_mask
+from morgs_mi.motion.cues import motion_cue
+from morgs_mi.motion.masks import flow_mask, flow_threshold, refine_mask
 from tests.motion.moving_disc import moving_disc
 
 CAMERA_NOISE = 2 / 255  # standard deviation of a video camera in room light
@@ -19,13 +19,13 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
 @pytest.mark.parametrize("size", [(120, 160), (240, 320)])
 def test_static_pair_gives_an_empty_mask_under_camera_noise(size):
     previous, image, _ = moving_disc(*size, shift=(0, 0), noise=CAMERA_NOISE)
-    assert not motion_mask(image, *motion_cue(image, previous)).any()
+    assert not motion_cue(image, previous, with_mask=True).mask.any()
 
 
 @pytest.mark.parametrize("shift", [(6, -4), (1, 0)])
 def test_moving_disc_is_found(shift):
     previous, image, disc = moving_disc(240, 320, shift, CAMERA_NOISE)
-    mask = motion_mask(image, *motion_cue(image, previous))
+    mask = motion_cue(image, previous, with_mask=True).mask
     # DIS spreads motion by up to half a patch, 4 px: the bound is a disc of 48 px radius grown by that much.
     assert overlap(mask, disc) > (48 / 52) ** 2 - 0.1
     assert mask[disc].mean() > 0.95
@@ -40,8 +40,8 @@ def test_refinement_recovers_an_object_from_a_part_of_it():
 
 def test_union_never_loses_flow():
     previous, image, _ = moving_disc(120, 160, (3, 2))
-    motion, reliable = motion_cue(image, previous)
-    assert not (flow_mask(motion, reliable) & ~motion_mask(image, motion, reliable)).any()
+    cue = motion_cue(image, previous, with_mask=True)
+    assert not (flow_mask(cue.motion, cue.reliable) & ~cue.mask).any()
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (40, 30), (700, 20)])

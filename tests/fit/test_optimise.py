@@ -1,0 +1,50 @@
+"""The optimisation loop: it converges, draws every view, and says when it breaks."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi.fit.optimise import optimise, view_order
+
+
+def bowl(values, view):
+    x = values["x"]
+    return {"near": dr.sum(dr.square(x - 1.0), axis=None), "far": dr.sum(dr.square(x - 3.0), axis=None)}
+
+
+@pytest.mark.parametrize("decay", [None, lambda step: 0.1 ** (step / 200)])
+def test_weights_decide_where_it_ends(decay):
+    start = {"x": mi.TensorXf(np.zeros(4, np.float32))}
+    fitted, losses = optimise(start, {"x": 0.1}, [0] * 200, bowl, {"far": 0.0}, decay)
+    assert np.asarray(fitted["x"]) == pytest.approx(np.ones(4), abs=0.02)
+    assert losses["far"] == pytest.approx(16, rel=0.05)
+    fitted, _ = optimise(start, {"x": 0.1}, [0] * 200, bowl, {}, decay)
+    assert np.asarray(fitted["x"]) == pytest.approx(np.full(4, 2.0), abs=0.02)
+
+
+def test_every_step_moves_by_about_the_rate():
+    """Adam's steps stay as long as the rate says, from the first to the last."""
+    start, path = {"x": mi.TensorXf(np.zeros(1, np.float32))}, []
+
+    def slope(values, view):
+        path.append(np.asarray(dr.detach(values["x"])).item())
+        return {"slope": dr.sum(values["x"], axis=None)}
+
+    optimise(start, {"x": 0.5}, [0] * 12, slope, {})
+    assert np.diff(path) == pytest.approx(np.full(11, -0.5), rel=1e-3)
+
+
+def test_broken_losses_are_named():
+    start = {"x": mi.TensorXf(np.zeros(1, np.float32))}
+    with pytest.raises(FloatingPointError, match="recon are not finite after 3 steps"):
+        optimise(start, {"x": 1.0}, [0] * 3, lambda v, _: {"recon": dr.log(dr.sum(v["x"], axis=None) - 100)}, {})
+
+
+def test_views_are_drawn_without_repetition():
+    order = view_order(5, 13, np.random.default_rng(0))
+    assert len(order) == 13
+    assert sorted(order[:5]) == sorted(order[5:10]) == list(range(5))
+    assert order == view_order(5, 13, np.random.default_rng(0))
