@@ -287,7 +287,9 @@ def _set_up(options: Options) -> None:
     import mitsuba as mi
 
     level = logging.DEBUG if options.debug else logging.WARNING
-    logging.basicConfig(level=level, format="%(message)s", handlers=[RichHandler(console=_ERR, show_path=False)])
+    logging.basicConfig(
+        level=level, format="%(message)s", handlers=[RichHandler(console=_ERR, show_time=False, show_path=False)]
+    )
     try:
         mi.set_variant(options.variant)
     except ImportError as error:
@@ -300,7 +302,7 @@ def _progress() -> Iterator[Report]:
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        TextColumn("{task.fields[count]}/{task.total:.0f}"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
     )
@@ -309,8 +311,8 @@ def _progress() -> Iterator[Report]:
 
         def report(stage: str, done: float, total: float) -> None:
             if stage not in tasks:
-                tasks[stage] = progress.add_task(stage)
-            progress.update(tasks[stage], completed=done, total=total)
+                tasks[stage] = progress.add_task(stage, count=0)
+            progress.update(tasks[stage], completed=done, total=total, count=int(done))
 
         yield report
 

@@ -53,9 +53,9 @@ def write_frames(
         OSError: the folder exists, or the files cannot be written.
     """
     output = Path(output)
-    kind = output.suffix.lower() or output.name.lower()
-    video, png = kind == ".mp4", kind in (".png", "png")
-    if output.suffix and kind not in (".mp4", ".png", ".exr"):
+    name = output.name.lower()
+    video, png = name.endswith(".mp4"), name.endswith("png")
+    if output.suffix.lower() not in ("", ".mp4", ".png", ".exr"):
         raise ValueError(
             f"{output}: the output must be FILE.mp4, or a folder ending in png or exr, got {output.suffix!r}."
         )
