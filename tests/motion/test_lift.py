@@ -39,9 +39,9 @@ def test_uniform_motion_is_recovered_in_3d():
     cameras, gaussians = rig(), cloud()
     cues = {view: uniform_cue(camera, SHIFT) for view, camera in enumerate(cameras)}
     lifted = lift_flow(gaussians, cameras, cues)
-    # A shift along the view shows least: there the prior holds back most.
+    # The prior of 0.3 px weighs against some 10 px of evidence; a shift along the view shows least.
     error = np.abs(np.median(lifted, axis=0) - SHIFT) / np.linalg.norm(SHIFT)
-    assert error[:2].max() < 0.03
+    assert error[:2].max() < 0.05
     assert error[2] < 0.1
 
 
