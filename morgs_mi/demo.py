@@ -18,6 +18,7 @@ from morgs_mi.evaluate.frames import PLAYABLE, even
 from morgs_mi.evaluate.pictures import contact_sheet, label, motion_legend, side_by_side, write_png
 from morgs_mi.evaluate.report import machine, versions, write_json
 from morgs_mi.evaluate.stream import channel_picture, evaluate_stream, open_stream, render_stream, truth_on
+from morgs_mi.fit.config import FitConfig
 from morgs_mi.stream_loop import StreamConfig, stream_capture
 
 __all__ = ["Clip", "DemoConfig", "run_demo"]
@@ -35,7 +36,7 @@ class Clip:
 
     num_cameras: int = 10
     """cam00 among them, which is held out."""
-    num_frames: int = 12
+    num_frames: int = 10
     """Frames per camera."""
     width: int = 320
     """In pixels, even."""
@@ -57,8 +58,8 @@ class DemoConfig:
     """The recording."""
     plain_frames: int = 5
     """Frames that are fitted a second time without learned motion, offset and confidence, for comparison."""
-    stream: StreamConfig = field(default_factory=StreamConfig)
-    """The fit; its seed is the clip's too."""
+    stream: StreamConfig = field(default_factory=lambda: StreamConfig(fit=FitConfig(first_frame_steps=600)))
+    """The fit, its first frame cut short to be done within minutes; its seed is the clip's too."""
 
 
 def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Progress | None = None) -> dict[str, Any]:

@@ -59,7 +59,7 @@ def fit_first_frame(
         return {"recon": recon_loss(image.color, targets[view], config.dssim_weight)}
 
     steps = config.first_frame_steps
-    rates = {name: config.first_frame_boost * rate for name, rate in config.rates(extent).items()}
+    rates = config.first_rates.by_parameter(extent)
     views = view_order(len(cameras), steps, rng)
     fitted, losses = optimise(
         parameters, rates, views, losses_of, {}, decay=lambda step: 0.1 ** (step / steps), on_step=on_step
@@ -85,7 +85,7 @@ def fit_confidence(
         return {"mask": mask_loss(image.confidence, targets[views[k]])}
 
     # Nothing else moves here, so the confidence may take long strides.
-    rates = {"logit_confidence": 4 * config.rate_confidence}
+    rates = {"logit_confidence": 4 * config.rates.confidence}
     order = view_order(len(views), config.confidence_steps, rng)
     parameters = {"logit_confidence": gaussians.logit_confidence}
     fitted, losses = optimise(parameters, rates, order, losses_of, {})

@@ -73,7 +73,7 @@ def fit_next_frame(
     views = view_order(len(cameras), config.epochs * len(cameras), rng)
     lifted = lift_flow(previous, cameras, cues, render) if motion.learn_motion and motion.lift_flow else None
     start = residual_parameters(previous, motion, lifted)
-    fitted, losses = optimise(start, config.rates(extent), views, losses_of, weights, on_step=on_step)
+    fitted, losses = optimise(start, config.rates.by_parameter(extent), views, losses_of, weights, on_step=on_step)
     with dr.suspend_grad():
         return apply_residual(previous, fitted, motion), losses
 
