@@ -190,8 +190,9 @@ class Eval:
     """File for all figures; - prints them in place of the tables."""
 
     def run(self) -> None:
-        from morgs_mi.evaluate.report import finite, machine, versions, write_json
+        from morgs_mi.evaluate.report import machine, versions
         from morgs_mi.evaluate.stream import evaluate_stream
+        from morgs_mi.files import finite, write_json
 
         with _progress() as report:
             result = evaluate_stream(self.out, self.capture, lambda done, total: report("Judging frames", done, total))

@@ -7,9 +7,7 @@ later frame is a gated residual guided by the flow of a few key views. The mathe
 
 from __future__ import annotations
 
-import json
 import logging
-import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -23,6 +21,7 @@ from morgs_mi.capture.camera import Camera
 from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.container import Packet, StreamWriter, encode_packet
 from morgs_mi.codec.gaussians import decode_gaussians, keyframe_packet, residual_packet
+from morgs_mi.files import write_json
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.losses import Target
@@ -294,6 +293,7 @@ def stream_capture(
     )
     metadata = {
         "capture": str(Path(capture.path).resolve()),
+        "downscale": capture.downscale,
         "test_view": capture.test_view,
         "train_views": list(train),
         "num_frames": capture.num_frames,
@@ -309,15 +309,9 @@ def stream_capture(
             tick = None if on_step is None else _frame_ticker(on_step, frame.index)
             packet, report = loop.push([frame.images[v] for v in train], tick)
             reports.append(replace(report, num_bytes=writer.write(packet)))
-            _write_json(out / "report.json", {**metadata, "frames": [asdict(r) for r in reports]})
+            write_json(out / "report.json", {**metadata, "frames": [asdict(r) for r in reports]})
     return reports
 
 
 def _frame_ticker(on_step: Callable[[int, int, int], None], frame: int) -> Callable[[int, int], None]:
     return lambda done, steps: on_step(frame, done, steps)
-
-
-def _write_json(path: Path, value: Any) -> None:
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(value, indent=2) + "\n")
-    os.replace(partial, path)

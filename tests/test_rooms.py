@@ -12,6 +12,7 @@ import morgs_mi
 ROOT = Path(morgs_mi.__file__).parent
 ROOMS = (
     "llvm",
+    "files",
     "capture",
     "gaussians",
     "render",

@@ -173,17 +173,18 @@ def test_a_capture_becomes_a_file(clip, tmp_path):
         test_view=4,
         truth=None,
         _sources=(),
+        downscale=2,
     )
     ticks = []
     reports = stream_capture(capture, tmp_path / "out", QUICK, lambda *tick: ticks.append(tick))
     path = tmp_path / "out" / "stream.morgs"
     reader = StreamReader(path)
     assert [c.name for c in reader.cameras] == [c.name for c in cameras()]
-    assert reader.metadata["train_views"] == [0, 1, 2, 3]
+    assert (reader.metadata["train_views"], reader.metadata["downscale"]) == ([0, 1, 2, 3], 2)
     assert [frame for frame, _ in play(reader)] == [0, 1]
     assert sum(r.num_bytes for r in reports) < path.stat().st_size
     assert ticks[-1] == (1, 16, 16)
-    assert not list((tmp_path / "out").glob("*.partial"))
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["report.json", "stream.morgs"]
 
 
 @pytest.mark.parametrize(

@@ -81,6 +81,7 @@ class Capture:
         masks: per camera [H, W] bool, true where the undistorted pixel was recorded; None for everywhere.
         test_view: index of the camera held out from training, or None.
         truth: folder of ground truth, or None.
+        downscale: the factor that it was opened with.
     """
 
     path: Path
@@ -93,6 +94,7 @@ class Capture:
     test_view: int | None
     truth: Path | None
     _sources: tuple[_Source, ...] = field(repr=False)
+    downscale: float = 1
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -165,6 +167,7 @@ def load_capture(
         test_view=_test_view(path, test_view, settings, len(cameras)),
         truth=path / "truth" if (path / "truth").is_dir() else None,
         _sources=sources,
+        downscale=downscale,
     )
 
 

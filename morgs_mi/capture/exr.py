@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
+
+from morgs_mi.files import whole
 
 __all__ = ["read_exr", "write_exr"]
 
@@ -22,18 +23,13 @@ def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
     shapes = {name: np.shape(channel) for name, channel in channels.items()}
     if len(set(shapes.values())) != 1 or any(len(shape) != 2 for shape in shapes.values()):
         raise ValueError(f"write_exr(): `channels` must share one shape [H, W], got {shapes}; pass one image each.")
-    path = Path(path)
-    partial = path.with_name(f".{path.name}.partial")
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     pixels = {name: np.ascontiguousarray(channel, np.float32) for name, channel in channels.items()}
-    try:
-        OpenEXR.File(header, pixels).write(str(partial))
-        os.replace(partial, path)
-    except (OSError, RuntimeError) as error:
-        partial.unlink(missing_ok=True)
-        raise OSError(
-            f"write_exr(): cannot write {path}: {error}; check that its folder exists and the disk has room."
-        ) from error
+    with whole(path, "write_exr()") as partial:
+        try:
+            OpenEXR.File(header, pixels).write(str(partial))
+        except RuntimeError as error:
+            raise OSError(str(error)) from error
 
 
 def read_exr(path: str | Path) -> dict[str, np.ndarray]:

@@ -6,11 +6,7 @@ at pixel centres, so that the truth has no noise and no blend of foreground and 
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
 from importlib import metadata
 from pathlib import Path
 
@@ -24,6 +20,7 @@ from morgs_mi.capture.scene import Scene, load_scene
 from morgs_mi.capture.stage import Stage
 from morgs_mi.capture.truth import Tracks, carry, project, save_truth, truth_of
 from morgs_mi.capture.video import VideoReader, write_video
+from morgs_mi.files import whole, write_json
 
 __all__ = ["synthesize"]
 
@@ -98,7 +95,9 @@ def synthesize(
     scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
     cameras = scene.rig.cameras(num_cameras, width, height)
     times = np.arange(num_frames) / fps
-    with _folder_at_once(Path(out), overwrite) as folder:
+    _check_folder(Path(out), overwrite)
+    with whole(out, "synthesize()") as folder:
+        folder.mkdir(parents=True)
         stage = Stage(scene)
         done = 0
 
@@ -135,7 +134,7 @@ def synthesize(
             "objects": list(scene.objects),
             "versions": {name: metadata.version(name) for name in ("morgs-mi", "mitsuba", "drjit")},
         }
-        (folder / "capture.json").write_text(json.dumps(about, indent=2) + "\n")
+        write_json(folder / "capture.json", about)
     return Path(out)
 
 
@@ -190,10 +189,8 @@ def _write_calibration(stage: Stage, cameras: Sequence[Camera], folder: Path, rn
     write_colmap(folder / "sparse" / "0", cameras, np.concatenate(points), np.concatenate(colors))
 
 
-@contextmanager
-def _folder_at_once(out: Path, overwrite: bool) -> Iterator[Path]:
-    """Give a folder beside `out` to write into, which takes its name if all goes well and vanishes if not."""
-    out = out.resolve()
+def _check_folder(out: Path, overwrite: bool) -> None:
+    """Raise if `out` holds what must not be replaced."""
     if out.exists() and not out.is_dir():
         raise FileExistsError(f"synthesize(): {out} is a file; give another folder.")
     occupied = out.is_dir() and any(out.iterdir())
@@ -201,19 +198,3 @@ def _folder_at_once(out: Path, overwrite: bool) -> Iterator[Path]:
         raise FileExistsError(f"synthesize(): {out} is not empty; give another folder or set overwrite.")
     if occupied and not (out / "capture.json").is_file():
         raise FileExistsError(f"synthesize(): {out} holds no capture, so it is not replaced; give another folder.")
-    partial = out.with_name(f".partial-{os.getpid()}-{out.name}")
-    try:
-        partial.mkdir(parents=True)
-        yield partial
-        if out.exists():
-            # Renamed first: deleting takes time, and a capture that is half deleted would look whole.
-            discarded = out.with_name(f".discarded-{os.getpid()}-{out.name}")
-            out.rename(discarded)
-            partial.rename(out)
-            shutil.rmtree(discarded)
-        else:
-            partial.rename(out)
-    except OSError as error:
-        raise OSError(f"synthesize(): cannot write {out}, of which nothing is left: {error}") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)

@@ -5,15 +5,15 @@ A frame is an RGB uint8 array [H, W, 3]. `VideoReader` and `FolderReader` offer 
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
+
+from morgs_mi.files import new_folder, whole
 
 __all__ = ["FolderReader", "FrameReader", "VideoReader", "natural_key", "open_frames", "write_video"]
 
@@ -179,18 +179,16 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float, code
         OSError: the encoder is missing, the folder exists, or what was written cannot be read back.
     """
     path = Path(path)
-    partial = path.with_name(f".partial-{os.getpid()}-{path.name}")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        if path.suffix:
+    if path.suffix:
+        with whole(path, "write_video()") as partial:
+            partial.parent.mkdir(parents=True, exist_ok=True)
             _write_file(partial, path, frames, fps, codec)
-        else:
-            _write_folder(partial, path, frames)
-        os.replace(partial, path)
-    finally:
-        if partial.is_dir():
-            shutil.rmtree(partial, ignore_errors=True)
-        partial.unlink(missing_ok=True)
+        return
+    with new_folder(path, "write_video()") as folder:
+        for i, frame in enumerate(_checked(path, frames)):
+            # Not cv2.imwrite, which says nothing of why it failed.
+            png = cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))[1]
+            (folder / f"{i:04d}.png").write_bytes(png.tobytes())
 
 
 def _write_file(partial: Path, path: Path, frames: Iterable[np.ndarray], fps: float, codec: str) -> None:
@@ -207,10 +205,7 @@ def _write_file(partial: Path, path: Path, frames: Iterable[np.ndarray], fps: fl
                 fourcc = cv2.VideoWriter.fourcc(*codec)
                 encoder = cv2.VideoWriter(str(partial), cv2.CAP_FFMPEG, fourcc, fps, (width, height))
                 if not encoder.isOpened():
-                    raise OSError(
-                        f"{path}: OpenCV could not open it with the encoder {codec!r}; check that the folder "
-                        "is writable, or try the codec FFV1 or mp4v."
-                    )
+                    raise OSError(f"OpenCV could not open it with the encoder {codec!r}; try the codec FFV1 or mp4v")
             encoder.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
             count += 1
     finally:
@@ -223,22 +218,7 @@ def _write_file(partial: Path, path: Path, frames: Iterable[np.ndarray], fps: fl
         readable += 1
     stream.release()
     if readable != count:
-        raise OSError(
-            f"{path}: {count} frames were written but {readable} can be read back; check the free disk space."
-        )
-
-
-def _write_folder(partial: Path, path: Path, frames: Iterable[np.ndarray]) -> None:
-    if path.exists():
-        raise FileExistsError(f"{path}: expected a new folder, got one that exists; remove it first.")
-    partial.mkdir()
-    for i, frame in enumerate(_checked(path, frames)):
-        # Not cv2.imwrite, which says nothing of why it failed.
-        png = cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))[1]
-        try:
-            (partial / f"{i:04d}.png").write_bytes(png.tobytes())
-        except OSError as error:
-            raise OSError(f"{path}: frame {i} could not be written ({error}); check the disk.") from error
+        raise OSError(f"{count} frames were written but {readable} can be read back")
 
 
 def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +13,7 @@ from morgs_mi.capture.video import write_video
 from morgs_mi.codec.container import StreamReader
 from morgs_mi.evaluate.pictures import side_by_side, write_png
 from morgs_mi.evaluate.stream import channel_picture, render_stream
+from morgs_mi.files import new_folder
 
 __all__ = ["PLAYABLE", "even", "exr_channels", "write_frames"]
 
@@ -70,12 +68,14 @@ def write_frames(
     if video:
         write_video(output, (even(_picture(images)) for _, images in frames()), stream.fps, PLAYABLE)
         return
-    with _new_folder(output) as folder:
+    with new_folder(output, "write_frames()") as folder:
         for frame, images in frames():
             if png:
                 write_png(folder / f"{frame:04d}.png", _picture(images))
             else:
                 write_exr(folder / f"{frame:04d}.exr", exr_channels(images))
+        if not any(folder.iterdir()):
+            raise ValueError(f"{output}: at least one frame was expected, got none; the stream has a header alone.")
 
 
 def exr_channels(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -100,19 +100,3 @@ def _picture(images: Mapping[str, np.ndarray]) -> np.ndarray:
 def _linear(encoded: np.ndarray) -> np.ndarray:
     """Undo sRGB's encoding (IEC 61966-2-1), beyond 1 too, where splats overshoot."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0) + 0.055) / 1.055) ** 2.4)
-
-
-@contextmanager
-def _new_folder(path: Path) -> Iterator[Path]:
-    """Give a folder that takes the name `path` if all goes well and something was written, and vanishes if not."""
-    if path.exists():
-        raise FileExistsError(f"{path}: expected a new folder, got one that exists; remove it first.")
-    partial = path.with_name(f".partial-{os.getpid()}-{path.name}")
-    try:
-        partial.mkdir(parents=True)
-        yield partial
-        if not any(partial.iterdir()):
-            raise ValueError(f"{path}: at least one frame was expected, got none; the stream has a header alone.")
-        partial.rename(path)
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)

@@ -6,12 +6,12 @@ Every picture is uint8 RGB [H, W, 3].
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
 
 import cv2
 import numpy as np
+
+from morgs_mi.files import whole
 
 __all__ = [
     "as_picture",
@@ -149,23 +149,13 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
         OSError: the file cannot be written; the message names it and the cause.
         ValueError: the image has no pixels or another shape.
     """
-    path, picture = Path(path), as_picture(image)
+    picture = as_picture(image)
     if not picture.size:
         raise ValueError(f"write_png(): the image for {path} has no pixels: {picture.shape}.")
     _, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
-    temporary = None
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        # In the same folder: a rename is atomic only within one file system.
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.name}.", delete=False) as file:
-            temporary = file.name
-            file.write(data.tobytes())
-        os.chmod(temporary, 0o644)  # temporary files are private
-        os.replace(temporary, path)
-    except OSError as error:
-        if temporary:
-            Path(temporary).unlink(missing_ok=True)
-        raise OSError(f"write_png(): cannot write {path}: {error.strerror or error}.") from error
+    with whole(path, "write_png()") as partial:
+        partial.parent.mkdir(parents=True, exist_ok=True)
+        partial.write_bytes(data.tobytes())
 
 
 def _coloured(values: np.ndarray, colours: int) -> np.ndarray:

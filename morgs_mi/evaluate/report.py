@@ -1,20 +1,16 @@
-"""What every figure comes with, and the files that keep it."""
+"""What every figure comes with."""
 
 from __future__ import annotations
 
-import contextlib
-import json
-import math
 import os
 import platform
-from collections.abc import Mapping
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 
-__all__ = ["finite", "machine", "versions", "write_json"]
+__all__ = ["machine", "versions"]
 
 
 def machine() -> dict[str, Any]:
@@ -31,35 +27,6 @@ def versions() -> dict[str, str]:
     """Return the versions of this package, of Python and of the libraries that the figures depend on."""
     packages = ("morgs-mi", "mitsuba", "drjit", "numpy", "opencv-contrib-python-headless")
     return {"python": platform.python_version()} | {name: metadata.version(name) for name in packages}
-
-
-def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> None:
-    """Write `value` as JSON; the file appears whole or not at all. What is not finite becomes null.
-
-    Missing folders are made.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    path = Path(path)
-    partial = path.with_name(f".partial-{os.getpid()}-{path.name}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(json.dumps(finite(value), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(partial, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):  # its folder may be a file
-            partial.unlink(missing_ok=True)
-        raise OSError(f"write_json(): cannot write {path}: {error.strerror or error}.") from error
-
-
-def finite(value: Any) -> Any:
-    """Return `value` with None for every float in it that JSON cannot express."""
-    if isinstance(value, Mapping):
-        return {key: finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _processor() -> str:

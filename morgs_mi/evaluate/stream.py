@@ -196,11 +196,9 @@ def _recording(stream: StreamReader, capture: str | Path | None, packets: Sequen
     if capture is None and "capture" not in about:
         raise ValueError(f"{stream.path}: its header names no capture to compare with; give one (--capture).")
     frames, path = [frame for frame, *_ in packets], capture or about["capture"]
-    recording = load_capture(path, test_view=about.get("test_view", "auto"), max_frames=frames[-1] + 1)
-    expected = _sizes(stream.cameras)
-    if (found := _sizes(recording.cameras)).keys() == expected.keys() and found != expected:
-        recording = load_capture(path, _downscale(found, expected), recording.test_view, frames[-1] + 1)
-    if (found := _sizes(recording.cameras)) != expected:
+    recording = load_capture(path, about.get("downscale", 1), about.get("test_view", "auto"), frames[-1] + 1)
+    expected, found = _sizes(stream.cameras), _sizes(recording.cameras)
+    if found != expected:
         raise ValueError(
             f"{path}: expected the cameras that {stream.path} was fitted to, {expected}, got {found}; "
             "give that capture (--capture)."
@@ -215,12 +213,6 @@ def _recording(stream: StreamReader, capture: str | Path | None, packets: Sequen
 
 def _sizes(cameras: Sequence[Camera]) -> dict[str, tuple[int, int]]:
     return {camera.name: (camera.width, camera.height) for camera in cameras}
-
-
-def _downscale(full: dict[str, tuple[int, int]], small: dict[str, tuple[int, int]]) -> float:
-    """Return a factor that rounds every full size to the small one, if there is any; which one does not matter."""
-    sides = [pair for name in full for pair in zip(full[name], small[name], strict=True)]
-    return max(1, (max(a / (b + 0.5) for a, b in sides) + min(a / (b - 0.5) for a, b in sides)) / 2)
 
 
 def _scores(

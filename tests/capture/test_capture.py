@@ -98,6 +98,7 @@ def test_downscaling_moves_projections_with_the_pixels(tmp_path: Path, downscale
 def test_lenses_are_undone_and_masked(tmp_path: Path) -> None:
     colmap(tmp_path, lenses=[Lens("SIMPLE_RADIAL", (0.3,)), Lens()])
     full, small = load_capture(tmp_path), load_capture(tmp_path, 2)
+    assert (full.downscale, small.downscale) == (1, 2)
     assert full.masks[1] is None
     assert full.masks[0] is not None
     assert small.masks[0] is not None
