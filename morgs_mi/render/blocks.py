@@ -1,9 +1,10 @@
 """Who touches which block of pixels, in depth order.
 
-Two levels. Coarse: every Gaussian is entered into the tiles that its extent touches; one counting sort by
-tile, fed in depth order, gives each tile its list. Fine: one lane per pixel block walks its tile's list,
-tests the ellipse against the block exactly and appends what passes to its own stretch of memory, in order.
-The walk ends where the Gaussians so far leave less light than the stop transmittance at every pixel.
+Two levels. Coarse: every Gaussian is entered into the tiles (4 x 8 blocks) that its extent touches; one counting
+sort by tile, fed in depth order, gives each tile its list. Fine: each entry of a tile's list is tested exactly
+against the tile's 32 blocks, one bit each; 32 entries by 32 blocks of bits are transposed in registers, so that
+every block has its own bit string over its tile's list; one lane per block then writes out the set ones, in order.
+No pair of Gaussian and block costs more than its bit, unless it is really drawn: then it costs 4 bytes.
 
 "Rank" is a Gaussian's place in depth order; equal depths keep the order of the input.
 """
@@ -24,6 +25,8 @@ __all__ = ["BlockLists", "build_lists", "fetch_record", "pack_records", "pixel_g
 
 # Half a thousandth of an octave: the block test may keep too much, never too little.
 _TEST_SLACK = 1e-3
+# Blocks of a tile, across and down: as many as a word has bits.
+_ACROSS, _DOWN = 4, 8
 
 
 @dataclass(frozen=True)
@@ -53,26 +56,32 @@ class BlockLists:
 
 def build_lists(splats: Splats, width: int, height: int, config: RenderConfig) -> BlockLists:
     """List the splats (N > 0) that each block of a width x height image may show, nearest first."""
-    UInt32, N, edge = mi.UInt32, len(splats), config.tile_size
-    tiles_x, tiles_y = -(-width // edge), -(-height // edge)
-    memory = UInt32([width, height, tiles_x])
-    size = tuple(dr.gather(UInt32, memory, UInt32(i)) for i in range(2))
-    stride = dr.gather(UInt32, memory, UInt32(2))
+    UInt32, N = mi.UInt32, len(splats)
+    block = config.block_shape(dr.backend_v(mi.Float) == dr.JitBackend.CUDA)
+    tile = (_ACROSS * block[0], _DOWN * block[1])
+    across, down = -(-width // tile[0]), -(-height // tile[1])
+    memory = UInt32([width, height, across, down])
+    *size, stride, rows = (dr.gather(UInt32, memory, UInt32(i)) for i in range(4))
 
     by_rank = dr.argsort(dr.select(splats.valid, splats.depths, dr.inf))
-    x0, y0, columns, counts = _tile_rectangles(splats, by_rank, stride, (size[1] + (edge - 1)) // edge, edge)
-    tile_entries, first, last = _tile_lists(x0, y0, columns, counts, stride, tiles_x * tiles_y)
     rank_of = dr.empty(UInt32, N)
     dr.scatter(rank_of, dr.arange(UInt32, N), by_rank, mode=dr.ReduceMode.Permute)
+    rectangles = _tile_rectangles(splats, by_rank, (stride, rows), tile)
+    tiles = _tile_lists(*rectangles, stride, across * down)
 
-    tests = pack_records([*splats.shape, *splats.slopes], by_rank)
-    block = config.block_shape(dr.backend_v(mi.Float) == dr.JitBackend.CUDA)
-    entries, start, count, origin = _block_lists(
-        tests, tile_entries, first, last, stride, size, tiles_x * tiles_y, block, config
-    )
+    records = pack_records([*splats.shape, *splats.slopes], by_rank)
+    words, first_word, end_word = _block_bits(records, tiles, stride, block, config)
+    lane = dr.arange(UInt32, across * down * _ACROSS * _DOWN)
+    home, part = lane // (_ACROSS * _DOWN), lane % (_ACROSS * _DOWN)
+    x = (home % stride) * tile[0] + (part % _ACROSS) * block[0]
+    y = (home // stride) * tile[1] + (part // _ACROSS) * block[1]
+    begin = dr.gather(UInt32, first_word, home)
+    end = dr.select((x < size[0]) & (y < size[1]), dr.gather(UInt32, end_word, home), begin)
+    entries, start, count = _written_out(words, begin, end, part, tiles.entries, dr.gather(UInt32, tiles.first, home))
     # 1023 buckets suffice: longer lists are all "long".
     order = dr.detail.block_mkperm(1023 - dr.minimum(count, 1023), dr.width(count), 1024)
-    return BlockLists(entries, start, count, origin, order, rank_of, by_rank, size)
+    dr.eval(x, y)
+    return BlockLists(entries, start, count, (x, y), order, rank_of, by_rank, (size[0], size[1]))
 
 
 def pack_records(columns: list[Any], order: Any) -> Any:
@@ -109,31 +118,42 @@ def pixel_grid(origin: tuple[Any, Any], block: tuple[int, int], size: tuple[Any,
     return grid
 
 
-def _tile_rectangles(splats: Splats, by_rank: Any, tiles_x: Any, tiles_y: Any, edge: int) -> tuple[Any, ...]:
+@dataclass(frozen=True)
+class _Tiles:
+    """The coarse lists: ranks `entries` sorted by tile and depth, the tile of each, each tile's first and end."""
+
+    entries: Any
+    tile_of: Any
+    first: Any
+    end: Any
+
+
+def _tile_rectangles(
+    splats: Splats, by_rank: Any, tiles: tuple[Any, Any], tile: tuple[int, int]
+) -> tuple[Any, Any, Any, Any]:
     """Return each rank's first tile (x, y), its tiles across, and its number of tiles."""
 
-    def span(center: Any, half: Any, tiles: Any) -> tuple[Any, Any]:
+    def span(center: Any, half: Any, tiles: Any, edge: int) -> tuple[Any, Any]:
         top, bound = mi.Float(tiles), 1.0 / edge
         low = dr.clip(dr.floor((center - half) * bound), 0, top)
         high = dr.clip(dr.floor((center + half) * bound) + 1, 0, top)
         return mi.UInt32(low), mi.UInt32(high)
 
-    (x0, x1), (y0, y1) = (
-        span(dr.detach(splats.shape[i]), splats.extent[i], tiles) for i, tiles in enumerate((tiles_x, tiles_y))
-    )
+    (x0, x1), (y0, y1) = (span(dr.detach(splats.shape[i]), splats.extent[i], tiles[i], tile[i]) for i in range(2))
     counts = dr.select(splats.valid, (x1 - x0) * (y1 - y0), 0)
     rectangles = (x0, y0, x1 - x0, counts)
     dr.eval(rectangles)
-    return tuple(dr.gather(mi.UInt32, v, by_rank) for v in rectangles)
+    x, y, columns, counts = (dr.gather(mi.UInt32, v, by_rank) for v in rectangles)
+    return x, y, columns, counts
 
 
-def _tile_lists(x0: Any, y0: Any, columns: Any, counts: Any, stride: Any, tiles: int) -> tuple[Any, Any, Any]:
-    """Return (ranks sorted by tile and depth, first entry of each tile, end of each tile)."""
+def _tile_lists(x0: Any, y0: Any, columns: Any, counts: Any, stride: Any, tiles: int) -> _Tiles:
+    """Enter every rank into the tiles of its rectangle and sort by tile."""
     UInt32 = mi.UInt32
     offsets = dr.cumsum(counts)
     total = int(offsets[-1])  # the one number that must reach the host: the size of the lists
     if total == 0:
-        return dr.zeros(UInt32, 1), dr.zeros(UInt32, tiles), dr.zeros(UInt32, tiles)
+        return _Tiles(dr.zeros(UInt32, 1), dr.zeros(UInt32, 1), dr.zeros(UInt32, tiles), dr.zeros(UInt32, tiles))
     tile_of, rank_at = dr.empty(UInt32, total), dr.empty(UInt32, total)
 
     def enter(k, column, tile, first, columns, counts, rank, stride, tile_of, rank_at):
@@ -172,71 +192,99 @@ def _tile_lists(x0: Any, y0: Any, columns: Any, counts: Any, stride: Any, tiles:
     dr.scatter(end, j + 1, tile_of, active=edge)
     dr.scatter(first, j + 1, following, active=edge & ~is_last)
     dr.eval(first, end)
-    return entries, first, end
+    return _Tiles(entries, tile_of, first, end)
 
 
-def _block_lists(
-    tests: Any,
-    tile_entries: Any,
-    first: Any,
-    end: Any,
-    stride: Any,
-    size: tuple[Any, Any],
-    tiles: int,
-    block: tuple[int, int],
-    config: RenderConfig,
-) -> tuple[Any, Any, Any, tuple[Any, Any]]:
-    """Return (entries, start, count, origin) of every block: its tile's list without what misses it."""
-    UInt32, edge, (bw, bh) = mi.UInt32, config.tile_size, block
-    across = edge // bw
-    per_tile = across * (edge // bh)
-    lane = dr.arange(UInt32, tiles * per_tile)
-    tile, part = lane // per_tile, lane % per_tile
-    origin = ((tile % stride) * edge + (part % across) * bw, (tile // stride) * edge + (part // across) * bh)
-    j0, j1 = dr.gather(UInt32, first, tile), dr.gather(UInt32, end, tile)
-    start = j0 * per_tile + part * (j1 - j0)
-    entries = dr.empty(UInt32, dr.width(tile_entries) * per_tile)
-    log_min = log2(config.alpha_min)
+def _block_bits(
+    records: Any, tiles: _Tiles, stride: Any, block: tuple[int, int], config: RenderConfig
+) -> tuple[Any, Any, Any]:
+    """Return (words, first word of each tile, end): bit k of word 32 w + b says that block b of the tile is
+    touched by entry 32 w + k, counted from the tile's first word and first entry.
+    """
+    UInt32, (bw, bh), num_tiles = mi.UInt32, block, dr.width(tiles.first)
+    length = (tiles.end - tiles.first + 31) // 32
+    end_word = dr.cumsum(length)
+    first_word = end_word - length
+    dr.eval(first_word, end_word)
+    num_words = dr.width(tiles.entries) // 32 + num_tiles  # at most one word per tile is not full
 
-    def visit(j, count, light, j1, start, px, py, tile_entries, tests, entries):
-        rank = dr.gather(UInt32, tile_entries, j)
-        mx, my, a, b, c, log2_opacity, slope_x, slope_y = fetch_record(tests, rank, 8)
-        x0, y0 = px - mx, py - my
-        x1, y1 = x0 + (bw - 1), y0 + (bh - 1)
+    tile = tiles.tile_of
+    mx, my, a, b, c, log2_opacity, slope_x, slope_y = fetch_record(records, tiles.entries, 8)
+    px, py = mi.Float((tile % stride) * (_ACROSS * bw)) - mx, mi.Float((tile // stride) * (_DOWN * bh)) - my
+    reach = log2_opacity - log2(config.alpha_min) + _TEST_SLACK
+    columns = []
+    for i in range(_ACROSS):
+        x0, x1 = px + (i * bw + 0.5), px + (i * bw + bw - 0.5)
+        x = dr.clip(0, x0, x1)
+        columns.append((x0, x1, a * x, slope_y * x))
+    mask = UInt32(0)
+    for j in range(_DOWN):
+        y0, y1 = py + (j * bh + 0.5), py + (j * bh + bh - 0.5)
+        y = dr.clip(0, y0, y1)
+        by, v, best_x = b * y, c * y, slope_x * y
+        for i, (x0, x1, ax, best_y) in enumerate(columns):
+            # Over a box, u^2 + v^2 is least at the clamped centre or on the two nearest edges.
+            u1, y_edge = dr.fma(a, dr.clip(best_x, x0, x1), by), dr.clip(best_y, y0, y1)
+            u2, v2 = dr.fma(b, y_edge, ax), c * y_edge
+            least = dr.minimum(dr.fma(u1, u1, v * v), dr.fma(u2, u2, v2 * v2))
+            mask |= dr.select(least <= reach, UInt32(1 << (j * _ACROSS + i)), UInt32(0))
 
-        def power(x: Any, y: Any) -> Any:
-            u, v = dr.fma(a, x, b * y), c * y
-            return dr.fma(-u, u, dr.fma(-v, v, log2_opacity))
+    place = dr.gather(UInt32, first_word, tile) * 32 + dr.arange(UInt32, dr.width(tile))
+    masks = dr.zeros(UInt32, num_words * 32)
+    dr.scatter(masks, mask, place - dr.gather(UInt32, tiles.first, tile), mode=dr.ReduceMode.NoConflicts)
+    dr.eval(masks)
+    word = dr.arange(UInt32, num_words) * 32
+    rows = _transposed([dr.gather(UInt32, masks, word + k) for k in range(32)])
+    words = dr.empty(UInt32, num_words * 32)
+    for k, row in enumerate(rows):
+        dr.scatter(words, row, word + k, mode=dr.ReduceMode.NoConflicts)
+    dr.eval(words)
+    return words, first_word, end_word
 
-        # Over a box, a concave quadratic is largest at the clamped centre or on the two nearest edges.
-        x, y = dr.clip(0, x0, x1), dr.clip(0, y0, y1)
-        highest = dr.maximum(power(x, dr.clip(slope_y * x, y0, y1)), power(dr.clip(slope_x * y, x0, x1), y))
-        touches = highest >= log_min - _TEST_SLACK
-        dr.scatter(entries, rank, start + count, active=touches, mode=dr.ReduceMode.NoConflicts)
 
-        # It is smallest at a corner: a lower bound of alpha, hence an upper bound of what light remains.
-        lowest = dr.minimum(dr.minimum(power(x0, y0), power(x1, y0)), dr.minimum(power(x0, y1), power(x1, y1)))
-        alpha = dr.select(lowest >= log_min, dr.minimum(dr.exp2(lowest), config.alpha_max), 0)
-        count = count + dr.select(touches, UInt32(1), UInt32(0))
-        return j + 1, count, light * (1 - alpha), j1, start, px, py, tile_entries, tests, entries
+def _transposed(rows: list[Any]) -> list[Any]:
+    """Transpose 32 words of 32 bits: swap off-diagonal squares of 16, 8, ... 1 bits (Hacker's Delight, 7-3)."""
+    rows, size, mask = list(rows), 16, 0x0000FFFF
+    while size:
+        for k in range(32):
+            if not k & size:
+                swap = ((rows[k] >> size) ^ rows[k + size]) & mask
+                rows[k], rows[k + size] = rows[k] ^ (swap << size), rows[k + size] ^ swap
+        size >>= 1
+        mask ^= (mask << size) & 0xFFFFFFFF
+    return rows
 
-    def unfinished(j, count, light, j1, *_):
-        return (j < j1) & (light >= config.stop_transmittance)
 
-    inside = (origin[0] < size[0]) & (origin[1] < size[1])
-    px, py = mi.Float(origin[0]) + 0.5, mi.Float(origin[1]) + 0.5
-    state = (
-        dr.select(inside, j0, j1),
-        UInt32(0),
-        mi.Float(1),
-        j1,
-        start,
-        px,
-        py,
-        tile_entries,
-        tests,
-        entries,
+def _written_out(
+    words: Any, begin: Any, end: Any, part: Any, tile_entries: Any, first_entry: Any
+) -> tuple[Any, Any, Any]:
+    """Return (entries, start, count) of every block: the ranks at the set bits of its words [begin, end)."""
+    UInt32 = mi.UInt32
+
+    def add(w, count, end, part, words):
+        return w + 1, count + dr.popcnt(dr.gather(UInt32, words, w * 32 + part)), end, part, words
+
+    state = (begin, UInt32(0), end, part, words)
+    _, count, *_ = dr.while_loop(state, lambda w, count, end, *_: w < end, add, label="count bits")
+    stop = dr.cumsum(count)
+    dr.eval(count, stop)
+    start = stop - count
+    entries = dr.empty(UInt32, max(int(stop[-1]), 1))
+
+    def emit(w, word, base, place, begin, end, part, first_entry, words, tile_entries, entries):
+        load = word == 0
+        base = dr.select(load, first_entry + (w - begin) * 32, base)
+        word = dr.select(load, dr.gather(UInt32, words, w * 32 + part, active=load), word)
+        w = dr.select(load, w + 1, w)
+        found = word != 0
+        rank = dr.gather(UInt32, tile_entries, base + dr.tzcnt(word), active=found)
+        dr.scatter(entries, rank, place, active=found, mode=dr.ReduceMode.NoConflicts)
+        place = dr.select(found, place + 1, place)
+        return w, word & (word - 1), base, place, begin, end, part, first_entry, words, tile_entries, entries
+
+    state = (begin, UInt32(0), UInt32(0), start, begin, end, part, first_entry, words, tile_entries, entries)
+    *_, entries = dr.while_loop(
+        state, lambda w, word, base, place, begin, end, *_: (w < end) | (word != 0), emit, label="block lists"
     )
-    _, count, *_, entries = dr.while_loop(state, unfinished, visit, label="block lists")
-    dr.eval(entries, start, count, origin)
-    return entries, start, count, origin
+    dr.eval(entries, start)
+    return entries, start, count

@@ -23,16 +23,13 @@ class RenderConfig:
     """Pixels across in the block that one SIMD lane owns; None: 8 on the CPU, 4 on the GPU."""
     block_height: int | None = None
     """Pixels down in that block; None: 4."""
-    tile_size: int = 32
-    """Edge in pixels of the coarse tiles; a multiple of the block's width and height."""
 
     def __post_init__(self) -> None:
         for name in ("block_width", "block_height"):
             edge = getattr(self, name)
-            if edge is not None and (edge < 1 or self.tile_size % edge):
+            if edge is not None and not 1 <= edge <= 16:
                 raise ValueError(
-                    f"RenderConfig(): `{name}` must divide tile_size={self.tile_size}, got {edge}; "
-                    "use a power of two up to the tile's size."
+                    f"RenderConfig(): `{name}` must be 1 to 16 px, got {edge}; the block's pixels are unrolled."
                 )
 
     def block_shape(self, cuda: bool) -> tuple[int, int]:

@@ -1,6 +1,6 @@
 """From Gaussians in the world to splats on the screen, differentiated by Dr.Jit.
 
-Notation: x = R mean + t in camera space, z its depth, J the Jacobian of the projection at x, and
+Notation: x = R (mean - eye) + t in camera space, z its depth, J the Jacobian of the projection at x, and
 U = J R Q diag(s) [2, 3], so that the screen covariance is U U' + eps2d I (EWA splatting, Zwicker 2001).
 A pixel at offset d = (dx, dy) from the splat's centre gets alpha = 2^p with
 
@@ -8,6 +8,10 @@ A pixel at offset d = (dx, dy) from the splat's centre gets alpha = 2^p with
 
 where [a b; 0 c] is the Cholesky factor of the conic times log2(e) / 2. Written so, p never exceeds
 log2(opacity), however thin the needle, and the pixel loop needs no exponential but 2^p.
+
+Nothing overflows on the way: U is computed in units of the splat's own size, the eye is subtracted before
+rotating, so that a scene far from the origin keeps its accuracy, and what the camera cannot see is projected
+from a stand-in, so that no 0 * inf spoils a gradient.
 """
 
 from __future__ import annotations
@@ -31,6 +35,11 @@ CHANNEL_SIZES = {"color": 3, "depth": 1, "motion": 2, "confidence": 1}
 
 _HALF_LOG2E = 0.5 * log2(2.718281828459045)
 
+# World units; squares of what is farther overflow.
+_FARTHEST = 1e18
+# A float32 rotation aims a needle no better than 1e-7 of its length: thinner than this it is not drawn.
+_THINNEST = 1e-6
+
 
 @dataclass(frozen=True)
 class Splats:
@@ -43,7 +52,7 @@ class Splats:
         extent: (half width, half height) in px of the region where alpha >= alpha_min, detached; 0 if culled.
         slopes: (dx/dy, dy/dx) along which p is largest for given dy or dx, detached.
         valid: False where culled: behind the near plane, too faint, or not finite.
-        finite: False where something in front of the camera is not finite.
+        finite: False where an attribute, or what becomes of it, is not finite.
     """
 
     shape: tuple[Any, ...]
@@ -73,22 +82,24 @@ def project(gaussians: ActivatedGaussians, camera: Camera, channels: tuple[str, 
     N = dr.prod(gaussians.means.shape[:1])
     means, quats = _rows(mi.Point3f, gaussians.means, N), _rows(mi.Vector4f, gaussians.quats, N)
     scales, opacities = _rows(mi.Vector3f, gaussians.scales, N), gaussians.opacities.array
-    R, t = _pose(camera.viewmat)
+    R, t, eye, eye_rest = _pose(camera.viewmat)
     fx, fy, cx, cy, near, *limits = _intrinsics(camera)
 
+    means = means - eye
     x, y, z = (dr.fma(R[i][0], means.x, dr.fma(R[i][1], means.y, dr.fma(R[i][2], means.z, t[i]))) for i in range(3))
-    front = dr.detach(z) >= near
-    rz = dr.rcp(dr.select(front, z, 1))
+    probe = dr.detach(x + y + z)
+    front = dr.detach((z >= near) & (dr.maximum(dr.maximum(dr.abs(x), dr.abs(y)), z) < _FARTHEST))
+    x, y, z = dr.select(front, x, 0), dr.select(front, y, 0), dr.select(front, z, 1)
+    rz = dr.rcp(z)
     mean_x, mean_y = dr.fma(fx, x * rz, cx), dr.fma(fy, y * rz, cy)
 
-    u0, u1 = _screen_axes(x * rz, y * rz, fx * rz, fy * rz, R, quats, scales, limits)
-    eps = config.eps2d
+    u0, u1, r_size = _screen_axes(x * rz, y * rz, fx * rz, fy * rz, R, quats, scales, limits)
+    eps = dr.maximum(config.eps2d * dr.square(r_size), _THINNEST**2)
     xx, yy, xy = dr.dot(u0, u0), dr.dot(u1, u1), dr.dot(u0, u1)
     # Lagrange's identity: det(U U' + eps I) without the cancellation that xx yy - xy^2 has for needles.
     det = dr.squared_norm(dr.cross(u0, u1)) + eps * (xx + yy) + eps * eps
     xx, yy = xx + eps, yy + eps
-    r_det, r_yy = dr.rsqrt(det), dr.rsqrt(yy)
-    s = sqrt(_HALF_LOG2E)
+    r_det, r_yy, s = dr.rsqrt(det), dr.rsqrt(yy), sqrt(_HALF_LOG2E) * r_size
     a, b, c = s * yy * r_yy * r_det, -s * xy * r_yy * r_det, s * r_yy
     log2_opacity = dr.log2(dr.maximum(opacities, 1e-9))
     shape = (mean_x, mean_y, a, b, c, log2_opacity)
@@ -96,7 +107,7 @@ def project(gaussians: ActivatedGaussians, camera: Camera, channels: tuple[str, 
     blended: dict[str, tuple[Any, ...]] = {}
     for name in channels:
         if name == "color":
-            blended[name] = _colors(means, gaussians.sh_coeffs, R, t, N)
+            blended[name] = _colors(dr.select(front, means - eye_rest, 1), gaussians.sh_coeffs, N)
         elif name == "depth":
             blended[name] = (z,)
         elif name == "motion":
@@ -107,11 +118,9 @@ def project(gaussians: ActivatedGaussians, camera: Camera, channels: tuple[str, 
     # alpha >= alpha_min  <=>  u^2 + v^2 <= reach, an ellipse with these half axes along x and y
     reach = dr.maximum(dr.detach(log2_opacity) - log2(config.alpha_min), 0)
     xx, yy, xy = dr.detach(xx), dr.detach(yy), dr.detach(xy)
-    probe = sum(dr.detach(v) for v in (*shape, *(v for values in blended.values() for v in values)))
-    finite = dr.isfinite(probe) | ~(front | dr.isnan(z))
-    # Beyond this a float cannot tell one pixel from the next.
-    near_screen = (dr.abs(dr.detach(mean_x)) < 1e7) & (dr.abs(dr.detach(mean_y)) < 1e7)
-    valid = front & (reach > 0) & finite & near_screen
+    probe += sum(dr.detach(v) for v in (*shape, *(v for values in blended.values() for v in values)))
+    finite = dr.isfinite(probe)
+    valid = front & (reach > 0) & finite
     extent = (dr.sqrt(reach * xx) / s, dr.sqrt(reach * yy) / s)
     return Splats(shape, blended, dr.detach(z), extent, (xy / yy, xy / xx), valid, finite)
 
@@ -121,11 +130,27 @@ def _rows(dtype: Any, tensor: Any, N: int) -> Any:
     return dr.gather(dtype, tensor.array, dr.arange(mi.UInt32, N), mode=dr.ReduceMode.NoConflicts)
 
 
-def _pose(viewmat: Any) -> tuple[list[list[Any]], list[Any]]:
-    """Return (R [3][3], t [3]) as width-1 Dr.Jit floats that keep the gradient of a Dr.Jit `viewmat`."""
-    flat = viewmat.array if dr.is_tensor_v(viewmat) else mi.Float(np.float32(viewmat).ravel())
-    entry = [[dr.gather(mi.Float, flat, mi.UInt32(4 * i + j)) for j in range(4)] for i in range(3)]
-    return [row[:3] for row in entry], [row[3] for row in entry]
+def _pose(viewmat: Any) -> tuple[list[list[Any]], list[Any], Any, Any]:
+    """Return (R [3][3], t [3], eye, rest) with x = R (mean - eye) + t and the camera's centre at eye + rest.
+
+    The eye is rounded to what means are made of, so that subtracting it is exact nearby; t and rest, computed
+    in double precision, are what that leaves. All are width-1 Dr.Jit floats that keep a Dr.Jit `viewmat`'s gradient.
+    """
+    tracked = dr.is_tensor_v(viewmat)
+    flat = mi.Float64(viewmat.array) if tracked else np.asarray(viewmat, np.float64).ravel()
+    V = [dr.gather(mi.Float64, flat, mi.UInt32(k)) if tracked else flat[k] for k in range(12)]
+    R, t = [V[4 * i : 4 * i + 3] for i in range(3)], V[3::4]
+    centre = [-sum(R[i][k] * t[i] for i in range(3)) for k in range(3)]
+    eye = [mi.Float64(mi.Float(dr.detach(v))) if tracked else float(np.float32(v)) for v in centre]
+    t = [sum((R[i][k] * eye[k] for k in range(3)), t[i]) for i in range(3)]
+    values = [*R[0], *R[1], *R[2], *t, *eye, *(v - e for v, e in zip(centre, eye, strict=True))]
+    if tracked:
+        values = [mi.Float(v) for v in values]
+        dr.eval(values)
+    else:
+        memory = mi.Float(np.float32(values))
+        values = [dr.gather(mi.Float, memory, mi.UInt32(k)) for k in range(len(values))]
+    return [values[3 * i : 3 * i + 3] for i in range(3)], values[9:12], mi.Point3f(values[12:15]), mi.Point3f(values[15:])
 
 
 def _intrinsics(camera: Camera) -> list[Any]:
@@ -144,9 +169,11 @@ def _intrinsics(camera: Camera) -> list[Any]:
 
 
 def _rotation(quats: Any) -> list[Any]:
-    """Return the columns of the rotation matrix of wxyz quaternions of any non-zero length."""
-    largest = dr.maximum(dr.max(dr.abs(dr.detach(quats))), 1e-30)  # so that squaring cannot overflow
-    w, x, y, z = dr.normalize(quats / largest + mi.Vector4f(1e-30, 0, 0, 0))
+    """Return the columns of the rotation matrix of wxyz quaternions of any length; length 0 does not rotate."""
+    largest = dr.max(dr.abs(dr.detach(quats)))
+    # Scaled so that squaring neither over- nor underflows.
+    scaled = quats / dr.clip(largest, 1e-30, 1e30)
+    w, x, y, z = dr.normalize(dr.select(largest < 1e-30, mi.Vector4f(1, 0, 0, 0), scaled))
     return [
         mi.Vector3f(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
         mi.Vector3f(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
@@ -156,19 +183,25 @@ def _rotation(quats: Any) -> list[Any]:
 
 def _screen_axes(
     tan_x: Any, tan_y: Any, jx: Any, jy: Any, R: list[list[Any]], quats: Any, scales: Any, limits: list[Any]
-) -> tuple[Any, Any]:
-    """Return the rows of U = J R Q diag(s), two vectors [3] in px."""
+) -> tuple[Any, Any, Any]:
+    """Return the rows of U = J R Q diag(s), two vectors [3] in units of the splat's size, and 1 / size in 1/px.
+
+    The size, at least one pixel, is any number of the order of the largest entry of U.
+    """
     # Outside the view the linearisation blows up: its point is clamped to 1.3 times the half view, as in 3DGS.
     lo_x, hi_x, lo_y, hi_y = limits
     tan_x, tan_y = dr.clip(tan_x, lo_x, hi_x), dr.clip(tan_y, lo_y, hi_y)
+    r_focal = dr.rcp(dr.detach(dr.maximum(jx, jy)))
+    r_scale = dr.rcp(dr.maximum(dr.max(dr.detach(scales)), r_focal))
+    jx, jy, scales = jx * r_focal, jy * r_focal, scales * r_scale
     J0 = mi.Vector3f(*(jx * (R[0][k] - tan_x * R[2][k]) for k in range(3)))
     J1 = mi.Vector3f(*(jy * (R[1][k] - tan_y * R[2][k]) for k in range(3)))
     Q = _rotation(quats)
     u0, u1 = (mi.Vector3f(*(dr.dot(J, Q[k]) * scales[k] for k in range(3))) for J in (J0, J1))
-    return u0, u1
+    return u0, u1, r_focal * r_scale
 
 
-def _colors(means: Any, sh_coeffs: Any, R: list[list[Any]], t: list[Any], N: int) -> tuple[Any, ...]:
+def _colors(direction: Any, sh_coeffs: Any, N: int) -> tuple[Any, ...]:
     """Return max(0.5 + SH(direction), 0) per colour component (3DGS's convention)."""
     K = int(sh_coeffs.shape[1])
     lane = dr.arange(mi.UInt32, N) * (3 * K)
@@ -176,8 +209,7 @@ def _colors(means: Any, sh_coeffs: Any, R: list[list[Any]], t: list[Any], N: int
     if K == 1:
         basis = [0.28209479177387814]
     else:
-        position = mi.Point3f(*(-sum(R[i][k] * t[i] for i in range(3)) for k in range(3)))
-        basis = dr.sh_eval(dr.normalize(means - position), int(sqrt(K)) - 1)
+        basis = dr.sh_eval(dr.normalize(direction), int(sqrt(K)) - 1)
     return tuple(dr.maximum(sum(B * coeff[3 * k + c] for k, B in enumerate(basis)) + 0.5, 0) for c in range(3))
 
 
