@@ -46,7 +46,7 @@ def backproject(
         lists = build_lists(splats, W, H, config)
     columns = [dr.zeros(mi.Float, len(splats)) for _ in range(C)]
     dr.enable_grad(columns)
-    image = blend(splats.shape, columns, Plan(lists, (False,) * C, False, W * H, config))
+    image = blend(splats.shape, columns, Plan(lists, (False,) * C, False, config), W * H)
     padded = np.zeros((H * W, pixel_stride(C)), np.float32)
     padded[:, :C] = picture.reshape(-1, C)
     dr.set_grad(image, mi.Float(padded.ravel()))

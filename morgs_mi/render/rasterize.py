@@ -93,8 +93,7 @@ def rasterize(
         or ("color" in channels and background is not None and "color" not in detach_weights)
         or any(name in blended and name not in detach_weights for name in _NORMALISED)
     )
-    plan = Plan(lists, attached, alpha_attached, W * H, config)
-    flat = blend(splats.shape, columns, plan)
+    flat = blend(splats.shape, columns, Plan(lists, attached, alpha_attached, config), W * H)
     return _unpack(flat, blended, channels, background, detach_weights, W, H)
 
 
