@@ -1,6 +1,6 @@
 """From Gaussians in the world to splats on the screen, differentiated by Dr.Jit.
 
-Notation: x = R (mean - eye) + t in camera space, z its depth, J the Jacobian of the projection at x, and
+Notation: x = R mean + t in camera space, z its depth, J the Jacobian of the projection at x, and
 U = J R Q diag(s) [2, 3], so that the screen covariance is U U' + eps2d I (EWA splatting, Zwicker 2001).
 A pixel at offset d = (dx, dy) from the splat's centre gets alpha = 2^p with
 
@@ -9,9 +9,9 @@ A pixel at offset d = (dx, dy) from the splat's centre gets alpha = 2^p with
 where [a b; 0 c] is the Cholesky factor of the conic times log2(e) / 2. Written so, p never exceeds
 log2(opacity), however thin the needle, and the pixel loop needs no exponential but 2^p.
 
-Nothing overflows on the way: U is computed in units of the splat's own size, the eye is subtracted before
-rotating, so that a scene far from the origin keeps its accuracy, and what the camera cannot see is projected
-from a stand-in, so that no 0 * inf spoils a gradient.
+Nothing overflows on the way: U is computed in units of the splat's own size, and what the camera cannot see is
+projected from a stand-in, so that no 0 * inf spoils a gradient. x is summed in double precision: scenes far
+from the origin, and cameras far from the scene, would lose as many digits as the one exceeds the other.
 """
 
 from __future__ import annotations
@@ -82,11 +82,11 @@ def project(gaussians: ActivatedGaussians, camera: Camera, channels: tuple[str, 
     N = dr.prod(gaussians.means.shape[:1])
     means, quats = _rows(mi.Point3f, gaussians.means, N), _rows(mi.Vector4f, gaussians.quats, N)
     scales, opacities = _rows(mi.Vector3f, gaussians.scales, N), gaussians.opacities.array
-    R, t, eye, eye_rest = _pose(camera.viewmat)
+    R, rows, eye = _pose(camera.viewmat)
     fx, fy, cx, cy, near, *limits = _intrinsics(camera)
 
-    means = means - eye
-    x, y, z = (dr.fma(R[i][0], means.x, dr.fma(R[i][1], means.y, dr.fma(R[i][2], means.z, t[i]))) for i in range(3))
+    world = [mi.Float64(v) for v in means]
+    x, y, z = (mi.Float(dr.fma(a, world[0], dr.fma(b, world[1], dr.fma(c, world[2], t)))) for a, b, c, t in rows)
     probe = dr.detach(x + y + z)
     front = dr.detach((z >= near) & (dr.maximum(dr.maximum(dr.abs(x), dr.abs(y)), z) < _FARTHEST))
     x, y, z = dr.select(front, x, 0), dr.select(front, y, 0), dr.select(front, z, 1)
@@ -107,7 +107,8 @@ def project(gaussians: ActivatedGaussians, camera: Camera, channels: tuple[str, 
     blended: dict[str, tuple[Any, ...]] = {}
     for name in channels:
         if name == "color":
-            blended[name] = _colors(dr.select(front, means - eye_rest, 1), gaussians.sh_coeffs, N)
+            direction = dr.select(front, mi.Vector3f(*(mi.Float(v - e) for v, e in zip(world, eye, strict=True))), 1)
+            blended[name] = _colors(direction, gaussians.sh_coeffs, N)
         elif name == "depth":
             blended[name] = (z,)
         elif name == "motion":
@@ -130,27 +131,15 @@ def _rows(dtype: Any, tensor: Any, N: int) -> Any:
     return dr.gather(dtype, tensor.array, dr.arange(mi.UInt32, N), mode=dr.ReduceMode.NoConflicts)
 
 
-def _pose(viewmat: Any) -> tuple[list[list[Any]], list[Any], Any, Any]:
-    """Return (R [3][3], t [3], eye, rest) with x = R (mean - eye) + t and the camera's centre at eye + rest.
+def _pose(viewmat: Any) -> tuple[list[list[Any]], list[list[Any]], list[Any]]:
+    """Return R [3][3] in single, and [R t] [3][4] and the camera's centre -R't [3] in double precision.
 
-    The eye is rounded to what means are made of, so that subtracting it is exact nearby; t and rest, computed
-    in double precision, are what that leaves. All are width-1 Dr.Jit floats that keep a Dr.Jit `viewmat`'s gradient.
+    All are width-1 Dr.Jit floats that keep the gradient of a Dr.Jit `viewmat`.
     """
-    tracked = dr.is_tensor_v(viewmat)
-    flat = mi.Float64(viewmat.array) if tracked else np.asarray(viewmat, np.float64).ravel()
-    V = [dr.gather(mi.Float64, flat, mi.UInt32(k)) if tracked else flat[k] for k in range(12)]
-    R, t = [V[4 * i : 4 * i + 3] for i in range(3)], V[3::4]
-    centre = [-sum(R[i][k] * t[i] for i in range(3)) for k in range(3)]
-    eye = [mi.Float64(mi.Float(dr.detach(v))) if tracked else float(np.float32(v)) for v in centre]
-    t = [sum((R[i][k] * eye[k] for k in range(3)), t[i]) for i in range(3)]
-    values = [*R[0], *R[1], *R[2], *t, *eye, *(v - e for v, e in zip(centre, eye, strict=True))]
-    if tracked:
-        values = [mi.Float(v) for v in values]
-        dr.eval(values)
-    else:
-        memory = mi.Float(np.float32(values))
-        values = [dr.gather(mi.Float, memory, mi.UInt32(k)) for k in range(len(values))]
-    return [values[3 * i : 3 * i + 3] for i in range(3)], values[9:12], mi.Point3f(values[12:15]), mi.Point3f(values[15:])
+    flat = mi.Float64(viewmat.array if dr.is_tensor_v(viewmat) else np.array(viewmat, np.float64).ravel())
+    rows = [[dr.gather(mi.Float64, flat, mi.UInt32(4 * i + k)) for k in range(4)] for i in range(3)]
+    eye = [-sum(row[k] * row[3] for row in rows) for k in range(3)]
+    return [[mi.Float(v) for v in row[:3]] for row in rows], rows, eye
 
 
 def _intrinsics(camera: Camera) -> list[Any]:
@@ -206,10 +195,7 @@ def _colors(direction: Any, sh_coeffs: Any, N: int) -> tuple[Any, ...]:
     K = int(sh_coeffs.shape[1])
     lane = dr.arange(mi.UInt32, N) * (3 * K)
     coeff = [dr.gather(mi.Float, sh_coeffs.array, lane + j, mode=dr.ReduceMode.NoConflicts) for j in range(3 * K)]
-    if K == 1:
-        basis = [0.28209479177387814]
-    else:
-        basis = dr.sh_eval(dr.normalize(direction), int(sqrt(K)) - 1)
+    basis = dr.sh_eval(dr.normalize(direction), int(sqrt(K)) - 1)
     return tuple(dr.maximum(sum(B * coeff[3 * k + c] for k, B in enumerate(basis)) + 0.5, 0) for c in range(3))
 
 
