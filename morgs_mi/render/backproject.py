@@ -11,7 +11,7 @@ import numpy as np
 from ..capture.camera import Camera
 from ..gaussians.gaussians import ActivatedGaussians
 from .blocks import build_lists
-from .compositing import Plan, blend, pixel_stride
+from .compositing import Plan, blend
 from .config import RenderConfig
 from .projection import project
 
@@ -46,11 +46,9 @@ def backproject(
         lists = build_lists(splats, W, H, config)
     columns = [dr.zeros(mi.Float, len(splats)) for _ in range(C)]
     dr.enable_grad(columns)
-    image = blend(splats.shape, columns, Plan(lists, (False,) * C, False, config), W * H)
-    padded = np.zeros((H * W, pixel_stride(C)), np.float32)
-    padded[:, :C] = picture.reshape(-1, C)
-    dr.set_grad(image, mi.Float(padded.ravel()))
-    dr.enqueue(dr.ADMode.Backward, image)
+    blended, *_ = blend(splats.shape, [tuple(columns)], Plan(lists, (False,) * C, False, config), W * H)
+    dr.set_grad(blended, mi.Float(np.ascontiguousarray(picture, np.float32).ravel()))
+    dr.enqueue(dr.ADMode.Backward, blended)
     dr.traverse(dr.ADMode.Backward)
     grads: list[Any] = [dr.grad(column) for column in columns]
     dr.eval(grads)

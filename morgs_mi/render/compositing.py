@@ -27,7 +27,7 @@ import mitsuba as mi
 from .blocks import BlockLists, fetch_record, pack_records, pixel_grid
 from .config import RenderConfig
 
-__all__ = ["Plan", "blend", "pixel_stride"]
+__all__ = ["Plan", "blend"]
 
 _LN2 = log(2.0)
 _GEOMETRY = 6  # mean_x, mean_y, a, b, c, log2_opacity
@@ -56,47 +56,75 @@ class Plan:
 
 
 def pixel_stride(columns: int) -> int:
-    """Return the floats per pixel in `blend`'s image: the columns, alpha, and padding to packets of 4."""
+    """Return the floats per pixel in a blended image: the columns, alpha, and padding to packets of 4."""
     return -(-(columns + 1) // 4) * 4
 
 
-def blend(geometry: tuple[Any, ...], columns: list[Any], plan: Plan, num_pixels: int) -> Any:
-    """Blend `columns` over an image.
+def blend(geometry: tuple[Any, ...], channels: list[tuple[Any, ...]], plan: Plan, num_pixels: int) -> list[Any]:
+    """Blend every channel's columns over an image.
 
     Args:
         geometry: (mean_x, mean_y, a, b, c, log2_opacity), six floats [N].
-        columns: C floats [N], what is blended.
+        channels: per channel its columns, floats [N]; C columns in all.
         plan: lists and layout.
         num_pixels: width x height.
 
     Returns:
-        One flat float [num_pixels * pixel_stride(C)]: per pixel the C blended columns, alpha, padding.
-        Differentiable in `geometry` and `columns` by `dr.backward` and `dr.forward`.
+        Per channel one flat float [num_pixels * columns], and alpha [num_pixels], twice: one to be shown, one to
+        divide by, for forward mode clears the gradients of what is used further. Differentiable in `geometry` and
+        `channels` by `dr.backward` and `dr.forward`.
     """
-    return dr.custom(_Blend, [*geometry, *columns], plan, num_pixels)
+    sizes = [len(channel) for channel in channels]
+    return dr.custom(
+        _Blend, [*geometry, *(column for channel in channels for column in channel)], plan, num_pixels, sizes
+    )
 
 
 class _Blend(dr.CustomOp):
-    def eval(self, values: list[Any], plan: Plan, num_pixels: int) -> Any:
-        self.plan, self.size = plan, num_pixels * pixel_stride(len(plan.attached))
+    def eval(self, values: list[Any], plan: Plan, num_pixels: int, sizes: list[int]) -> list[Any]:
+        self.plan, self.num_pixels, self.sizes = plan, num_pixels, [*sizes, 1, 1]
+        self.stride = pixel_stride(len(plan.attached))
         self.records = pack_records(values, plan.lists.by_rank)
-        self.image = _blend(self.records, _zeros(self.size), plan)
-        return self.image
+        self.image = _blend(self.records, _zeros(num_pixels * self.stride), plan)
+        return self._split(self.image)
 
     def backward(self) -> None:
         plan, lists = self.plan, self.plan.lists
         C, skipped = len(plan.attached), 0 if plan.reaches_weights else _GEOMETRY
         packets = -(-(_GEOMETRY + C - skipped) // 4)
         sums = _zeros(_ladder(dr.width(lists.by_rank)) * packets * 4)
-        sums = _adjoint(self.records, self.image, self.grad_out(), sums, plan)
+        sums = _adjoint(self.records, self.image, self._joined(self.grad_out()), sums, plan)
         lane = lists.rank_of * (4 * packets)
         columns = [dr.gather(mi.Float, sums, lane + k) for k in range(_GEOMETRY + C - skipped)]
         self.set_grad_in("values", [mi.Float(0)] * skipped + columns)
 
+    def _split(self, image: Any) -> list[Any]:
+        """Cut an image of `stride` floats per pixel into one array per channel, alpha and alpha again."""
+        parts = []
+        for first, size in zip(self._firsts(), self.sizes, strict=True):
+            lane = dr.arange(mi.UInt32, self.num_pixels * size)
+            parts.append(dr.gather(mi.Float, image, lane // size * self.stride + lane % size + first))
+        return parts
+
+    def _joined(self, parts: list[Any]) -> Any:
+        """Transpose `_split`: what belongs to the same place is added up."""
+        lane = dr.arange(mi.UInt32, self.num_pixels * self.stride)
+        pixel, place, image = lane // self.stride, lane % self.stride, mi.Float(0)
+        for part, first, size in zip(parts, self._firsts(), self.sizes, strict=True):
+            if dr.width(part) == self.num_pixels * size:  # a literal 0 otherwise: nothing depends on it
+                inside = (place >= first) & (place < first + size)
+                image += dr.gather(mi.Float, part, pixel * size + place - first, active=inside)
+        return image + dr.zeros(mi.Float, self.num_pixels * self.stride)
+
+    def _firsts(self) -> list[int]:
+        C = len(self.plan.attached)
+        return [min(sum(self.sizes[:k]), C) for k in range(len(self.sizes))]
+
     def forward(self) -> None:
         grads = [dr.zeros(mi.Float, 1) + g for g in list(self.grad_in("values"))]  # type: ignore[call-overload]
         tangents = pack_records(grads, self.plan.lists.by_rank)
-        self.set_grad_out(_tangent(self.records, tangents, _zeros(self.size), self.plan))
+        image = _tangent(self.records, tangents, _zeros(self.num_pixels * self.stride), self.plan)
+        self.set_grad_out(self._split(image))
 
     def name(self) -> str:
         return "morgs_mi.blend"

@@ -13,7 +13,7 @@ import numpy as np
 from ..capture.camera import Camera
 from ..gaussians.gaussians import ActivatedGaussians
 from .blocks import build_lists
-from .compositing import Plan, blend, pixel_stride
+from .compositing import Plan, blend
 from .config import RenderConfig
 from .projection import CHANNEL_SIZES, project
 
@@ -86,48 +86,23 @@ def rasterize(
     with dr.suspend_grad():
         lists = build_lists(splats, W, H, config)
 
-    columns = [v for name in blended for v in splats.channels[name]]
     attached = tuple(name not in detach_weights for name in blended for _ in range(CHANNEL_SIZES[name]))
     alpha_attached = (
         ("alpha" in channels and "alpha" not in detach_weights)
         or ("color" in channels and background is not None and "color" not in detach_weights)
         or any(name in blended and name not in detach_weights for name in _NORMALISED)
     )
-    flat = blend(splats.shape, columns, Plan(lists, attached, alpha_attached, config), W * H)
-    return _unpack(flat, blended, channels, background, detach_weights, W, H)
-
-
-def _unpack(
-    flat: Any,
-    blended: tuple[str, ...],
-    channels: tuple[str, ...],
-    background: Sequence[float] | None,
-    detach_weights: Sequence[str],
-    W: int,
-    H: int,
-) -> Image:
-    """Cut the blended image into tensors, normalise, and put the background behind the colour."""
-    sizes = [CHANNEL_SIZES[name] for name in blended]
-    stride = pixel_stride(sum(sizes))
-
-    def columns(first: int, count: int) -> Any:
-        lane = dr.arange(mi.UInt32, W * H * count)
-        index = lane // count * stride + lane % count + first
-        return dr.gather(mi.Float, flat, index, mode=dr.ReduceMode.NoConflicts)
-
-    images, first = {"alpha": columns(sum(sizes), 1)}, 0
-    for name, size in zip(blended, sizes, strict=True):
-        value, behind = columns(first, size), name == "color" and background is not None
-        if name in _NORMALISED or behind:
-            # Its own node in the gradient graph: forward mode clears the gradients of interior nodes.
-            coverage = dr.repeat(columns(sum(sizes), 1), size)
-            coverage = dr.detach(coverage) if name in detach_weights else coverage
-        if behind:
+    values = [splats.channels[name] for name in blended]
+    *parts, alpha, coverage = blend(splats.shape, values, Plan(lists, attached, alpha_attached, config), W * H)
+    images = {"alpha": alpha}
+    for name, value in zip(blended, parts, strict=True):
+        behind = dr.repeat(dr.detach(coverage) if name in detach_weights else coverage, CHANNEL_SIZES[name])
+        if name in _NORMALISED:
+            value = dr.select(behind > 0, value / dr.maximum(behind, 1e-8), 0)
+        elif name == "color" and background is not None:
             backdrop = dr.gather(mi.Float, mi.Float(np.float32(background)), dr.arange(mi.UInt32, W * H * 3) % 3)
-            value = dr.fma(1 - coverage, backdrop, value)
-        elif name in _NORMALISED:
-            value = dr.select(coverage > 0, value / dr.maximum(coverage, 1e-8), 0)
-        images[name], first = value, first + size
+            value = dr.fma(1 - behind, backdrop, value)
+        images[name] = value
     return Image(**{n: mi.TensorXf(images[n], (H, W, CHANNEL_SIZES.get(n, 1))) for n in channels})
 
 
