@@ -160,9 +160,10 @@ def _intrinsics(camera: Camera) -> list[Any]:
 def _rotation(quats: Any) -> list[Any]:
     """Return the columns of the rotation matrix of wxyz quaternions of any length; length 0 does not rotate."""
     largest = dr.max(dr.abs(dr.detach(quats)))
-    # Scaled so that squaring neither over- nor underflows.
-    scaled = quats / dr.clip(largest, 1e-30, 1e30)
-    w, x, y, z = dr.normalize(dr.select(largest < 1e-30, mi.Vector4f(1, 0, 0, 0), scaled))
+    none = largest < 1e-30
+    # Scaled so that squaring neither over- nor underflows; by a product with 0, not a choice, so that NaN stays.
+    scaled = quats * dr.select(none, 0, dr.rcp(dr.minimum(largest, 1e30)))
+    w, x, y, z = dr.normalize(scaled + mi.Vector4f(dr.select(none, 1, 0), 0, 0, 0))
     return [
         mi.Vector3f(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
         mi.Vector3f(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),

@@ -1,0 +1,486 @@
+"""The renderer at the extremes: every case against the float64 twin, or finite within a stated bound.
+
+The twin runs in extended precision here (80-bit `longdouble` where the platform has it), because its textbook
+determinant cancels for needles. Pixels where an alpha lies within `AMBIGUOUS` of a cut-off are left out: there,
+rounding decides what is drawn. Gradients are judged by attribute, relative to the largest entry: of scales and
+quaternions per relative change, as an optimiser of logarithms sees them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from tests import reference
+from tests import tolerances as tol
+
+CHANNELS = ("color", "alpha", "depth", "motion", "confidence")
+SIZES = {"color": 3, "motion": 2}
+ATTRIBUTES = ("means", "scales", "quats", "opacities", "sh_coeffs", "motion", "confidence")
+BACKGROUND = (0.2, 0.5, 0.9)
+AMBIGUOUS = 1e-3  # relative distance of an alpha to a cut-off
+# Nothing hides behind the stop, so that the twin, which knows none, can judge the gradients of opaque scenes.
+CONFIG = RenderConfig(stop_transmittance=1e-12)
+
+Values = dict[str, np.ndarray]
+
+
+class Activated:
+    """Activated attributes, as the plugin passes them; nothing has gone through a logit or a logarithm."""
+
+    def __init__(self, values: Values) -> None:
+        one = dr.opaque(mi.Float, 1)  # multiplying copies what Dr.Jit borrows from NumPy
+        for name in ATTRIBUTES:
+            setattr(self, name, mi.TensorXf(np.ascontiguousarray(values[name], np.float32)) * one)
+        self.tensors = [getattr(self, name) for name in ATTRIBUTES]
+        dr.enable_grad(*self.tensors)
+
+    def gradients(self) -> Values:
+        return {name: np.asarray(dr.grad(getattr(self, name)), np.float64) for name in ATTRIBUTES}
+
+
+# --------------------------------------------------------------------------------------------------
+#  The twin in extended precision
+# --------------------------------------------------------------------------------------------------
+
+
+def twin(values: dict[str, Any], camera: Camera, alpha_min: float = 1 / 255, alpha_max: float = 0.99) -> dict[str, Any]:
+    with np.errstate(all="ignore"):
+
+        def logit(x):  # of 1 it is infinite; 60 has the same sigmoid
+            return np.where(x == 1, 60, np.log(x / np.where(x == 1, 1, 1 - x)))
+
+        zero = (values["quats"] == 0).all(axis=1, keepdims=True)
+        raw = {
+            "means": values["means"],
+            "log_scales": np.log(values["scales"]),
+            "quats": np.where(zero, np.array([1, 0, 0, 0]), values["quats"]),
+            "logit_opacities": logit(values["opacities"]),
+            "sh_coeffs": values["sh_coeffs"],
+            "motion": values["motion"],
+            "logit_confidence": logit(values["confidence"]),
+        }
+        return reference.rasterize(
+            raw,
+            np.float32(camera.K).astype(np.longdouble),
+            np.asarray(camera.viewmat).astype(np.longdouble),
+            camera.width,
+            camera.height,
+            BACKGROUND,
+            near=float(np.float32(camera.near)),
+            alpha_min=alpha_min,
+            alpha_max=alpha_max,
+        )
+
+
+def clear_pixels(values: Values, camera: Camera) -> np.ndarray:
+    """Return the pixels [H, W] where no alpha is near a cut-off; near one, a nudge of it changes something."""
+    low, high = (twin(values, camera, alpha_min=(1 + s * AMBIGUOUS) / 255)["alpha"][..., 0] for s in (-1, 1))
+    under, at, over = (twin(values, camera, alpha_max=0.99 * (1 + s * 1e-4))["alpha"][..., 0] for s in (-1, 0, 1))
+    return (low == high) & (np.abs(under - 2 * at + over) < 1e-6)
+
+
+def weights(expected: dict[str, np.ndarray], clear: np.ndarray, seed: int = 1) -> dict[str, np.ndarray]:
+    """Return random weights per channel that make a loss of all of them, each at its own scale."""
+    rng = np.random.default_rng(seed)
+    solid = clear & (expected["alpha"][..., 0] > 0.02)
+    result = {}
+    for name in CHANNELS:
+        mask = solid if name in ("depth", "motion") else clear
+        scale = max(1e-30, float(np.abs(expected[name]).max()))
+        result[name] = np.float32(rng.normal(size=(*clear.shape, SIZES.get(name, 1))) * mask[..., None] / scale)
+    return result
+
+
+def twin_gradients(values: Values, camera: Camera, weight: dict[str, np.ndarray]) -> Values:
+    """Complex step, relative to each number, so that nothing between 1e-30 and 1e30 loses its imaginary part."""
+    grads = {}
+    for name in ATTRIBUTES:
+        grad = np.zeros(values[name].shape)
+        for index in np.ndindex(*grad.shape):
+            nudged = values[name].astype(np.clongdouble)
+            step = np.longdouble(1e-30) * (np.abs(values[name][index]) or 1)
+            nudged[index] += 1j * step
+            image = twin({**values, name: nudged}, camera)
+            grad[index] = sum(np.sum(image[c].imag * weight[c]) for c in CHANNELS) / step
+        grads[name] = grad
+    return grads
+
+
+def twin_slope(values: Values, camera: Camera, weight: dict[str, np.ndarray], name: str, along: np.ndarray) -> float:
+    """Return the derivative of the weighted channels along a direction of one attribute."""
+    image = twin({**values, name: values[name].astype(np.clongdouble) + 1e-30j * along}, camera)
+    return float(sum(np.sum(image[c].imag * weight[c]) for c in CHANNELS) / 1e-30)
+
+
+# --------------------------------------------------------------------------------------------------
+#  Cases
+# --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene and a view, and how far the image and any gradient may be from the twin's."""
+
+    name: str
+    values: Values
+    camera: Camera
+    image: float = tol.IMAGE_ABS
+    gradient: float = tol.GRADIENT_REL
+    every_entry: bool = True  # else each attribute's gradient along the direction of its signs
+
+
+def cloud(n: int = 6, seed: int = 5) -> Values:
+    """Return activated attributes of a cloud at the origin, degree 1."""
+    rng = np.random.default_rng(seed)
+    return {
+        "means": rng.uniform((-1.0, -0.8, -0.5), (1.0, 0.8, 0.5), (n, 3)),
+        "scales": np.exp(rng.uniform(np.log(0.1), np.log(0.4), (n, 3))),
+        "quats": rng.normal(size=(n, 4)) * rng.uniform(0.5, 2, (n, 1)),
+        "opacities": rng.uniform(0.2, 0.8, n),
+        "sh_coeffs": rng.normal(size=(n, 4, 3)) * 0.3 + 0.2,
+        "motion": rng.normal(size=(n, 3)) * 0.1,
+        "confidence": rng.uniform(0.1, 0.9, n),
+    }
+
+
+def eye(
+    width: int = 21,
+    height: int = 18,
+    fov: float = 45.0,
+    origin: Any = (0.3, -0.4, -3.0),
+    up: Any = (0, -1, 0),
+    shift: tuple[float, float] = (1.3, -0.7),
+    near: float = 0.01,
+    viewmat: Any = None,
+) -> Camera:
+    """Return a camera that sees the origin: neither size divides a block, fx and fy differ, cx, cy are off centre."""
+    camera = Camera.look_at(origin, np.zeros(3), up, fov, width, height)
+    K = camera.K + np.array([[0, 0, shift[0]], [0, 0.08 * camera.K[0, 0], shift[1]], [0, 0, 0]])
+    viewmat = camera.viewmat if viewmat is None else viewmat
+    return Camera(K, np.float32(viewmat).astype(np.float64), width, height, near=near)
+
+
+def case(
+    name: str, camera: Camera | None = None, n: int = 6, bounds: dict[str, Any] | None = None, **change: Any
+) -> Case:
+    """Return the cloud with some attributes replaced, or changed by a function."""
+    values = cloud(n)
+    for key, new in change.items():
+        values[key] = new(values[key]) if callable(new) else np.broadcast_to(np.asarray(new, float), values[key].shape)
+    values = {key: np.float32(value).astype(np.float64) for key, value in values.items()}
+    return Case(name, values, camera or eye(), **(bounds or {}))
+
+
+def screen_bound(pixels: float) -> dict[str, float]:
+    """Return the bounds where screen coordinates are as large as `pixels`: a float32 is that coarse there.
+
+    Alpha falls by at most 1.1 a pixel (a standard deviation is at least sqrt(eps2d) px); three roundings.
+    """
+    return {
+        "image": tol.IMAGE_ABS + 3.3 * 2**-24 * pixels,
+        "gradient": tol.GRADIENT_REL + 10 * 2**-24 * pixels,  # alpha's second derivative is at most 3.3 / px^2
+    }
+
+
+def scaled(factor: float) -> dict[str, Callable]:
+    return {name: lambda v: v * factor for name in ("means", "scales", "motion")}
+
+
+NEAR = float(np.float32(0.01))
+BELOW, ABOVE = (float(np.nextafter(np.float32(NEAR), np.float32(x))) for x in (0, 1))
+AT_NEAR_PLANE = [[1e-3, 0, NEAR], [1e-3, -1e-3, BELOW], [-1e-3, 1e-3, ABOVE], [0, 0, 0], [0, 0, -3], [1, 1, 0.02]]
+GRAZING = [[5, 0, 0.011], [0, 5, 0.02], [1e3, 1e3, 0.01], [1e-3, 0, 0.5], [1e17, 0, 1], [1, 1, 1e17]]
+GRAZING_SCALES = [[0.2, 0.1, 0.3]] * 4 + [[1e16, 2e16, 1e16], [1e16, 1e17, 1e17]]
+ALONG_VIEW = np.linalg.qr(np.c_[[-0.3, 0.4, 3.0], np.eye(3)[:, :2]])[0]
+MIRROR, ORIGIN = np.diag([-1.0, 1, 1, 1]), eye(viewmat=np.eye(4))
+FAR = np.array([1e5, -1e5, 1e5])
+LIFT = np.eye(4)
+LIFT[:3, 3] = -FAR
+BLOCKS = np.stack(np.meshgrid(np.arange(8) * 8 + 4.0, np.arange(8) * 4 + 2.0), -1).reshape(-1, 2)
+SLOW_TWIN = {"every_entry": False}
+
+# Errors reached on a 2-core x86, 80-bit twin: image at most 4e-6, gradients at most 1e-5, unless a comment says more.
+CASES = [
+    case("plain"),
+    case("one Gaussian", n=1),
+    case("two Gaussians", n=2),
+    case("needles", scales=(1, 1e-4, 1e-4)),
+    case("needles across the screen", scales=(100, 1e-2, 1e-2)),
+    case("needles of 250,000 px", scales=(1e4, 1, 1)),
+    case("needles along the axis", scales=(1e-4, 1e-4, 1), means=lambda m: m * 0.05, quats=(1, 0.0656, 0.0495, 0)),
+    case("discs", scales=(1, 1, 1e-4)),
+    case("discs across the screen", scales=(100, 100, 1e-2)),
+    case("sub-pixel splats", scales=(1e-6, 2e-6, 3e-6)),
+    case("screen-filling splats", scales=(50, 70, 90)),
+    case("scales 0", scales=0),
+    case("scales 1e-38", scales=1e-38),
+    case("scales 1e6", scales=(1e6, 2e6, 3e6)),
+    case("scales 1e12", scales=(1e12, 2e12, 3e12)),
+    case("scales 3e38", scales=3e38),
+    case("on the near plane", ORIGIN, means=AT_NEAR_PLANE, scales=(0.002, 0.001, 0.003)),
+    case("big, on the near plane", ORIGIN, means=AT_NEAR_PLANE, scales=(0.2, 0.1, 0.3)),
+    case("grazing the near plane, and at 1e17 units", ORIGIN, means=GRAZING, scales=GRAZING_SCALES),
+    case("all behind", ORIGIN, means=lambda m: m - (0, 0, 5)),
+    case("1e-3 units", eye(origin=(3e-4, -4e-4, -3e-3), near=1e-5), **scaled(1e-3)),
+    case("1e6 units", eye(origin=(3e5, -4e5, -3e6), near=1e4), **scaled(1e6)),
+    # Means there are multiples of 2^-7; of what they are, nothing is lost, because poses are summed in double.
+    case("offset by 1e5", eye(viewmat=eye().viewmat @ LIFT), means=lambda m: m + FAR),
+    case("opacities 0, 1 and near", opacities=[0, 1, 1e-7, 1 - 2**-23, 0.99, 0.004]),
+    case("opacities 1", opacities=1),
+    case("opacities 0", opacities=0),
+    case("equal depths", ORIGIN, means=lambda m: m * (0.5, 0.5, 0) + (0, 0, 2), opacities=0.9),
+    case("some quaternions 0", quats=lambda q: q * np.array([[0], [1], [0], [1], [1], [1]])),
+    case("quaternions 1e-25", quats=lambda q: q * 1e-25),
+    case("quaternions 1e33", quats=lambda q: q * 1e33),
+    # Their gradients of 1e-38 are where float32 underflows to zero.
+    case("quaternions 1e38", quats=lambda q: np.clip(q, -3, 3) * 1e38, bounds={"gradient": 1.0}),
+    case("colours 1e6 and 1e-6", sh_coeffs=lambda c: c * np.array([1e6, 1, 1e-6, 1, -1e6, 1])[:, None, None]),
+    case("colours 1e15", sh_coeffs=lambda c: c * 1e15),
+    case("image 1x1", eye(1, 1)),
+    case("image 33x1", eye(33, 1)),
+    case("image 1x65", eye(1, 65)),
+    case("image 4096x1", eye(4096, 1, shift=(1.3, 0)), bounds=SLOW_TWIN),
+    case("image 1x4096", eye(1, 4096, fov=0.02, shift=(0, 0)), bounds=SLOW_TWIN),
+    case(
+        "one Gaussian in every block",
+        Camera(np.array([[40.0, 0, 32], [0, 40, 16], [0, 0, 1]]), np.eye(4), 64, 32),
+        n=64,
+        means=np.c_[(BLOCKS - (32, 16)) / 40 * 3, np.full(64, 3.0)],
+        scales=(0.04, 0.06, 0.05),
+        bounds=SLOW_TWIN,
+    ),
+    case("camera rolled", eye(up=(0.6, -0.3, 0.1))),
+    case("camera upside down", eye(up=(0, 1, 0))),
+    case("camera mirrored", eye(viewmat=MIRROR @ eye().viewmat)),
+    case("principal point outside", eye(viewmat=np.eye(4), shift=(-200, 150)), means=lambda m: m + (23.7, -16.4, 3)),
+    # Reached: image 1.4e-4, gradients 3e-4. fx x / z + cx cancels; that it could be had in double is not worth it.
+    case(
+        "principal point far outside",
+        eye(viewmat=np.eye(4), shift=(-2e4, 1e4)),
+        means=lambda m: m + (2367, -1096, 3),
+        bounds=screen_bound(2e4),
+    ),
+    case("lens of 0.01 degrees", eye(fov=0.01, origin=(1e3, 2e3, -1e4))),
+    case("lens of 179.9 degrees", eye(fov=179.9, origin=(0.1, 0.1, -0.5))),
+]
+
+
+# --------------------------------------------------------------------------------------------------
+#  Judging
+# --------------------------------------------------------------------------------------------------
+
+
+def run(
+    values: Values, camera: Camera, weight: dict[str, np.ndarray] | None = None, config: RenderConfig = CONFIG
+) -> tuple[Values, Values]:
+    """Return the channels and the gradients of the sum of the weighted channels; all must be finite."""
+    gaussians = Activated(values)
+    image = rasterize(gaussians, camera, CHANNELS, BACKGROUND, config=config)
+    found = {name: np.asarray(dr.detach(getattr(image, name)), np.float64) for name in CHANNELS}
+    if weight is None:
+        weight = weights(found, np.ones((camera.height, camera.width), bool))
+    dr.backward(sum(dr.sum(getattr(image, name) * mi.TensorXf(weight[name]), axis=None) for name in CHANNELS))
+    grads = gaussians.gradients()
+    for name, value in (*found.items(), *grads.items()):
+        assert np.isfinite(value).all(), f"{name} is not finite at {np.argwhere(~np.isfinite(value))[:5].tolist()}"
+    return found, grads
+
+
+def errors(case: Case) -> dict[str, float]:
+    """Return how far the image and each attribute's gradient are from the twin's."""
+    values, camera = case.values, case.camera
+    expected = twin(values, camera)
+    weight = weights(expected, clear_pixels(values, camera))
+    found, grads = run(values, camera, weight)
+    result = {"image": 0.0}
+    for name in CHANNELS:
+        wrong = np.abs(found[name] - expected[name])[weight[name] != 0] / max(1.0, np.abs(expected[name]).max())
+        result["image"] = max(result["image"], float(wrong.max(initial=0)))
+    # As an optimiser sees them; the size of a quaternion's or a scale's change is relative to itself.
+    unit = {"scales": values["scales"], "quats": np.linalg.norm(values["quats"], axis=1, keepdims=True)}
+    if case.every_entry:
+        exact = {n: g * unit.get(n, 1) for n, g in twin_gradients(values, camera, weight).items()}
+        grads = {n: g * unit.get(n, 1) for n, g in grads.items()}
+    else:
+        along = {n: np.sign(g) for n, g in grads.items()}
+        exact = {n: twin_slope(values, camera, weight, n, v) for n, v in along.items()}
+        grads = {n: np.abs(g).sum() for n, g in grads.items()}
+    # A splat too small or too large to have a shape is judged by what a relative change of its opacity does.
+    floor = 0.01 * np.abs(exact["opacities"]).max()
+    for name in ATTRIBUTES:
+        scale = max(np.abs(exact[name]).max(), floor if name in unit else 0, 1e-30)
+        result[name] = float(np.abs(grads[name] - exact[name]).max() / scale)
+    return result
+
+
+def complaints(case: Case) -> list[str]:
+    """Return what is wrong with a case, empty if nothing is."""
+    try:
+        found = errors(case)
+    except (AssertionError, ValueError) as error:
+        return [f"{case.name}: {error}"]
+    bounds = {name: case.image if name == "image" else case.gradient for name in found}
+    return [
+        f"{case.name}: {name} off by {e:.1e}, bound {bounds[name]:.1e}"
+        for name, e in found.items()
+        if not e < bounds[name]
+    ]
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_extreme_agrees_with_twin(case):
+    assert not complaints(case)
+
+
+def test_forward_and_reverse_mode_are_dual_at_the_extremes():
+    """<g, J v> = <J' g, v> along the signs of J' g, where nothing cancels."""
+    wrong = []
+    for case in CASES:
+        weight = weights(twin(case.values, case.camera), np.ones((case.camera.height, case.camera.width), bool))
+        _, grads = run(case.values, case.camera, weight)
+        gaussians = Activated(case.values)
+        image = rasterize(gaussians, case.camera, CHANNELS, BACKGROUND, config=CONFIG)
+        for name in ATTRIBUTES:
+            # Steps as long as the attribute: a unit step of a scale of 1e-38 would overflow.
+            step = np.sign(grads[name]) * np.minimum(np.abs(case.values[name]), 1e6)
+            dr.set_grad(getattr(gaussians, name), mi.TensorXf(np.float32(step)))
+            grads[name] = np.vdot(grads[name], step)
+        outputs = [getattr(image, name) for name in CHANNELS]
+        dr.forward_to(outputs)
+        tangents = [np.asarray(dr.grad(output), np.float64) for output in outputs]
+        forward = sum(np.vdot(t, weight[name]) for t, name in zip(tangents, CHANNELS, strict=True))
+        reverse = sum(grads.values())
+        if not abs(forward - reverse) <= tol.DUALITY_REL * abs(reverse):
+            wrong.append(f"{case.name}: forward {forward:.7g}, reverse {reverse:.7g}")
+    assert not wrong
+
+
+# --------------------------------------------------------------------------------------------------
+#  Crowds
+# --------------------------------------------------------------------------------------------------
+
+
+def stack(n: int, opacity: float) -> Values:
+    """Return n discs of every colour behind each other, before a camera at the origin."""
+    values = cloud(n)
+    values |= {"means": np.c_[np.zeros((n, 2)), np.linspace(1, 2, n)], "opacities": np.full(n, opacity)}
+    values["sh_coeffs"] = np.clip(values["sh_coeffs"], -0.4, 0.4)
+    return {name: np.float32(value).astype(np.float64) for name, value in values.items()}
+
+
+@pytest.mark.parametrize("opacity", [1.0, 0.99, 0.02])
+def test_ten_thousand_layers_on_one_pixel(opacity):
+    values, camera = stack(10_000, opacity), Camera(np.array([[9.0, 0, 0.5], [0, 9, 0.5], [0, 0, 1]]), np.eye(4), 1, 1)
+    expected = twin(values, camera)
+    for config in (CONFIG, RenderConfig()):
+        found, grads = run(values, camera, config=config)
+        hidden = config.stop_transmittance if config is not CONFIG else 0
+        for name in CHANNELS:
+            bound = (tol.IMAGE_ABS + 2 * hidden) * max(1, np.abs(expected[name]).max())
+            assert np.abs(found[name] - expected[name]).max() < bound, name
+        if opacity > 0.9:
+            assert np.abs(grads["sh_coeffs"][8:]).max() < 1e-12, "what nothing shows has no gradient"
+
+
+def test_equal_depths_are_blended_in_the_order_of_the_input():
+    """300 layers at one depth: the first in the input is the nearest; turned round, the last is."""
+    values = stack(300, 0.3)
+    values["means"][:, 2] = 1.5
+    camera = Camera(np.array([[9.0, 0, 3], [0, 9, 2.5], [0, 0, 1]]), np.eye(4), 6, 5)
+    pictures = []
+    for order in (slice(None), slice(None, None, -1)):
+        ordered = {name: np.ascontiguousarray(value[order]) for name, value in values.items()}
+        pictures.append(run(ordered, camera)[0]["color"])
+        assert np.abs(pictures[-1] - twin(ordered, camera)["color"]).max() < tol.IMAGE_ABS
+    assert np.abs(pictures[0] - pictures[1]).max() > 0.05
+
+
+@pytest.mark.slow
+def test_two_million_gaussians():
+    """All but 1,000 are out of sight: the image is that of the 1,000, and no gradient is lost or not finite."""
+    N, seen = 2_000_000, 1_000
+    rng = np.random.default_rng(0)
+    values = {name: np.repeat(value, N // 1000, axis=0) for name, value in cloud(1000).items()}
+    values["means"] += rng.normal(size=(N, 3)) * 0.3
+    values["scales"] *= 0.05
+    where = np.sort(rng.choice(N, seen, replace=False))
+    away = np.ones(N, bool)
+    away[where] = False
+    values["means"][away] = values["means"][away] * 100 - (0, 0, 1e4)
+    camera = eye(640, 480)
+    found, grads = run(values, camera)
+    few, few_grads = run({name: value[where] for name, value in values.items()}, camera)
+    for name in CHANNELS:
+        assert np.abs(found[name] - few[name]).max() == 0, name
+    for name in ATTRIBUTES:
+        assert np.abs(grads[name][where] - few_grads[name]).max() <= 1e-5 * np.abs(few_grads[name]).max(), name
+        assert np.abs(grads[name][away]).max() == 0, name
+
+
+@pytest.mark.slow
+def test_two_million_gaussians_in_view():
+    values = {name: np.repeat(value, 2000, axis=0) for name, value in cloud(1000).items()}
+    values["means"] += np.random.default_rng(0).normal(size=values["means"].shape) * 0.3
+    values["scales"] *= 0.02
+    found, grads = run(values, eye(640, 480))
+    assert found["alpha"].max() > 0.999
+    assert np.abs(grads["means"]).max() > 0
+
+
+# --------------------------------------------------------------------------------------------------
+#  Raw attributes: what the activations make of extremes
+# --------------------------------------------------------------------------------------------------
+
+
+def raw_gaussians(**change: Any) -> Gaussians:
+    values = cloud()
+    raw = {name: values[name] for name in ("means", "quats", "sh_coeffs", "motion")}
+    raw |= {"log_scales": np.log(values["scales"]), "logit_opacities": np.zeros(6), "logit_confidence": np.zeros(6)}
+    gaussians = Gaussians(**(raw | change))
+    dr.enable_grad(*gaussians.items().values())
+    return gaussians
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"log_scales": np.array([-200.0, -100, -50, 0, 50, 88])[:, None] * np.ones(3)},
+        {"log_scales": np.array([88.0, -200, 0]) * np.ones((6, 1))},
+        {"logit_opacities": np.array([-1e38, -100, -17, 17, 100, 1e38])},
+        {"logit_confidence": np.array([-1e38, -100, -17, 17, 100, 1e38])},
+        {"means": np.array([1e30, -3e38, 1e19, 0, 1e-30, 3e38])[:, None] * np.ones(3)},
+        {"sh_coeffs": np.full((6, 4, 3), -3e37)},
+    ],
+    ids=["scales", "needles", "opacities", "confidence", "means", "colours"],
+)
+def test_raw_extremes_stay_finite(change):
+    gaussians = raw_gaussians(**change)
+    image = rasterize(gaussians, eye(), CHANNELS, BACKGROUND, config=CONFIG)
+    for name in CHANNELS:
+        assert np.isfinite(np.asarray(getattr(image, name))).all(), name
+    dr.backward(sum(dr.mean(getattr(image, name), axis=None) for name in CHANNELS))
+    for name, value in gaussians.items().items():
+        assert np.isfinite(np.asarray(dr.grad(value))).all(), name
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"log_scales": np.full((6, 3), 100.0)}, r"`scales` must be finite, got inf at \[0, 0\]"),
+        ({"means": np.full((6, 3), [0, 0, -np.inf])}, r"`means` must be finite, got -inf at \[0, 2\]"),
+        ({"means": np.full((6, 3), [0, 0, -10.0]), "quats": np.full((6, 4), np.nan)}, "`quats` must be finite"),
+        ({"quats": np.full((6, 4), [0, 0, 0, np.nan])}, r"`quats` must be finite, got nan at \[0, 3\]"),
+    ],
+    ids=["overflow", "infinite mean", "behind the camera", "one component"],
+)
+def test_what_is_not_finite_is_refused_wherever_it_is(change, message):
+    with pytest.raises(ValueError, match=message):
+        rasterize(raw_gaussians(**change), eye(), CHANNELS, BACKGROUND, config=CONFIG)
