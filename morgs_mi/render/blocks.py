@@ -215,19 +215,19 @@ def _block_bits(
     columns = []
     for i in range(_ACROSS):
         x0, x1 = px + (i * bw + 0.5), px + (i * bw + bw - 0.5)
-        x = dr.clip(0, x0, x1)
+        x = _clipped(0, x0, x1)
         columns.append((x0, x1, a * x, slope_y * x))
     mask = UInt32(0)
     for j in range(_DOWN):
         y0, y1 = py + (j * bh + 0.5), py + (j * bh + bh - 0.5)
-        y = dr.clip(0, y0, y1)
+        y = _clipped(0, y0, y1)
         by, v, best_x = b * y, c * y, slope_x * y
         for i, (x0, x1, ax, best_y) in enumerate(columns):
             # Over a box, u^2 + v^2 is least at the clamped centre or on the two nearest edges.
-            u1, y_edge = dr.fma(a, dr.clip(best_x, x0, x1), by), dr.clip(best_y, y0, y1)
+            u1, y_edge = dr.fma(a, _clipped(best_x, x0, x1), by), _clipped(best_y, y0, y1)
             u2, v2 = dr.fma(b, y_edge, ax), c * y_edge
-            least = dr.minimum(dr.fma(u1, u1, v * v), dr.fma(u2, u2, v2 * v2))
-            mask |= dr.select(least <= reach, UInt32(1 << (j * _ACROSS + i)), UInt32(0))
+            touches = (dr.fma(u1, u1, v * v) <= reach) | (dr.fma(u2, u2, v2 * v2) <= reach)
+            mask |= dr.select(touches, UInt32(1 << (j * _ACROSS + i)), UInt32(0))
 
     place = dr.gather(UInt32, first_word, tile) * 32 + dr.arange(UInt32, dr.width(tile))
     masks = dr.zeros(UInt32, num_words * 32)
@@ -240,6 +240,12 @@ def _block_bits(
         dr.scatter(words, row, word + k, mode=dr.ReduceMode.NoConflicts)
     dr.eval(words)
     return words, first_word, end_word
+
+
+def _clipped(value: Any, low: Any, high: Any) -> Any:
+    """Return `value` within [low, high]: two instructions, where `dr.clip` takes six to be right about NaN."""
+    value = dr.select(value < low, low, value)
+    return dr.select(value > high, high, value)
 
 
 def _transposed(rows: list[Any]) -> list[Any]:
