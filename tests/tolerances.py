@@ -6,6 +6,13 @@ IMAGE_ABS = 2e-5
 STOPPED_IMAGE_ABS = 2e-4
 # Gradients add the rounding of sums over some hundred pixels; relative to the largest entry of an attribute.
 GRADIENT_REL = 2e-4
+# Per pixel that a splat moves, with a standard deviation of at least sqrt(0.3) px: alpha changes by at most 1.1,
+# its slope by at most 3.3. A screen coordinate X is the result of three roundings, each of 2^-24 X.
+ALPHA_PER_PIXEL = 3 * 1.1
+ALPHA_SLOPE_PER_PIXEL = 3 * 3.3
+# Sums over randomly weighted pixels may cancel. Of 400 seeds, half stay below 2e-6 and one exceeds 2e-4 (28: 8e-4):
+# the tilt of a needle of 5,000 px by 0.5 whose centre is 60 px off, where u = a dx + b dy is a difference of 130s.
+FUZZ_GRADIENT_REL = 2e-3
 # Forward and reverse mode take different roundings of the same sums.
 DUALITY_REL = 2e-4
 # Central differences of a float32 image at the best step are good to the cube root of its rounding.
