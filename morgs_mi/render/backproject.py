@@ -11,7 +11,7 @@ import numpy as np
 from ..capture.camera import Camera
 from ..gaussians.gaussians import ActivatedGaussians
 from .blocks import build_lists
-from .compositing import Plan, blend
+from .compositing import Layout, blend
 from .config import RenderConfig
 from .projection import project
 
@@ -46,7 +46,7 @@ def backproject(
         lists = build_lists(splats, W, H, config)
     columns = [dr.zeros(mi.Float, len(splats)) for _ in range(C)]
     dr.enable_grad(columns)
-    blended, *_ = blend(splats.shape, [tuple(columns)], Plan(lists, (False,) * C, False, config), W * H)
+    blended, *_ = blend(splats.shape, [tuple(columns)], lists, Layout((False,) * C, False, config), W * H)
     dr.set_grad(blended, mi.Float(np.ascontiguousarray(picture, np.float32).ravel()))
     dr.enqueue(dr.ADMode.Backward, blended)
     dr.traverse(dr.ADMode.Backward)

@@ -21,7 +21,7 @@ import mitsuba as mi
 from .config import RenderConfig
 from .projection import Splats
 
-__all__ = ["BlockLists", "build_lists", "fetch_record", "pack_records", "pixel_grid"]
+__all__ = ["BlockLists", "build_lists", "fetch_record", "pack_records", "pixel_grid", "sorted_buckets"]
 
 # Half a thousandth of an octave: the block test may keep too much, never too little.
 _TEST_SLACK = 1e-3
@@ -179,20 +179,29 @@ def _tile_lists(x0: Any, y0: Any, columns: Any, counts: Any, stride: Any, tiles:
     *_, tile_of, rank_at = dr.while_loop(state, lambda k, *s: k < s[4], enter, label="tile entries")
     dr.eval(tile_of, rank_at)
 
-    # On the CPU one counting pass sorts by tile, stably. On the GPU that pass is stable for few buckets only.
-    on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
-    perm = dr.detail.block_mkperm(tile_of, total, tiles) if on_cpu else dr.argsort(tile_of)
+    perm, first, end = sorted_buckets(tile_of, tiles)
     entries, tile_of = dr.gather(UInt32, rank_at, perm), dr.gather(UInt32, tile_of, perm)
     dr.eval(entries, tile_of)
-    first, end = dr.zeros(UInt32, tiles), dr.zeros(UInt32, tiles)
+    return _Tiles(entries, tile_of, first, end)
+
+
+def sorted_buckets(keys: Any, buckets: int) -> tuple[Any, Any, Any]:
+    """Return (permutation that sorts `keys` stably, first place of each bucket, end of each bucket)."""
+    UInt32, total = mi.UInt32, dr.width(keys)
+    # On the CPU one counting pass sorts, stably. On the GPU that pass is stable for few buckets only.
+    on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
+    perm = dr.detail.block_mkperm(keys, total, buckets) if on_cpu else dr.argsort(keys)
+    ordered = dr.gather(UInt32, keys, perm)
+    dr.eval(ordered)
+    first, end = dr.zeros(UInt32, buckets), dr.zeros(UInt32, buckets)
     j = dr.arange(UInt32, total)
     is_last = j + 1 == dr.opaque(UInt32, total)
-    following = dr.gather(UInt32, tile_of, j + 1, active=~is_last)
-    edge = is_last | (following != tile_of)
-    dr.scatter(end, j + 1, tile_of, active=edge)
+    following = dr.gather(UInt32, ordered, j + 1, active=~is_last)
+    edge = is_last | (following != ordered)
+    dr.scatter(end, j + 1, ordered, active=edge)
     dr.scatter(first, j + 1, following, active=edge & ~is_last)
     dr.eval(first, end)
-    return _Tiles(entries, tile_of, first, end)
+    return perm, first, end
 
 
 def _block_bits(
@@ -275,7 +284,9 @@ def _written_out(
     stop = dr.cumsum(count)
     dr.eval(count, stop)
     start = stop - count
-    entries = dr.empty(UInt32, max(int(stop[-1]), 1))
+    total = int(stop[-1])
+    # An array of one would be taken for a scalar.
+    entries = dr.empty(UInt32, total) if total > 1 else dr.zeros(UInt32, 2)
 
     def emit(w, word, base, place, begin, end, part, first_entry, words, tile_entries, entries):
         load = word == 0

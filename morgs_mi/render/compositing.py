@@ -17,34 +17,34 @@ only the blended value itself. Alpha is blended as one more column of ones.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cache
 from math import log, log2
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from .blocks import BlockLists, fetch_record, pack_records, pixel_grid
+from .blocks import BlockLists, fetch_record, pack_records, pixel_grid, sorted_buckets
 from .config import RenderConfig
 
-__all__ = ["Plan", "blend"]
+__all__ = ["Layout", "blend"]
 
 _LN2 = log(2.0)
 _GEOMETRY = 6  # mean_x, mean_y, a, b, c, log2_opacity
 
 
 @dataclass(frozen=True)
-class Plan:
-    """What one call of `blend` works on; the loops are traced for exactly this.
+class Layout:
+    """What the loops are traced for: one recording for each.
 
     Attributes:
-        lists: the blocks and who touches them.
         attached: for each blended column, whether its gradient reaches the weights.
         alpha_attached: whether the gradient of alpha is wanted.
         config: cut-offs.
     """
 
-    lists: BlockLists
     attached: tuple[bool, ...]
     alpha_attached: bool
     config: RenderConfig
@@ -60,13 +60,16 @@ def pixel_stride(columns: int) -> int:
     return -(-(columns + 1) // 4) * 4
 
 
-def blend(geometry: tuple[Any, ...], channels: list[tuple[Any, ...]], plan: Plan, num_pixels: int) -> list[Any]:
+def blend(
+    geometry: tuple[Any, ...], channels: list[tuple[Any, ...]], lists: BlockLists, layout: Layout, num_pixels: int
+) -> list[Any]:
     """Blend every channel's columns over an image.
 
     Args:
         geometry: (mean_x, mean_y, a, b, c, log2_opacity), six floats [N].
         channels: per channel its columns, floats [N]; C columns in all.
-        plan: lists and layout.
+        lists: the blocks and who touches them.
+        layout: what the gradients reach, and cut-offs.
         num_pixels: width x height.
 
     Returns:
@@ -74,29 +77,47 @@ def blend(geometry: tuple[Any, ...], channels: list[tuple[Any, ...]], plan: Plan
         divide by, for forward mode clears the gradients of what is used further. Differentiable in `geometry` and
         `channels` by `dr.backward` and `dr.forward`.
     """
-    sizes = [len(channel) for channel in channels]
-    return dr.custom(
-        _Blend, [*geometry, *(column for channel in channels for column in channel)], plan, num_pixels, sizes
-    )
+    columns = [column for channel in channels for column in channel]
+    return dr.custom(_Blend, [*geometry, *columns], lists, layout, num_pixels, [len(channel) for channel in channels])
+
+
+@cache
+def _frozen(loop: Callable[..., Any], layout: Layout, variant: str) -> Callable[..., Any]:
+    """Return a traced loop as a function of arrays alone, recorded once for each layout and variant.
+
+    Tracing it anew would cost several ms per call. The layout must not be an argument of the recording:
+    Dr.Jit 1.5 tells Python values apart by a hash in which two booleans can cancel.
+    """
+    return dr.freeze(lambda *arrays: loop(layout, *arrays), warn_after=1000)
 
 
 class _Blend(dr.CustomOp):
-    def eval(self, values: list[Any], plan: Plan, num_pixels: int, sizes: list[int]) -> list[Any]:
-        self.plan, self.num_pixels, self.sizes = plan, num_pixels, [*sizes, 1, 1]
-        self.stride = pixel_stride(len(plan.attached))
-        self.records = pack_records(values, plan.lists.by_rank)
-        self.image = _blend(self.records, _zeros(num_pixels * self.stride), plan)
+    def eval(
+        self, values: list[Any], lists: BlockLists, layout: Layout, num_pixels: int, sizes: list[int]
+    ) -> list[Any]:
+        self.lists, self.layout, self.num_pixels, self.sizes = lists, layout, num_pixels, [*sizes, 1, 1]
+        self.stride = pixel_stride(len(layout.attached))
+        self.records = pack_records(values, lists.by_rank)
+        self.image = self._run(_blend, self.records, _zeros(num_pixels * self.stride))
         return self._split(self.image)
 
     def backward(self) -> None:
-        plan, lists = self.plan, self.plan.lists
-        C, skipped = len(plan.attached), 0 if plan.reaches_weights else _GEOMETRY
+        lists, layout = self.lists, self.layout
+        C, skipped = len(layout.attached), 0 if layout.reaches_weights else _GEOMETRY
         packets = -(-(_GEOMETRY + C - skipped) // 4)
-        sums = _zeros(_ladder(dr.width(lists.by_rank)) * packets * 4)
-        sums = _adjoint(self.records, self.image, self._joined(self.grad_out()), sums, plan)
+        pairs, N = layout.config.reproducible, dr.width(lists.by_rank)
+        sums = _zeros((dr.width(lists.entries) if pairs else _ladder(N)) * packets * 4)
+        sums = self._run(_adjoint, self.records, self.image, self._joined(self.grad_out()), sums)
+        if pairs:
+            sums = _summed_by_rank(sums, lists.entries, N, packets)
         lane = lists.rank_of * (4 * packets)
         columns = [dr.gather(mi.Float, sums, lane + k) for k in range(_GEOMETRY + C - skipped)]
         self.set_grad_in("values", [mi.Float(0)] * skipped + columns)
+
+    def _run(self, loop: Callable[..., Any], *arrays: Any) -> Any:
+        # The maps of length N play no part in the loops; a recording is tied to what it is given.
+        walked = replace(self.lists, rank_of=None, by_rank=None)
+        return _frozen(loop, self.layout, mi.variant())(walked, *arrays)
 
     def _split(self, image: Any) -> list[Any]:
         """Cut an image of `stride` floats per pixel into one array per channel, alpha and alpha again."""
@@ -117,13 +138,13 @@ class _Blend(dr.CustomOp):
         return image + dr.zeros(mi.Float, self.num_pixels * self.stride)
 
     def _firsts(self) -> list[int]:
-        C = len(self.plan.attached)
+        C = len(self.layout.attached)
         return [min(sum(self.sizes[:k]), C) for k in range(len(self.sizes))]
 
     def forward(self) -> None:
         grads = [dr.zeros(mi.Float, 1) + g for g in list(self.grad_in("values"))]  # type: ignore[call-overload]
-        tangents = pack_records(grads, self.plan.lists.by_rank)
-        image = _tangent(self.records, tangents, _zeros(self.num_pixels * self.stride), self.plan)
+        tangents = pack_records(grads, self.lists.by_rank)
+        image = self._run(_tangent, self.records, tangents, _zeros(self.num_pixels * self.stride))
         self.set_grad_out(self._split(image))
 
     def name(self) -> str:
@@ -138,8 +159,8 @@ class _Blend(dr.CustomOp):
 class _Block:
     """The lanes' blocks: their pixels, their stretch of the lists, and the shape they are unrolled in."""
 
-    def __init__(self, plan: Plan) -> None:
-        lists, config = plan.lists, plan.config
+    def __init__(self, layout: Layout, lists: BlockLists) -> None:
+        config = layout.config
         self.width, self.height = config.block_shape(dr.backend_v(mi.Float) == dr.JitBackend.CUDA)
         self.area = self.width * self.height
         self.log_min, self.alpha_max = log2(config.alpha_min), config.alpha_max
@@ -235,10 +256,9 @@ def _load(block: _Block, image: Any, C: int) -> list[list[Any]]:
 # --------------------------------------------------------------------------------------------------
 
 
-@dr.freeze(warn_after=1000)
-def _blend(records: Any, image: Any, plan: Plan) -> Any:
+def _blend(layout: Layout, lists: BlockLists, records: Any, image: Any) -> Any:
     """Blend the records' columns into `image`, which comes as zeros."""
-    block, C = _Block(plan), len(plan.attached)
+    block, C = _Block(layout, lists), len(layout.attached)
 
     def body(j, end, x, y, T, sums, records, entries):
         record = fetch_record(records, dr.gather(mi.UInt32, entries, j), _GEOMETRY + C)
@@ -259,7 +279,7 @@ def _blend(records: Any, image: Any, plan: Plan) -> Any:
         _floats(block.area, 1.0),
         sums,
         records,
-        plan.lists.entries,
+        lists.entries,
     )
     *_, T, sums, _, _ = dr.while_loop(
         state, lambda j, end, x, y, T, *_: block.continues(j, end, T), body, label="blend"
@@ -274,12 +294,14 @@ def _blend(records: Any, image: Any, plan: Plan) -> Any:
 # --------------------------------------------------------------------------------------------------
 
 
-@dr.freeze(warn_after=1000)
-def _adjoint(records: Any, image: Any, image_grad: Any, sums: Any, plan: Plan) -> Any:
-    """Add dL/d(value) of every rank to its record in `sums`: the six geometry floats if any, the C columns."""
-    block, C, geometric = _Block(plan), len(plan.attached), plan.reaches_weights
+def _adjoint(layout: Layout, lists: BlockLists, records: Any, image: Any, image_grad: Any, sums: Any) -> Any:
+    """Add dL/d(value) of every rank to its record in `sums`: the six geometry floats if any, the C columns.
+
+    Where results must be reproducible, every pair of Gaussian and block has a record of its own instead.
+    """
+    block, C, geometric = _Block(layout, lists), len(layout.attached), layout.reaches_weights
     gradients = _load(block, image_grad, C)
-    suffix = [_inner(g, v, plan, v[C]) for g, v in zip(gradients, _load(block, image, C), strict=True)]
+    suffix = [_inner(g, v, layout, v[C]) for g, v in zip(gradients, _load(block, image, C), strict=True)]
     length = C + (_GEOMETRY if geometric else 0)
     packets = -(-length // 4)
     on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
@@ -299,7 +321,7 @@ def _adjoint(records: Any, image: Any, image_grad: Any, sums: Any, plan: Plan) -
             value_grads = [dr.fma(w, g_c, total) for g_c, total in zip(g[k], value_grads, strict=False)]
             T_next.append(T[k] - w)
             if geometric:
-                gc = _inner(g[k], values, plan, None)
+                gc = _inner(g[k], values, layout, None)
                 s = dr.fma(-w, gc, S[k])
                 S_next.append(s)
                 d = dr.fma(w, gc, -alpha * s * dr.rcp(1 - alpha))
@@ -308,18 +330,40 @@ def _adjoint(records: Any, image: Any, image_grad: Any, sums: Any, plan: Plan) -
         grads += _floats(packets * 4 - length)
         for k in range(packets):
             packet = mi.Vector4f(*grads[4 * k : 4 * k + 4])
-            dr.scatter_reduce(dr.ReduceOp.Add, sums, packet, rank * packets + k, mode=mode)
+            if layout.config.reproducible:
+                dr.scatter(sums, packet, j * packets + k, mode=dr.ReduceMode.NoConflicts)
+            else:
+                dr.scatter_reduce(dr.ReduceOp.Add, sums, packet, rank * packets + k, mode=mode)
         return j + 1, end, x, y, T_next, S_next, g, records, entries, sums
 
     if not geometric:
         suffix = []
     light = _floats(block.area, 1.0)
-    entries = plan.lists.entries
+    entries = lists.entries
     state = (block.start, block.end, block.x, block.y, light, suffix, gradients, records, entries, sums)
     *_, sums = dr.while_loop(
         state, lambda j, end, x, y, T, *_: block.continues(j, end, T), body, label="blend (adjoint)"
     )
     return sums
+
+
+def _summed_by_rank(pairs: Any, entries: Any, N: int, packets: int) -> Any:
+    """Sum the records of all pairs of a rank, one lane per rank, in the order of the blocks."""
+    perm, first, end = sorted_buckets(entries, N)
+
+    def add(k, sums, end, perm, pairs):
+        pair = dr.gather(mi.UInt32, perm, k) * packets
+        sums = [a + dr.gather(mi.Vector4f, pairs, pair + i) for i, a in enumerate(sums)]
+        return k + 1, sums, end, perm, pairs
+
+    state = (first, [mi.Vector4f(0) for _ in range(packets)], end, perm, pairs)
+    _, sums, *_ = dr.while_loop(state, lambda k, sums, end, *_: k < end, add, label="sum of pairs")
+    total = dr.empty(mi.Float, N * packets * 4)
+    lane = dr.arange(mi.UInt32, N) * packets
+    for i, packet in enumerate(sums):
+        dr.scatter(total, packet, lane + i, mode=dr.ReduceMode.NoConflicts)
+    dr.eval(total)
+    return total
 
 
 def _ladder(n: int) -> int:
@@ -328,12 +372,12 @@ def _ladder(n: int) -> int:
     return -(-n // step) * step
 
 
-def _inner(g: list[Any], values: list[Any], plan: Plan, alpha: Any) -> Any:
+def _inner(g: list[Any], values: list[Any], layout: Layout, alpha: Any) -> Any:
     """Return <g, values> over the attached columns, plus g_alpha alpha; `alpha` None stands for 1."""
     total = None
-    if plan.alpha_attached:
-        total = g[len(plan.attached)] if alpha is None else g[len(plan.attached)] * alpha
-    for g_c, c, attached in zip(g, values, plan.attached, strict=False):
+    if layout.alpha_attached:
+        total = g[len(layout.attached)] if alpha is None else g[len(layout.attached)] * alpha
+    for g_c, c, attached in zip(g, values, layout.attached, strict=False):
         if attached:
             total = g_c * c if total is None else dr.fma(g_c, c, total)
     return mi.Float(0) if total is None else total
@@ -383,10 +427,9 @@ class _Moments:
 # --------------------------------------------------------------------------------------------------
 
 
-@dr.freeze(warn_after=1000)
-def _tangent(records: Any, tangents: Any, image: Any, plan: Plan) -> Any:
+def _tangent(layout: Layout, lists: BlockLists, records: Any, tangents: Any, image: Any) -> Any:
     """Write the directional derivative along the records' tangents into `image`, which comes as zeros."""
-    block, C = _Block(plan), len(plan.attached)
+    block, C = _Block(layout, lists), len(layout.attached)
 
     def body(j, end, x, y, T, dT, dsums, records, tangents, entries):
         rank = dr.gather(mi.UInt32, entries, j)
@@ -406,7 +449,7 @@ def _tangent(records: Any, tangents: Any, image: Any, plan: Plan) -> Any:
             dT_next.append(dT[k] - tw)
             dsums_next.append(
                 [
-                    dr.fma(w, tangent[_GEOMETRY + i], dr.fma(tw, values[i], total) if plan.attached[i] else total)
+                    dr.fma(w, tangent[_GEOMETRY + i], dr.fma(tw, values[i], total) if layout.attached[i] else total)
                     for i, total in enumerate(dsums[k])
                 ]
             )
@@ -414,9 +457,9 @@ def _tangent(records: Any, tangents: Any, image: Any, plan: Plan) -> Any:
 
     dsums = [_floats(C) for _ in range(block.area)]
     light, dlight = _floats(block.area, 1.0), _floats(block.area)
-    entries = plan.lists.entries
+    entries = lists.entries
     state = (block.start, block.end, block.x, block.y, light, dlight, dsums, records, tangents, entries)
     _, _, _, _, _, dT, dsums, *_ = dr.while_loop(
         state, lambda j, end, x, y, T, *_: block.continues(j, end, T), body, label="blend (tangent)"
     )
-    return _store(block, dsums, [-t if plan.alpha_attached else mi.Float(0) for t in dT], image)
+    return _store(block, dsums, [-t if layout.alpha_attached else mi.Float(0) for t in dT], image)

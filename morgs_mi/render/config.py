@@ -23,6 +23,9 @@ class RenderConfig:
     """Pixels across in the block that one SIMD lane owns; None: 8 on the CPU, 4 on the GPU."""
     block_height: int | None = None
     """Pixels down in that block; None: 4."""
+    reproducible: bool = False
+    """Sum gradients in a fixed order: the same bytes on every run and any number of threads. A step takes 1.5 to 1.9
+    times as long (20k and 100k Gaussians, two cores), and 48 bytes for every pair of Gaussian and block."""
 
     def __post_init__(self) -> None:
         for name in ("block_width", "block_height"):

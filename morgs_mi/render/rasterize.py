@@ -13,7 +13,7 @@ import numpy as np
 from ..capture.camera import Camera
 from ..gaussians.gaussians import ActivatedGaussians
 from .blocks import build_lists
-from .compositing import Plan, blend
+from .compositing import Layout, blend
 from .config import RenderConfig
 from .projection import CHANNEL_SIZES, project
 
@@ -93,7 +93,7 @@ def rasterize(
         or any(name in blended and name not in detach_weights for name in _NORMALISED)
     )
     values = [splats.channels[name] for name in blended]
-    *parts, alpha, coverage = blend(splats.shape, values, Plan(lists, attached, alpha_attached, config), W * H)
+    *parts, alpha, coverage = blend(splats.shape, values, lists, Layout(attached, alpha_attached, config), W * H)
     images = {"alpha": alpha}
     for name, value in zip(blended, parts, strict=True):
         behind = dr.repeat(dr.detach(coverage) if name in detach_weights else coverage, CHANNEL_SIZES[name])

@@ -222,6 +222,28 @@ def test_gradients_of_a_dense_scene():
         assert relative(np.asarray(dr.grad(getattr(gaussians, name))), expected[name]) < 10 * tol.GRADIENT_REL, name
 
 
+def test_reproducible_gradients_have_the_same_bytes_and_the_same_values():
+    raw, camera = as_float32(make_scene(1, 400, seed=9)), make_camera(120, 90)
+
+    def gradients(config, threads):
+        dr.set_thread_count(threads)
+        gaussians = to_gaussians(raw, grad=True)
+        image = rasterize(gaussians, camera, ("color", "alpha"), config=config)
+        dr.backward(dr.sum(dr.sin(5 * image.color), axis=None) + dr.sum(image.alpha, axis=None))
+        return {name: np.array(dr.grad(value)) for name, value in gaussians.items().items()}
+
+    threads = dr.thread_count()
+    try:
+        runs = [gradients(RenderConfig(reproducible=True), n) for n in (threads, 1, threads, 3)]
+        fast = gradients(RenderConfig(), threads)
+    finally:
+        dr.set_thread_count(threads)
+    for name, expected in runs[0].items():
+        assert all(np.array_equal(run[name], expected) for run in runs), name
+        if np.abs(expected).max() > 0:
+            assert relative(fast[name], expected) < tol.GRADIENT_REL, name
+
+
 def test_equal_depths_keep_the_order_of_the_input():
     raw = as_float32(make_scene(0, 2))
     raw["means"][:] = 0
