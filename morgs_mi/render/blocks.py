@@ -149,7 +149,12 @@ def _tile_rectangles(
 
 def _tile_lists(x0: Any, y0: Any, columns: Any, counts: Any, stride: Any, tiles: int) -> _Tiles:
     """Enter every rank into the tiles of its rectangle and sort by tile."""
-    UInt32 = mi.UInt32
+    UInt32, N = mi.UInt32, dr.width(counts)
+    if N * tiles >= 2**32 and (entries := dr.sum(mi.Float64(counts))[0]) >= 2**32:
+        raise ValueError(
+            f"rasterize(): the lists must have fewer than 2^32 entries, got {entries:.3g} for {N} Gaussians in "
+            f"{tiles} tiles; make the Gaussians smaller or fewer, or render the image in parts."
+        )
     offsets = dr.cumsum(counts)
     total = int(offsets[-1])  # the one number that must reach the host: the size of the lists
     if total == 0:
@@ -163,7 +168,7 @@ def _tile_lists(x0: Any, y0: Any, columns: Any, counts: Any, stride: Any, tiles:
         column, tile = dr.select(wrap, 0, column + 1), dr.select(wrap, tile + stride, tile)
         return k + 1, column, tile, first, columns, counts, rank, stride, tile_of, rank_at
 
-    rank = dr.arange(UInt32, dr.width(counts))
+    rank = dr.arange(UInt32, N)
     state = (
         UInt32(0),
         UInt32(0),
