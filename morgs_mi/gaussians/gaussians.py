@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["ActivatedGaussians", "Gaussians", "sigmoid"]
+__all__ = ["ActivatedGaussians", "Gaussians", "repeated", "sigmoid"]
 
 
 class ActivatedGaussians(Protocol):
@@ -58,6 +58,29 @@ class ActivatedGaussians(Protocol):
 def sigmoid(x: Any) -> Any:
     """Return 1 / (1 + exp(-x)); finite with a finite gradient for every finite x."""
     return 0.5 + 0.5 * dr.tanh(0.5 * x)
+
+
+def repeated(x: Any, count: int) -> Any:
+    """Return every element of a float [N] `count` times in a row, [N * count].
+
+    Dr.Jit's own `repeat` gathers, so its adjoint adds atomically, in an order of its own; this one sums blocks.
+    """
+    return dr.custom(_Repeated, x, count) if count > 1 else x
+
+
+class _Repeated(dr.CustomOp):
+    def eval(self, x: Any, count: int) -> Any:
+        self.count = count
+        return dr.repeat(x, count)
+
+    def backward(self) -> None:
+        self.set_grad_in("x", dr.block_sum(self.grad_out(), self.count))
+
+    def forward(self) -> None:
+        self.set_grad_out(dr.repeat(self.grad_in("x"), self.count))
+
+    def name(self) -> str:
+        return "morgs_mi.repeated"
 
 
 def _aligned_tensor(value: Any) -> Any:

@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.gaussians.gaussians import Gaussians, sigmoid
+from morgs_mi.gaussians.gaussians import Gaussians, repeated, sigmoid
 from morgs_mi.motion.config import MotionConfig
 
 __all__ = ["apply_residual", "join_sh", "residual_parameters", "split_sh"]
@@ -68,7 +68,7 @@ def apply_residual(previous: Gaussians, parameters: Mapping[str, Any], config: M
         if gate is None:
             return change
         width = change.array.shape[0] // len(previous)
-        return mi.TensorXf(dr.repeat(gate, width) * change.array, tuple(change.shape))
+        return mi.TensorXf(repeated(gate, width) * change.array, tuple(change.shape))
 
     motion = gated("motion")
     shift = motion + gated("offset") if "offset" in parameters else motion

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from ..capture.camera import Camera
-from ..gaussians.gaussians import ActivatedGaussians
+from ..gaussians.gaussians import ActivatedGaussians, repeated
 from .blocks import build_lists
 from .compositing import Layout, blend
 from .config import RenderConfig
@@ -70,6 +70,8 @@ def rasterize(
     Raises:
         ValueError: an unknown channel, a channel whose attribute is missing, NaN or infinite attributes.
 
+    Equal depths are blended in the order of the input. A quaternion of length 0 does not rotate. What lies before
+    the camera's near plane or beyond 1e18 units, and what overflows float32 once projected, is not drawn.
     It does not antialias beyond `eps2d`, and it does not undistort lenses.
     """
     config = config or RenderConfig()
@@ -96,7 +98,7 @@ def rasterize(
     *parts, alpha, coverage = blend(splats.shape, values, lists, Layout(attached, alpha_attached, config), W * H)
     images = {"alpha": alpha}
     for name, value in zip(blended, parts, strict=True):
-        behind = dr.repeat(dr.detach(coverage) if name in detach_weights else coverage, CHANNEL_SIZES[name])
+        behind = repeated(dr.detach(coverage) if name in detach_weights else coverage, CHANNEL_SIZES[name])
         if name in _NORMALISED:
             value = dr.select(behind > 0, value / dr.maximum(behind, 1e-8), 0)
         elif name == "color" and background is not None:
