@@ -52,7 +52,9 @@ class Activated:
 # --------------------------------------------------------------------------------------------------
 
 
-def twin(values: dict[str, Any], camera: Camera, alpha_min: float = 1 / 255, alpha_max: float = 0.99) -> dict[str, Any]:
+def twin(
+    values: dict[str, Any], camera: Camera, alpha_min: float = 1 / 255, alpha_max: float = 0.99, viewmat: Any = None
+) -> dict[str, Any]:
     with np.errstate(all="ignore"):
 
         def logit(x):  # of 1 it is infinite; 60 has the same sigmoid
@@ -71,7 +73,7 @@ def twin(values: dict[str, Any], camera: Camera, alpha_min: float = 1 / 255, alp
         return reference.rasterize(
             raw,
             np.float32(camera.K).astype(np.longdouble),
-            np.asarray(camera.viewmat).astype(np.longdouble),
+            np.asarray(camera.viewmat).astype(np.longdouble) if viewmat is None else viewmat,
             camera.width,
             camera.height,
             BACKGROUND,
@@ -364,6 +366,27 @@ def test_forward_and_reverse_mode_are_dual_at_the_extremes():
         if not abs(forward - reverse) <= tol.DUALITY_REL * abs(reverse):
             wrong.append(f"{case.name}: forward {forward:.7g}, reverse {reverse:.7g}")
     assert not wrong
+
+
+def test_gradients_of_the_pose_at_the_extremes():
+    """Column by column: turning a world at 1e5 units moves things 1e5 times as far as shifting it."""
+    wrong = []
+    for case in CASES:
+        camera, exact = case.camera, np.zeros((3, 4))
+        posed = Camera(camera.K, mi.TensorXf(np.float32(camera.viewmat)), camera.width, camera.height, near=camera.near)
+        dr.enable_grad(posed.viewmat)
+        weight = weights(twin(case.values, camera), clear_pixels(case.values, camera))
+        run(case.values, posed, weight)
+        found = np.asarray(dr.grad(posed.viewmat), np.float64)[:3]
+        for index in np.ndindex(*exact.shape):
+            nudged = camera.viewmat.astype(np.clongdouble)
+            nudged[index] += 1e-30j
+            image = twin(case.values, camera, viewmat=nudged)
+            exact[index] = sum(np.sum(image[c].imag * weight[c]) for c in CHANNELS) / 1e-30
+        off = np.abs(found - exact).max(axis=0) / np.maximum(np.abs(exact).max(axis=0), 1e-30)
+        if not (off <= case.gradient).all():
+            wrong.append(f"{case.name}: columns off by {off}, bound {case.gradient:.1e}")
+    assert not wrong, "\n".join(wrong)
 
 
 # --------------------------------------------------------------------------------------------------
