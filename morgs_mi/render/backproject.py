@@ -8,12 +8,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..capture.camera import Camera
-from ..gaussians.gaussians import ActivatedGaussians
-from .blocks import build_lists
-from .compositing import Layout, blend
-from .config import RenderConfig
-from .projection import project
+from morgs_mi.capture.camera import Camera
+from morgs_mi.gaussians.gaussians import ActivatedGaussians
+from morgs_mi.render.blocks import build_lists
+from morgs_mi.render.compositing import Layout, blend
+from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.projection import project
 
 __all__ = ["backproject"]
 

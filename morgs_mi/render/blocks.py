@@ -18,8 +18,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from .config import RenderConfig
-from .projection import Splats
+from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.projection import Splats
 
 __all__ = ["BlockLists", "build_lists", "fetch_record", "pack_records", "pixel_grid", "sorted_buckets"]
 

@@ -24,9 +24,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..capture.camera import Camera
-from ..gaussians.gaussians import ActivatedGaussians
-from .config import RenderConfig
+from morgs_mi.capture.camera import Camera
+from morgs_mi.gaussians.gaussians import ActivatedGaussians
+from morgs_mi.render.config import RenderConfig
 
 __all__ = ["CHANNEL_SIZES", "Splats", "project"]
 

@@ -10,12 +10,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from ..capture.camera import Camera
-from ..gaussians.gaussians import ActivatedGaussians, repeated
-from .blocks import build_lists
-from .compositing import Layout, blend
-from .config import RenderConfig
-from .projection import CHANNEL_SIZES, project
+from morgs_mi.capture.camera import Camera
+from morgs_mi.gaussians.gaussians import ActivatedGaussians, repeated
+from morgs_mi.render.blocks import build_lists
+from morgs_mi.render.compositing import Layout, blend
+from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.projection import CHANNEL_SIZES, project
 
 __all__ = ["Image", "rasterize"]
 
