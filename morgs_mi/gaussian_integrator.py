@@ -27,9 +27,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from .capture.camera import Camera
-from .gaussians.gaussians import ActivatedGaussians
-from .render.rasterize import rasterize
+from morgs_mi.capture.camera import Camera
+from morgs_mi.gaussians.gaussians import ActivatedGaussians
+from morgs_mi.render.rasterize import rasterize
 
 __all__ = ["ellipsoids"]
 
