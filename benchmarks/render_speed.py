@@ -1,169 +1,192 @@
-"""Time one optimisation step of the renderer on a workload, beside a yardstick if there is one.
+"""Time the renderer: one optimisation step on a workload, or a ladder of sizes, beside what else there is.
 
-    python benchmarks/render_speed.py --workload W1.npz --json out.json [--yardstick BIN]
+    python benchmarks/render_speed.py --workload W1.npz --json out.json [--yardstick BIN] [--baselines]
+    python benchmarks/render_speed.py [--quick] --json out.json --csv out.csv --plot out.png [--baselines]
 
-A workload holds `means [N,3]`, `quats [N,4]` wxyz, `scales [N,3]`, `opacities [N]`, `colors [N,3]`, `K [3,3]`,
-`viewmat [4,4]`, `width`, `height`. The whole step is: projection, lists, forward, L1 loss against a constant,
-adjoint, the projection's adjoint, and the gradients of all attributes in memory. The yardstick is a program
-`BIN FILE.bin REPETITIONS THREADS` that prints the median of its own whole step; the two are run in turns.
+The whole step is: projection, lists, forward, L1 loss against a constant, adjoint, the projection's adjoint, and the
+gradients of all attributes in memory. All programs run in turns, so that they meet the same noise: compare ratios.
+Without `--workload` it climbs a ladder, one property at a time: Gaussians, image size, size of the splats, channels.
 """
 
 from __future__ import annotations
 
+import csv
 import json
 import platform
-import re
-import subprocess
-import tempfile
-import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
+import timing
 import tyro
+import workloads
 
 import morgs_mi
-from morgs_mi import Camera, Gaussians, rasterize
-from morgs_mi.render.blocks import build_lists
-from morgs_mi.render.config import RenderConfig
-from morgs_mi.render.projection import project
-
-TARGET = (0.4, 0.5, 0.6)
-SH_C0 = 0.28209479177387814
+from morgs_mi import Camera, Gaussians
+from morgs_mi.evaluate.report import machine, versions
+from morgs_mi.render.projection import CHANNEL_SIZES
 
 
 @dataclass(frozen=True)
 class Options:
     """What to time and where to write it."""
 
-    workload: Path
-    """File .npz, see the module docstring."""
+    workload: Path | None = None
+    """File .npz with one workload; the ladder if left out."""
     json: Path | None = None
     """Where the figures go; standard output if left out."""
     yardstick: Path | None = None
-    """Program to run on the same workload."""
+    """Program to run on the same workloads."""
     repeats: int = 9
     """Timed repetitions per round; the median counts."""
     rounds: int = 3
-    """Rounds; ours and the yardstick's take turns, so that both meet the same noise."""
+    """Rounds; ours, the yardstick's and the baselines' take turns, so that all meet the same noise."""
     variant: str = "llvm_ad_rgb"
     """Mitsuba variant."""
+    baselines: bool = False
+    """Also time Mitsuba's volprim_rf_basic and a renderer with one lane per pixel."""
+    quick: bool = False
+    """A short ladder, under a minute."""
+    csv: Path | None = None
+    """The ladder as a table."""
+    plot: Path | None = None
+    """The ladder as a picture; needs matplotlib."""
+    seed: int = 1
+    """Of the ladder's Gaussians and of the pixels whose error is measured."""
 
 
-def load(path: Path) -> tuple[Gaussians, Camera]:
-    """Return the workload's Gaussians, SH degree 0, and its camera."""
-    z = np.load(path)
-    sh = ((z["colors"] - 0.5) / SH_C0)[:, None, :]
-    gaussians = Gaussians.from_activated(z["means"], z["scales"], z["quats"], z["opacities"], sh)
-    return gaussians, Camera(z["K"], z["viewmat"].astype(float), int(z["width"]), int(z["height"]))
+def figures(
+    gaussians: Gaussians,
+    camera: Camera,
+    channels: tuple[str, ...],
+    options: Options,
+    patience: float = float("inf"),
+) -> dict[str, Any]:
+    """Return medians over the rounds, their ratios, memory and error for one workload."""
+    ours = timing.stages(gaussians, camera, channels)
+    others, left_out = timing.baselines(gaussians, camera, channels) if options.baselines else ({}, {})
+    yardstick = timing.Yardstick(options.yardstick) if options.yardstick and channels == ("color",) else None
+    rounds: list[dict[str, float]] = []
+    for _ in range(options.rounds):
+        row = timing.measure(ours, options.repeats, patience)
+        if yardstick:
+            row["yardstick_step"] = yardstick.step(gaussians, camera, options.repeats)
+        # What takes a hundred times longer is measured well enough by one run.
+        row |= timing.measure(others, options.repeats, patience=0.5)
+        rounds.append(row)
+
+    result: dict[str, Any] = {f"{key}_ms": round(median(r[key] for r in rounds), 3) for key in rounds[0]}
+    for key in ("yardstick_step", "plain_step", "volprim_step"):
+        if key in rounds[0]:
+            ratios = [r["step"] / r[key] for r in rounds]
+            result[f"ratio_to_{key.removesuffix('_step')}"] = round(median(ratios), 4)
+            if key == "yardstick_step":
+                result["ratio_per_round"] = [round(r, 3) for r in ratios]
+    if left_out:
+        result["left_out"] = left_out
+    result["peak_megabytes"] = timing.peak_megabytes(ours["step"])
+    result |= timing.extent(gaussians, camera)
+    return result | timing.error(gaussians, camera, options.seed)
 
 
-def timed(work: Any, repeats: int) -> float:
-    """Return the median time of `work` in ms, synchronised, after two runs of warm-up."""
-    times = []
-    for _ in range(repeats + 2):
-        dr.sync_thread()
-        start = time.perf_counter()
-        dr.eval(work())
-        dr.sync_thread()
-        times.append(1e3 * (time.perf_counter() - start))
-    return median(times[2:])
+def time_workload(path: Path, options: Options) -> dict[str, Any]:
+    """Return the figures of one workload file."""
+    gaussians, camera = workloads.load(path)
+    return figures(gaussians, camera, ("color",), options) | {
+        "workload": path.name,
+        "gaussians": len(gaussians),
+        "size": [camera.width, camera.height],
+        "threads": dr.thread_count(),
+        "machine": f"{platform.machine()}, {machine()['processor']}",
+        "versions": {"mitsuba": mi.__version__, "drjit": dr.__version__, "python": platform.python_version()},
+        "variant": options.variant,
+        "package": morgs_mi.__name__,
+    }
 
 
-def measure(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str, float]:
-    """Return ms for lists (with projection), forward (with lists) and the whole step, and for tracing alone."""
-    config, target = RenderConfig(), dr.opaque(mi.Float, 0)
-    target = mi.TensorXf(np.broadcast_to(np.float32(TARGET), (camera.height, camera.width, 3)).copy())
-    dr.enable_grad(*gaussians.items().values())
-
-    def lists() -> Any:
-        with dr.suspend_grad():
-            built = build_lists(project(gaussians, camera, ("color",), config), camera.width, camera.height, config)
-        return built.entries, built.order
-
-    def forward() -> Any:
-        with dr.suspend_grad():
-            return rasterize(gaussians, camera, ("color",)).color
-
-    def step() -> Any:
-        image = rasterize(gaussians, camera, ("color",)).color
-        dr.backward(dr.mean(dr.abs(image - target), axis=None))
-        grads = [dr.grad(v) for v in gaussians.items().values()]
-        dr.eval(grads)
-        for value in gaussians.items().values():
-            dr.clear_grad(value)
-        return grads
-
-    return {name: timed(work, repeats) for name, work in (("lists", lists), ("forward", forward), ("step", step))}
+def climb(options: Options) -> dict[str, Any]:
+    """Return the figures of every rung of the ladder."""
+    if options.quick:
+        options = replace(options, rounds=min(options.rounds, 2), repeats=min(options.repeats, 5))
+    rows = []
+    for rung in workloads.QUICK if options.quick else workloads.FULL:
+        gaussians, camera = workloads.build(rung, options.seed)
+        row: dict[str, Any] = {"name": rung.name, "series": rung.series, "gaussians": rung.count}
+        row |= {"size": list(rung.size), "scale": rung.scale, "channels": list(rung.channels)}
+        row |= {"columns": sum(CHANNEL_SIZES.get(name, 0) for name in rung.channels)}
+        row |= figures(gaussians, camera, rung.channels, options, patience=0.7 if options.quick else 2)
+        print(
+            f"{rung.name:30s} lists {row['lists_ms']:8.1f}  forward {row['forward_ms']:8.1f}  "
+            f"step {row['step_ms']:8.1f} ms  {row['peak_megabytes']:8.1f} MB  error {row['error_max']:.1e}",
+            flush=True,
+        )
+        rows.append(row)
+    return {"rungs": rows, "seed": options.seed, "threads": dr.thread_count(), "machine": machine()} | {
+        "versions": versions()
+    }
 
 
-def write_bin(workload: Path, path: Path) -> None:
-    """Write the workload in the yardstick's format."""
-    z = np.load(workload)
-    with path.open("wb") as file:
-        np.array([len(z["means"]), z["width"], z["height"]], np.int32).tofile(file)
-        for name in ("means", "quats", "scales", "opacities", "colors", "K", "viewmat"):
-            z[name].astype(np.float32).tofile(file)
-        np.float32([*TARGET, 0, 0, 0]).tofile(file)
+def write_csv(rows: list[dict[str, Any]], path: Path) -> None:
+    """Write one line per rung; lists of words are joined, what a rung lacks stays empty."""
+    names = list(dict.fromkeys(name for row in rows for name in row if name not in ("left_out", "ratio_per_round")))
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, names, extrasaction="ignore", lineterminator="\n")
+        writer.writeheader()
+        for row in rows:
+            writer.writerow({k: " ".join(map(str, v)) if isinstance(v, list) else v for k, v in row.items()})
 
 
-def run_yardstick(program: Path, workload: Path, repeats: int, threads: int) -> float:
-    """Return the yardstick's own median of its whole step in ms."""
-    output = subprocess.run(
-        [program.resolve(), workload, str(repeats), str(threads)], capture_output=True, text=True, check=True
-    ).stdout
-    found = re.search(r"fwd\+bwd ms: median ([\d.]+)", output)
-    if not found:
-        raise SystemExit(f"{program}: expected a line 'fwd+bwd ms: median ...', got {output!r}")
-    return float(found[1])
+def plot(rows: list[dict[str, Any]], path: Path) -> None:
+    """Draw time and memory against the pixels on the lists, log-log."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(13, 5.5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    x = [row["listed_megapixels"] for row in rows]
+    for key, mark in (
+        ("lists", "v"),
+        ("forward", "o"),
+        ("step", "s"),
+        ("yardstick_step", "x"),
+        ("plain_step", "+"),
+        ("volprim_step", "*"),
+    ):
+        points = [(a, row[f"{key}_ms"]) for a, row in zip(x, rows, strict=True) if f"{key}_ms" in row]
+        if points:
+            left.plot(*zip(*sorted(points), strict=True), mark, label=key.replace("_", ", "), linestyle="none")
+    largest = max(rows, key=lambda row: row["step_ms"])
+    slope = largest["step_ms"] / largest["listed_megapixels"]
+    left.plot([min(x), max(x)], [slope * min(x), slope * max(x)], "k:", linewidth=1, label="linear")
+    right.plot(x, [row["peak_megabytes"] for row in rows], "s", color="C4", label="peak of a step, Dr.Jit")
+    right.plot(x, [4e-6 * row["pairs"] for row in rows], "v", color="C0", label="fine lists, 4 bytes a pair")
+    for axis, key in ((left, "step_ms"), (right, "peak_megabytes")):
+        for a, row in zip(x, rows, strict=True):
+            axis.annotate(row["name"], (a, row[key]), xytext=(5, 4), textcoords="offset points", fontsize=6)
+        axis.set(xscale="log", yscale="log", xlabel="pixels that the listed Gaussians may touch, millions")
+        axis.margins(0.12)
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=8)
+    left.set_ylabel("ms")
+    right.set_ylabel("MB")
+    figure.savefig(path, dpi=80)
 
 
 def main(options: Options) -> None:
     """Run the rounds and write the medians."""
     mi.set_variant(options.variant)
-    gaussians, camera = load(options.workload)
-    threads = dr.thread_count()
-    rounds: list[dict[str, float]] = []
-    with tempfile.TemporaryDirectory() as folder:
-        binary = Path(folder) / "workload.bin"
-        write_bin(options.workload, binary)
-        for _ in range(options.rounds):
-            figures = measure(gaussians, camera, options.repeats)
-            if options.yardstick:
-                figures["yardstick_step"] = run_yardstick(options.yardstick, binary, options.repeats, threads)
-            rounds.append(figures)
-
-    result: dict[str, Any] = {f"{key}_ms": round(median(r[key] for r in rounds), 3) for key in rounds[0]}
-    if options.yardstick:
-        ratios = [r["step"] / r["yardstick_step"] for r in rounds]
-        result["ratio_to_yardstick"] = round(median(ratios), 3)
-        result["ratio_per_round"] = [round(r, 3) for r in ratios]
-    result |= {
-        "workload": options.workload.name,
-        "gaussians": len(gaussians),
-        "size": [camera.width, camera.height],
-        "threads": threads,
-        "machine": f"{platform.machine()}, {_cpu()}",
-        "versions": {"mitsuba": mi.__version__, "drjit": dr.__version__, "python": platform.python_version()},
-        "variant": options.variant,
-        "package": morgs_mi.__name__,
-    }
+    result = time_workload(options.workload, options) if options.workload else climb(options)
     text = json.dumps(result, indent=2)
     if options.json:
         options.json.write_text(text + "\n")
-    print(text)
-
-
-def _cpu() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor()
+    if options.workload or not options.json:
+        print(text)
+    if options.csv:
+        write_csv(result.get("rungs", [result]), options.csv)
+    if options.plot:
+        plot(result.get("rungs", [{**result, "name": result.get("workload")}]), options.plot)
 
 
 if __name__ == "__main__":

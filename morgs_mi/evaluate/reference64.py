@@ -9,8 +9,8 @@ The adjoint of the blend is written by hand: with g the gradient at a pixel and 
     dL/dalpha_i = T_i <g, c_i> - S_i / (1 - alpha_i),
 
 and its chain through A = opacity exp(-sigma) likewise. Eleven numbers (centre, size, rotation, opacity) make a splat
-of nine with its colour; that Jacobian comes from complex steps, which are exact to rounding: derivatives written a third time would
-only share the renderer's mistakes.
+of nine, colour included; that Jacobian comes from complex steps, exact to rounding: derivatives written once more by
+hand might share the renderer's mistakes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Twin:
 
     Attributes:
         raw: raw attributes by name, as `Gaussians.numpy()` gives them.
-        camera: the view; its pose and intrinsics are rounded to float32 as the renderer's are.
+        camera: the view; its intrinsics are rounded to float32, as the renderer takes them.
         config: `eps2d`, `alpha_min` and `alpha_max` count, the rest is ignored.
     """
 
@@ -49,10 +49,7 @@ class Twin:
     def render(self, pixels: np.ndarray) -> np.ndarray:
         """Return colour and alpha [P, 4] at the pixels [P, 2] (column, row)."""
         splats, values, order = self._splats()
-        images = [
-            np.einsum("pn,nc->pc", weights, values[order]) for _, _, weights, *_ in self._blended(splats, order, pixels)
-        ]
-        return np.concatenate(images)
+        return np.concatenate([w @ values[order] for _, _, w, *_ in self._blended(splats, order, pixels)])
 
     def gradients(self, pixels: np.ndarray, gradient: np.ndarray) -> dict[str, np.ndarray]:
         """Return dL/d(attribute) by name, given dL/d(colour, alpha) [P, 4] at the pixels [P, 2]."""
@@ -120,7 +117,7 @@ class Twin:
 
 
 def _pose(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    view = np.asarray(np.float32(camera.viewmat), np.float64)
+    view = np.asarray(camera.viewmat, np.float64)
     return view[:3, :3], view[:3, 3]
 
 

@@ -1,0 +1,183 @@
+"""Timing, peak memory and error of one workload, and the programs it is compared with."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import plain
+from workloads import TARGET, write_bin
+
+from morgs_mi import Camera, Gaussians, RenderConfig, ellipsoids, rasterize
+from morgs_mi.evaluate.reference64 import Twin
+from morgs_mi.render.blocks import build_lists
+from morgs_mi.render.projection import project
+
+# Pairs of pixel and Gaussian that the float64 twin is asked for.
+_TWIN_PAIRS = 20_000_000
+# Mitsuba's integrator traces rays through a hierarchy: beyond this a step takes many seconds.
+VOLPRIM_GAUSSIANS, VOLPRIM_PIXELS = 20_000, 512 * 384
+
+
+def timed(work: Callable[[], Any], repeats: int, patience: float = float("inf")) -> float:
+    """Return the median time of `work` in ms, synchronised, after two runs of warm-up.
+
+    Once `patience` seconds are spent, one run of warm-up and one timed one have to do.
+    """
+    times: list[float] = []
+    while len(times) < repeats + 2 and (len(times) < 2 or sum(times) < 1e3 * patience):
+        dr.sync_thread()
+        start = time.perf_counter()
+        dr.eval(work())
+        dr.sync_thread()
+        times.append(1e3 * (time.perf_counter() - start))
+    return median(times[2:] or times[1:])
+
+
+def stages(
+    gaussians: Gaussians, camera: Camera, channels: tuple[str, ...] = ("color",)
+) -> dict[str, Callable[[], Any]]:
+    """Return what is timed: lists (with projection), forward (with lists) and the whole step with its gradients."""
+    config = RenderConfig()
+    shape = (camera.height, camera.width, 3)
+    targets = {"color": mi.TensorXf(np.broadcast_to(np.float32(TARGET), shape).copy())}
+    dr.enable_grad(*gaussians.items().values())
+
+    def lists() -> Any:
+        with dr.suspend_grad():
+            built = build_lists(project(gaussians, camera, channels, config), camera.width, camera.height, config)
+        return built.entries, built.order
+
+    def forward() -> Any:
+        with dr.suspend_grad():
+            image = rasterize(gaussians, camera, channels)
+            return [getattr(image, name) for name in channels]
+
+    def step() -> Any:
+        image = rasterize(gaussians, camera, channels)
+        errors = (dr.abs(getattr(image, name) - targets.get(name, 0.5)) for name in channels)
+        dr.backward(sum(dr.mean(error, axis=None) for error in errors))
+        grads = [dr.grad(v) for v in gaussians.items().values()]
+        dr.eval(grads)
+        for value in gaussians.items().values():
+            dr.clear_grad(value)
+        return grads
+
+    return {"lists": lists, "forward": forward, "step": step}
+
+
+def measure(works: dict[str, Callable[[], Any]], repeats: int, patience: float = float("inf")) -> dict[str, float]:
+    """Return the median ms of every piece of work."""
+    return {name: timed(work, repeats, patience) for name, work in works.items()}
+
+
+def extent(gaussians: Gaussians, camera: Camera) -> dict[str, float]:
+    """Return how much there is to draw: pairs of Gaussian and block on the lists, and their pixels in millions."""
+    config = RenderConfig()
+    with dr.suspend_grad():
+        lists = build_lists(project(gaussians, camera, (), config), camera.width, camera.height, config)
+        pairs = int(dr.sum(mi.UInt64(lists.count))[0])
+    width, height = config.block_shape(dr.backend_v(mi.Float) == dr.JitBackend.CUDA)
+    return {"pairs": pairs, "listed_megapixels": round(1e-6 * pairs * width * height, 3)}
+
+
+def peak_megabytes(work: Callable[[], Any]) -> float:
+    """Return the most memory that Dr.Jit has held at once while `work` was done, in MB, inputs included."""
+    dr.sync_thread()
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    dr.eval(work())
+    dr.sync_thread()
+    return round(1e-6 * dr.detail.malloc_watermark(dr.backend_v(mi.Float)), 1)
+
+
+def error(gaussians: Gaussians, camera: Camera, seed: int) -> dict[str, float]:
+    """Return the colour's largest and RMS error against float64 at a sample of pixels."""
+    count = max(16, min(256, _TWIN_PAIRS // len(gaussians)))
+    chosen = np.random.default_rng(seed).choice(camera.width * camera.height, count, replace=False)
+    pixels = np.stack([chosen % camera.width, chosen // camera.width], axis=1)
+    with dr.suspend_grad():
+        image = np.asarray(rasterize(gaussians, camera, ("color",)).color, np.float64)
+    twin = Twin(gaussians.numpy(), camera, RenderConfig()).render(pixels)[:, :3]
+    difference = image[pixels[:, 1], pixels[:, 0]] - twin
+    figures = {"error_max": np.abs(difference).max(), "error_rms": np.sqrt(np.mean(difference**2))}
+    return {name: float(f"{value:.3g}") for name, value in figures.items()}
+
+
+def plain_stages(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[], Any]]:
+    """Return forward and whole step of the one-lane-per-pixel renderer."""
+    config = RenderConfig()
+    return {
+        "plain_forward": lambda: plain.render(gaussians, camera, config),
+        "plain_step": lambda: plain.step(gaussians, camera, TARGET, config),
+    }
+
+
+def volprim_stages(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[], Any]]:
+    """Return forward and whole step of Mitsuba's own `volprim_rf_basic` over the same Gaussians, one sample a pixel."""
+    scene: Any = mi.load_dict(
+        {
+            "type": "scene",
+            "gaussians": ellipsoids(gaussians),
+            "sensor": camera.sensor(),
+            "integrator": {"type": "volprim_rf_basic", "srgb_primitives": False},
+        }
+    )
+    params = mi.traverse(scene)
+    names = [f"gaussians.{name}" for name in ("data", "opacities", "sh_coeffs")]
+    dr.enable_grad([params[name] for name in names])
+    params.update()
+
+    def forward() -> Any:
+        with dr.suspend_grad():
+            return mi.render(scene, spp=1)
+
+    def step() -> Any:
+        image = mi.render(scene, params, spp=1)[..., :3]
+        dr.backward(dr.mean(dr.abs(image - 0.5), axis=None))
+        grads = [dr.grad(params[name]) for name in names]
+        dr.eval(grads)
+        for name in names:
+            dr.clear_grad(params[name])
+        return grads
+
+    return {"volprim_forward": forward, "volprim_step": step}
+
+
+def baselines(gaussians: Gaussians, camera: Camera, channels: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the baselines' stages for this workload, and why others are left out."""
+    if channels != ("color",):
+        return {}, {"baselines": "they render colour only"}
+    works = plain_stages(gaussians, camera)
+    if len(gaussians) > VOLPRIM_GAUSSIANS or camera.width * camera.height > VOLPRIM_PIXELS:
+        reason = f"a step beyond {VOLPRIM_GAUSSIANS} Gaussians or {VOLPRIM_PIXELS} pixels takes many seconds"
+        return works, {"volprim": reason}
+    return works | volprim_stages(gaussians, camera), {}
+
+
+class Yardstick:
+    """A program `BIN FILE.bin REPETITIONS THREADS` that prints the median of its own whole step."""
+
+    def __init__(self, program: Path) -> None:
+        self.program = program.resolve()
+
+    def step(self, gaussians: Gaussians, camera: Camera, repeats: int) -> float:
+        """Return its own median of its whole step in ms."""
+        with tempfile.TemporaryDirectory() as folder:
+            workload = Path(folder) / "workload.bin"
+            write_bin(gaussians, camera, workload)
+            command = [self.program, workload, str(repeats), str(dr.thread_count())]
+            output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        found = re.search(r"fwd\+bwd ms: median ([\d.]+)", output)
+        if not found:
+            raise SystemExit(f"{self.program}: expected a line 'fwd+bwd ms: median ...', got {output!r}")
+        return float(found[1])

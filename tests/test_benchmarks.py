@@ -1,0 +1,108 @@
+"""The speed benchmark as a command: a workload beside a yardstick, and what the ladder's files hold."""
+
+from __future__ import annotations
+
+import csv
+import json
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parent.parent
+TOOL = ROOT / "benchmarks" / "render_speed.py"
+# What a yardstick prints, from a program that checks what it is given: 60 Gaussians on 40x24 pixels.
+YARDSTICK = """#!/bin/sh
+[ "$(wc -c < "$1")" = $((3 * 4 + 60 * 14 * 4 + 25 * 4 + 6 * 4)) ] || exit 1
+[ "$2" = 2 ] && [ "$3" -ge 1 ] || exit 1
+echo "forward ms: median 1.0"
+echo "fwd+bwd ms: median 0.5 min 0.4"
+"""
+
+
+@pytest.fixture
+def workload(tmp_path: Path) -> Path:
+    """Sixty Gaussians in front of a small camera."""
+    rng, path = np.random.default_rng(0), tmp_path / "tiny.npz"
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[2, 3] = 3
+    np.savez(
+        path,
+        means=np.float32(rng.uniform(-1, 1, (60, 3))),
+        quats=np.float32(rng.normal(size=(60, 4))),
+        scales=np.full((60, 3), 0.1, np.float32),
+        opacities=np.full(60, 0.6, np.float32),
+        colors=np.float32(rng.uniform(size=(60, 3))),
+        K=np.float32([[40, 0, 20], [0, 40, 12], [0, 0, 1]]),
+        viewmat=viewmat,
+        width=40,
+        height=24,
+    )
+    return path
+
+
+def run(*args: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, TOOL, *map(str, args)], capture_output=True, text=True, cwd=ROOT)
+
+
+def test_a_workload_beside_a_yardstick(workload: Path, tmp_path: Path):
+    yardstick, out = tmp_path / "yardstick", tmp_path / "out.json"
+    yardstick.write_text(YARDSTICK)
+    yardstick.chmod(yardstick.stat().st_mode | stat.S_IXUSR)
+    done = run("--workload", workload, "--json", out, "--yardstick", yardstick, "--repeats", 2, "--rounds", 1)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(out.read_text())
+    assert json.loads(done.stdout) == result
+    for stage in ("lists_ms", "forward_ms", "step_ms", "peak_megabytes", "pairs"):
+        assert result[stage] > 0, stage
+    assert result["yardstick_step_ms"] == 0.5
+    assert result["ratio_to_yardstick"] == pytest.approx(result["step_ms"] / 0.5, rel=1e-2)
+    assert len(result["ratio_per_round"]) == 1
+    assert result["error_rms"] <= result["error_max"] < 2e-4
+    assert (result["gaussians"], result["size"], result["workload"]) == (60, [40, 24], "tiny.npz")
+    assert {"machine", "versions", "variant", "threads"} <= result.keys()
+
+
+def test_baselines_and_the_table(workload: Path, tmp_path: Path):
+    out, table = tmp_path / "out.json", tmp_path / "out.csv"
+    done = run("--workload", workload, "--json", out, "--csv", table, "--baselines", "--repeats", 1, "--rounds", 1)
+    assert done.returncode == 0, done.stderr
+    result = json.loads(out.read_text())
+    for name in ("plain_forward_ms", "plain_step_ms", "volprim_forward_ms", "volprim_step_ms", "ratio_to_plain"):
+        assert result[name] > 0, name
+    with table.open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert float(row["step_ms"]) == result["step_ms"]
+    assert row["size"] == "40 24"
+
+
+@pytest.fixture
+def plain(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    import plain
+
+    return plain
+
+
+def test_the_plain_baseline_draws_the_same(plain):
+    """It would be no baseline if it did other work."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from morgs_mi import RenderConfig, rasterize
+    from morgs_mi.evaluate.renderer_report import ball
+
+    gaussians, camera = ball(2, 300, 50, 38, 0.1)
+    config, target = RenderConfig(stop_transmittance=0), (3.0, 4.0, 5.0)  # beyond any colour: no sign is in doubt
+    dr.enable_grad(*gaussians.items().values())
+    image = rasterize(gaussians, camera, ("color",), config=config).color
+    assert np.abs(np.asarray(plain.render(gaussians, camera, config)) - np.asarray(dr.detach(image))).max() < 2e-5
+    found = [np.asarray(grad) for grad in plain.step(gaussians, camera, target, config)]
+    dr.backward(dr.mean(dr.abs(image - mi.TensorXf(np.tile(np.float32(target), (38, 50, 1)))), axis=None))
+    for (name, value), grad in zip(gaussians.items().items(), found, strict=True):
+        expected = np.asarray(dr.grad(value))
+        assert np.abs(expected).max() > 0
+        assert np.abs(grad - expected).max() < 1e-3 * np.abs(expected).max(), name
