@@ -211,7 +211,7 @@ LIFT[:3, 3] = -FAR
 BLOCKS = np.stack(np.meshgrid(np.arange(8) * 8 + 4.0, np.arange(8) * 4 + 2.0), -1).reshape(-1, 2)
 SLOW_TWIN = {"every_entry": False}
 
-# Errors reached on a 2-core x86, 80-bit twin: image at most 4e-6, gradients at most 1e-5 (4e-5 for needles across the
+# Errors reached on a 2-core x86, 80-bit twin: image at most 6e-6, gradients at most 2e-5 (4e-5 for needles across the
 # screen), unless a comment says more. What does not work: an aspect beyond 1e6 is drawn at 1e6, because a float32
 # rotation aims no better; beyond 1e18 units nothing is drawn; depths that a float32 cannot tell apart are equal.
 CASES = [
