@@ -76,7 +76,7 @@ def rasterize(
     """
     config = config or RenderConfig()
     channels = tuple(dict.fromkeys(channels))
-    _check(gaussians, camera, channels, detach_weights)
+    _check(gaussians, camera, channels, background, detach_weights)
     W, H = camera.width, camera.height
     blended = tuple(c for c in channels if c != "alpha")
     if dr.prod(gaussians.means.shape[:1]) == 0:
@@ -98,12 +98,13 @@ def rasterize(
     *parts, alpha, coverage = blend(splats.shape, values, lists, Layout(attached, alpha_attached, config), W * H)
     images = {"alpha": alpha}
     for name, value in zip(blended, parts, strict=True):
-        behind = repeated(dr.detach(coverage) if name in detach_weights else coverage, CHANNEL_SIZES[name])
+        weight = dr.detach(coverage) if name in detach_weights else coverage
         if name in _NORMALISED:
-            value = dr.select(behind > 0, value / dr.maximum(behind, 1e-8), 0)
+            weight = repeated(weight, CHANNEL_SIZES[name])
+            value = dr.select(weight > 0, value / dr.maximum(weight, 1e-8), 0)
         elif name == "color" and background is not None:
             backdrop = dr.gather(mi.Float, mi.Float(np.float32(background)), dr.arange(mi.UInt32, W * H * 3) % 3)
-            value = dr.fma(1 - behind, backdrop, value)
+            value = dr.fma(1 - repeated(weight, 3), backdrop, value)
         images[name] = value
     return Image(**{n: mi.TensorXf(images[n], (H, W, CHANNEL_SIZES.get(n, 1))) for n in channels})
 
@@ -117,7 +118,11 @@ def _empty(channels: tuple[str, ...], background: Sequence[float] | None, W: int
 
 
 def _check(
-    gaussians: ActivatedGaussians, camera: Camera, channels: tuple[str, ...], detach_weights: Sequence[str]
+    gaussians: ActivatedGaussians,
+    camera: Camera,
+    channels: tuple[str, ...],
+    background: Sequence[float] | None,
+    detach_weights: Sequence[str],
 ) -> None:
     if mi.variant() is None or not dr.is_jit_v(mi.Float) or not dr.is_diff_v(mi.Float):
         raise ValueError(
@@ -133,6 +138,8 @@ def _check(
                 f"rasterize(): channel {name!r} needs Gaussians that carry it, got none; "
                 f"set `{'motion' if name == 'motion' else 'logit_confidence'}` or leave the channel out."
             )
+    if background is not None and not (np.shape(background) == (3,) and np.isfinite(background).all()):
+        raise ValueError(f"rasterize(): `background` must be three finite numbers, got {background!r}.")
     if camera.width * camera.height > 2**28:
         raise ValueError(
             f"rasterize(): the image must have at most 2^28 pixels, got {camera.width}x{camera.height}; "

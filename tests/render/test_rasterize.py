@@ -304,6 +304,9 @@ def test_bad_calls_say_what_was_expected(scene):
     raw, camera = scene
     with pytest.raises(ValueError, match="`channels` must be out of color, alpha"):
         rasterize(to_gaussians(raw), camera, ("colour",))
+    for background in ((1, 2), 0.5, (0, 0, np.nan)):
+        with pytest.raises(ValueError, match="`background` must be three finite numbers"):
+            rasterize(to_gaussians(raw), camera, background=background)
     bare = {k: v for k, v in raw.items() if k not in ("motion", "logit_confidence")}
     with pytest.raises(ValueError, match="channel 'motion' needs Gaussians that carry it"):
         rasterize(to_gaussians(bare), camera, ("motion",))
