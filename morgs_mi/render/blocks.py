@@ -243,6 +243,24 @@ def _block_bits(
             touches = (dr.fma(u1, u1, v * v) <= reach) | (dr.fma(u2, u2, v2 * v2) <= reach)
             mask |= dr.select(touches, UInt32(1 << (j * _ACROSS + i)), UInt32(0))
 
+    # Over the tile, u^2 + v^2 is largest at a corner: a lower bound of alpha, so an upper bound of the light that
+    # is left behind an entry. What no light can reach in any block is not listed; it would not have been blended.
+    def distance(x: Any, y: Any) -> Any:
+        u, v = dr.fma(a, x, b * y), c * y
+        return dr.fma(u, u, v * v)
+
+    x0, x1, y0, y1 = columns[0][0], columns[-1][1], py + 0.5, py + (_DOWN * bh - 0.5)
+    farthest = distance(x0, y0)
+    for x, y in ((x0, y1), (x1, y0), (x1, y1)):
+        farthest = dr.maximum(farthest, distance(x, y))
+    alpha = dr.select(farthest < reach - 2 * _TEST_SLACK, dr.exp2(log2_opacity - farthest), 0)
+    dimming = dr.log2(1 - dr.minimum(alpha, config.alpha_max))
+    dr.eval(mask, dimming)
+    behind = dr.prefix_sum(mi.Float64(dimming))
+    light = behind - dr.gather(mi.Float64, behind, dr.gather(UInt32, tiles.first, tile))
+    # Half an octave is more than the blend's own rounding can lose; with no stop at all nothing is left out.
+    mask = dr.select(light < log2(max(config.stop_transmittance, 1e-38)) - 0.5, 0, mask)
+
     place = dr.gather(UInt32, first_word, tile) * 32 + dr.arange(UInt32, dr.width(tile))
     masks = dr.zeros(UInt32, num_words * 32)
     dr.scatter(masks, mask, place - dr.gather(UInt32, tiles.first, tile), mode=dr.ReduceMode.NoConflicts)
