@@ -1,4 +1,4 @@
-"""The command line: `morgs-mi synth`, `info`, `fit`, `render`, `eval` and `demo`. The only argument parser.
+"""The command line: `morgs-mi synth`, `info`, `fit`, `render`, `eval`, `demo` and `report`. The only argument parser.
 
 Results go to standard output; progress, warnings and complaints to standard error. What the user can set right is
 one sentence and exit status 1, an interruption 130; `--debug` shows where it came from. Arguments that the parser
@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.logging import RichHandler
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -24,6 +25,7 @@ from rich.table import Table
 from tyro.conf import Positional, arg
 
 from morgs_mi.demo import DemoConfig
+from morgs_mi.evaluate.renderer_report import RendererReportConfig
 from morgs_mi.stream_loop import StreamConfig
 
 __all__ = ["main"]
@@ -239,6 +241,35 @@ class Demo:
         _say(f"all figures are in {self.out / 'report.json'}.")
 
 
+@dataclass(frozen=True)
+class RendererReport:
+    """Measure the renderer's settings: error against a float64 twin beside run time."""
+
+    subject: Positional[Literal["renderer"]]
+    """What to report on."""
+    json: Path | None = None
+    """File for all figures; - prints them in place of the tables."""
+    plot: Path | None = None
+    """Picture of error against run time, .png or .svg; needs matplotlib."""
+    config: Annotated[RendererReportConfig, arg(name="")] = field(default_factory=RendererReportConfig)
+
+    def run(self) -> None:
+        from morgs_mi.evaluate.renderer_report import plot_renderer, report_renderer
+        from morgs_mi.files import finite, write_json
+
+        with _progress() as report:
+            result = report_renderer(self.config, report)
+        if self.json == Path("-"):
+            _say(json.dumps(finite(result), indent=2))
+        else:
+            _show_renderer(result)
+        if self.json not in (None, Path("-")):
+            write_json(self.json, result)
+            _say(f"All figures: {self.json}")
+        if self.plot is not None:
+            plot_renderer(result, self.plot)
+
+
 Command = (
     Annotated[Synth, tyro.conf.subcommand("synth")]
     | Annotated[Info, tyro.conf.subcommand("info")]
@@ -246,6 +277,7 @@ Command = (
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[RendererReport, tyro.conf.subcommand("report")]
 )
 
 
@@ -358,6 +390,41 @@ def _show(result: Mapping[str, Any]) -> None:
     )
     if not result["complete"]:
         _warn(f"{result['stream']}: the fit was not finished, its stream holds {result['num_frames']} frames.")
+
+
+def _show_renderer(result: Mapping[str, Any]) -> None:
+    """Print what `report_renderer` has found."""
+    attributes = list(result["rows"][0]["gradients"])
+    for against, pick in (
+        ("no cut-off at all", lambda row: row),
+        ("the same alpha_min (float32 and early stop)", lambda row: row["rounding"]),
+    ):
+        image, gradients = (
+            Table(title=f"{what} against {against}", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+            for what in ("image", "gradients: relative L2 error")
+        )
+        for table in (image, gradients):
+            table.add_column("setting", no_wrap=True)
+        names = (name.replace("_", " ") for name in attributes)
+        for table, columns in (
+            (image, ("forward ms", "step ms", "times default", "max", "RMS", "PSNR dB")),
+            (gradients, (*names, "least cosine")),
+        ):
+            for column in columns:
+                table.add_column(column, justify="right", min_width=max(7, *map(len, column.split())))
+        for row in result["rows"]:
+            errors, name = pick(row), f"{row['knob']} {row['value']}"
+            style = "bold" if row["default"] else None
+            times = (_figure(row["forward_ms"], 1), _figure(row["step_ms"], 1), _figure(row["step_ratio"], 2))
+            pixels = errors["image"]
+            image.add_row(
+                name, *times, f"{pixels['max']:.1e}", f"{pixels['rms']:.1e}", _figure(pixels["psnr"], 1), style=style
+            )
+            found = errors["gradients"].values()
+            cosine = min(gradient["cosine"] for gradient in found)
+            gradients.add_row(name, *(f"{g['relative_l2']:.1e}" for g in found), f"{cosine:.5f}", style=style)
+        _OUT.print(image)
+        _OUT.print(gradients)
 
 
 def _figure(value: float | None, digits: int) -> str:

@@ -28,6 +28,7 @@ from morgs_mi.render.rasterize import rasterize
 
 __all__ = ["RendererReportConfig", "ball", "markdown_table", "plot_renderer", "report_renderer"]
 
+_MARKS = {"block": "s", "reproducible": "D"}
 _EXACT_ALPHA_MIN = 1e-12  # what is fainter changes no float32 image
 
 
@@ -86,6 +87,8 @@ def ladder() -> list[Setting]:
         width, height = (None, None) if shape == own else shape
         config = replace(default, block_width=width, block_height=height)
         settings.append(Setting("block", f"{shape[0]}x{shape[1]}", config))
+    for flag in (False, True):
+        settings.append(Setting("reproducible", str(flag).lower(), replace(default, reproducible=flag)))
     return settings
 
 
@@ -201,7 +204,7 @@ def plot_renderer(result: dict[str, Any], path: str | Path) -> None:
         for knob in dict.fromkeys(row["knob"] for row in result["rows"]):
             rows = [row for row in result["rows"] if row["knob"] == knob]
             points = [(row["step_ratio"], error(row)) for row in rows]
-            axis.plot(*zip(*points, strict=True), "s" if knob == "block" else "o-", label=knob, alpha=0.8, markersize=5)
+            axis.plot(*zip(*points, strict=True), _MARKS.get(knob, "o-"), label=knob, alpha=0.8, markersize=5)
             # Where a knob changes nothing, its labels would lie on one another.
             spread = max(y for _, y in points) > 1.5 * min(y for _, y in points)
             for row, point in zip(rows, points, strict=True):
