@@ -41,6 +41,13 @@ def test_figures_are_those_of_the_committed_demo():
     assert re.search(rf"from {arm[0]['psnr']:.2f} dB\s+to {arm[-1]['psnr']:.2f} dB over {len(arm)}", README)
 
 
+def test_speed_is_that_of_the_committed_benchmark():
+    for workload in ("W1", "W2b"):
+        run = json.loads((ROOT / f"benchmarks/results/render_speed_{workload}.json").read_text(encoding="utf-8"))
+        figures = f"{run['step_ms']:.0f} ms | {run['ratio_to_yardstick']:.2f} x | {run['plain_step_ms']:.0f} ms"
+        assert f"| {figures} |" in README
+
+
 def test_every_command_of_the_readme_exists():
     from morgs_mi.cli import Demo, Eval, Fit, Info, Render, Synth
 
