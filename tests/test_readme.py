@@ -42,10 +42,10 @@ def test_figures_are_those_of_the_committed_demo():
 
 
 def test_speed_is_that_of_the_committed_benchmark():
-    for workload in ("W1", "W2b"):
+    for workload in ("W1", "W2", "W2b"):
         run = json.loads((ROOT / f"benchmarks/results/render_speed_{workload}.json").read_text(encoding="utf-8"))
-        figures = f"{run['step_ms']:.0f} ms | {run['ratio_to_yardstick']:.2f} x | {run['plain_step_ms']:.0f} ms"
-        assert f"| {figures} |" in README
+        plain = f"{run['plain_step_ms']:.0f} ms" if run.get("plain_step_ms") else "not run"
+        assert f"| {run['step_ms']:.0f} ms | {run['ratio_to_yardstick']:.2f} x | {plain} |" in README
 
 
 def test_every_command_of_the_readme_exists():
