@@ -305,7 +305,7 @@ def main(args: Sequence[str] | None = None) -> int:
         _set_up(options)
         options.command.run()
         return 0
-    except (KeyboardInterrupt, ValueError, OSError, MemoryError) as error:
+    except (KeyboardInterrupt, ValueError, OSError, MemoryError, ArithmeticError) as error:
         interrupted = isinstance(error, KeyboardInterrupt)
         sentence = "Interrupted; a stream file is whole up to its last frame." if interrupted else str(error)
         _warn(" ".join(sentence.split()) or f"{type(error).__name__}.")

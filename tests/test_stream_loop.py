@@ -12,7 +12,7 @@ from morgs_mi.capture.capture import Capture, Frame
 from morgs_mi.codec.container import PacketKind, StreamReader, encode_packet
 from morgs_mi.codec.gaussians import decode_gaussians, play
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
-from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.config import FitConfig, Rates
 from morgs_mi.motion.config import MotionConfig
 from morgs_mi.stream_loop import StreamConfig, StreamLoop, stream_capture
 
@@ -199,6 +199,7 @@ def test_a_capture_becomes_a_file(clip, tmp_path):
             r"`point_colors` must be \(200, 3\)",
         ),
         (lambda clip: FitConfig(epochs=0), "`epochs` must be at least 1, got 0"),
+        (lambda clip: Rates(means=np.nan), "`means` must be finite and not negative, got nan"),
         (lambda clip: FitConfig(sh_degree=4), "`sh_degree` must be 0 to 3, got 4"),
         (lambda clip: MotionConfig(flow_method="raft"), "`flow_method` must be one of dis-ultrafast"),
     ],

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from math import inf
 
 __all__ = ["FitConfig", "Rates"]
 
@@ -29,6 +30,11 @@ class Rates:
     """Of the other SH coefficients, a twentieth, as in 3DGS."""
     confidence: float = 0.05
     """Of logit_confidence."""
+
+    def __post_init__(self) -> None:
+        for name, rate in asdict(self).items():
+            if not 0 <= rate < inf:
+                raise ValueError(f"Rates(): `{name}` must be finite and not negative, got {rate}.")
 
     def by_parameter(self, extent: float) -> dict[str, float]:
         """Return the rate of every parameter by its name; `extent` in world units."""
