@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -29,7 +28,8 @@ from morgs_mi.fit.next_frame import fit_next_frame
 from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.gaussians.initialise import from_points, resample_points, scene_extent, seed_points
 from morgs_mi.motion.config import MotionConfig
-from morgs_mi.motion.cues import choose_key_views, motion_cues
+from morgs_mi.motion.cues import MotionCue, choose_key_views, motion_cues
+from morgs_mi.motion.masks import motion_mask
 from morgs_mi.render.config import RenderConfig
 
 __all__ = ["FrameReport", "StreamConfig", "StreamLoop", "StreamState", "step", "stream_capture"]
@@ -122,9 +122,9 @@ def step(
         decoded = decode_gaussians(None, packet)
     else:
         previous, status = state.gaussians, "ok"
-        if state.frame == 1 and setup.config.motion.learn_confidence:
-            previous = _first_confidence(setup, state, images)
         cues = _cues(setup, state, images)
+        if state.frame == 1 and setup.config.motion.learn_confidence:
+            previous = _first_confidence(setup, state, cues)
         gaussians, losses = fit_next_frame(
             previous,
             setup.cameras,
@@ -156,20 +156,20 @@ def _first_gaussians(setup: Setup, images: Sequence[np.ndarray], rng: np.random.
     return from_points(points, colors, setup.config.fit.sh_degree), status
 
 
-def _first_confidence(setup: Setup, state: StreamState, images: Sequence[np.ndarray]) -> Gaussians:
-    """Learn who moves from the first frame's masks, which the second frame alone can tell."""
+def _first_confidence(setup: Setup, state: StreamState, cues: Mapping[int, MotionCue]) -> Gaussians:
+    """Learn who moves from the first frame's masks, which the flow to the second frame alone can tell."""
     assert state.gaussians is not None
-    cues = motion_cues(state.images, images, setup.key_views, setup.config.motion, True, setup.masks)
-    masks = {view: cue.mask for view, cue in cues.items() if cue.mask is not None}
+    masks = {v: motion_mask(state.images[v], cue.onward, cue.onward_reliable) for v, cue in cues.items()}
     fitted, _ = fit_confidence(state.gaussians, setup.cameras, masks, setup.config.fit, setup.config.render, state.rng)
     return fitted
 
 
-def _cues(setup: Setup, state: StreamState, images: Sequence[np.ndarray]) -> Any:
+def _cues(setup: Setup, state: StreamState, images: Sequence[np.ndarray]) -> Mapping[int, MotionCue]:
     """Compute flow on the key views if anything uses it, and masks at keyframes."""
     motion = setup.config.motion
     with_masks = motion.learn_confidence and state.frame % motion.keyframe_interval == 0
-    if not motion.learn_motion and not with_masks:
+    first_masks = motion.learn_confidence and state.frame == 1
+    if not (motion.learn_motion or with_masks or first_masks):
         return {}
     return motion_cues(images, state.images, setup.key_views, motion, with_masks, setup.masks)
 
