@@ -192,8 +192,8 @@ class Eval:
     """File for all figures; - prints them in place of the tables."""
 
     def run(self) -> None:
+        from morgs_mi.evaluate.judge import evaluate_stream
         from morgs_mi.evaluate.report import machine, versions
-        from morgs_mi.evaluate.stream import evaluate_stream
         from morgs_mi.files import finite, write_json
 
         with _progress() as report:

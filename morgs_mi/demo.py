@@ -15,9 +15,10 @@ from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.synth import synthesize
 from morgs_mi.capture.video import write_video
 from morgs_mi.evaluate.frames import PLAYABLE, even
+from morgs_mi.evaluate.judge import evaluate_stream
 from morgs_mi.evaluate.pictures import contact_sheet, label, motion_legend, side_by_side, write_png
 from morgs_mi.evaluate.report import machine, versions
-from morgs_mi.evaluate.stream import channel_picture, evaluate_stream, open_stream, render_stream, truth_on
+from morgs_mi.evaluate.stream import channel_picture, open_stream, render_stream, truth_on
 from morgs_mi.files import write_json
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.stream_loop import StreamConfig, stream_capture

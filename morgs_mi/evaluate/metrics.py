@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import correlate1d
 
-__all__ = ["endpoint_error", "psnr", "ssim"]
+__all__ = ["endpoint_error", "iou", "mean_over", "psnr", "psnr_of", "ssim", "ssim_map", "unit_pair"]
 
 # Wang, Bovik, Sheikh and Simoncelli, "Image quality assessment", TIP 2004.
 WINDOW, SIGMA = 11, 1.5
@@ -26,9 +26,12 @@ def psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -
     Raises:
         ValueError: the sizes differ.
     """
-    image, truth = _pair("psnr", image, truth, mask)
-    squared = np.square(image - truth)
-    error = _mean(squared if mask is None else squared[mask])
+    image, truth = unit_pair("psnr", image, truth, mask)
+    return psnr_of(mean_over(np.square(image - truth), mask))
+
+
+def psnr_of(error: float) -> float:
+    """Return a mean squared error in dB below 1; infinite for 0."""
     return float(-10 * np.log10(error)) if error != 0 else float("inf")
 
 
@@ -46,15 +49,24 @@ def ssim(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -
     Raises:
         ValueError: the sizes differ or are smaller than the window.
     """
-    image, truth = _pair("ssim", image, truth, mask)
+    _check("ssim", image, truth, mask)
+    return mean_over(ssim_map(image, truth), mask)
+
+
+def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Return the similarity (see `ssim`) of the window about each pixel [H - 10, W - 10] where it fits.
+
+    Raises:
+        ValueError: the sizes differ or are smaller than the window.
+    """
+    image, truth = unit_pair("ssim", image, truth)
     if min(image.shape[:2]) < WINDOW:
         raise ValueError(f"ssim(): pictures must be at least {WINDOW}x{WINDOW} pixels, got {image.shape[:2]}.")
     x, y = _blur(image), _blur(truth)
     var_x, var_y = _blur(image**2) - x**2, _blur(truth**2) - y**2
     covariance = _blur(image * truth) - x * y
     similarity = (2 * x * y + C1) * (2 * covariance + C2) / ((x**2 + y**2 + C1) * (var_x + var_y + C2))
-    half = WINDOW // 2
-    return _mean(similarity if mask is None else similarity[mask[half:-half, half:-half]])
+    return similarity.reshape(*similarity.shape[:2], -1).mean(-1)
 
 
 def endpoint_error(motion: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
@@ -72,7 +84,24 @@ def endpoint_error(motion: np.ndarray, truth: np.ndarray, mask: np.ndarray | Non
         raise ValueError(f"endpoint_error(): `motion` must be [H, W, 2], got {motion.shape}.")
     _check("endpoint_error", motion, truth, mask)
     error = np.linalg.norm(np.asarray(motion, np.float64) - truth, axis=-1)
-    return _mean(error if mask is None else error[mask])
+    return mean_over(error, mask)
+
+
+def iou(mask: np.ndarray, truth: np.ndarray) -> float:
+    """Return the intersection of two bool masks [H, W] over their union; NaN where both are empty."""
+    union = np.count_nonzero(mask | truth)
+    return np.count_nonzero(mask & truth) / union if union else float("nan")
+
+
+def mean_over(values: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Return the mean of a map [h, w, ...] over `mask` [H, W], or over all; NaN is that of nothing.
+
+    A map smaller than the mask lies in its middle, as that of `ssim_map` does.
+    """
+    if mask is not None:
+        rows, columns = (slice((n - m) // 2, (n - m) // 2 + m) for n, m in zip(mask.shape, values.shape, strict=False))
+        values = values[mask[rows, columns]]
+    return float(values.mean()) if values.size else float("nan")
 
 
 def _blur(image: np.ndarray) -> np.ndarray:
@@ -84,7 +113,9 @@ def _blur(image: np.ndarray) -> np.ndarray:
     return correlate1d(rows, weights, axis=1)[:, half:-half]
 
 
-def _pair(name: str, image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+def unit_pair(
+    name: str, image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     _check(name, image, truth, mask)
     return _unit(image), _unit(truth)
 
@@ -101,7 +132,3 @@ def _check(name: str, image: np.ndarray, truth: np.ndarray, mask: np.ndarray | N
 def _unit(image: np.ndarray) -> np.ndarray:
     image = np.asarray(image)
     return image / 255.0 if image.dtype == np.uint8 else image.astype(np.float64)
-
-
-def _mean(values: np.ndarray) -> float:
-    return float(values.mean()) if values.size else float("nan")

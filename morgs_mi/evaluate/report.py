@@ -25,7 +25,7 @@ def machine() -> dict[str, Any]:
 
 def versions() -> dict[str, str]:
     """Return the versions of this package, of Python and of the libraries that the figures depend on."""
-    packages = ("morgs-mi", "mitsuba", "drjit", "numpy", "opencv-contrib-python-headless")
+    packages = ("morgs-mi", "mitsuba", "drjit", "numpy", "opencv-contrib-python-headless", "colour-science")
     return {"python": platform.python_version()} | {name: metadata.version(name) for name in packages}
 
 

@@ -1,4 +1,4 @@
-"""Play a stream file: its frames as images, and how far these are from what was recorded.
+"""Play a stream file: its frames as images, its recording and ground truth, and how fast it plays.
 
 Frame t's Gaussians carry their displacement since frame t-1, so that the motion map rendered with them lies on
 frame t's pixel grid and says where each pixel came from, as the ground truth does. Keyframes carry none.
@@ -6,30 +6,38 @@ frame t's pixel grid and says where each pixel came from, as the ground truth do
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from morgs_mi.capture.camera import Camera
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.truth import Truth, load_truth
-from morgs_mi.codec.container import PacketKind, StreamReader, encode_packet
-from morgs_mi.codec.gaussians import play
-from morgs_mi.evaluate.metrics import WINDOW, endpoint_error, psnr, ssim
+from morgs_mi.codec.container import StreamReader
+from morgs_mi.codec.gaussians import decode_gaussians, play
 from morgs_mi.evaluate.pictures import as_picture, confidence_picture, depth_picture, motion_picture
 from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 
-__all__ = ["CHANNELS", "channel_picture", "evaluate_stream", "find_camera", "open_stream", "render_stream", "truth_on"]
+__all__ = [
+    "CHANNELS",
+    "channel_picture",
+    "find_camera",
+    "open_recording",
+    "open_stream",
+    "playback",
+    "render",
+    "render_config",
+    "render_stream",
+    "truth_on",
+]
 
 CHANNELS = ("color", "motion", "confidence", "depth", "alpha")
-_IMAGE_SCORES = ("psnr", "ssim")
-_MOTION_SCORES = ("motion_error", "motion_error_moving", "motion_error_still", "true_motion_moving")
+_TIMED = 30
 
 
 def open_stream(out: str | Path) -> StreamReader:
@@ -79,9 +87,9 @@ def render_stream(
     Raises:
         ValueError: an unknown channel, one that the stream does not hold, or a broken packet.
     """
-    config = _render_config(stream)
+    config = render_config(stream)
     for frame, gaussians in play(stream):
-        yield frame, _render(gaussians, camera, channels or _carried(gaussians), config)
+        yield frame, render(gaussians, camera, channels or _carried(gaussians), config)
 
 
 def channel_picture(name: str, image: np.ndarray, motion_scale: float | None = None) -> np.ndarray:
@@ -98,65 +106,34 @@ def channel_picture(name: str, image: np.ndarray, motion_scale: float | None = N
     return {"confidence": confidence_picture, "depth": depth_picture}.get(name, as_picture)(image)
 
 
-def evaluate_stream(
-    out: str | Path,
-    capture: str | Path | None = None,
-    progress: Callable[[int, int], None] | None = None,
-) -> dict[str, Any]:
-    """Decode a stream and compare it with its recording: in the held-out view, or else in all training views.
+def playback(stream: StreamReader, camera: Camera) -> dict[str, float]:
+    """Time how fast a receiver could show a stream on this machine: decode a frame, render its colour, read it back.
 
-    Args:
-        out: the stream file or its folder; seconds come from the ``report.json`` beside it.
-        capture: the recording; default is where it was when it was fitted.
-        progress: called with (frames done, frames in all).
+    At most the first 30 frames; the first one, which compiles kernels, is left out unless it is the only one.
 
     Returns:
-        What JSON can hold, apart from scores that are infinite or NaN. ``frames`` has a row per frame, ``views`` the
-        mean scores per camera, ``complete`` tells whether all frames that were to be fitted are there, the other
-        entries are the whole clip's: PSNR in dB, SSIM, endpoint error of the rendered
-        motion in pixels against ``truth/`` over the whole image, where the surface moved and where it stood still,
-        the mean true motion where it moved, bytes, seconds. What is unknown is NaN or None.
+        ``fps``, frames per second at the size of `camera`, and the means ``decode_ms`` and ``render_ms``; NaN
+        without a frame.
 
     Raises:
-        FileNotFoundError: the stream or the capture is missing.
-        ValueError: the stream is truncated, broken or empty, or the capture is not the one it was fitted to.
+        ValueError: a broken packet.
     """
-    stream = open_stream(out)
-    # Not from the report: what counts is what a receiver of the file gets.
-    packets = [(packet.frame, packet.kind, len(encode_packet(packet))) for packet in stream]
-    if not packets:
-        raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
-    recording, config, seconds = _recording(stream, capture, packets), _render_config(stream), _seconds(stream.path)
-    views = recording.train_views if recording.test_view is None else (recording.test_view,)
-    rows = []
-    # The file may have grown meanwhile.
-    decoded = play(islice(stream, len(packets)))
-    recorded = recording.frames(packets[0][0], packets[-1][0] + 1)
-    for (index, kind, num_bytes), (_, gaussians), frame in zip(packets, decoded, recorded, strict=True):
-        scores = {}
-        for view in views:
-            camera = stream.cameras[view]
-            images = _render(gaussians, camera, ("color", "motion"), config)
-            truth = truth_on(recording, camera, index) if kind == PacketKind.RESIDUAL else None
-            scores[camera.name] = _scores(images, frame.images[view], recording.masks[view], truth)
-        mean = {name: _mean([score[name] for score in scores.values()]) for name in (*_IMAGE_SCORES, *_MOTION_SCORES)}
-        about = {"frame": index, "kind": kind.name.lower(), "num_bytes": num_bytes, "seconds": seconds.get(index)}
-        rows.append({**about, **mean, "views": scores})
-        if progress is not None:
-            progress(len(rows), len(packets))
-    return {
-        "stream": str(stream.path.resolve()),
-        "capture": str(recording.path.resolve()),
-        "held_out": recording.test_view is not None,
-        "num_frames": len(rows),
-        "complete": len(rows) == stream.metadata.get("num_frames", len(rows)),
-        **_summary(stream.path.stat().st_size, rows),
-        "views": {
-            name: {score: _mean([row["views"][name][score] for row in rows]) for score in _IMAGE_SCORES}
-            for name in rows[0]["views"]
-        },
-        "frames": rows,
-    }
+    config, gaussians, times = render_config(stream), None, []
+    packets = islice(stream, _TIMED)
+    while True:
+        start = time.perf_counter()
+        packet = next(packets, None)
+        if packet is None:
+            break
+        gaussians = decode_gaussians(gaussians, packet)
+        decoded = time.perf_counter()
+        if not times:
+            render(gaussians, camera, ("color",), config)
+        begun = time.perf_counter()
+        as_picture(render(gaussians, camera, ("color",), config)["color"])
+        times.append((decoded - start, time.perf_counter() - begun))
+    decode, show = np.mean(times[1:] or times or [(np.nan, np.nan)], axis=0)
+    return {"fps": float(1 / (decode + show)), "decode_ms": float(1e3 * decode), "render_ms": float(1e3 * show)}
 
 
 def truth_on(capture: Capture, camera: Camera, frame: int) -> Truth | None:
@@ -179,23 +156,35 @@ def _carried(gaussians: Gaussians) -> tuple[str, ...]:
     return ("color", "motion", "depth", *(("confidence",) if gaussians.logit_confidence is not None else ()))
 
 
-def _render(
+def render(
     gaussians: Gaussians, camera: Camera, channels: Sequence[str], config: RenderConfig
 ) -> dict[str, np.ndarray]:
+    """Render channels into float32 arrays [H, W, 1 to 3] by name."""
     image = rasterize(gaussians, camera, channels, config=config)
     return {name: np.array(getattr(image, name)) for name in channels}
 
 
-def _render_config(stream: StreamReader) -> RenderConfig:
+def render_config(stream: StreamReader) -> RenderConfig:
+    """Return the cut-offs that the stream was fitted with."""
     return RenderConfig(**stream.metadata.get("config", {}).get("render", {}))
 
 
-def _recording(stream: StreamReader, capture: str | Path | None, packets: Sequence[tuple[int, Any, int]]) -> Capture:
-    """Open what the stream was fitted to, as it was opened then."""
+def open_recording(stream: StreamReader, capture: str | Path | None, frames: Sequence[int]) -> Capture:
+    """Open what the stream was fitted to, as it was opened then.
+
+    Args:
+        stream: the file.
+        capture: the recording; default is where it was when it was fitted.
+        frames: indices of the stream's frames.
+
+    Raises:
+        FileNotFoundError: the capture is missing.
+        ValueError: the header names none, or it is not the one that was fitted.
+    """
     about = stream.metadata
     if capture is None and "capture" not in about:
         raise ValueError(f"{stream.path}: its header names no capture to compare with; give one (--capture).")
-    frames, path = [frame for frame, *_ in packets], capture or about["capture"]
+    path = capture or about["capture"]
     recording = load_capture(path, about.get("downscale", 1), about.get("test_view", "auto"), frames[-1] + 1)
     expected, found = _sizes(stream.cameras), _sizes(recording.cameras)
     if found != expected:
@@ -213,60 +202,3 @@ def _recording(stream: StreamReader, capture: str | Path | None, packets: Sequen
 
 def _sizes(cameras: Sequence[Camera]) -> dict[str, tuple[int, int]]:
     return {camera.name: (camera.width, camera.height) for camera in cameras}
-
-
-def _scores(
-    images: dict[str, np.ndarray], recorded: np.ndarray, mask: np.ndarray | None, truth: Truth | None
-) -> dict[str, float]:
-    # A decoder shows 8 bits.
-    picture = as_picture(images["color"])
-    small = min(picture.shape[:2]) < WINDOW
-    scores = {"psnr": psnr(picture, recorded, mask), "ssim": float("nan") if small else ssim(picture, recorded, mask)}
-    if truth is None:
-        return scores | dict.fromkeys(_MOTION_SCORES, float("nan"))
-    motion, moving = images["motion"], truth.mask
-    errors = [endpoint_error(motion, truth.motion, where) for where in (None, moving, ~moving)]
-    speed = endpoint_error(np.zeros_like(motion), truth.motion, moving)
-    return scores | dict(zip(_MOTION_SCORES, (*errors, speed), strict=True))
-
-
-def _summary(num_bytes: int, rows: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the whole clip's figures."""
-
-    def packets(kind: str) -> list[int]:
-        return [row["num_bytes"] for row in rows if row["kind"] == kind]
-
-    ends = {
-        name: {"mean": _mean([row[name] for row in rows]), "first": rows[0][name], "last": rows[-1][name]}
-        for name in _IMAGE_SCORES
-    }
-    later = [row["seconds"] for row in rows[1:] if row["seconds"] is not None]
-    return {
-        **ends,
-        **{name: _mean([row[name] for row in rows]) for name in _MOTION_SCORES},
-        "seconds": {"first": rows[0]["seconds"], "per_later_frame": _mean(later)},
-        "bytes": {
-            "file": num_bytes,
-            "header": num_bytes - sum(row["num_bytes"] for row in rows),
-            "per_keyframe": _mean(packets("keyframe")),
-            "per_residual": _mean(packets("residual")),
-        },
-    }
-
-
-def _seconds(stream: Path) -> dict[int, float]:
-    """Return seconds by frame from the report beside the stream, empty without one."""
-    path = stream.with_name("report.json")
-    if not path.is_file():
-        return {}
-    try:
-        report = json.loads(path.read_text(encoding="utf-8"))
-        return {row["frame"]: float(row["seconds"]) for row in report["frames"]}
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected a fit's report, got a broken one ({error!r}); remove it.") from None
-
-
-def _mean(values: Sequence[float]) -> float:
-    """Return the mean of what is known, NaN where nothing is."""
-    known = [value for value in values if not np.isnan(value)]
-    return float(np.mean(known)) if known else float("nan")

@@ -1,0 +1,133 @@
+"""How Gaussians on moving objects moved, in 3D, against the objects' true trajectories.
+
+d_i is a Gaussian's displacement from frame t-1 to frame t, and d*_i that of the surface it lay on at t-1:
+
+1. It lay on the surface of object k if, in some view, the pixel that its centre fell on at t-1 saw k within 1 % of
+   the centre's depth, and no view says the same of another object.
+2. Objects are rigid. k's motion is the rigid one that best carries its tracked points from t-1 to t, exact up to
+   rounding; an object whose tracks do not fit one is left out.
+3. Judged are those with an opacity of at least 0.1 whose d* is at least a tenth of the longest on their object: the
+   others neither show nor have a direction to speak of.
+
+Where a Gaussian went does not matter for whether it is judged, so that one which left its object counts in full.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from morgs_mi.capture.camera import Camera
+from morgs_mi.capture.truth import Truth, project
+
+__all__ = ["compare_motion", "judge_motion", "rigid_motions", "surface_ids"]
+
+_DEPTH_TOLERANCE = 0.01
+_LEAST_OPACITY = 0.1
+_LEAST_SHARE = 0.1
+# Of an object's size: what tracked points may be off a rigid motion, and from one line.
+_RIGID, _FLAT = 1e-4, 1e-3
+
+
+def judge_motion(
+    means: np.ndarray,
+    displacements: np.ndarray,
+    opacities: np.ndarray,
+    tracks: tuple[np.ndarray, np.ndarray, np.ndarray],
+    views: Sequence[tuple[Camera, Truth]],
+) -> dict[str, float]:
+    """Compare the displacements of one frame with the truth; see the module for who is judged.
+
+    Args:
+        means: centres at t-1 [N, 3], world units.
+        displacements: from t-1 to t [N, 3].
+        opacities: [N].
+        tracks: the tracked points at t-1 and at t [P, 3], and their objects' ids [P].
+        views: cameras and what they truly saw at t-1.
+
+    Returns:
+        As `compare_motion`.
+    """
+    ids = surface_ids(means, views)
+    true, judged = np.zeros_like(means, float), np.zeros(len(means), bool)
+    for index, (rotation, shift) in rigid_motions(*tracks).items():
+        own = tracks[2] == index
+        longest = np.linalg.norm(tracks[1][own] - tracks[0][own], axis=-1).max()
+        on = (ids == index) & (opacities >= _LEAST_OPACITY)
+        true[on] = means[on] @ (rotation - np.eye(3)).T + shift
+        judged |= on & (np.linalg.norm(true, axis=-1) >= _LEAST_SHARE * longest)
+    return compare_motion(displacements[judged], true[judged])
+
+
+def compare_motion(motion: np.ndarray, truth: np.ndarray) -> dict[str, float]:
+    """Return how displacements [M, 3] differ from the true ones [M, 3], none of which is 0.
+
+    Returns:
+        ``num_gaussians`` M; ``error``, the mean of |d - d*| in world units; ``true_length``, the mean of |d*|;
+        ``relative_error`` and ``length_ratio``, the means of |d - d*| and of |d| over that of |d*|; ``angle``, the
+        mean angle between d and d* in degrees, 90 for what did not move at all. NaN where M is 0.
+    """
+    if not len(truth):
+        return {"num_gaussians": 0} | dict.fromkeys(
+            ("error", "true_length", "relative_error", "length_ratio", "angle"), float("nan")
+        )
+    length, true_length = np.linalg.norm(motion, axis=-1), np.linalg.norm(truth, axis=-1)
+    error = np.linalg.norm(motion - truth, axis=-1)
+    cosine = (motion * truth).sum(-1) / np.where(length > 0, length * true_length, 1)
+    return {
+        "num_gaussians": len(truth),
+        "error": float(error.mean()),
+        "true_length": float(true_length.mean()),
+        "relative_error": float(error.mean() / true_length.mean()),
+        "length_ratio": float(length.mean() / true_length.mean()),
+        "angle": float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))).mean()),
+    }
+
+
+def surface_ids(points: np.ndarray, views: Sequence[tuple[Camera, Truth]]) -> np.ndarray:
+    """Return the id of the object on whose visible surface each point [N, 3] lies, -1 for none or for several."""
+    ids = np.full(len(points), -1, np.int64)
+    several = np.zeros(len(points), bool)
+    for camera, truth in views:
+        depth = points @ np.asarray(camera.viewmat)[2, :3] + np.asarray(camera.viewmat)[2, 3]
+        front = np.flatnonzero(depth > camera.near)
+        pixels = np.floor(project(camera, points[front])[0])
+        inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
+        front, (column, row) = front[inside], pixels[inside].astype(int).T
+        seen = truth.ids[row, column]
+        on = (seen >= 0) & (np.abs(truth.depth[row, column] - depth[front]) <= _DEPTH_TOLERANCE * depth[front])
+        front, seen = front[on], seen[on]
+        several[front] |= (ids[front] >= 0) & (ids[front] != seen)
+        ids[front] = seen
+    ids[several] = -1
+    return ids
+
+
+def rigid_motions(
+    before: np.ndarray, after: np.ndarray, ids: np.ndarray
+) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
+    """Return rotation [3, 3] and shift [3] of every object that moved, by its id: x -> R x + s.
+
+    Least squares over the object's points (Kabsch 1976). Left out are objects that stand still, that have too few
+    points or points on one line, and that are not rigid.
+
+    Args:
+        before: tracked points [P, 3].
+        after: the same, a frame later.
+        ids: their objects' [P].
+    """
+    found = {}
+    for index in np.unique(ids):
+        p, q = before[ids == index], after[ids == index]
+        if np.array_equal(p, q) or len(p) < 3:
+            continue
+        center, target = p.mean(0), q.mean(0)
+        size = np.linalg.norm(p - center, axis=-1).max()
+        U, spread, Vt = np.linalg.svd((q - target).T @ (p - center) / len(p))
+        rotation = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+        shift = target - rotation @ center
+        off = np.linalg.norm(p @ rotation.T + shift - q, axis=-1).max()
+        if spread[1] > (_FLAT * size) ** 2 and off <= _RIGID * size:
+            found[int(index)] = (rotation, shift)
+    return found
