@@ -103,12 +103,18 @@ def no_video(path: Path) -> tuple[str, ...]:
     return "cam1.mkv", "truncated or no video"
 
 
+def truncated_clip(path: Path) -> tuple[str, ...]:
+    data = (path / "cam1.mkv").read_bytes()
+    (path / "cam1.mkv").write_bytes(data[: len(data) * 2 // 3])
+    return "cam1.mkv: frame ", "cannot be read", "truncated"
+
+
 def broken_json(path: Path) -> tuple[str, ...]:
     (path / "capture.json").write_text("{")
     return ("capture.json: expected JSON",)
 
 
-BROKEN = [no_capture, no_clip, no_calibration, other_length, empty_clip, no_video, broken_json]
+BROKEN = [no_capture, no_clip, no_calibration, other_length, empty_clip, no_video, truncated_clip, broken_json]
 
 
 @pytest.mark.parametrize("spoil", BROKEN)
@@ -121,9 +127,11 @@ def test_a_broken_capture(capture: Path, tmp_path: Path, capsys, spoil) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_truncated_clip_leaves_a_stream_that_says_it_is_not_whole(capture: Path, tmp_path: Path, capsys) -> None:
-    data = (capture / "cam1.mkv").read_bytes()
-    (capture / "cam1.mkv").write_bytes(data[: len(data) * 2 // 3])
+def test_a_clip_cut_off_meanwhile_leaves_a_stream_that_says_it_is_not_whole(
+    capture: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truncated_clip(capture)
+    monkeypatch.setattr("morgs_mi.capture.video._count_packets", lambda path: FRAMES)
     status, _, error = run(capsys, "fit", capture, tmp_path / "out", *QUICK)
     assert status == 1
     assert_one_sentence(error, "cam1.mkv: frame ", "cannot be decoded", "truncated")

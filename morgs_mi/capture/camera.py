@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Camera"]
+__all__ = ["Camera", "rigid"]
 
 # Mitsuba's camera looks along +z with x to the left and y up; OpenCV's has x right and y down.
 _OPENCV_FROM_MITSUBA = np.diag([-1.0, -1.0, 1.0, 1.0])
@@ -127,3 +127,24 @@ class Camera:
                 **film,
             },
         }
+
+
+def rigid(where: str, matrix: np.ndarray) -> np.ndarray:
+    """Return `matrix` [4, 4] (or [3, 4], completed) if it is a rotation and a translation.
+
+    Raises:
+        ValueError: it is not, in a sentence that begins with `where`.
+    """
+    matrix = np.asarray(matrix, dtype=np.float64)
+    if matrix.shape not in ((3, 4), (4, 4)):
+        raise ValueError(f"{where}: the pose must be a matrix [4, 4], got {matrix.shape}; calibrate again.")
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"{where}: the pose must be finite, got {matrix.tolist()}; calibrate again.")
+    R = matrix[:3, :3]
+    # Files with six digits are off by 1e-6, scaled or sheared poses by far more than 1e-3.
+    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
+        raise ValueError(
+            f"{where}: the axes must be a right-handed orthonormal frame, got {R.round(4).tolist()}; "
+            "undo any scaling or mirroring of the poses."
+        )
+    return np.vstack([matrix[:3], [0, 0, 0, 1.0]])

@@ -1,13 +1,7 @@
 """A multi-view recording as the rest of the package sees it: pinhole cameras and their frames.
 
-Layouts (names are ordered numerically, cam_2 before cam_10):
-
-- N3DV: ``cam00.mp4 ...`` beside ``poses_bounds.npy``;
-- a COLMAP model in ``sparse/0`` or ``sparse`` whose images are named after the cameras (``cam01.png`` or
-  ``cam01/0000.png`` for ``cam01.mp4``). It wins over ``poses_bounds.npy``, for it carries principal
-  points and lenses;
-- a camera's frames are ``frames/cam01/*.png`` if present, else ``cam01.mp4``, else the folder ``cam01/``;
-- ``capture.json`` may give ``test_view`` (index or null) and ``fps``; ``truth/`` may hold ground truth.
+`layouts.py` finds out how a folder is laid out, `views.py` where each camera's frames lie. Beside them,
+``capture.json`` may give ``test_view`` (index or null) and ``fps``; ``truth/`` may hold ground truth.
 """
 
 from __future__ import annotations
@@ -15,7 +9,7 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -23,16 +17,13 @@ import cv2
 import numpy as np
 
 from morgs_mi.capture.camera import Camera
-from morgs_mi.capture.colmap import find_colmap, read_colmap
+from morgs_mi.capture.layouts import Calibration, read_calibration
 from morgs_mi.capture.lens import Lens, Undistortion, undistortion
-from morgs_mi.capture.poses_bounds import read_poses_bounds
-from morgs_mi.capture.video import IMAGE_SUFFIXES, VIDEO_SUFFIXES, FrameReader, natural_key, open_frames
+from morgs_mi.capture.video import FrameReader, open_frames
 
 __all__ = ["Capture", "Frame", "load_capture"]
 
 _LOG = logging.getLogger(__name__)
-# Folders of a capture that are no camera's even where they hold images.
-_NOT_CAMERAS = {"frames", "images", "sparse", "truth"}
 _DEFAULT_FPS = 30.0
 
 
@@ -54,6 +45,7 @@ class _Source:
     """Where one camera's frames come from and what undoes its lens."""
 
     reader: FrameReader
+    lens: Lens
     undo: Undistortion | None
 
     def images(self, camera: Camera, start: int, stop: int) -> Iterator[np.ndarray]:
@@ -82,6 +74,7 @@ class Capture:
         test_view: index of the camera held out from training, or None.
         truth: folder of ground truth, or None.
         downscale: the factor that it was opened with.
+        layout: how its folder is laid out, e.g. ``COLMAP``.
     """
 
     path: Path
@@ -95,6 +88,7 @@ class Capture:
     truth: Path | None
     _sources: tuple[_Source, ...] = field(repr=False)
     downscale: float = 1
+    layout: str = ""
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -105,6 +99,33 @@ class Capture:
     def train_views(self) -> tuple[int, ...]:
         """Indices of the cameras that are not held out."""
         return tuple(i for i in range(len(self.cameras)) if i != self.test_view)
+
+    def record(self) -> dict[str, Any]:
+        """Return how the frames come about, for `capture.json` beside a stream: what JSON takes, and small."""
+        views = zip(self.cameras, self._sources, self.masks, strict=True)
+        return {
+            "capture": str(self.path),
+            "layout": self.layout,
+            "frames": self.num_frames,
+            "fps": self.fps,
+            "downscale": self.downscale,
+            "filter": "none" if self.downscale == 1 else "area",
+            "test_view": self.test_view,
+            "points": len(self.points),
+            "cameras": [
+                {
+                    "name": camera.name,
+                    "recorded_size": [source.reader.width, source.reader.height],
+                    "size": [camera.width, camera.height],
+                    "K": camera.K.tolist(),
+                    "lens": source.lens.model,
+                    "distortion": list(source.lens.distortion),
+                    "undistortion": "none" if source.undo is None else "cubic, same intrinsics",
+                    "valid_share": 1.0 if mask is None else float(mask.mean()),
+                }
+                for camera, source, mask in views
+            ],
+        }
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Yield frames start..stop-1, one decoded at a time.
@@ -129,8 +150,8 @@ def load_capture(
     Args:
         path: the folder; see the module for its layouts.
         downscale: images are averaged down by this factor, to the nearest whole size.
-        test_view: index of the camera to hold out, None for none; "auto" takes `capture.json`'s, else 0
-            as N3DV does, or none with fewer than six cameras.
+        test_view: index of the camera to hold out, None for none; "auto" takes `capture.json`'s, else the
+            layout's, else 0 as N3DV does, or none with fewer than six cameras.
         max_frames: use at most this many frames from the start.
 
     Raises:
@@ -146,86 +167,46 @@ def load_capture(
     if max_frames is not None and max_frames < 1:
         raise ValueError(f"load_capture(): `max_frames` must be at least 1 or None, got {max_frames}.")
     settings = _settings(path / "capture.json")
-    cameras, lenses, places, points, point_colors = _calibration(path)
-    readers = [open_frames(place) for place in places]
-    for camera, reader in zip(cameras, readers, strict=True):
-        if (reader.width, reader.height) != (camera.width, camera.height):
-            raise ValueError(
-                f"{reader.path}: expected {camera.width}x{camera.height} as the calibration of {camera.name} "
-                f"says, got {reader.width}x{reader.height}; calibrate at the recorded size."
-            )
-    sources = tuple(_Source(r, undistortion(c, lens)) for r, c, lens in zip(readers, cameras, lenses, strict=True))
-    cameras = tuple(_resized(camera, downscale) for camera in cameras)
+    calibration = read_calibration(path)
+    readers = [open_frames(clip) for clip in calibration.clips]
+    recorded = [_recorded(c, r) for c, r in zip(calibration.cameras, readers, strict=True)]
+    sources = tuple(
+        _Source(reader, lens, undistortion(camera, lens))
+        for reader, lens, camera in zip(readers, calibration.lenses, recorded, strict=True)
+    )
+    cameras = tuple(_resized(camera, downscale) for camera in recorded)
     return Capture(
         path=path,
         cameras=cameras,
         num_frames=_num_frames(path, readers, max_frames),
         fps=_fps(path, readers, settings.get("fps")),
-        points=points,
-        point_colors=point_colors,
+        points=calibration.points,
+        point_colors=calibration.point_colors,
         masks=tuple(s.mask(c) for s, c in zip(sources, cameras, strict=True)),
-        test_view=_test_view(path, test_view, settings, len(cameras)),
+        test_view=_test_view(path, test_view, settings, calibration),
         truth=path / "truth" if (path / "truth").is_dir() else None,
         _sources=sources,
         downscale=downscale,
+        layout=calibration.layout,
     )
 
 
-def _calibration(
-    path: Path,
-) -> tuple[tuple[Camera, ...], tuple[Lens, ...], list[Path], np.ndarray, np.ndarray]:
-    """Return cameras at full size, their lenses, where their frames lie, points and their colours."""
-    views = _find_views(path)
-    if not views:
-        raise FileNotFoundError(
-            f"{path}: expected videos ({', '.join(VIDEO_SUFFIXES)}) or folders of frames, found none; check the path."
+def _recorded(camera: Camera, reader: FrameReader) -> Camera:
+    """Return the camera at the size of its clip, which may be the calibrated one made smaller or larger."""
+    if (reader.width, reader.height) == (camera.width, camera.height):
+        return camera
+    x, y = reader.width / camera.width, reader.height / camera.height
+    # Both sides were rounded to whole pixels.
+    if abs(camera.width * y - reader.width) > 1 or abs(camera.height * x - reader.height) > 1:
+        raise ValueError(
+            f"{reader.path}: expected {camera.width}x{camera.height} as the calibration of {camera.name} says, or "
+            f"that scaled, got {reader.width}x{reader.height}; calibrate at the recorded size."
         )
-    if folder := find_colmap(path):
-        model = read_colmap(folder)
-        pairs = sorted(zip(model.cameras, model.lenses, strict=True), key=lambda p: natural_key(p[0].name))
-        names = [_view_of_image(folder, views, camera.name) for camera, _ in pairs]
-        if len(set(names)) < len(names):
-            raise ValueError(
-                f"{folder}: expected one image per camera, got {len(names)} images of {len(set(names))} "
-                "cameras; keep one image of each fixed camera in the model."
-            )
-        if unused := [name for name in views if name not in names]:
-            _LOG.warning("%s does not calibrate %s: not used.", folder, ", ".join(unused))
-        cameras = tuple(replace(camera, name=name) for (camera, _), name in zip(pairs, names, strict=True))
-        lenses = tuple(lens for _, lens in pairs)
-        return cameras, lenses, [views[n] for n in names], model.points, model.point_colors
-    if (path / "poses_bounds.npy").exists():
-        cameras, _ = read_poses_bounds(path / "poses_bounds.npy", list(views))
-        empty = np.zeros((0, 3), np.float32)
-        return cameras, (Lens(),) * len(cameras), list(views.values()), empty, empty
-    raise FileNotFoundError(
-        f"{path}: expected a calibration (sparse/0, sparse or poses_bounds.npy), found none; "
-        "run COLMAP on one frame of each camera."
+    _LOG.warning(
+        "%s: calibrated at %dx%d, recorded at %dx%d: its intrinsics are scaled to match.",
+        *(camera.name, camera.width, camera.height, reader.width, reader.height),
     )
-
-
-def _find_views(path: Path) -> dict[str, Path]:
-    """Return where each camera's frames lie, by its name and in numerical order."""
-    folders = [f for f in path.iterdir() if f.name not in _NOT_CAMERAS and _holds_images(f)]
-    videos = [f for f in path.iterdir() if f.is_file() and f.suffix.lower() in VIDEO_SUFFIXES]
-    lossless = [f for f in (path / "frames").glob("*") if _holds_images(f)]
-    found = {f.name: f for f in folders} | {f.stem: f for f in videos} | {f.name: f for f in lossless}
-    return {name: found[name] for name in sorted(found, key=natural_key)}
-
-
-def _holds_images(folder: Path) -> bool:
-    return folder.is_dir() and any(f.suffix.lower() in IMAGE_SUFFIXES for f in folder.iterdir())
-
-
-def _view_of_image(folder: Path, views: dict[str, Path], image: str) -> str:
-    """Return the camera that an image of the model belongs to: cam01 for cam01.png and cam01/0000.png."""
-    for name in (Path(image).stem, Path(image).parent.name):
-        if name in views:
-            return name
-    raise FileNotFoundError(
-        f"{folder}: its image {image!r} needs a clip called {Path(image).stem}, found "
-        f"{', '.join(views)}; name the clips after the model's images."
-    )
+    return camera.resized(reader.width, reader.height)
 
 
 def _resized(camera: Camera, downscale: float) -> Camera:
@@ -241,6 +222,13 @@ def _shrunk(image: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def _num_frames(path: Path, readers: list[FrameReader], max_frames: int | None) -> int:
+    for reader in readers:
+        wanted = min(reader.num_frames, max_frames or reader.num_frames)
+        if wanted > reader.num_held:
+            raise ValueError(
+                f"{reader.path}: frame {reader.num_held} of {reader.num_frames} cannot be read: the file is truncated "
+                f"or broken; copy it again or use the first {reader.num_held} frames (max_frames)."
+            )
     lengths = [reader.num_frames for reader in readers]
     shortest = min(lengths)
     if max_frames is not None and max_frames <= shortest:
@@ -285,10 +273,12 @@ def _settings(path: Path) -> dict[str, Any]:
 
 
 def _test_view(
-    path: Path, asked: int | Literal["auto"] | None, settings: dict[str, Any], num_cameras: int
+    path: Path, asked: int | Literal["auto"] | None, settings: dict[str, Any], calibration: Calibration
 ) -> int | None:
+    num_cameras = len(calibration.cameras)
     if asked == "auto":
-        asked = settings.get("test_view", 0 if num_cameras >= 6 else None)
+        usual = 0 if num_cameras >= 6 else None
+        asked = settings.get("test_view", usual if calibration.test_view is None else calibration.test_view)
     if asked is not None and not 0 <= asked < num_cameras:
         raise ValueError(
             f"{path}: `test_view` must be in 0..{num_cameras - 1}, or None for no held-out view, got {asked}."

@@ -42,8 +42,11 @@ class ColmapModel:
 
 
 def find_colmap(folder: Path) -> Path | None:
-    """Return the folder of the COLMAP model in a capture (`sparse/0` or `sparse`), or None."""
-    for place in (folder / "sparse" / "0", folder / "sparse"):
+    """Return the folder of the COLMAP model in a capture, or None.
+
+    It lies in `sparse/0`, `sparse`, `colmap/sparse/0` or the folder itself, the first of these that has one.
+    """
+    for place in (folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0", folder):
         if any((place / f"cameras.{kind}").exists() for kind in ("bin", "txt")):
             return place
     return None
@@ -84,7 +87,7 @@ def read_colmap(folder: str | Path) -> ColmapModel:
         try:
             cameras.append(Camera(K, _viewmat(pose), width, height, name))
         except ValueError as error:
-            raise ValueError(f"{images_path}: {error}") from None
+            raise ValueError(f"{images_path}, image {name!r}: {error}") from None
         lenses.append(lens)
     if not cameras:
         raise ValueError(f"{images_path}: at least one image was expected, got none; register the images.")
@@ -154,8 +157,11 @@ def write_colmap(
 def _viewmat(pose: Sequence[float]) -> np.ndarray:
     """Return world -> camera [4, 4] of a wxyz quaternion and a translation."""
     quat, t = np.array(pose[:4]), np.array(pose[4:])
-    with np.errstate(invalid="ignore"):  # a quaternion of zeros becomes NaN, which Camera refuses
-        w, x, y, z = quat / np.linalg.norm(quat)
+    norm = np.linalg.norm(quat)
+    # COLMAP writes unit quaternions; Camera refuses one that is not finite.
+    if np.isfinite(norm) and abs(norm - 1) > 1e-2:
+        raise ValueError(f"its quaternion must have length 1, got {quat.tolist()}; check the order of the columns.")
+    w, x, y, z = quat / norm
     viewmat = np.eye(4)
     viewmat[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],

@@ -14,7 +14,7 @@ import numpy as np
 
 from morgs_mi.capture.camera import Camera
 
-__all__ = ["read_poses_bounds", "write_poses_bounds"]
+__all__ = ["count_rows", "read_poses_bounds", "write_poses_bounds"]
 
 
 def read_poses_bounds(path: str | Path, names: Sequence[str]) -> tuple[tuple[Camera, ...], np.ndarray]:
@@ -29,14 +29,7 @@ def read_poses_bounds(path: str | Path, names: Sequence[str]) -> tuple[tuple[Cam
         ValueError: it is not a NumPy array [C, 17] with one row per name, or a row is no pose.
     """
     path = Path(path)
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise ValueError(
-            f"{path}: expected a NumPy array [C, 17], got a broken file ({error}); export it again."
-        ) from None
-    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
-        raise ValueError(f"{path}: expected a float array [C, 17], got {rows.dtype} {rows.shape}; export it again.")
+    rows = _rows(path)
     if len(rows) != len(names):
         raise ValueError(
             f"{path}: expected one row per camera, got {len(rows)} rows for {len(names)} videos "
@@ -44,6 +37,24 @@ def read_poses_bounds(path: str | Path, names: Sequence[str]) -> tuple[tuple[Cam
         )
     cameras = tuple(_camera(path, i, row, name) for i, (row, name) in enumerate(zip(rows, names, strict=True)))
     return cameras, rows[:, 15:].astype(np.float64)
+
+
+def count_rows(path: Path) -> int:
+    """Return the number of cameras in the file; raises what `read_poses_bounds` raises."""
+    return len(_rows(path))
+
+
+def _rows(path: Path) -> np.ndarray:
+    try:
+        rows = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ValueError(
+            f"{path}: expected a NumPy array [C, 17], got a broken file ({error}); export it again."
+        ) from None
+    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
+        what = f"{rows.dtype} {rows.shape}" if isinstance(rows, np.ndarray) else "an archive"
+        raise ValueError(f"{path}: expected a float array [C, 17], got {what}; export it again.")
+    return rows
 
 
 def _camera(path: Path, index: int, row: np.ndarray, name: str) -> Camera:

@@ -6,7 +6,7 @@ A frame is an RGB uint8 array [H, W, 3]. `VideoReader` and `FolderReader` offer 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from morgs_mi.files import new_folder, whole
 
-__all__ = ["FolderReader", "FrameReader", "VideoReader", "natural_key", "open_frames", "write_video"]
+__all__ = ["Clip", "FolderReader", "FrameReader", "VideoReader", "natural_key", "open_frames", "write_video"]
 
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -33,10 +33,11 @@ class VideoReader:
 
     Attributes:
         path: the file.
-        num_frames: what the file's header promises; `frames` checks it.
+        num_frames: what the file's header promises.
         fps: frames per second.
         width: in pixels.
         height: in pixels.
+        num_held: how many frames the file holds; less than `num_frames` where it was cut off.
     """
 
     path: Path
@@ -44,10 +45,11 @@ class VideoReader:
     fps: float | None
     width: int
     height: int
+    num_held: int
 
     @classmethod
     def open(cls, path: str | Path) -> VideoReader:
-        """Read a video's header and decode its first frame.
+        """Read a video's header, decode its first frame and count the others.
 
         Raises:
             FileNotFoundError: there is no such file.
@@ -69,7 +71,10 @@ class VideoReader:
                 f"{path}: expected a video, got {path.stat().st_size} bytes of which OpenCV cannot decode "
                 "one frame: the file is truncated or no video; copy or convert it again."
             )
-        return cls(path, max(num_frames, 1), fps if fps > 0 else None, first.shape[1], first.shape[0])
+        held = _count_packets(path)
+        # Some containers promise nothing.
+        promised = num_frames if num_frames > 0 else held
+        return cls(path, promised, fps if fps > 0 else None, first.shape[1], first.shape[0], held)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
         """Yield frames start..stop-1; those before `start` are decoded too, for seeking is inexact.
@@ -95,7 +100,10 @@ class VideoReader:
 
 @dataclass(frozen=True)
 class FolderReader:
-    """A folder of numbered images, e.g. ``0000.png``; members as in `VideoReader`, but no `fps`."""
+    """A folder of numbered images, e.g. ``0000.png``; members as in `VideoReader`, but no `fps`.
+
+    It may also be a list of images that lie anywhere; `path` is then the folder of the first.
+    """
 
     path: Path
     files: tuple[Path, ...]
@@ -130,11 +138,29 @@ class FolderReader:
                 f"{path}: the images must be numbered without gaps, got {files[gap].name} followed by "
                 f"{files[gap + 1].name}; extract the frames again."
             )
+        return cls.of_files(files)
+
+    @classmethod
+    def of_files(cls, files: Sequence[Path]) -> FolderReader:
+        """Take the images `files` in their order and decode the first.
+
+        Raises:
+            FileNotFoundError: a file is missing.
+            ValueError: there are none, or the first cannot be decoded.
+        """
+        if not files:
+            raise ValueError("FolderReader.of_files(): expected at least one image, got none; list the frames.")
+        if missing := next((f for f in files if not f.is_file()), None):
+            raise FileNotFoundError(f"{missing}: expected an image, found none; extract the frames again.")
         first = _read_image(files[0])
-        return cls(path, tuple(files), first.shape[1], first.shape[0])
+        return cls(files[0].parent, tuple(files), first.shape[1], first.shape[0])
 
     @property
     def num_frames(self) -> int:
+        return len(self.files)
+
+    @property
+    def num_held(self) -> int:
         return len(self.files)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
@@ -154,10 +180,14 @@ class FolderReader:
 
 
 FrameReader = VideoReader | FolderReader
+# A video file, a folder of images, or images that lie anywhere.
+Clip = Path | tuple[Path, ...]
 
 
-def open_frames(path: str | Path) -> FrameReader:
-    """Open a video file or a folder of images; raises what their `open` raises."""
+def open_frames(path: str | Path | tuple[Path, ...]) -> FrameReader:
+    """Open a video file, a folder of images or a list of images; raises what their `open` raises."""
+    if isinstance(path, tuple):
+        return FolderReader.of_files(path)
     return FolderReader.open(path) if Path(path).is_dir() else VideoReader.open(path)
 
 
@@ -233,6 +263,16 @@ def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
         yield frame
     if shape is None:
         raise ValueError(f"write_video({path}): at least one frame was expected, got none; pass frames.")
+
+
+def _count_packets(path: Path) -> int:
+    """Return how many frames a video file holds; they are read but not decoded, 0.2 ms each at 1080x1920."""
+    stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
+    count = 0
+    while stream.grab():
+        count += 1
+    stream.release()
+    return count
 
 
 def _read_image(file: Path) -> np.ndarray:

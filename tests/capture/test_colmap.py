@@ -108,7 +108,7 @@ def test_every_truncation_of_a_binary_file_is_refused(tmp_path: Path, name: str)
             r"'cam01.png' refers to camera 9, cameras.txt has \[1, 2, 3\]",
         ),
         ("images.txt", "\n\n", "\n", "images.txt, line 6: expected `POINTS2D"),
-        ("images.txt", r"\n1 \S+", "\n1 nan", r"images.txt: Camera\('cam00.png'\): `viewmat` must be finite"),
+        ("images.txt", r"\n1 \S+", "\n1 nan", r"image 'cam00.png': Camera\('cam00.png'\): `viewmat` must"),
         ("images.txt", r"\n1 \S+", "\n1 word", "images.txt, line 5: expected `IMAGE_ID"),
         ("points3D.txt", "\n1 ", "\n1 red ", "points3D.txt, line 4: expected `POINT3D_ID"),
         ("points3D.txt", "\n1 ", "\n1 inf ", "points3D.txt: the points must be finite"),

@@ -1,0 +1,228 @@
+"""Broken captures in every layout: the sentence that the user gets, and nothing is written."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi import cli
+from morgs_mi.capture import write_video
+from tests.capture import layouts
+
+Spoil = Callable[[Path], None]
+
+
+# ---- what goes wrong with clips --------------------------------------------------------------------------
+
+
+def missing(name: str) -> Spoil:
+    return lambda path: (path / name).unlink()
+
+
+def truncated(name: str) -> Spoil:
+    def spoil(path: Path) -> None:
+        data = (path / name).read_bytes()
+        (path / name).write_bytes(data[: len(data) * 2 // 3])
+
+    return spoil
+
+
+def empty(name: str) -> Spoil:
+    return lambda path: (path / name).write_bytes(b"")
+
+
+def headers_only(name: str) -> Spoil:
+    """Leave a video that has begun and holds no frame."""
+    return lambda path: (path / name).write_bytes((path / name).read_bytes()[:600])
+
+
+def shorter(name: str, i: int) -> Spoil:
+    return lambda path: write_video(path / name, layouts.frames(i, layouts.COUNT - 1), layouts.FPS)
+
+
+# ---- what goes wrong with calibrations -------------------------------------------------------------------
+
+
+def rows(change: Callable[[np.ndarray], np.ndarray | None]) -> Spoil:
+    def spoil(path: Path) -> None:
+        values = np.load(path / "poses_bounds.npy")
+        changed = change(values)
+        np.save(path / "poses_bounds.npy", values if changed is None else changed)
+
+    return spoil
+
+
+def entry(row: int, columns: slice | int, value: float) -> Spoil:
+    def change(values: np.ndarray) -> None:
+        values[row, columns] = value
+
+    return rows(change)
+
+
+def replace(name: str, old: str, new: str) -> Spoil:
+    def spoil(path: Path) -> None:
+        text = (path / name).read_text()
+        assert old in text
+        (path / name).write_text(text.replace(old, new, 1))
+
+    return spoil
+
+
+def quaternion(values: str) -> Spoil:
+    def spoil(path: Path) -> None:
+        file = path / "sparse/0/images.txt"
+        lines = file.read_text().splitlines()
+        fields = lines[1].split()
+        lines[1] = " ".join([fields[0], values, *fields[5:]])
+        file.write_text("\n".join(lines) + "\n")
+
+    return spoil
+
+
+def transforms(change: Callable[[dict], object]) -> Spoil:
+    return in_json("transforms.json", change)
+
+
+def meta(change: Callable[[dict], object]) -> Spoil:
+    return in_json("train_meta.json", change)
+
+
+def in_json(name: str, change: Callable[[dict], object]) -> Spoil:
+    def spoil(path: Path) -> None:
+        values = json.loads((path / name).read_text())
+        change(values)
+        (path / name).write_text(json.dumps(values))
+
+    return spoil
+
+
+def pose(index: int, scale: float) -> Callable[[dict], None]:
+    """Scale the first column of a camera's rotation."""
+
+    def change(values: dict) -> None:
+        for row in values["frames"][index]["transform_matrix"][:3]:
+            row[0] *= scale
+
+    return change
+
+
+def stretch(values: dict) -> None:
+    for frame, ids in zip(values["w2c"], values["cam_id"], strict=True):
+        for row in frame[ids.index(1)][:3]:
+            row[0] *= 2
+
+
+def moving(values: dict) -> None:
+    values["w2c"][2][values["cam_id"][2].index(10)][0][3] += 0.5
+
+
+NAN = float("nan")
+POSES_BOUNDS = {
+    "no file": (missing("poses_bounds.npy"), "expected a calibration .*poses_bounds.npy.* run `morgs-mi calibrate`"),
+    "no clip": (missing("cam02.mkv"), r"expected one row per camera, got 3 rows for 2 videos \(cam00, cam11\)"),
+    "fewer rows": (rows(lambda values: values[:2]), r"got 2 rows for 3 videos \(cam00, cam02, cam11\)"),
+    "other columns": (rows(lambda values: values[:, :15]), r"expected a float array \[C, 17\], got float64 \(3, 15\)"),
+    "broken file": (truncated("poses_bounds.npy"), "poses_bounds.npy: expected a NumPy array .* got a broken file"),
+    "NaN pose": (entry(1, 3, NAN), r"row 1 \(cam02\): the pose must be finite"),
+    "no rotation": (entry(2, slice(0, 2), 0.5), r"row 2 \(cam11\): the axes .* right-handed orthonormal frame"),
+    "no focal length": (entry(0, 14, 0), r"row 0 \(cam00\): .* positive focal lengths"),
+    "truncated clip": (truncated("cam11.mkv"), r"cam11.mkv: frame \d of 4 cannot be read: the file is truncated"),
+    "shorter clip": (shorter("cam11.mkv", 2), "the same number of frames, got cam00.mkv 4, cam02.mkv 4, cam11.mkv 3"),
+    "empty clip": (empty("cam00.mkv"), "cam00.mkv: expected a video, got an empty file"),
+    "clip of no frames": (headers_only("cam00.mkv"), "cam00.mkv: .* cannot decode one frame"),
+}
+BY_FRAME = {
+    "no image": (missing("frame000002/cam_2.png"), "frame000002/cam_2.png: expected an image, found none"),
+    "no camera": (missing("frame000000/cam_10.png"), "got 3 rows for 4 videos"),
+    "truncated image": (empty("frame000000/cam_0.png"), "frame000000/cam_0.png: expected an image, got 0 bytes"),
+}
+COLMAP = {
+    "no file": (missing("sparse/0/images.txt"), "images.txt is missing; export the whole model"),
+    "no clip": (missing("cam2.mkv"), "its image 'cam2.png' needs a clip called cam2, found cam1, cam10"),
+    "fewer parameters": (replace("sparse/0/cameras.txt", " 34.0 20.0\n", "\n"), "PINHOLE takes 4 parameters, got 2"),
+    "no such camera": (replace("sparse/0/cameras.txt", "\n2 ", "\n7 "), "refers to camera 2, cameras.txt has"),
+    "unknown model": (replace("sparse/0/cameras.txt", "PINHOLE", "FOV"), "camera model must be one of .* got FOV"),
+    "NaN pose": (quaternion("1 nan 0 0"), "image 'cam1.png': .* must be finite"),
+    "no rotation": (quaternion("1 0 0 1"), "image 'cam1.png': its quaternion must have length 1"),
+    "truncated clip": (truncated("cam10.mkv"), "cam10.mkv: frame . of 4 cannot be read"),
+    "shorter clip": (shorter("cam2.mkv", 1), "the same number of frames, got cam1.mkv 4, cam2.mkv 3"),
+    "empty clip": (empty("cam2.mkv"), "cam2.mkv: expected a video, got an empty file"),
+}
+NERFSTUDIO = {
+    "no file": (missing("transforms.json"), "expected a calibration .*transforms.json"),
+    "no clip": (missing("cam2.mkv"), "its image './images/cam2.png' needs a clip called cam2, found cam1, cam10"),
+    "no frames": (transforms(lambda m: m.update(frames=[])), "expected an object with a list of `frames`, got none"),
+    "broken file": (truncated("transforms.json"), "transforms.json: expected JSON, got a broken file"),
+    "unnamed": (
+        transforms(lambda m: m["frames"][1].pop("file_path")),
+        "frame 1: `file_path` must name a file, got None",
+    ),
+    "no size": (transforms(lambda m: m.pop("w")), "frame 0 .*: `w` must be a finite number, here or .* got none"),
+    "no focal length": (transforms(lambda m: m["frames"][2].pop("fl_x")), "frame 2 .*cam10.png.: `fl_x` must be a fin"),
+    "word": (transforms(lambda m: m.update(k1="no")), "`k1` must be a finite number, .* got 'no'"),
+    "unknown model": (transforms(lambda m: m.update(camera_model="EQUIRECTANGULAR")), "got 'EQUIRECTANGULAR'; undist"),
+    "k4": (transforms(lambda m: m.update(k4=0.1)), "`k4` must be 0 in a perspective camera, got 0.1"),
+    "NaN pose": (transforms(pose(1, NAN)), "frame 1 .*cam2.png.: the pose must be finite"),
+    "no rotation": (transforms(pose(0, 1.5)), "frame 0 .*cam1.png.: the axes must be a right-handed orthonormal frame"),
+    "mirrored": (transforms(pose(0, -1)), "frame 0 .*cam1.png.: the axes must be a right-handed"),
+    "no pose": (transforms(lambda m: m["frames"][0].pop("transform_matrix")), "the pose must be a matrix"),
+    "no points": (transforms(lambda m: m.update(ply_file_path="a.ply")), "a.ply: expected the points' PLY file, found"),
+    "moving camera": (
+        transforms(lambda m: m["frames"][1].update(file_path="cam1/0001.png")),
+        "cameras must not move, but './images/cam1.png' and 'cam1/0001.png', both of cam1",
+    ),
+    "truncated clip": (truncated("cam10.mkv"), "cam10.mkv: frame . of 4 cannot be read"),
+    "empty clip": (empty("cam2.mkv"), "cam2.mkv: expected a video, got an empty file"),
+}
+DYNAMIC3DGS = {
+    "no file": (missing("train_meta.json"), "expected a calibration .*train_meta.json"),
+    "no image": (missing("ims/10/000002.png"), "ims/10/000002.png: expected an image, found none"),
+    "broken file": (truncated("train_meta.json"), "train_meta.json: expected JSON, got a broken file"),
+    "no key": (meta(lambda m: m.pop("w2c")), "train_meta.json: expected the keys .*, w2c missing"),
+    "fewer poses": (meta(lambda m: m["w2c"].pop()), "as many cameras in every frame .* w2c 3 frames of 3 to 3 cameras"),
+    "fewer cameras": (
+        meta(lambda m: m["k"][1].pop()),
+        "as many cameras in every frame .* k 4 frames of 2 to 3 cameras",
+    ),
+    "no frames": (meta(lambda m: m.update(fn=[])), "must be lists of frames of cameras"),
+    "other camera": (meta(lambda m: m["cam_id"][1].__setitem__(0, 7)), "frame 1: `cam_id` must name each camera of"),
+    "NaN pose": (meta(lambda m: m["w2c"][1][0][0].__setitem__(0, NAN)), "frame 1: the pose must be finite"),
+    "no rotation": (meta(stretch), "camera 1: the axes must be a right-handed orthonormal frame"),
+    "moving camera": (meta(moving), "camera 10: its pose in frame 2 must be that of frame 0, for cameras must not"),
+    "no size": (meta(lambda m: m.update(w=0)), "`w` and `h` must be positive whole numbers"),
+    "broken points": (truncated("init_pt_cld.npz"), "init_pt_cld.npz: expected an array `data`"),
+    "truncated image": (empty("ims/1/000000.png"), "ims/1/000000.png: expected an image, got 0 bytes"),
+}
+TABLES = {
+    layouts.n3dv: POSES_BOUNDS,
+    lambda path: layouts.meet_room(path, layouts.folder_per_frame): BY_FRAME,
+    layouts.colmap: COLMAP,
+    layouts.nerfstudio: NERFSTUDIO,
+    layouts.dynamic3dgs: DYNAMIC3DGS,
+}
+TITLES = ("poses_bounds", "by frame", "COLMAP", "Nerfstudio", "Dynamic 3D Gaussians")
+CASES = [
+    pytest.param(build, *case, id=f"{title}: {name}")
+    for title, (build, table) in zip(TITLES, TABLES.items(), strict=True)
+    for name, case in table.items()
+]
+
+
+@pytest.mark.parametrize(("build", "spoil", "sentence"), CASES)
+def test_a_broken_capture_gets_one_sentence_and_nothing_is_written(
+    tmp_path: Path, capsys, build, spoil: Spoil, sentence: str
+) -> None:
+    path = build(tmp_path / "capture")
+    spoil(path)
+    before = sorted(tmp_path.rglob("*"))
+    status = cli.main(["fit", str(path), str(tmp_path / "out")])
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.strip() and "━" not in line]
+    assert status == 1
+    assert len(lines) == 1, lines
+    assert re.search(sentence, lines[0]), lines[0]
+    assert sorted(tmp_path.rglob("*")) == before
