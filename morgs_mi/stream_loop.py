@@ -29,6 +29,7 @@ from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.gaussians.initialise import from_points, resample_points, scene_extent, seed_points
 from morgs_mi.motion.config import MotionConfig
 from morgs_mi.motion.cues import MotionCue, choose_key_views, motion_cues
+from morgs_mi.motion.flow_sources import FramePair
 from morgs_mi.motion.masks import motion_mask
 from morgs_mi.render.config import RenderConfig
 
@@ -171,7 +172,11 @@ def _cues(setup: Setup, state: StreamState, images: Sequence[np.ndarray]) -> Map
     first_masks = motion.learn_confidence and state.frame == 1
     if not (motion.learn_motion or with_masks or first_masks):
         return {}
-    return motion_cues(images, state.images, setup.key_views, motion, with_masks, setup.masks)
+    pairs = {
+        v: FramePair(images[v], state.images[v], setup.cameras[v].name, state.frame, setup.masks[v])
+        for v in setup.key_views
+    }
+    return motion_cues(pairs, motion, with_masks)
 
 
 def _ticker(on_step: Callable[[int, int], None] | None, steps: int) -> Callable[[int], None] | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from morgs_mi.motion.flow import FLOW_METHODS
+from morgs_mi.motion.flow_sources import flow_source
 
 __all__ = ["MotionConfig"]
 
@@ -25,7 +25,8 @@ class MotionConfig:
     lift_flow: bool = True
     """Start each Gaussian's motion from the key views' flow in closed form; False: from zero, as in the paper."""
     flow_method: str = "dis-medium"
-    """Optical flow, a key of `FLOW_METHODS`."""
+    """Optical flow: the name of a method (see docs/flow.md), files:FOLDER for flow from files, or onnx:FILE for a
+    network (onnx-unit:FILE or onnx-signed:FILE if it takes values from 0 or -1 to 1 in place of bytes)."""
     key_views: int = 4
     """Cameras that get optical flow and masks."""
     keyframe_interval: int = 5
@@ -40,9 +41,7 @@ class MotionConfig:
     """Keep the flow and mask losses from moving opacity and geometry: they are about motion and confidence."""
 
     def __post_init__(self) -> None:
-        if self.flow_method not in FLOW_METHODS:
-            known = ", ".join(FLOW_METHODS)
-            raise ValueError(f"MotionConfig(): `flow_method` must be one of {known}, got {self.flow_method!r}.")
+        flow_source(self.flow_method)  # what is wrong with it shall be said before the first frame is fitted
         for name in ("key_views", "keyframe_interval"):
             if getattr(self, name) < 1:
                 raise ValueError(f"MotionConfig(): `{name}` must be at least 1, got {getattr(self, name)}.")

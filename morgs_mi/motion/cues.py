@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from morgs_mi.capture.camera import Camera
 from morgs_mi.motion.config import MotionConfig
-from morgs_mi.motion.flow import consistent, optical_flow
+from morgs_mi.motion.flow import consistent
+from morgs_mi.motion.flow_sources import FlowSource, FramePair, flow_source
 from morgs_mi.motion.masks import motion_mask
 
 __all__ = ["MotionCue", "choose_key_views", "motion_cue", "motion_cues"]
@@ -51,35 +52,37 @@ def motion_cue(
     with_mask: bool = False,
     valid: np.ndarray | None = None,
 ) -> MotionCue:
-    """Return one view's cue (eq. 4, and 9 and 10 for the mask), from optical flow both ways.
+    """Return the cue of two pictures, whichever camera's they are.
 
     Args:
         image: I_t [H, W, 3], RGB, uint8 or float in [0, 1].
         previous: I_{t-1}, likewise.
-        method: a key of `FLOW_METHODS`; it runs twice.
+        method: as `flow_source` takes it.
         with_mask: whether the mask is wanted.
         valid: [H, W] bool, False where undistortion left nothing; None: valid everywhere.
 
     Raises:
-        ValueError: as `optical_flow`.
+        ValueError: as `flow_source` and `optical_flow`.
     """
-    flow, onward = optical_flow(image, previous, method), optical_flow(previous, image, method)
+    return _cue(FramePair(np.asarray(image), np.asarray(previous), valid=valid), flow_source(method), with_mask)
+
+
+def motion_cues(pairs: Mapping[int, FramePair], config: MotionConfig, with_masks: bool) -> dict[int, MotionCue]:
+    """Return the cue of every key view from its two pictures, by view.
+
+    Raises:
+        OSError: flow that is read from files is missing.
+        ValueError: as `flow_source` and what it names.
+    """
+    source = flow_source(config.flow_method)
+    return {view: _cue(pair, source, with_masks) for view, pair in pairs.items()}
+
+
+def _cue(pair: FramePair, source: FlowSource, with_mask: bool) -> MotionCue:
+    """Return one view's cue (eq. 4, and 9 and 10 for the mask), from optical flow both ways."""
+    flow, onward = source(pair)
     reliable, onward_reliable = consistent(flow, onward), consistent(onward, flow)
-    if valid is not None:
-        reliable, onward_reliable = reliable & valid, onward_reliable & valid
-    mask = motion_mask(image, -flow, reliable) if with_mask else None
+    if pair.valid is not None:
+        reliable, onward_reliable = reliable & pair.valid, onward_reliable & pair.valid
+    mask = motion_mask(pair.image, -flow, reliable) if with_mask else None
     return MotionCue(-flow, reliable, onward, onward_reliable, mask)
-
-
-def motion_cues(
-    images: Sequence[np.ndarray],
-    previous: Sequence[np.ndarray],
-    views: Sequence[int],
-    config: MotionConfig,
-    with_masks: bool,
-    valid: Sequence[np.ndarray | None],
-) -> dict[int, MotionCue]:
-    """Return the cue of every key view, by view; `images`, `previous` and `valid` hold all views."""
-    return {
-        view: motion_cue(images[view], previous[view], config.flow_method, with_masks, valid[view]) for view in views
-    }

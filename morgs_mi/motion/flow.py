@@ -12,7 +12,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-__all__ = ["FLOW_METHODS", "consistent", "optical_flow"]
+__all__ = ["FLOW_METHODS", "check_pictures", "consistent", "optical_flow"]
 
 # DIS needs patches of 8 pixels on its coarsest level; below this no method has anything to match.
 MIN_SIDE = 16
@@ -58,14 +58,19 @@ def optical_flow(image: np.ndarray, previous: np.ndarray, method: str = "dis-med
     if method not in FLOW_METHODS:
         raise ValueError(f"optical_flow(): `method` must be one of {', '.join(FLOW_METHODS)}, got {method!r}.")
     image, previous = np.asarray(image), np.asarray(previous)
-    if image.ndim != 3 or image.shape[2] != 3 or image.shape != previous.shape:
-        raise ValueError(
-            "optical_flow(): `image` and `previous` must be RGB of one size [H, W, 3], "
-            f"got {image.shape} and {previous.shape}."
-        )
+    check_pictures("optical_flow()", image, previous)
     if min(image.shape[:2]) < MIN_SIDE:
         return np.zeros((*image.shape[:2], 2), np.float32)
     return FLOW_METHODS[method](_gray(image), _gray(previous))
+
+
+def check_pictures(place: str, image: np.ndarray, previous: np.ndarray) -> None:
+    """Refuse two pictures that are not RGB of one size [H, W, 3]."""
+    if image.ndim != 3 or image.shape[2] != 3 or image.shape != previous.shape:
+        raise ValueError(
+            f"{place}: `image` and `previous` must be RGB of one size [H, W, 3], got {image.shape} and "
+            f"{previous.shape}."
+        )
 
 
 def consistent(flow: np.ndarray, back: np.ndarray) -> np.ndarray:

@@ -1,0 +1,51 @@
+"""Networks of a few operators whose flow is known, exported as ONNX files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+# Per flow component, of red, green and blue: no two alike, so that a swap of anything shows.
+OF_IMAGE = np.array([[0.1, 0.2, 0.3], [0.02, 0.05, 0.01]], np.float32)
+OF_OTHER = np.array([[-0.3, 0.1, 0.2], [0.04, 0.03, -0.02]], np.float32)
+
+
+def known_flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return the flow [H, W, 2] that the network gives for two pictures [H, W, 3] in its own range of values."""
+    return image @ OF_IMAGE.T + other @ OF_OTHER.T
+
+
+def export(path: Path, height: int | str = "h", width: int | str = "w", inputs: int = 2, channels: int = 2) -> Path:
+    """Write a network with RAFT's signature: two pictures in, flow at an eighth and at the whole size out.
+
+    It fails on sizes that are no multiples of 8, as RAFT does: the whole flow takes up the small one enlarged, times 0.
+    """
+    names = [f"image{k}" for k in range(1, inputs + 1)]
+    weights = dict(zip(names, (OF_IMAGE, OF_OTHER, OF_OTHER), strict=False))
+    constants = {f"{name}.weight": w[:channels, :, None, None] for name, w in weights.items()}
+    constants |= {"ones": np.ones((channels, 1, 8, 8), np.float32), "nothing": np.zeros(1, np.float32)}
+    nodes = [helper.make_node("Conv", [name, f"{name}.weight"], [f"{name}.part"]) for name in names]
+    nodes += [
+        helper.make_node("Sum", [f"{name}.part" for name in names], ["sum"]),
+        helper.make_node("AveragePool", ["sum"], ["flow_low"], kernel_shape=[8, 8], strides=[8, 8]),
+        helper.make_node("ConvTranspose", ["flow_low", "ones"], ["large"], strides=[8, 8], group=channels),
+        helper.make_node("Mul", ["large", "nothing"], ["no_flow"]),
+        helper.make_node("Add", ["sum", "no_flow"], ["flow_up"]),
+    ]
+    graph = helper.make_graph(
+        nodes,
+        "tiny",
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 3, height, width]) for name in names],
+        [
+            helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, channels, None, None])
+            for name in ("flow_low", "flow_up")
+        ],
+        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 16)], ir_version=8)
+    onnx.checker.check_model(model)
+    onnx.save(model, path)
+    return path
