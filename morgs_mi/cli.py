@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -26,6 +27,7 @@ from tyro.conf import Positional, arg
 
 from morgs_mi.demo import DemoConfig
 from morgs_mi.evaluate.renderer_report import RendererReportConfig
+from morgs_mi.evaluate.tables import figure, judgement_sentences, judgement_tables
 from morgs_mi.stream_loop import StreamConfig
 
 __all__ = ["main"]
@@ -190,14 +192,23 @@ class Eval:
     """Folder of the capture, if it is no longer where it was fitted from."""
     json: Path | None = None
     """File for all figures; - prints them in place of the tables."""
+    pictures: Path | None = None
+    """Folder for slice.png (one column over time), motion.png and confidence.png."""
+    lpips: Path | None = None
+    """LPIPS network as ONNX with inputs in0 and in1, RGB [1, 3, H, W] from -1 to 1; none comes with the package."""
 
     def run(self) -> None:
+        from morgs_mi.evaluate.drawings import draw_stream
         from morgs_mi.evaluate.judge import evaluate_stream
+        from morgs_mi.evaluate.lpips import Lpips
         from morgs_mi.evaluate.report import machine, versions
         from morgs_mi.files import finite, write_json
 
+        network = None if self.lpips is None else Lpips(self.lpips)
         with _progress() as report:
-            result = evaluate_stream(self.out, self.capture, lambda done, total: report("Judging frames", done, total))
+            result = evaluate_stream(self.out, self.capture, partial(report, "Judging frames"), network)
+            if self.pictures is not None:
+                draw_stream(self.out, self.pictures, self.capture, partial(report, "Drawing frames"))
         result |= {"machine": machine(), "versions": versions()}
         if self.json == Path("-"):
             _say(json.dumps(finite(result), indent=2))
@@ -206,6 +217,8 @@ class Eval:
         if self.json is not None:
             write_json(self.json, result)
             _say(f"All figures: {self.json}")
+        if self.pictures is not None:
+            _say(f"Pictures: {self.pictures}")
 
 
 @dataclass(frozen=True)
@@ -227,14 +240,14 @@ class Demo:
             table.add_column(column, justify="right" if column else "left")
         for name, title in (("full", "with motion"), ("plain", "without")):
             figures = compared[name]
-            motion = (_figure(figures[key], 2) for key in ("motion_error", "motion_error_moving", "motion_error_still"))
-            table.add_row(title, _figure(figures["psnr"], 2), _figure(figures["ssim"], 4), *motion)
+            motion = (figure(figures[key], 2) for key in ("motion_error", "motion_error_moving", "motion_error_still"))
+            table.add_row(title, figure(figures["psnr"], 2), figure(figures["ssim"], 4), *motion)
         _OUT.print(table)
         _say(
-            f"Held-out PSNR {_figure(full['psnr']['first'], 2)} dB in the first frame, "
-            f"{_figure(full['psnr']['last'], 2)} dB in the last of {full['num_frames']}; "
-            f"{_figure(full['seconds']['per_later_frame'], 1)} s and "
-            f"{_figure(full['bytes']['per_residual'] / 1e6, 2)} MB per later frame; "
+            f"Held-out PSNR {figure(full['psnr']['first'], 2)} dB in the first frame, "
+            f"{figure(full['psnr']['last'], 2)} dB in the last of {full['num_frames']}; "
+            f"{figure(full['seconds']['per_later_frame'], 1)} s and "
+            f"{figure(full['bytes']['per_residual'] / 1e6, 2)} MB per later frame; "
             f"{result['seconds']['total']:.0f} s in all."
         )
         _say(f"Look at {self.out / 'side_by_side.mp4'} and {self.out / 'contact_sheet.png'};")
@@ -352,42 +365,10 @@ def _progress() -> Iterator[Report]:
 
 def _show(result: Mapping[str, Any]) -> None:
     """Print what `evaluate_stream` has found."""
-    views = ", ".join(result["views"])
-    table = Table(title=f"{'held-out view' if result['held_out'] else 'training views'} {views}")
-    titles = ("frame", "PSNR, dB", "SSIM", "flow error, px", "moving, px", "still, px", "kB", "s")
-    for title in titles:
-        table.add_column(title, justify="right")
-    motion = ("motion_error", "motion_error_moving", "motion_error_still")
-    for row in result["frames"]:
-        table.add_row(
-            str(row["frame"]),
-            _figure(row["psnr"], 2),
-            _figure(row["ssim"], 4),
-            *(_figure(row[name], 2) for name in motion),
-            _figure(row["num_bytes"] / 1e3, 1),
-            _figure(row["seconds"], 1),
-            end_section=row is result["frames"][-1],
-        )
-    means = (_figure(result[name], 2) for name in motion)
-    size, seconds = result["bytes"], result["seconds"]
-    table.add_row(
-        "mean",
-        _figure(result["psnr"]["mean"], 2),
-        _figure(result["ssim"]["mean"], 4),
-        *means,
-        _figure(size["file"] / result["num_frames"] / 1e3, 1),
-        _figure(seconds["per_later_frame"], 1),
-    )
-    _OUT.print(table)
-    if not result["held_out"]:
-        scores = (f"{name} {_figure(score['psnr'], 2)}" for name, score in result["views"].items())
-        _say(f"PSNR by view, dB: {', '.join(scores)}")
-    _say(
-        f"PSNR {_figure(result['psnr']['first'], 2)} dB in the first frame, {_figure(result['psnr']['last'], 2)} dB in "
-        f"the last; {size['file'] / 1e6:.2f} MB, {_figure(size['per_keyframe'] / 1e3, 1)} kB per keyframe, "
-        f"{_figure(size['per_residual'] / 1e3, 1)} kB per residual; {_figure(seconds['first'], 1)} s for the first "
-        f"frame, {_figure(seconds['per_later_frame'], 1)} s per later one."
-    )
+    for table in judgement_tables(result):
+        _OUT.print(table)
+    for sentence in judgement_sentences(result):
+        _say(sentence)
     if not result["complete"]:
         _warn(f"{result['stream']}: the fit was not finished, its stream holds {result['num_frames']} frames.")
 
@@ -415,20 +396,16 @@ def _show_renderer(result: Mapping[str, Any]) -> None:
         for row in result["rows"]:
             errors, name = pick(row), f"{row['knob']} {row['value']}"
             style = "bold" if row["default"] else None
-            times = (_figure(row["forward_ms"], 1), _figure(row["step_ms"], 1), _figure(row["step_ratio"], 2))
+            times = (figure(row["forward_ms"], 1), figure(row["step_ms"], 1), figure(row["step_ratio"], 2))
             pixels = errors["image"]
             image.add_row(
-                name, *times, f"{pixels['max']:.1e}", f"{pixels['rms']:.1e}", _figure(pixels["psnr"], 1), style=style
+                name, *times, f"{pixels['max']:.1e}", f"{pixels['rms']:.1e}", figure(pixels["psnr"], 1), style=style
             )
             found = errors["gradients"].values()
             cosine = min(gradient["cosine"] for gradient in found)
             gradients.add_row(name, *(f"{g['relative_l2']:.1e}" for g in found), f"{cosine:.5f}", style=style)
         _OUT.print(image)
         _OUT.print(gradients)
-
-
-def _figure(value: float | None, digits: int) -> str:
-    return "-" if value is None or value != value else f"{value:.{digits}f}"
 
 
 def _span(frames: Sequence[int]) -> str:

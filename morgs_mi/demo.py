@@ -14,6 +14,7 @@ import numpy as np
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.synth import synthesize
 from morgs_mi.capture.video import write_video
+from morgs_mi.evaluate.drawings import motion_scale
 from morgs_mi.evaluate.frames import PLAYABLE, even
 from morgs_mi.evaluate.judge import evaluate_stream
 from morgs_mi.evaluate.pictures import contact_sheet, label, motion_legend, side_by_side, write_png
@@ -148,7 +149,7 @@ def _compared(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
 
 def _draw(out: Path, capture: Capture, tell: Callable[[float, float], None]) -> None:
     """Write the video and the contact sheet."""
-    scale = _motion_scale(capture)
+    scale = motion_scale(capture, capture.cameras[capture.test_view or 0])
     full = _panels(capture, out / "stream", scale)
     plain = _panels(capture, out / "stream_plain", scale, ", no ML, MO, MC")
     shown = ("truth", "render", "motion", "confidence")
@@ -185,12 +186,3 @@ def _panels(capture: Capture, stream: Path, scale: float, note: str = "") -> lis
 
 def _moving(images: Mapping[str, np.ndarray]) -> Sequence[str]:
     return [name for name in ("motion", "confidence") if name in images]
-
-
-def _motion_scale(capture: Capture) -> float:
-    """Return a speed in pixels that few pixels of the held-out view exceed."""
-    camera = capture.cameras[capture.test_view or 0]
-    truths = [truth_on(capture, camera, frame) for frame in range(capture.num_frames)]
-    speeds = [np.linalg.norm(truth.motion[truth.mask], axis=-1) for truth in truths[1:] if truth is not None]
-    moving = np.concatenate(speeds) if speeds else np.zeros(0)
-    return float(np.percentile(moving, 95)) if moving.size else 0.03 * camera.width

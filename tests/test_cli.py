@@ -337,9 +337,14 @@ def test_from_a_scene_to_figures(tmp_path: Path, capsys) -> None:
     assert result["bytes"]["file"] == (out / "stream.morgs").stat().st_size
     assert 0 < result["frames"][1]["motion_error_moving"] < 10
     assert result["frames"][1]["seconds"] > 0
-    status, said, _ = run(capsys, "eval", out, "--json", tmp_path / "eval.json")
+    more = ("--json", tmp_path / "eval.json", "--pictures", tmp_path / "pictures")
+    status, said, _ = run(capsys, "eval", out, *more)
     assert status == 0
     assert "held-out view cam00" in said
+    assert {path.name for path in (tmp_path / "pictures").iterdir()} == {"slice.png", "motion.png", "confidence.png"}
+    assert 0 < result["motion_3d"]["num_gaussians"] <= 600
+    status, _, error = run(capsys, "eval", out, "--lpips", tmp_path / "none.onnx")
+    assert (status, "expected an LPIPS network as ONNX, found none" in error) == (1, True)
     assert json.loads((tmp_path / "eval.json").read_text())["psnr"] == result["psnr"]
 
     assert run(capsys, "render", out, "--camera", "cam02")[0] == 0

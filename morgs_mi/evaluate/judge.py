@@ -20,14 +20,22 @@ import numpy as np
 from morgs_mi.capture.camera import Camera
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.truth import Tracks, Truth, load_tracks, load_truth
-from morgs_mi.codec.container import PacketKind, StreamReader, encode_packet
+from morgs_mi.codec.container import PacketKind, encode_packet
 from morgs_mi.codec.gaussians import play
 from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.metrics import WINDOW, endpoint_error, iou, mean_over, psnr_of, ssim_map, unit_pair
 from morgs_mi.evaluate.motion3d import judge_motion
 from morgs_mi.evaluate.perception import delta_e_map, flip_map
 from morgs_mi.evaluate.pictures import as_picture
-from morgs_mi.evaluate.stream import open_recording, open_stream, playback, render, render_config, truth_on
+from morgs_mi.evaluate.stream import (
+    has_confidence,
+    open_recording,
+    open_stream,
+    playback,
+    render,
+    render_config,
+    truth_on,
+)
 from morgs_mi.evaluate.temporal import StillVariation, recorded_change, slope
 from morgs_mi.gaussians.gaussians import Gaussians
 
@@ -90,7 +98,7 @@ def evaluate_stream(
     recording = open_recording(stream, capture, [frame for frame, *_ in packets])
     seconds = _seconds(stream.path)
     views = recording.train_views if recording.test_view is None else (recording.test_view,)
-    channels = ("color", "motion", *(("confidence",) if _learned_confidence(stream) else ()))
+    channels = ("color", "motion", *(("confidence",) if has_confidence(stream) else ()))
     config, tracks = render_config(stream), _tracks(recording)
     variations = {view: StillVariation(recording.masks[view]) for view in views}
     rows, before, last = [], None, None
@@ -122,7 +130,7 @@ def evaluate_stream(
         "held_out": recording.test_view is not None,
         "num_frames": len(rows),
         "complete": len(rows) == stream.metadata.get("num_frames", len(rows)),
-        "regions": "recorded change" if recording.truth is None else "truth",
+        "regions": "recorded change" if recording.truth is None else "true masks",
         **_summary(stream.path.stat().st_size, rows),
         "mtv": _means([variation.result() for variation in variations.values()]),
         "playback": playback(stream, stream.cameras[views[0]]),
@@ -207,13 +215,6 @@ def _tracks(recording: Capture) -> Tracks | None:
     if recording.truth is None or not (recording.truth / "tracks.npz").is_file():
         return None
     return load_tracks(recording.truth)
-
-
-def _learned_confidence(stream: StreamReader) -> bool:
-    """Tell whether a stream carries a confidence that anything was learned about."""
-    learned = stream.metadata.get("config", {}).get("motion", {}).get("learn_confidence", True)
-    first = next(iter(stream))
-    return learned and "logit_confidence" in first.arrays
 
 
 def _summary(num_bytes: int, rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from morgs_mi.files import whole
 
 __all__ = [
     "as_picture",
+    "confidence_legend",
     "confidence_picture",
     "contact_sheet",
     "depth_picture",
@@ -22,6 +23,7 @@ __all__ = [
     "motion_legend",
     "motion_picture",
     "side_by_side",
+    "time_slice",
     "write_png",
 ]
 
@@ -87,6 +89,33 @@ def motion_legend(scale_px: float, size: int = 96) -> np.ndarray:
 def confidence_picture(confidence: np.ndarray) -> np.ndarray:
     """Return [H, W] or [H, W, 1] in [0, 1] as colour: dark violet is still, bright yellow moves."""
     return _coloured(np.asarray(confidence, np.float64), cv2.COLORMAP_INFERNO)
+
+
+def confidence_legend(size: int = 96) -> np.ndarray:
+    """Return the key [size, size, 3] to `confidence_picture`: a bar from 1 at the top to 0 at the bottom."""
+    ramp = np.repeat(np.linspace(1, 0, size)[:, None], size // 3, axis=1)
+    picture = np.full((size, size, 3), BACKGROUND, np.uint8)
+    picture[:, : ramp.shape[1]] = confidence_picture(ramp)
+    for text, row in (("1 moves", 0.0), ("0.5", 0.5), ("0 still", 1.0)):
+        place = (ramp.shape[1] + 4, round(12 + row * (size - 16)))
+        cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.35, (0, 0, 0), 1, cv2.LINE_AA)
+    return picture
+
+
+def time_slice(images: Sequence[np.ndarray], column: int, least_width: int = 320) -> np.ndarray:
+    """Return one column of every picture side by side, time to the right: [H, W, 3].
+
+    What stands still is a horizontal streak, noise a rough one. The columns of a short clip are repeated until they
+    fill `least_width` pixels.
+
+    Raises:
+        ValueError: no picture, or a column outside them.
+    """
+    if not images or not 0 <= column < images[0].shape[1]:
+        found = f"pictures {images[0].shape[1]} pixels wide" if images else "no picture"
+        raise ValueError(f"time_slice(): `column` must lie in the pictures, got {column} and {found}.")
+    columns = np.stack([as_picture(image)[:, column] for image in images], axis=1)
+    return np.repeat(columns, -(-least_width // len(images)), axis=1)
 
 
 def depth_picture(depth: np.ndarray, near: float | None = None, far: float | None = None) -> np.ndarray:

@@ -27,6 +27,7 @@ __all__ = [
     "CHANNELS",
     "channel_picture",
     "find_camera",
+    "has_confidence",
     "open_recording",
     "open_stream",
     "playback",
@@ -90,6 +91,12 @@ def render_stream(
     config = render_config(stream)
     for frame, gaussians in play(stream):
         yield frame, render(gaussians, camera, channels or _carried(gaussians), config)
+
+
+def has_confidence(stream: StreamReader) -> bool:
+    """Tell whether a stream carries a confidence about which anything was learned."""
+    learned = stream.metadata.get("config", {}).get("motion", {}).get("learn_confidence", True)
+    return learned and any("logit_confidence" in packet.arrays for packet in islice(stream, 1))
 
 
 def channel_picture(name: str, image: np.ndarray, motion_scale: float | None = None) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.evaluate.metrics import endpoint_error, psnr, ssim
+from morgs_mi.evaluate.metrics import endpoint_error, iou, mean_over, psnr, ssim, ssim_map
 
 rng = np.random.default_rng(0)
 TRUTH = rng.random((24, 31, 3))
@@ -71,6 +71,25 @@ def test_endpoint_error_is_a_mean_length():
     mask = np.zeros((6, 7), bool)
     mask[:2] = True
     assert endpoint_error(motion, truth, mask) == pytest.approx(1)
+
+
+def test_iou_of_known_masks():
+    a, b = np.zeros((2, 4, 5), bool)
+    a[0], b[:, 0] = True, True
+    assert iou(a, b) == pytest.approx(1 / 8)
+    assert iou(a, a) == 1
+    assert iou(a, ~a) == 0
+    assert np.isnan(iou(a & ~a, b & ~b))
+
+
+def test_a_smaller_map_lies_in_the_middle_of_its_mask():
+    mask = np.zeros((6, 7), bool)
+    mask[2, 3] = True
+    values = np.arange(12.0).reshape(4, 3)  # its pixel (1, 1) is the mask's (2, 3)
+    assert mean_over(values, mask) == values[1, 1]
+    assert np.isnan(mean_over(values, mask & ~mask))
+    assert np.isnan(mean_over(np.array([1, np.nan]))), "a broken map does not look whole"
+    assert ssim_map(NOISY, TRUTH).shape == (14, 21)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,82 @@
+"""What `evaluate_stream` has found, as tables of at most 80 columns and sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from morgs_mi.evaluate.judge import REGIONS
+
+__all__ = ["figure", "judgement_sentences", "judgement_tables"]
+
+_PICTURE = (("PSNR, dB", "psnr", 2), ("SSIM", "ssim", 4), ("FLIP", "flip", 4), ("dE2000", "delta_e", 2))
+_PICTURE += (("LPIPS", "lpips", 4), ("flow error, px", "motion_error", 2))
+_FRAME = (("PSNR, dB", "psnr", 2), ("moving", "psnr_moving", 2), ("SSIM", "ssim", 4), ("FLIP", "flip", 4))
+_FRAME += (("flow error", "motion_error", 2), ("moving", "motion_error_moving", 2))
+
+
+def figure(value: float | None, digits: int) -> str:
+    """Return a number with so many decimals, "-" where it is unknown."""
+    return "-" if value is None or value != value else f"{value:.{digits}f}"
+
+
+def judgement_tables(result: Mapping[str, Any]) -> Iterator[Table]:
+    """Yield a table of the frames and one of the regions."""
+    frames = _table("frame by frame", "frame", *(title for title, *_ in _FRAME), "kB", "s")
+    for row in result["frames"]:
+        scores = (figure(row[name], digits) for _, name, digits in _FRAME)
+        size, seconds = figure(row["num_bytes"] / 1e3, 1), figure(row["seconds"], 1)
+        frames.add_row(str(row["frame"]), *scores, size, seconds)
+    yield frames
+    views = ("held-out view " if result["held_out"] else "training views ") + ", ".join(result["views"])
+    regions = _table(f"{views}: means, regions from {result['regions']}", "", "whole", "moving", "still")
+    for title, name, digits in _PICTURE:
+        values = [result[name + region] for region in REGIONS]
+        values[0] = values[0]["mean"] if isinstance(values[0], Mapping) else values[0]
+        if any(value == value for value in values):
+            regions.add_row(title, *(figure(value, digits) for value in values))
+    if result["mtv"]["render"] == result["mtv"]["render"]:
+        regions.add_row("mTV x100", "", "", figure(result["mtv"]["render"], 3))
+        regions.add_row("mTV x100 of the recording", "", "", figure(result["mtv"]["input"], 3))
+    yield regions
+
+
+def judgement_sentences(result: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what fits no table: time, space, drift, 3D motion."""
+    size, seconds, play, psnr = result["bytes"], result["seconds"], result["playback"], result["psnr"]
+    if not result["held_out"]:
+        scores = (f"{name} {figure(score['psnr'], 2)}" for name, score in result["views"].items())
+        yield f"PSNR by view, dB: {', '.join(scores)}"
+    yield (
+        f"Drift: PSNR {figure(psnr['first'], 2)} dB in the first frame, {figure(psnr['last'], 2)} dB in the last, "
+        f"{figure(result['psnr_slope'], 4)} dB per frame."
+    )
+    motion = result["motion_3d"]
+    if motion.get("num_gaussians"):
+        yield (
+            f"3D motion of {motion['num_gaussians']:.0f} Gaussians on moving objects: error {motion['error']:.4f} of "
+            f"{motion['true_length']:.4f} units ({100 * motion['relative_error']:.0f} %), angle "
+            f"{motion['angle']:.1f} degrees, length ratio {motion['length_ratio']:.2f}."
+        )
+    if result["confidence_iou"] == result["confidence_iou"]:
+        yield f"Confidence over the true mask: IoU {result['confidence_iou']:.2f}."
+    yield (
+        f"Size: {size['file'] / 1e6:.2f} MB, {figure(size['per_keyframe'] / 1e3, 1)} kB per keyframe, "
+        f"{figure(size['per_residual'] / 1e3, 1)} kB per residual."
+    )
+    yield (
+        f"Time: {figure(seconds['first'], 1)} s for the first frame, {figure(seconds['per_later_frame'], 1)} s per "
+        f"later one, from pictures to packet; played at {figure(play['fps'], 0)} frames per second "
+        f"({figure(play['decode_ms'], 1)} ms to decode, {figure(play['render_ms'], 1)} ms to render)."
+    )
+
+
+def _table(title: str, first: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    table.add_column(first, justify="right" if first else "left", no_wrap=True)
+    for column in columns:
+        table.add_column(column, justify="right", min_width=max(map(len, column.split())))
+    return table

@@ -1,0 +1,42 @@
+"""Five splats that step along x, their stream, and cameras that see them: what the room's tests have in common."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.capture import Camera
+from morgs_mi.codec.container import Packet, StreamWriter
+from morgs_mi.codec.gaussians import decode_gaussians, keyframe_packet, residual_packet
+from morgs_mi.gaussians.gaussians import Gaussians
+
+WIDTH, HEIGHT, DISTANCE, STEP, FRAMES = 40, 30, 4.0, 0.05, 3
+CAMERAS = [
+    Camera.look_at((0, 0, -DISTANCE), (0, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT, "cam0"),
+    Camera.look_at((0.5, 0, -DISTANCE), (0.5, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT, "cam1"),
+]
+# Pixels per frame of a step along x in a plane that is parallel to both images.
+PIXELS = CAMERAS[0].K[0, 0] * STEP / DISTANCE
+
+
+def moved(frame: float, logit: float | None = 0.0) -> Gaussians:
+    """Five splats in the plane z = 0 that have gone `frame` steps along x, with a confidence unless `logit` is None."""
+    rng = np.random.default_rng(0)
+    means = np.float32(rng.uniform(-1, 1, (5, 3)) * (1, 1, 0) + (frame * STEP, 0, 0))
+    sh = np.float32(rng.uniform(-1, 1.5, (5, 1, 3)))
+    more = {} if logit is None else {"logit_confidence": np.full(5, logit, np.float32)}
+    return Gaussians.from_activated(means, np.full((5, 3), 0.2), np.tile([1, 0, 0, 0], (5, 1)), [0.9] * 5, sh, **more)
+
+
+def write_stream(path: Path, metadata: dict, logit: float | None = 0.0, shift: float = 0) -> list[Packet]:
+    """Write the splats' stream, `shift` steps ahead of them, and return its packets."""
+    first = keyframe_packet(moved(shift, logit), 0)
+    state, packets = decode_gaussians(None, first), [first]
+    for frame in range(1, FRAMES):
+        packets.append(residual_packet(state, moved(frame + shift, logit), frame))
+        state = decode_gaussians(state, packets[-1])
+    with StreamWriter(path, CAMERAS, 25, metadata) as writer:
+        for packet in packets:
+            writer.write(packet)
+    return packets

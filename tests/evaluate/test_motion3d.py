@@ -1,0 +1,95 @@
+"""3D motion: who lies on which object, how objects move, how displacements compare."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from morgs_mi.capture import Camera
+from morgs_mi.capture.truth import Truth
+from morgs_mi.evaluate.motion3d import compare_motion, judge_motion, rigid_motions, surface_ids
+
+rng = np.random.default_rng(0)
+WIDTH, HEIGHT = 40, 30
+FRONT = Camera.look_at((0, 0, -4), (0, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT)
+TURN, SHIFT = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0.05, 0, -0.02])
+
+
+def plane(depth: float, left: int, right: int) -> Truth:
+    """What a camera sees of a wall: object `left` in its left half, `right` in its right half."""
+    ids = np.where(np.arange(WIDTH) < WIDTH // 2, left, right) + np.zeros((HEIGHT, 1), int)
+    return Truth(np.zeros((HEIGHT, WIDTH, 2)), np.full((HEIGHT, WIDTH), depth), ids, np.zeros((HEIGHT, WIDTH), bool))
+
+
+def test_points_on_a_visible_surface_are_its_objects():
+    points = np.array([(-0.5, 0, 0), (0.5, 0, 0.03), (-0.5, 0, -0.1), (0.5, 0, 0.1), (9, 0, 0), (0, 0, -9)])
+    # On, on within 1 % of the depth of 4, in front, behind, beside the picture, behind the camera.
+    assert surface_ids(points, [(FRONT, plane(4, 3, 5))]).tolist() == [3, 5, -1, -1, -1, -1]
+    assert surface_ids(points, []).tolist() == [-1] * 6
+
+
+def test_views_that_disagree_leave_a_point_out_and_others_complete_each_other():
+    points = np.array([(-0.5, 0, 0.0), (0.5, 0, 0.0)])
+    assert surface_ids(points, [(FRONT, plane(4, 3, 5)), (FRONT, plane(4, 3, 6))]).tolist() == [3, -1]
+    assert surface_ids(points, [(FRONT, plane(4, -1, 5)), (FRONT, plane(4, 3, 5))]).tolist() == [3, 5]
+
+
+def test_rigid_motions_are_recovered_from_tracks():
+    before = rng.normal(size=(40, 3))
+    ids = np.repeat([0, 2, 4, 5], 10)
+    after = before.copy()
+    after[ids == 2] = before[ids == 2] @ TURN.T + SHIFT
+    after[ids == 4] *= 1.1  # it swells: not rigid
+    before[ids == 5] *= (1, 0, 0)
+    after[ids == 5] = before[ids == 5] + SHIFT  # on a line: a turn about it would not show
+    found = rigid_motions(before, after, ids)
+    assert list(found) == [2]
+    np.testing.assert_allclose(found[2][0], TURN, atol=1e-12)
+    np.testing.assert_allclose(found[2][1], SHIFT, atol=1e-12)
+
+
+def test_points_in_a_plane_are_enough():
+    before = rng.normal(size=(5, 3)) * (1, 1, 0)
+    rotation, shift = rigid_motions(before, before @ TURN.T + SHIFT, np.zeros(5, int))[0]
+    np.testing.assert_allclose(rotation, TURN, atol=1e-12)
+    np.testing.assert_allclose(shift, SHIFT, atol=1e-12)
+
+
+def test_comparison_of_known_displacements():
+    truth = np.array([(1.0, 0, 0), (0, 3, 0)])
+    score = compare_motion(np.array([(0, 1.0, 0), (0, 0, 0)]), truth)
+    assert score["num_gaussians"] == 2
+    assert score["error"] == pytest.approx((np.sqrt(2) + 3) / 2)
+    assert score["true_length"] == 2
+    assert score["relative_error"] == pytest.approx((np.sqrt(2) + 3) / 4)
+    assert score["length_ratio"] == pytest.approx(0.25)
+    assert score["angle"] == pytest.approx(90)
+    assert compare_motion(-truth, truth)["angle"] == pytest.approx(180)
+    half = compare_motion(truth / 2, truth)
+    assert (half["relative_error"], half["length_ratio"], half["angle"]) == pytest.approx((0.5, 0.5, 0))
+
+
+def test_of_no_gaussian_nothing_is_known():
+    nothing = compare_motion(np.zeros((0, 3)), np.zeros((0, 3)))
+    assert nothing.pop("num_gaussians") == 0
+    assert np.isnan(list(nothing.values())).all()
+
+
+def test_the_judged_are_opaque_on_a_moving_object_and_not_on_its_axis():
+    """The left half of the wall turns about the axis through (-1, 0, 0) along the view."""
+    turn = Rotation.from_rotvec([0, 0, 0.2]).as_matrix()
+    centre = np.array([-1.0, 0, 0])
+    tracked = np.array([(-1.6, 0, 0), (-0.4, 0, 0), (-1, 0.6, 0), (0.5, 0, 0), (0.6, 0, 0), (0.5, 0.1, 0)])
+    ids = np.array([3, 3, 3, 5, 5, 5])
+    after = np.where(ids[:, None] == 3, (tracked - centre) @ turn.T + centre, tracked)
+    means = np.array([(-0.6, 0, 0), (-1.01, 0, 0), (-0.6, 0.2, 0), (0.5, 0, 0), (-0.6, 0, 1)])
+    true = (means - centre) @ turn.T + centre - means
+    opacities = np.array([0.9, 0.9, 0.05, 0.9, 0.9])
+    views = [(FRONT, plane(4, 3, 5))]
+    # Judged is the first alone: the axis, too thin, the half that stands still, off the surface.
+    score = judge_motion(means, 1.5 * true, opacities, (tracked, after, ids), views)
+    assert score["num_gaussians"] == 1
+    assert score["true_length"] == pytest.approx(2 * 0.4 * np.sin(0.1))
+    assert (score["relative_error"], score["length_ratio"]) == pytest.approx((0.5, 1.5))
+    assert score["angle"] == pytest.approx(0, abs=1e-5)  # an arc cosine near 1 halves the digits
