@@ -22,7 +22,7 @@ __all__ = ["PIXELS_PER_DEGREE", "delta_e_map", "flip_map"]
 # FLIP's own default: 0.7 m from a 4K monitor 0.7 m wide.
 PIXELS_PER_DEGREE = 0.7 * 3840 / 0.7 * np.pi / 180
 
-# Linear sRGB to CIE XYZ, D65 (IEC 61966-2-1), with the digits of the authors' code; rows sum to the white point.
+# Linear sRGB to CIE XYZ as exact fractions; the rows sum to the white point, D65.
 _XYZ = np.array(
     [
         [10135552 / 24577794, 8788810 / 24577794, 4435075 / 24577794],
@@ -32,7 +32,7 @@ _XYZ = np.array(
 )
 _WHITE = _XYZ.sum(1)
 # Contrast sensitivity per channel: amplitudes and widths (degrees squared) of two Gaussians; luminance, red-green,
-# blue-yellow. Paper, table 1.
+# blue-yellow.
 _SENSITIVITY = (((1, 0.0047), (0, 1e-5)), ((1, 0.0053), (0, 1e-5)), ((34.1, 0.04), (13.5, 0.025)))
 _COLOUR_EXPONENT, _FEATURE_EXPONENT = 0.7, 0.5
 # Colour errors up to 0.4 of the largest take 0.95 of the range.
@@ -99,7 +99,7 @@ def delta_e_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
 
 
 def _colour_error(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return HyAB's distance of adjusted colours [H, W], compressed and scaled to [0, 1] (paper, eqs. 7 and 8)."""
+    """Return HyAB's distance of adjusted colours [H, W], compressed and scaled to [0, 1]."""
     error, largest = _hyab(a, b) ** _COLOUR_EXPONENT, _largest_error()
     knee = _KNEE * largest
     above = _KNEE_VALUE + (error - knee) / (largest - knee) * (1 - _KNEE_VALUE)

@@ -116,11 +116,11 @@ def channel_picture(name: str, image: np.ndarray, motion_scale: float | None = N
 def playback(stream: StreamReader, camera: Camera) -> dict[str, float]:
     """Time how fast a receiver could show a stream on this machine: decode a frame, render its colour, read it back.
 
-    At most the first 30 frames; the first one, which compiles kernels, is left out unless it is the only one.
+    At most the first 30 frames count, without the first, which compiles kernels, unless it is the only one.
 
     Returns:
-        ``fps``, frames per second at the size of `camera`, and the means ``decode_ms`` and ``render_ms``; NaN
-        without a frame.
+        ``fps``, frames per second at the size of `camera`, and the medians ``decode_ms`` and ``render_ms`` that it
+        follows from; NaN without a frame.
 
     Raises:
         ValueError: a broken packet.
@@ -139,7 +139,7 @@ def playback(stream: StreamReader, camera: Camera) -> dict[str, float]:
         begun = time.perf_counter()
         as_picture(render(gaussians, camera, ("color",), config)["color"])
         times.append((decoded - start, time.perf_counter() - begun))
-    decode, show = np.mean(times[1:] or times or [(np.nan, np.nan)], axis=0)
+    decode, show = np.median(times[1:] or times or [(np.nan, np.nan)], axis=0)
     return {"fps": float(1 / (decode + show)), "decode_ms": float(1e3 * decode), "render_ms": float(1e3 * show)}
 
 

@@ -23,26 +23,29 @@ class StillVariation:
     """Masked total variation of a view (mTV): 100 mean |I_t - I_{t-1}| over the pixels that stand still.
 
     The mask is one for the clip, as in the paper: pixels where nothing moved in any frame. A view that is frozen
-    has a variation of 0, and a recording's own is its noise, so the two are told side by side.
+    has a variation of 0, and a recording's own is its noise, so the two are told side by side. A mask that is told from
+    the recording itself favours the recording a little: it is made of what changed least there.
 
     Args:
         valid: [H, W] bool, pixels that may count; None for all.
+        false_alarms: share of the frames in which a pixel may be said to move and still count as standing still:
+            0 for true masks, more for those told from a noisy recording.
     """
 
-    def __init__(self, valid: np.ndarray | None = None) -> None:
-        self._valid, self._pairs = valid, 0
+    def __init__(self, valid: np.ndarray | None = None, false_alarms: float = 0) -> None:
+        self._valid, self._false_alarms, self._frames = valid, false_alarms, 0
         self._last: tuple[np.ndarray, np.ndarray] | None = None
         self._sums: list[np.ndarray] = []
-        self._moved: np.ndarray | None = None
+        self._moved = np.zeros((1, 1), int)
 
     def add(self, image: np.ndarray, recorded: np.ndarray, moving: np.ndarray) -> None:
         """Take in the next frame: rendered and recorded picture [H, W, 3], and where something moves [H, W] bool."""
         pair = unit_pair("StillVariation.add", image, recorded, moving)
-        self._moved = moving.copy() if self._moved is None else self._moved | moving
+        self._moved = self._moved + moving
+        self._frames += 1
         if self._last is not None:
             changes = [np.abs(new - old).mean(-1) for new, old in zip(pair, self._last, strict=True)]
             self._sums = [a + b for a, b in zip(self._sums, changes, strict=True)] if self._sums else changes
-            self._pairs += 1
         self._last = pair
 
     def result(self) -> dict[str, float]:
@@ -50,11 +53,11 @@ class StillVariation:
 
         Without two frames or a still pixel they are NaN.
         """
-        if not self._pairs or self._moved is None:
+        if self._frames < 2:
             return dict.fromkeys(("render", "input", "still_share"), float("nan"))
-        valid = np.ones_like(self._moved) if self._valid is None else self._valid
-        still = ~self._moved & valid
-        render, recorded = (100 * mean_over(total, still) / self._pairs for total in self._sums)
+        valid = np.ones(self._moved.shape, bool) if self._valid is None else self._valid
+        still = (self._moved <= self._false_alarms * self._frames) & valid
+        render, recorded = (100 * mean_over(total, still) / (self._frames - 1) for total in self._sums)
         return {"render": render, "input": recorded, "still_share": float(still.sum() / max(valid.sum(), 1))}
 
 

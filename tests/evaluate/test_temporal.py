@@ -37,6 +37,15 @@ def test_a_frozen_view_has_no_variation_but_its_recording_has():
     assert result["input"] == pytest.approx(100 * 2 * 0.01 / np.sqrt(np.pi), rel=0.05)
 
 
+def test_false_alarms_are_forgiven():
+    once, twice = NOTHING.copy(), NOTHING.copy()
+    once[:, :8], twice[:, :4] = True, True
+    variation = StillVariation(false_alarms=0.1)
+    for moving in (once, twice, *[NOTHING] * 8):
+        variation.add(GREY, GREY, moving)
+    assert variation.result()["still_share"] == pytest.approx(28 / 32), "one frame in ten"
+
+
 def test_variation_of_too_little_is_unknown():
     variation = StillVariation(valid=NOTHING)
     variation.add(GREY, GREY, NOTHING)
