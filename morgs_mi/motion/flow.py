@@ -17,28 +17,59 @@ __all__ = ["FLOW_METHODS", "check_pictures", "consistent", "optical_flow"]
 # DIS needs patches of 8 pixels on its coarsest level; below this no method has anything to match.
 MIN_SIDE = 16
 
-_Gray = Callable[[np.ndarray, np.ndarray], np.ndarray]
+# PCAFlow writes its 18 x 14 coefficients into a quarter of the width and height: out of bounds below this size.
+_PCA_SIZE = (72, 56)
+
+_Method = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
-def _dis(preset: int) -> _Gray:
+def _on_gray(method: _Method) -> _Method:
+    return lambda a, b: method(cv2.cvtColor(a, cv2.COLOR_RGB2GRAY), cv2.cvtColor(b, cv2.COLOR_RGB2GRAY))
+
+
+def _at_least(width: int, height: int, method: _Method, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the flow of pictures that are padded below and on the right where they are smaller."""
+    down, right = max(0, height - a.shape[0]), max(0, width - a.shape[1])
+    padded = (cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_REPLICATE) for image in (a, b))
+    return method(*padded)[: a.shape[0], : a.shape[1]]
+
+
+def _dis(preset: int) -> _Method:
     def flow(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        method = cv2.DISOpticalFlow_create(preset)
         # DIS picks its coarsest level by the width alone and crashes where the height falls under a patch.
-        missing = max(0, a.shape[1] // 2 - a.shape[0])
-        a, b = (cv2.copyMakeBorder(image, 0, missing, 0, 0, cv2.BORDER_REPLICATE) for image in (a, b))
-        return cv2.DISOpticalFlow_create(preset).calc(a, b, None)[: a.shape[0] - missing]
+        return _at_least(0, a.shape[1] // 2, lambda a, b: method.calc(a, b, None), a, b)
 
-    return flow
+    return _on_gray(flow)
 
 
-# OpenCV 5.0's PCAFlow, RLOF and sparse-to-dense corrupt memory on small images and SimpleFlow returns NaN:
-# they are not offered. Two cores take 0.01, 0.02, 0.1, 0.3, 3 and 18 s for 1352x1014, from first to last.
-FLOW_METHODS: dict[str, _Gray] = {
+def _pcaflow(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    method = cv2.optflow.createOptFlow_PCAFlow()
+    try:
+        return _at_least(*_PCA_SIZE, lambda a, b: method.calc(a, b, None), a, b)
+    except cv2.error:  # it found no corner, or lost every one: nothing speaks for motion
+        return np.zeros((*a.shape[:2], 2), np.float32)
+
+
+def _rlof(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    # The global motion prior is for moving cameras, and its grid never ends on pictures of less than 40 rows; the
+    # default interpolation (EPIC) reads what is not there where nothing is matched, the other one needs colours.
+    parameters = cv2.optflow.RLOFOpticalFlowParameter_create()
+    parameters.setUseGlobalMotionPrior(False)
+    return cv2.optflow.calcOpticalFlowDenseRLOF(a, b, None, rlofParam=parameters, interp_type=cv2.optflow.INTERP_GEO)
+
+
+# What OpenCV has beside these (sparse-to-dense, SimpleFlow, RLOF with other interpolations) crashes or gives NaN on
+# pictures with too little to match: see docs/flow.md. All take RGB as bytes.
+FLOW_METHODS: dict[str, _Method] = {
     "dis-ultrafast": _dis(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST),
     "dis-fast": _dis(cv2.DISOPTICAL_FLOW_PRESET_FAST),
     "dis-medium": _dis(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM),
-    "farneback": lambda a, b: cv2.calcOpticalFlowFarneback(a, b, None, 0.5, 5, 15, 3, 5, 1.2, 0),
-    "deepflow": lambda a, b: cv2.optflow.createOptFlow_DeepFlow().calc(a, b, None),
-    "tvl1": lambda a, b: cv2.optflow.createOptFlow_DualTVL1().calc(a, b, None),
+    "farneback": _on_gray(lambda a, b: cv2.calcOpticalFlowFarneback(a, b, None, 0.5, 5, 15, 3, 5, 1.2, 0)),
+    "pcaflow": _on_gray(_pcaflow),
+    "rlof": _rlof,
+    "deepflow": _on_gray(lambda a, b: cv2.optflow.createOptFlow_DeepFlow().calc(a, b, None)),
+    "tvl1": _on_gray(lambda a, b: cv2.optflow.createOptFlow_DualTVL1().calc(a, b, None)),
 }
 
 
@@ -61,7 +92,7 @@ def optical_flow(image: np.ndarray, previous: np.ndarray, method: str = "dis-med
     check_pictures("optical_flow()", image, previous)
     if min(image.shape[:2]) < MIN_SIDE:
         return np.zeros((*image.shape[:2], 2), np.float32)
-    return FLOW_METHODS[method](_gray(image), _gray(previous))
+    return FLOW_METHODS[method](_bytes(image), _bytes(previous))
 
 
 def check_pictures(place: str, image: np.ndarray, previous: np.ndarray) -> None:
@@ -93,10 +124,10 @@ def consistent(flow: np.ndarray, back: np.ndarray) -> np.ndarray:
     return agrees & (x > -0.5) & (x < width - 0.5) & (y > -0.5) & (y < height - 0.5)
 
 
-def _gray(image: np.ndarray) -> np.ndarray:
+def _bytes(image: np.ndarray) -> np.ndarray:
     if image.dtype != np.uint8:
         image = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
-    return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    return np.ascontiguousarray(image)
 
 
 def _squared(vectors: np.ndarray) -> np.ndarray:

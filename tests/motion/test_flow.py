@@ -57,6 +57,18 @@ def test_any_size_gives_a_finite_flow(method, size):
     assert min(size) >= 16 or not flow.any()
 
 
+@pytest.mark.parametrize("method", FLOW_METHODS)
+def test_pictures_with_nothing_to_match_give_a_finite_flow(method):
+    scene = (255 * texture(130, 150, seed=3)).astype(np.uint8)
+    image, flat = scene[:60, :80], np.full((60, 80, 3), 90, np.uint8)
+    part = np.where(np.arange(80)[:, None] < 20, image, flat)
+    for previous, following in ((flat, flat), (flat, image), (image, flat), (part, part), (image, scene[70:, 70:])):
+        flow = optical_flow(following, previous, method)
+        assert np.isfinite(flow).all()
+    # A picture that stands still does so in every method; RLOF and PCAFlow interpolate between sparse matches.
+    assert np.abs(optical_flow(image, image, method)).max() < 0.1
+
+
 RGB = np.zeros((20, 20, 3), np.uint8)
 
 
