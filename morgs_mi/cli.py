@@ -1,4 +1,6 @@
-"""The command line: `morgs-mi synth`, `info`, `fit`, `render`, `eval`, `demo` and `report`. The only argument parser.
+"""The command line, and the only argument parser.
+
+`morgs-mi synth`, `info`, `calibrate`, `fit`, `render`, `eval`, `demo` and `report`.
 
 Results go to standard output; progress, warnings and complaints to standard error. What the user can set right is
 one sentence and exit status 1, an interruption 130; `--debug` shows where it came from. Arguments that the parser
@@ -25,6 +27,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 from rich.table import Table
 from tyro.conf import Positional, arg
 
+from morgs_mi.capture.calibrate import CalibrateConfig
 from morgs_mi.demo import DemoConfig
 from morgs_mi.evaluate.renderer_report import RendererReportConfig
 from morgs_mi.evaluate.tables import figure, judgement_sentences, judgement_tables
@@ -87,32 +90,80 @@ class Synth:
 
 @dataclass(frozen=True)
 class Info:
-    """Say what a capture holds: cameras, sizes, frames, points."""
+    """Say what a capture holds: layout, cameras, sizes, frames, points, and whether the poses fit the pictures."""
 
     capture: Positional[Path]
     """Folder of the capture."""
+    plot: Path | None = None
+    """Picture of the rig, .png or .jpg."""
+    check: bool = True
+    """Compare the poses with what the views of the first frame have in common."""
 
     def run(self) -> None:
         from morgs_mi.capture.capture import load_capture
+        from morgs_mi.capture.rig_check import check_rig, find_common, with_points
+        from morgs_mi.capture.rig_plot import write_rig
 
-        capture = load_capture(self.capture)
-        table = Table(title=str(self.capture))
-        for column in ("index", "camera", "size", "focal lengths, px", "centre, px", "seen", "use"):
-            table.add_column(column)
+        capture, found = load_capture(self.capture), None
+        origin = "" if len(capture.points) else "without points"
+        if self.check:
+            with _progress() as report:
+                common = find_common(capture, lambda done, total: report("Matching views", done, total))
+            found = check_rig(capture, common)
+            if origin:
+                capture = with_points(capture, common)
+                origin += f" ({len(capture.points)} can be triangulated)"
+        table = Table(title=f"{self.capture}: {capture.layout}", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for column in ("", "camera", "size", "focal, px", "centre, px", "seen", "use", "matches", "error, px"):
+            table.add_column(column, no_wrap=True)
         for index, (camera, mask) in enumerate(zip(capture.cameras, capture.masks, strict=True)):
             K = camera.K
             table.add_row(
                 str(index),
                 camera.name,
                 f"{camera.width}x{camera.height}",
-                f"{K[0, 0]:.1f}, {K[1, 1]:.1f}",
-                f"{K[0, 2]:.1f}, {K[1, 2]:.1f}",
+                f"{K[0, 0]:.1f}" if f"{K[0, 0]:.1f}" == f"{K[1, 1]:.1f}" else f"{K[0, 0]:.1f} {K[1, 1]:.1f}",
+                f"{K[0, 2]:.1f} {K[1, 2]:.1f}",
                 "100 %" if mask is None else f"{100 * mask.mean():.0f} %",
-                "held out" if index == capture.test_view else "training",
+                "test" if index == capture.test_view else "train",
+                str(found.camera_matches[index]) if found else "-",
+                f"{found.camera_errors[index]:.2f}" if found and found.camera_matches[index] else "-",
             )
         _OUT.print(table)
+        points = origin or f"{len(capture.points)} points"
         truth = "with ground truth" if capture.truth else "without ground truth"
-        _say(f"{capture.num_frames} frames at {capture.fps:g} fps, {len(capture.points)} points, {truth}.")
+        _say(f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.")
+        if found:
+            error = f"median {found.error:.2f} px over " if found.matches else ""
+            _say(f"Reprojection check: {error}{found.matches} matches in {found.pairs} pairs; {found.advice}")
+        if self.plot is not None:
+            write_rig(self.plot, capture)
+            _say(f"The rig: {self.plot}")
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Find the cameras of a folder of clips with COLMAP, and write FOLDER/sparse/0."""
+
+    folder: Positional[Path]
+    """Folder of videos, or of a folder of images per camera."""
+    config: Annotated[CalibrateConfig, arg(name="")] = field(default_factory=CalibrateConfig)
+    overwrite: bool = False
+    """Replace an earlier model."""
+
+    def run(self) -> None:
+        from morgs_mi.capture.calibrate import calibrate
+
+        with _progress() as report:
+            found = calibrate(
+                self.folder, self.config, self.overwrite, lambda stage, done, total: report(stage, done, total)
+            )
+        if found.left_out:
+            _warn(f"{found.model}: {', '.join(found.left_out)} could not be tied to the others and have no camera.")
+        _say(
+            f"{found.model}: {len(found.cameras)} cameras, {found.points} points, mean reprojection error "
+            f"{found.error:.2f} px; its world has no scale and no up."
+        )
 
 
 @dataclass(frozen=True)
@@ -286,6 +337,7 @@ class RendererReport:
 Command = (
     Annotated[Synth, tyro.conf.subcommand("synth")]
     | Annotated[Info, tyro.conf.subcommand("info")]
+    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]

@@ -316,7 +316,7 @@ def test_debug_shows_where_an_error_came_from(tmp_path: Path, capsys) -> None:
 def test_the_cameras_of_a_capture_are_listed(capture: Path, capsys) -> None:
     status, out, _ = run(capsys, "info", capture)
     assert status == 0
-    assert all(f"{name} │ {WIDTH}x{HEIGHT}" in " ".join(out.split()) for name in NAMES)
+    assert all(f"{name} {WIDTH}x{HEIGHT}" in " ".join(out.split()) for name in NAMES)
     assert f"{FRAMES} frames at 25 fps, 150 points, without ground truth." in out
 
 

@@ -22,6 +22,9 @@ MAX_ERROR = 2.0
 # A wrong pose lets a handful of matches fit by chance, not this many.
 _MIN_MATCHES = 50
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+# From a camera whose right and down were read where right and up are, to what it is.
+_UPRIGHT = np.array([[0, 1.0, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+_OPENGL, _OPENCV = "OpenGL's axes (x right, y up, z backward)", "OpenCV's (x right, y down, z forward)"
 
 
 @dataclass(frozen=True)
@@ -133,22 +136,34 @@ def _verdict(capture: Capture, common: Common, by_camera: np.ndarray, counts: np
 
 
 def _alternatives(capture: Capture) -> list[tuple[list[Camera], str]]:
-    """Return what the cameras would be after each usual mistake, and what to do about it."""
+    """Return what the cameras would be after each usual mistake, and what it is.
+
+    A rotation of the world changes nothing that pictures could tell, so the kinds of poses that may be mistaken for
+    each other are four: camera to world or the inverse, in OpenCV's axes or OpenGL's.
+    """
     cameras = capture.cameras
-    flipped = [replace(c, viewmat=_FLIP @ c.viewmat) for c in cameras]
-    inverted = [replace(c, viewmat=np.linalg.inv(c.viewmat)) for c in cameras]
-    both = [replace(c, viewmat=_FLIP @ np.linalg.inv(c.viewmat) @ _FLIP) for c in cameras]
-    axes = "the camera axes y and z point the other way (OpenCV's: down and forward, OpenGL's: up and backward)"
-    inverse = "the poses are inverted (camera to world is taken for world to camera or the other way round)"
-    found = [
-        (flipped, f"{axes}; convert them"),
-        (inverted, f"{inverse}; invert them"),
-        (both, f"{inverse}, in OpenGL's axes; invert them"),
-        ([replace(c, viewmat=_FLIP @ c.viewmat) for c in inverted], f"{inverse}, and {axes}; do both"),
-    ]
     if capture.layout == "poses_bounds":
         alphabetical = sorted(capture.names)
         rows = [cameras[alphabetical.index(name)] for name in capture.names]
-        text = f"the rows are in alphabetical order ({', '.join(alphabetical[:4])}, ...); put them in numerical order"
-        found.insert(0, (rows, text))
-    return found
+        turned = [replace(c, viewmat=_UPRIGHT @ c.viewmat) for c in cameras]
+        order = ", ".join(alphabetical[:4])
+        return [
+            (rows, f"the rows seem to be in alphabetical order ({order}, ...); put them in numerical order"),
+            (turned, "the columns seem to be the camera's right, up and backward axes; expected down, right, backward"),
+        ]
+    inverses = [replace(c, viewmat=np.linalg.inv(c.viewmat)) for c in cameras]
+    found = [
+        [replace(c, viewmat=_FLIP @ c.viewmat) for c in cameras],
+        inverses,
+        [replace(c, viewmat=_FLIP @ c.viewmat) for c in inverses],
+    ]
+    to_world, to_camera = "camera to world", "world to camera"
+    if capture.layout == "Nerfstudio":
+        expected, others = (to_world, _OPENGL), ((to_world, _OPENCV), (to_camera, _OPENCV), (to_camera, _OPENGL))
+    else:
+        expected, others = (to_camera, _OPENCV), ((to_camera, _OPENGL), (to_world, _OPENCV), (to_world, _OPENGL))
+    remedy = f"expected {expected[0]} in {expected[1]}; convert them"
+    return [
+        (cameras, f"the poses seem to be {kind} in {axes}; {remedy}")
+        for cameras, (kind, axes) in zip(found, others, strict=True)
+    ]

@@ -1,0 +1,71 @@
+"""Pictures of textured planes from known cameras, drawn exactly by homographies."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from morgs_mi.capture import Camera
+
+_TEXTURE = 512
+# Corner, and the edges that span it; far ones first, for the near ones hide them.
+_PLANES = (
+    ((-4.0, -3.0, 6.0), (8.0, 0, 0), (0, 6.0, 0)),  # back wall
+    ((-4.0, 1.5, 1.0), (8.0, 0, 0), (0, 0, 5.0)),  # floor (y points down)
+    ((-1.8, -0.6, 4.5), (1.3, 0, 0.4), (0, 1.6, 0)),
+    ((0.4, -0.9, 3.6), (1.2, 0, -0.5), (0, 1.7, 0.2)),
+)
+
+
+def rig(count: int = 6, width: int = 320, height: int = 240, shift: float = 0.0) -> list[Camera]:
+    """Cameras on an arc in front of the planes, `shift` px off the middle of their images."""
+    cameras = []
+    for i, angle in enumerate(np.linspace(-0.35, 0.35, count)):
+        place = (4.0 * np.sin(angle), -0.5 + 0.5 * np.cos(5 * i), 4.2 - 4.0 * np.cos(angle))
+        view = Camera.look_at(place, (0, 0, 4.2), (0, -1, 0), 60, width, height, f"cam{i}")
+        K = view.K + np.array([[0, 0, shift], [0, 0, -0.5 * shift], [0, 0, 0]])
+        cameras.append(Camera(K, view.viewmat, width, height, view.name))
+    return cameras
+
+
+def textures() -> list[np.ndarray]:
+    """One texture per plane, RGB uint8, with detail at several scales."""
+    rng = np.random.default_rng(0)
+    found = []
+    for _ in _PLANES:
+        octaves = [rng.uniform(0, 1, (n, n, 3)) for n in (16, 32, 64, 128)]
+        sum_ = sum(cv2.resize(o, (_TEXTURE, _TEXTURE), interpolation=cv2.INTER_CUBIC) for o in octaves)
+        found.append((255 * np.clip(sum_ / 3 - 0.1, 0, 1)).astype(np.uint8))
+    return found
+
+
+def render(camera: Camera, planes: Sequence[np.ndarray]) -> np.ndarray:
+    """Draw the planes' textures as the camera sees them: RGB uint8 [H, W, 3]."""
+    image = np.zeros((camera.height, camera.width, 3), np.uint8)
+    R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
+    centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV's pixel centres are integers
+    for (corner, across, down), texture in zip(_PLANES, planes, strict=True):
+        plane = np.stack([R @ across, R @ down, R @ corner + t], axis=1) @ np.diag([1 / _TEXTURE, 1 / _TEXTURE, 1])
+        H = np.linalg.inv(centre) @ camera.K @ plane @ centre
+        # Twice as large and shrunk: less aliasing.
+        double = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1.0]])
+        size = (2 * camera.width, 2 * camera.height)
+        seen = cv2.warpPerspective(texture, double @ H, size, flags=cv2.INTER_LINEAR)
+        cover = cv2.warpPerspective(
+            np.full(texture.shape[:2], 255, np.uint8), double @ H, size, flags=cv2.INTER_NEAREST
+        )
+        shrink = (camera.width, camera.height)
+        seen, cover = (cv2.resize(x, shrink, interpolation=cv2.INTER_AREA) for x in (seen, cover))
+        image[cover > 127] = seen[cover > 127]
+    return image
+
+
+def distance_to_planes(points: np.ndarray) -> np.ndarray:
+    """Return how far each point [n, 3] is from the nearest of the planes (taken as endless), world units."""
+    found = []
+    for corner, across, down in _PLANES:
+        normal = np.cross(across, down)
+        found.append(np.abs((points - corner) @ normal) / np.linalg.norm(normal))
+    return np.min(found, axis=0)
