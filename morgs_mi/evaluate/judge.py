@@ -39,7 +39,7 @@ from morgs_mi.evaluate.stream import (
 from morgs_mi.evaluate.temporal import StillVariation, recorded_change, slope
 from morgs_mi.gaussians.gaussians import Gaussians
 
-__all__ = ["REGIONS", "SECONDS", "evaluate_stream"]
+__all__ = ["MOTION_SCORES", "PICTURE_SCORES", "REGIONS", "SECONDS", "evaluate_stream"]
 
 REGIONS = ("", "_moving", "_still")
 PICTURE_SCORES = ("psnr", "ssim", "flip", "delta_e", "lpips")
