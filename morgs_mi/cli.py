@@ -29,6 +29,7 @@ from tyro.conf import Positional, arg
 
 from morgs_mi.capture.calibrate import CalibrateConfig
 from morgs_mi.demo import DemoConfig
+from morgs_mi.evaluate.flow_report import FlowReportConfig
 from morgs_mi.evaluate.renderer_report import RendererReportConfig
 from morgs_mi.evaluate.tables import figure, judgement_sentences, judgement_tables
 from morgs_mi.stream_loop import StreamConfig
@@ -309,8 +310,6 @@ class Demo:
 class RendererReport:
     """Measure the renderer's settings: error against a float64 twin beside run time."""
 
-    subject: Positional[Literal["renderer"]]
-    """What to report on."""
     json: Path | None = None
     """File for all figures; - prints them in place of the tables."""
     plot: Path | None = None
@@ -334,6 +333,51 @@ class RendererReport:
             plot_renderer(result, self.plot)
 
 
+@dataclass(frozen=True)
+class FlowReport:
+    """Measure methods of optical flow: error against synthetic clips' true flow beside run time."""
+
+    captures: Positional[tuple[Path, ...]]
+    """Folders of captures with ground truth, as synth makes them."""
+    json: Path | None = None
+    """File for all figures; - prints them in place of the tables."""
+    plot: Path | None = None
+    """Picture of error against run time, .png or .svg; needs matplotlib."""
+    config: Annotated[FlowReportConfig, arg(name="")] = field(default_factory=FlowReportConfig)
+
+    def run(self) -> None:
+        from morgs_mi.evaluate.flow_report import markdown_table, plot_flow, report_flow
+        from morgs_mi.files import finite, write_json
+
+        with _progress() as report:
+            result = report_flow(self.captures, self.config, report)
+        if self.json == Path("-"):
+            _say(json.dumps(finite(result), indent=2))
+        else:
+            for clip in result["clips"]:
+                title = f"{clip['name']}: {clip['pairs']} pairs of {clip['width']}x{clip['height']} pixels"
+                _say(f"{title}, motion of {figure(clip['motion'], 1)} px\n\n{markdown_table(clip)}")
+        if self.json not in (None, Path("-")):
+            write_json(self.json, result)
+            _say(f"All figures: {self.json}")
+        if self.plot is not None:
+            plot_flow(result, self.plot)
+
+
+@dataclass(frozen=True)
+class Measure:
+    """Measure a part of the package: error beside run time."""
+
+    subject: Annotated[
+        Annotated[RendererReport, tyro.conf.subcommand("renderer")]
+        | Annotated[FlowReport, tyro.conf.subcommand("flow")],
+        arg(name=""),
+    ]
+
+    def run(self) -> None:
+        self.subject.run()
+
+
 Command = (
     Annotated[Synth, tyro.conf.subcommand("synth")]
     | Annotated[Info, tyro.conf.subcommand("info")]
@@ -342,7 +386,7 @@ Command = (
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
-    | Annotated[RendererReport, tyro.conf.subcommand("report")]
+    | Annotated[Measure, tyro.conf.subcommand("report")]
 )
 
 
