@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -68,12 +67,14 @@ def draw_stream(
     later = frames[1:] or frames
     chosen = {later[i] for i in np.linspace(0, len(later) - 1, min(_ROWS, len(later))).astype(int)}
     scale = motion_scale(recording, camera)
+    column, sight = _busiest_column(recording, view, frames)
     shown, recorded, motions, confidences = [], [], [], []
     trusted = has_confidence(stream)
     played = render_stream(stream, camera, ("color", "motion", *(("confidence",) if trusted else ())))
     for (index, images), frame in zip(played, recording.frames(frames[0], frames[-1] + 1), strict=False):
-        shown.append(as_picture(images["color"]))
-        recorded.append(frame.images[view])
+        # Copies, for the pictures of a long clip do not all fit in memory.
+        shown.append(as_picture(images["color"])[:, column].copy())
+        recorded.append(frame.images[view][:, column].copy())
         if index in chosen:
             truth = truth_on(recording, camera, index)
             true_motion, mask = (None, None) if truth is None else (truth.motion, truth.mask)
@@ -84,7 +85,7 @@ def draw_stream(
                 confidences.append(_row(index, confidence_picture, found))
         if progress is not None:
             progress(len(shown), len(frames))
-    sheets = {"slice": _slices(recorded, shown), "motion": _with_legend(motions, motion_legend(scale))}
+    sheets = {"slice": _slices(sight, column, recorded, shown), "motion": _with_legend(motions, motion_legend(scale))}
     if confidences:
         sheets["confidence"] = _with_legend(confidences, confidence_legend())
     paths = [Path(folder) / f"{name}.png" for name in sheets]
@@ -101,21 +102,25 @@ def motion_scale(capture: Capture, camera: Camera) -> float:
     return float(np.percentile(moving, 95)) if moving.size else 0.03 * camera.width
 
 
-def _slices(recorded: Sequence[np.ndarray], shown: Sequence[np.ndarray]) -> np.ndarray:
-    """Return where the column is, and what is recorded and rendered there over time."""
-    change = np.zeros(recorded[0].shape[1])
-    for before, after in pairwise(recorded):
-        change += np.abs(after.astype(float) - before).sum((0, 2))
-    column = int(change.argmax())
-    view = recorded[-1].copy()
-    view[:, column] = _MARK
-    return side_by_side(
-        [
-            label(view, f"column {column}"),
-            label(time_slice(recorded, column), "recorded, over time"),
-            label(time_slice(shown, column), "rendered, over time"),
-        ]
-    )
+def _busiest_column(recording: Capture, view: int, frames: Sequence[int]) -> tuple[int, np.ndarray]:
+    """Return the column of a view in which the recording changes most, and the last picture of it."""
+    change, last = np.zeros(recording.cameras[view].width), None
+    for frame in recording.frames(frames[0], frames[-1] + 1):
+        picture = frame.images[view].astype(float)
+        if last is not None:
+            change += np.abs(picture - last).sum((0, 2))
+        last = picture
+    assert last is not None
+    return int(change.argmax()), last.astype(np.uint8)
+
+
+def _slices(sight: np.ndarray, column: int, recorded: Sequence[np.ndarray], shown: Sequence[np.ndarray]) -> np.ndarray:
+    """Return where the column is in a picture, and what is recorded and rendered there over time."""
+    marked = sight.copy()
+    marked[:, column] = _MARK
+    over_time = [(recorded, "recorded, over time"), (shown, "rendered, over time")]
+    slices = [label(time_slice(columns), title) for columns, title in over_time]
+    return side_by_side([label(marked, f"column {column}"), *slices])
 
 
 def _row(

@@ -102,20 +102,18 @@ def confidence_legend(size: int = 96) -> np.ndarray:
     return picture
 
 
-def time_slice(images: Sequence[np.ndarray], column: int, least_width: int = 320) -> np.ndarray:
-    """Return one column of every picture side by side, time to the right: [H, W, 3].
+def time_slice(columns: Sequence[np.ndarray], least_width: int = 320) -> np.ndarray:
+    """Return the same column of every frame [H, 3] side by side, time to the right: a picture [H, W, 3].
 
     What stands still is a horizontal streak, noise a rough one. The columns of a short clip are repeated until they
     fill `least_width` pixels.
 
     Raises:
-        ValueError: no picture, or a column outside them.
+        ValueError: no column.
     """
-    if not images or not 0 <= column < images[0].shape[1]:
-        found = f"pictures {images[0].shape[1]} pixels wide" if images else "no picture"
-        raise ValueError(f"time_slice(): `column` must lie in the pictures, got {column} and {found}.")
-    columns = np.stack([as_picture(image)[:, column] for image in images], axis=1)
-    return np.repeat(columns, -(-least_width // len(images)), axis=1)
+    if not columns:
+        raise ValueError("time_slice(): there must be at least one column, got none.")
+    return np.repeat(as_picture(np.stack(columns, axis=1)), -(-least_width // len(columns)), axis=1)
 
 
 def depth_picture(depth: np.ndarray, near: float | None = None, far: float | None = None) -> np.ndarray:

@@ -44,13 +44,13 @@ def test_confidence_legend_agrees_with_the_picture():
 
 
 def test_time_runs_to_the_right_of_a_slice():
-    frames = [np.full((5, 7, 3), 10 * t, np.uint8) for t in range(4)]
-    frames[2][3, 6] = 255
-    sliced = pictures.time_slice(frames, 6, least_width=8)
+    columns = [np.full((5, 3), 10 * t, np.uint8) for t in range(4)]
+    columns[2][3] = 255
+    sliced = pictures.time_slice(columns, least_width=8)
     assert sliced.shape == (5, 8, 3)
     assert sliced[0, :, 0].tolist() == [0, 0, 10, 10, 20, 20, 30, 30]
     assert (sliced == 255).all(-1).nonzero()[1].tolist() == [4, 5]
-    assert pictures.time_slice(frames * 100, 0).shape == (5, 400, 3)
+    assert pictures.time_slice(columns * 100).shape == (5, 400, 3)
 
 
 def test_depth_is_red_near_blue_far_and_grey_nowhere():
@@ -104,8 +104,7 @@ def test_failed_png_leaves_nothing_behind(tmp_path):
         (lambda: pictures.motion_picture(np.zeros((2, 2)), 1), r"\[H, W, 2\]"),
         (lambda: pictures.motion_picture(np.zeros((2, 2, 2)), 0), "positive, got 0"),
         (lambda: pictures.side_by_side([]), "at least one"),
-        (lambda: pictures.time_slice([], 0), "got 0 and no picture"),
-        (lambda: pictures.time_slice([np.zeros((2, 3))], 3), "got 3 and pictures 3 pixels wide"),
+        (lambda: pictures.time_slice([]), "at least one column"),
         (lambda: pictures.write_png("x.png", np.zeros((0, 2))), "no pixels"),
     ],
 )
