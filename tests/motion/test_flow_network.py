@@ -9,7 +9,7 @@ import pytest
 from morgs_mi.motion.config import MotionConfig
 from morgs_mi.motion.flow_network import FlowNetwork, read_signature
 from morgs_mi.motion.flow_sources import FramePair, flow_source
-from tests.motion.tiny_network import export, known_flow
+from tests.motion.tiny_network import export, export_lookup, known_flow
 
 # Float32 sums of six products of up to 255 each.
 TOLERANCE = 1e-3
@@ -108,5 +108,13 @@ def test_a_network_that_fails_says_where(network, monkeypatch):
         FlowNetwork(network)(*pictures(20, 30))
 
 
-def test_opencv_can_run_what_the_test_exports(network):
-    assert not cv2.dnn.readNetFromONNX(str(network)).empty()
+def test_the_lookup_that_raft_needs_runs_or_is_named(tmp_path):
+    image, other = pictures(24, 40)
+    path = export_lookup(tmp_path / "lookup.onnx", 24, 40)
+    if int(cv2.__version__.split(".")[0]) < 5:
+        with pytest.raises(ValueError, match=r"lookup.onnx: OpenCV 4\..* cannot load this network .*GridSample"):
+            FlowNetwork(path)
+        return
+    expected = 0.5 * (other[::-1, ::-1, :2].astype(float) - image[..., :2])
+    # Grid coordinates in float32 put a lookup up to 1e-5 px beside its pixel.
+    np.testing.assert_allclose(FlowNetwork(path)(image, other), expected, atol=0.01)

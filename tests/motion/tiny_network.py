@@ -21,7 +21,7 @@ def known_flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
 def export(path: Path, height: int | str = "h", width: int | str = "w", inputs: int = 2, channels: int = 2) -> Path:
     """Write a network with RAFT's signature: two pictures in, flow at an eighth and at the whole size out.
 
-    It fails on sizes that are no multiples of 8, as RAFT does: the whole flow takes up the small one enlarged, times 0.
+    It wants multiples of 8, as RAFT does: the whole flow takes up the small one enlarged, times 0.
     """
     names = [f"image{k}" for k in range(1, inputs + 1)]
     weights = dict(zip(names, (OF_IMAGE, OF_OTHER, OF_OTHER), strict=False))
@@ -35,16 +35,35 @@ def export(path: Path, height: int | str = "h", width: int | str = "w", inputs: 
         helper.make_node("Mul", ["large", "nothing"], ["no_flow"]),
         helper.make_node("Add", ["sum", "no_flow"], ["flow_up"]),
     ]
-    graph = helper.make_graph(
-        nodes,
-        "tiny",
-        [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 3, height, width]) for name in names],
-        [
-            helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, channels, None, None])
-            for name in ("flow_low", "flow_up")
-        ],
-        [numpy_helper.from_array(value, name) for name, value in constants.items()],
+    sizes = (1, 3, height, width), (1, channels, None, None)
+    return _write(
+        path, nodes, dict.fromkeys(names, sizes[0]), dict.fromkeys(("flow_low", "flow_up"), sizes[1]), constants
     )
+
+
+def export_lookup(path: Path, height: int, width: int) -> Path:
+    """Write a network that looks up the second picture in the first one's grid turned by 180 degrees, as RAFT looks up
+    correlations: the flow is the difference of red and of green, at half weight.
+    """
+    y, x = np.linspace(1, -1, height), np.linspace(1, -1, width)
+    weights = np.array([[0.5, 0, 0], [0, 0.5, 0]], np.float32)[:, :, None, None]
+    grid = np.stack(np.meshgrid(x, y), axis=-1)[None].astype(np.float32)
+    nodes = [
+        helper.make_node("GridSample", ["image2", "grid"], ["turned"], align_corners=1),
+        helper.make_node("Sub", ["turned", "image1"], ["difference"]),
+        helper.make_node("Conv", ["difference", "weights"], ["flow"]),
+    ]
+    pictures = dict.fromkeys(("image1", "image2"), (1, 3, height, width))
+    return _write(path, nodes, pictures, {"flow": [1, 2, height, width]}, {"weights": weights, "grid": grid})
+
+
+def _write(path: Path, nodes: list, inputs: dict, outputs: dict, constants: dict[str, np.ndarray]) -> Path:
+    ends = (
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in values.items()]
+        for values in (inputs, outputs)
+    )
+    weights = [numpy_helper.from_array(value, name) for name, value in constants.items()]
+    graph = helper.make_graph(nodes, "tiny", *ends, weights)
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 16)], ir_version=8)
     onnx.checker.check_model(model)
     onnx.save(model, path)
