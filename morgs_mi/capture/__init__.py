@@ -5,6 +5,7 @@ from morgs_mi.capture.capture import Capture, Frame, load_capture
 from morgs_mi.capture.colmap import ColmapModel, read_colmap, write_colmap
 from morgs_mi.capture.lens import Lens, Undistortion, undistortion
 from morgs_mi.capture.poses_bounds import read_poses_bounds, write_poses_bounds
+from morgs_mi.capture.rig_check import RigCheck, check_rig, find_common, with_points
 from morgs_mi.capture.video import FolderReader, VideoReader, open_frames, write_video
 
 __all__ = [
@@ -14,13 +15,17 @@ __all__ = [
     "FolderReader",
     "Frame",
     "Lens",
+    "RigCheck",
     "Undistortion",
     "VideoReader",
+    "check_rig",
+    "find_common",
     "load_capture",
     "open_frames",
     "read_colmap",
     "read_poses_bounds",
     "undistortion",
+    "with_points",
     "write_colmap",
     "write_poses_bounds",
     "write_video",

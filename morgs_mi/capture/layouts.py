@@ -20,7 +20,7 @@ from morgs_mi.capture.lens import Lens
 from morgs_mi.capture.nerfstudio import read_points_ply, read_transforms
 from morgs_mi.capture.poses_bounds import count_rows, read_poses_bounds
 from morgs_mi.capture.video import VIDEO_SUFFIXES, Clip, natural_key
-from morgs_mi.capture.views import clips_by_camera, clips_by_frame, view_of_image
+from morgs_mi.capture.views import check_frames, clips_by_camera, clips_by_frame, view_of_image
 
 __all__ = ["Calibration", "read_calibration"]
 
@@ -61,7 +61,8 @@ def read_calibration(path: Path) -> Calibration:
         ValueError: a file is broken, or does not fit the clips.
     """
     colmap = find_colmap(path)
-    if colmap is None and (path / "train_meta.json").is_file():
+    transforms = path / "transforms.json"
+    if colmap is None and not transforms.is_file() and (path / "train_meta.json").is_file():
         return _dynamic3dgs(path)
     if not clips_by_camera(path):
         raise FileNotFoundError(
@@ -71,10 +72,10 @@ def read_calibration(path: Path) -> Calibration:
         model = read_colmap(colmap)
         named = _by_name(path, colmap, model.cameras, model.lenses)
         return Calibration("COLMAP", *named, model.points, model.point_colors)
-    if (path / "transforms.json").is_file():
-        cameras, lenses, ply = read_transforms(path / "transforms.json")
+    if transforms.is_file():
+        cameras, lenses, ply = read_transforms(transforms)
         points, colors = read_points_ply(ply) if ply else (_NO_POINTS, _NO_POINTS)
-        named = _by_name(path, path / "transforms.json", cameras, lenses)
+        named = _by_name(path, transforms, cameras, lenses)
         return Calibration("Nerfstudio", *named, points, colors)
     if (path / "poses_bounds.npy").is_file():
         return _poses_bounds(path)
@@ -92,11 +93,12 @@ def _by_name(
     try:
         group = _grouped(source, views, cameras, lenses)
     except (FileNotFoundError, ValueError) as error:
-        views = dict(clips_by_frame(path))
+        views = dict(by_frame := clips_by_frame(path))
         try:
             group = _grouped(source, views, cameras, lenses)
         except (FileNotFoundError, ValueError):
             raise error from None
+        check_frames(path, by_frame)
     if unused := [name for name in views if name not in group]:
         _LOG.warning("%s does not calibrate %s: not used.", source, ", ".join(unused))
     names = sorted(group, key=natural_key)
@@ -133,6 +135,7 @@ def _poses_bounds(path: Path) -> Calibration:
     source = path / "poses_bounds.npy"
     views: dict[str, Clip] = dict(clips_by_camera(path))
     if len(views) != count_rows(source) == len(by_frame := clips_by_frame(path)):
+        check_frames(path, by_frame)
         views = dict(by_frame)
     cameras, _ = read_poses_bounds(source, list(views))
     lenses = (Lens(),) * len(cameras)

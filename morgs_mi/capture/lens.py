@@ -75,7 +75,7 @@ class Undistortion:
 
     Attributes:
         maps: OpenCV's fixed-point maps for `cv2.remap`.
-        mask: [H, W] bool, true where the undistorted pixel lies inside the recorded image.
+        mask: [H, W] bool, true where the undistorted pixel lies inside the recorded image, and the lens model holds.
     """
 
     maps: tuple[np.ndarray, np.ndarray]
@@ -102,5 +102,20 @@ def undistortion(camera: Camera, lens: Lens) -> Undistortion | None:
     build = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
     x, y = build(K, lens.opencv_coefficients, np.eye(3), K, size, cv2.CV_32FC1)
     mask = (x >= -0.5) & (x <= camera.width - 0.5) & (y >= -0.5) & (y <= camera.height - 0.5)
+    mask &= ~_folded(x, y, K)
     # Fixed point halves the memory of a rig's maps; its 1/32 px is far below any calibration's error.
     return Undistortion(cv2.convertMaps(x, y, cv2.CV_16SC2), mask)
+
+
+def _folded(x: np.ndarray, y: np.ndarray, K: np.ndarray) -> np.ndarray:
+    """Return where a lens model is beyond the angle up to which it holds [H, W].
+
+    A polynomial that was fitted to the recorded rays turns back farther out, and would show the image's inside there
+    once more, mirrored.
+    """
+    if min(x.shape) < 2:
+        return np.zeros(x.shape, bool)
+    determinant = np.gradient(x, axis=1) * np.gradient(y, axis=0) - np.gradient(x, axis=0) * np.gradient(y, axis=1)
+    rows, columns = np.mgrid[: x.shape[0], : x.shape[1]]
+    radius = np.hypot((columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1])
+    return radius >= np.min(radius[determinant <= 0], initial=np.inf)

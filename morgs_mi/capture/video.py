@@ -15,7 +15,16 @@ import numpy as np
 
 from morgs_mi.files import new_folder, whole
 
-__all__ = ["Clip", "FolderReader", "FrameReader", "VideoReader", "natural_key", "open_frames", "write_video"]
+__all__ = [
+    "Clip",
+    "FolderReader",
+    "FrameReader",
+    "VideoReader",
+    "natural_key",
+    "numbering_gap",
+    "open_frames",
+    "write_video",
+]
 
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -25,6 +34,15 @@ def natural_key(name: str) -> list[str | int]:
     """Return a sorting key that puts cam_2 before cam_10."""
     # split() with a group alternates text and digits, so keys compare text with text and int with int.
     return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", name))]
+
+
+def numbering_gap(names: Sequence[str]) -> int | None:
+    """Return the index of the first name whose last number does not continue the sequence, or None."""
+    numbers = [int((re.findall(r"[0-9]+", name) or ["-1"])[-1]) for name in names]
+    steps = np.diff(numbers)
+    if len(names) < 2 or (min(numbers) >= 0 and steps.min() >= 1 and steps.min() == steps.max()):
+        return None
+    return 1 + int(np.argmax(steps != steps.min()) if steps.min() > 0 else np.argmin(steps))
 
 
 @dataclass(frozen=True)
@@ -130,13 +148,10 @@ class FolderReader:
             raise FileNotFoundError(
                 f"{path}: expected images ({', '.join(IMAGE_SUFFIXES)}), found none; extract the frames."
             )
-        numbers = [int((re.findall(r"[0-9]+", f.stem) or ["-1"])[-1]) for f in files]
-        steps = np.diff(numbers)
-        if len(files) > 1 and (min(numbers) < 0 or steps.min() < 1 or steps.min() != steps.max()):
-            gap = int(np.argmax(steps != steps.min())) if steps.min() > 0 else int(np.argmin(steps))
+        if gap := numbering_gap([f.stem for f in files]):
             raise ValueError(
-                f"{path}: the images must be numbered without gaps, got {files[gap].name} followed by "
-                f"{files[gap + 1].name}; extract the frames again."
+                f"{path}: the images must be numbered without gaps, got {files[gap - 1].name} followed by "
+                f"{files[gap].name}; extract the frames again."
             )
         return cls.of_files(files)
 

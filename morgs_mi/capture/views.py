@@ -11,12 +11,12 @@ laying clips out are known; cameras are ordered numerically, cam_2 before cam_10
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
-from morgs_mi.capture.video import IMAGE_SUFFIXES, VIDEO_SUFFIXES, natural_key
+from morgs_mi.capture.video import IMAGE_SUFFIXES, VIDEO_SUFFIXES, natural_key, numbering_gap
 
-__all__ = ["clips_by_camera", "clips_by_frame", "view_of_image"]
+__all__ = ["check_frames", "clips_by_camera", "clips_by_frame", "view_of_image"]
 
 # Folders that are no camera's even where they hold images: calibrations, ground truth, and images by themselves.
 _NOT_CAMERAS = {"frames", "images", "sparse", "truth"}
@@ -46,6 +46,20 @@ def clips_by_frame(path: Path) -> dict[str, tuple[Path, ...]]:
         return {}
     images = sorted((f for f in frames[0].iterdir() if _is_image(f)), key=lambda f: natural_key(f.stem))
     return {f.stem: tuple(folder / f.name for folder in frames) for f in images}
+
+
+def check_frames(path: Path, clips: Mapping[str, Sequence[Path]]) -> None:
+    """Check that the folders of `clips_by_frame` are numbered without gaps.
+
+    Raises:
+        ValueError: they are not.
+    """
+    folders = [f.relative_to(path).parts[0] for f in next(iter(clips.values()))]
+    if gap := numbering_gap(folders):
+        raise ValueError(
+            f"{path}: the folders of the frames must be numbered without gaps, got {folders[gap - 1]} followed by "
+            f"{folders[gap]}; extract the frames again."
+        )
 
 
 def view_of_image(views: Collection[str], image: str) -> str | None:

@@ -139,6 +139,10 @@ POSES_BOUNDS = {
 BY_FRAME = {
     "no image": (missing("frame000002/cam_2.png"), "frame000002/cam_2.png: expected an image, found none"),
     "no camera": (missing("frame000000/cam_10.png"), "got 3 rows for 4 videos"),
+    "no frame": (
+        lambda path: (path / "frame000001").rename(path / "frame000007"),
+        "the folders of the frames must be numbered without gaps, got frame000000 followed by frame000002",
+    ),
     "truncated image": (empty("frame000000/cam_0.png"), "frame000000/cam_0.png: expected an image, got 0 bytes"),
 }
 COLMAP = {

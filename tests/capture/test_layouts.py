@@ -108,6 +108,45 @@ def test_colmap_models_lie_in_several_places(tmp_path: Path, place: str) -> None
     assert_holds(load_capture(tmp_path / "a"), ("cam1", "cam2", "cam10"), (0, 1, 2), shift=3)
 
 
+def test_the_first_calibration_that_is_there_counts(tmp_path: Path) -> None:
+    """COLMAP before Nerfstudio before Dynamic 3D Gaussians before poses_bounds, binary before text."""
+    path = layouts.nerfstudio(tmp_path / "a")
+    write_poses_bounds(path / "poses_bounds.npy", rig(("cam1", "cam2", "cam10")), [[1, 9]] * 3)
+    assert load_capture(path).layout == "Nerfstudio"
+    layouts.colmap_text(path / "sparse", rig(("cam1", "cam2")), "PINHOLE", [[50.0, 50, 31, 23]], shared=True)
+    assert load_capture(path).names == ("cam1", "cam2")
+    model = pycolmap.Reconstruction(str(path / "sparse"))
+    model.cameras[1].params = [60.0, 60, 31, 23]
+    model.write_binary(str(path / "sparse"))
+    assert load_capture(path).cameras[0].K[0, 0] == 60
+    meta = layouts.dynamic3dgs(tmp_path / "b")
+    layouts.videos(meta, ("cam1",))
+    write_poses_bounds(meta / "poses_bounds.npy", rig(("cam1",)), [[1, 9]])
+    assert load_capture(meta).layout == "Dynamic 3D Gaussians"
+    (meta / "transforms.json").write_text((path / "transforms.json").read_text())
+    layouts.videos(meta, ("cam1", "cam2", "cam10"))
+    assert load_capture(meta).layout == "Nerfstudio"
+
+
+def test_folders_that_hold_no_clips(tmp_path: Path) -> None:
+    path = layouts.n3dv(tmp_path / "a")
+    for place in (
+        "images/cam05.png",
+        "frames/cam05.png",
+        "truth/cam05/0000.png",
+        "masks/cam05/0.png",
+        "seg/cam05/0.png",
+    ):
+        layouts.write_image(path / place, 0, 0)
+    assert load_capture(path).names == ("cam00", "cam02", "cam11")
+
+
+def test_frame_rates_may_differ_by_a_hundredth(tmp_path: Path) -> None:
+    path = layouts.n3dv(tmp_path / "a")
+    write_video(path / "cam02.mkv", layouts.frames(1), 1.005 * FPS)
+    assert load_capture(path).fps == FPS
+
+
 def test_nerfstudio(tmp_path: Path) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
     capture = load_capture(path)

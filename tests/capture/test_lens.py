@@ -73,6 +73,21 @@ def test_the_mask_marks_what_a_pincushion_leaves_empty() -> None:
     assert barrel.mask.all()
 
 
+@pytest.mark.parametrize(("model", "fold"), [("SIMPLE_RADIAL", (3 * 0.5) ** -0.5), ("OPENCV_FISHEYE", None)])
+def test_the_mask_ends_where_the_lens_model_turns_back(model: str, fold: float | None) -> None:
+    """R (1 - 0.5 r^2) falls beyond r = 0.816; theta (1 - 0.5 theta^2) beyond that angle, whose tangent is 1.066."""
+    radius = fold or np.tan((3 * 0.5) ** -0.5)
+    cam = camera(focal=60.0)
+    undo = undistortion(cam, Lens(model, (-0.5,)))
+    assert undo is not None
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    r = np.hypot((columns - cam.K[0, 2]) / cam.K[0, 0], (rows - cam.K[1, 2]) / cam.K[1, 1])
+    assert r.max() > 1.2 * radius
+    pixel = 1.5 / cam.K[0, 0]
+    assert undo.mask[r < radius - pixel].all()
+    assert not undo.mask[r > radius + pixel].any()
+
+
 @pytest.mark.parametrize(
     ("model", "params", "message"),
     [

@@ -164,6 +164,22 @@ def test_too_few_matches_are_no_verdict(capture: Capture) -> None:
     assert "too few matches" in check.advice
 
 
+def test_fewer_than_fifty_matches_are_no_verdict_even_if_they_fit(capture: Capture, common: Common) -> None:
+    first = common.matches[0]
+    for count, fits in ((49, None), (50, True)):
+        few = Common(common.features, (replace(first, features=first.features[:count]),))
+        assert check_rig(capture, few).fits is fits
+    assert "no match with cam2, cam3, cam4, cam5" in check_rig(capture, few).advice
+
+
+def test_what_the_check_hardly_sees(capture: Capture, common: Common) -> None:
+    """The price of trusting two views at a time: all principal points off by 5 px still fit."""
+    shift = np.array([[0, 0, 5], [0, 0, 5], [0, 0, 0]])
+    check = check_rig(with_cameras(capture, lambda i, c: replace(c, K=c.K + shift)), common)
+    assert check.fits
+    assert check.error > 3 * check_rig(capture, common).error
+
+
 def test_features_lie_where_the_picture_says() -> None:
     """A blob at a known place, at several sizes of the image: pixel centres lie at +0.5."""
     for width, height in ((160, 120), (1600, 1200)):
@@ -197,6 +213,13 @@ def test_points_are_triangulated_on_the_planes(capture: Capture, common: Common)
     u, v = (x[:, :2] / x[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]).astype(int).T
     inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (x[:, 2] > 0)
     assert np.median(np.abs(image[v[inside], u[inside]] / 255 - colors[inside])) < 0.05
+
+
+def test_points_under_a_small_angle_are_left_out(capture: Capture, common: Common) -> None:
+    counts = [
+        len(triangulate(common.matches, common.features, capture.cameras, min_angle=angle)[0]) for angle in (1, 20, 60)
+    ]
+    assert counts[0] > counts[1] > counts[2] == 0
 
 
 def test_points_of_a_capture_leave_the_held_out_view_alone(capture: Capture, common: Common) -> None:
@@ -239,6 +262,7 @@ def test_a_lens_that_is_undone_fits_and_one_that_is_ignored_does_not(tmp_path: P
 
 def test_info_prints_the_check_and_draws_the_rig(capture: Capture, tmp_path: Path, capsys) -> None:
     plot = tmp_path / "new" / "rig.png"
+    before = {file: file.stat().st_mtime_ns for file in capture.path.rglob("*")}
     assert cli.main(["info", str(capture.path), "--plot", str(plot)]) == 0
     out = capsys.readouterr().out
     assert "COLMAP" in out
@@ -247,6 +271,7 @@ def test_info_prints_the_check_and_draws_the_rig(capture: Capture, tmp_path: Pat
     assert "in 15 pairs; the poses fit the pictures." in out
     image = cv2.imread(str(plot))
     assert image.shape == (760, 1440, 3)
+    assert {file: file.stat().st_mtime_ns for file in capture.path.rglob("*")} == before
     assert cli.main(["info", str(capture.path), "--no-check"]) == 0
     assert "Reprojection" not in capsys.readouterr().out
     assert cli.main(["info", str(capture.path), "--plot", str(tmp_path / "rig.pdf")]) == 1

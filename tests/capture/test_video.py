@@ -113,6 +113,28 @@ def test_bad_input(tmp_path: Path, case: str, error: type[Exception], message: s
         list(open_frames(make_bad(tmp_path, case)).frames())
 
 
+def test_the_frames_that_a_cut_file_holds_are_counted(tmp_path: Path) -> None:
+    for name, codec in (("cam.mp4", "FFV1"), ("cam.mkv", "FFV1"), ("cam.avi", "MJPG")):
+        write_video(tmp_path / name, clip(), 30, codec)
+        reader = open_frames(tmp_path / name)
+        assert reader.num_held == reader.num_frames == len(clip())
+    cut(tmp_path / "cam.mkv", (tmp_path / "cam.mkv").stat().st_size * 2 // 3)
+    reader = open_frames(tmp_path / "cam.mkv")
+    assert reader.num_frames == len(clip())
+    assert 0 < reader.num_held < len(clip())
+    assert len(list(reader.frames(0, reader.num_held))) == reader.num_held
+
+
+def test_images_are_not_turned_by_exif(tmp_path: Path) -> None:
+    jpeg = cv2.imencode(".jpg", np.zeros((16, 32, 3), np.uint8))[1].tobytes()
+    # One entry, orientation (0x112) 6: turned by 90 degrees.
+    tiff = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    exif = b"Exif\0\0" + tiff
+    (tmp_path / "0.jpg").write_bytes(jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:])
+    assert cv2.imread(str(tmp_path / "0.jpg")).shape == (32, 16, 3), "OpenCV turns it by itself"
+    assert next(open_frames(tmp_path).frames()).shape == (16, 32, 3)
+
+
 def interrupted():
     yield clip()[0]
     raise KeyboardInterrupt("Ctrl-C")

@@ -1,0 +1,45 @@
+"""The examples of docs/captures.md are read as it says."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData, PlyElement
+
+from morgs_mi.capture import load_capture, write_video
+
+TEXT = (Path(__file__).parents[2] / "docs" / "captures.md").read_text(encoding="utf-8")
+TRANSFORMS, META = re.findall(r"```json\n(.*?)```", TEXT, re.DOTALL)
+
+
+def test_the_example_of_nerfstudio(tmp_path: Path) -> None:
+    (tmp_path / "transforms.json").write_text(TRANSFORMS)
+    PlyData([PlyElement.describe(np.array([(1, 2, 3)], [(a, "f4") for a in "xyz"]), "vertex")]).write(
+        str(tmp_path / "points.ply")
+    )
+    write_video(tmp_path / "cam01", [np.zeros((720, 1280, 3), np.uint8)], 30)
+    capture = load_capture(tmp_path)
+    camera = capture.cameras[0]
+    np.testing.assert_allclose(camera.position, (5, 6, 7))
+    right, down, forward = camera.viewmat[:3, :3]
+    np.testing.assert_allclose(forward, (0, 1, 0), atol=1e-12)
+    np.testing.assert_allclose(-down, (0, 0, 1), atol=1e-12)
+    np.testing.assert_allclose(right, (1, 0, 0), atol=1e-12)
+    assert capture.record()["cameras"][0]["distortion"] == [-0.05, 0.01, 0, 0]
+    np.testing.assert_array_equal(capture.points, [[1, 2, 3]])
+    np.testing.assert_array_equal(capture.point_colors, [[0.5, 0.5, 0.5]])
+
+
+def test_the_example_of_dynamic_3d_gaussians(tmp_path: Path) -> None:
+    (tmp_path / "train_meta.json").write_text(META)
+    names = [name for row in json.loads(META)["fn"] for name in row]
+    write_video(tmp_path / "ims" / "1", [np.zeros((360, 640, 3), np.uint8)] * 2, 30)
+    for name, image in zip(names, sorted((tmp_path / "ims" / "1").glob("*.png")), strict=True):
+        image.rename(tmp_path / "ims" / name)
+    capture = load_capture(tmp_path)
+    assert (capture.names, capture.num_frames, capture.fps) == (("1",), 2, 30)
+    np.testing.assert_allclose(capture.cameras[0].position, (0, 0, -4))
+    assert len(list(capture.frames())) == 2
