@@ -170,6 +170,11 @@ def load_capture(
     calibration = read_calibration(path)
     readers = [open_frames(clip) for clip in calibration.clips]
     recorded = [_recorded(c, r) for c, r in zip(calibration.cameras, readers, strict=True)]
+    if scaled := [new for old, new in zip(calibration.cameras, recorded, strict=True) if new is not old]:
+        _LOG.warning(
+            "%s: the clips of %s are not of the size that was calibrated, %dx%d for one: the intrinsics are scaled.",
+            *(path, ", ".join(c.name for c in scaled), scaled[0].width, scaled[0].height),
+        )
     sources = tuple(
         _Source(reader, lens, undistortion(camera, lens))
         for reader, lens, camera in zip(readers, calibration.lenses, recorded, strict=True)
@@ -202,10 +207,6 @@ def _recorded(camera: Camera, reader: FrameReader) -> Camera:
             f"{reader.path}: expected {camera.width}x{camera.height} as the calibration of {camera.name} says, or "
             f"that scaled, got {reader.width}x{reader.height}; calibrate at the recorded size."
         )
-    _LOG.warning(
-        "%s: calibrated at %dx%d, recorded at %dx%d: its intrinsics are scaled to match.",
-        *(camera.name, camera.width, camera.height, reader.width, reader.height),
-    )
     return camera.resized(reader.width, reader.height)
 
 

@@ -46,10 +46,12 @@ def find_colmap(folder: Path) -> Path | None:
 
     It lies in `sparse/0`, `sparse`, `colmap/sparse/0` or the folder itself, the first of these that has one.
     """
-    for place in (folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0", folder):
+    for place in (folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0"):
         if any((place / f"cameras.{kind}").exists() for kind in ("bin", "txt")):
             return place
-    return None
+    # Among other files the name of one says little.
+    here = any(all((folder / f"{name}.{kind}").exists() for name in _FILES) for kind in ("bin", "txt"))
+    return folder if here else None
 
 
 def read_colmap(folder: str | Path) -> ColmapModel:

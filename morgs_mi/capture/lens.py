@@ -113,9 +113,13 @@ def _folded(x: np.ndarray, y: np.ndarray, K: np.ndarray) -> np.ndarray:
     A polynomial that was fitted to the recorded rays turns back farther out, and would show the image's inside there
     once more, mirrored.
     """
-    if min(x.shape) < 2:
+    # Every few pixels is enough, and quick.
+    step = max(1, min(x.shape) // 256)
+    coarse = x[::step, ::step], y[::step, ::step]
+    if min(coarse[0].shape) < 2:
         return np.zeros(x.shape, bool)
-    determinant = np.gradient(x, axis=1) * np.gradient(y, axis=0) - np.gradient(x, axis=0) * np.gradient(y, axis=1)
-    rows, columns = np.mgrid[: x.shape[0], : x.shape[1]]
+    (x_down, x_right), (y_down, y_right) = (np.gradient(values) for values in coarse)
+    rows, columns = np.ogrid[: x.shape[0], : x.shape[1]]
     radius = np.hypot((columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1])
-    return radius >= np.min(radius[determinant <= 0], initial=np.inf)
+    turned = x_right * y_down - x_down * y_right <= 0
+    return radius >= np.min(radius[::step, ::step][turned], initial=np.inf)

@@ -18,14 +18,14 @@ from morgs_mi.capture.video import IMAGE_SUFFIXES, VIDEO_SUFFIXES, natural_key, 
 
 __all__ = ["check_frames", "clips_by_camera", "clips_by_frame", "view_of_image"]
 
-# Folders that are no camera's even where they hold images: calibrations, ground truth, and images by themselves.
-_NOT_CAMERAS = {"frames", "images", "sparse", "truth"}
+# Folders that hold no clips at all, and those whose own images are no camera's.
 _NOT_CLIPS = {"sparse", "truth", "masks", "seg"}
+_NOT_CAMERAS = _NOT_CLIPS | {"frames", "images"}
 
 
 def clips_by_camera(path: Path) -> dict[str, Path]:
     """Return each camera's video or folder of images by the camera's name, in numerical order."""
-    inner = [f for f in path.iterdir() if f.is_dir() and f.name not in _NOT_CLIPS]
+    inner = [f for f in path.iterdir() if f.is_dir() and f.name not in _NOT_CLIPS and not f.name.startswith(".")]
     found: dict[str, Path] = {}
     # The last one to name a camera wins.
     for folder in [*sorted(f for f in inner if f.name != "frames"), path]:
@@ -40,8 +40,7 @@ def clips_by_frame(path: Path) -> dict[str, tuple[Path, ...]]:
 
     The first frame says which cameras there are; an image that a later one lacks is listed all the same.
     """
-    folders = [_image_folder(f) for f in path.iterdir() if f.is_dir() and f.name not in _NOT_CAMERAS | _NOT_CLIPS]
-    frames = sorted((f for f in folders if f), key=lambda f: natural_key(str(f)))
+    frames = sorted(_folders(path).values(), key=lambda f: natural_key(str(f)))
     if not frames:
         return {}
     images = sorted((f for f in frames[0].iterdir() if _is_image(f)), key=lambda f: natural_key(f.stem))
@@ -73,8 +72,8 @@ def view_of_image(views: Collection[str], image: str) -> str | None:
 
 
 def _folders(folder: Path) -> dict[str, Path]:
-    inner = {f.name: _image_folder(f) for f in folder.iterdir() if f.is_dir() and f.name not in _NOT_CAMERAS}
-    return {name: found for name, found in inner.items() if found}
+    inner = [f for f in folder.iterdir() if f.is_dir() and f.name not in _NOT_CAMERAS and not f.name.startswith(".")]
+    return {f.name: found for f in inner if (found := _image_folder(f))}
 
 
 def _image_folder(folder: Path) -> Path | None:

@@ -253,7 +253,7 @@ def test_smaller_clips_scale_the_intrinsics(tmp_path: Path, caplog: pytest.LogCa
     write_video(path / "frames" / "cam2", [small] * COUNT, FPS)
     with caplog.at_level(logging.WARNING):
         capture = load_capture(path)
-    assert "cam2: calibrated at 62x46, recorded at 31x23" in caplog.text
+    assert "the clips of cam2 are not of the size that was calibrated, 31x23 for one: the intrinsics" in caplog.text
     assert [(c.width, c.height) for c in capture.cameras] == [(62, 46), (31, 23), (62, 46)]
     np.testing.assert_allclose(capture.cameras[1].K[:2], rig(("a", "b"), shift=3)[1].K[:2] / 2, atol=PIXEL_ABS)
 
