@@ -117,13 +117,9 @@ def plot_flow(result: dict[str, Any], path: str | Path) -> None:
     for axis, clip in zip(figure.subplots(1, len(clips), squeeze=False).flat, clips, strict=True):
         for row in clip["rows"]:
             moving = row["moving"]
-            (line,) = axis.plot(row["ms"], moving["error"], "o", markersize=7)
+            (line,) = axis.plot(row["ms"], moving["error"], "o", markersize=7, label=row["method"])
             axis.plot(row["ms"], moving["reliable_error"], "v", color=line.get_color(), fillstyle="none")
             axis.plot([row["ms"]] * 2, [moving["error"], moving["reliable_error"]], color=line.get_color(), alpha=0.3)
-            point = (row["ms"], moving["error"])
-            axis.annotate(row["method"], point, xytext=(6, 4), textcoords="offset points", fontsize=8)
-        axis.plot([], [], "ko", label="all pixels that move")
-        axis.plot([], [], "kv", fillstyle="none", label="those that pass the check")
         axis.set(
             title=f"{clip['name']}, {clip['width']}x{clip['height']}, motion of {clip['motion']:.1f} px",
             xlabel="both directions of a pair, ms",
@@ -133,7 +129,11 @@ def plot_flow(result: dict[str, Any], path: str | Path) -> None:
         axis.margins(x=0.2, y=0.1)
         axis.set_ylim(bottom=0)
         axis.grid(alpha=0.3, which="both")
-        axis.legend(fontsize=8)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    marks = [figure.axes[0].plot([], [], *style)[0] for style in (("ko",), ("kv",))]
+    marks[1].set_fillstyle("none")
+    labels += ["all pixels that move", "those that pass the check"]
+    figure.legend(handles + marks, labels, loc="outside lower center", ncols=5, fontsize=8)
     figure.savefig(path, dpi=90)
 
 

@@ -102,7 +102,7 @@ def read_flow(path: str | Path) -> np.ndarray:
         FileNotFoundError: there is no such file.
         OSError: an EXR file cannot be read.
         ValueError: neither kind of file, a `.flo` file that does not begin with its magic number or has not the
-            length that its header says, an EXR file without a known pair of channels, or pixels without flow.
+            length that its header says, an EXR file without one known pair of channels, or pixels without flow.
     """
     path = Path(path)
     reader = _read_flo if _suffix("read_flow()", path) == ".flo" else _read_exr
@@ -156,9 +156,12 @@ def _read_flo(path: Path) -> np.ndarray:
 def _read_exr(path: Path) -> np.ndarray:
     channels = read_exr(path)
     pairs = [pair for pair in _CHANNELS if set(pair) <= channels.keys()]
-    if not pairs:
+    # The renderer's files hold colours beside the motion, whose R and G are no flow.
+    if len(pairs) != 1 or "motion.X" in channels:
         names = ", ".join("/".join(pair) for pair in _CHANNELS)
-        raise ValueError(f"{path}: expected a pair of the channels {names}, got {', '.join(sorted(channels))}.")
+        raise ValueError(
+            f"{path}: expected one pair of the channels {names}, and no motion map, got {', '.join(sorted(channels))}."
+        )
     return np.stack([channels[name] for name in pairs[0]], axis=-1)
 
 

@@ -18,7 +18,7 @@ def test_translation_is_recovered_with_its_sign(method, shift):
     previous, image = scene[10:130, 10:170], scene[10 - dy : 130 - dy, 10 - dx : 170 - dx]
     motion = -optical_flow(image, previous, method)
     error = np.linalg.norm(motion - shift, axis=-1)[10:-10, 10:-10]
-    # Ultrafast and fast stop at a quarter and half of the resolution.
+    # Ultrafast and fast stop at a quarter of the resolution.
     assert np.median(error) < 0.5
 
 

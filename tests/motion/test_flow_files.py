@@ -113,9 +113,15 @@ def test_bad_files_are_named(tmp_path, folder):
     (tmp_path / "a.exr").write_bytes(b"no picture")
     with pytest.raises(OSError, match="cannot read"):
         read_flow(tmp_path / "a.exr")
-    # The renderer's motion points the other way.
-    write_exr(tmp_path / "b.exr", {"motion.X": np.zeros((2, 2)), "motion.Y": np.zeros((2, 2))})
-    with pytest.raises(ValueError, match=r"flow\.X/flow\.Y.*got motion\.X, motion\.Y"):
+
+
+@pytest.mark.parametrize(
+    "names", [("motion.X", "motion.Y"), ("B", "G", "R", "motion.X", "motion.Y"), ("X", "Y", "u", "v"), ("u",)]
+)
+def test_channels_that_are_no_flow_are_named(tmp_path, names):
+    # The renderer's motion points the other way, and the colours beside it are no flow.
+    write_exr(tmp_path / "b.exr", dict.fromkeys(names, np.zeros((2, 2))))
+    with pytest.raises(ValueError, match=rf"flow\.X/flow\.Y.*, got {', '.join(names)}\."):
         read_flow(tmp_path / "b.exr")
 
 
