@@ -1,7 +1,7 @@
 """Finding each camera's clip in a capture folder, by what lies there.
 
-A clip is a video file, a folder of numbered images, or a list of image files (one per frame). Three ways of
-laying clips out are known; cameras are ordered numerically, cam_2 before cam_10:
+A clip is a video file, a folder of numbered images, or a list of image files (one per frame). Clips are laid out per
+camera or per frame; cameras are ordered numerically, cam_2 before cam_10:
 
 - per camera: ``cam01.mp4``, ``cam01/0000.png`` or ``cam01/images/0000.png``, in the capture or in a folder of it
   (``videos/cam01.mp4``, ``images/cam01/0000.png``). Of several clips of a name the lossless one in ``frames/``
