@@ -14,6 +14,10 @@ class MotionConfig:
     """Settings of the motion modules; the first three are the rows of the paper's ablation.
 
     With all three off, what is left is the residual-only baseline (eq. 3).
+
+    Raises:
+        FileNotFoundError: `flow_method` names a file or folder that does not exist.
+        ValueError: `flow_method` names no source of flow, or a number is out of range.
     """
 
     learn_motion: bool = True

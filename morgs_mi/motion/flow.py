@@ -52,8 +52,8 @@ def _pcaflow(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _rlof(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    # The global motion prior is for moving cameras, and its grid never ends on pictures of less than 40 rows; the
-    # default interpolation (EPIC) reads what is not there where nothing is matched, the other one needs colours.
+    # The global motion prior is for moving cameras, and its grid never ends on pictures of less than 40 rows. The
+    # default interpolation (EPIC) crashes or gives NaN on small pictures; this one needs colours.
     parameters = cv2.optflow.RLOFOpticalFlowParameter_create()
     parameters.setUseGlobalMotionPrior(False)
     return cv2.optflow.calcOpticalFlowDenseRLOF(a, b, None, rlofParam=parameters, interp_type=cv2.optflow.INTERP_GEO)

@@ -65,7 +65,9 @@ def flow_source(flow_method: str) -> FlowSource:
     raise ValueError(f"flow_source(): `flow_method` must be one of {known}, got {flow_method!r}.")
 
 
-def _there_and_back(method: Callable[[np.ndarray, np.ndarray], np.ndarray], pair: FramePair):
+def _there_and_back(
+    method: Callable[[np.ndarray, np.ndarray], np.ndarray], pair: FramePair
+) -> tuple[np.ndarray, np.ndarray]:
     check_pictures("flow_source()", pair.image, pair.previous)
     return method(pair.image, pair.previous), method(pair.previous, pair.image)
 
