@@ -21,6 +21,7 @@ from morgs_mi import Camera, Gaussians, RenderConfig, ellipsoids, rasterize
 from morgs_mi.evaluate.reference64 import Twin
 from morgs_mi.render.blocks import build_lists
 from morgs_mi.render.projection import project
+from morgs_mi.render.region import whole_view
 
 # Pairs of pixel and Gaussian that the float64 twin is asked for.
 _TWIN_PAIRS = 20_000_000
@@ -54,8 +55,10 @@ def stages(
 
     def lists() -> Any:
         with dr.suspend_grad():
-            built = build_lists(project(gaussians, camera, channels, config), camera.width, camera.height, config)
-        return built.entries, built.order
+            region = whole_view(camera.width, camera.height, config)
+            splats = project(gaussians, camera, channels, config)
+            built = build_lists(splats, [v for name in channels for v in splats.channels[name]], region, config)
+        return built.words, built.order
 
     def forward() -> Any:
         with dr.suspend_grad():
@@ -84,9 +87,10 @@ def extent(gaussians: Gaussians, camera: Camera) -> dict[str, float]:
     """Return how much there is to draw: pairs of Gaussian and block on the lists, and their pixels in millions."""
     config = RenderConfig()
     with dr.suspend_grad():
-        lists = build_lists(project(gaussians, camera, (), config), camera.width, camera.height, config)
+        region = whole_view(camera.width, camera.height, config)
+        lists = build_lists(project(gaussians, camera, (), config), [], region, config)
         pairs = int(dr.sum(mi.UInt64(lists.count))[0])
-    width, height = config.block_shape(dr.backend_v(mi.Float) == dr.JitBackend.CUDA)
+    width, height = region.block
     return {"pairs": pairs, "listed_megapixels": round(1e-6 * pairs * width * height, 3)}
 
 

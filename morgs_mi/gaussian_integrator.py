@@ -28,7 +28,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.capture.camera import Camera
-from morgs_mi.gaussians.gaussians import ActivatedGaussians
+from morgs_mi.gaussians.gaussians import ActivatedGaussians, tensor_rows
 from morgs_mi.render.rasterize import rasterize
 
 __all__ = ["ellipsoids"]
@@ -66,6 +66,10 @@ class _SceneGaussians:
     sh_coeffs: Any
     motion: Any = None
     confidence: Any = None
+
+    def rows(self, name: str, index: Any) -> list[Any]:
+        """Return rows of an attribute, see `ActivatedGaussians`."""
+        return tensor_rows(getattr(self, name), index)
 
 
 def _scene_gaussians(scene: Any, attributes: list[str]) -> _SceneGaussians:

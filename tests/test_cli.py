@@ -164,7 +164,7 @@ def test_bad_settings(capture: Path, tmp_path: Path, capsys, args, parts) -> Non
     [
         (["--fit.num-gaussians", "0"], "`num_gaussians` must be at least 1, got 0"),
         (["--motion.flow-method", "none"], "`flow_method` must be one of"),
-        (["--render.block-width", "17"], "`block_width` must be 1 to 16"),
+        (["--render.block-width", "17"], "`block_width` must be 4, 8, 12 or 16"),
         (["--fit.rates.means", "nan"], "`means` must be finite and not negative"),
         (["--fit.epochs", "many"], "many"),
         (["--nonsense"], "--nonsense"),

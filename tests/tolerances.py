@@ -22,3 +22,5 @@ CENTRAL_DIFFERENCE_REL = 2e-2
 LOSS_REL = 1e-4
 # The derivative of a float32 SSIM map against float64 differences.
 LOSS_GRADIENT_REL = 5e-3
+# The same float32 terms summed in another order, relative to the largest entry of an attribute.
+SUM_ORDER_REL = 1e-5

@@ -13,7 +13,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["ActivatedGaussians", "Gaussians", "repeated", "sigmoid"]
+__all__ = ["ActivatedGaussians", "Gaussians", "repeated", "sigmoid", "tensor_rows"]
 
 
 class ActivatedGaussians(Protocol):
@@ -53,6 +53,23 @@ class ActivatedGaussians(Protocol):
     def confidence(self) -> Any:
         """Motion confidence [N] in [0, 1], or None."""
         ...
+
+    def rows(self, name: str, index: Any) -> list[Any]:
+        """Return an attribute of the Gaussians at `index`, as `tensor_rows` does."""
+        ...
+
+
+def tensor_rows(tensor: Any, index: Any) -> list[Any]:
+    """Return rows of a tensor [N, ...], one Dr.Jit float [M] per number of a row, differentiable.
+
+    Args:
+        tensor: D numbers in each of N rows.
+        index: UInt32 [M], none of them twice: every element is read once, so that the adjoint needs no atomics.
+    """
+    size, mode = int(dr.prod(tensor.shape[1:])), dr.ReduceMode.NoConflicts
+    if size in (3, 4):  # four at a time are read as one packet
+        return list(dr.gather(mi.Vector3f if size == 3 else mi.Vector4f, tensor.array, index, mode=mode))
+    return [dr.gather(mi.Float, tensor.array, index * size + k, mode=mode) for k in range(size)]
 
 
 def sigmoid(x: Any) -> Any:
@@ -94,6 +111,14 @@ def _aligned_tensor(value: Any) -> Any:
         tensor = tensor * dr.opaque(mi.Float, 1)
         dr.eval(tensor)
     return tensor
+
+
+# Activated name -> what is optimised, and the function between them.
+_ACTIVATIONS = {
+    "scales": ("log_scales", dr.exp),
+    "opacities": ("logit_opacities", sigmoid),
+    "confidence": ("logit_confidence", sigmoid),
+}
 
 
 @dataclass(frozen=True)
@@ -193,6 +218,12 @@ class Gaussians:
     def detached(self) -> Gaussians:
         """Return the same values cut off from the gradient graph."""
         return replace(self, **{name: dr.detach(value) for name, value in self.items().items()})
+
+    def rows(self, name: str, index: Any) -> list[Any]:
+        """Return an activated attribute of the Gaussians at `index` (see `tensor_rows`): read first, then activated."""
+        raw, activation = _ACTIVATIONS.get(name, (name, None))
+        columns = tensor_rows(getattr(self, raw), index)
+        return [activation(column) for column in columns] if activation else columns
 
     def select(self, index: Any) -> Gaussians:
         """Return the Gaussians at `index` [M] (integers, or a mask [N]); gradients are not carried."""

@@ -11,9 +11,10 @@ import numpy as np
 from morgs_mi.capture.camera import Camera
 from morgs_mi.gaussians.gaussians import ActivatedGaussians
 from morgs_mi.render.blocks import build_lists
-from morgs_mi.render.compositing import Layout, blend
+from morgs_mi.render.compositing import Channel, Layout, blend
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.projection import project
+from morgs_mi.render.region import whole_view
 
 __all__ = ["backproject"]
 
@@ -43,10 +44,12 @@ def backproject(
     config = config or RenderConfig()
     with dr.suspend_grad():
         splats = project(gaussians, camera, (), config)
-        lists = build_lists(splats, W, H, config)
-    columns = [dr.zeros(mi.Float, len(splats)) for _ in range(C)]
+        region = whole_view(W, H, config)
+        columns = [dr.zeros(mi.Float, len(splats)) for _ in range(C)]
+        lists = build_lists(splats, columns, region, config)
     dr.enable_grad(columns)
-    blended, *_ = blend(splats.shape, [tuple(columns)], lists, Layout((False,) * C, False, config), W * H)
+    layout = Layout((Channel(C, False),), False, False, config)
+    (blended,) = blend(splats.shape, [tuple(columns)], region, lists, layout)
     dr.set_grad(blended, mi.Float(np.ascontiguousarray(picture, np.float32).ravel()))
     dr.enqueue(dr.ADMode.Backward, blended)
     dr.traverse(dr.ADMode.Backward)

@@ -1,9 +1,8 @@
-"""Blending as one differentiable operation: lists in, channels out, three traced loops behind it (see `loops`)."""
+"""Blending as one differentiable operation: lists in, channels out, traced loops behind it (see `loops`)."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from typing import Any
 
@@ -11,110 +10,141 @@ import drjit as dr
 import mitsuba as mi
 
 from morgs_mi.render.blocks import BlockLists, pack_records, sorted_buckets
-from morgs_mi.render.loops import GEOMETRY, Layout, adjoint, pixel_stride, primal, tangent
+from morgs_mi.render.loops import (
+    GEOMETRY,
+    Blocks,
+    Channel,
+    Layout,
+    adjoint,
+    adjoint_of_pairs,
+    pair_packets,
+    primal,
+    record_packets,
+    tangent,
+)
+from morgs_mi.render.region import Region
 
-__all__ = ["Layout", "blend"]
+__all__ = ["Channel", "Layout", "blend"]
 
 
 def blend(
-    geometry: tuple[Any, ...], channels: list[tuple[Any, ...]], lists: BlockLists, layout: Layout, num_pixels: int
+    geometry: tuple[Any, ...], channels: list[tuple[Any, ...]], region: Region, lists: BlockLists, layout: Layout
 ) -> list[Any]:
-    """Blend every channel's columns over an image.
+    """Blend every channel's columns over a region.
 
     Args:
         geometry: (mean_x, mean_y, a, b, c, log2_opacity), six floats [N].
-        channels: per channel its columns, floats [N]; C columns in all.
-        lists: the blocks and who touches them.
-        layout: what the gradients reach, and cut-offs.
-        num_pixels: width x height.
+        channels: per channel its columns, floats [N].
+        region: the blocks that are drawn.
+        lists: who touches them; made of the same geometry and columns.
+        layout: the channels' sizes, what the gradients reach, and cut-offs.
 
     Returns:
-        Per channel one flat float [num_pixels * columns], and alpha [num_pixels], twice: one to be shown, one to
+        Per channel its picture on the region, flat; and, if the layout has it, alpha, twice: one to be shown, one to
         divide by, for forward mode clears the gradients of what is used further. Differentiable in `geometry` and
         `channels` by `dr.backward` and `dr.forward`.
     """
     columns = [column for channel in channels for column in channel]
-    return dr.custom(_Blend, [*geometry, *columns], lists, layout, num_pixels, [len(channel) for channel in channels])
+    return dr.custom(_Blend, [*geometry, *columns], region, lists, layout)
 
 
 @cache
-def _frozen(loop: Callable[..., Any], layout: Layout, variant: str) -> Callable[..., Any]:
-    """Return a traced loop as a function of arrays alone, recorded once for each layout and variant.
+def _frozen(loop: Callable[..., Any], variant: str, *static: Any) -> Callable[..., Any]:
+    """Return a traced loop as a function of arrays alone, recorded once for each variant and set of other arguments.
 
     Tracing it anew would cost several ms per call. The layout must not be an argument of the recording:
     Dr.Jit 1.5 tells Python values apart by a hash in which two booleans can cancel.
     """
-    return dr.freeze(lambda *arrays: loop(layout, *arrays), warn_after=1000)
+    return dr.freeze(lambda *arrays: loop(*static, *arrays), warn_after=1000)
 
 
 class _Blend(dr.CustomOp):
-    def eval(
-        self, values: list[Any], lists: BlockLists, layout: Layout, num_pixels: int, sizes: list[int]
-    ) -> list[Any]:
-        self.lists, self.layout, self.num_pixels, self.sizes = lists, layout, num_pixels, [*sizes, 1, 1]
-        self.stride = pixel_stride(len(layout.attached))
-        self.records = pack_records(values, lists.by_rank)
-        self.image = self._run(primal, self.records, _zeros(num_pixels * self.stride))
-        return self._split(self.image)
+    def eval(self, values: list[Any], region: Region, lists: BlockLists, layout: Layout) -> list[Any]:
+        # The values are in the lists' records already: they are named here to be differentiated.
+        self.region, self.lists, self.layout, self.blocks = region, lists, layout, Blocks.of(region, lists)
+        self.pictures = self._run(primal, layout, self.blocks, lists.records, self._blank())
+        return self._shown(self.pictures)
 
     def backward(self) -> None:
         lists, layout = self.lists, self.layout
-        C, skipped = len(layout.attached), 0 if layout.reaches_weights else GEOMETRY
-        packets = -(-(GEOMETRY + C - skipped) // 4)
-        pairs, N = layout.config.reproducible, dr.width(lists.by_rank)
-        sums = _zeros((dr.width(lists.entries) if pairs else _ladder(N)) * packets * 4)
-        sums = self._run(adjoint, self.records, self.image, self._joined(self.grad_out()), sums)
-        if pairs:
-            sums = _summed_by_rank(sums, lists.entries, N, packets)
-        lane = lists.rank_of * (4 * packets)
-        columns = [dr.gather(mi.Float, sums, lane + k) for k in range(GEOMETRY + C - skipped)]
+        N, grads = dr.width(lists.by_rank), self._hidden(list(self.grad_out()))
+        arrays, stride = (self.blocks, self.lists.records, self.pictures, grads), 4 * record_packets(layout)
+        if layout.config.reproducible:
+            end = dr.cumsum(lists.count)
+            first = end - lists.count
+            dr.eval(first)
+            pairs = dr.opaque(mi.Float, 0, max(int(end[-1]), 1) * 4 * pair_packets(layout))
+            pairs = self._run(adjoint_of_pairs, layout, *arrays, first, pairs)
+            sums, stride = _summed_by_rank(pairs, N, layout), 4 * pair_packets(layout)
+        else:
+            sums = self._run(adjoint, layout, _ladder(N), *arrays)
+        lane, skipped = lists.rank_of * stride, 0 if layout.reaches_weights else GEOMETRY
+        columns = [dr.gather(mi.Float, sums, lane + k) for k in range(skipped, GEOMETRY + layout.columns)]
         self.set_grad_in("values", [mi.Float(0)] * skipped + columns)
-
-    def _run(self, loop: Callable[..., Any], *arrays: Any) -> Any:
-        # The maps of length N play no part in the loops; a recording is tied to what it is given.
-        walked = replace(self.lists, rank_of=None, by_rank=None)
-        return _frozen(loop, self.layout, mi.variant())(walked, *arrays)
-
-    def _split(self, image: Any) -> list[Any]:
-        """Cut an image of `stride` floats per pixel into one array per channel, alpha and alpha again."""
-        parts = []
-        for first, size in zip(self._firsts(), self.sizes, strict=True):
-            lane = dr.arange(mi.UInt32, self.num_pixels * size)
-            parts.append(dr.gather(mi.Float, image, lane // size * self.stride + lane % size + first))
-        return parts
-
-    def _joined(self, parts: list[Any]) -> Any:
-        """Transpose `_split`: what belongs to the same place is added up."""
-        lane = dr.arange(mi.UInt32, self.num_pixels * self.stride)
-        pixel, place, image = lane // self.stride, lane % self.stride, mi.Float(0)
-        for part, first, size in zip(parts, self._firsts(), self.sizes, strict=True):
-            if dr.width(part) == self.num_pixels * size:  # a literal 0 otherwise: nothing depends on it
-                inside = (place >= first) & (place < first + size)
-                image += dr.gather(mi.Float, part, pixel * size + place - first, active=inside)
-        return image + dr.zeros(mi.Float, self.num_pixels * self.stride)
-
-    def _firsts(self) -> list[int]:
-        C = len(self.layout.attached)
-        return [min(sum(self.sizes[:k]), C) for k in range(len(self.sizes))]
 
     def forward(self) -> None:
         grads = [dr.zeros(mi.Float, 1) + g for g in list(self.grad_in("values"))]  # type: ignore[call-overload]
         tangents = pack_records(grads, self.lists.by_rank)
-        image = self._run(tangent, self.records, tangents, _zeros(self.num_pixels * self.stride))
-        self.set_grad_out(self._split(image))
+        pictures = self._run(tangent, self.layout, self.blocks, self.lists.records, tangents, self._blank())
+        self.set_grad_out(self._shown(pictures))
+
+    def _run(self, loop: Callable[..., Any], *arguments: Any) -> Any:
+        static = [v for v in arguments if isinstance(v, (Layout, int))]
+        return _frozen(loop, mi.variant(), *static)(*arguments[len(static) :])
+
+    def _blank(self) -> list[Any]:
+        """Return memory to write to: a frozen function cannot know sizes of its own."""
+        return [dr.empty(mi.Float, self.region.num_pixels * size) for size in self.layout.sizes]
+
+    def _shown(self, pictures: list[Any]) -> list[Any]:
+        """Return what the caller gets: without the padding to whole blocks, and alpha twice."""
+        shown = [_cropped(v, self.region, size) for v, size in zip(pictures, self.layout.sizes, strict=True)]
+        return [*shown, shown[-1] + 0] if self.layout.alpha else shown
+
+    def _hidden(self, grads: list[Any]) -> list[Any]:
+        """Transpose `_shown`."""
+        if self.layout.alpha:
+            *grads, alpha, coverage = grads
+            grads = [*grads, alpha + coverage]
+        return [_padded(v, self.region, size) for v, size in zip(grads, self.layout.sizes, strict=True)]
 
     def name(self) -> str:
         return "morgs_mi.blend"
 
 
-def _zeros(size: int) -> Any:
-    """Return zeros in memory: a frozen function writes to what it is given, it cannot know sizes of its own."""
-    return dr.opaque(mi.Float, 0, size)
+def _cropped(picture: Any, region: Region, size: int) -> Any:
+    """Return a picture without the columns that make its blocks whole."""
+    if not region.whole or region.row == region.width:
+        return picture
+    lane = dr.arange(mi.UInt32, region.width * region.height * size)
+    row = _quotient(lane, region.width * size)
+    return dr.gather(mi.Float, picture, lane + row * dr.opaque(mi.UInt32, (region.row - region.width) * size))
 
 
-def _summed_by_rank(pairs: Any, entries: Any, N: int, packets: int) -> Any:
+def _padded(picture: Any, region: Region, size: int) -> Any:
+    """Transpose `_cropped`; a literal 0 becomes a picture of zeros."""
+    total = region.num_pixels * size
+    if dr.width(picture) != dr.prod(region.shape(size)):
+        return dr.opaque(mi.Float, 0, total)
+    if not region.whole or region.row == region.width:
+        return picture
+    lane = dr.arange(mi.UInt32, total)
+    row = _quotient(lane, region.row * size)
+    column, width = lane - row * dr.opaque(mi.UInt32, region.row * size), dr.opaque(mi.UInt32, region.width * size)
+    return dr.gather(mi.Float, picture, row * width + column, active=column < width)
+
+
+def _quotient(lane: Any, divisor: int) -> Any:
+    """Return lane // divisor: exact, since half a step is more than what a double rounds away."""
+    return mi.UInt32((mi.Float64(lane) + 0.5) * dr.opaque(mi.Float64, 1 / divisor))
+
+
+def _summed_by_rank(pairs: Any, N: int, layout: Layout) -> Any:
     """Sum the records of all pairs of a rank, one lane per rank, in the order of the blocks."""
-    perm, first, end = sorted_buckets(entries, N)
+    packets, place = pair_packets(layout), GEOMETRY + layout.columns
+    lane = dr.arange(mi.UInt32, dr.width(pairs) // (4 * packets)) * (4 * packets)
+    rank = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, pairs, lane + place))
+    perm, _, first, end = sorted_buckets(dr.opaque(rank), N)
 
     def add(k, sums, end, perm, pairs):
         pair = dr.gather(mi.UInt32, perm, k) * packets
@@ -132,6 +162,6 @@ def _summed_by_rank(pairs: Any, entries: Any, N: int, packets: int) -> Any:
 
 
 def _ladder(n: int) -> int:
-    """Round up to a quarter octave: scatter-reductions have their target's size as a literal in the kernel."""
+    """Round up to a quarter octave, for each size of a scatter-reduction's target has a kernel of its own."""
     step = max(1024, 1 << max(n.bit_length() - 3, 0))
     return -(-n // step) * step

@@ -20,20 +20,24 @@ class RenderConfig:
     stop_transmittance: float = 1e-4
     """A block ends when its most transparent pixel falls below this; bounds the error of the colour."""
     block_width: int | None = None
-    """Pixels across in the block that one SIMD lane owns; None: 8 on the CPU, 4 on the GPU."""
+    """Pixels across in the block that one SIMD lane owns: 4, 8, 12 or 16; None: 8 on the CPU, 4 on the GPU."""
     block_height: int | None = None
-    """Pixels down in that block; None: 4."""
+    """Pixels down in that block, 1 to 16; None: 4."""
     reproducible: bool = False
     """Sum gradients in a fixed order: the same bytes on every run and any number of threads. A step takes 1.5 to 1.9
     times as long (20k and 100k Gaussians, two cores), and 48 bytes for every pair of Gaussian and block."""
 
     def __post_init__(self) -> None:
-        for name in ("block_width", "block_height"):
-            edge = getattr(self, name)
-            if edge is not None and not 1 <= edge <= 16:
-                raise ValueError(
-                    f"RenderConfig(): `{name}` must be 1 to 16 px, got {edge}; the block's pixels are unrolled."
-                )
+        if self.block_width not in (None, 4, 8, 12, 16):
+            raise ValueError(
+                f"RenderConfig(): `block_width` must be 4, 8, 12 or 16 px, got {self.block_width}; pixels are read and "
+                "written by fours."
+            )
+        if self.block_height is not None and not 1 <= self.block_height <= 16:
+            raise ValueError(
+                f"RenderConfig(): `block_height` must be 1 to 16 px, got {self.block_height}; the block's pixels are "
+                "unrolled."
+            )
 
     def block_shape(self, cuda: bool) -> tuple[int, int]:
         """Return (width, height) in pixels of one lane's block on this backend."""

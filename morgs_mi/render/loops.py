@@ -11,12 +11,16 @@ more per pixel, the suffix S = <g, C_final> - sum_j<=i w_j <g, c_j>, and
 
     dL/dp = ln(2) (w <g, c_i> - alpha S / (1 - alpha)).
 
-A column is *attached* if its gradient reaches the weights w (geometry and opacity), detached if it reaches
-only the blended value itself. Alpha is blended as one more column of ones.
+A channel is *attached* if its gradient reaches the weights w (geometry and opacity), detached if it reaches
+only the blended value itself. Alpha is blended as one more channel of ones.
+
+Every channel has a picture of its own, rows of blocks times its columns (see `region`), so that a row of a block is a
+run of packets of 4 floats.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import log, log2
 from typing import Any
@@ -24,13 +28,33 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from morgs_mi.render.blocks import BlockLists, fetch_record, pixel_grid
+from morgs_mi.render.blocks import BlockLists, fetch_record, next_entry
 from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.region import Region
 
-__all__ = ["GEOMETRY", "Layout", "adjoint", "pixel_stride", "primal", "tangent"]
+__all__ = [
+    "GEOMETRY",
+    "Blocks",
+    "Channel",
+    "Layout",
+    "adjoint",
+    "adjoint_of_pairs",
+    "pair_packets",
+    "primal",
+    "record_packets",
+    "tangent",
+]
 
 _LN2 = log(2.0)
 GEOMETRY = 6  # mean_x, mean_y, a, b, c, log2_opacity
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A picture to blend: its floats per pixel, and whether its gradient reaches the weights."""
+
+    size: int
+    attached: bool
 
 
 @dataclass(frozen=True)
@@ -38,24 +62,41 @@ class Layout:
     """What the loops are traced for: one recording for each.
 
     Attributes:
-        attached: for each blended column, whether its gradient reaches the weights.
+        channels: what is blended, in the order of the records' columns.
+        alpha: whether alpha is an output.
         alpha_attached: whether the gradient of alpha is wanted.
         config: cut-offs.
     """
 
-    attached: tuple[bool, ...]
+    channels: tuple[Channel, ...]
+    alpha: bool
     alpha_attached: bool
     config: RenderConfig
 
     @property
+    def columns(self) -> int:
+        """The number of blended floats."""
+        return sum(channel.size for channel in self.channels)
+
+    @property
+    def attached(self) -> tuple[bool, ...]:
+        """For each column, whether its gradient reaches the weights."""
+        return tuple(channel.attached for channel in self.channels for _ in range(channel.size))
+
+    @property
     def reaches_weights(self) -> bool:
         """Whether the adjoint has any gradient for geometry and opacity."""
-        return self.alpha_attached or any(self.attached)
+        return self.alpha_attached or any(channel.attached for channel in self.channels)
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Floats per pixel of every output, alpha last."""
+        return (*(channel.size for channel in self.channels), *((1,) if self.alpha else ()))
 
 
-def pixel_stride(columns: int) -> int:
-    """Return the floats per pixel in a blended image: the columns, alpha, and padding to packets of 4."""
-    return -(-(columns + 1) // 4) * 4
+def record_packets(layout: Layout) -> int:
+    """Return the packets of 4 floats that a Gaussian's record takes, and its gradient too."""
+    return -(-(GEOMETRY + layout.columns) // 4)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -63,26 +104,59 @@ def pixel_stride(columns: int) -> int:
 # --------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class Blocks:
+    """What the loops read of a region and its lists, see `Region` and `BlockLists`; one entry per block."""
+
+    x: Any
+    y: Any
+    place: Any
+    rows: Any
+    pitch: Any
+    words: Any
+    entries: Any
+    begin: Any
+    end: Any
+    first: Any
+    order: Any
+
+    @staticmethod
+    def of(region: Region, lists: BlockLists) -> Blocks:
+        """Join a region and its lists."""
+        where = (region.x, region.y, region.place, region.rows, region.pitch)
+        return Blocks(*where, lists.words, lists.entries, lists.begin, lists.end, lists.first, lists.order)
+
+
 class _Block:
     """The lanes' blocks: their pixels, their stretch of the lists, and the shape they are unrolled in."""
 
-    def __init__(self, layout: Layout, lists: BlockLists) -> None:
-        config = layout.config
+    def __init__(self, layout: Layout, blocks: Blocks) -> None:
+        config, order = layout.config, blocks.order
         self.width, self.height = config.block_shape(dr.backend_v(mi.Float) == dr.JitBackend.CUDA)
         self.area = self.width * self.height
         self.log_min, self.alpha_max = log2(config.alpha_min), config.alpha_max
         self.stop = config.stop_transmittance
-        x, y, start, count = (dr.gather(mi.UInt32, v, lists.order) for v in (*lists.origin, lists.start, lists.count))
-        self.start, self.end = start, start + count
-        self.x, self.y = mi.Float(x) + 0.5, mi.Float(y) + 0.5  # centre of the first pixel
-        self.pixels = pixel_grid((x, y), (self.width, self.height), lists.size)
+        self.place, self.rows = dr.gather(mi.UInt32, blocks.place, order), dr.gather(mi.UInt32, blocks.rows, order)
+        self.pitch = dr.gather(mi.UInt32, blocks.pitch, mi.UInt32(0))
+        # Centre of the first pixel.
+        self.x, self.y = (mi.Float(dr.gather(mi.UInt32, v, order)) + 0.5 for v in (blocks.x, blocks.y))
+        begin, first = dr.gather(mi.UInt32, blocks.begin, order), dr.gather(mi.UInt32, blocks.first, order)
+        self.end = dr.gather(mi.UInt32, blocks.end, order)
+        # Before a block's first word, as `next_entry` wants it.
+        self.walk = next_entry(begin, mi.UInt32(0), first - 32, self.end, blocks.words)
 
-    def continues(self, j: Any, end: Any, light: list[Any]) -> Any:
+    def continues(self, walk: tuple[Any, Any, Any], light: list[Any]) -> Any:
         """Return whether a lane goes on: entries are left, and its most transparent pixel lets light through."""
         while len(light) > 1:
             pairs = zip(light[::2], light[1::2], strict=False)
             light = [dr.select(a > b, a, b) for a, b in pairs] + light[len(light) & ~1 :]
-        return (j < end) & (light[0] >= self.stop)
+        return (walk[1] != 0) & (light[0] >= self.stop)
+
+    def packets(self, size: int) -> list[tuple[Any, Any]]:
+        """Return (place, is there) of all packets of 4 in a picture of `size` floats per pixel, row by row."""
+        run = self.width * size // 4
+        starts = [((self.place + j * self.pitch) * size, self.rows > j) for j in range(self.height)]
+        return [(start + k, there) for start, there in starts for k in range(run)]
 
     def offsets(self, x: Any, y: Any, geometry: list[Any]) -> tuple[list[Any], list[Any]]:
         """Return the distances dx [width] and dy [height] of the block's columns and rows to the mean."""
@@ -109,6 +183,13 @@ class _Block:
         return dr.select(p >= self.log_min, capped, 0), full
 
 
+def _taken(walk: tuple[Any, Any, Any], end: Any, words: Any, entries: Any) -> tuple[Any, tuple[Any, Any, Any]]:
+    """Return the rank that a lane has come to, and where it goes next."""
+    place, word, base = walk
+    rank = dr.gather(mi.UInt32, entries, base + dr.tzcnt(word))
+    return rank, next_entry(place, word & (word - 1), base, end, words)
+
+
 # Minimax over [-1/2, 1/2], highest power first: relative error 2.7e-6 in float32, like Taylor's fifth degree.
 _EXP2 = (0.009570102207362652, 0.05591786280274391, 0.240247443318367, 0.6931217908859253, 0.9999992847442627)
 
@@ -131,25 +212,26 @@ def _floats(count: int, value: float = 0.0) -> list[Any]:
     return [mi.Float(value) for _ in range(count)]
 
 
-def _store(block: _Block, sums: list[list[Any]], alpha: list[Any], image: Any) -> Any:
-    """Write every pixel's columns and alpha to an image of `pixel_stride` floats per pixel."""
-    C = len(sums[0])
-    packets = pixel_stride(C) // 4
-    for (pixel, inside), row, a in zip(block.pixels, sums, alpha, strict=True):
-        values = [*row, a] + [mi.Float(0)] * (packets * 4 - C - 1)
-        for k in range(packets):
+def _store(block: _Block, layout: Layout, sums: list[list[Any]], alpha: list[Any], pictures: list[Any]) -> list[Any]:
+    """Write every pixel's columns, and alpha if it is wanted, to the channels' pictures."""
+    pixels, first = [[*row, a] for row, a in zip(sums, alpha, strict=True)], 0
+    for picture, size in zip(pictures, layout.sizes, strict=True):
+        values = [value for pixel in pixels for value in pixel[first : first + size]]
+        for k, (place, there) in enumerate(block.packets(size)):
             packet = mi.Vector4f(*values[4 * k : 4 * k + 4])
-            dr.scatter(image, packet, pixel * packets + k, active=inside, mode=dr.ReduceMode.NoConflicts)
-    return image
+            dr.scatter(picture, packet, place, active=there, mode=dr.ReduceMode.NoConflicts)
+        first += size
+    return pictures
 
 
-def _load(block: _Block, image: Any, C: int) -> list[list[Any]]:
-    """Read every pixel's C columns and alpha; zeros outside the image."""
-    packets = pixel_stride(C) // 4
-    pixels = []
-    for pixel, inside in block.pixels:
-        reads = [dr.gather(mi.Vector4f, image, pixel * packets + k, active=inside) for k in range(packets)]
-        pixels.append([v for packet in reads for v in packet][: C + 1])
+def _load(block: _Block, layout: Layout, pictures: list[Any]) -> list[list[Any]]:
+    """Read every pixel's columns, and alpha if there is one; zeros outside the image."""
+    pixels: list[list[Any]] = [[] for _ in range(block.area)]
+    for picture, size in zip(pictures, layout.sizes, strict=True):
+        packets = (dr.gather(mi.Vector4f, picture, place, active=there) for place, there in block.packets(size))
+        values = [value for packet in packets for value in packet]
+        for k, pixel in enumerate(pixels):
+            pixel += values[k * size : (k + 1) * size]
     return pixels
 
 
@@ -158,35 +240,27 @@ def _load(block: _Block, image: Any, C: int) -> list[list[Any]]:
 # --------------------------------------------------------------------------------------------------
 
 
-def primal(layout: Layout, lists: BlockLists, records: Any, image: Any) -> Any:
-    """Blend the records' columns into `image`, which comes as zeros."""
-    block, C = _Block(layout, lists), len(layout.attached)
+def primal(layout: Layout, blocks: Blocks, records: Any, pictures: list[Any]) -> list[Any]:
+    """Blend the records' columns into the channels' pictures, whatever is in them."""
+    block, C = _Block(layout, blocks), layout.columns
 
-    def body(j, end, x, y, T, sums, records, entries):
-        record = fetch_record(records, dr.gather(mi.UInt32, entries, j), GEOMETRY + C)
+    def body(walk, end, x, y, T, sums, records, words, entries):
+        rank, walk = _taken(walk, end, words, entries)
+        record = fetch_record(records, rank, GEOMETRY + C)
         geometry, values = record[:GEOMETRY], record[GEOMETRY:]
         T_next, sums_next = [], []
         for k, (p, _) in enumerate(block.powers(*block.offsets(x, y, geometry), geometry)):
             w = block.alpha(p)[0] * T[k]
             T_next.append(T[k] - w)
             sums_next.append([dr.fma(w, c, total) for c, total in zip(values, sums[k], strict=True)])
-        return j + 1, end, x, y, T_next, sums_next, records, entries
+        return walk, end, x, y, T_next, sums_next, records, words, entries
 
-    sums = [_floats(C) for _ in range(block.area)]
-    state = (
-        block.start,
-        block.end,
-        block.x,
-        block.y,
-        _floats(block.area, 1.0),
-        sums,
-        records,
-        lists.entries,
+    light, sums = _floats(block.area, 1.0), [_floats(C) for _ in range(block.area)]
+    state = (block.walk, block.end, block.x, block.y, light, sums, records, blocks.words, blocks.entries)
+    *_, T, sums, _, _, _ = dr.while_loop(
+        state, lambda walk, end, x, y, T, *_: block.continues(walk, T), body, label="blend"
     )
-    *_, T, sums, _, _ = dr.while_loop(
-        state, lambda j, end, x, y, T, *_: block.continues(j, end, T), body, label="blend"
-    )
-    return _store(block, sums, [1 - t for t in T], image)
+    return _store(block, layout, sums, [1 - t for t in T], pictures)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -196,22 +270,84 @@ def primal(layout: Layout, lists: BlockLists, records: Any, image: Any) -> Any:
 # --------------------------------------------------------------------------------------------------
 
 
-def adjoint(layout: Layout, lists: BlockLists, records: Any, image: Any, image_grad: Any, sums: Any) -> Any:
-    """Add dL/d(value) of every rank to its record in `sums`: the six geometry floats if any, the C columns.
+def adjoint(
+    layout: Layout, ranks: int, blocks: Blocks, records: Any, pictures: list[Any], picture_grads: list[Any]
+) -> Any:
+    """Return dL/d(record) of `ranks` ranks, a record each: the six geometry floats, the columns, padding.
 
-    Where results must be reproducible, every pair of Gaussian and block has a record of its own instead.
+    Args:
+        layout: what is blended.
+        ranks: at least N. Scatter-reductions have their target's size as a literal in the kernel.
+        blocks: where to walk.
+        records: of N ranks.
+        pictures: what `primal` returned.
+        picture_grads: their gradients.
     """
-    block, C, geometric = _Block(layout, lists), len(layout.attached), layout.reaches_weights
-    gradients = _load(block, image_grad, C)
-    suffix = [_inner(g, v, layout, v[C]) for g, v in zip(gradients, _load(block, image, C), strict=True)]
-    length = C + (GEOMETRY if geometric else 0)
-    packets = -(-length // 4)
-    on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
+    packets = record_packets(layout)
+    sums = dr.zeros(mi.Float, 4 * packets * ranks)
     # One copy of the target per thread beats atomics on few cores: 1.8 times faster than `Direct` on two.
+    on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
     mode = dr.ReduceMode.Expand if on_cpu else dr.ReduceMode.Auto
 
-    def body(j, end, x, y, T, S, g, records, entries, sums):
-        rank = dr.gather(mi.UInt32, entries, j)
+    def add(sums: Any, grads: list[Any], rank: Any, pair: Any) -> None:
+        grads = [*grads, *_floats(packets * 4 - len(grads))]
+        for k in range(packets):
+            packet = mi.Vector4f(*grads[4 * k : 4 * k + 4])
+            dr.scatter_reduce(dr.ReduceOp.Add, sums, packet, rank * packets + k, mode=mode)
+
+    return _adjoint(layout, blocks, records, pictures, picture_grads, mi.UInt32(0), sums, add)
+
+
+def adjoint_of_pairs(
+    layout: Layout,
+    blocks: Blocks,
+    records: Any,
+    pictures: list[Any],
+    picture_grads: list[Any],
+    first_pair: Any,
+    pairs: Any,
+) -> Any:
+    """Write dL/d(record) of every pair of block and Gaussian, with the rank behind it, to a stretch of `pairs`.
+
+    `first_pair` [A] says where each block's stretch begins. Nothing depends on the order of execution.
+    """
+    packets = pair_packets(layout)
+
+    def add(pairs: Any, grads: list[Any], rank: Any, pair: Any) -> None:
+        grads = [*grads, dr.reinterpret_array(mi.Float, rank)]
+        grads += _floats(packets * 4 - len(grads))
+        for k in range(packets):
+            packet = mi.Vector4f(*grads[4 * k : 4 * k + 4])
+            dr.scatter(pairs, packet, pair * packets + k, mode=dr.ReduceMode.NoConflicts)
+
+    pair = dr.gather(mi.UInt32, first_pair, blocks.order)
+    return _adjoint(layout, blocks, records, pictures, picture_grads, pair, pairs, add)
+
+
+def pair_packets(layout: Layout) -> int:
+    """Return the packets of 4 floats of a pair's gradient and rank."""
+    return (GEOMETRY + layout.columns) // 4 + 1
+
+
+def _adjoint(
+    layout: Layout,
+    blocks: Blocks,
+    records: Any,
+    pictures: list[Any],
+    picture_grads: list[Any],
+    pair: Any,
+    target: Any,
+    add: Callable[[Any, list[Any], Any, Any], None],
+) -> Any:
+    block, C, geometric = _Block(layout, blocks), layout.columns, layout.reaches_weights
+    gradients = _load(block, layout, picture_grads)
+    suffix = [
+        _inner(g, v, layout, v[C] if layout.alpha else None)
+        for g, v in zip(gradients, _load(block, layout, pictures), strict=True)
+    ]
+
+    def body(walk, pair, end, x, y, T, S, g, records, words, entries, target):
+        rank, walk = _taken(walk, end, words, entries)
         record = fetch_record(records, rank, GEOMETRY + C)
         geometry, values = record[:GEOMETRY], record[GEOMETRY:]
         dx, dy = block.offsets(x, y, geometry)
@@ -228,32 +364,24 @@ def adjoint(layout: Layout, lists: BlockLists, records: Any, image: Any, image_g
                 S_next.append(s)
                 d = dr.fma(w, gc, -alpha * s * dr.rcp(1 - alpha))
                 moments.add(k, dr.select(full <= block.alpha_max, d, 0), u)
-        grads = [*(moments.gradients(dx[0], dy[0], geometry) if geometric else []), *value_grads]
-        grads += _floats(packets * 4 - length)
-        for k in range(packets):
-            packet = mi.Vector4f(*grads[4 * k : 4 * k + 4])
-            if layout.config.reproducible:
-                dr.scatter(sums, packet, j * packets + k, mode=dr.ReduceMode.NoConflicts)
-            else:
-                dr.scatter_reduce(dr.ReduceOp.Add, sums, packet, rank * packets + k, mode=mode)
-        return j + 1, end, x, y, T_next, S_next, g, records, entries, sums
+        geometry_grads = moments.gradients(dx[0], dy[0], geometry) if geometric else _floats(GEOMETRY)
+        add(target, [*geometry_grads, *value_grads], rank, pair)
+        return walk, pair + 1, end, x, y, T_next, S_next, g, records, words, entries, target
 
-    if not geometric:
-        suffix = []
-    light = _floats(block.area, 1.0)
-    entries = lists.entries
-    state = (block.start, block.end, block.x, block.y, light, suffix, gradients, records, entries, sums)
-    *_, sums = dr.while_loop(
-        state, lambda j, end, x, y, T, *_: block.continues(j, end, T), body, label="blend (adjoint)"
+    light, suffix = _floats(block.area, 1.0), suffix if geometric else []
+    where = (block.walk, pair, block.end, block.x, block.y)
+    state = (*where, light, suffix, gradients, records, blocks.words, blocks.entries, target)
+    *_, target = dr.while_loop(
+        state, lambda walk, pair, end, x, y, T, *_: block.continues(walk, T), body, label="blend (adjoint)"
     )
-    return sums
+    return target
 
 
 def _inner(g: list[Any], values: list[Any], layout: Layout, alpha: Any) -> Any:
     """Return <g, values> over the attached columns, plus g_alpha alpha; `alpha` None stands for 1."""
     total = None
     if layout.alpha_attached:
-        total = g[len(layout.attached)] if alpha is None else g[len(layout.attached)] * alpha
+        total = g[layout.columns] if alpha is None else g[layout.columns] * alpha
     for g_c, c, attached in zip(g, values, layout.attached, strict=False):
         if attached:
             total = g_c * c if total is None else dr.fma(g_c, c, total)
@@ -304,12 +432,12 @@ class _Moments:
 # --------------------------------------------------------------------------------------------------
 
 
-def tangent(layout: Layout, lists: BlockLists, records: Any, tangents: Any, image: Any) -> Any:
-    """Write the directional derivative along the records' tangents into `image`, which comes as zeros."""
-    block, C = _Block(layout, lists), len(layout.attached)
+def tangent(layout: Layout, blocks: Blocks, records: Any, tangents: Any, pictures: list[Any]) -> list[Any]:
+    """Write the directional derivative along the records' tangents into `pictures`, whatever is in them."""
+    block, C = _Block(layout, blocks), layout.columns
 
-    def body(j, end, x, y, T, dT, dsums, records, tangents, entries):
-        rank = dr.gather(mi.UInt32, entries, j)
+    def body(walk, end, x, y, T, dT, dsums, records, tangents, words, entries):
+        rank, walk = _taken(walk, end, words, entries)
         record, tangent = (fetch_record(r, rank, GEOMETRY + C) for r in (records, tangents))
         geometry, values = record[:GEOMETRY], record[GEOMETRY:]
         (a, b, c), (tx, ty, ta, tb, tc, t_log2) = geometry[2:5], tangent[:GEOMETRY]
@@ -326,17 +454,17 @@ def tangent(layout: Layout, lists: BlockLists, records: Any, tangents: Any, imag
             dT_next.append(dT[k] - tw)
             dsums_next.append(
                 [
-                    dr.fma(w, tangent[GEOMETRY + i], dr.fma(tw, values[i], total) if layout.attached[i] else total)
-                    for i, total in enumerate(dsums[k])
+                    dr.fma(w, tangent[GEOMETRY + i], dr.fma(tw, values[i], total) if attached else total)
+                    for i, (total, attached) in enumerate(zip(dsums[k], layout.attached, strict=True))
                 ]
             )
-        return j + 1, end, x, y, T_next, dT_next, dsums_next, records, tangents, entries
+        return walk, end, x, y, T_next, dT_next, dsums_next, records, tangents, words, entries
 
     dsums = [_floats(C) for _ in range(block.area)]
     light, dlight = _floats(block.area, 1.0), _floats(block.area)
-    entries = lists.entries
-    state = (block.start, block.end, block.x, block.y, light, dlight, dsums, records, tangents, entries)
+    where = (block.walk, block.end, block.x, block.y)
+    state = (*where, light, dlight, dsums, records, tangents, blocks.words, blocks.entries)
     _, _, _, _, _, dT, dsums, *_ = dr.while_loop(
-        state, lambda j, end, x, y, T, *_: block.continues(j, end, T), body, label="blend (tangent)"
+        state, lambda walk, end, x, y, T, *_: block.continues(walk, T), body, label="blend (tangent)"
     )
-    return _store(block, dsums, [-t if layout.alpha_attached else mi.Float(0) for t in dT], image)
+    return _store(block, layout, dsums, [-t if layout.alpha_attached else mi.Float(0) for t in dT], pictures)

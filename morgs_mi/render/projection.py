@@ -50,43 +50,74 @@ class Splats:
         channels: what is blended, by channel name.
         depths: camera-space z in world units, detached.
         extent: (half width, half height) in px of the region where alpha >= alpha_min, detached; 0 if culled.
-        slopes: (dx/dy, dy/dx) along which p is largest for given dy or dx, detached.
         valid: False where culled: behind the near plane, too faint, or not finite.
         finite: False where an attribute, or what becomes of it, is not finite.
+        order: splats in the order in which equal depths are blended; None: as they come.
     """
 
     shape: tuple[Any, ...]
     channels: dict[str, tuple[Any, ...]]
     depths: Any
     extent: tuple[Any, Any]
-    slopes: tuple[Any, Any]
     valid: Any
     finite: Any
+    order: Any | None = None
 
     def __len__(self) -> int:
         return dr.width(self.depths)
 
+    def followed_by(self, other: Splats, order: Any) -> Splats:
+        """Return these splats and the others, to be blended in `order` where depths are equal."""
+        n, mode = dr.opaque(mi.UInt32, len(self)), dr.ReduceMode.NoConflicts
+        lane = dr.arange(mi.UInt32, len(self) + len(other))
+        ours = lane < n
 
-def project(gaussians: ActivatedGaussians, camera: Camera, channels: tuple[str, ...], config: RenderConfig) -> Splats:
-    """Project every Gaussian to the screen of `camera` and evaluate the channels asked for.
+        def joined(a: Any, b: Any) -> Any:
+            # `dr.concat` would compile a kernel for every length.
+            if isinstance(a, tuple):
+                return tuple(joined(v, w) for v, w in zip(a, b, strict=True))
+            front = dr.gather(type(a), a, lane, active=ours, mode=mode)
+            return dr.select(ours, front, dr.gather(type(b), b, lane - n, active=~ours, mode=mode))
+
+        return Splats(
+            joined(self.shape, other.shape),
+            {name: joined(value, other.channels[name]) for name, value in self.channels.items()},
+            joined(self.depths, other.depths),
+            joined(self.extent, other.extent),
+            joined(self.valid, other.valid),
+            joined(self.finite, other.finite),
+            order,
+        )
+
+
+def project(
+    gaussians: ActivatedGaussians,
+    camera: Camera,
+    channels: tuple[str, ...],
+    config: RenderConfig,
+    rows: Any | None = None,
+) -> Splats:
+    """Project Gaussians to the screen of `camera` and evaluate the channels asked for.
 
     Args:
         gaussians: N Gaussians with activated attributes.
         camera: the view; a Dr.Jit `viewmat` receives gradients.
         channels: names out of `CHANNEL_SIZES`.
         config: cut-offs.
+        rows: which Gaussians, UInt32 [M], none of them twice; None: all N, in order.
 
     Returns:
-        Splats of length N, differentiable in every attribute and in the camera's pose.
+        Splats of length M, differentiable in every attribute and in the camera's pose.
     """
-    N = dr.prod(gaussians.means.shape[:1])
-    means, quats = _rows(mi.Point3f, gaussians.means, N), _rows(mi.Vector4f, gaussians.quats, N)
-    scales, opacities = _rows(mi.Vector3f, gaussians.scales, N), gaussians.opacities.array
-    R, rows, eye = _pose(camera.viewmat)
+    if rows is None:
+        rows = dr.arange(mi.UInt32, dr.prod(gaussians.means.shape[:1]))
+    means, quats = gaussians.rows("means", rows), mi.Vector4f(*gaussians.rows("quats", rows))
+    scales, (opacities,) = mi.Vector3f(*gaussians.rows("scales", rows)), gaussians.rows("opacities", rows)
+    R, pose, eye = _pose(camera.viewmat)
     fx, fy, cx, cy, near, *limits = _intrinsics(camera)
 
     world = [mi.Float64(v) for v in means]
-    x, y, z = (mi.Float(dr.fma(a, world[0], dr.fma(b, world[1], dr.fma(c, world[2], t)))) for a, b, c, t in rows)
+    x, y, z = (mi.Float(dr.fma(a, world[0], dr.fma(b, world[1], dr.fma(c, world[2], t)))) for a, b, c, t in pose)
     probe = dr.detach(x + y + z)
     front = dr.detach((z >= near) & (dr.maximum(dr.maximum(dr.abs(x), dr.abs(y)), z) < _FARTHEST))
     x, y, z = dr.select(front, x, 0), dr.select(front, y, 0), dr.select(front, z, 1)
@@ -108,27 +139,22 @@ def project(gaussians: ActivatedGaussians, camera: Camera, channels: tuple[str, 
     for name in channels:
         if name == "color":
             direction = dr.select(front, mi.Vector3f(*(mi.Float(v - e) for v, e in zip(world, eye, strict=True))), 1)
-            blended[name] = _colors(direction, gaussians.sh_coeffs, N)
+            blended[name] = _colors(direction, gaussians.rows("sh_coeffs", rows))
         elif name == "depth":
             blended[name] = (z,)
         elif name == "motion":
-            blended[name] = _screen_motion(_rows(mi.Vector3f, gaussians.motion, N), x * rz, y * rz, fx * rz, fy * rz, R)
+            blended[name] = _screen_motion(gaussians.rows("motion", rows), x * rz, y * rz, fx * rz, fy * rz, R)
         elif name == "confidence":
-            blended[name] = (gaussians.confidence.array,)
+            blended[name] = tuple(gaussians.rows("confidence", rows))
 
     # alpha >= alpha_min  <=>  u^2 + v^2 <= reach, an ellipse with these half axes along x and y
     reach = dr.maximum(dr.detach(log2_opacity) - log2(config.alpha_min), 0)
-    xx, yy, xy = dr.detach(xx), dr.detach(yy), dr.detach(xy)
+    xx, yy = dr.detach(xx), dr.detach(yy)
     probe += sum(dr.detach(v) for v in (*shape, *(v for values in blended.values() for v in values)))
     finite = dr.isfinite(probe)
     valid = front & (reach > 0) & finite
     extent = (dr.sqrt(reach * xx) / s, dr.sqrt(reach * yy) / s)
-    return Splats(shape, blended, dr.detach(z), extent, (xy / yy, xy / xx), valid, finite)
-
-
-def _rows(dtype: Any, tensor: Any, N: int) -> Any:
-    """Return a tensor [N, D] as D arrays [N]; every element is read once, so its adjoint needs no atomics."""
-    return dr.gather(dtype, tensor.array, dr.arange(mi.UInt32, N), mode=dr.ReduceMode.NoConflicts)
+    return Splats(shape, blended, dr.detach(z), extent, valid, finite)
 
 
 def _pose(viewmat: Any) -> tuple[list[list[Any]], list[list[Any]], list[Any]]:
@@ -191,13 +217,10 @@ def _screen_axes(
     return u0, u1, r_focal * r_scale
 
 
-def _colors(direction: Any, sh_coeffs: Any, N: int) -> tuple[Any, ...]:
-    """Return max(0.5 + SH(direction), 0) per colour component (3DGS's convention)."""
-    K = int(sh_coeffs.shape[1])
-    lane = dr.arange(mi.UInt32, N) * (3 * K)
-    coeff = [dr.gather(mi.Float, sh_coeffs.array, lane + j, mode=dr.ReduceMode.NoConflicts) for j in range(3 * K)]
-    basis = dr.sh_eval(dr.normalize(direction), int(sqrt(K)) - 1)
-    return tuple(dr.maximum(sum(B * coeff[3 * k + c] for k, B in enumerate(basis)) + 0.5, 0) for c in range(3))
+def _colors(direction: Any, coeffs: list[Any]) -> tuple[Any, ...]:
+    """Return max(0.5 + SH(direction), 0) per colour component (3DGS's convention) of 3 K coefficients."""
+    basis = dr.sh_eval(dr.normalize(direction), int(sqrt(len(coeffs) // 3)) - 1)
+    return tuple(dr.maximum(sum(B * coeffs[3 * k + c] for k, B in enumerate(basis)) + 0.5, 0) for c in range(3))
 
 
 def _screen_motion(motion: Any, tan_x: Any, tan_y: Any, jx: Any, jy: Any, R: list[list[Any]]) -> tuple[Any, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,10 +12,11 @@ import numpy as np
 
 from morgs_mi.capture.camera import Camera
 from morgs_mi.gaussians.gaussians import ActivatedGaussians, repeated
-from morgs_mi.render.blocks import build_lists
-from morgs_mi.render.compositing import Layout, blend
+from morgs_mi.render.blocks import build_lists, touches
+from morgs_mi.render.compositing import Channel, Layout, blend
 from morgs_mi.render.config import RenderConfig
-from morgs_mi.render.projection import CHANNEL_SIZES, project
+from morgs_mi.render.projection import CHANNEL_SIZES, Splats, project
+from morgs_mi.render.region import Region, whole_view
 
 __all__ = ["Image", "rasterize"]
 
@@ -26,6 +27,8 @@ _NORMALISED = ("depth", "motion")  # divided by alpha: expected values, not sums
 @dataclass(frozen=True)
 class Image:
     """Tensors of one view, those that were asked for; H rows, W columns.
+
+    On a region all of them are [A, block_height, block_width, C] in place of [H, W, C], and 0 outside the view.
 
     Attributes:
         color: display-referred colour [H, W, 3].
@@ -48,6 +51,8 @@ def rasterize(
     channels: Sequence[str] = ("color", "alpha"),
     background: Sequence[float] | None = None,
     detach_weights: Sequence[str] = (),
+    region: Region | None = None,
+    active: Any | None = None,
     config: RenderConfig | None = None,
 ) -> Image:
     """Render Gaussians by depth-ordered alpha blending (eq. 1), differentiably.
@@ -62,13 +67,18 @@ def rasterize(
             sums weighted by T alpha; depth and motion are divided by the sum of those weights.
         background: display-referred colour [3] behind everything; None is black.
         detach_weights: channels whose gradient reaches only what is blended, not opacity and geometry.
+        region: the blocks of pixels to draw; None: the whole view. What it does not need is not done: Gaussians that
+            touch none of its blocks are only projected.
+        active: bool [N], the Gaussians that gradients reach; None: all.
         config: cut-offs and block shape.
 
     Returns:
-        An `Image` with one tensor per requested channel.
+        An `Image` with one tensor per requested channel. On a region, and with `active`, what is drawn and the
+        gradients that are left are those of the full computation.
 
     Raises:
-        ValueError: an unknown channel, a channel whose attribute is missing, NaN or infinite attributes.
+        ValueError: an unknown channel, a channel whose attribute is missing, NaN or infinite attributes, a region of
+            another view or block shape.
 
     Equal depths are blended in the order of the input. A quaternion of length 0 does not rotate. What lies before
     the camera's near plane or beyond 1e18 units, and what overflows float32 once projected, is not drawn.
@@ -77,44 +87,122 @@ def rasterize(
     config = config or RenderConfig()
     channels = tuple(dict.fromkeys(channels))
     _check(gaussians, camera, channels, background, detach_weights)
-    W, H = camera.width, camera.height
+    region = region or whole_view(camera.width, camera.height, config)
+    _check_region(region, camera, config)
     blended = tuple(c for c in channels if c != "alpha")
     if dr.prod(gaussians.means.shape[:1]) == 0:
-        return _empty(channels, background, W, H)
-
-    splats = project(gaussians, camera, blended, config)
-    dr.schedule(splats.shape, splats.channels, splats.depths, splats.extent, splats.slopes, splats.valid)
+        return _empty(channels, background, region)
+    if region.whole and active is None:
+        splats = project(gaussians, camera, blended, config)
+    else:
+        splats = _project_part(gaussians, camera, blended, region, active, config)
+    if splats is None:
+        return _empty(channels, background, region)
+    dr.schedule(splats.shape, splats.channels, splats.depths, splats.extent, splats.valid)
     _check_finite(splats.finite, gaussians)
-    with dr.suspend_grad():
-        lists = build_lists(splats, W, H, config)
-
-    attached = tuple(name not in detach_weights for name in blended for _ in range(CHANNEL_SIZES[name]))
-    alpha_attached = (
-        ("alpha" in channels and "alpha" not in detach_weights)
-        or ("color" in channels and background is not None and "color" not in detach_weights)
-        or any(name in blended and name not in detach_weights for name in _NORMALISED)
-    )
     values = [splats.channels[name] for name in blended]
-    *parts, alpha, coverage = blend(splats.shape, values, lists, Layout(attached, alpha_attached, config), W * H)
-    images = {"alpha": alpha}
-    for name, value in zip(blended, parts, strict=True):
-        weight = dr.detach(coverage) if name in detach_weights else coverage
-        if name in _NORMALISED:
-            weight = repeated(weight, CHANNEL_SIZES[name])
-            value = dr.select(weight > 0, value / dr.maximum(weight, 1e-8), 0)
-        elif name == "color" and background is not None:
-            backdrop = dr.gather(mi.Float, mi.Float(np.float32(background)), dr.arange(mi.UInt32, W * H * 3) % 3)
-            value = dr.fma(1 - repeated(weight, 3), backdrop, value)
-        images[name] = value
-    return Image(**{n: mi.TensorXf(images[n], (H, W, CHANNEL_SIZES.get(n, 1))) for n in channels})
+    with dr.suspend_grad():
+        lists = build_lists(splats, [column for columns in values for column in columns], region, config)
+    layout = _layout(channels, blended, background, detach_weights, config)
+    parts = blend(splats.shape, values, region, lists, layout)
+    images = dict(zip((*blended, "alpha", "coverage"), parts, strict=False))
+    coverage = images.pop("coverage", None)
+    for name in blended:
+        if name in _NORMALISED or (name == "color" and background is not None):
+            weight = repeated(dr.detach(coverage) if name in detach_weights else coverage, CHANNEL_SIZES[name])
+            finish = _normalised if name in _NORMALISED else _over(background)
+            images[name] = finish(images[name], weight)
+    return Image(**{name: _tensor(images[name], region, CHANNEL_SIZES.get(name, 1)) for name in channels})
 
 
-def _empty(channels: tuple[str, ...], background: Sequence[float] | None, W: int, H: int) -> Image:
+def _normalised(values: Any, weight: Any) -> Any:
+    """Divide by the sum of the weights; 0 where nothing is."""
+    return dr.select(weight > 0, values / dr.maximum(weight, 1e-8), 0)
+
+
+def _over(background: Sequence[float] | None) -> Callable[[Any, Any], Any]:
+    """Return what fills a colour up with the background."""
+    behind = mi.Float(np.float32(background))
+    return lambda values, weight: dr.fma(
+        1 - weight, dr.gather(mi.Float, behind, dr.arange(mi.UInt32, dr.width(weight)) % 3), values
+    )
+
+
+def _project_part(
+    gaussians: ActivatedGaussians,
+    camera: Camera,
+    channels: tuple[str, ...],
+    region: Region,
+    active: Any | None,
+    config: RenderConfig,
+) -> Splats | None:
+    """Project those Gaussians that the region may show, attached to the gradient graph only those that are active."""
+    still = dr.detach(gaussians)
+    with dr.suspend_grad():
+        everything = project(still, camera, (), config)
+        shown = touches(everything, region)
+        dr.schedule(shown)
+        _check_finite(everything.finite, gaussians)
+        if active is None:
+            rows = [dr.compress(shown), mi.UInt32()]
+        else:
+            active = mi.Bool(active)
+            N = int(gaussians.means.shape[0])
+            if dr.width(active) != N:
+                raise ValueError(f"rasterize(): `active` must be bool [N] with N={N}, got {dr.width(active)} values.")
+            rows = [dr.compress(shown & active), dr.compress(shown & ~active)]
+    parts = [
+        project(some, camera, channels, config, index)
+        for some, index in zip((gaussians, still), rows, strict=False)
+        if dr.width(index)
+    ]
+    if len(parts) < 2:
+        return parts[0] if parts else None
+    return parts[0].followed_by(parts[1], dr.argsort(dr.concat(rows)))
+
+
+def _layout(
+    channels: tuple[str, ...],
+    blended: tuple[str, ...],
+    background: Sequence[float] | None,
+    detach_weights: Sequence[str],
+    config: RenderConfig,
+) -> Layout:
+    """Return what is blended, and what its gradients reach."""
+    # Who reads alpha: those who ask for it, and those who divide by it or fill up with it.
+    readers = [
+        name
+        for name in channels
+        if name == "alpha" or name in _NORMALISED or (name == "color" and background is not None)
+    ]
+    sizes = tuple(Channel(CHANNEL_SIZES[name], name not in detach_weights) for name in blended)
+    return Layout(sizes, bool(readers), any(name not in detach_weights for name in readers), config)
+
+
+def _tensor(values: Any, region: Region, size: int) -> Any:
+    """Return a channel's picture; pixels of a region that lie outside the view are 0."""
+    if region.weights is not None:
+        values = values * repeated(region.weights, size)
+    return mi.TensorXf(values, region.shape(size))
+
+
+def _empty(channels: tuple[str, ...], background: Sequence[float] | None, region: Region) -> Image:
     """Return the image of no Gaussians."""
-    images = {n: dr.zeros(mi.TensorXf, (H, W, CHANNEL_SIZES.get(n, 1))) for n in channels}
+    images = {n: dr.zeros(mi.TensorXf, region.shape(CHANNEL_SIZES.get(n, 1))) for n in channels}
     if background is not None and "color" in images:
-        images["color"] = mi.TensorXf(np.tile(np.float32(background), (H, W, 1)))
+        backdrop = np.broadcast_to(np.float32(background), region.shape(3))
+        images["color"] = _tensor(mi.Float(backdrop.ravel()), region, 3)
     return Image(**images)
+
+
+def _check_region(region: Region, camera: Camera, config: RenderConfig) -> None:
+    block = config.block_shape(dr.backend_v(mi.Float) == dr.JitBackend.CUDA)
+    found = (region.width, region.height, *region.block)
+    if found != (camera.width, camera.height, *block):
+        raise ValueError(
+            f"rasterize(): `region` must be of a {camera.width}x{camera.height} view with {block[0]}x{block[1]} blocks "
+            f"like the camera's and the config's, got {found[0]}x{found[1]} with {found[2]}x{found[3]}."
+        )
 
 
 def _check(

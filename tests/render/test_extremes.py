@@ -19,6 +19,7 @@ import pytest
 from drjit.opt import Adam
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from morgs_mi.gaussians.gaussians import tensor_rows
 from tests import reference
 from tests import tolerances as tol
 
@@ -42,6 +43,9 @@ class Activated:
             setattr(self, name, mi.TensorXf(np.ascontiguousarray(values[name], np.float32)) * one)
         self.tensors = [getattr(self, name) for name in ATTRIBUTES]
         dr.enable_grad(*self.tensors)
+
+    def rows(self, name: str, index: Any) -> list[Any]:
+        return tensor_rows(getattr(self, name), index)
 
     def gradients(self) -> Values:
         return {name: np.asarray(dr.grad(getattr(self, name)), np.float64) for name in ATTRIBUTES}

@@ -1,0 +1,187 @@
+"""Active blocks and active Gaussians: what is left is what the full computation gives there."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from morgs_mi.render.region import Region
+from tests import tolerances as tol
+
+CHANNELS = ("color", "alpha", "depth", "motion", "confidence")
+RAW = ("means", "log_scales", "quats", "logit_opacities", "sh_coeffs", "motion", "logit_confidence")
+BACKGROUND = (0.2, 0.5, 0.9)
+
+
+@pytest.fixture(scope="module")
+def camera() -> Camera:
+    """Several tiles, and blocks that stick out on both sides."""
+    return Camera.look_at((0.3, -0.4, -3.0), (0, 0, 0), (0, -1, 0), 45.0, 101, 75)
+
+
+@pytest.fixture(scope="module")
+def raw() -> dict[str, np.ndarray]:
+    rng, n = np.random.default_rng(7), 120
+    return {
+        "means": rng.uniform((-1.5, -1.0, -0.5), (1.5, 1.0, 0.5), (n, 3)),
+        "log_scales": rng.uniform(np.log(0.02), np.log(0.2), (n, 3)),
+        "quats": rng.normal(size=(n, 4)),
+        "logit_opacities": rng.uniform(-2, 3, n),
+        "sh_coeffs": rng.normal(size=(n, 4, 3)) * 0.3,
+        "motion": rng.normal(size=(n, 3)) * 0.1,
+        "logit_confidence": rng.normal(size=n),
+    }
+
+
+@pytest.fixture(scope="module")
+def mask(camera: Camera) -> np.ndarray:
+    """A disc, a lonely pixel in a tile of its own, and the lower right corner."""
+    y, x = np.mgrid[: camera.height, : camera.width]
+    mask = (x - 30) ** 2 + (y - 20) ** 2 < 12**2
+    mask[70, 5] = mask[74, 100] = True
+    return mask
+
+
+def run(raw, camera, region=None, active=None, weight=None, config=None):
+    """Return images and gradients of <image, weight>, with the weight laid out for the region."""
+    gaussians = Gaussians(**raw)
+    dr.enable_grad(*gaussians.items().values())
+    image = rasterize(gaussians, camera, CHANNELS, BACKGROUND, region=region, active=active, config=config)
+    images = {name: getattr(image, name) for name in CHANNELS}
+    if weight is not None:
+        laid_out = {name: region.cut(w) if region else w for name, w in weight.items()}
+        dr.backward(sum(dr.sum(images[n] * mi.TensorXf(np.float32(laid_out[n])), axis=None) for n in CHANNELS))
+    grads = {name: np.asarray(dr.grad(getattr(gaussians, name)), np.float64) for name in RAW}
+    return {name: np.asarray(value) for name, value in images.items()}, grads
+
+
+@pytest.fixture(scope="module")
+def weight(camera: Camera, mask: np.ndarray) -> dict[str, np.ndarray]:
+    """Random weights on the pixels of the region's blocks, 0 elsewhere."""
+    rng, region = np.random.default_rng(3), Region(mask)
+    drawn = region.paste(np.ones(region.shape(1)[:3]), np.zeros(mask.shape))[..., None]
+    sizes = {"color": 3, "motion": 2}
+    return {name: rng.normal(size=(*mask.shape, sizes.get(name, 1))) * drawn for name in CHANNELS}
+
+
+def assert_same_gradients(found, expected, rows=slice(None)):
+    for name in RAW:
+        scale = np.abs(expected[name]).max()
+        assert scale > 0, name
+        assert np.abs(found[name][rows] - expected[name][rows]).max() < tol.SUM_ORDER_REL * scale, name
+
+
+@pytest.mark.parametrize("reproducible", [False, True])
+def test_a_region_shows_and_teaches_what_the_whole_view_does(raw, camera, mask, weight, reproducible):
+    config = RenderConfig(reproducible=reproducible)
+    region = Region(mask, config)
+    assert region.num_blocks < 0.3 * (camera.width * camera.height) / 32
+    images, grads = run(raw, camera, region, None, weight, config)
+    full_images, full_grads = run(raw, camera, None, None, weight, config)
+    for name in CHANNELS:
+        assert np.array_equal(images[name], region.cut(full_images[name])), name
+        assert (images[name][~region.inside()] == 0).all(), name
+    assert_same_gradients(grads, full_grads)
+
+
+def test_only_active_gaussians_get_gradients(raw, camera, mask, weight):
+    rng = np.random.default_rng(0)
+    active = rng.uniform(size=len(raw["means"])) < 0.4
+    for region in (None, Region(mask)):
+        images, grads = run(raw, camera, region, active, weight)
+        expected_images, expected = run(raw, camera, region, None, weight)
+        for name in CHANNELS:
+            assert np.array_equal(images[name], expected_images[name]), name
+        assert_same_gradients(grads, expected, active)
+        assert all((grads[name][~active] == 0).all() for name in RAW)
+
+
+def test_equal_depths_keep_their_order_whoever_is_active(camera):
+    """Two opaque Gaussians in one place: the first one hides the second, active or not."""
+    raw = {
+        "means": np.zeros((2, 3)),
+        "log_scales": np.full((2, 3), -1.0),
+        "quats": np.tile([1.0, 0, 0, 0], (2, 1)),
+        "logit_opacities": np.full(2, 4.0),
+        "sh_coeffs": np.array([[[1.5, -1.5, -1.5]], [[-1.5, -1.5, 1.5]]]),
+    }
+    colors = [
+        np.asarray(rasterize(Gaussians(**raw), camera, ("color",), active=np.array(active)).color)
+        for active in ([True, True], [False, True], [True, False], [False, False])
+    ]
+    assert colors[0][37, 50, 0] > 0.9
+    assert all(np.array_equal(color, colors[0]) for color in colors)
+
+
+def test_a_region_in_forward_mode(raw, camera, mask):
+    rng, region, tangents = np.random.default_rng(1), Region(mask), []
+    direction = {name: np.float32(rng.normal(size=raw[name].shape)) for name in RAW}
+    for where in (region, None):
+        gaussians = Gaussians(**raw)
+        dr.enable_grad(*gaussians.items().values())
+        image = rasterize(gaussians, camera, CHANNELS, region=where)
+        for name in RAW:
+            dr.set_grad(getattr(gaussians, name), mi.TensorXf(direction[name]))
+        outputs = [getattr(image, name) for name in CHANNELS]
+        dr.forward_to(outputs)
+        tangents.append([np.asarray(dr.grad(output)) for output in outputs])
+    for name, found, expected in zip(CHANNELS, *tangents, strict=True):
+        assert np.abs(found - region.cut(expected)).max() < tol.SUM_ORDER_REL * np.abs(expected).max(), name
+
+
+def test_a_region_where_nothing_is(raw, camera, mask):
+    raw = raw | {"means": raw["means"] * (1, 1, 0) + (0, 0, -50)}
+    image = rasterize(Gaussians(**raw), camera, ("color", "depth"), BACKGROUND, region=Region(mask))
+    inside = Region(mask).inside()
+    assert np.array_equal(np.asarray(image.color)[inside], np.tile(np.float32(BACKGROUND), (inside.sum(), 1)))
+    assert (np.asarray(image.color)[~inside] == 0).all()
+    assert (np.asarray(image.depth) == 0).all()
+
+
+def test_cut_and_paste_are_inverse(camera, mask):
+    region, rng = Region(mask), np.random.default_rng(0)
+    picture, other = (rng.normal(size=(*mask.shape, 3)) for _ in range(2))
+    pasted = region.paste(region.cut(picture), other)
+    assert (pasted[mask] == picture[mask]).all()
+    drawn = region.paste(np.ones(region.shape(1)[:3], bool), np.zeros(mask.shape, bool))
+    assert (pasted[~drawn] == other[~drawn]).all()
+    assert drawn.sum() == region.inside().sum()
+
+
+def test_regions_share_their_kernels(raw, camera, mask):
+    """Another region, another number of Gaussians in it: nothing is compiled anew."""
+    active = np.arange(len(raw["means"])) % 3 == 0
+
+    def step(where):
+        gaussians = Gaussians(**raw)
+        dr.enable_grad(*gaussians.items().values())
+        image = rasterize(gaussians, camera, ("color",), region=Region(where), active=active)
+        dr.backward(dr.sum(image.color, axis=None))
+        dr.eval(dr.grad(gaussians.means))
+        dr.sync_thread()
+
+    step(mask)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        step(np.roll(mask, 21, axis=1) | (np.arange(camera.width) < 20))
+        compiled = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and not k["cache_hit"]]
+    assert not compiled, [k["operation_count"] for k in compiled]
+
+
+def test_bad_regions_are_refused(raw, camera, mask):
+    gaussians = Gaussians(**raw)
+    for bad in (np.zeros((4, 4), bool), np.ones((4, 4)), np.ones(4, bool)):
+        with pytest.raises(ValueError, match=r"Region\(\): `mask` must be bool \[H, W\] with at least one pixel"):
+            Region(bad)
+    with pytest.raises(ValueError, match="`region` must be of a 101x75 view with 8x4 blocks"):
+        rasterize(gaussians, camera, region=Region(mask[:, :-1]))
+    with pytest.raises(ValueError, match="got 101x75 with 4x4"):
+        rasterize(gaussians, camera, region=Region(mask, RenderConfig(block_width=4)))
+    with pytest.raises(ValueError, match=r"`active` must be bool \[N\] with N=120, got 7"):
+        rasterize(gaussians, camera, active=np.ones(7, bool))
+    broken = raw | {"means": np.where(np.arange(360).reshape(120, 3) == 7, np.nan, raw["means"])}
+    with pytest.raises(ValueError, match=r"`means` must be finite, got nan at \[2, 1\]"):
+        rasterize(Gaussians(**broken), camera, region=Region(mask))
