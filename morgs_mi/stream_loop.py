@@ -126,7 +126,7 @@ def step(
         cues = _cues(setup, state, images)
         if state.frame == 1 and setup.config.motion.learn_confidence:
             previous = _first_confidence(setup, state, cues)
-        gaussians, losses = fit_next_frame(
+        gaussians, _, losses = fit_next_frame(
             previous,
             setup.cameras,
             targets,

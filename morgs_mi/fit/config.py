@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from math import inf
 
-__all__ = ["FitConfig", "Rates"]
+__all__ = ["DensityConfig", "FitConfig", "Rates"]
 
 
 @dataclass(frozen=True)
@@ -53,6 +53,28 @@ class Rates:
 
 
 @dataclass(frozen=True)
+class DensityConfig:
+    """How the number of Gaussians follows the pictures; thresholds are those of 3DGS where it has them."""
+
+    max_gaussians: int = 30_000
+    """Nobody is born beyond this many."""
+    rounds: int = 0
+    """Steps of density control in the first frame, between a tenth and a half of its steps; 0: none."""
+    growth: float = 0.2
+    """Of one such step, births as a share of the Gaussians."""
+    births: float = 0.02
+    """Of a later frame, as a share of its Gaussians."""
+    min_error: float = 0.0
+    """Who answers for less summed error, in pixels of full contrast, is no parent."""
+    split_scale: float = 0.01
+    """Who is wider than this share of the scene's extent is split, who is narrower is cloned."""
+    min_opacity: float = 0.005
+    """Who is fainter dies."""
+    later_frames: bool = False
+    """One step of density control in every later frame."""
+
+
+@dataclass(frozen=True)
 class FitConfig:
     """Settings of the optimisation."""
 
@@ -68,6 +90,8 @@ class FitConfig:
     """Passes over all training views for every later frame; the paper's small variant takes 5."""
     dssim_weight: float = 0.2
     """lambda of eq. 2."""
+    density: DensityConfig = field(default_factory=DensityConfig)
+    """Births and deaths."""
     rates: Rates = field(default_factory=Rates)
     """Learning rates of every later frame."""
     first_rates: Rates = field(default_factory=lambda: Rates(means=2e-3, scales=0.02, quats=0.02, opacities=0.2))

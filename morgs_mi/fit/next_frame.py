@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import drjit as dr
@@ -11,8 +12,9 @@ import numpy as np
 
 from morgs_mi.capture.camera import Camera
 from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.density import apply_plan, find_need, plan_density, regrow
 from morgs_mi.fit.losses import Target, flow_loss, mask_loss, offset_loss, recon_loss
-from morgs_mi.fit.optimise import optimise, view_order
+from morgs_mi.fit.optimise import adam, optimise, values_of, view_order
 from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.motion.config import MotionConfig
 from morgs_mi.motion.cues import MotionCue
@@ -35,7 +37,7 @@ def fit_next_frame(
     render: RenderConfig,
     rng: np.random.Generator,
     on_step: Callable[[int], None] | None = None,
-) -> tuple[Gaussians, dict[str, float]]:
+) -> tuple[Gaussians, np.ndarray, dict[str, float]]:
     """Fit one frame's residual (eq. 12) by L_recon + L_mask + L_flow + L_off (eq. 13).
 
     Args:
@@ -51,12 +53,13 @@ def fit_next_frame(
         on_step: called with the number of steps done.
 
     Returns:
-        The Gaussians of this frame and the final losses.
+        The M Gaussians of this frame; `source` [M], each one's index among the N of the frame before, survivors
+        first in ascending order, or -1 for those born, who come last; and the final losses.
     """
     evidence = {view: _Evidence(cue, motion) for view, cue in cues.items()}
 
-    def losses_of(values: Mapping[str, Any], view: int) -> dict[str, Any]:
-        gaussians, seen = apply_residual(previous, values, motion), evidence.get(view)
+    def losses_of(base: Gaussians, values: Mapping[str, Any], view: int) -> dict[str, Any]:
+        gaussians, seen = apply_residual(base, values, motion), evidence.get(view)
         maps = seen.channels if seen else ()
         detached = maps if motion.detach_weights else ()
         image = rasterize(gaussians, cameras[view], ("color", *maps), detach_weights=detached, config=render)
@@ -70,12 +73,27 @@ def fit_next_frame(
         return losses
 
     weights = {"flow": motion.weight_flow, "mask": motion.weight_mask, "offset": motion.weight_offset}
+    rates = config.rates.by_parameter(extent)
     views = view_order(len(cameras), config.epochs * len(cameras), rng)
     lifted = lift_flow(previous, cameras, cues, render) if motion.learn_motion and motion.lift_flow else None
-    start = residual_parameters(previous, motion, lifted)
-    fitted, losses = optimise(start, config.rates.by_parameter(extent), views, losses_of, weights, on_step=on_step)
+    optimizer = adam(residual_parameters(previous, motion, lifted))
+    # Enough is settled by then to tell what is missing, and enough is left to put it in its place.
+    cut = round(0.625 * config.epochs) * len(cameras) if config.density.later_frames else len(views)
+    losses = optimise(optimizer, rates, views[:cut], partial(losses_of, previous), weights, on_step=on_step)
+    source = np.arange(len(previous))
+    if config.density.later_frames:
+        with dr.suspend_grad():
+            now = apply_residual(previous, values_of(optimizer), motion)
+        need, births = find_need(now, cameras, targets, render), round(config.density.births * len(now))
+        plan = plan_density(now, need, births, extent, config.density, rng)
+        # What is born starts from its parent's past and shares its residual, so that its motion is the parent's.
+        previous, source = apply_plan(previous, plan), plan.source
+        regrow(optimizer, plan)
+        losses |= optimise(
+            optimizer, rates, views[cut:], partial(losses_of, previous), weights, on_step=on_step, first_step=cut
+        )
     with dr.suspend_grad():
-        return apply_residual(previous, fitted, motion), losses
+        return apply_residual(previous, values_of(optimizer), motion), source, losses
 
 
 class _Evidence:

@@ -6,47 +6,76 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
-__all__ = ["Losses", "optimise", "view_order"]
+__all__ = ["Losses", "adam", "optimise", "replace_parameter", "values_of", "view_order"]
 
 Losses = dict[str, Any]
 
 
+def adam(parameters: Mapping[str, Any]) -> Adam:
+    """Return Adam with these tensors, by name, at their start."""
+    # Gradients of means over a million pixels are tiny: Adam's usual epsilon of 1e-8 would drown them.
+    return Adam(lr=1.0, params=dict(parameters), epsilon=1e-15)
+
+
+def values_of(optimizer: Adam) -> dict[str, Any]:
+    """Return the parameters as they are, detached."""
+    return {name: dr.detach(optimizer[name]) for name in optimizer}
+
+
+def replace_parameter(optimizer: Adam, name: str, value: np.ndarray, carry: Callable[[np.ndarray], np.ndarray]) -> None:
+    """Give a parameter another value and shape; unlike on assignment, Adam's two moments go along.
+
+    Args:
+        optimizer: its learning rates and its count of steps stay.
+        name: of the parameter.
+        value: the new one.
+        carry: makes a moment of the new shape out of one of the old.
+    """
+    _, promoted, rate, (steps, first, second, largest) = optimizer.state[name]
+    shape = tuple(optimizer[name].shape)
+    moments = [mi.Float(np.float32(carry(np.asarray(m).reshape(shape))).ravel()) for m in (first, second)]
+    dr.make_opaque(moments)
+    optimizer[name] = mi.TensorXf(np.ascontiguousarray(value, np.float32))
+    optimizer.state[name] = (optimizer.state[name][0], promoted, rate, (steps, *moments, largest))
+
+
 def optimise(
-    parameters: Mapping[str, Any],
+    optimizer: Adam,
     rates: Mapping[str, float],
     views: Iterable[int],
     losses_of: Callable[[Mapping[str, Any], int], Losses],
     weights: Mapping[str, float],
     decay: Callable[[int], float] | None = None,
     on_step: Callable[[int], None] | None = None,
-) -> tuple[dict[str, Any], dict[str, float]]:
-    """Minimise the weighted sum of losses by one Adam step per view.
+    first_step: int = 0,
+) -> dict[str, float]:
+    """Minimise the weighted sum of losses by one Adam step per view; the optimiser holds the parameters.
 
     Args:
-        parameters: tensors by name, the start.
+        optimizer: as from `adam`.
         rates: learning rate of each parameter.
         views: the view of every step.
         losses_of: (parameters, view) -> losses by name; a view may leave some out.
         weights: of the losses by name; 1 where not named.
         decay: step -> factor on all rates; None: 1.
         on_step: called with the number of steps done.
+        first_step: what the count of steps goes on from.
 
     Returns:
-        The parameters at the end, detached, and each loss's mean over the last steps that had it.
+        Each loss's mean over the last steps that had it.
 
     Raises:
         FloatingPointError: the losses of the last steps are not finite.
     """
-    # Gradients of means over a million pixels are tiny: Adam's usual epsilon of 1e-8 would drown them.
-    optimizer = Adam(lr=1.0, params=dict(parameters), epsilon=1e-15)
-    scale = {name: float(rates[name]) for name in parameters}
+    scale = {name: float(rates[name]) for name in optimizer}
     # As Python numbers: Dr.Jit 1.5 multiplies a rate that is an array in place, once per step.
     optimizer.set_learning_rate(scale)
     history: dict[str, list[Any]] = {}
-    for step, view in enumerate(views):
+    for step, view in enumerate(views, first_step):
         if decay is not None:
             factor = decay(step)
             optimizer.set_learning_rate({name: factor * rate for name, rate in scale.items()})
@@ -61,10 +90,10 @@ def optimise(
     broken = [name for name, value in final.items() if not np.isfinite(value)]
     if broken:
         raise FloatingPointError(
-            f"optimise(): the losses {', '.join(broken)} are not finite after {len(history[broken[0]])} steps; "
-            "lower the learning rates."
+            f"optimise(): the losses {', '.join(broken)} are not finite after {first_step + len(history[broken[0]])} "
+            "steps; lower the learning rates."
         )
-    return {name: dr.detach(optimizer[name]) for name in parameters}, final
+    return final
 
 
 def view_order(num_views: int, steps: int, rng: np.random.Generator) -> list[int]:

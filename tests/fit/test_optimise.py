@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi.fit.optimise import optimise, view_order
+from morgs_mi.fit.optimise import adam, optimise, replace_parameter, values_of, view_order
 
 
 def bowl(values, view):
@@ -18,11 +18,13 @@ def bowl(values, view):
 @pytest.mark.parametrize("decay", [None, lambda step: 0.1 ** (step / 200)])
 def test_weights_decide_where_it_ends(decay):
     start = {"x": mi.TensorXf(np.zeros(4, np.float32))}
-    fitted, losses = optimise(start, {"x": 0.1}, [0] * 200, bowl, {"far": 0.0}, decay)
-    assert np.asarray(fitted["x"]) == pytest.approx(np.ones(4), abs=0.02)
+    near = adam(start)
+    losses = optimise(near, {"x": 0.1}, [0] * 200, bowl, {"far": 0.0}, decay)
+    assert np.asarray(values_of(near)["x"]) == pytest.approx(np.ones(4), abs=0.02)
     assert losses["far"] == pytest.approx(16, rel=0.05)
-    fitted, _ = optimise(start, {"x": 0.1}, [0] * 200, bowl, {}, decay)
-    assert np.asarray(fitted["x"]) == pytest.approx(np.full(4, 2.0), abs=0.02)
+    both = adam(start)
+    optimise(both, {"x": 0.1}, [0] * 200, bowl, {}, decay)
+    assert np.asarray(values_of(both)["x"]) == pytest.approx(np.full(4, 2.0), abs=0.02)
 
 
 def test_every_step_moves_by_about_the_rate():
@@ -33,14 +35,42 @@ def test_every_step_moves_by_about_the_rate():
         path.append(np.asarray(dr.detach(values["x"])).item())
         return {"slope": dr.sum(values["x"], axis=None)}
 
-    optimise(start, {"x": 0.5}, [0] * 12, slope, {})
+    optimise(adam(start), {"x": 0.5}, [0] * 12, slope, {})
     assert np.diff(path) == pytest.approx(np.full(11, -0.5), rel=1e-3)
 
 
 def test_broken_losses_are_named():
     start = {"x": mi.TensorXf(np.zeros(1, np.float32))}
     with pytest.raises(FloatingPointError, match="recon are not finite after 3 steps"):
-        optimise(start, {"x": 1.0}, [0] * 3, lambda v, _: {"recon": dr.log(dr.sum(v["x"], axis=None) - 100)}, {})
+        optimise(adam(start), {"x": 1.0}, [0] * 3, lambda v, _: {"recon": dr.log(dr.sum(v["x"], axis=None) - 100)}, {})
+
+
+def test_stages_continue_where_the_last_one_ended():
+    """Twelve steps in one go and in two are the same steps."""
+    ends = []
+    for stages in ([12], [5, 7]):
+        optimizer, step = adam({"x": mi.TensorXf(np.zeros(3, np.float32))}), 0
+        for length in stages:
+            optimise(optimizer, {"x": 0.1}, [0] * length, bowl, {}, lambda step: 0.9**step, first_step=step)
+            step += length
+        ends.append(np.asarray(values_of(optimizer)["x"]))
+    assert np.array_equal(*ends)
+
+
+def test_a_parameter_that_widens_keeps_its_momentum():
+    """Columns that come in later start afresh; those that are there step as if nothing had happened."""
+    ends = []
+    for widens in (False, True):
+        optimizer = adam({"x": mi.TensorXf(np.zeros((2, 1), np.float32))})
+        optimise(optimizer, {"x": 0.1}, [0] * 4, bowl, {})
+        if widens:
+            value = np.asarray(values_of(optimizer)["x"])
+            replace_parameter(optimizer, "x", np.pad(value, [(0, 0), (0, 2)]), lambda m: np.pad(m, [(0, 0), (0, 2)]))
+        optimise(optimizer, {"x": 0.1}, [0] * 4, bowl, {}, first_step=4)
+        ends.append(np.asarray(values_of(optimizer)["x"]))
+    assert np.array_equal(ends[0][:, 0], ends[1][:, 0])
+    assert ends[1].shape == (2, 3)
+    assert 0 < ends[1][0, 1] < ends[1][0, 0]
 
 
 def test_views_are_drawn_without_repetition():
