@@ -14,7 +14,7 @@ import logging
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -32,6 +32,7 @@ from morgs_mi.demo import DemoConfig
 from morgs_mi.evaluate.flow_report import FlowReportConfig
 from morgs_mi.evaluate.renderer_report import RendererReportConfig
 from morgs_mi.evaluate.tables import figure, judgement_sentences, judgement_tables
+from morgs_mi.fit.presets import PresetName, apply_preset
 from morgs_mi.stream_loop import StreamConfig
 
 __all__ = ["main"]
@@ -181,19 +182,26 @@ class Fit:
     """Average the images down by this factor."""
     test_view: int | Literal["auto"] | None = "auto"
     """Index of the camera to hold out; auto takes the capture's own choice, or camera 0 of six or more."""
+    preset: PresetName | None = None
+    """The paper's variants (l: 8 passes over the views, s: 5), the rows of its ablation (residuals only, with motion,
+    with offset, with confidence), or all of it without lifted flow; what it does not set stays as given."""
     config: Annotated[StreamConfig, arg(name="")] = field(default_factory=StreamConfig)
 
     def run(self) -> None:
         from morgs_mi.capture.capture import load_capture
         from morgs_mi.stream_loop import stream_capture
 
+        config = self.config
+        if self.preset is not None:
+            fit, motion = apply_preset(self.preset, config.fit, config.motion)
+            config = replace(config, fit=fit, motion=motion)
         capture = load_capture(self.capture, self.downscale, self.test_view, self.frames)
         count = capture.num_frames
         with _progress() as report:
             reports = stream_capture(
                 capture,
                 self.out,
-                self.config,
+                config,
                 lambda frame, step, steps: report("Fitting frames", frame + step / steps, count),
             )
         seconds = [row.seconds for row in reports[1:]]
