@@ -18,8 +18,9 @@ import numpy as np
 
 from morgs_mi.capture.camera import Camera
 from morgs_mi.capture.capture import Capture
+from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import Packet, StreamWriter, encode_packet
-from morgs_mi.codec.gaussians import decode_gaussians, keyframe_packet, residual_packet
+from morgs_mi.codec.gaussians import CodedFrame, decode, keyframe_packet, residual_packet, restated
 from morgs_mi.files import write_json
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
@@ -48,6 +49,7 @@ class StreamConfig:
     fit: FitConfig = field(default_factory=FitConfig)
     motion: MotionConfig = field(default_factory=MotionConfig)
     render: RenderConfig = field(default_factory=RenderConfig)
+    codec: CodecConfig = field(default_factory=CodecConfig)
     seed: int = 0
     """Of every random choice: order of the views, points that are added."""
 
@@ -79,15 +81,20 @@ class StreamState:
 
     Attributes:
         frame: index of the next frame.
-        gaussians: the decoded Gaussians of the last frame; None before the first.
+        coded: what a decoder has after the last frame; None before the first.
         images: the pictures of the last frame.
         rng: state of the random choices.
     """
 
     frame: int
-    gaussians: Gaussians | None
+    coded: CodedFrame | None
     images: tuple[np.ndarray, ...]
     rng: np.random.Generator
+
+    @property
+    def gaussians(self) -> Gaussians | None:
+        """The decoded Gaussians of the last frame."""
+        return self.coded.gaussians if self.coded else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,20 +120,20 @@ def step(
     start = time.perf_counter()
     config, render = setup.config.fit, setup.config.render
     targets = [Target(image, mask) for image, mask in zip(images, setup.masks, strict=True)]
-    if state.gaussians is None:
+    if state.coded is None:
         gaussians, status = _first_gaussians(setup, images, state.rng)
         tick = _ticker(on_step, config.first_frame_steps)
         gaussians, losses = fit_first_frame(
             gaussians, setup.cameras, targets, setup.extent, config, render, state.rng, tick
         )
-        packet = keyframe_packet(gaussians, state.frame)
-        decoded = decode_gaussians(None, packet)
+        packet = keyframe_packet(gaussians, state.frame, setup.cameras, setup.config.codec)
+        decoded = decode(None, packet)
     else:
-        previous, status = state.gaussians, "ok"
+        previous, status = state.coded.gaussians, "ok"
         cues = _cues(setup, state, images)
         if state.frame == 1 and setup.config.motion.learn_confidence:
             previous = _first_confidence(setup, state, cues)
-        gaussians, _, losses = fit_next_frame(
+        gaussians, source, losses = fit_next_frame(
             previous,
             setup.cameras,
             targets,
@@ -138,8 +145,8 @@ def step(
             state.rng,
             _ticker(on_step, config.epochs * len(setup.cameras)),
         )
-        packet = residual_packet(state.gaussians, gaussians, state.frame)
-        decoded = decode_gaussians(state.gaussians, packet)
+        packet = residual_packet(state.coded, gaussians, source, setup.cameras, setup.config.codec)
+        decoded = decode(state.coded, packet)
     seconds = time.perf_counter() - start
     report = FrameReport(state.frame, seconds, len(encode_packet(packet)), losses, len(decoded), status)
     return StreamState(state.frame + 1, decoded, tuple(images), state.rng), packet, report

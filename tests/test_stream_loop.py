@@ -10,7 +10,7 @@ import pytest
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.capture.capture import Capture, Frame
 from morgs_mi.codec.container import PacketKind, StreamReader, encode_packet
-from morgs_mi.codec.gaussians import decode_gaussians, play
+from morgs_mi.codec.gaussians import decode, play
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
 from morgs_mi.fit.config import FitConfig, Rates
 from morgs_mi.motion.config import MotionConfig
@@ -125,7 +125,7 @@ def test_packets_are_a_keyframe_and_then_residuals(full):
     assert [p.kind for p in packets] == [PacketKind.KEYFRAME, PacketKind.RESIDUAL, PacketKind.RESIDUAL]
     assert [r.frame for r in reports] == [p.frame for p in packets] == [0, 1, 2]
     with pytest.raises(ValueError, match="a residual needs the frame before it"):
-        decode_gaussians(None, packets[1])
+        decode(None, packets[1])
 
 
 def test_same_seed_gives_the_same_bytes_and_nothing_looks_ahead(clip):

@@ -1,77 +1,319 @@
-"""Gaussians <-> packets: a keyframe holds all raw attributes, a residual what is to be added to the frame before.
+"""Frames <-> packets: a keyframe states all integers of a frame, a residual what changes from the frame before.
 
-The encoder goes on from what the decoder will see, so the two can never drift: after writing a packet, take
-`decode_gaussians` of it as the new state.
+The state of a stream is a `CodedFrame`. Encoder and decoder get it from the same packets by the same integers, so the
+two cannot drift: after making a packet, take `decode` of it as the new state, and fit the next frame to that. Each
+residual also names the state that it continues, and is refused by any other.
+
+`source` [N'] says who is who: the index of the same Gaussian in the frame before, -1 for one that was born. Survivors
+come first in ascending order, births after them. Each keeps its number in `ids` for life, births get the next free.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from hashlib import blake2b
 
 import numpy as np
 
+from morgs_mi.capture.camera import Camera
+from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import Packet, PacketKind
+from morgs_mi.codec.entropy import LIMIT, ColumnReader, ColumnWriter, column_bits
+from morgs_mi.codec.grid import GROUPS, Grid, columns_of, new_grid, real_values, step_sizes
 from morgs_mi.gaussians.gaussians import Gaussians
 
-__all__ = ["decode_gaussians", "keyframe_packet", "play", "residual_packet"]
+__all__ = ["CodedFrame", "decode", "keyframe_packet", "play", "residual_packet", "restated"]
 
-# Displacements are no state: they are recovered as the difference of two frames' centres.
-_STATE = ("means", "log_scales", "quats", "logit_opacities", "sh_coeffs", "logit_confidence")
-
-
-def keyframe_packet(gaussians: Gaussians, frame: int) -> Packet:
-    """Return the packet that states every attribute of `gaussians` at `frame`."""
-    return Packet(PacketKind.KEYFRAME, frame, _state(gaussians))
+# The three groups of a Gaussian's geometry and the four of its look have a flag each; 8 instead says that it died.
+_GEOMETRY, _LOOK, _DEAD = GROUPS[:3], GROUPS[3:], 8
+# A packet has at least a word per 16 Gaussians that it brings, so that no damaged number can ask for much memory.
+_PER_WORD = 16
+_COARSEST = 80  # quarter octaves: a million times the step
 
 
-def residual_packet(previous: Gaussians, current: Gaussians, frame: int) -> Packet:
-    """Return the packet that leads from `previous` to `current` (eq. 3); attributes that stay are left out.
+@dataclass(frozen=True, eq=False)
+class CodedFrame:
+    """State of a stream after a packet, the same in encoder and decoder to the bit.
 
-    Raises:
-        ValueError: the two have different numbers of Gaussians or different attributes.
+    Attributes:
+        frame: index of the video frame.
+        grid: its N Gaussians as integers.
+        ids: uint32 [N], ascending: which Gaussian each one is, from its birth to its death.
+        next_id: what the next to be born gets.
+        gaussians: the same as numbers; `motion` is the displacement since the frame before, zero where there is none.
     """
-    before, after = _state(previous), _state(current)
-    if before.keys() != after.keys() or len(previous) != len(current):
-        raise ValueError(
-            f"residual_packet(): both frames must hold the same Gaussians, got {len(previous)} with "
-            f"{sorted(before)} and {len(current)} with {sorted(after)}; write a keyframe instead."
-        )
-    changes = {name: after[name] - before[name] for name in after}
-    return Packet(PacketKind.RESIDUAL, frame, {name: change for name, change in changes.items() if change.any()})
+
+    frame: int
+    grid: Grid
+    ids: np.ndarray
+    next_id: int
+    gaussians: Gaussians
+
+    def __len__(self) -> int:
+        return len(self.grid)
+
+    @cached_property
+    def digest(self) -> np.ndarray:
+        """BLAKE2b of all integers, uint8 [8]: what a residual names as its parent."""
+        grid, hashed = self.grid, blake2b(digest_size=8)
+        for array, dtype in ((self.ids, "<u4"), (grid.pivots, "u1"), (grid.exponents, "i1"), (grid.values, "<i4")):
+            hashed.update(np.ascontiguousarray(array, dtype))
+        hashed.update(np.array([self.next_id, grid.degree], "<u4"))
+        return np.frombuffer(hashed.digest(), np.uint8)
 
 
-def decode_gaussians(previous: Gaussians | None, packet: Packet) -> Gaussians:
-    """Return the Gaussians of the packet's frame; `motion` [N, 3] is their displacement since the last one.
+def keyframe_packet(
+    gaussians: Gaussians, frame: int, cameras: Sequence[Camera] = (), config: CodecConfig | None = None
+) -> Packet:
+    """Return the packet that states every attribute of `gaussians`, which are new: their numbers count from zero.
+
+    Args:
+        gaussians: N Gaussians; their `motion` is not written.
+        frame: index of the video frame.
+        cameras: on whose screens errors count.
+        config: what may be off.
 
     Raises:
-        ValueError: a residual without a frame before it, or arrays that do not fit that frame.
+        ValueError: an attribute is not finite.
+    """
+    grid = new_grid(gaussians, cameras, config or CodecConfig())
+    return restated(CodedFrame(frame, grid, np.arange(len(grid), dtype=np.uint32), len(grid), gaussians))
+
+
+def restated(coded: CodedFrame) -> Packet:
+    """Return the keyframe that leads to the very state `coded`: a place to start from, with nothing lost."""
+    grid, writer = coded.grid, ColumnWriter()
+    writer.put(np.diff(coded.ids.astype(np.int64), prepend=-1) - 1)
+    _put_grid(writer, grid)
+    head = np.array([len(grid), grid.degree, grid.has_confidence, coded.next_id], np.uint32)
+    return Packet(PacketKind.KEYFRAME, coded.frame, {"head": head, "code": _padded(writer.words(), len(grid))})
+
+
+def residual_packet(
+    previous: CodedFrame,
+    gaussians: Gaussians,
+    source: np.ndarray | None = None,
+    cameras: Sequence[Camera] = (),
+    config: CodecConfig | None = None,
+) -> Packet:
+    """Return the packet that leads from `previous` to `gaussians` (eq. 3); only those that changed are written.
+
+    What changed by less than half a step did not change. With a `target_size`, steps are widened until it is kept.
+
+    Args:
+        previous: state that the decoder has, N Gaussians.
+        gaussians: of the frame after it, N'.
+        source: int [N'], see above; None if nobody was born or died.
+        cameras: on whose screens the errors of those born count.
+        config: what may be off.
+
+    Raises:
+        ValueError: `source` or the attributes do not fit, or an attribute is not finite.
+    """
+    config, grid = config or CodecConfig(), previous.grid
+    same = gaussians.sh_degree == grid.degree and (gaussians.logit_confidence is not None) == grid.has_confidence
+    if not same:
+        raise ValueError(
+            f"residual_packet(): frame {previous.frame + 1} must have SH of degree {grid.degree} "
+            f"{'and' if grid.has_confidence else 'but no'} confidence as the frame before; write a keyframe instead."
+        )
+    source = _checked(np.arange(len(grid)) if source is None else source, len(grid), len(gaussians))
+    survivors, births = source[source >= 0], int((source < 0).sum())
+    kept = grid.select(survivors)
+    change = real_values(gaussians.select(np.arange(len(survivors))), kept) - kept.values
+    born = new_grid(gaussians.select(np.arange(len(survivors), len(source))), cameras, config) if births else None
+
+    def columns(coarseness: int) -> Iterator[np.ndarray]:
+        r = np.zeros(grid.values.shape, np.int64)
+        r[survivors] = np.rint(change / step_sizes(np.array(coarseness)))
+        dead = np.ones(len(grid), bool)
+        dead[survivors] = False
+        return _columns_of_change(r, dead, grid)
+
+    coarseness = least = round(4 * np.log2(config.birth_precision))
+    if config.target_size:
+        coarseness = _fitting(columns, least, config.target_size)
+    while True:
+        writer = ColumnWriter()
+        for column in columns(coarseness):
+            writer.put(column)
+        if born is not None:
+            _put_grid(writer, born)
+        code = _padded(writer.words(), births)
+        if not config.target_size or code.nbytes <= config.target_size or coarseness >= _COARSEST:
+            break
+        coarseness += 1
+    arrays = {"parent": previous.digest, "head": np.array([births, coarseness], np.uint32), "code": code}
+    return Packet(PacketKind.RESIDUAL, previous.frame + 1, arrays)
+
+
+def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
+    """Return the state after a packet.
+
+    Args:
+        previous: the state before it; a keyframe does not ask for it.
+        packet: of the stream.
+
+    Raises:
+        ValueError: a residual without the state that it continues, or a packet that contradicts itself.
     """
     where = f"packet of frame {packet.frame}"
-    if packet.kind == PacketKind.KEYFRAME:
-        missing = [name for name in _STATE[:5] if name not in packet.arrays]
-        if missing:
-            raise ValueError(f"{where}: a keyframe must hold {', '.join(_STATE[:5])}, got none of {missing}.")
-        state = {name: packet.arrays[name] for name in _STATE if name in packet.arrays}
-        return Gaussians(**state, motion=np.zeros_like(state["means"]))
-    if previous is None:
-        raise ValueError(f"{where}: a residual needs the frame before it, got none; start from a keyframe.")
-    state = _state(previous)
-    for name, change in packet.arrays.items():
-        if name not in state or state[name].shape != change.shape:
-            found = state[name].shape if name in state else "no such attribute"
-            raise ValueError(f"{where}: `{name}` {change.shape} must fit the frame before, which has {found}.")
-        state[name] = state[name] + change
-    return Gaussians(**state, motion=state["means"] - previous.numpy()["means"])
+    names = {"head", "code"} | ({"parent"} if packet.kind == PacketKind.RESIDUAL else set())
+    if packet.arrays.keys() != names:
+        raise ValueError(f"{where}: expected the arrays {sorted(names)}, got {sorted(packet.arrays)}.")
+    try:
+        if packet.kind == PacketKind.KEYFRAME:
+            return _decoded_keyframe(packet)
+        if previous is None:
+            raise ValueError("a residual needs the frame before it, got none; start from a keyframe")
+        if not np.array_equal(packet.arrays["parent"], previous.digest):
+            raise ValueError(f"it does not continue the state after frame {previous.frame}; a packet is missing")
+        return _decoded_residual(previous, packet)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}.") from None
 
 
 def play(packets: Iterable[Packet]) -> Iterator[tuple[int, Gaussians]]:
-    """Decode packets in order and yield (frame, Gaussians)."""
-    gaussians = None
+    """Decode packets in order and yield (frame, Gaussians), once for each frame."""
+    coded = None
     for packet in packets:
-        gaussians = decode_gaussians(gaussians, packet)
-        yield packet.frame, gaussians
+        if coded is None or packet.frame != coded.frame:  # a keyframe that restates is for those who start there
+            coded = decode(coded, packet)
+            yield packet.frame, coded.gaussians
 
 
-def _state(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    columns = gaussians.numpy()
-    return {name: np.ascontiguousarray(columns[name], np.float32) for name in _STATE if name in columns}
+def _decoded_keyframe(packet: Packet) -> CodedFrame:
+    code = packet.arrays["code"]
+    N, degree, has_confidence, next_id = _head(packet, 4)
+    if _PER_WORD * len(code) < N or degree > 3 or has_confidence > 1 or next_id >= LIMIT:
+        raise ValueError(f"its head {[N, degree, has_confidence, next_id]} does not fit its {len(code)} words of code")
+    reader = ColumnReader(code)
+    ids = np.cumsum(reader.take(N) + 1) - 1
+    grid = _taken_grid(reader, N, degree, bool(has_confidence))
+    if np.any(np.diff(ids, prepend=-1) < 1) or (N and ids[-1] >= next_id):
+        raise ValueError("its ids do not ascend")
+    return CodedFrame(packet.frame, grid, ids.astype(np.uint32), next_id, grid.gaussians())
+
+
+def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
+    births, coarseness = _head(packet, 2)
+    code, grid = packet.arrays["code"], previous.grid
+    if _PER_WORD * len(code) < births or coarseness > _COARSEST or previous.next_id + births >= LIMIT:
+        raise ValueError(f"its head {[births, coarseness]} does not fit its {len(code)} words of code")
+    reader = ColumnReader(code)
+    r, dead = _taken_change(reader, grid)
+    values = grid.values + np.rint(r * step_sizes(np.array(coarseness))).astype(np.int64)
+    survivors = np.flatnonzero(~dead)
+    moved = _bounded(values, LIMIT, "value").astype(np.int32)
+    new = Grid(moved, grid.exponents, grid.pivots, grid.degree).select(survivors)
+    motion = np.zeros((len(survivors) + births, 3), np.float32)
+    before, at = previous.gaussians.numpy()["means"][survivors], grid.columns["position"]
+    motion[: len(survivors)] = (new.values[:, at] * new.steps[:, at]).astype(np.float32) - before
+    if births:
+        new = new.concatenate(_taken_grid(reader, births, grid.degree, grid.has_confidence))
+    ids = np.concatenate([previous.ids[survivors], previous.next_id + np.arange(births, dtype=np.uint32)])
+    gaussians = new.gaussians(motion)
+    return CodedFrame(packet.frame, new, ids.astype(np.uint32), previous.next_id + births, gaussians)
+
+
+def _put_grid(writer: ColumnWriter, grid: Grid) -> None:
+    columns = np.concatenate([grid.pivots[:, None], grid.exponents, grid.values], axis=1, dtype=np.int64)
+    middle = np.sort(columns, axis=0)[len(grid) // 2] if len(grid) else np.zeros(columns.shape[1], np.int64)
+    writer.put(middle)
+    for column in (columns - middle).T:  # small numbers are coded one by one, large ones by their octave
+        writer.put(column)
+
+
+def _taken_grid(reader: ColumnReader, N: int, degree: int, has_confidence: bool) -> Grid:
+    first = 9 + has_confidence  # column of the values
+    middle = reader.take(first + max(at.stop for at in columns_of(degree, has_confidence).values()))
+    columns = np.stack([reader.take(N) + shift for shift in middle], axis=1)
+    if np.any((columns[:, 0] < 0) | (columns[:, 0] > 3)):
+        raise ValueError("a quaternion's pivot must be 0 to 3")
+    exponents = _bounded(columns[:, 1:first], 128, "exponent").astype(np.int8)
+    values = _bounded(columns[:, first:], LIMIT, "value").astype(np.int32)
+    return Grid(values, exponents, columns[:, 0].astype(np.uint8), degree)
+
+
+def _classes(grid: Grid) -> list[np.ndarray]:
+    """Return the indices of those that stand and of those that move, as far as their confidence knows."""
+    moves = grid.values[:, -1] > 0 if grid.has_confidence else np.zeros(len(grid), bool)
+    return [np.flatnonzero(~moves), np.flatnonzero(moves)]
+
+
+def _columns_of_change(r: np.ndarray, dead: np.ndarray, grid: Grid) -> Iterator[np.ndarray]:
+    """Yield the columns that say which integers [N, C] change and by how much; `_taken_change` reads them."""
+    for rows in _classes(grid):
+        flags = {name: r[rows, at].any(1) for name, at in grid.columns.items()}
+        geometry = sum(flags[name].astype(np.int64) << bit for bit, name in enumerate(_GEOMETRY))
+        look = sum(flags[name].astype(np.int64) << bit for bit, name in enumerate(_LOOK) if name in flags)
+        geometry, look = np.where(dead[rows], _DEAD, geometry), np.broadcast_to(look, len(rows))
+        yield geometry
+        yield look[geometry == 0]
+        yield look[(geometry > 0) & (geometry < _DEAD)]
+        for name, at in grid.columns.items():
+            yield from r[rows[flags[name]], at].T
+
+
+def _taken_change(reader: ColumnReader, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Return the changes int64 [N, C] and who died, bool [N]."""
+    r, dead = np.zeros(grid.values.shape, np.int64), np.zeros(len(grid), bool)
+    for rows in _classes(grid):
+        geometry, look = reader.take(len(rows)), np.zeros(len(rows), np.int64)
+        for some in (geometry == 0, (geometry > 0) & (geometry < _DEAD)):
+            look[some] = reader.take(int(some.sum()))
+        known = sum(1 << bit for bit, name in enumerate(_LOOK) if name in grid.columns)
+        if np.any((geometry < 0) | (geometry > _DEAD) | (look & ~known != 0)):
+            raise ValueError("its flags name groups that do not exist")
+        dead[rows] = geometry == _DEAD
+        flags = {name: (geometry >> bit & 1) & (geometry < _DEAD) for bit, name in enumerate(_GEOMETRY)}
+        flags |= {name: look >> bit & 1 for bit, name in enumerate(_LOOK)}
+        for name, at in grid.columns.items():
+            who = rows[flags[name] == 1]
+            for column in range(at.start, at.stop):
+                r[who, column] = reader.take(len(who))
+    return r, dead
+
+
+def _fitting(columns: Callable[[int], Iterator[np.ndarray]], low: int, target: int) -> int:
+    """Return the least coarseness from `low` at which the columns are estimated to take `target` bytes."""
+    high = _COARSEST
+    while low < high:
+        middle = (low + high) // 2
+        if sum(map(column_bits, columns(middle))) / 8 <= target:
+            high = middle
+        else:
+            low = middle + 1
+    return low
+
+
+def _checked(source: np.ndarray, before: int, now: int) -> np.ndarray:
+    source = np.asarray(source)
+    born = source < 0
+    survivors = source[~born]
+    sound = source.shape == (now,) and np.all(np.diff(survivors) > 0) and np.all(np.diff(born.astype(int)) >= 0)
+    if not sound or np.any(survivors >= before):
+        raise ValueError(
+            f"residual_packet(): `source` must be [{now}] with survivors of 0..{before - 1} in ascending order, then "
+            f"-1 for each birth, got {source.shape}; sort the Gaussians so."
+        )
+    return source
+
+
+def _head(packet: Packet, count: int) -> list[int]:
+    head = packet.arrays["head"]
+    if head.shape != (count,):
+        raise ValueError(f"its head must have {count} numbers, got {list(head.shape)}")
+    return [int(number) for number in head]
+
+
+def _bounded(values: np.ndarray, limit: int, what: str) -> np.ndarray:
+    if np.any((values >= limit) | (values < -limit)):
+        raise ValueError(f"an {what} must lie between -{limit} and {limit}")
+    return values
+
+
+def _padded(words: np.ndarray, count: int) -> np.ndarray:
+    return np.pad(words, (0, max(0, -(-count // _PER_WORD) - len(words))))

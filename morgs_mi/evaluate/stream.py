@@ -17,7 +17,7 @@ from morgs_mi.capture.camera import Camera
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.truth import Truth, load_truth
 from morgs_mi.codec.container import StreamReader
-from morgs_mi.codec.gaussians import decode_gaussians, play
+from morgs_mi.codec.gaussians import play
 from morgs_mi.evaluate.pictures import as_picture, confidence_picture, depth_picture, motion_picture
 from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.render.config import RenderConfig
@@ -96,7 +96,7 @@ def render_stream(
 def has_confidence(stream: StreamReader) -> bool:
     """Tell whether a stream carries a confidence about which anything was learned."""
     learned = stream.metadata.get("config", {}).get("motion", {}).get("learn_confidence", True)
-    return learned and any("logit_confidence" in packet.arrays for packet in islice(stream, 1))
+    return learned and any(gaussians.logit_confidence is not None for _, gaussians in islice(play(stream), 1))
 
 
 def channel_picture(name: str, image: np.ndarray, motion_scale: float | None = None) -> np.ndarray:
@@ -125,14 +125,13 @@ def playback(stream: StreamReader, camera: Camera) -> dict[str, float]:
     Raises:
         ValueError: a broken packet.
     """
-    config, gaussians, times = render_config(stream), None, []
-    packets = islice(stream, _TIMED)
+    config, times = render_config(stream), []
+    frames = islice(play(stream), _TIMED)
     while True:
         start = time.perf_counter()
-        packet = next(packets, None)
-        if packet is None:
+        _, gaussians = next(frames, (0, None))
+        if gaussians is None:
             break
-        gaussians = decode_gaussians(gaussians, packet)
         decoded = time.perf_counter()
         if not times:
             render(gaussians, camera, ("color",), config)

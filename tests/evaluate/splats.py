@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.capture import Camera
+from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import Packet, StreamWriter
-from morgs_mi.codec.gaussians import decode_gaussians, keyframe_packet, residual_packet
+from morgs_mi.codec.gaussians import decode, keyframe_packet, residual_packet
 from morgs_mi.gaussians.gaussians import Gaussians
 
 WIDTH, HEIGHT, DISTANCE, STEP, FRAMES = 40, 30, 4.0, 0.05, 3
@@ -16,6 +17,8 @@ CAMERAS = [
     Camera.look_at((0, 0, -DISTANCE), (0, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT, "cam0"),
     Camera.look_at((0.5, 0, -DISTANCE), (0.5, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT, "cam1"),
 ]
+# As good as float32: what is judged is the judge.
+EXACT = CodecConfig(quality=1e5)
 # Pixels per frame of a step along x in a plane that is parallel to both images.
 PIXELS = CAMERAS[0].K[0, 0] * STEP / DISTANCE
 
@@ -31,11 +34,11 @@ def moved(frame: float, logit: float | None = 0.0) -> Gaussians:
 
 def write_stream(path: Path, metadata: dict, logit: float | None = 0.0, shift: float = 0) -> list[Packet]:
     """Write the splats' stream, `shift` steps ahead of them, and return its packets."""
-    first = keyframe_packet(moved(shift, logit), 0)
-    state, packets = decode_gaussians(None, first), [first]
+    first = keyframe_packet(moved(shift, logit), 0, CAMERAS, EXACT)
+    state, packets = decode(None, first), [first]
     for frame in range(1, FRAMES):
-        packets.append(residual_packet(state, moved(frame + shift, logit), frame))
-        state = decode_gaussians(state, packets[-1])
+        packets.append(residual_packet(state, moved(frame + shift, logit), None, CAMERAS, EXACT))
+        state = decode(state, packets[-1])
     with StreamWriter(path, CAMERAS, 25, metadata) as writer:
         for packet in packets:
             writer.write(packet)

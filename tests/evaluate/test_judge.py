@@ -10,11 +10,11 @@ import pytest
 
 from morgs_mi.capture import load_capture, write_colmap, write_video
 from morgs_mi.codec.container import StreamReader, StreamWriter
-from morgs_mi.codec.gaussians import decode_gaussians, keyframe_packet, residual_packet
+from morgs_mi.codec.gaussians import decode, keyframe_packet, residual_packet, restated
 from morgs_mi.evaluate.judge import PICTURE_SCORES, evaluate_stream
 from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.render.rasterize import rasterize
-from tests.evaluate.splats import CAMERAS, FRAMES, HEIGHT, PIXELS, STEP, WIDTH, moved, write_stream
+from tests.evaluate.splats import CAMERAS, EXACT, FRAMES, HEIGHT, PIXELS, STEP, WIDTH, moved, write_stream
 from tests.evaluate.tiny_onnx import squared_difference
 
 
@@ -54,11 +54,11 @@ def test_without_a_held_out_view_the_training_views_are_judged(clip: Path, tmp_p
 
 def test_a_wrong_motion_is_an_error_where_things_move(clip: Path, tmp_path: Path) -> None:
     """A stream of keyframes alone carries no motion: none is judged. One that stands still errs by the truth."""
-    state = decode_gaussians(None, keyframe_packet(moved(1), 0))
+    state = decode(None, keyframe_packet(moved(1), 0, CAMERAS, EXACT))
     with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
-        writer.write(keyframe_packet(state, 0))
-        writer.write(residual_packet(state, state, 1))
-        writer.write(keyframe_packet(state, 2))
+        writer.write(restated(state))
+        writer.write(residual_packet(state, state.gaussians))
+        writer.write(keyframe_packet(moved(1), 2, CAMERAS, EXACT))
     result = evaluate_stream(tmp_path / "s.morgs", clip / "capture")
     assert result["frames"][1]["motion_error_moving"] == pytest.approx(PIXELS)
     assert np.isnan(result["frames"][2]["motion_error"])

@@ -1,0 +1,127 @@
+"""Integers <-> words: adaptive entropy coding in columns.
+
+A column is an array of integers that are expected to follow one distribution. Each integer v becomes a token, and
+where the token stands for more than one value the rest of its bits are coded as they are:
+
+    m = |v| below 16, else 12 + k with k = floor(log2 |v|), the rest being |v| - 2^k of k bits
+    token = 0 for v = 0, 2 m - 1 for v > 0, 2 m for v < 0
+
+Tokens are coded in blocks of 16, 16, 32, 64, ...; the distribution of a block follows from the tokens of the blocks
+before it, so nothing about it is stored. docs/stream-format.md says it to the bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import constriction
+import numpy as np
+
+__all__ = ["LIMIT", "ColumnReader", "ColumnWriter", "column_bits"]
+
+LIMIT = 2**30
+"""Integers must lie between -LIMIT and LIMIT."""
+
+_QUEUE, _MODEL = constriction.stream.queue, constriction.stream.model
+_DIRECT = 16
+_TOKENS = 2 * 42 + 1
+_BLOCK = 16
+_LOW = 16  # bits that one uniform model takes; it has room for fewer than 24
+_WEIGHT = 32  # of a token that was seen, against the prior below
+_PRIOR = np.maximum(1, 256 // (1 + np.arange(_TOKENS)) ** 2)
+
+
+class ColumnWriter:
+    """Collects columns of integers and turns them into words."""
+
+    def __init__(self) -> None:
+        self._encoder = _QUEUE.RangeEncoder()
+
+    def put(self, values: np.ndarray) -> None:
+        """Append a column [n] of integers between -LIMIT and LIMIT."""
+        tokens, bits, rest = _tokens(values)
+        counts = _PRIOR.copy()
+        for block in _blocks(len(tokens)):
+            self._encoder.encode(tokens[block], _model(counts))
+            counts += _WEIGHT * np.bincount(tokens[block], minlength=_TOKENS)
+        for shift, some in _parts(bits):
+            part = (rest[some] >> shift) & (2**_LOW - 1)
+            width = np.minimum(bits[some] - shift, _LOW)
+            self._encoder.encode(part.astype(np.int32), _MODEL.Uniform(), (1 << width).astype(np.int32))
+
+    def words(self) -> np.ndarray:
+        """Return everything so far as uint32."""
+        return self._encoder.get_compressed()
+
+
+class ColumnReader:
+    """Takes columns out of words in the order in which they were put in.
+
+    Args:
+        words: uint32, of any content: damage gives wrong integers or a ValueError, never more of them.
+    """
+
+    def __init__(self, words: np.ndarray) -> None:
+        self._decoder = _QUEUE.RangeDecoder(np.ascontiguousarray(words, np.uint32))
+
+    def take(self, count: int) -> np.ndarray:
+        """Return the next column, int64 [count].
+
+        Raises:
+            ValueError: the words cannot be those of such a column.
+        """
+        tokens, counts = np.zeros(count, np.int64), _PRIOR.copy()
+        try:
+            for block in _blocks(count):
+                tokens[block] = self._decoder.decode(_model(counts), block.stop - block.start)
+                counts += _WEIGHT * np.bincount(tokens[block], minlength=_TOKENS)
+            m = (tokens + 1) // 2
+            bits = np.where(m < _DIRECT, 0, m - 12)
+            rest = np.zeros(count, np.int64)
+            for shift, some in _parts(bits):
+                width = np.minimum(bits[some] - shift, _LOW)
+                rest[some] |= (
+                    self._decoder.decode(_MODEL.Uniform(), (1 << width).astype(np.int32)).astype(np.int64) << shift
+                )
+        except AssertionError as error:  # constriction's way to say that no symbol has this code
+            raise ValueError(f"its code is broken ({error})") from None
+        size = np.where(bits > 0, (1 << bits) + rest, m)
+        return np.where(tokens % 2, size, -size)
+
+
+def column_bits(values: np.ndarray) -> float:
+    """Return about how many bits a column takes: the entropy of its tokens and the bits beside them."""
+    tokens, bits, _ = _tokens(values)
+    counts = np.bincount(tokens)
+    counts = counts[counts > 0]
+    return float(bits.sum() - (counts * np.log2(counts / max(len(tokens), 1))).sum())
+
+
+def _tokens(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return tokens int32, the number of bits beside each, and those bits."""
+    size = np.abs(values.astype(np.int64))
+    assert size.max(initial=0) < LIMIT
+    bits = np.where(size < _DIRECT, 0, np.frexp(size.astype(np.float64))[1] - 1)
+    m = np.where(bits > 0, 12 + bits, size)
+    tokens = np.where(values > 0, 2 * m - 1, 2 * m).astype(np.int32)
+    return tokens, bits, np.where(bits > 0, size - (1 << bits), 0)
+
+
+def _blocks(count: int) -> Iterator[slice]:
+    start, stop = 0, _BLOCK
+    while start < count:
+        yield slice(start, min(stop, count))
+        start, stop = stop, 2 * stop
+
+
+def _parts(bits: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield (shift, which) of the low and the high halves of the bits that stand beside the tokens."""
+    for shift in (0, _LOW):
+        some = np.flatnonzero(bits > shift)
+        if len(some):
+            yield shift, some
+
+
+def _model(counts: np.ndarray) -> Any:
+    return _MODEL.Categorical(counts.astype(np.float64), perfect=False)
