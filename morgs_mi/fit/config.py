@@ -54,24 +54,32 @@ class Rates:
 
 @dataclass(frozen=True)
 class DensityConfig:
-    """How the number of Gaussians follows the pictures; thresholds are those of 3DGS where it has them."""
+    """How the number of Gaussians follows the pictures (see `density`); thresholds are those of the literature."""
 
     max_gaussians: int = 30_000
-    """Nobody is born beyond this many."""
+    """Nobody is born beyond this many, unless another dies."""
     rounds: int = 0
-    """Steps of density control in the first frame, between a tenth and a half of its steps; 0: none."""
+    """Steps of density control in the first frame, from a tenth to a half of its steps; 0: none."""
     growth: float = 0.2
-    """Of one such step, births as a share of the Gaussians."""
+    """Most births of such a step, as a share of the Gaussians."""
+    later_frames: bool = False
+    """One step of density control in every later frame, after five eighths of its epochs."""
     births: float = 0.02
-    """Of a later frame, as a share of its Gaussians."""
-    min_error: float = 0.0
-    """Who answers for less summed error, in pixels of full contrast, is no parent."""
+    """Most births of a later frame, as a share of the Gaussians."""
+    birth_opacity: float = 0.1
+    """What is added in a later frame starts as faint as this."""
     split_scale: float = 0.01
-    """Who is wider than this share of the scene's extent is split, who is narrower is cloned."""
+    """In the first frame, who is wider than this share of the scene's extent is split, others are cloned."""
     min_opacity: float = 0.005
     """Who is fainter dies."""
-    later_frames: bool = False
-    """One step of density control in every later frame."""
+
+    def __post_init__(self) -> None:
+        for name, low in (("max_gaussians", 1), ("rounds", 0), ("growth", 0), ("births", 0), ("split_scale", 0)):
+            if not getattr(self, name) >= low:
+                raise ValueError(f"DensityConfig(): `{name}` must be at least {low}, got {getattr(self, name)}.")
+        for name in ("birth_opacity", "min_opacity"):
+            if not 0 < getattr(self, name) < 1:
+                raise ValueError(f"DensityConfig(): `{name}` must lie between 0 and 1, got {getattr(self, name)}.")
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,17 @@
-"""Density control: which Gaussians are cloned, split or pruned, and what the optimiser remembers of them.
+"""Density control: who is cloned, split, added or pruned, and what the optimiser remembers of them.
 
 N Gaussians become M. `parent` [M] says which of the N each one is or was made from; `source` [M] is the same for
-survivors, who come first in ascending order, and -1 for births, who come after them. A survivor keeps its centre,
-so that its track does not jump: what is born is drawn from the parent's own density, and
+survivors, who come first in ascending order, and -1 for births, who come after them. Survivors keep their centres,
+so that their tracks do not jump; what is born is drawn from its parent's own density.
 
-    split (parent wider than `split_scale` of the scene): both shrink by 1.6, as in 3DGS (Kerbl et al. 2023);
-    clone (all others): both get opacity 1 - sqrt(1 - o), so that together they cover what one did (Bulo et al. 2024).
+In the first frame, `plan_growth` (Kerbl et al. 2023): a wide parent is split, both shrink by 1.6; a narrow one is
+cloned, both get opacity 1 - sqrt(1 - o), so that together they cover what one did (Bulo et al. 2024).
+In a later frame, `plan_additions` (Sun et al. 2024): parents stay as they are, so that nothing is spoilt that the
+few steps left could not mend; what is born is faint and small, and earns its opacity or dies.
 
 Who is in need is told by the pictures: E_i = sum_x w_i(x) |I(x) - I*(x)|, the error that a Gaussian answers for
-with its blend weights w_i (the same paper), of that view where it is largest; and W_i = sum_x w_i(x), the pixels that
-it covers.
+with its blend weights w_i (Bulo et al. 2024), of that view where it is largest; and W_i = sum_x w_i(x), the pixels
+that it covers.
 """
 
 from __future__ import annotations
@@ -30,9 +32,11 @@ from morgs_mi.render.backproject import backproject
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 
-__all__ = ["Need", "Plan", "apply_plan", "find_need", "plan_density", "regrow"]
+__all__ = ["Need", "Plan", "apply_plan", "find_need", "plan_additions", "plan_growth", "regrow"]
 
 _SHRINK = float(np.log(1.6))
+# float32 knows no opacity closer to 1.
+_MOST_OPAQUE = 1 - 1e-6
 
 
 @dataclass(frozen=True)
@@ -87,48 +91,72 @@ def find_need(gaussians: Gaussians, cameras: Sequence[Camera], targets: Sequence
     return Need(error, weight)
 
 
-def plan_density(
-    gaussians: Gaussians, need: Need, births: int, extent: float, config: DensityConfig, rng: np.random.Generator
+def plan_growth(
+    gaussians: Gaussians, need: Need, extent: float, config: DensityConfig, rng: np.random.Generator
 ) -> Plan:
-    """Decide who dies and who is cloned or split.
-
-    Those fainter than `min_opacity` die. Of the rest, those with the largest error become parents, as many as
-    `births` and `max_gaussians` allow; nobody is a parent whose error is below `min_error`.
+    """Decide who dies and who is cloned or split in the first frame, `growth` of them at most.
 
     Args:
         gaussians: N of them.
         need: of the same.
-        births: at most so many.
         extent: of the scene, world units.
         config: thresholds.
         rng: draws where the births lie.
     """
-    columns = gaussians.numpy()
-    opacity, scales = np.asarray(gaussians.opacities), np.exp(columns["log_scales"])
-    survivors = np.flatnonzero(opacity >= config.min_opacity)
-    if not len(survivors):  # an empty scene could never come back
-        survivors = np.arange(len(opacity))
-    room = max(config.max_gaussians - len(survivors), 0)
-    candidates = survivors[need.error[survivors] > config.min_error]
-    order = np.argsort(-need.error[candidates], kind="stable")
-    chosen = np.sort(candidates[order[: min(births, room)]])
+    survivors, chosen = _choose(gaussians, need, config.growth, config)
+    parent, opacity = np.concatenate([survivors, chosen]), np.asarray(gaussians.opacities)
+    touched, scales = np.isin(parent, chosen), np.asarray(gaussians.scales).max(axis=1)[parent]
+    wide = touched & (scales > config.split_scale * extent)
+    half = 1 - np.sqrt(1 - np.minimum(opacity[parent], _MOST_OPAQUE))
+    fainter = np.where(touched & ~wide, _logit(half) - np.asarray(gaussians.logit_opacities)[parent], 0)
+    return _plan(gaussians, survivors, chosen, np.where(wide, -_SHRINK, 0), fainter, rng)
 
-    parent = np.concatenate([survivors, chosen])
-    source = np.concatenate([survivors, np.full(len(chosen), -1)])
-    touched = np.isin(parent, chosen)
-    wide = touched & (scales[parent].max(axis=1) > config.split_scale * extent)
-    shift = np.zeros((len(parent), 3), np.float32)
-    shift[len(survivors) :] = _draw(columns["quats"][chosen], scales[chosen], rng)
-    clone = touched & ~wide
-    o = np.clip(opacity[parent].astype(float), 1e-6, 1 - 1e-6)
-    half = 1 - np.sqrt(1 - o)
-    fainter = np.where(clone, np.log(half / (1 - half)) - np.log(o / (1 - o)), 0)
-    edits = {
-        "means": shift,
-        "log_scales": np.repeat(np.where(wide, -_SHRINK, 0)[:, None], 3, axis=1).astype(np.float32),
-        "logit_opacities": fainter.astype(np.float32),
-    }
-    return Plan(parent, source, edits)
+
+def plan_additions(gaussians: Gaussians, need: Need, config: DensityConfig, rng: np.random.Generator) -> Plan:
+    """Decide who dies and beside whom a faint Gaussian is added in a later frame, `births` of them at most.
+
+    Args:
+        gaussians: N of them.
+        need: of the same.
+        config: thresholds.
+        rng: draws where the births lie.
+    """
+    survivors, chosen = _choose(gaussians, need, config.births, config)
+    born = np.arange(len(survivors) + len(chosen)) >= len(survivors)
+    logits = np.asarray(gaussians.logit_opacities)[np.concatenate([survivors, chosen])]
+    fainter = np.where(born, _logit(config.birth_opacity) - logits, 0)
+    return _plan(gaussians, survivors, chosen, np.where(born, -_SHRINK, 0), fainter, rng)
+
+
+def _choose(gaussians: Gaussians, need: Need, share: float, config: DensityConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Return who lives on, and who of them becomes a parent: those with the largest error, `share` of all at most.
+
+    Who is fainter than `min_opacity` dies, and so does who covers least where births would exceed `max_gaussians`.
+    """
+    alive = np.asarray(gaussians.opacities) >= config.min_opacity
+    survivors = np.flatnonzero(alive) if alive.any() else np.arange(len(alive))  # no scene could come back from none
+    needy = survivors[need.error[survivors] > 0]
+    chosen = needy[np.argsort(-need.error[needy], kind="stable")][: round(share * len(gaussians))]
+    excess = min(max(len(survivors) + len(chosen) - config.max_gaussians, 0), len(chosen))
+    expendable = np.setdiff1d(survivors, chosen)
+    least = expendable[np.argsort(need.weight[expendable], kind="stable")][:excess]
+    return np.setdiff1d(survivors, least), np.sort(chosen[: len(chosen) - (excess - len(least))])
+
+
+def _plan(
+    gaussians: Gaussians,
+    survivors: np.ndarray,
+    chosen: np.ndarray,
+    log_scale: np.ndarray,
+    logit_opacity: np.ndarray,
+    rng: np.random.Generator,
+) -> Plan:
+    """Return the plan that adds `log_scale` and `logit_opacity` [M] and draws the places of the births."""
+    parent, source = np.concatenate([survivors, chosen]), np.concatenate([survivors, np.full(len(chosen), -1)])
+    shift = np.zeros((len(parent), 3))
+    shift[len(survivors) :] = _draw(np.asarray(gaussians.quats)[chosen], np.asarray(gaussians.scales)[chosen], rng)
+    edits = {"means": shift, "log_scales": np.repeat(log_scale[:, None], 3, axis=1), "logit_opacities": logit_opacity}
+    return Plan(parent, source, {name: edit.astype(np.float32) for name, edit in edits.items()})
 
 
 def _draw(quats: np.ndarray, scales: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -138,7 +166,11 @@ def _draw(quats: np.ndarray, scales: np.ndarray, rng: np.random.Generator) -> np
     # Rodrigues: the rotation of n by a quaternion of any length
     t = 2 * np.cross(v, n)
     square = np.maximum((quats**2).sum(axis=1, keepdims=True), 1e-30)
-    return (n + (w * t + np.cross(v, t)) / square).astype(np.float32)
+    return n + (w * t + np.cross(v, t)) / square
+
+
+def _logit(x: np.ndarray | float) -> np.ndarray:
+    return np.log(x) - np.log1p(-np.asarray(x, float))
 
 
 def apply_plan(gaussians: Gaussians, plan: Plan) -> Gaussians:

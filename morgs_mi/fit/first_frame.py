@@ -14,7 +14,7 @@ from drjit.opt import Adam
 
 from morgs_mi.capture.camera import Camera
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.density import find_need, plan_density, regrow
+from morgs_mi.fit.density import find_need, plan_growth, regrow
 from morgs_mi.fit.losses import Target, mask_loss, recon_loss
 from morgs_mi.fit.optimise import adam, optimise, replace_parameter, values_of, view_order
 from morgs_mi.gaussians.gaussians import Gaussians
@@ -65,8 +65,8 @@ def fit_first_frame(
             _add_band(optimizer, gaussians)
         if start in rounds:
             now = _assemble(gaussians, values_of(optimizer))
-            births = round(config.density.growth * len(now))
-            plan = plan_density(now, find_need(now, cameras, targets, render), births, extent, config.density, rng)
+            need = find_need(now, cameras, targets, render)
+            plan = plan_growth(now, need, extent, config.density, rng)
             gaussians = gaussians.select(plan.parent)
             regrow(optimizer, plan, plan.edits)
 

@@ -11,11 +11,11 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.fit.config import DensityConfig
-from morgs_mi.fit.density import Need, Plan, apply_plan, find_need, plan_density, regrow
+from morgs_mi.fit.density import Need, Plan, apply_plan, find_need, plan_additions, plan_growth, regrow
 from morgs_mi.fit.losses import Target
 from morgs_mi.fit.optimise import adam, values_of
 
-CONFIG = DensityConfig(max_gaussians=100, split_scale=0.1, min_opacity=0.005)
+CONFIG = DensityConfig(max_gaussians=100, split_scale=0.1, min_opacity=0.005, growth=1.0, births=1.0)
 
 
 def some(n=6, opacity=0.6, scale=0.05):
@@ -30,32 +30,47 @@ def some(n=6, opacity=0.6, scale=0.05):
     )
 
 
-def plan(gaussians, error, births, config=CONFIG, extent=10.0):
-    need = Need(np.asarray(error, float), np.ones(len(gaussians)))
-    return plan_density(gaussians, need, births, extent, config, np.random.default_rng(1))
+def need(error, weight=None):
+    return Need(np.asarray(error, float), np.ones(len(error)) if weight is None else np.asarray(weight, float))
+
+
+def growth(gaussians, error, config=CONFIG):
+    return plan_growth(gaussians, need(error), 10.0, config, np.random.default_rng(1))
+
+
+def additions(gaussians, error, weight=None, **settings):
+    config = dataclasses.replace(CONFIG, **settings)
+    return plan_additions(gaussians, need(error, weight), config, np.random.default_rng(1))
 
 
 def test_survivors_come_first_and_births_last():
     faint = dataclasses.replace(some(), logit_opacities=np.array([1, -9, 1, 1, -9, 1.0]))
-    found = plan(faint, [0, 9, 5, 1, 8, 3], births=2)
+    found = additions(faint, [0, 9, 5, 1, 8, 3], births=1 / 3)
     assert found.source.tolist() == [0, 2, 3, 5, -1, -1]
-    assert found.parent.tolist() == [0, 2, 3, 5, 2, 5]  # neediest of those who live
+    assert found.parent.tolist() == [0, 2, 3, 5, 2, 5]  # the neediest of those who live
 
 
-@pytest.mark.parametrize(("births", "limit", "expected"), [(0, 100, 6), (3, 100, 9), (100, 100, 12), (100, 8, 8)])
+@pytest.mark.parametrize(("births", "limit", "expected"), [(0, 100, 6), (0.5, 100, 9), (1, 100, 12), (1, 8, 8)])
 def test_births_stay_within_the_budget_and_the_bound(births, limit, expected):
-    config = dataclasses.replace(CONFIG, max_gaussians=limit)
-    assert len(plan(some(), np.arange(1, 7), births, config).source) == expected
+    assert len(additions(some(), np.arange(1, 7), births=births, max_gaussians=limit).source) == expected
+
+
+def test_at_the_bound_those_who_cover_least_make_room():
+    found = additions(some(), [0, 1, 2, 3, 4, 5], [3, 9, 1, 2, 9, 0], births=1 / 3, max_gaussians=6)
+    assert found.source.tolist() == [0, 1, 4, 5, -1, -1]  # parents stay, however little they cover
+    assert found.parent[-2:].tolist() == [4, 5]
+    beyond = additions(some(), [0, 1, 2, 3, 4, 5], births=1 / 3, max_gaussians=3)
+    assert (beyond.num_births, beyond.num_survivors) == (2, 4)  # no more die than are born
 
 
 def test_nobody_is_born_where_all_is_well_and_somebody_always_stays():
-    assert plan(some(), np.zeros(6), births=6).num_births == 0
-    assert plan(some(opacity=1e-4), np.zeros(6), births=6).num_survivors == 6
+    assert additions(some(), np.zeros(6)).num_births == 0
+    assert additions(some(opacity=1e-4), np.zeros(6)).num_survivors == 6
 
 
 def test_narrow_ones_are_cloned_and_cover_together_what_one_did():
     before = some(scale=0.05)
-    after = apply_plan(before, plan(before, [0, 0, 0, 0, 0, 1], births=1))
+    after = apply_plan(before, growth(before, [0, 0, 0, 0, 0, 1]))
     o, scales = np.asarray(after.opacities), np.asarray(after.scales)
     assert 1 - (1 - o[5]) * (1 - o[6]) == pytest.approx(0.6, rel=1e-5)
     assert o[:5] == pytest.approx(np.full(5, 0.6), rel=1e-6)
@@ -64,19 +79,34 @@ def test_narrow_ones_are_cloned_and_cover_together_what_one_did():
 
 def test_wide_ones_are_split_and_survivors_stay_where_they_are():
     before = some(scale=1.0)
-    after = apply_plan(before, plan(before, [0, 0, 0, 0, 0, 1], births=1))
+    after = apply_plan(before, growth(before, [0, 0, 0, 0, 0, 1]))
     assert np.asarray(after.scales)[5:] == pytest.approx(np.tile([1, 2, 3], (2, 1)) / 1.6, rel=1e-5)
     assert np.asarray(after.opacities) == pytest.approx(np.full(7, 0.6), rel=1e-5)
     assert np.array_equal(np.asarray(after.means)[:6], np.asarray(before.means))
     assert np.asarray(after.logit_confidence)[6] == 5
 
 
+def test_additions_are_faint_and_leave_their_parents_alone():
+    before = some(scale=1.0)
+    after = apply_plan(before, additions(before, [0, 0, 0, 0, 0, 1], birth_opacity=0.1))
+    for name, value in after.numpy().items():
+        assert np.array_equal(value[:6], before.numpy()[name]), name
+    assert np.asarray(after.opacities)[6] == pytest.approx(0.1, rel=1e-5)
+    assert np.asarray(after.scales)[6] == pytest.approx(np.array([1, 2, 3]) / 1.6, rel=1e-5)
+
+
+def test_opaque_parents_have_finite_children():
+    before = dataclasses.replace(some(), logit_opacities=np.full(6, 40.0))
+    for found in (growth(before, np.ones(6)), additions(before, np.ones(6))):
+        for name, value in apply_plan(before, found).numpy().items():
+            assert np.isfinite(value).all(), name
+
+
 def test_births_are_drawn_from_their_parents_density():
     """Whitened by the parent's axes, thousands of births have no mean and unit covariance."""
     n = 4000
     one = some(1, scale=0.05)
-    many = one.select(np.zeros(n, int))
-    found = plan(many, np.ones(n), births=n, config=dataclasses.replace(CONFIG, max_gaussians=2 * n))
+    found = growth(one.select(np.zeros(n, int)), np.ones(n), dataclasses.replace(CONFIG, max_gaussians=2 * n))
     w, x, y, z = (one.numpy()["quats"][0] / np.linalg.norm(one.numpy()["quats"][0])).astype(float)
     axes = np.array(
         [
@@ -117,7 +147,7 @@ def test_optimiser_remembers_survivors_and_knows_nothing_of_births():
 
 def test_edits_reach_the_parameters():
     before = some()
-    found = plan(before, np.ones(6), births=6)
+    found = growth(before, np.ones(6))
     optimizer = adam({"means": before.means, "log_scales": before.log_scales})
     regrow(optimizer, found, found.edits)
     after = apply_plan(before, found)
@@ -139,11 +169,24 @@ def test_need_points_at_the_gaussian_that_is_wrong():
     sh = np.full((6, 1, 3), 0.5, np.float32)
     sh[4] = -1.0
     wrong = dataclasses.replace(truth, sh_coeffs=sh)
-    need = find_need(wrong, [camera], [Target(image)], RenderConfig())
-    assert need.error.argmax() == 4
-    assert need.error[[0, 1, 2]].max() < 0.01 * need.error[4]
+    found = find_need(wrong, [camera], [Target(image)], RenderConfig())
+    assert found.error.argmax() == 4
+    assert found.error[[0, 1, 2]].max() < 0.01 * found.error[4]
     # w sums to the alpha of the whole picture
-    assert need.weight.sum() == pytest.approx(np.asarray(rasterize(wrong, camera, ("alpha",)).alpha).sum(), rel=1e-4)
+    assert found.weight.sum() == pytest.approx(np.asarray(rasterize(wrong, camera, ("alpha",)).alpha).sum(), rel=1e-4)
     hidden = np.ones((48, 64), bool)
     hidden[:, 32:] = False
-    assert find_need(wrong, [camera], [Target(image, hidden)], RenderConfig()).error.max() < 0.01 * need.error[4]
+    assert find_need(wrong, [camera], [Target(image, hidden)], RenderConfig()).error.max() < 0.01 * found.error[4]
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"max_gaussians": 0}, "`max_gaussians` must be at least 1, got 0"),
+        ({"births": float("nan")}, "`births` must be at least 0, got nan"),
+        ({"birth_opacity": 0.0}, "`birth_opacity` must lie between 0 and 1, got 0.0"),
+    ],
+)
+def test_bad_settings_get_a_sentence(settings, message):
+    with pytest.raises(ValueError, match=message):
+        DensityConfig(**settings)
