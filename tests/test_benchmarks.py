@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import platform
 import stat
 import subprocess
 import sys
@@ -106,3 +107,66 @@ def test_the_plain_baseline_draws_the_same(plain):
         expected = np.asarray(dr.grad(value))
         assert np.abs(expected).max() > 0
         assert np.abs(grad - expected).max() < 1e-3 * np.abs(expected).max(), name
+
+
+# A kernel: loop over packets (0x10 to 0x3a) around the blend (0x14 to 0x36) around the next word (0x2a to 0x2e).
+LISTING = """    ; Symbolic loop: blend
+jit_llvm_disasm(): ========== 0 ==========
+jit_llvm_disasm(): 0x00000000   sub\trsp, 128
+jit_llvm_disasm(): 0x00000010   vmovaps\tzmm0, zmmword ptr [rdi]
+jit_llvm_disasm(): 0x00000014   vfmadd213ps\tzmm0, zmm1, zmm2
+jit_llvm_disasm(): 0x0000001a   vmulps\tzmm0, zmm0, zmmword ptr [rsp + 64]
+jit_llvm_disasm(): 0x00000020   vmovups\tzmmword ptr [rsp + 64], zmm0
+jit_llvm_disasm(): 0x00000024   je\t14
+jit_llvm_disasm(): 0x00000026   jmp\t2
+jit_llvm_disasm(): ...
+jit_llvm_disasm(): 0x0000002a   vpgatherdd\tzmm1 {k3}, zmmword ptr [r9 + 4*zmm2]
+jit_llvm_disasm(): 0x0000002e   jne\t-6
+jit_llvm_disasm(): 0x00000034   kortestw\tk1, k1
+jit_llvm_disasm(): 0x00000036   jne\t-36
+jit_llvm_disasm(): 0x00000038   nop
+jit_llvm_disasm(): 0x0000003a   jne\t-44
+jit_llvm_disasm(): 0x0000003c   ret
+  -> launching
+"""
+
+
+@pytest.fixture
+def machine_code(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    import machine_code
+
+    return machine_code
+
+
+def test_a_listing_is_split_into_its_loops(machine_code):
+    body, within = machine_code.main_loop(machine_code.kernel_code(LISTING, "blend"))
+    assert [i.place for i in body] == [0x14, 0x1A, 0x20, 0x24, 0x26, 0x34, 0x36]
+    assert [i.place for i in within] == [0x2A, 0x2E]
+    found = machine_code.counts(body)
+    assert found["total"] == 7
+    assert found["kinds"] == {"branch": 3, "multiply-add": 1, "multiply": 1, "store": 1, "mask": 1}
+    assert found["memory"] == {"stack loads": 1, "stack stores": 1}
+    with pytest.raises(SystemExit, match=r"printed no machine code for 'blend \(adjoint\)'"):
+        machine_code.kernel_code(LISTING, "blend (adjoint)")
+
+
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the listing is read as x86-64")
+def test_instructions_are_counted(workload: Path, tmp_path: Path):
+    out, tool = tmp_path / "out.json", ROOT / "benchmarks" / "count_instructions.py"
+    command = [sys.executable, tool, "--workload", workload, "--json", out, "--repeats", "2"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    (result,) = json.loads(out.read_text())["workloads"]
+    assert 0 < result["pairs_walked"] <= result["pairs_listed"]
+    assert result["pairs_walked"] <= result["lanes"] * result["turns"]
+    assert 0 < result["pixels_reached"] <= 1
+    assert 0.5 < result["clock_ghz"] < 8
+    pixels = result["pixels_per_block"]
+    # Per pixel and Gaussian: 3 sums, p and the polynomial of 2^p; the adjoint's sums, suffix and moments besides.
+    for name, least in (("blend", 8), ("adjoint", 13)):
+        found = result[name]
+        assert found["total"] == sum(found["kinds"].values())
+        assert found["kinds"]["multiply-add"] >= least * pixels, name
+        assert found["memory"]["stack stores"] > pixels, name
+        assert result["milliseconds"][name] > 0
