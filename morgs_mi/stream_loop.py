@@ -321,6 +321,9 @@ def stream_capture(
             tick = None if on_step is None else _frame_ticker(on_step, frame.index)
             packet, report = loop.push([frame.images[v] for v in train], tick)
             reports.append(replace(report, num_bytes=writer.write(packet)))
+            if report.frame and config.codec.keyframe_interval and report.frame % config.codec.keyframe_interval == 0:
+                assert loop.state.coded is not None
+                writer.write(restated(loop.state.coded))
             write_json(out / "report.json", {**metadata, "frames": [asdict(r) for r in reports]})
     return reports
 

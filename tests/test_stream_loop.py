@@ -9,8 +9,9 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.capture.capture import Capture, Frame
-from morgs_mi.codec.container import PacketKind, StreamReader, encode_packet
+from morgs_mi.codec.container import PacketKind, encode_packet
 from morgs_mi.codec.gaussians import decode, play
+from morgs_mi.codec.reader import StreamReader
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
 from morgs_mi.fit.config import FitConfig, Rates
 from morgs_mi.motion.config import MotionConfig

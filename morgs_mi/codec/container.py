@@ -1,11 +1,13 @@
-"""The stream file: self-contained packets, appended one by one, readable while it is written.
+"""The stream: packets that are checked one by one, appended one by one, and readable while they are written.
 
-    file    = magic [8], version uint32, packet*
+    stream  = magic [8], version uint32, packet*
     packet  = kind uint32, frame uint32, length uint64, crc uint32, payload [length]
     payload = table length uint32, table (JSON: name, dtype and shape of each array), the arrays' bytes
 
 All numbers are little-endian. The CRC-32 covers the packet's first 16 bytes and its payload. Packet 0 is
-the header, whose payload is JSON alone: cameras, frame rate and free metadata.
+the header, whose payload is JSON alone: cameras, frame rate and free metadata. A stream that was closed ends with an
+index: (kind uint32, frame uint32, offset uint64) of each packet but the header, then its own offset uint64 and a magic
+[8]. What is in the arrays is the matter of `codec.gaussians`; docs/stream-format.md has it all.
 """
 
 from __future__ import annotations
@@ -13,10 +15,9 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import os
 import struct
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from pathlib import Path
@@ -28,21 +29,32 @@ import numpy as np
 from morgs_mi.capture.camera import Camera
 
 __all__ = [
+    "ENTRY",
+    "HEAD",
+    "INDEX_MAGIC",
+    "MAGIC",
+    "PAYLOAD",
+    "PREAMBLE",
+    "TRAILER",
+    "VERSION",
     "Packet",
     "PacketKind",
-    "StreamReader",
     "StreamWriter",
     "TruncatedStreamError",
     "decode_packet",
     "encode_packet",
+    "header_fields",
+    "open_packet",
 ]
 
-MAGIC = b"MORGS-MI"
-VERSION = 1
-_PREAMBLE = struct.Struct("<8sI")
-_HEAD = struct.Struct("<IIQ")  # kind, frame, payload length: what the CRC covers beside the payload
+MAGIC, INDEX_MAGIC = b"MORGS-MI", b"MORGSIDX"
+VERSION = 2
+PREAMBLE = struct.Struct("<8sI")
+HEAD = struct.Struct("<IIQ")  # kind, frame, payload length: what the CRC covers beside the payload
+ENTRY = struct.Struct("<IIQ")  # kind, frame, offset
+TRAILER = struct.Struct("<Q8s")
 _U32 = struct.Struct("<I")
-_PAYLOAD = _HEAD.size + _U32.size
+PAYLOAD = HEAD.size + _U32.size  # where it begins in a packet
 _DTYPES = ("float32", "uint32", "uint8")
 
 
@@ -52,10 +64,11 @@ class PacketKind(IntEnum):
     HEADER = 0
     KEYFRAME = 1
     RESIDUAL = 2
+    INDEX = 3
 
 
 class TruncatedStreamError(ValueError):
-    """The file ends inside a packet: it was cut off, or its writer has not finished that packet."""
+    """The stream ends inside a packet: it was cut off, or its writer has not finished that packet."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +112,7 @@ def decode_packet(data: bytes) -> Packet:
     Raises:
         ValueError: the bytes are not exactly one intact keyframe or residual packet.
     """
-    kind, frame, payload = _unsealed(data)
+    kind, frame, payload = open_packet(data)
     if kind not in (PacketKind.KEYFRAME, PacketKind.RESIDUAL):
         raise ValueError(f"the kind must be 1 (keyframe) or 2 (residual), got {kind}")
     try:
@@ -109,10 +122,11 @@ def decode_packet(data: bytes) -> Packet:
 
 
 class StreamWriter:
-    """Appends packets to a new stream file; each is on its way to the disk when `write` returns.
+    """Appends packets to a new stream; each is on its way when `write` returns.
 
     Args:
-        path: the file; an existing one is replaced.
+        sink: the file, an existing one is replaced; or something binary to write to, such as a pipe or a socket's
+            file, which is left open.
         cameras: the rig.
         fps: frames per second.
         metadata: anything that JSON can hold.
@@ -124,7 +138,7 @@ class StreamWriter:
 
     def __init__(
         self,
-        path: str | Path,
+        sink: str | Path | BinaryIO,
         cameras: Sequence[Camera],
         fps: float,
         metadata: Mapping[str, Any] | None = None,
@@ -138,13 +152,16 @@ class StreamWriter:
             payload = json.dumps(header, allow_nan=False).encode()
         except (TypeError, ValueError) as error:
             raise ValueError(f"StreamWriter(): `metadata` and `fps` must fit into JSON ({error}).") from None
-        self.path = Path(path)
+        self._owned = isinstance(sink, str | Path)
+        self.path = Path(sink if self._owned else str(getattr(sink, "name", "stream")))
         self.num_bytes = 0
+        self._index: list[tuple[int, int, int]] | None = []
         # Unbuffered: a buffer would try to write its rest again after a failed packet has been taken back.
-        self._file = open(self.path, "wb", buffering=0)  # noqa: SIM115
+        self._file = open(self.path, "wb", buffering=0) if self._owned else sink  # noqa: SIM115
         try:
-            self._append(_PREAMBLE.pack(MAGIC, VERSION) + _sealed(PacketKind.HEADER, 0, payload))
+            self._append(PREAMBLE.pack(MAGIC, VERSION) + _sealed(PacketKind.HEADER, 0, payload))
         except OSError:
+            self._index = None
             self.close()
             raise
 
@@ -155,11 +172,21 @@ class StreamWriter:
             ValueError: the packet cannot be encoded.
             OSError: it could not be written; the file ends with the last whole packet again.
         """
-        return self._append(encode_packet(packet))
+        at, size = self.num_bytes, self._append(encode_packet(packet))
+        assert self._index is not None, "written to after it was closed"
+        self._index.append((packet.kind, packet.frame, at))
+        return size
 
     def close(self) -> None:
-        """Close the file; a second call does nothing."""
-        self._file.close()
+        """Write the index and close the file; a second call does nothing."""
+        if self._index is not None:
+            entries = b"".join(ENTRY.pack(*entry) for entry in self._index)
+            payload = entries + TRAILER.pack(self.num_bytes, INDEX_MAGIC)
+            self._index = None
+            with contextlib.suppress(OSError):  # a full disk, a closed pipe: readers can do without
+                self._append(_sealed(PacketKind.INDEX, 0, payload))
+        if self._owned:
+            self._file.close()
 
     def __enter__(self) -> StreamWriter:
         return self
@@ -174,8 +201,9 @@ class StreamWriter:
         try:
             while rest:
                 rest = rest[self._file.write(rest) :]
+            self._file.flush()
         except BaseException as error:  # a Ctrl-C must leave whole packets too
-            with contextlib.suppress(OSError):  # a pipe or device cannot be taken back
+            with contextlib.suppress(OSError, AttributeError):  # a pipe or device cannot be taken back
                 self._file.truncate(self.num_bytes)
                 self._file.seek(self.num_bytes)
             if not isinstance(error, OSError):
@@ -189,97 +217,24 @@ class StreamWriter:
         return len(data)
 
 
-class StreamReader:
-    """Reads a stream file, whole or still growing.
-
-    Iterating yields its packets from the first; it may be done again, e.g. when the file has grown.
-
-    Attributes:
-        path: the file.
-        cameras: the rig.
-        fps: frames per second.
-        metadata: what the writer was given.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        TruncatedStreamError: the file ends inside a packet (while iterating: after the whole ones).
-        ValueError: it is no stream, of another version, or a packet is broken. The message names the
-            file, the packet's number and byte offset and how many packets before it are intact.
-    """
-
-    def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-        with open(self.path, "rb") as file:
-            preamble = file.read(_PREAMBLE.size)
-            if not MAGIC.startswith(preamble[:8]):
-                raise ValueError(
-                    f"{self.path}: expected a stream that starts with {MAGIC!r}, got {preamble[:8]!r}; check the path."
-                )
-            if len(preamble) == _PREAMBLE.size and (version := _PREAMBLE.unpack(preamble)[1]) != VERSION:
-                raise ValueError(
-                    f"{self.path}: expected format version {VERSION}, got {version}; "
-                    "read it with the release that wrote it."
-                )
-            data = self._read(file, 0)
-            if data is None:
-                raise TruncatedStreamError(self._sentence(0, file.tell(), "the header is missing"))
-            with self._located(0, _PREAMBLE.size):
-                kind, _, payload = _unsealed(data)
-                if kind != PacketKind.HEADER:
-                    raise ValueError(f"the first packet must be the header, got kind {kind}")
-                self.cameras, self.fps, self.metadata = _header_fields(payload)
-            self._first = file.tell()
-
-    def __iter__(self) -> Iterator[Packet]:
-        number = 1
-        with open(self.path, "rb") as file:
-            file.seek(self._first)
-            while (data := self._read(file, number)) is not None:
-                with self._located(number, file.tell() - len(data)):
-                    packet = decode_packet(data)
-                yield packet
-                number += 1
-
-    def _read(self, file: BinaryIO, number: int) -> bytes | None:
-        """Return the bytes of the packet at the file's position, None at the file's end."""
-        at = file.tell()
-        left = os.fstat(file.fileno()).st_size - at
-        if left == 0:
-            return None
-        head = file.read(_PAYLOAD)
-        # The length is not to be trusted: nothing is allocated before it is known to be in the file.
-        need = _PAYLOAD + (_HEAD.unpack_from(head)[2] if len(head) == _PAYLOAD else 0)
-        if need > left:
-            raise TruncatedStreamError(
-                self._sentence(number, at, f"at least {need} bytes expected, got {left}: truncated or still written")
-            )
-        return head + file.read(need - _PAYLOAD)
-
-    @contextlib.contextmanager
-    def _located(self, number: int, at: int) -> Iterator[None]:
-        try:
-            yield
-        except ValueError as error:
-            raise ValueError(self._sentence(number, at, str(error))) from None
-
-    def _sentence(self, number: int, at: int, problem: str) -> str:
-        return f"{self.path}: packet {number} at byte {at}: {problem}; {number} packets before it are intact."
-
-
 def _sealed(kind: int, frame: int, payload: bytes) -> bytes:
-    head = _HEAD.pack(kind, frame, len(payload))
+    head = HEAD.pack(kind, frame, len(payload))
     return b"".join([head, _U32.pack(zlib.crc32(payload, zlib.crc32(head))), payload])
 
 
-def _unsealed(data: bytes) -> tuple[int, int, memoryview]:
-    """Return (kind, frame, payload) of a packet whose length and CRC are right."""
-    if len(data) < _PAYLOAD:
-        raise ValueError(f"a packet has at least {_PAYLOAD} bytes, got {len(data)}")
-    head, payload = data[: _HEAD.size], memoryview(data)[_PAYLOAD:]
-    kind, frame, length = _HEAD.unpack(head)
+def open_packet(data: bytes) -> tuple[int, int, memoryview]:
+    """Return (kind, frame, payload) of a packet of any kind.
+
+    Raises:
+        ValueError: its length or its CRC is wrong.
+    """
+    if len(data) < PAYLOAD:
+        raise ValueError(f"a packet has at least {PAYLOAD} bytes, got {len(data)}")
+    head, payload = data[: HEAD.size], memoryview(data)[PAYLOAD:]
+    kind, frame, length = HEAD.unpack(head)
     if length != len(payload):
         raise ValueError(f"its payload should have {length} bytes, got {len(payload)}")
-    (expected,) = _U32.unpack_from(data, _HEAD.size)
+    (expected,) = _U32.unpack_from(data, HEAD.size)
     if (crc := zlib.crc32(payload, zlib.crc32(head))) != expected:
         raise ValueError(f"its CRC should be {expected:08x}, got {crc:08x}: the bytes are damaged")
     return kind, frame, payload
@@ -315,7 +270,12 @@ def _camera_fields(camera: Camera) -> dict[str, Any]:
     }
 
 
-def _header_fields(payload: memoryview) -> tuple[tuple[Camera, ...], float, dict[str, Any]]:
+def header_fields(payload: memoryview) -> tuple[tuple[Camera, ...], float, dict[str, Any]]:
+    """Return cameras, frame rate and metadata of a header's payload.
+
+    Raises:
+        ValueError: it is broken.
+    """
     try:
         header = json.loads(bytes(payload))
         cameras = tuple(

@@ -22,9 +22,19 @@ from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import Packet, PacketKind
 from morgs_mi.codec.entropy import LIMIT, ColumnReader, ColumnWriter, column_bits
 from morgs_mi.codec.grid import GROUPS, Grid, columns_of, new_grid, real_values, step_sizes
+from morgs_mi.codec.reader import StreamReader
 from morgs_mi.gaussians.gaussians import Gaussians
 
-__all__ = ["CodedFrame", "decode", "keyframe_packet", "play", "residual_packet", "restated"]
+__all__ = [
+    "CodedFrame",
+    "coded_frames",
+    "decode",
+    "keyframe_packet",
+    "play",
+    "residual_packet",
+    "restated",
+    "seek",
+]
 
 # The three groups of a Gaussian's geometry and the four of its look have a flag each; 8 instead says that it died.
 _GEOMETRY, _LOOK, _DEAD = GROUPS[:3], GROUPS[3:], 8
@@ -175,13 +185,30 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
         raise ValueError(f"{where}: {error}.") from None
 
 
-def play(packets: Iterable[Packet]) -> Iterator[tuple[int, Gaussians]]:
-    """Decode packets in order and yield (frame, Gaussians), once for each frame."""
+def coded_frames(packets: Iterable[Packet]) -> Iterator[CodedFrame]:
+    """Decode packets in order and yield the state after each frame."""
     coded = None
     for packet in packets:
         if coded is None or packet.frame != coded.frame:  # a keyframe that restates is for those who start there
             coded = decode(coded, packet)
-            yield packet.frame, coded.gaussians
+            yield coded
+
+
+def play(packets: Iterable[Packet]) -> Iterator[tuple[int, Gaussians]]:
+    """Decode packets in order and yield (frame, Gaussians), once for each frame."""
+    return ((coded.frame, coded.gaussians) for coded in coded_frames(packets))
+
+
+def seek(stream: StreamReader, frame: int) -> CodedFrame:
+    """Return the state at a frame, decoding no more than what lies between it and the keyframe before it.
+
+    Raises:
+        ValueError: the stream has no such frame, is no file, or a packet is broken.
+    """
+    for coded in coded_frames(stream.near(frame)):
+        if coded.frame == frame:
+            return coded
+    raise ValueError(f"{stream.path}: expected a frame of the stream, got {frame}; it has none of that number.")
 
 
 def _decoded_keyframe(packet: Packet) -> CodedFrame:

@@ -94,10 +94,13 @@ def evaluate_stream(
     """
     stream = open_stream(out)
     # Not from the report: what counts is what a receiver of the file gets.
-    packets = [(packet.frame, packet.kind, len(encode_packet(packet))) for packet in stream]
+    packets, read = {}, 0
+    for packet in stream:
+        packets.setdefault(packet.frame, (packet.kind, len(encode_packet(packet))))  # what follows only restates it
+        read += 1
     if not packets:
         raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
-    recording = open_recording(stream, capture, [frame for frame, *_ in packets])
+    recording = open_recording(stream, capture, list(packets))
     seconds = _seconds(stream.path)
     views = recording.train_views if recording.test_view is None else (recording.test_view,)
     channels = ("color", "motion", *(("confidence",) if has_confidence(stream) else ()))
@@ -106,9 +109,10 @@ def evaluate_stream(
     variations = {view: StillVariation(recording.masks[view], false_alarms) for view in views}
     rows, before, last = [], None, None
     # The file may have grown meanwhile.
-    decoded = play(islice(stream, len(packets)))
-    recorded = recording.frames(packets[0][0], packets[-1][0] + 1)
-    for (index, kind, num_bytes), (_, gaussians), frame in zip(packets, decoded, recorded, strict=True):
+    decoded = play(islice(stream, read))
+    recorded = recording.frames(min(packets), max(packets) + 1)
+    for (index, gaussians), frame in zip(decoded, recorded, strict=True):
+        kind, num_bytes = packets[index]
         scores = {}
         for view in views:
             camera = stream.cameras[view]
@@ -236,7 +240,7 @@ def _summary(num_bytes: int, rows: list[dict[str, Any]]) -> dict[str, Any]:
         "seconds": {"first": rows[0]["seconds"], "per_later_frame": _mean(later), "definition": SECONDS},
         "bytes": {
             "file": num_bytes,
-            "header": num_bytes - sum(row["num_bytes"] for row in rows),
+            "overhead": num_bytes - sum(row["num_bytes"] for row in rows),  # header, index, keyframes to start from
             "per_frame": num_bytes / len(rows),
             "per_keyframe": _mean(packets("keyframe")),
             "per_residual": _mean(packets("residual")),

@@ -16,8 +16,8 @@ import numpy as np
 from morgs_mi.capture.camera import Camera
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.truth import Truth, load_truth
-from morgs_mi.codec.container import StreamReader
 from morgs_mi.codec.gaussians import play
+from morgs_mi.codec.reader import StreamReader
 from morgs_mi.evaluate.pictures import as_picture, confidence_picture, depth_picture, motion_picture
 from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.render.config import RenderConfig

@@ -15,12 +15,12 @@ from morgs_mi.capture.camera import Camera
 from morgs_mi.codec.container import (
     Packet,
     PacketKind,
-    StreamReader,
     StreamWriter,
     TruncatedStreamError,
     decode_packet,
     encode_packet,
 )
+from morgs_mi.codec.reader import StreamReader
 
 RNG = np.random.default_rng(5)
 PACKETS = [
@@ -189,9 +189,9 @@ def test_files_that_are_no_stream(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"expected a stream that starts with .* got b'ply"):
         StreamReader(path)
     path.write_bytes(struct.pack("<8sI", b"MORGS-MI", 9))
-    with pytest.raises(ValueError, match="expected format version 1, got 9"):
+    with pytest.raises(ValueError, match="expected format version 2, got 9"):
         StreamReader(path)
-    preamble = struct.pack("<8sI", b"MORGS-MI", 1)
+    preamble = struct.pack("<8sI", b"MORGS-MI", 2)
     path.write_bytes(preamble + sealed(b"{}", kind=1))
     with pytest.raises(ValueError, match="packet 0 at byte 12: the first packet must be the header, got kind 1"):
         StreamReader(path)

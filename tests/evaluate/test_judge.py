@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from morgs_mi.capture import load_capture, write_colmap, write_video
-from morgs_mi.codec.container import StreamReader, StreamWriter
+from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.gaussians import decode, keyframe_packet, residual_packet, restated
+from morgs_mi.codec.reader import StreamReader
 from morgs_mi.evaluate.judge import PICTURE_SCORES, evaluate_stream
 from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.render.rasterize import rasterize
@@ -37,7 +38,7 @@ def test_bytes_are_those_of_the_file(clip: Path) -> None:
     packets = [row["num_bytes"] for row in result["frames"]]
     assert [row["kind"] for row in result["frames"]] == ["keyframe", "residual", "residual"]
     assert result["bytes"]["file"] == (clip / "stream.morgs").stat().st_size
-    assert result["bytes"]["header"] + sum(packets) == result["bytes"]["file"]
+    assert result["bytes"]["overhead"] + sum(packets) == result["bytes"]["file"]
     assert result["bytes"]["per_keyframe"] == packets[0]
     assert result["bytes"]["per_residual"] == np.mean(packets[1:])
 

@@ -1,0 +1,172 @@
+"""Reading a stream: from a file, whole or still growing, or from a pipe; from the start, or from near a frame."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO
+
+from morgs_mi.codec.container import (
+    ENTRY,
+    HEAD,
+    INDEX_MAGIC,
+    MAGIC,
+    PAYLOAD,
+    PREAMBLE,
+    TRAILER,
+    VERSION,
+    Packet,
+    PacketKind,
+    TruncatedStreamError,
+    decode_packet,
+    header_fields,
+    open_packet,
+)
+
+__all__ = ["StreamReader"]
+
+_CHUNK = 2**20
+
+
+class StreamReader:
+    """Reads a stream.
+
+    Iterating yields its packets from the first. A file may be read again, e.g. when it has grown; a pipe gives each
+    packet once, as soon as it is there.
+
+    Args:
+        source: the file, or something binary to read from, such as a pipe or a socket's file.
+
+    Attributes:
+        path: the file.
+        cameras: the rig.
+        fps: frames per second.
+        metadata: what the writer was given.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        TruncatedStreamError: the stream ends inside a packet (while iterating: after the whole ones).
+        ValueError: it is no stream, of another version, or a packet is broken. The message names the
+            file, the packet's number and byte offset and how many packets before it are intact.
+    """
+
+    def __init__(self, source: str | Path | BinaryIO) -> None:
+        self._pipe = None if isinstance(source, str | Path) else source
+        self.path = Path(source if isinstance(source, str | Path) else str(getattr(source, "name", "stream")))
+        with self._opened() as file:
+            preamble = _read(file, PREAMBLE.size)
+            if not MAGIC.startswith(preamble[:8]):
+                raise ValueError(
+                    f"{self.path}: expected a stream that starts with {MAGIC!r}, got {preamble[:8]!r}; check the path."
+                )
+            if len(preamble) == PREAMBLE.size and (version := PREAMBLE.unpack(preamble)[1]) != VERSION:
+                raise ValueError(
+                    f"{self.path}: expected format version {VERSION}, got {version}; "
+                    "read it with the release that wrote it."
+                )
+            data = self._packet(file, 0, len(preamble))
+            if data is None:
+                raise TruncatedStreamError(self._sentence(0, len(preamble), "the header is missing"))
+            with self._located(0, PREAMBLE.size):
+                kind, _, payload = open_packet(data)
+                if kind != PacketKind.HEADER:
+                    raise ValueError(f"the first packet must be the header, got kind {kind}")
+                self.cameras, self.fps, self.metadata = header_fields(payload)
+        self._first = PREAMBLE.size + len(data)
+
+    def __iter__(self) -> Iterator[Packet]:
+        return self._packets(1, self._first)
+
+    def near(self, frame: int) -> Iterator[Packet]:
+        """Yield the packets from the last keyframe before `frame` on, or from the first.
+
+        A frame's displacements are told by its residual, so a keyframe of that very frame is not the place.
+
+        Raises:
+            ValueError: it is a pipe, which cannot be turned back, or a packet is broken.
+        """
+        if self._pipe is not None:
+            raise ValueError(f"{self.path}: expected a file to seek in, got a pipe; save it first.")
+        number, at = 1, self._first
+        for k, (kind, known, offset) in enumerate(self.index()):
+            if kind == PacketKind.KEYFRAME and known < frame:
+                number, at = k + 1, offset
+        return self._packets(number, at)
+
+    def index(self) -> list[tuple[int, int, int]]:
+        """Return (kind, frame, offset) of every whole packet but the header, from the file's index if it has one."""
+        with open(self.path, "rb") as file:
+            size = file.seek(0, 2)
+            file.seek(max(size - TRAILER.size, 0))
+            at, magic = TRAILER.unpack(file.read(TRAILER.size))
+            if magic == INDEX_MAGIC and self._first <= at < size:
+                file.seek(at)
+                with contextlib.suppress(ValueError):  # a payload that looks like an index by chance
+                    kind, _, payload = open_packet(file.read(size - at))
+                    if kind == PacketKind.INDEX:
+                        return list(ENTRY.iter_unpack(payload[: -TRAILER.size]))
+            entries, at = [], self._first
+            while at + PAYLOAD <= size:
+                file.seek(at)
+                kind, frame, length = HEAD.unpack(file.read(HEAD.size))
+                if at + PAYLOAD + length <= size and kind != PacketKind.INDEX:
+                    entries.append((kind, frame, at))
+                at += PAYLOAD + length
+            return entries
+
+    def _packets(self, number: int, at: int) -> Iterator[Packet]:
+        with self._opened() as file:
+            if self._pipe is None:
+                file.seek(at)
+            while (data := self._packet(file, number, at)) is not None:
+                with self._located(number, at):
+                    packet = None
+                    # An index may stand between packets: a stream that was closed may have been continued.
+                    if HEAD.unpack_from(data)[0] != PacketKind.INDEX:
+                        packet = decode_packet(data)
+                    else:
+                        open_packet(data)
+                at += len(data)
+                if packet is not None:
+                    yield packet
+                    number += 1
+
+    def _packet(self, file: BinaryIO, number: int, at: int) -> bytes | None:
+        """Return the bytes of the packet that comes next, None at the stream's end."""
+        head = _read(file, PAYLOAD)
+        if not head:
+            return None
+        need = PAYLOAD + (HEAD.unpack_from(head)[2] if len(head) == PAYLOAD else 0)
+        data = head + _read(file, need - PAYLOAD)
+        if len(head) < PAYLOAD or len(data) < need:
+            problem = f"at least {need} bytes expected, got {len(data)}: truncated or still written"
+            raise TruncatedStreamError(self._sentence(number, at, problem))
+        return data
+
+    @contextlib.contextmanager
+    def _opened(self) -> Iterator[BinaryIO]:
+        if self._pipe is not None:
+            yield self._pipe
+        else:
+            with open(self.path, "rb") as file:
+                yield file
+
+    @contextlib.contextmanager
+    def _located(self, number: int, at: int) -> Iterator[None]:
+        try:
+            yield
+        except ValueError as error:
+            raise ValueError(self._sentence(number, at, str(error))) from None
+
+    def _sentence(self, number: int, at: int, problem: str) -> str:
+        return f"{self.path}: packet {number} at byte {at}: {problem}; {number} packets before it are intact."
+
+
+def _read(file: BinaryIO, count: int) -> bytes:
+    """Return `count` bytes, or what there is. A length is not to be trusted: memory grows with what has come."""
+    parts = []
+    while count > 0 and (part := file.read(min(count, _CHUNK))):
+        parts.append(part)
+        count -= len(part)
+    return b"".join(parts)
