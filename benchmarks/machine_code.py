@@ -22,7 +22,7 @@ _KINDS = (
     ("shuffle", r"v(unpck|punpck|shuf|pshuf|perm|insert|pinsert|extract|pextr|p?broadcast|pmovsx|pmovzx|movh|movl)"),
     ("mask", r"k"),
     ("branch", r"(j|call|ret)"),
-    ("integer", r"(v?p|vx?or|vand|test|cmp|add|sub|and|or|x?or|sh|imul|inc|dec|lea|neg|not|set|bt|tzcnt|popcnt)"),
+    ("integer", r"(v?p|vx?or|vand|test|cmp|add|sub|and|or|xor|sh|imul|inc|dec|lea|neg|not|set|bt|tzcnt|popcnt)"),
     ("move", r"v?mov"),
 )
 
@@ -65,6 +65,7 @@ def successors(code: list[Instruction]) -> list[list[int]]:
     for k, instruction in enumerate(code):
         follows = [k + 1] if k + 1 < len(code) and not re.match(r"(jmp|ret)", instruction.name) else []
         if instruction.jump is not None:
+            # Padding is left out, so the next line does not tell where a jump ends; its reach tells its size.
             short = -128 <= instruction.jump <= 127
             size = 2 if short else 5 if instruction.name == "jmp" else 6
             target = index.get(instruction.place + size + instruction.jump)
