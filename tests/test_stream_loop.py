@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -10,10 +11,10 @@ import pytest
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.capture.capture import Capture, Frame
 from morgs_mi.codec.container import PacketKind, encode_packet
-from morgs_mi.codec.gaussians import decode, play
+from morgs_mi.codec.gaussians import coded_frames, decode, play
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
-from morgs_mi.fit.config import FitConfig, Rates
+from morgs_mi.fit.config import DensityConfig, FitConfig, Rates
 from morgs_mi.motion.config import MotionConfig
 from morgs_mi.stream_loop import StreamConfig, StreamLoop, stream_capture
 
@@ -136,6 +137,20 @@ def test_same_seed_gives_the_same_bytes_and_nothing_looks_ahead(clip):
     runs = [[encode_packet(packet) for packet in run(frames, config)[1]] for frames in (clip, dark)]
     assert runs[0][:2] == runs[1][:2]
     assert runs[0][2] != runs[1][2]
+
+
+def test_births_and_deaths_travel_with_the_stream(clip):
+    """At the bound as many die as are born, their numbers are never given twice, and the decoder has them all."""
+    density = DensityConfig(later_frames=True, births=0.05, max_gaussians=610)
+    loop, packets, reports = run(clip, dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, density=density)))
+    assert [r.num_gaussians for r in reports] == [600, 610, 610]
+    frames = list(coded_frames(packets))
+    for before, after in pairwise(frames):
+        born = np.setdiff1d(after.ids, before.ids)
+        assert born.tolist() == list(range(before.next_id, before.next_id + 30))
+    assert len(np.intersect1d(frames[0].ids, frames[2].ids)) < 600
+    for name, value in frames[-1].gaussians.numpy().items():
+        assert np.array_equal(value, loop.gaussians.numpy()[name]), name
 
 
 def test_modules_can_be_switched_off(clip):

@@ -21,7 +21,7 @@ from morgs_mi.capture.camera import Camera
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.truth import Tracks, Truth, load_tracks, load_truth
 from morgs_mi.codec.container import PacketKind, encode_packet
-from morgs_mi.codec.gaussians import play
+from morgs_mi.codec.gaussians import CodedFrame, coded_frames
 from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.metrics import WINDOW, endpoint_error, iou, mean_over, psnr_of, ssim_map, unit_pair
 from morgs_mi.evaluate.motion3d import judge_motion
@@ -37,7 +37,6 @@ from morgs_mi.evaluate.stream import (
     truth_on,
 )
 from morgs_mi.evaluate.temporal import StillVariation, recorded_change, slope
-from morgs_mi.gaussians.gaussians import Gaussians
 
 __all__ = ["MOTION_SCORES", "PICTURE_SCORES", "REGIONS", "SECONDS", "evaluate_stream"]
 
@@ -109,11 +108,11 @@ def evaluate_stream(
     variations = {view: StillVariation(recording.masks[view], false_alarms) for view in views}
     rows, before, last = [], None, None
     # The file may have grown meanwhile.
-    decoded = play(islice(stream, read))
+    decoded = coded_frames(islice(stream, read))
     recorded = recording.frames(min(packets), max(packets) + 1)
-    for (index, gaussians), frame in zip(decoded, recorded, strict=True):
+    for coded, frame in zip(decoded, recorded, strict=True):
+        index, gaussians, scores = coded.frame, coded.gaussians, {}
         kind, num_bytes = packets[index]
-        scores = {}
         for view in views:
             camera = stream.cameras[view]
             images = render(gaussians, camera, channels, config)
@@ -125,9 +124,9 @@ def evaluate_stream(
             scores[camera.name] = _picture_scores(picture, seen, lpips) | _motion_scores(images, truth)
         mean = {name: _mean([score[name] for score in scores.values()]) for name in _SCORES}
         about = {"frame": index, "kind": kind.name.lower(), "num_bytes": num_bytes, "seconds": seconds.get(index)}
-        motion = _motion_3d(recording, tracks, before, gaussians, index) if kind == PacketKind.RESIDUAL else {}
+        motion = _motion_3d(recording, tracks, before, coded) if kind == PacketKind.RESIDUAL else {}
         rows.append({**about, **mean, "motion_3d": motion, "views": scores})
-        before, last = gaussians, frame.images
+        before, last = coded, frame.images
         if progress is not None:
             progress(len(rows), len(packets))
     return {
@@ -203,18 +202,21 @@ def _motion_scores(images: Mapping[str, np.ndarray], truth: Truth | None) -> dic
 
 
 def _motion_3d(
-    recording: Capture, tracks: Tracks | None, before: Gaussians | None, now: Gaussians, frame: int
+    recording: Capture, tracks: Tracks | None, before: CodedFrame | None, now: CodedFrame
 ) -> dict[str, float]:
-    """Return `judge_motion` of a frame, empty without truth."""
+    """Return `judge_motion` of those who live in both frames, empty without truth."""
+    frame = now.frame
     if tracks is None or recording.truth is None or before is None or frame >= tracks.points.shape[1]:
         return {}
     views = []
     for camera in recording.cameras:
         truth = load_truth(recording.truth, camera.name, frame - 1)
         views.append((camera.resized(*truth.mask.shape[::-1]), truth))
-    old, new = before.numpy()["means"].astype(float), now.numpy()["means"].astype(float)
+    _, then, later = np.intersect1d(before.ids, now.ids, return_indices=True)
+    old = before.gaussians.numpy()["means"][then].astype(float)
+    new = now.gaussians.numpy()["means"][later].astype(float)
     points = tracks.points[:, frame - 1], tracks.points[:, frame], tracks.ids
-    return judge_motion(old, new - old, np.asarray(before.opacities), points, views)
+    return judge_motion(old, new - old, np.asarray(before.gaussians.opacities)[then], points, views)
 
 
 def _tracks(recording: Capture) -> Tracks | None:

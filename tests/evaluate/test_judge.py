@@ -66,6 +66,18 @@ def test_a_wrong_motion_is_an_error_where_things_move(clip: Path, tmp_path: Path
     assert result["frames"][0]["psnr"] < result["frames"][1]["psnr"] == np.inf
 
 
+def test_only_those_who_live_in_both_frames_are_judged_by_their_motion(clip: Path, tmp_path: Path) -> None:
+    """The first splat dies, and one that moves in no true way is born: the others' motion is still exact."""
+    state = decode(None, keyframe_packet(moved(0), 0, CAMERAS, EXACT))
+    after = moved(1).select([1, 2, 3, 4, 0])
+    with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
+        writer.write(restated(state))
+        writer.write(residual_packet(state, after, np.array([1, 2, 3, 4, -1]), CAMERAS, EXACT))
+    result = evaluate_stream(tmp_path / "s.morgs", clip / "capture")["motion_3d"]
+    assert 0 < result["num_gaussians"] <= 4
+    assert result["relative_error"] < 1e-3
+
+
 def test_a_downscaled_fit_is_judged_at_its_own_size(clip: Path, tmp_path: Path) -> None:
     small = load_capture(clip / "capture", downscale=1.7)
     with StreamWriter(
