@@ -82,10 +82,7 @@ def find_need(gaussians: Gaussians, cameras: Sequence[Camera], targets: Sequence
     gaussians = gaussians.detached()
     error, weight = np.zeros((2, len(gaussians)), np.float32)
     for camera, target in zip(cameras, targets, strict=True):
-        image = np.asarray(rasterize(gaussians, camera, ("color",), config=render).color)
-        if target.weight is not None:
-            image = image * np.asarray(target.weight)
-        wrong = np.abs(image - np.asarray(target.pixels).reshape(target.shape)).mean(axis=2)
+        wrong = target.error(rasterize(gaussians, camera, ("color",), config=render).color)
         sums = backproject(gaussians, camera, np.stack([wrong, np.ones_like(wrong)], axis=2), render)
         error, weight = np.maximum(error, sums[:, 0]), np.maximum(weight, sums[:, 1])
     return Need(error, weight)

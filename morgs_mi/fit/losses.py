@@ -1,11 +1,24 @@
 """The losses: L_recon (eq. 2), L_flow (eq. 7), L_mask (eq. 11) and L_off, each a scalar Dr.Jit tensor.
 
 Every loss is a mean, over pixels or Gaussians, so that its weight does not depend on the picture's size.
-SSIM (Wang et al. 2004) has the 11x11 Gaussian window of sigma 1.5 and takes what is outside as black.
+
+L_recon is (1 - lambda) L1 + lambda (1 - SSIM). SSIM (Wang et al. 2004) has the 11x11 Gaussian window of sigma 1.5 and
+takes what is outside the picture as black. With x the picture, y its target and M the mean over a window,
+
+    SSIM = (2 Mx My + C1) (2 (Mxy - Mx My) + C2) / ((Mx^2 + My^2 + C1) (Mxx - Mx^2 + Myy - My^2 + C2)).
+
+Two traced passes, over a whole view or a region of it: the first computes SSIM's derivatives D by Mx, Mxx and Mxy at
+every window, the second sends them back through the window, which is its own transpose:
+
+    dL/dx = (1 - lambda) sign(x - y) - lambda (M D_x + 2 x M D_xx + y M D_xy).
+
+In both, a SIMD lane walks down a run of rows of a strip (see `planes`). It blurs each row across as it comes, and adds
+it to the 11 windows that the row is part of: every number is read once, and no blurred row goes to memory.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import cv2
@@ -13,11 +26,17 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.fit.planes import COLUMN, RADIUS, STRIP, Planes, Runs, packet_type, read_packet, write_packet
+from morgs_mi.render.region import Region, owned
+
 __all__ = ["Target", "flow_loss", "mask_loss", "offset_loss", "recon_loss"]
 
+_Read = Callable[[Any], list[Any]]  # plane -> its numbers around the lane's row
+
 _C1, _C2 = 0.01**2, 0.03**2
-_WINDOW = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+_WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
 _WINDOW = (_WINDOW / _WINDOW.sum()).astype(np.float32)
+_TAPS = [float(tap) for tap in _WINDOW]
 
 
 class Target:
@@ -30,83 +49,228 @@ class Target:
 
     def __init__(self, image: np.ndarray, mask: np.ndarray | None = None) -> None:
         pixels = image.astype(np.float32) / 255 if image.dtype == np.uint8 else image.astype(np.float32)
-        weight = None
+        self.shape: tuple[int, ...] = pixels.shape
+        self.planes = Planes(*pixels.shape[:2])
+        self.weight: Any = None
         if mask is not None and not mask.all():
             weight = np.repeat(mask[..., None], 3, axis=2).astype(np.float32)
-            pixels = pixels * weight
-        self.shape: tuple[int, ...] = pixels.shape
-        self.pixels = mi.Float(pixels.ravel())
-        self.weight = None if weight is None else mi.TensorXf(weight)
-        self.blurred = mi.Float(_blur(np.concatenate([pixels, pixels * pixels], axis=2)).ravel())
-        dr.eval(self.pixels, self.blurred)
+            pixels, self.weight = pixels * weight, self._planes(weight)
+        mean = _blur(pixels)
+        self.pixels, self.mean = self._planes(pixels), self._planes(mean)
+        self.variance = self._planes(_blur(pixels * pixels) - mean * mean)
+        self.windows, self.lines = self.planes.runs(None, RADIUS), self.planes.runs(None, 0)
+        self.surroundings: Any = None
+
+    def _planes(self, picture: np.ndarray) -> Any:
+        planes = self.planes.of(owned(mi.Float(picture.ravel())))
+        dr.eval(planes)
+        return planes
+
+    def error(self, image: Any) -> np.ndarray:
+        """Return how far a picture [H, W, 3] is from this one at every pixel, mean |I - I*| over its colour [H, W]."""
+        wrong = dr.abs(self.weighed(self.planes.of(owned(dr.detach(image).array))) - self.pixels)
+        return np.asarray(self.planes.picture(wrong)).reshape(self.shape).mean(axis=2)
+
+    def remember(self, image: Any) -> None:
+        """Keep a rendered picture [H, W, 3]: it surrounds what is compared on a region from now on."""
+        self.surroundings = self.weighed(self.planes.of(owned(dr.detach(image).array)))
+        dr.eval(self.surroundings)
+
+    def weighed(self, values: Any, places: Any = None) -> Any:
+        """Return planes, or the numbers of them at `places`, without what does not count."""
+        if self.weight is None:
+            return values
+        return values * (self.weight if places is None else dr.gather(mi.Float, self.weight, places))
 
 
-def recon_loss(image: Any, target: Target, dssim_weight: float = 0.2) -> Any:
-    """Return (1 - lambda) mean |I - I*| + lambda (1 - SSIM) (eq. 2), differentiable in `image` [H, W, 3].
+def _blur(image: np.ndarray) -> np.ndarray:
+    return cv2.sepFilter2D(image, -1, _WINDOW, _WINDOW, borderType=cv2.BORDER_CONSTANT)
+
+
+def recon_loss(image: Any, target: Target, dssim_weight: float = 0.2, region: Region | None = None) -> Any:
+    """Return (1 - lambda) mean |I - I*| + lambda (1 - SSIM) (eq. 2), differentiable in `image`.
 
     Value and derivative are computed together, so that backward costs one multiplication.
 
+    Args:
+        image: [H, W, 3], or a picture on the region.
+        target: what it should show.
+        dssim_weight: lambda.
+        region: only its pixels have changed since the target was told to `remember` a picture. The derivative is the
+            whole view's; the value leaves out what cannot have changed: pixels outside, windows that see none inside.
+
     Raises:
-        ValueError: image and target differ in size.
+        ValueError: image and target differ in size, or nothing is known about what surrounds the region.
     """
-    if tuple(image.shape) != tuple(target.shape):
-        raise ValueError(f"recon_loss(): `image` must be {target.shape} like its target, got {tuple(image.shape)}.")
-    if target.weight is not None:
-        image = image * target.weight
-    return dr.custom(_Recon, image.array, target, dssim_weight)
+    expected = tuple(target.shape if region is None else region.shape(3))
+    if tuple(image.shape) != expected:
+        raise ValueError(f"recon_loss(): `image` must be {expected} like its target, got {tuple(image.shape)}.")
+    if region is None or region.whole:
+        return dr.custom(_Whole, image.array, target, dssim_weight)
+    if (region.height, region.width) != target.shape[:2]:
+        raise ValueError(
+            f"recon_loss(): `region` must be of a {target.shape[1]}x{target.shape[0]} view like its target, got "
+            f"{region.width}x{region.height}."
+        )
+    if target.surroundings is None:
+        raise ValueError(
+            "recon_loss(): what surrounds `region` must be known, got nothing; call target.remember(image) once before."
+        )
+    return dr.custom(_Part, image.array, target, dssim_weight, region)
 
 
 class _Recon(dr.CustomOp):
-    def eval(self, x: Any, target: Target, weight: float) -> Any:
-        y, (H, W, _) = target.pixels, target.shape
-        n = H * W * 3
-        lane = dr.arange(mi.UInt32, n)
-        texel = lane // 3 * 6 + lane % 3  # into the target's blurred y and y^2, interleaved [H, W, 6]
-        mu_y, yy = dr.gather(mi.Float, target.blurred, texel), dr.gather(mi.Float, target.blurred, texel + 3)
-        mu_x, xx, xy = _blur3(x, x * x, x * y, H, W)
+    gradient: Any
 
-        a1, a2 = 2 * mu_x * mu_y + _C1, 2 * (xy - mu_x * mu_y) + _C2
-        b1, b2 = mu_x * mu_x + mu_y * mu_y + _C1, xx - mu_x * mu_x + yy - mu_y * mu_y + _C2
-        inverse = dr.rcp(b1 * b2)
-        ssim = a1 * a2 * inverse
-        # dSSIM/d(mu_x, xx, xy), then through the window, which is its own transpose
-        d_xy, d_xx = 2 * a1 * inverse, -ssim * dr.rcp(b2)
-        d_mu = 2 * (mu_y * (a2 - a1) * inverse - mu_x * ssim * (dr.rcp(b1) - dr.rcp(b2)))
-        d_mu, d_xx, d_xy = _blur3(d_mu, d_xx, d_xy, H, W)
-
-        error = x - y
-        scale = 1 / n
-        self.grad = (1 - weight) * scale * dr.sign(error) * dr.select(error == 0, 0, 1)
-        self.grad -= weight * scale * (d_mu + 2 * x * d_xx + y * d_xy)
-        loss = (1 - weight) * dr.mean(dr.abs(error)) + weight * (1 - dr.mean(ssim))
-        dr.eval(self.grad, loss)
+    def finish(self, gradient: Any, loss: Any) -> Any:
+        """Keep the derivative for `backward`, and return the value."""
+        self.gradient = gradient
+        dr.eval(gradient, loss)
         return loss
 
     def backward(self) -> None:
-        self.set_grad_in("x", self.grad * self.grad_out())
+        self.set_grad_in("x", self.gradient * self.grad_out())
 
     def forward(self) -> None:
-        self.set_grad_out(dr.dot(self.grad, self.grad_in("x")))
+        self.set_grad_out(dr.dot(self.gradient, self.grad_in("x")))
 
     def name(self) -> str:
         return "morgs_mi.recon_loss"
 
 
-def _blur3(a: Any, b: Any, c: Any, H: int, W: int) -> tuple[Any, Any, Any]:
-    """Blur three pictures [H * W * 3] in one pass of OpenCV's separable filter, six times as fast as `dr.convolve`."""
-    n = H * W * 3
-    stacked = dr.empty(mi.Float, 3 * n)
-    texel = dr.arange(mi.UInt32, n)
-    texel = texel // 3 * 9 + texel % 3
-    for k, picture in enumerate((a, b, c)):
-        dr.scatter(stacked, picture, texel + 3 * k, mode=dr.ReduceMode.NoConflicts)
-    blurred = mi.Float(_blur(np.asarray(stacked).reshape(H, W, 9)).ravel())
-    a, b, c = (dr.gather(mi.Float, blurred, texel + 3 * k) for k in range(3))
-    return a, b, c
+class _Whole(_Recon):
+    def eval(self, x: Any, target: Target, weight: float) -> Any:
+        planes = target.planes
+        picture = target.weighed(planes.of(x * dr.opaque(mi.Float, 1)))  # in memory of our own
+        gradient, loss = _passes(picture, target, weight, target.windows, target.lines)
+        return self.finish(planes.picture(target.weighed(gradient)), loss)
 
 
-def _blur(image: np.ndarray) -> np.ndarray:
-    return cv2.sepFilter2D(image, -1, _WINDOW, _WINDOW, borderType=cv2.BORDER_CONSTANT)
+class _Part(_Recon):
+    def eval(self, x: Any, target: Target, weight: float, region: Region) -> Any:
+        planes, picture = target.planes, target.surroundings
+        places, inside = planes.places_on(region)
+        dr.scatter(picture, target.weighed(x, places), places, active=inside, mode=dr.ReduceMode.NoConflicts)
+        gradient, loss = _passes(picture, target, weight, planes.runs(region, RADIUS), planes.runs(region, 0))
+        return self.finish(target.weighed(dr.gather(mi.Float, gradient, places, active=inside), places), loss)
+
+
+def _passes(picture: Any, target: Target, weight: float, windows: Runs, pixels: Runs) -> tuple[Any, Any]:
+    """Return dL/dx in planes, set on the runs of `pixels`, and L over the runs of `windows` and `pixels`."""
+    planes, scale = target.planes, dr.opaque(mi.Float, 1 / int(np.prod(target.shape)))
+    dr.eval(picture)
+
+    def products(read: _Read) -> list[list[Any]]:
+        x, y = read(picture), read(target.pixels)
+        return [x, [v * v for v in x], [v * w for v, w in zip(x, y, strict=True)]]
+
+    def similarity(read: _Read, blurred: list[Any]) -> tuple[list[list[Any]], list[Any]]:
+        mean, variance = read(target.mean), read(target.variance)
+        terms = [_similarity(*values) for values in zip(*blurred, mean, variance, strict=True)]
+        ssim, *derivatives = map(list, zip(*terms, strict=True))
+        return derivatives, ssim
+
+    derivatives, ssim = _walk(planes, windows, products, similarity, 3)
+
+    def as_they_are(read: _Read) -> list[list[Any]]:
+        return [read(plane) for plane in derivatives]
+
+    def gradient(read: _Read, blurred: list[Any]) -> tuple[list[list[Any]], list[Any]]:
+        rows, errors = [], []
+        for x, y, d_x, d_xx, d_xy in zip(read(picture), read(target.pixels), *blurred, strict=True):
+            error, structure = x - y, dr.fma(y, d_xy, dr.fma(2 * x, d_xx, d_x))
+            sign = dr.select(error > 0, 1.0, dr.select(error < 0, -1.0, 0.0))
+            rows.append(scale * ((1 - weight) * sign - weight * structure))
+            errors.append(dr.abs(error))
+        return [rows], errors
+
+    (grad,), error = _walk(planes, pixels, as_they_are, gradient, 1)
+    return grad, scale * ((1 - weight) * error + weight * (dr.opaque(mi.Float, windows.num_pixels) - ssim))
+
+
+def _similarity(mx: Any, xx: Any, xy: Any, my: Any, variance: Any) -> tuple[Any, Any, Any, Any]:
+    """Return SSIM of a window and its derivatives by M x, M xx and M xy."""
+    a1, a2 = dr.fma(2 * mx, my, _C1), dr.fma(2.0, dr.fma(-mx, my, xy), _C2)
+    b1, b2 = dr.fma(mx, mx, dr.fma(my, my, _C1)), dr.fma(-mx, mx, xx) + (variance + _C2)
+    r1, r2 = dr.rcp(b1), dr.rcp(b2)
+    r12 = r1 * r2
+    ssim = a1 * a2 * r12
+    d_x = 2 * dr.fma(my * r12, a2 - a1, mx * ssim * (r2 - r1))
+    return ssim, d_x, -ssim * r2, 2 * a1 * r12
+
+
+def _walk(planes: Planes, runs: Runs, across: Any, finish: Any, outputs: int) -> tuple[list[Any], Any]:
+    """Walk down the runs with a window: blur what `across` reads of each row, and write what `finish` makes of it.
+
+    Args:
+        planes: the layout.
+        runs: the lanes' rows.
+        across: read -> three rows of numbers, 5 more on both sides than a strip is wide.
+        finish: (read, three blurred rows of a strip) -> (rows of a strip to write, row of a strip to sum up).
+        outputs: how many rows it writes.
+
+    Returns:
+        The planes that were written, set on the runs, and the sum over all pixels of the picture.
+    """
+    many = packet_type()
+    height = dr.opaque(mi.Int32, planes.height)
+    targets = [dr.empty(mi.Float, planes.size) for _ in range(outputs)]
+
+    def blurred(row: Any, height: Any, places: Any) -> Any:
+        inside, down = (row >= 0) & (row < height), mi.UInt32(row) * COLUMN
+
+        def wide(plane: Any) -> list[Any]:
+            numbers = [v for place in places for v in read_packet(plane, place + down, inside)]
+            return numbers[STRIP - RADIUS : 2 * STRIP + RADIUS]
+
+        sums = []
+        for values in across(wide):
+            shifted = [many(values[k : k + STRIP]) for k in range(2 * RADIUS + 1)]
+            total = shifted[0] * _TAPS[0]
+            for tap, v in zip(_TAPS[1:], shifted[1:], strict=True):
+                total = dr.fma(v, tap, total)
+            sums += list(total)
+        return many(sums)
+
+    def body(row, end, first, places, columns, height, windows, total, targets):
+        # Two rows at a time, so that the windows are read and written half as often. Window k ends k rows further down.
+        a, b, w = blurred(row, height, places), blurred(row + 1, height, places), _TAPS
+        done = dr.fma(a, w[0], windows[0]), dr.fma(b, w[0], dr.fma(a, w[1], windows[1]))
+        windows = [dr.fma(a, w[k], dr.fma(b, w[k - 1], windows[k])) for k in range(2, 2 * RADIUS)]
+        windows += [dr.fma(a, w[-1], b * w[-2]), b * w[-1]]
+
+        there = [columns > k for k in range(STRIP)]
+        for k in range(2):
+            at = row + k - RADIUS
+            center, ready = places[1] + mi.UInt32(at) * COLUMN, (at >= first) & (at < end)
+
+            def narrow(plane: Any, center: Any = center, ready: Any = ready) -> list[Any]:
+                return list(read_packet(plane, center, ready))
+
+            sums = list(done[k])
+            written, summed = finish(narrow, [sums[STRIP * c : STRIP * (c + 1)] for c in range(3)])
+            for target, values in zip(targets, written, strict=True):
+                write_packet(target, [dr.select(t, v, 0) for t, v in zip(there, values, strict=True)], center, ready)
+            for t, v in zip(there, summed, strict=True):
+                total = total + dr.select(t & ready, v, 0)
+        return row + 2, end, first, places, columns, height, windows, total, targets
+
+    windows = [many([mi.Float(0) for _ in range(3 * STRIP)]) for _ in range(2 * RADIUS)]
+    state = (
+        runs.first - RADIUS,
+        runs.end,
+        runs.first,
+        runs.places,
+        runs.columns,
+        height,
+        windows,
+        mi.Float(0),
+        targets,
+    )
+    *_, total, targets = dr.while_loop(state, lambda row, end, *_: row < end + RADIUS, body, label="window")
+    sums = dr.sum(total)
+    dr.eval(targets, sums)
+    return targets, sums
 
 
 def flow_loss(motion: Any, cue: Any, reliable: Any) -> Any:

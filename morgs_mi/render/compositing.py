@@ -22,7 +22,7 @@ from morgs_mi.render.loops import (
     record_packets,
     tangent,
 )
-from morgs_mi.render.region import Region
+from morgs_mi.render.region import Region, quotient
 
 __all__ = ["Channel", "Layout", "blend"]
 
@@ -117,7 +117,7 @@ def _cropped(picture: Any, region: Region, size: int) -> Any:
     if not region.whole or region.row == region.width:
         return picture
     lane = dr.arange(mi.UInt32, region.width * region.height * size)
-    row = _quotient(lane, region.width * size)
+    row = quotient(lane, region.width * size)
     return dr.gather(mi.Float, picture, lane + row * dr.opaque(mi.UInt32, (region.row - region.width) * size))
 
 
@@ -127,16 +127,12 @@ def _padded(picture: Any, region: Region, size: int) -> Any:
     if dr.width(picture) != dr.prod(region.shape(size)):
         return dr.opaque(mi.Float, 0, total)
     if not region.whole or region.row == region.width:
-        return picture
+        # In memory of our own (see `region.owned`), by what fuses with whatever computes the gradient.
+        return picture * dr.opaque(mi.Float, 1)
     lane = dr.arange(mi.UInt32, total)
-    row = _quotient(lane, region.row * size)
+    row = quotient(lane, region.row * size)
     column, width = lane - row * dr.opaque(mi.UInt32, region.row * size), dr.opaque(mi.UInt32, region.width * size)
     return dr.gather(mi.Float, picture, row * width + column, active=column < width)
-
-
-def _quotient(lane: Any, divisor: int) -> Any:
-    """Return lane // divisor: exact, since half a step is more than what a double rounds away."""
-    return mi.UInt32((mi.Float64(lane) + 0.5) * dr.opaque(mi.Float64, 1 / divisor))
 
 
 def _summed_by_rank(pairs: Any, N: int, layout: Layout) -> Any:

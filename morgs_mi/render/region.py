@@ -15,7 +15,7 @@ import numpy as np
 
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["ACROSS", "DOWN", "NO_SLOT", "Region", "whole_view"]
+__all__ = ["ACROSS", "DOWN", "NO_SLOT", "Region", "owned", "quotient", "whole_view"]
 
 # Blocks of a tile, across and down: as many as a word has bits.
 ACROSS, DOWN = 4, 8
@@ -52,6 +52,18 @@ class Region:
             )
         self._build(mask, config or RenderConfig(), whole=False)
 
+    home: Any
+    part: Any
+    x: Any
+    y: Any
+    place: Any
+    pitch: Any
+    rows: Any
+    grid: Any
+    slot_of: Any
+    block_table: Any
+    tile_table: Any
+
     def _build(self, mask: np.ndarray, config: RenderConfig, whole: bool) -> None:
         H, W = mask.shape
         bw, bh = config.block_shape(dr.backend_v(mi.Float) == dr.JitBackend.CUDA)
@@ -73,19 +85,26 @@ class Region:
 
         self.num_blocks, self.num_tiles = len(x), len(tiles)
         self.row, self.num_pixels = pitch, pitch * H if whole else len(x) * bw * bh
-        self.corner_x = mi.Float(np.float32(tiles % self.across * (ACROSS * bw)))
-        self.corner_y = mi.Float(np.float32(tiles // self.across * (DOWN * bh)))
-        self.slot_of = mi.UInt32(slot_of)
-        self.block_table = _summed_area(blocks)
-        self.tile_table = _summed_area(active.any(1).reshape(self.down, self.across))
-        self.home, self.part, self.x, self.y = (mi.UInt32(v) for v in (home, part, x, y))
         # Pixels are read and written in packets of 4 floats: places and pitch count by fours.
-        self.place, self.pitch = mi.UInt32(place // 4), mi.UInt32([pitch // 4])
-        self.rows = mi.UInt32(np.minimum(H - y, bh) if whole else np.full(len(y), bh))
-        self.grid = mi.UInt32([self.across, self.down])
+        arrays = {
+            "home": home,
+            "part": part,
+            "x": x,
+            "y": y,
+            "place": place // 4,
+            "pitch": [pitch // 4],
+            "rows": np.minimum(H - y, bh) if whole else np.full(len(y), bh),
+            "grid": [self.across, self.down],
+            "slot_of": slot_of,
+            "block_table": _summed_area(blocks),
+            "tile_table": _summed_area(active.any(1).reshape(self.down, self.across)),
+        }
+        for name, values in arrays.items():
+            setattr(self, name, owned(mi.UInt32(np.asarray(values, np.uint32))))
+        self.corner_x = owned(mi.Float(np.float32(tiles % self.across * (ACROSS * bw))))
+        self.corner_y = owned(mi.Float(np.float32(tiles // self.across * (DOWN * bh))))
         inside = None if whole else self.inside()
-        self.weights = None if inside is None or inside.all() else mi.Float(np.float32(inside).ravel())
-        dr.eval(vars(self))
+        self.weights = None if inside is None or inside.all() else owned(mi.Float(np.float32(inside).ravel()))
 
     def shape(self, channels: int) -> tuple[int, ...]:
         """Return the shape of a picture on this region."""
@@ -122,9 +141,25 @@ class Region:
         return picture
 
 
-def _summed_area(grid: np.ndarray) -> Any:
+def _summed_area(grid: np.ndarray) -> np.ndarray:
     """Return how many cells are set to the left of and above every corner of a grid [R, C], flat [(R + 1) (C + 1)]."""
-    return mi.UInt32(np.pad(grid, ((1, 0), (1, 0))).cumsum(0).cumsum(1).astype(np.uint32).ravel())
+    return np.pad(grid, ((1, 0), (1, 0))).cumsum(0).cumsum(1).ravel()
+
+
+def owned(values: Any) -> Any:
+    """Return a copy in memory of Dr.Jit's own, evaluated.
+
+    It borrows NumPy's memory where it can. Packets cannot be read from there unless it happens to be aligned, and
+    kernels would be compiled for both cases; a gather does not care. The opaque 0 keeps it from being optimised away.
+    """
+    copy = dr.gather(type(values), values, dr.arange(mi.UInt32, dr.width(values)) + dr.opaque(mi.UInt32, 0))
+    dr.eval(copy)
+    return copy
+
+
+def quotient(lane: Any, divisor: int) -> Any:
+    """Return lane // divisor, of which no kernel knows: half a step is more than what a double rounds away."""
+    return mi.UInt32((mi.Float64(lane) + 0.5) * dr.opaque(mi.Float64, 1 / divisor))
 
 
 def whole_view(width: int, height: int, config: RenderConfig) -> Region:

@@ -9,6 +9,7 @@ import pytest
 
 from morgs_mi.evaluate.metrics import ssim
 from morgs_mi.fit.losses import Target, flow_loss, mask_loss, offset_loss, recon_loss
+from morgs_mi.render.region import Region
 from tests import tolerances as tol
 
 SIZE = (19, 23, 3)
@@ -125,3 +126,76 @@ def test_mask_and_offset_losses():
     assert found == pytest.approx(np.abs(confidence[..., 0] - mask).mean(), rel=1e-5)
     offset = rng.normal(size=(7, 3)).astype(np.float32)
     assert item(offset_loss(mi.TensorXf(offset), 2.0)) == pytest.approx(np.abs(offset).sum(1).mean() / 2, rel=1e-5)
+
+
+@pytest.mark.parametrize("width", [64, 77])
+@pytest.mark.parametrize("masked", [False, True])
+def test_recon_loss_on_a_region_teaches_what_the_whole_view_does(width, masked):
+    """Where only a region has changed, its derivative is the whole view's, and the value changes by as much."""
+    height, rng = 150, np.random.default_rng(4)
+    y, x = np.mgrid[:height, :width]
+    drawn = (x - 30) ** 2 + (y - 100) ** 2 < 15**2
+    drawn[0, 0] = drawn[-1, -1] = drawn[70, 5] = True
+    region = Region(drawn)
+    truth, before = (np.float32(rng.uniform(size=(height, width, 3))) for _ in range(2))
+    changed = region.cut(before) + np.float32(rng.normal(size=region.shape(3))) * region.inside()[..., None] * 0.1
+    after = region.paste(changed, before)
+    target = Target(truth, rng.uniform(size=drawn.shape) < 0.8 if masked else None)
+    target.remember(mi.TensorXf(before))
+
+    def evaluate(picture, where):
+        tensor = mi.TensorXf(np.float32(picture))
+        dr.enable_grad(tensor)
+        loss = recon_loss(tensor, target, 0.3, where)
+        dr.backward(loss)
+        return item(loss), np.asarray(dr.grad(tensor))
+
+    found, found_grad = evaluate(changed, region)
+    expected, expected_grad = evaluate(after, None)
+    scale = np.abs(expected_grad).max()
+    assert np.abs(found_grad - region.cut(expected_grad)).max() < tol.SUM_ORDER_REL * scale
+    (old, _), (old_part, _) = evaluate(before, None), evaluate(region.cut(before), region)
+    assert found - old_part == pytest.approx(expected - old, abs=tol.LOSS_REL * expected)
+    again, again_grad = evaluate(changed, region)  # the surroundings have not suffered
+    assert (again, np.abs(again_grad - found_grad).max()) == (found, 0)
+
+
+@pytest.mark.parametrize("width", [23, 24])
+def test_error_is_that_of_every_pixel(width):
+    rng = np.random.default_rng(0)
+    image, truth = (np.float32(rng.uniform(size=(19, width, 3))) for _ in range(2))
+    mask = rng.uniform(size=(19, width)) < 0.7
+    found = Target(truth, mask).error(mi.TensorXf(image))
+    assert np.allclose(found, np.abs(image - truth).mean(2) * mask, atol=1e-6)
+
+
+def test_a_region_needs_surroundings(pictures):
+    image, target = (np.zeros((32, 40, 3), np.float32) for _ in range(2))
+    mask = np.zeros((32, 40), bool)
+    mask[3, 4] = True
+    region = Region(mask)
+    with pytest.raises(ValueError, match=r"what surrounds `region` must be known, got nothing; call target.remember"):
+        recon_loss(mi.TensorXf(region.cut(image)), Target(target), region=region)
+    with pytest.raises(ValueError, match=r"`image` must be \(1, 4, 8, 3\) like its target"):
+        recon_loss(mi.TensorXf(image), Target(target), region=region)
+    with pytest.raises(ValueError, match="`region` must be of a 23x19 view like its target, got 40x32"):
+        recon_loss(mi.TensorXf(region.cut(image)), Target(pictures[1]), region=region)
+
+
+def test_recon_kernels_are_compiled_once_for_all_sizes():
+    rng = np.random.default_rng(0)
+
+    def step(height, width):
+        image = mi.TensorXf(np.float32(rng.uniform(size=(height, width, 3)))) * dr.opaque(mi.Float, 1)
+        dr.eval(image)
+        dr.enable_grad(image)
+        dr.backward(recon_loss(image, Target(np.asarray(image))))
+        dr.eval(dr.grad(image))
+        dr.sync_thread()
+
+    step(40, 48)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        step(90, 72)
+        compiled = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and not k["cache_hit"]]
+    assert not compiled, [k["operation_count"] for k in compiled]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
-from morgs_mi.render.region import Region
+from morgs_mi.render.region import Region, owned
 from tests import tolerances as tol
 
 CHANNELS = ("color", "alpha", "depth", "motion", "confidence")
@@ -185,3 +185,25 @@ def test_bad_regions_are_refused(raw, camera, mask):
     broken = raw | {"means": np.where(np.arange(360).reshape(120, 3) == 7, np.nan, raw["means"])}
     with pytest.raises(ValueError, match=r"`means` must be finite, got nan at \[2, 1\]"):
         rasterize(Gaussians(**broken), camera, region=Region(mask))
+
+
+@pytest.mark.parametrize("offset", range(4))
+def test_gradients_from_memory_of_any_alignment(raw, offset):
+    """A gradient may lie in NumPy's memory, at any address: the loops read packets of floats."""
+    camera = Camera.look_at((0, 0, -3.0), (0, 0, 0), (0, -1, 0), 45.0, 64, 32)
+    memory = np.ones(64 * 32 * 3 + 4, np.float32)
+    seed = memory[offset : offset + 64 * 32 * 3].reshape(32, 64, 3)
+    gaussians = Gaussians(**raw)
+    dr.enable_grad(gaussians.means)
+    image = rasterize(gaussians, camera, ("color",)).color
+    dr.set_grad(image, mi.TensorXf(seed))
+    dr.enqueue(dr.ADMode.Backward, image)
+    dr.traverse(dr.ADMode.Backward)
+    assert np.isfinite(np.asarray(dr.grad(gaussians.means))).all()
+
+
+def test_owned_memory_is_aligned():
+    borrowed = mi.Float(np.arange(1001, dtype=np.float32)[1:])
+    copy = np.asarray(owned(borrowed))
+    assert np.array_equal(copy, np.arange(1, 1001))
+    assert copy.__array_interface__["data"][0] % 64 == 0

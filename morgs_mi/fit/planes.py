@@ -1,0 +1,173 @@
+"""Pictures as planes, and the runs of rows in which a separable window walks over them.
+
+A strip is 8 pixels across, a column 16 strips. The three components of a picture [H, W, 3] lie one after the other,
+each column by column, and a column row by row: 16 SIMD lanes that walk down 16 strips side by side read one stretch of
+memory. Two strips of zeros lie on either side of a picture: there the derivatives of its windows are 0, and read.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.render.region import Region, owned, quotient
+
+__all__ = ["COLUMN", "RADIUS", "STRIP", "Planes", "Runs", "packet_type", "read_packet", "write_packet"]
+
+RADIUS = 5
+STRIP = 8  # pixels across: a window reaches at most into the next strip
+COLUMN = 16  # strips
+_SPARE = 2  # strips on either side
+# Rows of a run: enough that the 10 rows before it hardly count, few enough to keep every thread busy.
+_LONGEST = 64
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Stretches of rows of strips, one per SIMD lane, in all three planes.
+
+    Attributes:
+        places: where row 0 of the strip to the left, of the strip, and of the one to the right lie, in strips.
+        first: row.
+        end: row.
+        columns: of the strip that lie in the picture, 0 to 8.
+        num_pixels: in the picture, over all runs.
+    """
+
+    places: tuple[Any, Any, Any]
+    first: Any
+    end: Any
+    columns: Any
+    num_pixels: int
+
+
+class Planes:
+    """The layout of a picture [H, W, 3] in planes."""
+
+    def __init__(self, height: int, width: int) -> None:
+        self.height, self.width = height, width
+        self.num_strips = -(-width // STRIP)
+        self.num_columns = -(-(self.num_strips + 2 * _SPARE) // COLUMN)
+        self.size = 3 * self.num_columns * height * COLUMN * STRIP
+
+    def of(self, picture: Any) -> Any:
+        """Return the planes of a flat picture [H * W * 3] in memory of Dr.Jit's own (see `region.owned`)."""
+        if self.width % STRIP == 0:
+            target = dr.zeros(mi.Float, self.size)
+            lane, places = self._strips()
+            reads = [read_packet(picture, 3 * lane + k) for k in range(3)]
+            values = [v for read in reads for v in read]
+            for component, place in enumerate(places):
+                write_packet(target, values[component::3], place)
+            return target
+        lane = dr.arange(mi.UInt32, self.size)
+        line, x = lane // (COLUMN * STRIP), lane % (COLUMN * STRIP)
+        column = quotient(line, self.height)
+        y = line - column * dr.opaque(mi.UInt32, self.height)
+        component = quotient(column, self.num_columns)
+        column -= component * dr.opaque(mi.UInt32, self.num_columns)
+        x += column * (COLUMN * STRIP) - _SPARE * STRIP
+        width = dr.opaque(mi.UInt32, self.width)
+        return dr.gather(mi.Float, picture, (y * width + x) * 3 + component, active=x < width)
+
+    def picture(self, planes: Any) -> Any:
+        """Return the flat picture [H * W * 3] of planes."""
+        if self.width % STRIP == 0:
+            target = dr.empty(mi.Float, 3 * self.height * self.width)
+            lane, places = self._strips()
+            rows = zip(*(read_packet(planes, place) for place in places), strict=True)
+            values = [v for pixel in rows for v in pixel]
+            for k in range(3):
+                write_packet(target, values[STRIP * k : STRIP * (k + 1)], 3 * lane + k)
+            return target
+        lane = dr.arange(mi.UInt32, 3 * self.height * self.width)
+        pixel = lane // 3
+        y = quotient(pixel, self.width)
+        place = self._place(lane - 3 * pixel, y, pixel - y * dr.opaque(mi.UInt32, self.width))
+        return dr.gather(mi.Float, planes, place)
+
+    def _strips(self) -> tuple[Any, list[Any]]:
+        """Return all rows of all strips, and where they lie in each plane, in strips; for a width of whole strips."""
+        lane = dr.arange(mi.UInt32, self.height * self.num_strips)
+        y = quotient(lane, self.num_strips)
+        x = (lane - y * dr.opaque(mi.UInt32, self.num_strips)) * STRIP
+        return lane, [self._place(mi.UInt32(component), y, x) // STRIP for component in range(3)]
+
+    def _place(self, component: Any, y: Any, x: Any) -> Any:
+        return _place(component, y, x, dr.opaque(mi.UInt32, self.height), dr.opaque(mi.UInt32, self.num_columns))
+
+    def places_on(self, region: Region) -> tuple[Any, Any]:
+        """Return where the numbers of a flat picture on a region lie, and which of them are in the view."""
+        x, y = (np.repeat(v.ravel(), 3) for v in region.pixels())
+        component = np.tile(np.arange(3), len(x) // 3)
+        inside = (x < self.width) & (y < self.height)
+        places = np.where(inside, _place(component, y, x, self.height, self.num_columns), 0)
+        return owned(mi.UInt32(places)), owned(mi.UInt32(inside)) != 0
+
+    def runs(self, region: Region | None, reach: int) -> Runs:
+        """Return the runs that cover a region, or the whole view, and `reach` <= 8 pixels around it."""
+        drawn = np.ones((self.height, self.num_strips), bool)
+        if region is not None:
+            x, y = region.pixels()
+            inside = (x < self.width) & (y < self.height)
+            drawn[:] = False
+            drawn[y[inside], x[inside] // STRIP] = True
+        drawn = np.pad(drawn, ((reach, reach), (1, 1)))
+        if reach:
+            drawn[:, 1:-1] |= drawn[:, 2:] | drawn[:, :-2]
+            drawn[:, 0], drawn[:, -1] = drawn[:, 1], drawn[:, -2]
+            count = np.pad(drawn, ((1, 0), (0, 0))).cumsum(0)
+            drawn = count[2 * reach + 1 :] > count[: -2 * reach - 1]
+        strip, first, end = _stretches(drawn.T)
+        columns = np.clip(self.width - (strip - 1) * STRIP, 0, STRIP) * (strip > 0)
+        component = np.repeat(np.arange(3), len(strip))
+        x = np.tile(strip - 1, 3) * STRIP
+        places = (_place(component, 0, x + k * STRIP, self.height, self.num_columns) // STRIP for k in (-1, 0, 1))
+        return Runs(
+            tuple(owned(mi.UInt32(place)) for place in places),  # type: ignore[arg-type]
+            owned(mi.Int32(np.tile(first, 3))),
+            owned(mi.Int32(np.tile(end, 3))),
+            owned(mi.UInt32(np.tile(columns, 3))),
+            3 * int(((end - first) * columns).sum()),
+        )
+
+
+def read_packet(values: Any, place: Any, active: Any = True) -> Any:
+    """Return the 8 floats at 8 `place`."""
+    return dr.gather(packet_type(), values, place, active=active, shape=(STRIP, dr.width(place)))
+
+
+def write_packet(target: Any, values: list[Any], place: Any, active: Any = True) -> None:
+    """Write 8 floats to 8 `place`; no two lanes to the same."""
+    dr.scatter(target, packet_type()(values), place, active=active, mode=dr.ReduceMode.NoConflicts)
+
+
+def packet_type() -> Any:
+    """Return Dr.Jit's array of arrays of floats: it is read and written in packets, and as many at once as it holds."""
+    return sys.modules[mi.Float.__module__].ArrayXf  # type: ignore[attr-defined]
+
+
+def _place(component: Any, y: Any, x: Any, height: Any, num_columns: Any) -> Any:
+    """Return where a number lies; of integers, NumPy's or Dr.Jit's."""
+    x = x + _SPARE * STRIP
+    column = component * num_columns + x // (COLUMN * STRIP)
+    return (column * height + y) * (COLUMN * STRIP) + x % (COLUMN * STRIP)
+
+
+def _stretches(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (line, first, end) of all stretches of set cells in the lines of [L, M], none longer than `_LONGEST`."""
+    edges = np.diff(np.pad(cells, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    line, first = np.nonzero(edges == 1)
+    end = np.nonzero(edges == -1)[1]
+    parts = -(-(end - first) // _LONGEST)
+    which = np.repeat(np.arange(len(line)), parts)
+    first = first[which] + _LONGEST * (np.arange(len(which)) - np.repeat(parts.cumsum() - parts, parts))
+    end, line = np.minimum(end[which], first + _LONGEST), line[which]
+    # The lanes of a packet are neighbours in one column.
+    order = np.lexsort((line, first, (line + _SPARE - 1) // COLUMN))
+    return line[order], first[order], end[order]
