@@ -1,0 +1,169 @@
+"""A decoder written from docs/stream-format.md alone: slow, obvious, and without the package's code."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+import struct
+import zlib
+
+import numpy as np
+
+F = (1.0, 1.189207115002721, 1.4142135623730951, 1.681792830507429)
+U64 = 2**64
+
+
+class RangeCode:
+    def __init__(self, words):
+        self.words = [int(w) for w in words]
+        self.low, self.range, self.at = 0, U64 - 1, 2
+        self.point = self.word(0) << 32 | self.word(1)
+
+    def word(self, i):
+        return self.words[i] if i < len(self.words) else 0
+
+    def symbol(self, lefts):
+        """Decode one symbol; `lefts` are the left ends of the intervals and 2^24."""
+        scale = self.range >> 24
+        t = ((self.point - self.low) % U64) // scale
+        assert t < 2**24, "the code is broken"
+        i = int(np.searchsorted(lefts, t, side="right")) - 1
+        self.low = (self.low + scale * int(lefts[i])) % U64
+        self.range = scale * int(lefts[i + 1] - lefts[i])
+        if self.range < 2**32:
+            self.low, self.range = (self.low << 32) % U64, self.range << 32
+            self.point = (self.point << 32) % U64 | self.word(self.at)
+            self.at += 1
+        return i
+
+    def bits(self, b):
+        return self.symbol(np.arange(2**b + 1, dtype=np.int64) << (24 - b))
+
+    def column(self, n):
+        weights, tokens, end = [max(1, 256 // (i + 1) ** 2) for i in range(85)], [], 16
+        while len(tokens) < n:
+            before = np.concatenate([[0], np.cumsum(weights)[:-1]]).astype(np.float64)
+            s = (2**24 - 85) / float(sum(weights))
+            lefts = np.append(np.floor(s * before).astype(np.int64) + np.arange(85), 2**24)
+            block = [self.symbol(lefts) for _ in range(min(end, n) - len(tokens))]
+            for token in block:
+                weights[token] += 32
+            tokens, end = tokens + block, 2 * end
+        ks = [(token + 1) // 2 - 12 if token > 30 else 0 for token in tokens]
+        rest = [self.bits(min(k, 16)) if k else 0 for k in ks]
+        rest = [low | self.bits(k - 16) << 16 if k > 16 else low for low, k in zip(rest, ks, strict=True)]
+        sizes = [2**k + r if k else (t + 1) // 2 for t, k, r in zip(tokens, ks, rest, strict=True)]
+        return np.array([v if t % 2 else -v for t, v in zip(tokens, sizes, strict=True)], dtype=np.int64)
+
+
+def packets(data):
+    assert data[:12] == b"MORGS-MI" + struct.pack("<I", 2)
+    at = 12
+    while at < len(data):
+        kind, frame, length, crc = struct.unpack_from("<IIQI", data, at)
+        payload = data[at + 20 : at + 20 + length]
+        assert zlib.crc32(data[at : at + 16] + payload) == crc
+        yield kind, frame, payload
+        at += 20 + length
+
+
+def arrays(payload):
+    (size,) = struct.unpack_from("<I", payload)
+    at, found = 4 + size, {}
+    for name, dtype, shape in json.loads(payload[4:at]):
+        count = math.prod(shape)
+        found[name] = np.frombuffer(payload, np.dtype(dtype).newbyteorder("<"), count, at).reshape(shape)
+        at += found[name].nbytes
+    assert at == len(payload)
+    return found
+
+
+def born(code, N, degree, confidence):
+    C = 10 + 3 * (degree + 1) ** 2 + confidence
+    middle = code.column(9 + confidence + C)
+    columns = np.stack([code.column(N) + shift for shift in middle], axis=1)
+    return columns[:, 0], columns[:, 1 : 9 + confidence], columns[:, 9 + confidence :]
+
+
+def groups(state):
+    ends = [0, 3, 6, 9, 10, 13, 10 + 3 * (state["degree"] + 1) ** 2]
+    ends.append(ends[-1] + state["confidence"])
+    return [range(a, b) for a, b in itertools.pairwise(ends)]
+
+
+def keyframe(payload):
+    found = arrays(payload)
+    N, degree, confidence, next_id = (int(x) for x in found["head"])
+    code = RangeCode(found["code"])
+    ids = np.cumsum(code.column(N) + 1) - 1
+    state = {"ids": ids, "degree": degree, "confidence": confidence, "next_id": next_id}
+    state["pivots"], state["exponents"], state["values"] = born(code, N, degree, confidence)
+    return state
+
+
+def digest(state):
+    parts = [state["ids"].astype("<u4"), state["pivots"].astype("u1"), state["exponents"].astype("i1")]
+    parts += [state["values"].astype("<i4"), np.array([state["next_id"], state["degree"]], "<u4")]
+    return hashlib.blake2b(b"".join(part.tobytes() for part in parts), digest_size=8).digest()
+
+
+def residual(state, payload):
+    found = arrays(payload)
+    assert found["parent"].tobytes() == digest(state)
+    births, coarseness = (int(x) for x in found["head"])
+    code, values, dead = RangeCode(found["code"]), state["values"].copy(), np.zeros(len(state["ids"]), bool)
+    moving = values[:, -1] > 0 if state["confidence"] else np.zeros(len(values), bool)
+    for members in (np.flatnonzero(~moving), np.flatnonzero(moving)):
+        geometry, look = code.column(len(members)), np.zeros(len(members), np.int64)
+        look[geometry == 0] = code.column(int((geometry == 0).sum()))
+        other = (geometry > 0) & (geometry < 8)
+        look[other] = code.column(int(other.sum()))
+        dead[members] = geometry == 8
+        for g, columns in enumerate(groups(state)):
+            flags = (geometry % 8) >> g & 1 if g < 3 else look >> (g - 3) & 1
+            changed = members[flags == 1]
+            for column in columns:
+                r = code.column(len(changed))
+                values[changed, column] += np.rint(r * F[coarseness % 4] * 2.0 ** (coarseness // 4)).astype(np.int64)
+    new = {**state, **{name: state[name][~dead] for name in ("ids", "pivots", "exponents")}, "values": values[~dead]}
+    if births:
+        parts = born(code, births, state["degree"], state["confidence"])
+        for name, part in zip(("pivots", "exponents", "values"), parts, strict=True):
+            new[name] = np.concatenate([new[name], part])
+        new["ids"] = np.concatenate([new["ids"], state["next_id"] + np.arange(births)])
+        new["next_id"] = state["next_id"] + births
+    return new
+
+
+def numbers(state):
+    """Return what a state stands for, by the names of the package."""
+    e, own = state["exponents"], [0, 0, 0, 1, 2, 3, 4, 4, 4, 5, 6, 6, 6]
+    own += [7] * (3 * ((state["degree"] + 1) ** 2 - 1)) + [8] * state["confidence"]
+    real = np.zeros(state["values"].shape)
+    for column, k in enumerate(own):
+        real[:, column] = [
+            int(q) * F[int(x) % 4] * 2.0 ** (int(x) // 4)
+            for q, x in zip(state["values"][:, column], e[:, k], strict=True)
+        ]
+    quats = np.zeros((len(real), 4))
+    for i, pivot in enumerate(state["pivots"]):
+        u, v, w = (float(x) for x in real[i, 6:9])
+        length = math.sqrt(((1 + u * u) + v * v) + w * w)
+        quats[i] = np.insert([u / length, v / length, w / length], int(pivot), 1 / length)
+    end = 10 + 3 * (state["degree"] + 1) ** 2
+    found = {"means": real[:, :3], "log_scales": real[:, 3:6], "quats": quats, "logit_opacities": real[:, 9]}
+    found["sh_coeffs"] = real[:, 10:end].reshape(len(real), -1, 3)
+    if state["confidence"]:
+        found["logit_confidence"] = real[:, end]
+    return {name: value.astype(np.float32) for name, value in found.items()}
+
+
+def states(data):
+    """Yield (frame, state) of a whole stream, once for each frame."""
+    state, last = None, None
+    for kind, frame, payload in packets(data):
+        if kind in (1, 2) and frame != last:
+            state, last = keyframe(payload) if kind == 1 else residual(state, payload), frame
+            yield frame, state
