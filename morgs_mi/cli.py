@@ -29,6 +29,7 @@ from tyro.conf import Positional, arg
 
 from morgs_mi.capture.calibrate import CalibrateConfig
 from morgs_mi.demo import DemoConfig
+from morgs_mi.evaluate.codec_report import CodecReportConfig
 from morgs_mi.evaluate.flow_report import FlowReportConfig
 from morgs_mi.evaluate.renderer_report import RendererReportConfig
 from morgs_mi.evaluate.tables import figure, judgement_sentences, judgement_tables
@@ -373,12 +374,45 @@ class FlowReport:
 
 
 @dataclass(frozen=True)
+class CodecReport:
+    """Measure the stream: bytes per frame against quality against time, beside lzma over raw residuals."""
+
+    captures: Positional[tuple[Path, ...]]
+    """Folders of captures; each is fitted once per quality."""
+    out: Path = Path("out/codec")
+    """Folder for the streams, which stay there."""
+    json: Path | None = None
+    """File for all figures; - prints them in place of the tables."""
+    plot: Path | None = None
+    """Picture of bytes against quality and time, .png or .svg; needs matplotlib."""
+    config: Annotated[CodecReportConfig, arg(name="")] = field(default_factory=CodecReportConfig)
+
+    def run(self) -> None:
+        from morgs_mi.evaluate.codec_report import markdown_table, plot_codec, report_codec
+        from morgs_mi.files import finite, write_json
+
+        with _progress() as report:
+            result = report_codec(self.captures, self.out, self.config, report)
+        if self.json == Path("-"):
+            _say(json.dumps(finite(result), indent=2))
+        else:
+            for clip in result["clips"]:
+                _say(f"{clip['name']}\n\n{markdown_table(clip)}")
+        if self.json not in (None, Path("-")):
+            write_json(self.json, result)
+            _say(f"All figures: {self.json}")
+        if self.plot is not None:
+            plot_codec(result, self.plot)
+
+
+@dataclass(frozen=True)
 class Measure:
     """Measure a part of the package: error beside run time."""
 
     subject: Annotated[
         Annotated[RendererReport, tyro.conf.subcommand("renderer")]
-        | Annotated[FlowReport, tyro.conf.subcommand("flow")],
+        | Annotated[FlowReport, tyro.conf.subcommand("flow")]
+        | Annotated[CodecReport, tyro.conf.subcommand("codec")],
         arg(name=""),
     ]
 

@@ -1,0 +1,56 @@
+"""The codec's report: every figure from the streams that it leaves behind."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi.evaluate.codec_report import CodecReportConfig, markdown_table, plot_codec, report_codec
+from morgs_mi.fit.config import FitConfig
+from morgs_mi.motion.config import MotionConfig
+from morgs_mi.stream_loop import StreamConfig
+
+QUICK = CodecReportConfig(
+    qualities=(4, 40),
+    stream=StreamConfig(
+        fit=FitConfig(sh_degree=0, num_gaussians=150, first_frame_steps=20, epochs=2), motion=MotionConfig(key_views=1)
+    ),
+)
+
+
+def test_coarser_streams_are_smaller_and_lzma_is_larger(clip: Path, tmp_path: Path) -> None:
+    stages = []
+    result = report_codec([clip / "capture"], tmp_path, QUICK, lambda *stage: stages.append(stage))
+    (found,) = result["clips"]
+    rows = found["rows"]
+    assert [row["quality"] for row in rows] == [4, 40, 1000]
+    assert stages[-1] == ("Fitting capture", 3, 3)
+    for row in rows:
+        assert row["file"] == (tmp_path / "capture" / f"{row['quality']:g}" / "stream.morgs").stat().st_size
+        assert row["later"] < row["lzma"] < row["raw"]
+        assert row["loss"] == pytest.approx(rows[-1]["psnr"]["later"] - row["psnr"]["later"])
+        # What is in the packet but for flags, births of the distributions and the packet's frame.
+        assert 0 < sum(row["bytes_by_group"].values()) < 1.1 * row["later"]
+        assert 0 < row["moved"] <= 150
+        assert min(row[name] for name in ("encode_ms", "decode_ms", "lzma_ms")) > 0
+    for name in ("first", "later", "file"):
+        sizes = [row[name] for row in rows]
+        assert sizes == sorted(sizes), name
+    assert np.isfinite(rows[0]["loss"])
+    table = markdown_table(found).splitlines()
+    assert len({line.count("|") for line in table}) == 1
+    assert len(table) == 2 + len(rows)
+    plot_codec(result, tmp_path / "codec.png")
+    assert (tmp_path / "codec.png").stat().st_size > 10_000
+
+
+def test_bad_settings_get_a_sentence(clip: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="`captures` must name at least one folder"):
+        report_codec([], tmp_path, QUICK)
+    with pytest.raises(ValueError, match="expected a capture of two frames or more, got 1"):
+        report_codec([clip / "capture"], tmp_path, replace(QUICK, frames=1))
+    with pytest.raises(ValueError, match="`qualities` must be positive and below the reference's 1000"):
+        CodecReportConfig(qualities=(2000,))
