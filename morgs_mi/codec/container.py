@@ -169,11 +169,12 @@ class StreamWriter:
         """Append one packet and return its number of bytes.
 
         Raises:
-            ValueError: the packet cannot be encoded.
-            OSError: it could not be written; the file ends with the last whole packet again.
+            ValueError: the packet cannot be encoded, or the stream was closed.
+            OSError: it could not be written; a file ends with the last whole packet again.
         """
+        if self._index is None:
+            raise ValueError(f"{self.path}: expected a stream that is still open, got one that was closed.")
         at, size = self.num_bytes, self._append(encode_packet(packet))
-        assert self._index is not None, "written to after it was closed"
         self._index.append((packet.kind, packet.frame, at))
         return size
 
@@ -203,9 +204,10 @@ class StreamWriter:
                 rest = rest[self._file.write(rest) :]
             self._file.flush()
         except BaseException as error:  # a Ctrl-C must leave whole packets too
-            with contextlib.suppress(OSError, AttributeError):  # a pipe or device cannot be taken back
-                self._file.truncate(self.num_bytes)
-                self._file.seek(self.num_bytes)
+            if self._owned:
+                with contextlib.suppress(OSError):  # a device cannot be taken back
+                    self._file.truncate(self.num_bytes)
+                    self._file.seek(self.num_bytes)
             if not isinstance(error, OSError):
                 raise
             raise OSError(

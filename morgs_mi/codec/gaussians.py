@@ -18,10 +18,11 @@ from hashlib import blake2b
 import numpy as np
 
 from morgs_mi.capture.camera import Camera
+from morgs_mi.codec.changes import columns_of_change, take_change
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import Packet, PacketKind
 from morgs_mi.codec.entropy import LIMIT, ColumnReader, ColumnWriter, column_bits
-from morgs_mi.codec.grid import GROUPS, Grid, columns_of, new_grid, real_values, step_sizes
+from morgs_mi.codec.grid import Grid, columns_of, new_grid, real_values, step_sizes
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.gaussians.gaussians import Gaussians
 
@@ -36,8 +37,6 @@ __all__ = [
     "seek",
 ]
 
-# The three groups of a Gaussian's geometry and the four of its look have a flag each; 8 instead says that it died.
-_GEOMETRY, _LOOK, _DEAD = GROUPS[:3], GROUPS[3:], 8
 # A packet has at least a word per 16 Gaussians that it brings, so that no damaged number can ask for much memory.
 _PER_WORD = 16
 _COARSEST = 80  # quarter octaves: a million times the step
@@ -140,7 +139,7 @@ def residual_packet(
         r[survivors] = np.rint(change / step_sizes(np.array(coarseness)))
         dead = np.ones(len(grid), bool)
         dead[survivors] = False
-        return _columns_of_change(r, dead, grid)
+        return columns_of_change(r, dead, grid)
 
     coarseness = least = round(4 * np.log2(config.birth_precision))
     if config.target_size:
@@ -173,6 +172,8 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
     names = {"head", "code"} | ({"parent"} if packet.kind == PacketKind.RESIDUAL else set())
     if packet.arrays.keys() != names:
         raise ValueError(f"{where}: expected the arrays {sorted(names)}, got {sorted(packet.arrays)}.")
+    if any(array.ndim != 1 for array in packet.arrays.values()):
+        raise ValueError(f"{where}: its arrays must have one axis each.")
     try:
         if packet.kind == PacketKind.KEYFRAME:
             return _decoded_keyframe(packet)
@@ -230,7 +231,7 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
     if _PER_WORD * len(code) < births or coarseness > _COARSEST or previous.next_id + births >= LIMIT:
         raise ValueError(f"its head {[births, coarseness]} does not fit its {len(code)} words of code")
     reader = ColumnReader(code)
-    r, dead = _taken_change(reader, grid)
+    r, dead = take_change(reader, grid)
     values = grid.values + np.rint(r * step_sizes(np.array(coarseness))).astype(np.int64)
     survivors = np.flatnonzero(~dead)
     moved = _bounded(values, LIMIT, "value").astype(np.int32)
@@ -262,46 +263,6 @@ def _taken_grid(reader: ColumnReader, N: int, degree: int, has_confidence: bool)
     exponents = _bounded(columns[:, 1:first], 128, "exponent").astype(np.int8)
     values = _bounded(columns[:, first:], LIMIT, "value").astype(np.int32)
     return Grid(values, exponents, columns[:, 0].astype(np.uint8), degree)
-
-
-def _classes(grid: Grid) -> list[np.ndarray]:
-    """Return the indices of those that stand and of those that move, as far as their confidence knows."""
-    moves = grid.values[:, -1] > 0 if grid.has_confidence else np.zeros(len(grid), bool)
-    return [np.flatnonzero(~moves), np.flatnonzero(moves)]
-
-
-def _columns_of_change(r: np.ndarray, dead: np.ndarray, grid: Grid) -> Iterator[np.ndarray]:
-    """Yield the columns that say which integers [N, C] change and by how much; `_taken_change` reads them."""
-    for rows in _classes(grid):
-        flags = {name: r[rows, at].any(1) for name, at in grid.columns.items()}
-        geometry = sum(flags[name].astype(np.int64) << bit for bit, name in enumerate(_GEOMETRY))
-        look = sum(flags[name].astype(np.int64) << bit for bit, name in enumerate(_LOOK) if name in flags)
-        geometry, look = np.where(dead[rows], _DEAD, geometry), np.broadcast_to(look, len(rows))
-        yield geometry
-        yield look[geometry == 0]
-        yield look[(geometry > 0) & (geometry < _DEAD)]
-        for name, at in grid.columns.items():
-            yield from r[rows[flags[name]], at].T
-
-
-def _taken_change(reader: ColumnReader, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Return the changes int64 [N, C] and who died, bool [N]."""
-    r, dead = np.zeros(grid.values.shape, np.int64), np.zeros(len(grid), bool)
-    for rows in _classes(grid):
-        geometry, look = reader.take(len(rows)), np.zeros(len(rows), np.int64)
-        for some in (geometry == 0, (geometry > 0) & (geometry < _DEAD)):
-            look[some] = reader.take(int(some.sum()))
-        known = sum(1 << bit for bit, name in enumerate(_LOOK) if name in grid.columns)
-        if np.any((geometry < 0) | (geometry > _DEAD) | (look & ~known != 0)):
-            raise ValueError("its flags name groups that do not exist")
-        dead[rows] = geometry == _DEAD
-        flags = {name: (geometry >> bit & 1) & (geometry < _DEAD) for bit, name in enumerate(_GEOMETRY)}
-        flags |= {name: look >> bit & 1 for bit, name in enumerate(_LOOK)}
-        for name, at in grid.columns.items():
-            who = rows[flags[name] == 1]
-            for column in range(at.start, at.stop):
-                r[who, column] = reader.take(len(who))
-    return r, dead
 
 
 def _fitting(columns: Callable[[int], Iterator[np.ndarray]], low: int, target: int) -> int:

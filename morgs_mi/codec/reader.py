@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import struct
 from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
@@ -102,7 +103,7 @@ class StreamReader:
             at, magic = TRAILER.unpack(file.read(TRAILER.size))
             if magic == INDEX_MAGIC and self._first <= at < size:
                 file.seek(at)
-                with contextlib.suppress(ValueError):  # a payload that looks like an index by chance
+                with contextlib.suppress(ValueError, struct.error):  # a payload that looks like an index by chance
                     kind, _, payload = open_packet(file.read(size - at))
                     if kind == PacketKind.INDEX:
                         return list(ENTRY.iter_unpack(payload[: -TRAILER.size]))

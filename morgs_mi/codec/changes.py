@@ -1,0 +1,58 @@
+"""What changes between two frames <-> columns: flags first, then the integers of what they name.
+
+Each Gaussian has a flag for each of the three groups of its geometry and the four of its look, or died. Those that
+moved last and those that stood are coded apart, as far as the confidence knows: their flags and residuals differ most.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from morgs_mi.codec.entropy import ColumnReader
+from morgs_mi.codec.grid import GROUPS, Grid
+
+__all__ = ["columns_of_change", "take_change"]
+
+_GEOMETRY, _LOOK, _DEAD = GROUPS[:3], GROUPS[3:], 8
+
+
+def columns_of_change(r: np.ndarray, dead: np.ndarray, grid: Grid) -> Iterator[np.ndarray]:
+    """Yield the columns that say which integers [N, C] change and by how much; `take_change` reads them."""
+    for rows in _classes(grid):
+        flags = {name: r[rows, at].any(1) for name, at in grid.columns.items()}
+        geometry = sum(flags[name].astype(np.int64) << bit for bit, name in enumerate(_GEOMETRY))
+        look = sum(flags[name].astype(np.int64) << bit for bit, name in enumerate(_LOOK) if name in flags)
+        geometry, look = np.where(dead[rows], _DEAD, geometry), np.broadcast_to(look, len(rows))
+        yield geometry
+        yield look[geometry == 0]
+        yield look[(geometry > 0) & (geometry < _DEAD)]
+        for name, at in grid.columns.items():
+            yield from r[rows[flags[name]], at].T
+
+
+def take_change(reader: ColumnReader, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    """Return the changes int64 [N, C] and who died, bool [N]."""
+    r, dead = np.zeros(grid.values.shape, np.int64), np.zeros(len(grid), bool)
+    for rows in _classes(grid):
+        geometry, look = reader.take(len(rows)), np.zeros(len(rows), np.int64)
+        for some in (geometry == 0, (geometry > 0) & (geometry < _DEAD)):
+            look[some] = reader.take(int(some.sum()))
+        known = sum(1 << bit for bit, name in enumerate(_LOOK) if name in grid.columns)
+        if np.any((geometry < 0) | (geometry > _DEAD) | (look & ~known != 0)):
+            raise ValueError("its flags name groups that do not exist")
+        dead[rows] = geometry == _DEAD
+        flags = {name: (geometry >> bit & 1) & (geometry < _DEAD) for bit, name in enumerate(_GEOMETRY)}
+        flags |= {name: look >> bit & 1 for bit, name in enumerate(_LOOK)}
+        for name, at in grid.columns.items():
+            who = rows[flags[name] == 1]
+            for column in range(at.start, at.stop):
+                r[who, column] = reader.take(len(who))
+    return r, dead
+
+
+def _classes(grid: Grid) -> list[np.ndarray]:
+    """Return the indices of those that stand and of those that move, as far as their confidence knows."""
+    moves = grid.values[:, -1] > 0 if grid.has_confidence else np.zeros(len(grid), bool)
+    return [np.flatnonzero(~moves), np.flatnonzero(moves)]
