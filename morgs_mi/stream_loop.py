@@ -154,7 +154,7 @@ def step(
 
 def _first_gaussians(setup: Setup, images: Sequence[np.ndarray], rng: np.random.Generator) -> tuple[Gaussians, str]:
     """Place the Gaussians of the first frame, and say so if there was nothing to place them on."""
-    count, status = setup.config.fit.num_gaussians, "ok"
+    count, status = setup.config.fit.first_count, "ok"
     points, colors = setup.points, setup.point_colors
     if len(points) < _MIN_POINTS:
         status = f"the capture has {len(points)} points, too few: seeded {count} random ones inside the views"

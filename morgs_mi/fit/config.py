@@ -56,25 +56,26 @@ class Rates:
 class DensityConfig:
     """How the number of Gaussians follows the pictures (see `density`); thresholds are those of the literature."""
 
-    max_gaussians: int = 30_000
-    """Nobody is born beyond this many, unless another dies."""
-    rounds: int = 0
-    """Steps of density control in the first frame, from a tenth to a half of its steps; 0: none."""
-    growth: float = 0.2
-    """Most births of such a step, as a share of the Gaussians."""
-    later_frames: bool = False
+    rounds: int = 6
+    """Steps of density control in the first frame, from a tenth to a half of its steps; 0: none. With them, the first
+    frame starts from half of its Gaussians and grows to all."""
+    later_frames: bool = True
     """One step of density control in every later frame, after five eighths of its epochs."""
     births: float = 0.02
     """Most births of a later frame, as a share of the Gaussians."""
+    max_gaussians: int = 30_000
+    """Beyond this many, nobody is born in a later frame unless another dies."""
     birth_opacity: float = 0.1
     """What is added in a later frame starts as faint as this."""
     split_scale: float = 0.01
     """In the first frame, who is wider than this share of the scene's extent is split, others are cloned."""
+    min_error: float = 0.1
+    """In a later frame, who answers for less error beyond noise, in pixels of full contrast, is nobody's parent."""
     min_opacity: float = 0.005
     """Who is fainter dies."""
 
     def __post_init__(self) -> None:
-        for name, low in (("max_gaussians", 1), ("rounds", 0), ("growth", 0), ("births", 0), ("split_scale", 0)):
+        for name, low in (("rounds", 0), ("births", 0), ("max_gaussians", 1), ("split_scale", 0), ("min_error", 0)):
             if not getattr(self, name) >= low:
                 raise ValueError(f"DensityConfig(): `{name}` must be at least {low}, got {getattr(self, name)}.")
         for name in ("birth_opacity", "min_opacity"):
@@ -89,7 +90,7 @@ class FitConfig:
     sh_degree: int = 1
     """Degree of the spherical harmonics, 0 to 3; 0 is enough where nothing shines."""
     num_gaussians: int = 20_000
-    """Gaussians of the first frame: fewer points are filled up between neighbours, more are thinned out."""
+    """Gaussians of the first frame; see `first_count` for those that it starts from."""
     first_frame_steps: int = 1500
     """Steps (one view each) for the first frame."""
     confidence_steps: int = 40
@@ -111,3 +112,8 @@ class FitConfig:
                 raise ValueError(f"FitConfig(): `{name}` must be at least {low}, got {getattr(self, name)}.")
         if self.sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"FitConfig(): `sh_degree` must be 0 to 3, got {self.sh_degree}.")
+
+    @property
+    def first_count(self) -> int:
+        """How many Gaussians to start from: fewer points are filled up between neighbours, more are thinned out."""
+        return -(-self.num_gaussians // 2) if self.density.rounds else self.num_gaussians

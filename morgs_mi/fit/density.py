@@ -9,9 +9,10 @@ cloned, both get opacity 1 - sqrt(1 - o), so that together they cover what one d
 In a later frame, `plan_additions` (Sun et al. 2024): parents stay as they are, so that nothing is spoilt that the
 few steps left could not mend; what is born is faint and small, and earns its opacity or dies.
 
-Who is in need is told by the pictures: E_i = sum_x w_i(x) |I(x) - I*(x)|, the error that a Gaussian answers for
-with its blend weights w_i (Bulo et al. 2024), of that view where it is largest; and W_i = sum_x w_i(x), the pixels
-that it covers.
+Who is in need is told by the pictures: E_i = sum_x w_i(x) e(x), the error that a Gaussian answers for with its blend
+weights w_i (Bulo et al. 2024), of that view where it is largest, and W_i = sum_x w_i(x), the pixels that it covers.
+While a picture is not yet fitted, e = |I - I*|; in a later frame what exceeds thrice its median over the picture, so
+that noise asks for nobody.
 """
 
 from __future__ import annotations
@@ -32,8 +33,10 @@ from morgs_mi.render.backproject import backproject
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 
-__all__ = ["Need", "Plan", "apply_plan", "find_need", "plan_additions", "plan_growth", "regrow"]
+__all__ = ["NOISE", "Need", "Plan", "apply_plan", "find_need", "plan_additions", "plan_growth", "regrow"]
 
+# Noise of a normal distribution exceeds this many times its median error once in 2,000 pixels.
+NOISE = 3.0
 _SHRINK = float(np.log(1.6))
 # float32 knows no opacity closer to 1.
 _MOST_OPAQUE = 1 - 1e-6
@@ -77,30 +80,54 @@ class Plan:
         return len(self.source) - self.num_births
 
 
-def find_need(gaussians: Gaussians, cameras: Sequence[Camera], targets: Sequence[Target], render: RenderConfig) -> Need:
-    """Render every view, and give each Gaussian its share of the errors and of the pixels (E and W)."""
+def find_need(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    targets: Sequence[Target],
+    render: RenderConfig,
+    tolerance: float = 0.0,
+) -> Need:
+    """Render every view, and give each Gaussian its share of the errors and of the pixels (E and W).
+
+    Args:
+        gaussians: N of them.
+        cameras: V views.
+        targets: their pictures.
+        render: cut-offs.
+        tolerance: in medians of a picture's error; what does not exceed it does not count.
+    """
     gaussians = gaussians.detached()
     error, weight = np.zeros((2, len(gaussians)), np.float32)
     for camera, target in zip(cameras, targets, strict=True):
         wrong = target.error(rasterize(gaussians, camera, ("color",), config=render).color)
+        seen = wrong[wrong > 0]  # where masked, it is 0
+        wrong = np.maximum(wrong - tolerance * np.median(seen), 0) if tolerance and len(seen) else wrong
         sums = backproject(gaussians, camera, np.stack([wrong, np.ones_like(wrong)], axis=2), render)
         error, weight = np.maximum(error, sums[:, 0]), np.maximum(weight, sums[:, 1])
     return Need(error, weight)
 
 
 def plan_growth(
-    gaussians: Gaussians, need: Need, extent: float, config: DensityConfig, rng: np.random.Generator
+    gaussians: Gaussians,
+    need: Need,
+    births: int,
+    limit: int,
+    extent: float,
+    config: DensityConfig,
+    rng: np.random.Generator,
 ) -> Plan:
-    """Decide who dies and who is cloned or split in the first frame, `growth` of them at most.
+    """Decide who dies and who is cloned or split in the first frame.
 
     Args:
         gaussians: N of them.
         need: of the same.
+        births: at most so many.
+        limit: how many there may be.
         extent: of the scene, world units.
         config: thresholds.
         rng: draws where the births lie.
     """
-    survivors, chosen = _choose(gaussians, need, config.growth, config)
+    survivors, chosen = _choose(gaussians, need, births, limit, 0, config)
     parent, opacity = np.concatenate([survivors, chosen]), np.asarray(gaussians.opacities)
     touched, scales = np.isin(parent, chosen), np.asarray(gaussians.scales).max(axis=1)[parent]
     wide = touched & (scales > config.split_scale * extent)
@@ -110,7 +137,7 @@ def plan_growth(
 
 
 def plan_additions(gaussians: Gaussians, need: Need, config: DensityConfig, rng: np.random.Generator) -> Plan:
-    """Decide who dies and beside whom a faint Gaussian is added in a later frame, `births` of them at most.
+    """Decide who dies and beside whom a faint Gaussian is added in a later frame.
 
     Args:
         gaussians: N of them.
@@ -118,23 +145,26 @@ def plan_additions(gaussians: Gaussians, need: Need, config: DensityConfig, rng:
         config: thresholds.
         rng: draws where the births lie.
     """
-    survivors, chosen = _choose(gaussians, need, config.births, config)
+    births = round(config.births * len(gaussians))
+    survivors, chosen = _choose(gaussians, need, births, config.max_gaussians, config.min_error, config)
     born = np.arange(len(survivors) + len(chosen)) >= len(survivors)
     logits = np.asarray(gaussians.logit_opacities)[np.concatenate([survivors, chosen])]
     fainter = np.where(born, _logit(config.birth_opacity) - logits, 0)
     return _plan(gaussians, survivors, chosen, np.where(born, -_SHRINK, 0), fainter, rng)
 
 
-def _choose(gaussians: Gaussians, need: Need, share: float, config: DensityConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Return who lives on, and who of them becomes a parent: those with the largest error, `share` of all at most.
+def _choose(
+    gaussians: Gaussians, need: Need, births: int, limit: int, least_error: float, config: DensityConfig
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return who lives on, and who of them becomes a parent: those with the largest error.
 
-    Who is fainter than `min_opacity` dies, and so does who covers least where births would exceed `max_gaussians`.
+    Who is fainter than `min_opacity` dies, and so does who covers least where births would exceed `limit`.
     """
     alive = np.asarray(gaussians.opacities) >= config.min_opacity
     survivors = np.flatnonzero(alive) if alive.any() else np.arange(len(alive))  # no scene could come back from none
-    needy = survivors[need.error[survivors] > 0]
-    chosen = needy[np.argsort(-need.error[needy], kind="stable")][: round(share * len(gaussians))]
-    excess = min(max(len(survivors) + len(chosen) - config.max_gaussians, 0), len(chosen))
+    needy = survivors[need.error[survivors] > least_error]
+    chosen = needy[np.argsort(-need.error[needy], kind="stable")][:births]
+    excess = min(max(len(survivors) + len(chosen) - limit, 0), len(chosen))
     expendable = np.setdiff1d(survivors, chosen)
     least = expendable[np.argsort(need.weight[expendable], kind="stable")][:excess]
     return np.setdiff1d(survivors, least), np.sort(chosen[: len(chosen) - (excess - len(least))])

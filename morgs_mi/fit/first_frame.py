@@ -38,7 +38,8 @@ def fit_first_frame(
     """Fit Gaussians to the pictures of one instant by L_recon alone (eq. 2); the confidence is left alone.
 
     As in 3DGS, the bands of the spherical harmonics come in one after the other, each a thirtieth of the steps
-    later, and between a tenth and a half of the steps Gaussians are born and die (see `density`).
+    later, and between a tenth and a half of the steps Gaussians are born and die (see `density`): in the end there
+    are `num_gaussians`, if that many are needed.
 
     Args:
         gaussians: the start, e.g. from SfM points.
@@ -66,7 +67,8 @@ def fit_first_frame(
         if start in rounds:
             now = _assemble(gaussians, values_of(optimizer))
             need = find_need(now, cameras, targets, render)
-            plan = plan_growth(now, need, extent, config.density, rng)
+            births = -(-max(config.num_gaussians - len(now), 0) // (len(rounds) - rounds.index(start)))
+            plan = plan_growth(now, need, births, config.num_gaussians, extent, config.density, rng)
             gaussians = gaussians.select(plan.parent)
             regrow(optimizer, plan, plan.edits)
 

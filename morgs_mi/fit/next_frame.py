@@ -12,7 +12,7 @@ import numpy as np
 
 from morgs_mi.capture.camera import Camera
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.density import apply_plan, find_need, plan_additions, regrow
+from morgs_mi.fit.density import NOISE, apply_plan, find_need, plan_additions, regrow
 from morgs_mi.fit.losses import Target, flow_loss, mask_loss, offset_loss, recon_loss
 from morgs_mi.fit.optimise import adam, optimise, values_of, view_order
 from morgs_mi.gaussians.gaussians import Gaussians
@@ -84,7 +84,7 @@ def fit_next_frame(
     if config.density.later_frames:
         with dr.suspend_grad():
             now = apply_residual(previous, values_of(optimizer), motion)
-        plan = plan_additions(now, find_need(now, cameras, targets, render), config.density, rng)
+        plan = plan_additions(now, find_need(now, cameras, targets, render, NOISE), config.density, rng)
         # What is born starts from its parent's past and shares its residual, so that its motion is the parent's.
         previous, source = apply_plan(previous, plan), plan.source
         regrow(optimizer, plan)

@@ -11,11 +11,11 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.fit.config import DensityConfig
-from morgs_mi.fit.density import Need, Plan, apply_plan, find_need, plan_additions, plan_growth, regrow
+from morgs_mi.fit.density import NOISE, Need, Plan, apply_plan, find_need, plan_additions, plan_growth, regrow
 from morgs_mi.fit.losses import Target
 from morgs_mi.fit.optimise import adam, values_of
 
-CONFIG = DensityConfig(max_gaussians=100, split_scale=0.1, min_opacity=0.005, growth=1.0, births=1.0)
+CONFIG = DensityConfig(max_gaussians=100, split_scale=0.1, min_opacity=0.005, births=1.0)
 
 
 def some(n=6, opacity=0.6, scale=0.05):
@@ -34,8 +34,9 @@ def need(error, weight=None):
     return Need(np.asarray(error, float), np.ones(len(error)) if weight is None else np.asarray(weight, float))
 
 
-def growth(gaussians, error, config=CONFIG):
-    return plan_growth(gaussians, need(error), 10.0, config, np.random.default_rng(1))
+def growth(gaussians, error):
+    n = len(gaussians)
+    return plan_growth(gaussians, need(error), n, 2 * n, 10.0, CONFIG, np.random.default_rng(1))
 
 
 def additions(gaussians, error, weight=None, **settings):
@@ -64,7 +65,7 @@ def test_at_the_bound_those_who_cover_least_make_room():
 
 
 def test_nobody_is_born_where_all_is_well_and_somebody_always_stays():
-    assert additions(some(), np.zeros(6)).num_births == 0
+    assert additions(some(), np.full(6, CONFIG.min_error)).num_births == 0
     assert additions(some(opacity=1e-4), np.zeros(6)).num_survivors == 6
 
 
@@ -106,7 +107,7 @@ def test_births_are_drawn_from_their_parents_density():
     """Whitened by the parent's axes, thousands of births have no mean and unit covariance."""
     n = 4000
     one = some(1, scale=0.05)
-    found = growth(one.select(np.zeros(n, int)), np.ones(n), dataclasses.replace(CONFIG, max_gaussians=2 * n))
+    found = growth(one.select(np.zeros(n, int)), np.ones(n))
     w, x, y, z = (one.numpy()["quats"][0] / np.linalg.norm(one.numpy()["quats"][0])).astype(float)
     axes = np.array(
         [
@@ -174,6 +175,8 @@ def test_need_points_at_the_gaussian_that_is_wrong():
     assert found.error[[0, 1, 2]].max() < 0.01 * found.error[4]
     # w sums to the alpha of the whole picture
     assert found.weight.sum() == pytest.approx(np.asarray(rasterize(wrong, camera, ("alpha",)).alpha).sum(), rel=1e-4)
+    noisy = [Target(np.float32(image + rng.normal(0, 0.02, image.shape))) for rng in [np.random.default_rng(3)]]
+    assert find_need(truth, [camera], noisy, RenderConfig(), NOISE).error.max() < DensityConfig().min_error
     hidden = np.ones((48, 64), bool)
     hidden[:, 32:] = False
     assert find_need(wrong, [camera], [Target(image, hidden)], RenderConfig()).error.max() < 0.01 * found.error[4]
