@@ -27,6 +27,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.fit.planes import COLUMN, RADIUS, STRIP, Planes, Runs, packet_type, read_packet, write_packet
+from morgs_mi.render.loops import on_aligned_stack
 from morgs_mi.render.region import Region, owned
 
 __all__ = ["Target", "flow_loss", "mask_loss", "offset_loss", "recon_loss"]
@@ -258,7 +259,7 @@ def _walk(planes: Planes, runs: Runs, across: Any, finish: Any, outputs: int) ->
     windows = [many([mi.Float(0) for _ in range(3 * STRIP)]) for _ in range(2 * RADIUS)]
     state = (
         runs.first - RADIUS,
-        runs.end,
+        on_aligned_stack(runs.end),
         runs.first,
         runs.places,
         runs.columns,
