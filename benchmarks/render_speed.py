@@ -86,6 +86,9 @@ def figures(
             result[f"ratio_to_{key.removesuffix('_step')}"] = round(median(ratios), 3 if key == "yardstick_step" else 4)
             if key == "yardstick_step":
                 result["ratio_per_round"] = [round(r, 3) for r in ratios]
+    for key, part, whole in (("tenth_share", "tenth_step", "step"), ("loss_share", "loss", "forward")):
+        if part in rounds[0]:
+            result[key] = round(median(r[part] / r[whole] for r in rounds), 3)
     if left_out:
         result["left_out"] = left_out
     result["peak_megabytes"] = timing.peak_megabytes(ours["step"])
@@ -152,6 +155,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     for key, mark in (
         ("lists", "v"),
         ("forward", "o"),
+        ("adjoint", "^"),
         ("step", "s"),
         ("yardstick_step", "x"),
         ("plain_step", "+"),
@@ -166,7 +170,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     if overhead:
         left.axhline(overhead[0], color="C2", linestyle="--", linewidth=1, label="step of next to nothing")
     right.plot(x, [row["peak_megabytes"] for row in rows], "s", color="C4", label="peak of a step, Dr.Jit")
-    right.plot(x, [4e-6 * row["pairs"] for row in rows], "v", color="C0", label="fine lists, 4 bytes a pair")
+    right.plot(x, [1e-6 * row["list_bytes"] for row in rows], "v", color="C0", label="lists")
     for axis, key in ((left, "step_ms"), (right, "peak_megabytes")):
         for a, row in zip(x, rows, strict=True):
             axis.annotate(row["name"], (a, row[key]), xytext=(5, 4), textcoords="offset points", fontsize=7)

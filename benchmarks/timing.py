@@ -19,9 +19,10 @@ from workloads import TARGET, write_bin
 
 from morgs_mi import Camera, Gaussians, RenderConfig, ellipsoids, rasterize
 from morgs_mi.evaluate.reference64 import Twin
+from morgs_mi.fit.losses import Target, recon_loss
 from morgs_mi.render.blocks import build_lists
 from morgs_mi.render.projection import project
-from morgs_mi.render.region import whole_view
+from morgs_mi.render.region import Region, whole_view
 
 # Pairs of pixel and Gaussian that the float64 twin is asked for.
 _TWIN_PAIRS = 20_000_000
@@ -32,32 +33,43 @@ VOLPRIM_GAUSSIANS, VOLPRIM_PIXELS = 20_000, 512 * 384
 def timed(work: Callable[[], Any], repeats: int, patience: float = float("inf")) -> float:
     """Return the median time of `work` in ms, synchronised, after two runs of warm-up.
 
-    Once `patience` seconds are spent, one run of warm-up and one timed one have to do.
+    Work that returns a function is what comes before the work: the function is timed alone. Once `patience` seconds are
+    spent, one run of warm-up and one timed one have to do.
     """
     times: list[float] = []
     while len(times) < repeats + 2 and (len(times) < 2 or sum(times) < 1e3 * patience):
         dr.sync_thread()
         start = time.perf_counter()
-        dr.eval(work())
+        result = work()
+        if callable(result):
+            dr.sync_thread()
+            start = time.perf_counter()
+            result = result()
+        dr.eval(result)
         dr.sync_thread()
         times.append(1e3 * (time.perf_counter() - start))
     return median(times[2:] or times[1:])
 
 
 def stages(
-    gaussians: Gaussians, camera: Camera, channels: tuple[str, ...] = ("color",)
+    gaussians: Gaussians, camera: Camera, channels: tuple[str, ...] = ("color",), seed: int = 1
 ) -> dict[str, Callable[[], Any]]:
-    """Return what is timed: lists (with projection), forward (with lists) and the whole step with its gradients."""
+    """Return what is timed.
+
+    Lists (with projection), forward (with lists), adjoint (from the image's gradient to the attributes'), and the whole
+    step; for colour alone also the step on a tenth of the tiles, drawn at random, and the L1 + D-SSIM loss with its
+    derivative.
+    """
     config = RenderConfig()
-    shape = (camera.height, camera.width, 3)
-    targets = {"color": mi.TensorXf(np.broadcast_to(np.float32(TARGET), shape).copy())}
-    dr.enable_grad(*gaussians.items().values())
+    target = np.broadcast_to(np.float32(TARGET), (camera.height, camera.width, 3)).copy()
+    attributes, full = list(gaussians.items().values()), mi.TensorXf(target)
+    dr.enable_grad(attributes)
 
     def lists() -> Any:
         with dr.suspend_grad():
             region = whole_view(camera.width, camera.height, config)
             splats = project(gaussians, camera, channels, config)
-            built = build_lists(splats, [v for name in channels for v in splats.channels[name]], region, config)
+            built = build_lists(splats, [v for name in channels for v in splats.channels.get(name, ())], region, config)
         return built.words, built.order
 
     def forward() -> Any:
@@ -65,17 +77,47 @@ def stages(
             image = rasterize(gaussians, camera, channels)
             return [getattr(image, name) for name in channels]
 
-    def step() -> Any:
-        image = rasterize(gaussians, camera, channels)
-        errors = (dr.abs(getattr(image, name) - targets.get(name, 0.5)) for name in channels)
-        dr.backward(sum(dr.mean(error, axis=None) for error in errors))
-        grads = [dr.grad(v) for v in gaussians.items().values()]
+    def gradients(loss: Any) -> Any:
+        dr.backward(loss)
+        grads = [dr.grad(value) for value in attributes]
         dr.eval(grads)
-        for value in gaussians.items().values():
-            dr.clear_grad(value)
+        dr.clear_grad(attributes)
         return grads
 
-    return {"lists": lists, "forward": forward, "step": step}
+    def step(region: Region | None = None, wanted: Any = None) -> Any:
+        image = rasterize(gaussians, camera, channels, region=region)
+        return gradients(_distance(image, channels, full if wanted is None else wanted, target.size))
+
+    def adjoint() -> Callable[[], Any]:
+        image = rasterize(gaussians, camera, channels)
+        loss = _distance(image, channels, full, target.size)
+        dr.eval(image, loss)
+        return lambda: gradients(loss)
+
+    works = {"lists": lists, "forward": forward, "adjoint": adjoint, "step": step}
+    if channels != ("color",):
+        return works
+    tiles = np.random.default_rng(seed).uniform(size=(-(-camera.height // 32), -(-camera.width // 32)))
+    mask = np.kron(tiles <= np.quantile(tiles, 0.1), np.ones((32, 32), bool))[: camera.height, : camera.width]
+    tenth, matched = Region(mask, config), Target(target)
+    tenth_wanted = mi.TensorXf(tenth.cut(target))
+    (image,) = forward()
+    image = dr.detach(image)
+    dr.enable_grad(image)
+
+    def loss() -> Any:
+        dr.backward(recon_loss(image, matched))
+        grad = dr.grad(image)
+        dr.clear_grad(image)
+        return grad
+
+    return works | {"tenth_step": lambda: step(tenth, tenth_wanted), "loss": loss}
+
+
+def _distance(image: Any, channels: tuple[str, ...], target: Any, size: int) -> Any:
+    """Return the L1 distance of the colour to its target and of the other channels to 0.5, summed up, over `size`."""
+    errors = (dr.abs(getattr(image, name) - (target if name == "color" else 0.5)) for name in channels)
+    return sum(dr.sum(error, axis=None) for error in errors) / size
 
 
 def measure(works: dict[str, Callable[[], Any]], repeats: int, patience: float = float("inf")) -> dict[str, float]:
@@ -84,14 +126,15 @@ def measure(works: dict[str, Callable[[], Any]], repeats: int, patience: float =
 
 
 def extent(gaussians: Gaussians, camera: Camera) -> dict[str, float]:
-    """Return how much there is to draw: pairs of Gaussian and block on the lists, and their pixels in millions."""
+    """Return how much there is to draw: pairs of Gaussian and block, their pixels in millions, and the lists' bytes."""
     config = RenderConfig()
     with dr.suspend_grad():
         region = whole_view(camera.width, camera.height, config)
         lists = build_lists(project(gaussians, camera, (), config), [], region, config)
         pairs = int(dr.sum(mi.UInt64(lists.count))[0])
     width, height = region.block
-    return {"pairs": pairs, "listed_megapixels": round(1e-6 * pairs * width * height, 3)}
+    size = 4 * (dr.width(lists.words) + dr.width(lists.entries))
+    return {"pairs": pairs, "listed_megapixels": round(1e-6 * pairs * width * height, 3), "list_bytes": size}
 
 
 def peak_megabytes(work: Callable[[], Any]) -> float:

@@ -26,8 +26,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.fit.planes import COLUMN, RADIUS, STRIP, Planes, Runs, packet_type, read_packet, write_packet
+from morgs_mi.fit.planes import COLUMN, RADIUS, STRIP, Lanes, Planes, Runs, packet_type, read_packet, write_packet
 from morgs_mi.render.loops import on_aligned_stack
+from morgs_mi.render.recording import recorded
 from morgs_mi.render.region import Region, owned
 
 __all__ = ["Target", "flow_loss", "mask_loss", "offset_loss", "recon_loss"]
@@ -159,34 +160,31 @@ class _Part(_Recon):
 def _passes(picture: Any, target: Target, weight: float, windows: Runs, pixels: Runs) -> tuple[Any, Any]:
     """Return dL/dx in planes, set on the runs of `pixels`, and L over the runs of `windows` and `pixels`."""
     planes, scale = target.planes, dr.opaque(mi.Float, 1 / int(np.prod(target.shape)))
+    height = dr.opaque(mi.Int32, planes.height)
     dr.eval(picture)
+    given = (windows.lanes, height, picture, target.pixels, target.mean, target.variance)
+    derivatives, ssim = recorded(_similarity_pass, planes.size)(*given)
+    given = (pixels.lanes, height, picture, target.pixels, derivatives, scale)
+    (gradient,), error = recorded(_gradient_pass, planes.size, weight)(*given)
+    structure = dr.opaque(mi.Float, windows.num_pixels) - dr.sum(ssim)
+    return gradient, scale * ((1 - weight) * dr.sum(error) + weight * structure)
+
+
+def _similarity_pass(
+    size: int, lanes: Lanes, height: Any, picture: Any, target: Any, mean: Any, variance: Any
+) -> tuple[list[Any], Any]:
+    """Return the planes of SSIM's derivatives by M x, M xx and M xy, and the sum of SSIM over each run."""
 
     def products(read: _Read) -> list[list[Any]]:
-        x, y = read(picture), read(target.pixels)
+        x, y = read(picture), read(target)
         return [x, [v * v for v in x], [v * w for v, w in zip(x, y, strict=True)]]
 
-    def similarity(read: _Read, blurred: list[Any]) -> tuple[list[list[Any]], list[Any]]:
-        mean, variance = read(target.mean), read(target.variance)
-        terms = [_similarity(*values) for values in zip(*blurred, mean, variance, strict=True)]
+    def similarity(read: _Read, blurred: list[list[Any]]) -> tuple[list[list[Any]], list[Any]]:
+        terms = [_similarity(*values) for values in zip(*blurred, read(mean), read(variance), strict=True)]
         ssim, *derivatives = map(list, zip(*terms, strict=True))
         return derivatives, ssim
 
-    derivatives, ssim = _walk(planes, windows, products, similarity, 3)
-
-    def as_they_are(read: _Read) -> list[list[Any]]:
-        return [read(plane) for plane in derivatives]
-
-    def gradient(read: _Read, blurred: list[Any]) -> tuple[list[list[Any]], list[Any]]:
-        rows, errors = [], []
-        for x, y, d_x, d_xx, d_xy in zip(read(picture), read(target.pixels), *blurred, strict=True):
-            error, structure = x - y, dr.fma(y, d_xy, dr.fma(2 * x, d_xx, d_x))
-            sign = dr.select(error > 0, 1.0, dr.select(error < 0, -1.0, 0.0))
-            rows.append(scale * ((1 - weight) * sign - weight * structure))
-            errors.append(dr.abs(error))
-        return [rows], errors
-
-    (grad,), error = _walk(planes, pixels, as_they_are, gradient, 1)
-    return grad, scale * ((1 - weight) * error + weight * (dr.opaque(mi.Float, windows.num_pixels) - ssim))
+    return _walk(size, lanes, height, products, similarity, 3)
 
 
 def _similarity(mx: Any, xx: Any, xy: Any, my: Any, variance: Any) -> tuple[Any, Any, Any, Any]:
@@ -200,22 +198,49 @@ def _similarity(mx: Any, xx: Any, xy: Any, my: Any, variance: Any) -> tuple[Any,
     return ssim, d_x, -ssim * r2, 2 * a1 * r12
 
 
-def _walk(planes: Planes, runs: Runs, across: Any, finish: Any, outputs: int) -> tuple[list[Any], Any]:
+def _gradient_pass(
+    size: int, weight: float, lanes: Lanes, height: Any, picture: Any, target: Any, derivatives: list[Any], scale: Any
+) -> tuple[list[Any], Any]:
+    """Return the planes of dL/dx, and the sum of |x - y| over each run."""
+
+    def as_they_are(read: _Read) -> list[list[Any]]:
+        return [read(plane) for plane in derivatives]
+
+    def gradient(read: _Read, blurred: list[list[Any]]) -> tuple[list[list[Any]], list[Any]]:
+        row, errors = [], []
+        for x, y, d_x, d_xx, d_xy in zip(read(picture), read(target), *blurred, strict=True):
+            error, structure = x - y, dr.fma(y, d_xy, dr.fma(2 * x, d_xx, d_x))
+            sign = dr.select(error > 0, 1.0, dr.select(error < 0, -1.0, 0.0))
+            row.append(scale * ((1 - weight) * sign - weight * structure))
+            errors.append(dr.abs(error))
+        return [row], errors
+
+    return _walk(size, lanes, height, as_they_are, gradient, 1)
+
+
+def _walk(
+    size: int,
+    lanes: Lanes,
+    height: Any,
+    across: Callable[[_Read], list[list[Any]]],
+    finish: Callable[[_Read, list[list[Any]]], tuple[list[list[Any]], list[Any]]],
+    outputs: int,
+) -> tuple[list[Any], Any]:
     """Walk down the runs with a window: blur what `across` reads of each row, and write what `finish` makes of it.
 
     Args:
-        planes: the layout.
-        runs: the lanes' rows.
+        size: of the planes.
+        lanes: the runs.
+        height: of the picture.
         across: read -> three rows of numbers, 5 more on both sides than a strip is wide.
         finish: (read, three blurred rows of a strip) -> (rows of a strip to write, row of a strip to sum up).
         outputs: how many rows it writes.
 
     Returns:
-        The planes that were written, set on the runs, and the sum over all pixels of the picture.
+        The planes that were written, set on the runs, and the sum over the pixels of each run.
     """
     many = packet_type()
-    height = dr.opaque(mi.Int32, planes.height)
-    targets = [dr.empty(mi.Float, planes.size) for _ in range(outputs)]
+    targets = [dr.empty(mi.Float, size) for _ in range(outputs)]
 
     def blurred(row: Any, height: Any, places: Any) -> Any:
         inside, down = (row >= 0) & (row < height), mi.UInt32(row) * COLUMN
@@ -257,21 +282,10 @@ def _walk(planes: Planes, runs: Runs, across: Any, finish: Any, outputs: int) ->
         return row + 2, end, first, places, columns, height, windows, total, targets
 
     windows = [many([mi.Float(0) for _ in range(3 * STRIP)]) for _ in range(2 * RADIUS)]
-    state = (
-        runs.first - RADIUS,
-        on_aligned_stack(runs.end),
-        runs.first,
-        runs.places,
-        runs.columns,
-        height,
-        windows,
-        mi.Float(0),
-        targets,
-    )
+    end = on_aligned_stack(lanes.end)
+    state = (lanes.first - RADIUS, end, lanes.first, lanes.places, lanes.columns, height, windows, mi.Float(0), targets)
     *_, total, targets = dr.while_loop(state, lambda row, end, *_: row < end + RADIUS, body, label="window")
-    sums = dr.sum(total)
-    dr.eval(targets, sums)
-    return targets, sums
+    return targets, total
 
 
 def flow_loss(motion: Any, cue: Any, reliable: Any) -> Any:

@@ -17,7 +17,7 @@ import numpy as np
 
 from morgs_mi.render.region import Region, owned, quotient
 
-__all__ = ["COLUMN", "RADIUS", "STRIP", "Planes", "Runs", "packet_type", "read_packet", "write_packet"]
+__all__ = ["COLUMN", "RADIUS", "STRIP", "Lanes", "Planes", "Runs", "packet_type", "read_packet", "write_packet"]
 
 RADIUS = 5
 STRIP = 8  # pixels across: a window reaches at most into the next strip
@@ -28,21 +28,27 @@ _LONGEST = 64
 
 
 @dataclass(frozen=True)
-class Runs:
-    """Stretches of rows of strips, one per SIMD lane, in all three planes.
+class Lanes:
+    """Stretches of rows of strips, in all three planes, one for each SIMD lane.
 
     Attributes:
         places: where row 0 of the strip to the left, of the strip, and of the one to the right lie, in strips.
         first: row.
         end: row.
         columns: of the strip that lie in the picture, 0 to 8.
-        num_pixels: in the picture, over all runs.
     """
 
     places: tuple[Any, Any, Any]
     first: Any
     end: Any
     columns: Any
+
+
+@dataclass(frozen=True)
+class Runs:
+    """What a window walks over: the lanes, and how many numbers of the picture they cover."""
+
+    lanes: Lanes
     num_pixels: int
 
 
@@ -58,9 +64,10 @@ class Planes:
     def of(self, picture: Any) -> Any:
         """Return the planes of a flat picture [H * W * 3] in memory of Dr.Jit's own (see `region.owned`)."""
         if self.width % STRIP == 0:
-            target = dr.zeros(mi.Float, self.size)
-            lane, places = self._strips()
-            reads = [read_packet(picture, 3 * lane + k) for k in range(3)]
+            target = dr.empty(mi.Float, self.size)
+            strip, y, places = self._strips(self.num_columns * COLUMN)
+            strip, strips = strip - _SPARE, dr.opaque(mi.UInt32, self.num_strips)
+            reads = [read_packet(picture, 3 * (y * strips + strip) + k, strip < strips) for k in range(3)]
             values = [v for read in reads for v in read]
             for component, place in enumerate(places):
                 write_packet(target, values[component::3], place)
@@ -79,11 +86,12 @@ class Planes:
         """Return the flat picture [H * W * 3] of planes."""
         if self.width % STRIP == 0:
             target = dr.empty(mi.Float, 3 * self.height * self.width)
-            lane, places = self._strips()
+            strip, y, places = self._strips(self.num_strips, _SPARE)
             rows = zip(*(read_packet(planes, place) for place in places), strict=True)
             values = [v for pixel in rows for v in pixel]
             for k in range(3):
-                write_packet(target, values[STRIP * k : STRIP * (k + 1)], 3 * lane + k)
+                lane = 3 * (y * dr.opaque(mi.UInt32, self.num_strips) + strip) + k
+                write_packet(target, values[STRIP * k : STRIP * (k + 1)], lane)
             return target
         lane = dr.arange(mi.UInt32, 3 * self.height * self.width)
         pixel = lane // 3
@@ -91,12 +99,13 @@ class Planes:
         place = self._place(lane - 3 * pixel, y, pixel - y * dr.opaque(mi.UInt32, self.width))
         return dr.gather(mi.Float, planes, place)
 
-    def _strips(self) -> tuple[Any, list[Any]]:
-        """Return all rows of all strips, and where they lie in each plane, in strips; for a width of whole strips."""
-        lane = dr.arange(mi.UInt32, self.height * self.num_strips)
-        y = quotient(lane, self.num_strips)
-        x = (lane - y * dr.opaque(mi.UInt32, self.num_strips)) * STRIP
-        return lane, [self._place(mi.UInt32(component), y, x) // STRIP for component in range(3)]
+    def _strips(self, count: int, first: int = 0) -> tuple[Any, Any, list[Any]]:
+        """Return (strip, row) of `count` strips of every row, and where strip `first` + strip lies in each plane."""
+        lane = dr.arange(mi.UInt32, self.height * count)
+        y = quotient(lane, count)
+        strip = lane - y * dr.opaque(mi.UInt32, count)
+        x = (strip + first) * STRIP - _SPARE * STRIP
+        return strip, y, [self._place(mi.UInt32(component), y, x) // STRIP for component in range(3)]
 
     def _place(self, component: Any, y: Any, x: Any) -> Any:
         return _place(component, y, x, dr.opaque(mi.UInt32, self.height), dr.opaque(mi.UInt32, self.num_columns))
@@ -128,13 +137,13 @@ class Planes:
         component = np.repeat(np.arange(3), len(strip))
         x = np.tile(strip - 1, 3) * STRIP
         places = (_place(component, 0, x + k * STRIP, self.height, self.num_columns) // STRIP for k in (-1, 0, 1))
-        return Runs(
+        lanes = Lanes(
             tuple(owned(mi.UInt32(place)) for place in places),  # type: ignore[arg-type]
             owned(mi.Int32(np.tile(first, 3))),
             owned(mi.Int32(np.tile(end, 3))),
             owned(mi.UInt32(np.tile(columns, 3))),
-            3 * int(((end - first) * columns).sum()),
         )
+        return Runs(lanes, 3 * int(((end - first) * columns).sum()))
 
 
 def read_packet(values: Any, place: Any, active: Any = True) -> Any:

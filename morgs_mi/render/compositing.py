@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import drjit as dr
@@ -22,6 +21,7 @@ from morgs_mi.render.loops import (
     record_packets,
     tangent,
 )
+from morgs_mi.render.recording import recorded
 from morgs_mi.render.region import Region, quotient
 
 __all__ = ["Channel", "Layout", "blend"]
@@ -46,16 +46,6 @@ def blend(
     """
     columns = [column for channel in channels for column in channel]
     return dr.custom(_Blend, [*geometry, *columns], region, lists, layout)
-
-
-@cache
-def _frozen(loop: Callable[..., Any], variant: str, *static: Any) -> Callable[..., Any]:
-    """Return a traced loop as a function of arrays alone, recorded once for each variant and set of other arguments.
-
-    Tracing it anew would cost several ms per call. The layout must not be an argument of the recording:
-    Dr.Jit 1.5 tells Python values apart by a hash in which two booleans can cancel.
-    """
-    return dr.freeze(lambda *arrays: loop(*static, *arrays), warn_after=1000)
 
 
 class _Blend(dr.CustomOp):
@@ -90,7 +80,7 @@ class _Blend(dr.CustomOp):
 
     def _run(self, loop: Callable[..., Any], *arguments: Any) -> Any:
         static = [v for v in arguments if isinstance(v, (Layout, int))]
-        return _frozen(loop, mi.variant(), *static)(*arguments[len(static) :])
+        return recorded(loop, *static)(*arguments[len(static) :])
 
     def _blank(self) -> list[Any]:
         """Return memory to write to: a frozen function cannot know sizes of its own."""

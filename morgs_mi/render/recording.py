@@ -1,0 +1,26 @@
+"""Traced functions that are recorded once: tracing a long loop anew costs several ms a call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+__all__ = ["recorded"]
+
+
+def recorded(function: Callable[..., Any], *static: Any) -> Callable[..., Any]:
+    """Return `function` with its first arguments fixed, as a recording of arrays alone; one per variant and `static`.
+
+    What is not an array must be in `static`: Dr.Jit 1.5 tells other arguments apart by a hash in which two booleans can
+    cancel. Sizes inside a recording are those of its arguments, or static: `dr.empty` and the like need a static one.
+    """
+    return _recorded(function, mi.variant(), static)
+
+
+@cache
+def _recorded(function: Callable[..., Any], variant: str, static: tuple[Any, ...]) -> Callable[..., Any]:
+    return dr.freeze(lambda *arrays: function(*static, *arrays), warn_after=1000)
