@@ -35,7 +35,7 @@ from morgs_mi.render.rasterize import rasterize
 
 __all__ = ["NOISE", "Need", "Plan", "apply_plan", "find_need", "plan_additions", "plan_growth", "regrow"]
 
-# Noise of a normal distribution exceeds this many times its median error once in 2,000 pixels.
+# Normal noise, independent in three colours, exceeds so many times its median error at 3 of 10,000 pixels.
 NOISE = 3.0
 _SHRINK = float(np.log(1.6))
 # float32 knows no opacity closer to 1.

@@ -81,7 +81,7 @@ def fit_next_frame(
     cut = round(0.625 * config.epochs) * len(cameras) if config.density.later_frames else len(views)
     losses = optimise(optimizer, rates, views[:cut], partial(losses_of, previous), weights, on_step=on_step)
     source = np.arange(len(previous))
-    if config.density.later_frames:
+    if cut < len(views):
         with dr.suspend_grad():
             now = apply_residual(previous, values_of(optimizer), motion)
         plan = plan_additions(now, find_need(now, cameras, targets, render, NOISE), config.density, rng)

@@ -119,3 +119,11 @@ def test_without_density_control_everybody_stays(truth):
     )
     assert isinstance(found, Gaussians)
     assert np.array_equal(source, np.arange(400))
+
+
+def test_nobody_is_born_when_no_step_is_left_to_fit_them(truth):
+    config = FitConfig(sh_degree=0, epochs=1, density=DensityConfig(min_error=0))
+    targets = [Target(image) for image in pictures(truth)]
+    before = truth.select(np.arange(200))
+    _, source, _ = fit_next_frame(before, views(), targets, {}, EXTENT, config, PLAIN, RENDER, np.random.default_rng(0))
+    assert np.array_equal(source, np.arange(200))
