@@ -20,14 +20,15 @@ class CodecConfig:
     """Divides the tolerated errors below: 2 doubles the precision of everything, 1000 is as good as float32."""
     birth_precision: float = 4.0
     """How much more precise Gaussians are when they appear: that is written once and seen for many frames."""
-    error_px: float = 0.1
-    """What centres, sizes and rotations may be off on screen, in px, in the camera that sees them largest."""
+    error_px: float = 0.04
+    """What centres, sizes and rotations may be off on screen, in px, in the camera that sees them largest: a step is
+    about a tenth of a pixel."""
     error_color: float = 1 / 255
     """What a colour may be off, from 0 to 1; in the SH of degree 1 and up for each coefficient."""
-    error_opacity: float = 0.01
+    error_opacity: float = 0.005
     """What an opacity may be off where it is most sensitive, at 0.5."""
-    error_confidence: float = 0.1
-    """What a confidence may be off where it is most sensitive, at 0.5: it gates the fit and is never seen."""
+    error_confidence: float = 0.05
+    """What a confidence may be off where it is most sensitive, at 0.5: it gates the fit, so all else shows its loss."""
     target_size: int = 0
     """Bytes that a later frame may take: it is coded more coarsely until it fits. 0: as many as the quality takes."""
     keyframe_interval: int = 30

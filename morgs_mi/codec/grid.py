@@ -207,5 +207,7 @@ def _finite(gaussians: Gaussians) -> dict[str, np.ndarray]:
     for name, value in raw.items():
         if not np.isfinite(value).all():
             row = np.argwhere(~np.isfinite(value))[0][0]
-            raise ValueError(f"encode: `{name}` must be finite, that of Gaussian {row} is not; lower the rates.")
+            raise ValueError(
+                f"the stream: `{name}` must be finite, that of Gaussian {row} is not; lower the learning rates."
+            )
     return raw

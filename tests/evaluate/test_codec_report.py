@@ -32,14 +32,16 @@ def test_coarser_streams_are_smaller_and_lzma_is_larger(clip: Path, tmp_path: Pa
         assert row["file"] == (tmp_path / "capture" / f"{row['quality']:g}" / "stream.morgs").stat().st_size
         assert row["later"] < row["lzma"] < row["raw"]
         assert row["loss"] == pytest.approx(rows[-1]["psnr"]["later"] - row["psnr"]["later"])
-        # What is in the packet but for flags, births of the distributions and the packet's frame.
-        assert 0 < sum(row["bytes_by_group"].values()) < 1.1 * row["later"]
-        assert 0 < row["moved"] <= 150
+        # What a packet holds beside its flags; of a handful of numbers, the entropy says little.
+        assert 0 <= sum(row["bytes_by_group"].values()) < 1.1 * row["later"]
+        assert 0 <= row["moved"] < 300
         assert min(row[name] for name in ("encode_ms", "decode_ms", "lzma_ms")) > 0
     for name in ("first", "later", "file"):
         sizes = [row[name] for row in rows]
         assert sizes == sorted(sizes), name
     assert np.isfinite(rows[0]["loss"])
+    assert rows[-1]["moved"] > 0
+    assert sum(rows[-1]["bytes_by_group"].values()) > 0.3 * rows[-1]["later"]
     table = markdown_table(found).splitlines()
     assert len({line.count("|") for line in table}) == 1
     assert len(table) == 2 + len(rows)
