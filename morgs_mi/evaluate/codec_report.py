@@ -130,10 +130,12 @@ def plot_codec(result: Mapping[str, Any], path: str | Path) -> None:
             axis.plot(np.array(packed) / 1e3, other, "s--", label="lzma over float32 residuals")
             axis.set(xscale="log", xlabel="kB per later frame")
             axis.grid(alpha=0.3, which="both")
+            axis.tick_params(axis="x", which="minor", labelsize=6, rotation=45)
             for x, y, name in zip(later, own, quality, strict=True):
                 axis.annotate(f"{name:g}", (x / 1e3, y), textcoords="offset points", xytext=(4, -12), fontsize=8)
         left.set(ylabel="PSNR of later frames, dB", title=f"{clip['name']}: quality at each byte rate")
         right.set(ylabel="ms to encode a frame", yscale="log", title="and the time it takes")
+        left.ticklabel_format(axis="y", useOffset=False)
         left.legend(fontsize=8)
     figure.savefig(path, dpi=90)
 
