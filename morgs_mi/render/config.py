@@ -24,7 +24,7 @@ class RenderConfig:
     block_height: int | None = None
     """Pixels down in that block, 1 to 16; None: 4."""
     reproducible: bool = False
-    """Sum gradients in a fixed order: the same bytes on every run and any number of threads. A step takes 1.5 to 1.9
+    """Sum gradients in a fixed order: the same bytes on every run and any number of threads. A step takes 1.9 to 2.4
     times as long (20k and 100k Gaussians, two cores), and 48 bytes for every pair of Gaussian and block."""
 
     def __post_init__(self) -> None:
