@@ -18,6 +18,7 @@ import numpy as np
 
 from morgs_mi.capture.camera import Camera
 from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.rig_check import find_common, with_points
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import Packet, StreamWriter, encode_packet
 from morgs_mi.codec.gaussians import CodedFrame, decode, keyframe_packet, residual_packet, restated
@@ -284,6 +285,8 @@ def stream_capture(
 ) -> list[FrameReport]:
     """Fit a whole capture and write OUT/stream.morgs packet by packet, and OUT/report.json after every frame.
 
+    OUT/capture.json says how the capture was read. One that comes with too few points gets them by triangulation.
+
     Args:
         capture: cameras and frames; its test view is not trained on, but stands in the stream's header.
         out: folder, made if missing.
@@ -295,6 +298,8 @@ def stream_capture(
         ValueError: as `StreamLoop`.
     """
     config, out = config or StreamConfig(), Path(out)
+    if len(capture.points) < _MIN_POINTS:
+        capture = with_points(capture, find_common(capture))
     train = capture.train_views
     loop = StreamLoop(
         [capture.cameras[v] for v in train],
@@ -315,6 +320,7 @@ def stream_capture(
         "variant": mi.variant(),
     }
     out.mkdir(parents=True, exist_ok=True)
+    write_json(out / "capture.json", capture.record())
     reports: list[FrameReport] = []
     with StreamWriter(out / "stream.morgs", capture.cameras, capture.fps, metadata) as writer:
         for frame in capture.frames():

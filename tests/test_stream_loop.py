@@ -187,6 +187,9 @@ def test_a_capture_becomes_a_file(clip, tmp_path):
         def frames(self, start=0, stop=None):
             yield from (Frame(i, tuple(images)) for i, images in enumerate(clip[:2]))
 
+        def record(self):
+            return {"layout": "in memory"}
+
     points = scene(0)[0].numpy()
     capture = Recorded(
         path=tmp_path,
@@ -210,7 +213,8 @@ def test_a_capture_becomes_a_file(clip, tmp_path):
     assert [frame for frame, _ in play(reader)] == [0, 1]
     assert sum(r.num_bytes for r in reports) < path.stat().st_size
     assert ticks[-1] == (1, 16, 16)
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["report.json", "stream.morgs"]
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["capture.json", "report.json", "stream.morgs"]
+    assert json.loads((tmp_path / "out" / "capture.json").read_text()) == {"layout": "in memory"}
 
 
 @pytest.mark.parametrize(
