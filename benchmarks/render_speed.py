@@ -67,6 +67,7 @@ def figures(
 ) -> dict[str, Any]:
     """Return medians over the rounds, their ratios, memory and error for one workload."""
     ours = timing.stages(gaussians, camera, channels)
+    memory = timing.peak_megabytes(ours["step"])  # before the other stages hold what they need
     others, left_out = timing.baselines(gaussians, camera, channels) if options.baselines else ({}, {})
     yardstick = timing.Yardstick(options.yardstick) if options.yardstick and channels == ("color",) else None
     rounds: list[dict[str, float]] = []
@@ -91,7 +92,7 @@ def figures(
             result[key] = round(median(r[part] / r[whole] for r in rounds), 3)
     if left_out:
         result["left_out"] = left_out
-    result["peak_megabytes"] = timing.peak_megabytes(ours["step"])
+    result["peak_megabytes"] = memory
     result |= timing.extent(gaussians, camera)
     return result | timing.error(gaussians, camera, options.seed)
 

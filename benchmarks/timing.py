@@ -7,6 +7,7 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -99,19 +100,26 @@ def stages(
         return works
     tiles = np.random.default_rng(seed).uniform(size=(-(-camera.height // 32), -(-camera.width // 32)))
     mask = np.kron(tiles <= np.quantile(tiles, 0.1), np.ones((32, 32), bool))[: camera.height, : camera.width]
-    tenth, matched = Region(mask, config), Target(target)
-    tenth_wanted = mi.TensorXf(tenth.cut(target))
-    (image,) = forward()
-    image = dr.detach(image)
-    dr.enable_grad(image)
+
+    @cache
+    def tenth() -> tuple[Region, Any]:
+        region = Region(mask, config)
+        return region, mi.TensorXf(region.cut(target))
+
+    @cache
+    def compared() -> tuple[Any, Target]:
+        image = dr.detach(forward()[0])
+        dr.enable_grad(image)
+        return image, Target(target)
 
     def loss() -> Any:
+        image, matched = compared()
         dr.backward(recon_loss(image, matched))
         grad = dr.grad(image)
         dr.clear_grad(image)
         return grad
 
-    return works | {"tenth_step": lambda: step(tenth, tenth_wanted), "loss": loss}
+    return works | {"tenth_step": lambda: step(*tenth()), "loss": loss}
 
 
 def _distance(image: Any, channels: tuple[str, ...], target: Any, size: int) -> Any:
