@@ -144,7 +144,7 @@ def _project_part(
         dr.schedule(shown)
         _check_finite(everything.finite, gaussians)
         if active is None:
-            rows = [dr.compress(shown), mi.UInt32()]
+            rows = [dr.compress(shown)]
         else:
             active = mi.Bool(active)
             N = int(gaussians.means.shape[0])
