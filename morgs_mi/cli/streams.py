@@ -1,0 +1,181 @@
+"""`morgs-mi fit`, `render`, `eval` and `demo`: from a capture to a stream, and what it is worth."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from rich.table import Table
+from tyro.conf import Positional, arg
+
+from morgs_mi.cli.console import OUT, progress, say, warn
+from morgs_mi.demo import DemoConfig
+from morgs_mi.evaluate.tables import figure, judgement_sentences, judgement_tables
+from morgs_mi.fit.presets import PresetName, apply_preset
+from morgs_mi.stream_loop import StreamConfig
+
+__all__ = ["Demo", "Eval", "Fit", "Render"]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Reconstruct a capture, frame after frame, into OUT/stream.morgs."""
+
+    capture: Positional[Path]
+    """Folder of the capture."""
+    out: Positional[Path]
+    """Folder for stream.morgs and report.json; an earlier stream there is replaced."""
+    frames: int | None = None
+    """Use at most this many frames from the start."""
+    downscale: float = 1
+    """Average the images down by this factor."""
+    test_view: int | Literal["auto"] | None = "auto"
+    """Index of the camera to hold out; auto takes the capture's own choice, or camera 0 of six or more."""
+    preset: PresetName | None = None
+    """The paper's variants (l: 8 passes over the views, s: 5), the rows of its ablation (residuals only, with motion,
+    with offset, with confidence), or all of it without lifted flow; what it does not set stays as given."""
+    config: Annotated[StreamConfig, arg(name="")] = field(default_factory=StreamConfig)
+
+    def run(self) -> None:
+        from morgs_mi.capture.capture import load_capture
+        from morgs_mi.stream_loop import stream_capture
+
+        config = self.config
+        if self.preset is not None:
+            fit, motion = apply_preset(self.preset, config.fit, config.motion)
+            config = replace(config, fit=fit, motion=motion)
+        capture = load_capture(self.capture, self.downscale, self.test_view, self.frames)
+        count = capture.num_frames
+        with progress() as report:
+            reports = stream_capture(
+                capture,
+                self.out,
+                config,
+                lambda frame, step, steps: report("Fitting frames", frame + step / steps, count),
+            )
+        seconds = [row.seconds for row in reports[1:]]
+        later = f", {sum(seconds) / len(seconds):.1f} s for each later one" if seconds else ""
+        stream = self.out / "stream.morgs"
+        say(
+            f"{stream}: {len(reports)} frames, {stream.stat().st_size / 1e6:.1f} MB, "
+            f"{reports[0].seconds:.1f} s for the first frame{later}."
+        )
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a stream for one camera into a video, EXR files or PNG files."""
+
+    out: Positional[Path]
+    """Folder of a fit, or a stream file."""
+    camera: str
+    """Camera of the stream, by index or name."""
+    channels: tuple[Literal["color", "motion", "confidence", "depth", "alpha"], ...] | None = None
+    """What to render; by default the colour, in EXR files all that the stream holds."""
+    output: Path | None = None
+    """FILE.mp4, a folder for PNG files whose name ends in png, or another new folder for multichannel EXR files (R, G,
+    B in linear light, motion.X, motion.Y in pixels, confidence.Y, depth.Y); by default OUT/CAMERA.mp4."""
+
+    def run(self) -> None:
+        from morgs_mi.evaluate.frames import write_frames
+        from morgs_mi.evaluate.stream import find_camera, open_stream
+
+        stream = open_stream(self.out)
+        camera = find_camera(stream, self.camera)
+        output = self.output or stream.path.with_name(f"{camera.name}.mp4")
+        total = stream.metadata.get("num_frames", 0)
+        with progress() as report:
+            write_frames(
+                stream, camera, output, self.channels, lambda done: report("Rendering", done, max(total, done))
+            )
+        say(f"{output}: camera {camera.name}, {camera.width}x{camera.height}.")
+
+
+@dataclass(frozen=True)
+class Eval:
+    """Measure a stream against its capture: quality, motion, bytes and seconds."""
+
+    out: Positional[Path]
+    """Folder of a fit, or a stream file."""
+    capture: Path | None = None
+    """Folder of the capture, if it is no longer where it was fitted from."""
+    json: Path | None = None
+    """File for all figures; - prints them in place of the tables."""
+    pictures: Path | None = None
+    """Folder for slice.png (one column over time), motion.png and confidence.png."""
+    lpips: Path | None = None
+    """LPIPS network as ONNX with inputs in0 and in1, RGB [1, 3, H, W] from -1 to 1; none comes with the package."""
+
+    def run(self) -> None:
+        from morgs_mi.evaluate.drawings import draw_stream
+        from morgs_mi.evaluate.judge import evaluate_stream
+        from morgs_mi.evaluate.lpips import Lpips
+        from morgs_mi.evaluate.report import machine, versions
+        from morgs_mi.files import finite, write_json
+
+        network = None if self.lpips is None else Lpips(self.lpips)
+        with progress() as report:
+            result = evaluate_stream(self.out, self.capture, partial(report, "Judging frames"), network)
+            if self.pictures is not None:
+                draw_stream(self.out, self.pictures, self.capture, partial(report, "Drawing frames"))
+        result |= {"machine": machine(), "versions": versions()}
+        if self.json == Path("-"):
+            say(json.dumps(finite(result), indent=2))
+            return
+        _show(result)
+        if self.json is not None:
+            write_json(self.json, result)
+            say(f"All figures: {self.json}")
+        if self.pictures is not None:
+            say(f"Pictures: {self.pictures}")
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Make a clip, reconstruct it with and without learned motion, and leave pictures and figures in OUT."""
+
+    out: Positional[Path]
+    """Folder for everything."""
+    config: Annotated[DemoConfig, arg(name="")] = field(default_factory=DemoConfig)
+
+    def run(self) -> None:
+        from morgs_mi.demo import run_demo
+
+        with progress() as report:
+            result = run_demo(self.out, self.config, report)
+        full, compared = result["full"], result["comparison"]
+        table = Table(title=f"held-out view, frames {_span(compared['frames'])}")
+        for column in ("", "PSNR, dB", "SSIM", "flow error, px", "moving, px", "still, px"):
+            table.add_column(column, justify="right" if column else "left")
+        for name, title in (("full", "with motion"), ("plain", "without")):
+            figures = compared[name]
+            motion = (figure(figures[key], 2) for key in ("motion_error", "motion_error_moving", "motion_error_still"))
+            table.add_row(title, figure(figures["psnr"], 2), figure(figures["ssim"], 4), *motion)
+        OUT.print(table)
+        say(
+            f"Held-out PSNR {figure(full['psnr']['first'], 2)} dB in the first frame, "
+            f"{figure(full['psnr']['last'], 2)} dB in the last of {full['num_frames']}; "
+            f"{figure(full['seconds']['per_later_frame'], 1)} s and "
+            f"{figure(full['bytes']['per_residual'] / 1e6, 2)} MB per later frame; "
+            f"{result['seconds']['total']:.0f} s in all."
+        )
+        say(f"Look at {self.out / 'side_by_side.mp4'} and {self.out / 'contact_sheet.png'};")
+        say(f"all figures are in {self.out / 'report.json'}.")
+
+
+def _show(result: Mapping[str, Any]) -> None:
+    """Print what `evaluate_stream` has found."""
+    for table in judgement_tables(result):
+        OUT.print(table)
+    for sentence in judgement_sentences(result):
+        say(sentence)
+    if not result["complete"]:
+        warn(f"{result['stream']}: the fit was not finished, its stream holds {result['num_frames']} frames.")
+
+
+def _span(frames: Sequence[int]) -> str:
+    return f"{frames[0]} to {frames[-1]}" if frames else "none"
