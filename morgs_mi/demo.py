@@ -22,7 +22,8 @@ from morgs_mi.evaluate.report import machine, versions
 from morgs_mi.evaluate.stream import channel_picture, open_stream, render_stream, truth_on
 from morgs_mi.files import write_json
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.stream_loop import StreamConfig, stream_capture
+from morgs_mi.recorder import stream_capture
+from morgs_mi.stream_loop import StreamConfig
 
 __all__ = ["Clip", "DemoConfig", "run_demo"]
 

@@ -10,19 +10,14 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field
 
-import mitsuba as mi
 import numpy as np
 
 from morgs_mi.capture.camera import Camera
-from morgs_mi.capture.capture import Capture
-from morgs_mi.capture.rig_check import find_common, with_points
 from morgs_mi.codec.config import CodecConfig
-from morgs_mi.codec.container import Packet, StreamWriter, encode_packet
-from morgs_mi.codec.gaussians import CodedFrame, decode, keyframe_packet, residual_packet, restated
-from morgs_mi.files import write_json
+from morgs_mi.codec.container import Packet, encode_packet
+from morgs_mi.codec.gaussians import CodedFrame, decode, keyframe_packet, residual_packet
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.losses import Target
@@ -35,12 +30,12 @@ from morgs_mi.motion.flow_sources import FramePair
 from morgs_mi.motion.masks import motion_mask
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["FrameReport", "StreamConfig", "StreamLoop", "StreamState", "step", "stream_capture"]
+__all__ = ["MIN_POINTS", "FrameReport", "StreamConfig", "StreamLoop", "StreamState", "step"]
 
 _LOG = logging.getLogger(__name__)
 
 # Fewer points than this are no scene: random points in the views are the better start.
-_MIN_POINTS = 100
+MIN_POINTS = 100
 
 
 @dataclass(frozen=True)
@@ -84,13 +79,14 @@ class StreamState:
         frame: index of the next frame.
         coded: what a decoder has after the last frame; None before the first.
         images: the pictures of the last frame.
-        rng: state of the random choices.
+
+    Nothing else crosses frames, and all of it follows from the stream and the recording, so that a fit that was
+    interrupted goes on as if it had not been (`recorder`).
     """
 
     frame: int
     coded: CodedFrame | None
     images: tuple[np.ndarray, ...]
-    rng: np.random.Generator
 
     @property
     def gaussians(self) -> Gaussians | None:
@@ -120,20 +116,19 @@ def step(
     """Take in one frame of all training views and return (state, packet, report)."""
     start = time.perf_counter()
     config, render = setup.config.fit, setup.config.render
+    rng = np.random.default_rng([setup.config.seed, state.frame])  # a frame's own: it needs no state
     targets = [Target(image, mask) for image, mask in zip(images, setup.masks, strict=True)]
     if state.coded is None:
-        gaussians, status = _first_gaussians(setup, images, state.rng)
+        gaussians, status = _first_gaussians(setup, images, rng)
         tick = _ticker(on_step, config.first_frame_steps)
-        gaussians, losses = fit_first_frame(
-            gaussians, setup.cameras, targets, setup.extent, config, render, state.rng, tick
-        )
+        gaussians, losses = fit_first_frame(gaussians, setup.cameras, targets, setup.extent, config, render, rng, tick)
         packet = keyframe_packet(gaussians, state.frame, setup.cameras, setup.config.codec)
         decoded = decode(None, packet)
     else:
         previous, status = state.coded.gaussians, "ok"
         cues = _cues(setup, state, images)
         if state.frame == 1 and setup.config.motion.learn_confidence:
-            previous = _first_confidence(setup, state, cues)
+            previous = _first_confidence(setup, state, cues, rng)
         gaussians, source, losses = fit_next_frame(
             previous,
             setup.cameras,
@@ -143,21 +138,21 @@ def step(
             config,
             setup.config.motion,
             render,
-            state.rng,
+            rng,
             _ticker(on_step, config.epochs * len(setup.cameras)),
         )
         packet = residual_packet(state.coded, gaussians, source, setup.cameras, setup.config.codec)
         decoded = decode(state.coded, packet)
     seconds = time.perf_counter() - start
     report = FrameReport(state.frame, seconds, len(encode_packet(packet)), losses, len(decoded), status)
-    return StreamState(state.frame + 1, decoded, tuple(images), state.rng), packet, report
+    return StreamState(state.frame + 1, decoded, tuple(images)), packet, report
 
 
 def _first_gaussians(setup: Setup, images: Sequence[np.ndarray], rng: np.random.Generator) -> tuple[Gaussians, str]:
     """Place the Gaussians of the first frame, and say so if there was nothing to place them on."""
     count, status = setup.config.fit.first_count, "ok"
     points, colors = setup.points, setup.point_colors
-    if len(points) < _MIN_POINTS:
+    if len(points) < MIN_POINTS:
         status = f"the capture has {len(points)} points, too few: seeded {count} random ones inside the views"
         _LOG.warning("frame 0: %s", status)
         points, colors = seed_points(setup.cameras, images, count, rng)
@@ -165,11 +160,13 @@ def _first_gaussians(setup: Setup, images: Sequence[np.ndarray], rng: np.random.
     return from_points(points, colors, setup.config.fit.sh_degree), status
 
 
-def _first_confidence(setup: Setup, state: StreamState, cues: Mapping[int, MotionCue]) -> Gaussians:
+def _first_confidence(
+    setup: Setup, state: StreamState, cues: Mapping[int, MotionCue], rng: np.random.Generator
+) -> Gaussians:
     """Learn who moves from the first frame's masks, which the flow to the second frame alone can tell."""
     assert state.gaussians is not None
     masks = {v: motion_mask(state.images[v], cue.onward, cue.onward_reliable) for v, cue in cues.items()}
-    fitted, _ = fit_confidence(state.gaussians, setup.cameras, masks, setup.config.fit, setup.config.render, state.rng)
+    fitted, _ = fit_confidence(state.gaussians, setup.cameras, masks, setup.config.fit, setup.config.render, rng)
     return fitted
 
 
@@ -237,7 +234,7 @@ class StreamLoop:
             scene_extent(cameras),
             config,
         )
-        self.state = StreamState(0, None, (), np.random.default_rng(config.seed))
+        self.state = StreamState(0, None, ())
 
     @property
     def gaussians(self) -> Gaussians | None:
@@ -275,64 +272,3 @@ def _check_images(cameras: Sequence[Camera], images: Sequence[np.ndarray], frame
                 f"push(): frame {frame} of view {camera.name!r} must be uint8 [{camera.height}, {camera.width}, 3], "
                 f"got {image.dtype} {list(image.shape)}."
             )
-
-
-def stream_capture(
-    capture: Capture,
-    out: str | Path,
-    config: StreamConfig | None = None,
-    on_step: Callable[[int, int, int], None] | None = None,
-) -> list[FrameReport]:
-    """Fit a whole capture and write OUT/stream.morgs packet by packet, and OUT/report.json after every frame.
-
-    OUT/capture.json says how the capture was read. One that comes with too few points gets them by triangulation.
-
-    Args:
-        capture: cameras and frames; its test view is not trained on, but stands in the stream's header.
-        out: folder, made if missing.
-        config: settings.
-        on_step: called with (frame, steps done, steps of that frame).
-
-    Raises:
-        OSError: the disk is full or not writable; what stands in the stream up to then is whole.
-        ValueError: as `StreamLoop`.
-    """
-    config, out = config or StreamConfig(), Path(out)
-    if len(capture.points) < _MIN_POINTS:
-        capture = with_points(capture, find_common(capture))
-    train = capture.train_views
-    loop = StreamLoop(
-        [capture.cameras[v] for v in train],
-        capture.points,
-        capture.point_colors,
-        config,
-        [capture.masks[v] for v in train],
-    )
-    metadata = {
-        "capture": str(Path(capture.path).resolve()),
-        "downscale": capture.downscale,
-        "test_view": capture.test_view,
-        "train_views": list(train),
-        "num_frames": capture.num_frames,
-        "key_views": [train[v] for v in loop.setup.key_views],
-        "config": asdict(config),
-        "versions": {"mitsuba": mi.__version__},
-        "variant": mi.variant(),
-    }
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "capture.json", capture.record())
-    reports: list[FrameReport] = []
-    with StreamWriter(out / "stream.morgs", capture.cameras, capture.fps, metadata) as writer:
-        for frame in capture.frames():
-            tick = None if on_step is None else _frame_ticker(on_step, frame.index)
-            packet, report = loop.push([frame.images[v] for v in train], tick)
-            reports.append(replace(report, num_bytes=writer.write(packet)))
-            if report.frame and config.codec.keyframe_interval and report.frame % config.codec.keyframe_interval == 0:
-                assert loop.state.coded is not None
-                writer.write(restated(loop.state.coded))
-            write_json(out / "report.json", {**metadata, "frames": [asdict(r) for r in reports]})
-    return reports
-
-
-def _frame_ticker(on_step: Callable[[int, int, int], None], frame: int) -> Callable[[int, int], None]:
-    return lambda done, steps: on_step(frame, done, steps)

@@ -21,6 +21,7 @@ ROOMS = (
     "fit",
     "codec",
     "stream_loop",
+    "recorder",
     "evaluate",
     "viewer",
     "demo",

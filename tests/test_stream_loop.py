@@ -17,7 +17,8 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
 from morgs_mi.fit.config import DensityConfig, FitConfig, Rates
 from morgs_mi.motion.config import MotionConfig
-from morgs_mi.stream_loop import StreamConfig, StreamLoop, stream_capture
+from morgs_mi.recorder import stream_capture
+from morgs_mi.stream_loop import StreamConfig, StreamLoop
 
 SHIFT = np.array([0.06, 0.02, 0.0])  # about 3 px a frame
 QUICK = StreamConfig(  # from all points, for they are those that made the pictures

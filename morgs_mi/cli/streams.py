@@ -42,7 +42,7 @@ class Fit:
 
     def run(self) -> None:
         from morgs_mi.capture.capture import load_capture
-        from morgs_mi.stream_loop import stream_capture
+        from morgs_mi.recorder import stream_capture
 
         config = self.config
         if self.preset is not None:

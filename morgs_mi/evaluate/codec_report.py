@@ -22,7 +22,8 @@ from morgs_mi.codec.grid import step_sizes
 from morgs_mi.evaluate.judge import evaluate_stream
 from morgs_mi.evaluate.report import machine, versions
 from morgs_mi.evaluate.stream import open_stream
-from morgs_mi.stream_loop import StreamConfig, stream_capture
+from morgs_mi.recorder import stream_capture
+from morgs_mi.stream_loop import StreamConfig
 
 __all__ = ["CodecReportConfig", "markdown_table", "plot_codec", "report_codec"]
 
