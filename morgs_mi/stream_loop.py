@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -61,6 +61,7 @@ class FrameReport:
         losses: means over the last steps, by name.
         num_gaussians: how many the frame has.
         status: "ok", or a sentence about what was done instead.
+        left_out: names of the views that had no picture.
     """
 
     frame: int
@@ -69,6 +70,7 @@ class FrameReport:
     losses: dict[str, float]
     num_gaussians: int
     status: str = "ok"
+    left_out: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +80,7 @@ class StreamState:
     Attributes:
         frame: index of the next frame.
         coded: what a decoder has after the last frame; None before the first.
-        images: the pictures of the last frame.
+        images: the pictures of the last frame, None where a view had none.
 
     Nothing else crosses frames, and all of it follows from the stream and the recording, so that a fit that was
     interrupted goes on as if it had not been (`recorder`).
@@ -86,7 +88,7 @@ class StreamState:
 
     frame: int
     coded: CodedFrame | None
-    images: tuple[np.ndarray, ...]
+    images: tuple[np.ndarray | None, ...]
 
     @property
     def gaussians(self) -> Gaussians | None:
@@ -113,7 +115,7 @@ def step(
     images: Sequence[np.ndarray],
     on_step: Callable[[int, int], None] | None = None,
 ) -> tuple[StreamState, Packet, FrameReport]:
-    """Take in one frame of all training views and return (state, packet, report)."""
+    """Take in one frame of all views of `setup` and return (state, packet, report)."""
     start = time.perf_counter()
     config, render = setup.config.fit, setup.config.render
     rng = np.random.default_rng([setup.config.seed, state.frame])  # a frame's own: it needs no state
@@ -127,7 +129,7 @@ def step(
     else:
         previous, status = state.coded.gaussians, "ok"
         cues = _cues(setup, state, images)
-        if state.frame == 1 and setup.config.motion.learn_confidence:
+        if state.frame == 1 and cues and setup.config.motion.learn_confidence:
             previous = _first_confidence(setup, state, cues, rng)
         gaussians, source, losses = fit_next_frame(
             previous,
@@ -188,6 +190,30 @@ def _ticker(on_step: Callable[[int, int], None] | None, steps: int) -> Callable[
     return None if on_step is None else lambda done: on_step(done, steps)
 
 
+def _seen_only(setup: Setup, state: StreamState, views: Sequence[int]) -> tuple[Setup, StreamState]:
+    """Return what `step` needs if there are pictures of `views` alone; flow takes those that had one before, too."""
+    if len(views) == len(setup.cameras) and all(image is not None for image in state.images):
+        return setup, state
+    before = [state.images[v] for v in views] if state.images else []
+    both = [i for i, image in enumerate(before) if image is not None]
+    key_views = tuple(i for i in both if views[i] in setup.key_views)
+    if len(key_views) < len(setup.key_views) and both:
+        cameras = [setup.cameras[views[i]] for i in both]
+        key_views = tuple(both[k] for k in choose_key_views(cameras, len(setup.key_views)))
+    cameras, masks = (tuple(values[v] for v in views) for values in (setup.cameras, setup.masks))
+    return replace(setup, cameras=cameras, masks=masks, key_views=key_views), replace(state, images=tuple(before))
+
+
+def _hold(setup: Setup, state: StreamState) -> tuple[StreamState, Packet, FrameReport]:
+    """Let everything stand still for a frame that nobody has seen."""
+    start = time.perf_counter()
+    assert state.coded is not None
+    packet = residual_packet(state.coded, state.coded.gaussians, None, setup.cameras, setup.config.codec)
+    decoded, seconds = decode(state.coded, packet), time.perf_counter() - start
+    report = FrameReport(state.frame, seconds, len(encode_packet(packet)), {}, len(decoded), "no view has a picture")
+    return StreamState(state.frame + 1, decoded, ()), packet, report
+
+
 class StreamLoop:
     """The causal loop as an object: push frames, get packets.
 
@@ -242,32 +268,41 @@ class StreamLoop:
         return self.state.gaussians
 
     def push(
-        self, images: Sequence[np.ndarray], on_step: Callable[[int, int], None] | None = None
+        self, images: Sequence[np.ndarray | None], on_step: Callable[[int, int], None] | None = None
     ) -> tuple[Packet, FrameReport]:
         """Take in the next frame.
 
         Args:
-            images: per training view uint8 [H, W, 3], RGB.
+            images: per training view uint8 [H, W, 3], RGB, or None: the view is left out of this frame.
             on_step: called with (steps done, steps of this frame).
 
         Returns:
             The packet for the stream, and the frame's report.
 
         Raises:
-            ValueError: a picture is missing or has another size or type than its camera says.
+            ValueError: a picture has another size or type than its camera says, or the first frame has none at all.
         """
         _check_images(self.setup.cameras, images, self.state.frame)
-        self.state, packet, report = step(self.setup, self.state, images, on_step)
-        return packet, report
+        seen = {view: image for view, image in enumerate(images) if image is not None}
+        if seen:
+            setup, state = _seen_only(self.setup, self.state, tuple(seen))
+            state, packet, report = step(setup, state, tuple(seen.values()), on_step)
+        else:
+            state, packet, report = _hold(self.setup, self.state)
+        self.state = replace(state, images=tuple(images))
+        left_out = tuple(camera.name for v, camera in enumerate(self.setup.cameras) if v not in seen)
+        return packet, replace(report, left_out=left_out)
 
 
-def _check_images(cameras: Sequence[Camera], images: Sequence[np.ndarray], frame: int) -> None:
+def _check_images(cameras: Sequence[Camera], images: Sequence[np.ndarray | None], frame: int) -> None:
     if len(images) != len(cameras):
         raise ValueError(
-            f"push(): frame {frame} must have one picture for each of {len(cameras)} views, got {len(images)}."
+            f"push(): frame {frame} must have one picture for each of {len(cameras)} views, or None, got {len(images)}."
         )
+    if not frame and all(image is None for image in images):
+        raise ValueError("push(): frame 0 must have a picture of at least one view, got none; begin with one that has.")
     for camera, image in zip(cameras, images, strict=True):
-        if image.shape != (camera.height, camera.width, 3) or image.dtype != np.uint8:
+        if image is not None and (image.shape != (camera.height, camera.width, 3) or image.dtype != np.uint8):
             raise ValueError(
                 f"push(): frame {frame} of view {camera.name!r} must be uint8 [{camera.height}, {camera.width}, 3], "
                 f"got {image.dtype} {list(image.shape)}."

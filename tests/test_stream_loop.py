@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from morgs_mi import Camera, Gaussians, RenderConfig, rasterize, stream_loop
 from morgs_mi.capture.capture import Capture, Frame
 from morgs_mi.codec.container import PacketKind, encode_packet
 from morgs_mi.codec.gaussians import coded_frames, decode, play
@@ -184,6 +184,51 @@ def test_too_few_points_are_replaced_and_reported(clip):
     assert 590 < len(loop.gaussians) <= 600  # those that fade in the last round are not made up for
 
 
+def without(images, *views):
+    return [None if view in views else image for view, image in enumerate(images[:4])]
+
+
+def test_a_view_that_drops_out_is_left_out_of_its_frame_and_of_the_next_flow(clip, monkeypatch):
+    """Flow on two key views, of those that have both pictures: never of the view that is away, nor when it is back."""
+    flowed = []
+    cues = stream_loop.motion_cues
+    monkeypatch.setattr(
+        stream_loop,
+        "motion_cues",
+        lambda pairs, *more: flowed.append({p.camera for p in pairs.values()}) or cues(pairs, *more),
+    )
+    loop = new_loop()
+    usual = {cameras()[view].name for view in loop.setup.key_views}
+    gone = loop.setup.key_views[0]
+    frames = [clip[0][:4], without(clip[1], gone), clip[2][:4], clip[3][:4]]
+    scores, reports = [], []
+    for images in frames:
+        reports.append(loop.push(images)[1])
+        shown = np.clip(np.asarray(held_out(loop.gaussians, ("color",)).color), 0, 1)
+        scores.append([psnr(shown, clip[t][4] / 255) for t in range(4)])
+    assert [report.left_out for report in reports] == [(), (f"cam{gone:02d}",), (), ()]
+    assert [len(views) for views in flowed] == [2, 2, 2]
+    assert all(f"cam{gone:02d}" not in views for views in flowed[:2])
+    assert flowed[2] == usual
+    # Every frame follows what moves, from three views of four too: it shows its own instant better than the last did.
+    assert all(scores[t][t] > scores[t - 1][t] + 1 for t in (1, 2, 3)), scores
+
+
+def test_a_frame_that_nobody_saw_stands_still(clip):
+    loop = new_loop()
+    first, _ = loop.push(without(clip[0], 1))
+    before = loop.gaussians.numpy()
+    packet, report = loop.push([None] * 4)
+    assert report.status == "no view has a picture"
+    assert report.left_out == ("cam00", "cam01", "cam02", "cam03")
+    assert report.num_bytes < 200 < len(encode_packet(first))  # the packet's frame, and nothing in it
+    for name, value in loop.gaussians.numpy().items():
+        assert name == "motion" or np.array_equal(value, before[name]), name
+    packet, report = loop.push(clip[1][:4])
+    assert (packet.frame, report.status, report.left_out) == (2, "ok", ())
+    assert "flow" not in report.losses
+
+
 def test_a_capture_becomes_a_file(clip, tmp_path):
     class Recorded(Capture):
         def frames(self, start=0, stop=None):
@@ -223,7 +268,8 @@ def test_a_capture_becomes_a_file(clip, tmp_path):
     ("call", "message"),
     [
         (lambda clip: StreamLoop([], np.zeros((0, 3)), np.zeros((0, 3))), "at least one view"),
-        (lambda clip: new_loop().push(clip[0][:3]), "one picture for each of 4 views, got 3"),
+        (lambda clip: new_loop().push(clip[0][:3]), "one picture for each of 4 views, or None, got 3"),
+        (lambda clip: new_loop().push([None] * 4), "frame 0 must have a picture of at least one view, got none"),
         (lambda clip: new_loop().push([i[:50] for i in clip[0][:4]]), r"view 'cam00' must be uint8 \[72, 96, 3\]"),
         (lambda clip: new_loop().push([i / 255 for i in clip[0][:4]]), "got float64"),
         (lambda clip: StreamLoop(cameras(), np.full((200, 3), np.nan), np.zeros((200, 3))), "point 0 is not"),
