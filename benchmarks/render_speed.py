@@ -64,9 +64,10 @@ def figures(
     channels: tuple[str, ...],
     options: Options,
     patience: float = float("inf"),
+    num_features: int = 0,
 ) -> dict[str, Any]:
     """Return medians over the rounds, their ratios, memory and error for one workload."""
-    ours = timing.stages(gaussians, camera, channels)
+    ours = timing.stages(gaussians, camera, channels, num_features)
     memory = timing.peak_megabytes(ours["step"])  # before the other stages hold what they need
     others, left_out = timing.baselines(gaussians, camera, channels) if options.baselines else ({}, {})
     yardstick = timing.Yardstick(options.yardstick) if options.yardstick and channels == ("color",) else None
@@ -121,8 +122,9 @@ def climb(options: Options) -> dict[str, Any]:
         gaussians, camera = workloads.build(rung, options.seed)
         row: dict[str, Any] = {"name": rung.name, "series": rung.series, "gaussians": rung.count}
         row |= {"size": list(rung.size), "scale": rung.scale, "channels": list(rung.channels)}
-        row |= {"columns": sum(CHANNEL_SIZES.get(name, 0) for name in rung.channels)}
-        row |= figures(gaussians, camera, rung.channels, options, patience=0.7 if options.quick else 2)
+        row |= {"columns": rung.features + sum(CHANNEL_SIZES.get(name, 0) for name in rung.channels)}
+        patience = 0.7 if options.quick else 2
+        row |= figures(gaussians, camera, rung.channels, options, patience, rung.features)
         print(
             f"{rung.name:30s} lists {row['lists_ms']:8.1f}  forward {row['forward_ms']:8.1f}  "
             f"step {row['step_ms']:8.1f} ms  {row['peak_megabytes']:8.1f} MB  error {row['error_max']:.1e}",

@@ -53,7 +53,7 @@ def timed(work: Callable[[], Any], repeats: int, patience: float = float("inf"))
 
 
 def stages(
-    gaussians: Gaussians, camera: Camera, channels: tuple[str, ...] = ("color",), seed: int = 1
+    gaussians: Gaussians, camera: Camera, channels: tuple[str, ...] = ("color",), num_features: int = 0, seed: int = 1
 ) -> dict[str, Callable[[], Any]]:
     """Return what is timed.
 
@@ -63,20 +63,24 @@ def stages(
     """
     config = RenderConfig()
     target = np.broadcast_to(np.float32(TARGET), (camera.height, camera.width, 3)).copy()
-    attributes, full = list(gaussians.items().values()), mi.TensorXf(target)
+    attributes, full, features = list(gaussians.items().values()), mi.TensorXf(target), None
+    if num_features:
+        features = mi.TensorXf(np.full((len(gaussians), num_features), 0.3, np.float32))
+        attributes.append(features)
+    named = (*channels, "features") if num_features else channels
     dr.enable_grad(attributes)
 
     def lists() -> Any:
         with dr.suspend_grad():
             region = whole_view(camera.width, camera.height, config)
-            splats = project(gaussians, camera, channels, config)
-            built = build_lists(splats, [v for name in channels for v in splats.channels.get(name, ())], region, config)
+            splats = project(gaussians, camera, named, config, features=features)
+            built = build_lists(splats, [v for name in named for v in splats.channels.get(name, ())], region, config)
         return built.words, built.order
 
     def forward() -> Any:
         with dr.suspend_grad():
-            image = rasterize(gaussians, camera, channels)
-            return [getattr(image, name) for name in channels]
+            image = rasterize(gaussians, camera, channels, features=features)
+            return [getattr(image, name) for name in named]
 
     def gradients(loss: Any) -> Any:
         dr.backward(loss)
@@ -86,17 +90,17 @@ def stages(
         return grads
 
     def step(region: Region | None = None, wanted: Any = None) -> Any:
-        image = rasterize(gaussians, camera, channels, region=region)
-        return gradients(_distance(image, channels, full if wanted is None else wanted, target.size))
+        image = rasterize(gaussians, camera, channels, features=features, region=region)
+        return gradients(_distance(image, named, full if wanted is None else wanted, target.size))
 
     def adjoint() -> Callable[[], Any]:
-        image = rasterize(gaussians, camera, channels)
-        loss = _distance(image, channels, full, target.size)
+        image = rasterize(gaussians, camera, channels, features=features)
+        loss = _distance(image, named, full, target.size)
         dr.eval(image, loss)
         return lambda: gradients(loss)
 
     works = {"lists": lists, "forward": forward, "adjoint": adjoint, "step": step}
-    if channels != ("color",):
+    if named != ("color",):
         return works
     tiles = np.random.default_rng(seed).uniform(size=(-(-camera.height // 32), -(-camera.width // 32)))
     mask = np.kron(tiles <= np.quantile(tiles, 0.1), np.ones((32, 32), bool))[: camera.height, : camera.width]

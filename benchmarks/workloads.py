@@ -30,6 +30,7 @@ class Rung:
         size: image (width, height) in px.
         scale: median standard deviation of a Gaussian; the ball's radius is 1 and fills the view.
         channels: what is rendered.
+        features: numbers per Gaussian that are blended beside the channels.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Rung:
     size: tuple[int, int] = (1352, 1014)
     scale: float = 0.01
     channels: tuple[str, ...] = ("color",)
+    features: int = 0
 
 
 _BASE = Rung("100k, 1352x1014", "base")
@@ -54,6 +56,7 @@ FULL = (
     replace(_BASE, name="color, depth", series="channels", channels=("color", "depth")),
     replace(_BASE, name="color, motion", series="channels", channels=("color", "motion")),
     replace(_BASE, name="every channel", series="channels", channels=EVERY_CHANNEL),
+    replace(_BASE, name="every channel, 5 features", series="channels", channels=EVERY_CHANNEL, features=5),
     Rung("500k, 2704x2028", "largest", 500_000, (2704, 2028)),
 )
 QUICK = (

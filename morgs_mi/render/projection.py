@@ -25,7 +25,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.capture.camera import Camera
-from morgs_mi.gaussians.gaussians import ActivatedGaussians
+from morgs_mi.gaussians.gaussians import ActivatedGaussians, tensor_rows
 from morgs_mi.render.config import RenderConfig
 
 __all__ = ["CHANNEL_SIZES", "Splats", "project"]
@@ -96,15 +96,17 @@ def project(
     channels: tuple[str, ...],
     config: RenderConfig,
     rows: Any | None = None,
+    features: Any | None = None,
 ) -> Splats:
     """Project Gaussians to the screen of `camera` and evaluate the channels asked for.
 
     Args:
         gaussians: N Gaussians with activated attributes.
         camera: the view; a Dr.Jit `viewmat` receives gradients.
-        channels: names out of `CHANNEL_SIZES`.
+        channels: names out of `CHANNEL_SIZES`, or ``features``.
         config: cut-offs.
         rows: which Gaussians, UInt32 [M], none of them twice; None: all N, in order.
+        features: tensor [N, F] that the channel ``features`` blends.
 
     Returns:
         Splats of length M, differentiable in every attribute and in the camera's pose.
@@ -146,6 +148,8 @@ def project(
             blended[name] = _screen_motion(gaussians.rows("motion", rows), x * rz, y * rz, fx * rz, fy * rz, R)
         elif name == "confidence":
             blended[name] = tuple(gaussians.rows("confidence", rows))
+        elif name == "features":
+            blended[name] = tuple(tensor_rows(features, rows))
 
     # alpha >= alpha_min  <=>  u^2 + v^2 <= reach, an ellipse with these half axes along x and y
     reach = dr.maximum(dr.detach(log2_opacity) - log2(config.alpha_min), 0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,11 +16,13 @@ from morgs_mi.render.blocks import build_lists, touches
 from morgs_mi.render.compositing import Channel, Layout, blend
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.projection import CHANNEL_SIZES, Splats, project
-from morgs_mi.render.region import Region, whole_view
+from morgs_mi.render.region import Region, owned, whole_view
 
 __all__ = ["Image", "rasterize"]
 
 _CHANNELS = ("color", "alpha", "depth", "motion", "confidence")
+# More would not fit a record of six packets beside all other channels.
+_MOST_FEATURES = 12
 _NORMALISED = ("depth", "motion")  # divided by alpha: expected values, not sums
 
 
@@ -36,6 +38,7 @@ class Image:
         depth: expected camera-space z [H, W, 1], world units; 0 where nothing is.
         motion: where each pixel came from [H, W, 2], px, x_t - x_{t-1} (eq. 6); 0 where nothing is.
         confidence: blended motion confidence [H, W, 1].
+        features: blended features [H, W, F].
     """
 
     color: Any = None
@@ -43,6 +46,7 @@ class Image:
     depth: Any = None
     motion: Any = None
     confidence: Any = None
+    features: Any = None
 
 
 def rasterize(
@@ -53,6 +57,7 @@ def rasterize(
     detach_weights: Sequence[str] = (),
     region: Region | None = None,
     active: Any | None = None,
+    features: Any | None = None,
     config: RenderConfig | None = None,
 ) -> Image:
     """Render Gaussians by depth-ordered alpha blending (eq. 1), differentiably.
@@ -70,6 +75,7 @@ def rasterize(
         region: the blocks of pixels to draw; None: the whole view. What it does not need is not done: Gaussians that
             touch none of its blocks are only projected.
         active: bool [N], the Gaussians that gradients reach; None: all.
+        features: [N, F], whatever else is to be blended like colours, in `Image.features`; F is at most 12.
         config: cut-offs and block shape.
 
     Returns:
@@ -85,25 +91,28 @@ def rasterize(
     It does not antialias beyond `eps2d`, and it does not undistort lenses.
     """
     config = config or RenderConfig()
-    channels = tuple(dict.fromkeys(channels))
+    channels, sizes = tuple(dict.fromkeys(channels)), {**CHANNEL_SIZES, "alpha": 1}
     _check(gaussians, camera, channels, background, detach_weights)
+    if features is not None:
+        features, sizes["features"] = _checked_features(features, gaussians)
+        channels = (*channels, "features")
     region = region or whole_view(camera.width, camera.height, config)
     _check_region(region, camera, config)
     blended = tuple(c for c in channels if c != "alpha")
     if dr.prod(gaussians.means.shape[:1]) == 0:
-        return _empty(channels, background, region)
+        return _empty(channels, sizes, background, region)
     if region.whole and active is None:
-        splats = project(gaussians, camera, blended, config)
+        splats = project(gaussians, camera, blended, config, features=features)
     else:
-        splats = _project_part(gaussians, camera, blended, region, active, config)
+        splats = _project_part(gaussians, camera, blended, region, active, features, config)
     if splats is None:
-        return _empty(channels, background, region)
+        return _empty(channels, sizes, background, region)
     dr.schedule(splats.shape, splats.channels, splats.depths, splats.extent, splats.valid)
-    _check_finite(splats.finite, gaussians)
+    _check_finite(splats.finite, gaussians, features)
     values = [splats.channels[name] for name in blended]
     with dr.suspend_grad():
         lists = build_lists(splats, [column for columns in values for column in columns], region, config)
-    layout = _layout(channels, blended, background, detach_weights, config)
+    layout = _layout(channels, sizes, background, detach_weights, config)
     parts = blend(splats.shape, values, region, lists, layout)
     images = dict(zip((*blended, "alpha", "coverage"), parts, strict=False))
     coverage = images.pop("coverage", None)
@@ -112,7 +121,7 @@ def rasterize(
             weight = repeated(dr.detach(coverage) if name in detach_weights else coverage, CHANNEL_SIZES[name])
             finish = _normalised if name in _NORMALISED else _over(background)
             images[name] = finish(images[name], weight)
-    return Image(**{name: _tensor(images[name], region, CHANNEL_SIZES.get(name, 1)) for name in channels})
+    return Image(**{name: _tensor(images[name], region, sizes[name]) for name in channels})
 
 
 def _normalised(values: Any, weight: Any) -> Any:
@@ -134,15 +143,16 @@ def _project_part(
     channels: tuple[str, ...],
     region: Region,
     active: Any | None,
+    features: Any | None,
     config: RenderConfig,
 ) -> Splats | None:
     """Project those Gaussians that the region may show, attached to the gradient graph only those that are active."""
-    still = dr.detach(gaussians)
+    still, still_features = dr.detach(gaussians), None if features is None else dr.detach(features)
     with dr.suspend_grad():
         everything = project(still, camera, (), config)
         shown = touches(everything, region)
         dr.schedule(shown)
-        _check_finite(everything.finite, gaussians)
+        _check_finite(everything.finite, gaussians, features)
         if active is None:
             rows = [dr.compress(shown)]
         else:
@@ -152,8 +162,8 @@ def _project_part(
                 raise ValueError(f"rasterize(): `active` must be bool [N] with N={N}, got {dr.width(active)} values.")
             rows = [dr.compress(shown & active), dr.compress(shown & ~active)]
     parts = [
-        project(some, camera, channels, config, index)
-        for some, index in zip((gaussians, still), rows, strict=False)
+        project(some, camera, channels, config, index, blended)
+        for some, blended, index in zip((gaussians, still), (features, still_features), rows, strict=False)
         if dr.width(index)
     ]
     if len(parts) < 2:
@@ -163,7 +173,7 @@ def _project_part(
 
 def _layout(
     channels: tuple[str, ...],
-    blended: tuple[str, ...],
+    sizes: Mapping[str, int],
     background: Sequence[float] | None,
     detach_weights: Sequence[str],
     config: RenderConfig,
@@ -175,8 +185,8 @@ def _layout(
         for name in channels
         if name == "alpha" or name in _NORMALISED or (name == "color" and background is not None)
     ]
-    sizes = tuple(Channel(CHANNEL_SIZES[name], name not in detach_weights) for name in blended)
-    return Layout(sizes, bool(readers), any(name not in detach_weights for name in readers), config)
+    parts = tuple(Channel(sizes[name], name not in detach_weights) for name in channels if name != "alpha")
+    return Layout(parts, bool(readers), any(name not in detach_weights for name in readers), config)
 
 
 def _tensor(values: Any, region: Region, size: int) -> Any:
@@ -186,9 +196,11 @@ def _tensor(values: Any, region: Region, size: int) -> Any:
     return mi.TensorXf(values, region.shape(size))
 
 
-def _empty(channels: tuple[str, ...], background: Sequence[float] | None, region: Region) -> Image:
+def _empty(
+    channels: tuple[str, ...], sizes: Mapping[str, int], background: Sequence[float] | None, region: Region
+) -> Image:
     """Return the image of no Gaussians."""
-    images = {n: dr.zeros(mi.TensorXf, region.shape(CHANNEL_SIZES.get(n, 1))) for n in channels}
+    images = {n: dr.zeros(mi.TensorXf, region.shape(sizes[n])) for n in channels}
     if background is not None and "color" in images:
         backdrop = np.broadcast_to(np.float32(background), region.shape(3))
         images["color"] = _tensor(mi.Float(backdrop.ravel()), region, 3)
@@ -218,7 +230,7 @@ def _check(
             f"got {mi.variant()!r}; call mi.set_variant() first."
         )
     for name in (*channels, *detach_weights):
-        if name not in _CHANNELS:
+        if name not in _CHANNELS and not (name == "features" and name not in channels):
             raise ValueError(f"rasterize(): `channels` must be out of {', '.join(_CHANNELS)}, got {name!r}.")
     for name in ("motion", "confidence"):
         if name in channels and getattr(gaussians, name) is None:
@@ -235,12 +247,26 @@ def _check(
         )
 
 
-def _check_finite(finite: Any, gaussians: ActivatedGaussians) -> None:
+def _checked_features(features: Any, gaussians: ActivatedGaussians) -> tuple[Any, int]:
+    """Return the features as a tensor [N, F], and F."""
+    features = (
+        features if dr.is_tensor_v(features) else mi.TensorXf(owned(mi.Float(np.ravel(features))), np.shape(features))
+    )
+    shape, N = tuple(features.shape), int(gaussians.means.shape[0])
+    if len(shape) != 2 or shape[0] != N or not 1 <= shape[1] <= _MOST_FEATURES:
+        raise ValueError(
+            f"rasterize(): `features` must be [N, F] with N={N} and F from 1 to {_MOST_FEATURES}, got {list(shape)}; "
+            "blend more in several calls."
+        )
+    return features, shape[1]
+
+
+def _check_finite(finite: Any, gaussians: ActivatedGaussians, features: Any | None) -> None:
     """Raise if a projected Gaussian is not finite because its attributes are not."""
     if dr.all(finite):
         return
-    for name in ("means", "scales", "quats", "opacities", "sh_coeffs", "motion", "confidence"):
-        value = getattr(gaussians, name)
+    names = ("means", "scales", "quats", "opacities", "sh_coeffs", "motion", "confidence")
+    for name, value in {**{name: getattr(gaussians, name) for name in names}, "features": features}.items():
         if value is None:
             continue
         bad = np.argwhere(~np.isfinite(np.asarray(dr.detach(value))))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -81,6 +83,45 @@ def test_every_channel_agrees_with_twin(scene):
         solid = np.broadcast_to(expected["alpha"] > 0.02, found.shape)
         scale = max(1.0, np.abs(expected[name]).max())
         assert np.abs(found - expected[name])[solid].max() < tol.IMAGE_ABS * scale, name
+
+
+def test_features_are_blended_like_the_confidence(scene):
+    """Twelve columns beside the colour: image, gradient of the features and of the geometry are the confidence's."""
+    raw, camera = scene
+    rng = np.random.default_rng(2)
+    values, seed = rng.normal(size=(len(raw["means"]), 12)), rng.normal(size=(camera.height, camera.width, 12))
+
+    def differentiated(column):
+        gaussians = to_gaussians(raw, grad=True)
+        if column is None:
+            features = mi.TensorXf(values)
+            dr.enable_grad(features)
+            image = rasterize(gaussians, camera, ("color",), features=features).features
+            dr.backward(dr.sum(image * mi.TensorXf(seed), axis=None))
+            return np.asarray(dr.detach(image)), np.asarray(dr.grad(features)), np.asarray(dr.grad(gaussians.means))
+        logits = mi.TensorXf(np.zeros(len(values)))
+        dr.enable_grad(logits)
+        one = replace(gaussians, logit_confidence=logits)
+        image = rasterize(one, camera, ("confidence",)).confidence
+        dr.backward(dr.sum(image * mi.TensorXf(seed[..., column : column + 1]), axis=None))
+        return dr.grad(logits)
+
+    image, grad, moved = differentiated(None)
+    expected = sum(w[..., None] * v for w, v in zip(weights_of(raw, camera), values, strict=True))
+    assert np.abs(image - expected).max() < tol.IMAGE_ABS * np.abs(values).max()
+    assert np.abs(moved).max() > 0
+    for column in (0, 11):
+        # sigmoid' (0) = 1 / 4
+        assert relative(grad[:, column], 4 * np.asarray(differentiated(column))) < tol.GRADIENT_REL
+
+
+def weights_of(raw, camera):
+    """Return T alpha [H, W] of every Gaussian: the confidence of a scene where nobody else is confident."""
+    n = len(raw["means"])
+    for k in range(n):
+        logits = np.where(np.arange(n) == k, 100.0, -100.0)
+        gaussians = to_gaussians({**raw, "logit_confidence": logits})
+        yield np.asarray(rasterize(gaussians, camera, ("confidence",)).confidence)[..., 0]
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
@@ -307,6 +348,12 @@ def test_bad_calls_say_what_was_expected(scene):
     for background in ((1, 2), 0.5, (0, 0, np.nan)):
         with pytest.raises(ValueError, match="`background` must be three finite numbers"):
             rasterize(to_gaussians(raw), camera, background=background)
+    for features in (np.ones(10), np.ones((9, 2)), np.ones((10, 13))):
+        with pytest.raises(ValueError, match=r"`features` must be \[N, F\] with N=10 and F from 1 to 12"):
+            rasterize(to_gaussians(raw), camera, features=features)
+    broken = np.where(np.arange(10)[:, None] == 3, np.nan, np.ones((10, 2)))
+    with pytest.raises(ValueError, match=r"`features` must be finite, got nan at \[3, 0\]"):
+        rasterize(to_gaussians(raw), camera, features=broken)
     bare = {k: v for k, v in raw.items() if k not in ("motion", "logit_confidence")}
     with pytest.raises(ValueError, match="channel 'motion' needs Gaussians that carry it"):
         rasterize(to_gaussians(bare), camera, ("motion",))

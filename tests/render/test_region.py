@@ -99,6 +99,31 @@ def test_only_active_gaussians_get_gradients(raw, camera, mask, weight):
         assert all((grads[name][~active] == 0).all() for name in RAW)
 
 
+def test_features_on_a_region_of_the_active(raw, camera, mask):
+    rng, region = np.random.default_rng(0), Region(mask)
+    values, active = np.float32(rng.normal(size=(len(raw["means"]), 5))), rng.uniform(size=len(raw["means"])) < 0.4
+
+    def run_features(**part):
+        features = mi.TensorXf(values)
+        dr.enable_grad(features)
+        image = rasterize(Gaussians(**raw), camera, (), features=features, **part).features
+        shown = image * (1 if part else mi.TensorXf(np.float32(mask_of(region, mask))))
+        dr.backward(dr.sum(dr.square(shown), axis=None))
+        return np.asarray(dr.detach(image)), np.asarray(dr.grad(features))
+
+    expected, full = run_features()
+    found, grad = run_features(region=region, active=active)
+    assert np.array_equal(found, region.cut(expected))
+    assert np.abs(full[active]).max() > 0
+    assert np.abs(grad[active] - full[active]).max() < tol.SUM_ORDER_REL * np.abs(full).max()
+    assert (grad[~active] == 0).all()
+
+
+def mask_of(region, mask):
+    """Return 1 on the pixels of the region's blocks [H, W, 1], 0 elsewhere."""
+    return region.paste(np.ones(region.shape(1)[:3]), np.zeros(mask.shape))[..., None]
+
+
 def test_equal_depths_keep_their_order_whoever_is_active(camera):
     """Two opaque Gaussians in one place: the first one hides the second, active or not."""
     raw = {
