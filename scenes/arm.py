@@ -5,11 +5,10 @@ Every link is rigid; its pose is its parent's pose times a joint, so the hand ad
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from morgs_mi.capture.scene import Object, Rig, Scene, rotate, translate
+from morgs_mi.capture.shapes import ball, box, disk, rod
 from morgs_mi.capture.textures import lights, pattern, room, textured
 
 UPPER, FORE = 0.70, 0.60
@@ -23,24 +22,26 @@ def build(seed: int = 0) -> Scene:
     green = textured(pattern(seed + 23, (0.20, 0.58, 0.30), (0.76, 0.70, 0.36), 2, 12))
     objects = {
         **room(seed),
-        "base": Object({"block": _box(0, 0.15, 0, 0.36, 0.15, 0.36, steel)}),
-        "turntable": Object({"drum": _rod(0, 0.25, 0.30, steel), "lid": _lid(0.25, 0.30, steel)}, turntable),
+        "base": Object({"block": box((0, 0.15, 0), (0.36, 0.15, 0.36), steel)}),
+        "turntable": Object(
+            {"drum": rod((0, 0, 0), (0, 0.25, 0), 0.30, steel), "lid": disk((0, 0.25, 0), 0.30, steel)}, turntable
+        ),
         "upper_arm": Object(
             {
-                "beam": _box(0, 0.5 * UPPER, 0, 0.16, 0.5 * UPPER, 0.16, orange),
-                "shoulder": _ball(0.26, steel),
+                "beam": box((0, 0.5 * UPPER, 0), (0.16, 0.5 * UPPER, 0.16), orange),
+                "shoulder": ball(0.26, steel),
             },
             upper_arm,
         ),
         "forearm": Object(
-            {"beam": _box(0, 0.5 * FORE, 0, 0.13, 0.5 * FORE, 0.13, blue), "elbow": _ball(0.21, orange)},
+            {"beam": box((0, 0.5 * FORE, 0), (0.13, 0.5 * FORE, 0.13), blue), "elbow": ball(0.21, orange)},
             forearm,
         ),
         "hand": Object(
             {
-                "palm": _box(0, 0.10, 0, 0.24, 0.07, 0.16, green),
-                "finger": _box(-0.17, 0.30, 0, 0.07, 0.15, 0.13, orange),
-                "thumb": _box(0.17, 0.30, 0, 0.07, 0.15, 0.13, blue),
+                "palm": box((0, 0.10, 0), (0.24, 0.07, 0.16), green),
+                "finger": box((-0.17, 0.30, 0), (0.07, 0.15, 0.13), orange),
+                "thumb": box((0.17, 0.30, 0), (0.07, 0.15, 0.13), blue),
             },
             hand,
         ),
@@ -66,31 +67,3 @@ def forearm(time: float) -> np.ndarray:
 def hand(time: float) -> np.ndarray:
     """Twist at the wrist."""
     return forearm(time) @ translate(0, FORE, 0) @ rotate("y", 2.4 * time)
-
-
-def _box(x: float, y: float, z: float, dx: float, dy: float, dz: float, bsdf: dict[str, Any]) -> dict[str, Any]:
-    """Return a box about (x, y, z) with half-widths (dx, dy, dz)."""
-    return {
-        "type": "cube",
-        "to_world": _transform(translate(x, y, z) @ np.diag([dx, dy, dz, 1])),
-        "bsdf": bsdf,
-    }
-
-
-def _rod(bottom: float, top: float, radius: float, bsdf: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "cylinder", "p0": [0, bottom, 0], "p1": [0, top, 0], "radius": radius, "bsdf": bsdf}
-
-
-def _lid(y: float, radius: float, bsdf: dict[str, Any]) -> dict[str, Any]:
-    facing_up = translate(0, y, 0) @ rotate("x", -np.pi / 2) @ np.diag([radius, radius, 1, 1])
-    return {"type": "disk", "to_world": _transform(facing_up), "bsdf": bsdf}
-
-
-def _ball(radius: float, bsdf: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "sphere", "radius": radius, "bsdf": bsdf}
-
-
-def _transform(matrix: np.ndarray) -> Any:
-    import mitsuba as mi
-
-    return mi.ScalarTransform4f(matrix)

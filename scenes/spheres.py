@@ -5,15 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from morgs_mi.capture.scene import Object, Scene, rotate, translate
+from morgs_mi.capture.shapes import ball, disk, rod
 from morgs_mi.capture.textures import RGB, lights, pattern, room, textured
-
-TOP = translate(0.15, 0.5, -0.75) @ rotate("x", -np.pi / 2) @ np.diag([0.34, 0.34, 1, 1])
 
 
 def build(seed: int = 0) -> Scene:
     """Return the scene; `seed` chooses its textures."""
-    import mitsuba as mi
-
     balls = {
         "roller": _ball(seed + 10, 0.38, (0.75, 0.20, 0.12), (0.80, 0.70, 0.30), rolling),
         "circler": _ball(seed + 11, 0.28, (0.14, 0.30, 0.70), (0.70, 0.74, 0.78), circling),
@@ -22,14 +19,8 @@ def build(seed: int = 0) -> Scene:
     }
     stone = textured(pattern(seed + 14, (0.40, 0.36, 0.30), (0.24, 0.20, 0.18), 8, 28))
     plinth = {
-        "side": {
-            "type": "cylinder",
-            "p0": [0.15, 0, -0.75],
-            "p1": [0.15, 0.5, -0.75],
-            "radius": 0.34,
-            "bsdf": stone,
-        },
-        "top": {"type": "disk", "to_world": mi.ScalarTransform4f(TOP), "bsdf": stone},
+        "side": rod((0.15, 0, -0.75), (0.15, 0.5, -0.75), 0.34, stone),
+        "top": disk((0.15, 0.5, -0.75), 0.34, stone),
     }
     objects = {**room(seed), "plinth": Object(plinth), **balls}
     return Scene("spheres", objects, lights())
@@ -62,4 +53,4 @@ def spinning(time: float) -> np.ndarray:
 
 def _ball(seed: int, radius: float, first: RGB, second: RGB, pose, roughness: float | None = None) -> Object:
     material = textured(pattern(seed, first, second, 8, 24), roughness)
-    return Object({"ball": {"type": "sphere", "radius": radius, "bsdf": material}}, pose)
+    return Object({"ball": ball(radius, material)}, pose)
