@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -27,7 +28,8 @@ def whole(path: str | os.PathLike[str], place: str) -> Iterator[Path]:
     final = Path(path).resolve()  # a rename would replace a link, and `.` has no name
     partial, old = (final.with_name(f".{what}-{os.getpid()}-{final.name}") for what in ("partial", "old"))
     replaces_folder = os.path.isdir(final)  # unlike Path's, never raises
-    _remove(partial)  # left by a killed process that had the same number
+    for left in _left_behind(final):
+        _remove(left)
     try:
         yield partial
         if replaces_folder and partial.is_dir():
@@ -84,6 +86,23 @@ def finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _left_behind(final: Path) -> list[Path]:
+    """Return what processes wrote that were to make `final` and were killed; one of them may have had our number."""
+    own, named = str(os.getpid()), re.compile(rf"\.partial-(\d+)-{re.escape(final.name)}")
+    found = ((path, named.fullmatch(path.name)) for path in final.parent.glob(".partial-*"))
+    return [path for path, match in found if match and (match[1] == own or not _alive(int(match[1])))]
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:  # somebody else's
+        pass
+    return True
 
 
 def _remove(path: Path) -> None:

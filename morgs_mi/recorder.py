@@ -1,18 +1,31 @@
-"""From a recording to a stream file: the loop run over a capture, one whole packet after the other."""
+"""From a recording to a stream file: the loop run over a capture, one whole packet after the other.
+
+A fit may be killed at any instruction. What stands in the file then is its whole packets and perhaps a piece of the
+next. The report gets a frame's row before the stream gets its packet, so that no packet is without one; nothing else
+needs to be kept, for all that crosses frames follows from the stream and the recording (`StreamState`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import asdict, replace
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from hashlib import blake2b
+from itertools import chain
 from pathlib import Path
+from reprlib import repr as shortened
+from typing import Any
 
 import mitsuba as mi
+import numpy as np
 
-from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.capture import Capture, Frame
 from morgs_mi.capture.rig_check import find_common, with_points
-from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.gaussians import restated
+from morgs_mi.codec.container import PacketKind, StreamWriter, TruncatedStreamError, header_json
+from morgs_mi.codec.gaussians import CodedFrame, restated, seek
+from morgs_mi.codec.reader import StreamReader
 from morgs_mi.files import write_json
+from morgs_mi.motion.cues import choose_key_views
 from morgs_mi.stream_loop import MIN_POINTS, FrameReport, StreamConfig, StreamLoop
 
 __all__ = ["stream_capture"]
@@ -23,8 +36,9 @@ def stream_capture(
     out: str | Path,
     config: StreamConfig | None = None,
     on_step: Callable[[int, int, int], None] | None = None,
+    resume: bool = False,
 ) -> list[FrameReport]:
-    """Fit a whole capture and write OUT/stream.morgs packet by packet, and OUT/report.json after every frame.
+    """Fit a whole capture and write OUT/stream.morgs packet by packet, and OUT/report.json with every frame.
 
     OUT/capture.json says how the capture was read. One that comes with too few points gets them by triangulation.
 
@@ -33,15 +47,23 @@ def stream_capture(
         out: folder, made if missing.
         config: settings.
         on_step: called with (frame, steps done, steps of that frame).
+        resume: go on behind the last whole packet of the stream in `out`, if there is one. With
+            `RenderConfig(reproducible=True)` the stream becomes the same, byte by byte, as without an interruption.
+
+    Returns:
+        The reports of all frames, those from before an interruption included.
 
     Raises:
         OSError: the disk is full or not writable; what stands in the stream up to then is whole.
-        ValueError: as `StreamLoop`.
+        ValueError: as `StreamLoop`; or what is to be resumed is damaged, or another capture's or other settings'.
     """
-    config, out = config or StreamConfig(), Path(out)
-    if len(capture.points) < MIN_POINTS:
+    config, out, train = config or StreamConfig(), Path(out), capture.train_views
+    frames = capture.frames()
+    first = next(frames)
+    metadata = _metadata(capture, first, config)
+    begun = _begun(out, capture, metadata) if resume else None
+    if begun is None and len(capture.points) < MIN_POINTS:
         capture = with_points(capture, find_common(capture))
-    train = capture.train_views
     loop = StreamLoop(
         [capture.cameras[v] for v in train],
         capture.points,
@@ -49,30 +71,128 @@ def stream_capture(
         config,
         [capture.masks[v] for v in train],
     )
-    metadata = {
+    if begun is None:
+        out.mkdir(parents=True, exist_ok=True)
+        write_json(out / "capture.json", capture.record())
+        writer, reports = StreamWriter(out / "stream.morgs", capture.cameras, capture.fps, metadata), []
+        frames = chain((first,), frames)
+    else:
+        frames = capture.frames(begun.coded.frame)
+        last = next(frames)
+        loop.resume(begun.coded, [last.images[v] for v in train])
+        writer, reports = StreamWriter.continued(out / "stream.morgs", begun.index, begun.end), begun.reports
+    interval = config.codec.keyframe_interval
+    with writer:
+        if begun is not None and begun.index[-1][0] == PacketKind.RESIDUAL:
+            _restate(writer, begun.coded, interval)
+        for frame in frames:
+            tick = None if on_step is None else _frame_ticker(on_step, frame.index)
+            packet, report = loop.push([frame.images[v] for v in train], tick)
+            reports.append(report)
+            write_json(out / "report.json", {**metadata, "frames": [asdict(r) for r in reports]})
+            writer.write(packet)
+            _restate(writer, loop.state.coded, interval)
+    return reports
+
+
+@dataclass(frozen=True, eq=False)
+class _Begun:
+    """A stream that was interrupted.
+
+    Attributes:
+        index: (kind, frame, offset) of its whole packets.
+        end: where the last one ends.
+        coded: what they lead to.
+        reports: of their frames.
+    """
+
+    index: list[tuple[int, int, int]]
+    end: int
+    coded: CodedFrame
+    reports: list[FrameReport]
+
+
+def _begun(out: Path, capture: Capture, metadata: Mapping[str, Any]) -> _Begun | None:
+    """Return the stream in `out` up to its last whole packet, None if there is none yet.
+
+    Raises:
+        ValueError: it is damaged, or does not belong to the capture or the settings.
+    """
+    path = out / "stream.morgs"
+    try:
+        stream = StreamReader(path)
+    except (FileNotFoundError, TruncatedStreamError):
+        return None
+    old, new = (
+        json.loads(header_json(*parts))
+        for parts in (
+            (stream.cameras, stream.fps, stream.metadata),
+            (capture.cameras, capture.fps, metadata),
+        )
+    )
+    if difference := _difference(old, new):
+        name, before, now = difference
+        raise ValueError(
+            f"{path}: expected to resume what was begun with {name} = {shortened(before)}, got {shortened(now)}; give "
+            "the same capture and settings, or start again without --resume."
+        )
+    index, end = stream.whole()
+    if not index:
+        return None
+    coded = seek(stream, index[-1][1])
+    return _Begun(index, end, coded, _reports(out / "report.json", coded.frame + 1))
+
+
+def _metadata(capture: Capture, first: Frame, config: StreamConfig) -> dict[str, Any]:
+    """Return what the stream's header says about the fit; one that is resumed must say the same."""
+    train = capture.train_views
+    key_views = choose_key_views([capture.cameras[v] for v in train], config.motion.key_views)
+    return {
         "capture": str(Path(capture.path).resolve()),
+        "fingerprint": _fingerprint([*first.images, capture.points, capture.point_colors]),
         "downscale": capture.downscale,
         "test_view": capture.test_view,
         "train_views": list(train),
         "num_frames": capture.num_frames,
-        "key_views": [train[v] for v in loop.setup.key_views],
+        "key_views": [train[v] for v in key_views],
         "config": asdict(config),
         "versions": {"mitsuba": mi.__version__},
         "variant": mi.variant(),
     }
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(out / "capture.json", capture.record())
-    reports: list[FrameReport] = []
-    with StreamWriter(out / "stream.morgs", capture.cameras, capture.fps, metadata) as writer:
-        for frame in capture.frames():
-            tick = None if on_step is None else _frame_ticker(on_step, frame.index)
-            packet, report = loop.push([frame.images[v] for v in train], tick)
-            reports.append(replace(report, num_bytes=writer.write(packet)))
-            if report.frame and config.codec.keyframe_interval and report.frame % config.codec.keyframe_interval == 0:
-                assert loop.state.coded is not None
-                writer.write(restated(loop.state.coded))
-            write_json(out / "report.json", {**metadata, "frames": [asdict(r) for r in reports]})
+
+
+def _fingerprint(arrays: Iterable[np.ndarray | None]) -> str:
+    """Return a digest of a recording's first pictures and its points, which tells it from another in its place."""
+    digest = blake2b(digest_size=8)
+    for array in arrays:
+        digest.update(b"" if array is None else np.ascontiguousarray(array))
+    return digest.hexdigest()
+
+
+def _difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any] | None:
+    """Return (name, old, new) of the first entry in which two pieces of JSON differ, None if they are the same."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        pairs = (_difference(old.get(key), new.get(key), f"{name}.{key}".lstrip(".")) for key in {**old, **new})
+        return next(filter(None, pairs), None)
+    return None if old == new else (name, old, new)
+
+
+def _reports(path: Path, count: int) -> list[FrameReport]:
+    """Return the reports of the first `count` frames."""
+    try:
+        rows = json.loads(path.read_text(encoding="utf-8"))["frames"][:count]
+        reports = [FrameReport(**{**row, "left_out": tuple(row["left_out"])}) for row in rows]
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path}: expected a fit's report, got a broken one ({error!r}); start again.") from None
+    if [report.frame for report in reports] != list(range(count)):
+        raise ValueError(f"{path}: expected the rows of {count} frames, got {len(reports)}; start again.")
     return reports
+
+
+def _restate(writer: StreamWriter, coded: CodedFrame | None, interval: int) -> None:
+    """Write the whole state once more where it is time for that."""
+    if coded is not None and interval and coded.frame and coded.frame % interval == 0:
+        writer.write(restated(coded))
 
 
 def _frame_ticker(on_step: Callable[[int, int, int], None], frame: int) -> Callable[[int, int], None]:

@@ -267,6 +267,15 @@ class StreamLoop:
         """The decoded Gaussians of the last frame, None before the first."""
         return self.state.gaussians
 
+    def resume(self, coded: CodedFrame, images: Sequence[np.ndarray | None]) -> None:
+        """Go on behind a frame that a stream holds, as if it had just been pushed.
+
+        Args:
+            coded: what the stream says of it.
+            images: its pictures, as for `push`.
+        """
+        self.state = StreamState(coded.frame + 1, coded, tuple(images))
+
     def push(
         self, images: Sequence[np.ndarray | None], on_step: Callable[[int, int], None] | None = None
     ) -> tuple[Packet, FrameReport]:

@@ -302,6 +302,21 @@ def test_an_interruption(stream: Path, tmp_path: Path, capsys, monkeypatch: pyte
     assert list(tmp_path.iterdir()) == [stream]
 
 
+def test_a_fit_that_was_cut_off_is_resumed(capture: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    fit = ("fit", capture, out, *QUICK, "--render.reproducible")
+    assert run(capsys, *fit)[0] == 0
+    whole = (out / "stream.morgs").read_bytes()
+    (out / "stream.morgs").write_bytes(whole[: len(whole) * 3 // 4])
+    status, said, _ = run(capsys, *fit, "--resume")
+    assert status == 0
+    assert f"stream.morgs: {FRAMES} frames" in said
+    assert (out / "stream.morgs").read_bytes() == whole
+    status, _, error = run(capsys, *fit, "--resume", "--seed", 1)
+    assert status == 1
+    assert_one_sentence(error, "stream.morgs: expected to resume", "config.seed = 0, got 1")
+
+
 def test_debug_shows_where_an_error_came_from(tmp_path: Path, capsys) -> None:
     status, _, error = run(capsys, "info", tmp_path / "nothing", "--debug")
     assert status == 1

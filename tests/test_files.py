@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -110,10 +111,17 @@ def test_a_failed_swap_puts_the_old_folder_back(tmp_path: Path, monkeypatch: pyt
 
 
 def test_what_a_killed_run_left_is_no_hindrance(tmp_path: Path) -> None:
-    write(tmp_path / f".partial-{os.getpid()}-x", "folder", "half")
+    """What others are still writing stays: another name's, and that of a process that lives."""
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    for number in (os.getpid(), gone.pid):
+        write(tmp_path / f".partial-{number}-x", "folder", "half")
+    theirs = {f".partial-{os.getppid()}-x": "", f".partial-{os.getpid()}-y-x": ""}
+    for name in theirs:
+        (tmp_path / name).touch()
     with new_folder(tmp_path / "x", "test()") as partial:
         (partial / "b").touch()
-    assert tree(tmp_path) == {"x": None, "x/b": ""}
+    assert tree(tmp_path) == theirs | {"x": None, "x/b": ""}
 
 
 def test_a_link_stays_a_link(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from rich.table import Table
-from tyro.conf import Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from morgs_mi.cli.console import OUT, progress, say, warn
 from morgs_mi.demo import DemoConfig
@@ -28,7 +28,7 @@ class Fit:
     capture: Positional[Path]
     """Folder of the capture."""
     out: Positional[Path]
-    """Folder for stream.morgs and report.json; an earlier stream there is replaced."""
+    """Folder for stream.morgs and report.json; an earlier stream there is replaced, unless it is resumed."""
     frames: int | None = None
     """Use at most this many frames from the start."""
     downscale: float = 1
@@ -38,6 +38,9 @@ class Fit:
     preset: PresetName | None = None
     """The paper's variants (l: 8 passes over the views, s: 5), the rows of its ablation (residuals only, with motion,
     with offset, with confidence), or all of it without lifted flow; what it does not set stays as given."""
+    resume: Annotated[bool, FlagCreatePairsOff] = False
+    """Go on behind the last whole frame of the stream in OUT, with the same capture and settings. With
+    --render.reproducible the stream becomes the very one of a fit that was not interrupted."""
     config: Annotated[StreamConfig, arg(name="")] = field(default_factory=StreamConfig)
 
     def run(self) -> None:
@@ -56,6 +59,7 @@ class Fit:
                 self.out,
                 config,
                 lambda frame, step, steps: report("Fitting frames", frame + step / steps, count),
+                self.resume,
             )
         seconds = [row.seconds for row in reports[1:]]
         later = f", {sum(seconds) / len(seconds):.1f} s for each later one" if seconds else ""

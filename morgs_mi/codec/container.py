@@ -44,6 +44,7 @@ __all__ = [
     "decode_packet",
     "encode_packet",
     "header_fields",
+    "header_json",
     "open_packet",
 ]
 
@@ -143,15 +144,7 @@ class StreamWriter:
         fps: float,
         metadata: Mapping[str, Any] | None = None,
     ) -> None:
-        header = {
-            "cameras": [_camera_fields(camera) for camera in cameras],
-            "fps": float(fps),
-            "metadata": dict(metadata or {}),
-        }
-        try:
-            payload = json.dumps(header, allow_nan=False).encode()
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"StreamWriter(): `metadata` and `fps` must fit into JSON ({error}).") from None
+        payload = header_json(cameras, fps, metadata or {}).encode()
         self._owned = isinstance(sink, str | Path)
         self.path = Path(sink if self._owned else str(getattr(sink, "name", "stream")))
         self.num_bytes = 0
@@ -164,6 +157,25 @@ class StreamWriter:
             self._index = None
             self.close()
             raise
+
+    @classmethod
+    def continued(cls, path: str | Path, index: Sequence[tuple[int, int, int]], end: int) -> StreamWriter:
+        """Return the writer of a file whose writing was interrupted; what stands from byte `end` on is cut off.
+
+        Args:
+            path: the file.
+            index: (kind, frame, offset) of its packets but the header, as `StreamReader.whole` finds them.
+            end: where the last of them ends.
+
+        Raises:
+            OSError: the file cannot be opened or cut off.
+        """
+        writer = cls.__new__(cls)
+        writer._owned, writer.path, writer.num_bytes, writer._index = True, Path(path), end, list(index)
+        writer._file = open(path, "r+b", buffering=0)  # noqa: SIM115
+        writer._file.truncate(end)
+        writer._file.seek(end)
+        return writer
 
     def write(self, packet: Packet) -> int:
         """Append one packet and return its number of bytes.
@@ -259,6 +271,19 @@ def _arrays(payload: memoryview) -> dict[str, np.ndarray]:
     if at != len(payload):
         raise ValueError(f"it describes {at} bytes of {len(payload)}")
     return arrays
+
+
+def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, Any]) -> str:
+    """Return a header's payload as JSON.
+
+    Raises:
+        ValueError: it does not fit into JSON.
+    """
+    fields = {"cameras": [_camera_fields(camera) for camera in cameras], "fps": float(fps), "metadata": dict(metadata)}
+    try:
+        return json.dumps(fields, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"StreamWriter(): `metadata` and `fps` must fit into JSON ({error}).") from None
 
 
 def _camera_fields(camera: Camera) -> dict[str, Any]:

@@ -116,22 +116,47 @@ class StreamReader:
                 at += PAYLOAD + length
             return entries
 
+    def whole(self) -> tuple[list[tuple[int, int, int]], int]:
+        """Check every packet and return the (kind, frame, offset) of all but the header, and where the last one ends.
+
+        An index at the file's end, and a packet that was cut off there, lie behind that byte.
+
+        Raises:
+            ValueError: it is a pipe, or a packet is broken.
+        """
+        if self._pipe is not None:
+            raise ValueError(f"{self.path}: expected a file that is read twice, got a pipe; save it first.")
+        entries, end = [], self._first
+        with contextlib.suppress(TruncatedStreamError):
+            for at, data in self._checked(1, self._first):
+                kind, frame, _ = HEAD.unpack_from(data)
+                if kind != PacketKind.INDEX:
+                    entries.append((kind, frame, at))
+                    end = at + len(data)
+        return entries, end
+
     def _packets(self, number: int, at: int) -> Iterator[Packet]:
+        for offset, data in self._checked(number, at):
+            if HEAD.unpack_from(data)[0] != PacketKind.INDEX:
+                with self._located(number, offset):
+                    packet = decode_packet(data)
+                yield packet
+                number += 1
+
+    def _checked(self, number: int, at: int) -> Iterator[tuple[int, bytes]]:
+        """Yield (offset, bytes) of every packet whose CRC is right, from packet `number` at byte `at` on.
+
+        An index may stand between packets, for a stream that was closed may have been continued; it has no number.
+        """
         with self._opened() as file:
             if self._pipe is None:
                 file.seek(at)
             while (data := self._packet(file, number, at)) is not None:
                 with self._located(number, at):
-                    packet = None
-                    # An index may stand between packets: a stream that was closed may have been continued.
-                    if HEAD.unpack_from(data)[0] != PacketKind.INDEX:
-                        packet = decode_packet(data)
-                    else:
-                        open_packet(data)
+                    kind, *_ = open_packet(data)
+                yield at, data
                 at += len(data)
-                if packet is not None:
-                    yield packet
-                    number += 1
+                number += kind != PacketKind.INDEX
 
     def _packet(self, file: BinaryIO, number: int, at: int) -> bytes | None:
         """Return the bytes of the packet that comes next, None at the stream's end."""

@@ -1,0 +1,97 @@
+"""A recording of three tiny views, and a process that fits it until it is killed.
+
+`python -m tests.recording OUT` says "ready" when it begins; with a number it kills itself within the write that
+brings the bytes written to that many.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi import Camera, RenderConfig
+from morgs_mi.capture.capture import Capture, Frame
+from morgs_mi.codec import container
+from morgs_mi.codec.config import CodecConfig
+from morgs_mi.fit.config import DensityConfig, FitConfig
+from morgs_mi.motion.config import MotionConfig
+from morgs_mi.recorder import stream_capture
+from morgs_mi.stream_loop import StreamConfig
+
+FRAMES = 6
+# As little as a fit can do with all that it does: births, deaths, masks, keyframes.
+CONFIG = StreamConfig(
+    fit=FitConfig(
+        sh_degree=0,
+        num_gaussians=80,
+        first_frame_steps=8,
+        confidence_steps=4,
+        epochs=2,
+        density=DensityConfig(rounds=2, births=0.05, max_gaussians=84, min_error=0),
+    ),
+    motion=MotionConfig(key_views=1, keyframe_interval=2),
+    codec=CodecConfig(keyframe_interval=2),
+    render=RenderConfig(reproducible=True),
+)
+
+
+class Recording(Capture):
+    """Noise that drifts to the right."""
+
+    def frames(self, start=0, stop=None):
+        rng = np.random.default_rng(0)
+        first = [np.repeat(np.repeat(rng.integers(0, 255, (6, 8, 3), np.uint8), 4, 0), 4, 1) for _ in self.cameras]
+        for t in range(start, FRAMES if stop is None else stop):
+            yield Frame(t, tuple(np.roll(image, t, 1) for image in first))
+
+    def record(self):
+        return {"layout": "noise"}
+
+
+def recording(**changes) -> Recording:
+    rng = np.random.default_rng(1)
+    views = [Camera.look_at((x, 0, -3), (0, 0, 0), (0, -1, 0), 60, 32, 24, f"cam{x}") for x in (-1, 0, 1)]
+    fields = {
+        "path": Path("noise"),
+        "cameras": tuple(views),
+        "num_frames": FRAMES,
+        "fps": 25.0,
+        "points": rng.uniform(-1, 1, (150, 3)).astype(np.float32),
+        "point_colors": rng.uniform(0, 1, (150, 3)).astype(np.float32),
+        "masks": (None,) * 3,
+        "test_view": None,
+        "truth": None,
+        "_sources": (),
+    }
+    return Recording(**(fields | changes))
+
+
+class Dying:
+    """A file whose process is killed after so many bytes."""
+
+    def __init__(self, file, left: int) -> None:
+        self.file, self.left = file, left
+
+    def __getattr__(self, name):
+        return getattr(self.file, name)
+
+    def write(self, data) -> int:
+        done = self.file.write(data[: self.left])
+        self.left -= done
+        if not self.left:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return done
+
+
+if __name__ == "__main__":
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    if len(sys.argv) > 2:
+        container.open = lambda *args, **more: Dying(open(*args, **more), int(sys.argv[2]))  # noqa: SIM115
+    print("ready", flush=True)
+    stream_capture(recording(), sys.argv[1], CONFIG, resume=True)

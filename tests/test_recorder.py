@@ -1,0 +1,165 @@
+"""Recording: a fit that is killed and resumed leaves the very files of one that was not."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi.codec.config import CodecConfig
+from morgs_mi.codec.container import PAYLOAD, TRAILER
+from morgs_mi.codec.gaussians import play
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.recorder import stream_capture
+from tests.recording import CONFIG, FRAMES, Recording, recording
+
+# Longer than the fit takes here by half; on a slower machine all kills come early.
+SECONDS = 1.5
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What a fit leaves that nobody has interrupted."""
+    out = tmp_path_factory.mktemp("whole")
+    stream_capture(recording(), out, CONFIG)
+    return out
+
+
+def stream_of(out: Path) -> bytes:
+    return (out / "stream.morgs").read_bytes()
+
+
+def report_of(out: Path) -> dict:
+    """Return the report without what no two runs have in common."""
+    report = json.loads((out / "report.json").read_text())
+    return report | {"frames": [{k: v for k, v in row.items() if k != "seconds"} for row in report["frames"]]}
+
+
+def assert_same(out: Path, whole: Path) -> None:
+    assert stream_of(out) == stream_of(whole)
+    assert report_of(out) == report_of(whole)
+    assert (out / "capture.json").read_bytes() == (whole / "capture.json").read_bytes()
+    assert sorted(path.name for path in out.iterdir()) == ["capture.json", "report.json", "stream.morgs"]
+
+
+def process(out: Path, *left: int) -> subprocess.Popen:
+    args = [sys.executable, "-m", "tests.recording", str(out), *map(str, left)]
+    started = subprocess.Popen(args, stdout=subprocess.PIPE, cwd=Path(__file__).parent.parent)
+    assert started.stdout is not None
+    assert started.stdout.readline() == b"ready\n"
+    return started
+
+
+def kill_and_resume(whole: Path, folder: Path, kills: int) -> None:
+    """Fit again and again, each time killed at a random byte of the stream or a random moment, until it is done."""
+    rng, size, killed, fits = np.random.default_rng(0), len(stream_of(whole)), 0, 0
+    while killed < kills:
+        out, fits, status = folder / f"{fits}", fits + 1, -9
+        while status and killed < kills:
+            written = len(stream_of(out)) if (out / "stream.morgs").exists() else 0
+            if rng.random() < 0.5 and written < size:
+                running = process(out, int(rng.integers(1, size - written + 1)))
+            else:
+                running = process(out)
+                time.sleep(rng.uniform(0, SECONDS))
+                running.kill()
+            status = running.wait()
+            assert status in (-9, 0)
+            killed += status == -9
+        stream_capture(recording(), out, CONFIG, resume=True)
+        assert_same(out, whole)
+
+
+def test_a_fit_that_is_killed_and_resumed_is_the_same(whole: Path, tmp_path: Path) -> None:
+    kill_and_resume(whole, tmp_path, 3)
+
+
+@pytest.mark.slow
+def test_a_fit_that_is_killed_60_times_is_the_same(whole: Path, tmp_path: Path) -> None:
+    kill_and_resume(whole, tmp_path, 60)
+
+
+def cuts(whole: Path) -> list[int]:
+    """Return bytes within and between packets of every kind."""
+    index = StreamReader(whole / "stream.morgs").index()
+    size, ends = len(stream_of(whole)), [offset for _, _, offset in index]
+    index_at = size - PAYLOAD - 16 * len(index) - TRAILER.size
+    # A keyframe that restates, the fourth of all, may be missing behind its residual.
+    return [0, ends[0] - 1, ends[0], ends[3] - 1, ends[3], ends[4], index_at, size - 1, size]
+
+
+def test_wherever_the_stream_was_cut_off_it_is_resumed_to_the_same(whole: Path, tmp_path: Path) -> None:
+    report = json.loads((whole / "report.json").read_text())
+    for k, at in enumerate(cuts(whole)):
+        out = interrupted(whole, tmp_path / f"{at}", at)
+        count = len(played(out / "stream.morgs"))
+        # A row of the report may be there before its packet.
+        rows = report["frames"][: count + k % 2]
+        (out / "report.json").write_text(json.dumps({**report, "frames": rows}))
+        reports = stream_capture(recording(), out, CONFIG, resume=True)
+        assert [r.frame for r in reports] == list(range(FRAMES))
+        # What was there was not fitted again.
+        assert [r.seconds for r in reports[:count]] == [row["seconds"] for row in rows[:count]]
+        assert_same(out, whole)
+
+
+def interrupted(whole: Path, out: Path, at: int) -> Path:
+    shutil.copytree(whole, out)
+    os.truncate(out / "stream.morgs", at)
+    return out
+
+
+def played(path: Path) -> list[int]:
+    """Return the frames that can be played."""
+    found = []
+    with contextlib.suppress(ValueError):
+        found.extend(frame for frame, _ in play(StreamReader(path)))
+    return found
+
+
+def brighter(capture: Recording) -> Recording:
+    """Return another recording with the same cameras."""
+    return replace(capture, point_colors=capture.point_colors / 2)
+
+
+@pytest.mark.parametrize(
+    ("capture", "config", "message"),
+    [
+        (recording(), replace(CONFIG, seed=1), r"begun with metadata\.config\.seed = 0, got 1"),
+        (recording(), replace(CONFIG, codec=CodecConfig(quality=2)), r"metadata\.config\.codec\.quality = 1\.0, got 2"),
+        (brighter(recording()), CONFIG, r"begun with metadata\.fingerprint = "),
+        (recording(fps=50.0), CONFIG, r"begun with fps = 25\.0, got 50\.0"),
+        (recording(cameras=recording().cameras[::-1]), CONFIG, "begun with cameras = "),
+    ],
+)
+def test_another_fit_is_not_resumed(whole: Path, tmp_path: Path, capture, config, message: str) -> None:
+    out = interrupted(whole, tmp_path / "out", len(stream_of(whole)) // 2)
+    before = stream_of(out)
+    with pytest.raises(ValueError, match=message):
+        stream_capture(capture, out, config, resume=True)
+    assert stream_of(out) == before
+
+
+def test_what_is_damaged_is_not_resumed(whole: Path, tmp_path: Path) -> None:
+    out = interrupted(whole, tmp_path / "out", len(stream_of(whole)))
+    (out / "report.json").write_text("{")
+    with pytest.raises(ValueError, match=r"report\.json: expected a fit's report, got a broken one"):
+        stream_capture(recording(), out, CONFIG, resume=True)
+    (out / "report.json").write_text('{"frames": []}')
+    with pytest.raises(ValueError, match=r"report\.json: expected the rows of 6 frames, got 0"):
+        stream_capture(recording(), out, CONFIG, resume=True)
+    damaged = bytearray(stream_of(whole))
+    damaged[len(damaged) // 2] ^= 1
+    (out / "stream.morgs").write_bytes(damaged)
+    with pytest.raises(ValueError, match="the bytes are damaged"):
+        stream_capture(recording(), out, CONFIG, resume=True)
+    assert stream_of(out) == damaged
