@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from morgs_mi.codec.entropy import ColumnReader
-from morgs_mi.codec.grid import GROUPS, Grid
+from morgs_mi.codec.entropy import LIMIT, ColumnReader
+from morgs_mi.codec.grid import GROUPS, Grid, bounded
 
 __all__ = ["columns_of_change", "take_change"]
 
@@ -19,22 +19,27 @@ _GEOMETRY, _LOOK, _DEAD = GROUPS[:3], GROUPS[3:], 8
 
 
 def columns_of_change(r: np.ndarray, dead: np.ndarray, grid: Grid) -> Iterator[np.ndarray]:
-    """Yield the columns that say which integers [N, C] change and by how much; `take_change` reads them."""
+    """Yield the columns that say by how much integers [C, N] change, and who died; `take_change` reads them."""
+    changed = {name: r[at].any(0) for name, at in grid.columns.items()}
+    geometry = sum(changed[name].astype(np.uint8) << bit for bit, name in enumerate(_GEOMETRY))
+    look = sum(changed[name].astype(np.uint8) << bit for bit, name in enumerate(_LOOK) if name in changed)
+    geometry = np.where(dead, _DEAD, geometry)
     for rows in _classes(grid):
-        flags = {name: r[rows, at].any(1) for name, at in grid.columns.items()}
-        geometry = sum(flags[name].astype(np.int64) << bit for bit, name in enumerate(_GEOMETRY))
-        look = sum(flags[name].astype(np.int64) << bit for bit, name in enumerate(_LOOK) if name in flags)
-        geometry, look = np.where(dead[rows], _DEAD, geometry), np.broadcast_to(look, len(rows))
-        yield geometry
-        yield look[geometry == 0]
-        yield look[(geometry > 0) & (geometry < _DEAD)]
+        shape, shade = geometry[rows], look[rows]
+        yield shape
+        yield shade[shape == 0]
+        yield shade[(shape > 0) & (shape < _DEAD)]
         for name, at in grid.columns.items():
-            yield from r[rows[flags[name]], at].T
+            yield from r[at].take(rows[changed[name][rows]], axis=1)
 
 
-def take_change(reader: ColumnReader, grid: Grid) -> tuple[np.ndarray, np.ndarray]:
-    """Return the changes int64 [N, C] and who died, bool [N]."""
-    r, dead = np.zeros(grid.values.shape, np.int64), np.zeros(len(grid), bool)
+def take_change(reader: ColumnReader, grid: Grid, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the integers int32 [N, C] after changes that count `step` each, and who died, bool [N].
+
+    Raises:
+        ValueError: the columns are none of changes, or lead too far.
+    """
+    values, dead = grid.values.copy(), np.zeros(len(grid), bool)
     for rows in _classes(grid):
         geometry, look = reader.take(len(rows)), np.zeros(len(rows), np.int64)
         for some in (geometry == 0, (geometry > 0) & (geometry < _DEAD)):
@@ -48,8 +53,9 @@ def take_change(reader: ColumnReader, grid: Grid) -> tuple[np.ndarray, np.ndarra
         for name, at in grid.columns.items():
             who = rows[flags[name] == 1]
             for column in range(at.start, at.stop):
-                r[who, column] = reader.take(len(who))
-    return r, dead
+                moved = values[who, column] + np.rint(reader.take(len(who)) * step).astype(np.int64)
+                values[who, column] = bounded(moved, LIMIT, "value")
+    return values, dead
 
 
 def _classes(grid: Grid) -> list[np.ndarray]:

@@ -77,6 +77,8 @@ class ColumnReader:
                 tokens[block] = self._decoder.decode(_model(counts), block.stop - block.start)
                 counts += _WEIGHT * np.bincount(tokens[block], minlength=_TOKENS)
             m = (tokens + 1) // 2
+            if not np.any(m >= _DIRECT):
+                return np.where(tokens % 2, m, -m)
             bits = np.where(m < _DIRECT, 0, m - 12)
             rest = np.zeros(count, np.int64)
             for shift, some in _parts(bits):
@@ -102,6 +104,9 @@ def _tokens(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return tokens int32, the number of bits beside each, and those bits."""
     size = np.abs(values.astype(np.int64))
     assert size.max(initial=0) < LIMIT
+    if size.max(initial=0) < _DIRECT:
+        nothing = np.zeros(len(size), np.int64)
+        return np.where(values > 0, 2 * size - 1, 2 * size).astype(np.int32), nothing, nothing
     bits = np.where(size < _DIRECT, 0, np.frexp(size.astype(np.float64))[1] - 1)
     m = np.where(bits > 0, 12 + bits, size)
     tokens = np.where(values > 0, 2 * m - 1, 2 * m).astype(np.int32)

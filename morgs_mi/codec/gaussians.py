@@ -11,7 +11,7 @@ come first in ascending order, births after them. Each keeps its number in `ids`
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import blake2b
 
@@ -22,7 +22,7 @@ from morgs_mi.codec.changes import columns_of_change, take_change
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import Packet, PacketKind
 from morgs_mi.codec.entropy import LIMIT, ColumnReader, ColumnWriter, column_bits
-from morgs_mi.codec.grid import Grid, columns_of, new_grid, real_values, step_sizes
+from morgs_mi.codec.grid import Grid, attributes, bounded, columns_of, new_grid, real_values, step_sizes
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.gaussians.gaussians import Gaussians
 
@@ -87,7 +87,7 @@ def keyframe_packet(
     Raises:
         ValueError: an attribute is not finite.
     """
-    grid = new_grid(gaussians, cameras, config or CodecConfig())
+    grid = new_grid(attributes(gaussians), cameras, config or CodecConfig())
     return restated(CodedFrame(frame, grid, np.arange(len(grid), dtype=np.uint32), len(grid), gaussians))
 
 
@@ -130,15 +130,16 @@ def residual_packet(
         )
     source = _checked(np.arange(len(grid)) if source is None else source, len(grid), len(gaussians))
     survivors, births = source[source >= 0], int((source < 0).sum())
-    kept = grid.select(survivors)
-    change = real_values(gaussians.select(np.arange(len(survivors))), kept) - kept.values
-    born = new_grid(gaussians.select(np.arange(len(survivors), len(source))), cameras, config) if births else None
+    raw, count = attributes(gaussians), len(survivors)
+    change = real_values({name: value[:count] for name, value in raw.items()}, grid.select(survivors))
+    change -= grid.values[survivors].T
+    born = new_grid({name: value[count:] for name, value in raw.items()}, cameras, config) if births else None
+    dead = np.ones(len(grid), bool)
+    dead[survivors] = False
 
     def columns(coarseness: int) -> Iterator[np.ndarray]:
-        r = np.zeros(grid.values.shape, np.int64)
-        r[survivors] = np.rint(change / step_sizes(np.array(coarseness)))
-        dead = np.ones(len(grid), bool)
-        dead[survivors] = False
+        r, scaled = np.zeros((len(change), len(grid)), np.int32), change / step_sizes(np.array(coarseness))
+        r[:, survivors] = np.clip(np.rint(scaled, out=scaled), 1 - LIMIT, LIMIT - 1, out=scaled)
         return columns_of_change(r, dead, grid)
 
     coarseness = least = round(4 * np.log2(config.birth_precision))
@@ -231,14 +232,12 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
     if _PER_WORD * len(code) < births or coarseness > _COARSEST or previous.next_id + births >= LIMIT:
         raise ValueError(f"its head {[births, coarseness]} does not fit its {len(code)} words of code")
     reader = ColumnReader(code)
-    r, dead = take_change(reader, grid)
-    values = grid.values + np.rint(r * step_sizes(np.array(coarseness))).astype(np.int64)
+    values, dead = take_change(reader, grid, float(step_sizes(np.array(coarseness))))
     survivors = np.flatnonzero(~dead)
-    moved = _bounded(values, LIMIT, "value").astype(np.int32)
-    new = Grid(moved, grid.exponents, grid.pivots, grid.degree).select(survivors)
+    new = replace(grid, values=values).select(survivors)
     motion = np.zeros((len(survivors) + births, 3), np.float32)
-    before, at = previous.gaussians.numpy()["means"][survivors], grid.columns["position"]
-    motion[: len(survivors)] = (new.values[:, at] * new.steps[:, at]).astype(np.float32) - before
+    before = np.asarray(previous.gaussians.means)[survivors]
+    motion[: len(survivors)] = new.real("position").astype(np.float32) - before
     if births:
         new = new.concatenate(_taken_grid(reader, births, grid.degree, grid.has_confidence))
     ids = np.concatenate([previous.ids[survivors], previous.next_id + np.arange(births, dtype=np.uint32)])
@@ -260,8 +259,8 @@ def _taken_grid(reader: ColumnReader, N: int, degree: int, has_confidence: bool)
     columns = np.stack([reader.take(N) + shift for shift in middle], axis=1)
     if np.any((columns[:, 0] < 0) | (columns[:, 0] > 3)):
         raise ValueError("a quaternion's pivot must be 0 to 3")
-    exponents = _bounded(columns[:, 1:first], 128, "exponent").astype(np.int8)
-    values = _bounded(columns[:, first:], LIMIT, "value").astype(np.int32)
+    exponents = bounded(columns[:, 1:first], 128, "exponent").astype(np.int8)
+    values = bounded(columns[:, first:], LIMIT, "value").astype(np.int32)
     return Grid(values, exponents, columns[:, 0].astype(np.uint8), degree)
 
 
@@ -295,12 +294,6 @@ def _head(packet: Packet, count: int) -> list[int]:
     if head.shape != (count,):
         raise ValueError(f"its head must have {count} numbers, got {list(head.shape)}")
     return [int(number) for number in head]
-
-
-def _bounded(values: np.ndarray, limit: int, what: str) -> np.ndarray:
-    if np.any((values >= limit) | (values < -limit)):
-        raise ValueError(f"an {what} must lie between -{limit} and {limit}")
-    return values
 
 
 def _padded(words: np.ndarray, count: int) -> np.ndarray:

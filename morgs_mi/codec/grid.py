@@ -19,7 +19,7 @@ number of threads can change a bit.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -30,11 +30,15 @@ from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.entropy import LIMIT
 from morgs_mi.gaussians.gaussians import Gaussians
 
-__all__ = ["GROUPS", "Grid", "columns_of", "new_grid", "real_values", "step_sizes"]
+__all__ = ["GROUPS", "Grid", "attributes", "bounded", "columns_of", "new_grid", "real_values", "step_sizes"]
 
 GROUPS = ("position", "size", "rotation", "opacity", "color", "shine", "confidence")
 
 _QUARTERS = np.array([1.0, 1.189207115002721, 1.4142135623730951, 1.681792830507429])  # 2^(k/4)
+_STEPS = np.ldexp(_QUARTERS[np.arange(256) & 3], np.arange(256).astype(np.int8) >> 2)  # by e mod 256
+_EXPONENTS = {name: slice(k, k + 1) for k, name in zip((0, 1, 4, 5, 6, 7, 8), GROUPS, strict=True)} | {
+    "size": slice(1, 4)
+}
 _DC = 0.28209479177387814  # basis function of degree 0
 # Beyond these nothing can be seen, and one wild number must not cost the others their steps.
 _MOST_TURN, _MOST_LOGIT, _MOST_CONFIDENCE = 4096.0, 16.0, 6.0
@@ -70,10 +74,13 @@ class Grid:
         """Where each group stands; those of no width are left out."""
         return columns_of(self.degree, self.has_confidence)
 
-    @cached_property
-    def steps(self) -> np.ndarray:
-        """Step of every number, float64 [N, C]."""
-        return step_sizes(self.exponents)[:, _exponent_of_column(self.columns)]
+    def steps(self, name: str) -> np.ndarray:
+        """Return the steps of a group, float64 [N, 3] for the size, [N, 1] for every other."""
+        return step_sizes(self.exponents[:, _EXPONENTS[name]])
+
+    def real(self, name: str) -> np.ndarray:
+        """Return what the integers of a group stand for, float64 [N, its width]."""
+        return self.values[:, self.columns[name]] * self.steps(name)
 
     def select(self, index: np.ndarray) -> Grid:
         """Return the Gaussians at `index`."""
@@ -86,23 +93,24 @@ class Grid:
 
     def gaussians(self, motion: np.ndarray | None = None) -> Gaussians:
         """Return what the integers stand for, with a displacement float32 [N, 3], zero if it is not given."""
-        real, at = self.values * self.steps, self.columns
-        u, v, w = real[:, at["rotation"]].T
+        u, v, w = np.ascontiguousarray(self.real("rotation").T)
         length = np.sqrt(((1 + u * u) + v * v) + w * w)
-        quats = np.empty((len(self), 4))
+        quats = np.empty((len(self), 4), np.float32)
         rows = np.arange(len(self))
         quats[rows, self.pivots] = 1 / length
         for k, part in enumerate((u, v, w)):
             quats[rows, k + (k >= self.pivots)] = part / length
-        sh = slice(at["color"].start, at.get("shine", at["color"]).stop)
+        sh = np.concatenate(
+            [self.real(name) for name in ("color", "shine") if name in self.columns], 1, dtype=np.float32
+        )
         return Gaussians(
-            means=real[:, at["position"]].astype(np.float32),
-            log_scales=real[:, at["size"]].astype(np.float32),
-            quats=quats.astype(np.float32),
-            logit_opacities=real[:, at["opacity"]][:, 0].astype(np.float32),
-            sh_coeffs=real[:, sh].astype(np.float32).reshape(len(self), (self.degree + 1) ** 2, 3),
+            means=self.real("position").astype(np.float32),
+            log_scales=self.real("size").astype(np.float32),
+            quats=quats,
+            logit_opacities=self.real("opacity")[:, 0].astype(np.float32),
+            sh_coeffs=sh.astype(np.float32).reshape(len(self), (self.degree + 1) ** 2, 3),
             motion=np.zeros((len(self), 3), np.float32) if motion is None else motion,
-            logit_confidence=real[:, at["confidence"]][:, 0].astype(np.float32) if self.has_confidence else None,
+            logit_confidence=self.real("confidence")[:, 0].astype(np.float32) if self.has_confidence else None,
         )
 
 
@@ -114,48 +122,71 @@ def columns_of(degree: int, has_confidence: bool) -> dict[str, slice]:
 
 
 def step_sizes(exponents: np.ndarray) -> np.ndarray:
-    """Return 2^(e / 4) as float64 for integers e: a factor out of four, times a power of two."""
-    return np.ldexp(_QUARTERS[exponents & 3], exponents.astype(np.int32) >> 2)
+    """Return 2^(e / 4) as float64 for integers e of -128 to 127: a factor out of four, times a power of two."""
+    return _STEPS[exponents.astype(np.uint8)]
 
 
-def new_grid(gaussians: Gaussians, cameras: Sequence[Camera], config: CodecConfig) -> Grid:
-    """Choose the steps of Gaussians that are new, and round them to these.
+def bounded(values: np.ndarray, limit: int, what: str) -> np.ndarray:
+    """Return integers that lie in -limit..limit - 1.
 
     Raises:
-        ValueError: an attribute is not finite.
+        ValueError: they do not.
     """
-    raw = _finite(gaussians)
+    if np.any((values >= limit) | (values < -limit)):
+        raise ValueError(f"an {what} must lie between -{limit} and {limit}")
+    return values
+
+
+def attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """Return the raw attributes that a stream holds, by name, as float64.
+
+    Raises:
+        ValueError: one is not finite.
+    """
+    raw = {name: np.asarray(value, np.float64) for name, value in gaussians.numpy().items() if name != "motion"}
+    for name, value in raw.items():
+        if not np.isfinite(value).all():
+            row = np.argwhere(~np.isfinite(value))[0][0]
+            raise ValueError(
+                f"the stream: `{name}` must be finite, that of Gaussian {row} is not; lower the learning rates."
+            )
+    return raw
+
+
+def new_grid(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> Grid:
+    """Choose the steps of Gaussians that are new, given by their `attributes`, and round them to these."""
     pivots = np.abs(raw["quats"]).argmax(1).astype(np.uint8)
-    exponents = _exponents(raw, cameras, config)
-    grid = Grid(np.zeros((0, 0), np.int32), exponents, pivots, gaussians.sh_degree)
-    return replace(grid, values=np.rint(real_values(gaussians, grid)).astype(np.int32))
+    degree = round(raw["sh_coeffs"].shape[1] ** 0.5) - 1
+    grid = Grid(np.zeros((0, 0), np.int32), _exponents(raw, cameras, config), pivots, degree)
+    values = np.rint(real_values(raw, grid)).astype(np.int32)
+    return replace(grid, values=np.ascontiguousarray(values.T))
 
 
-def real_values(gaussians: Gaussians, grid: Grid) -> np.ndarray:
-    """Return what `Grid.values` of other attributes would be without rounding, float64 [N, C]; N as in `grid`.
-
-    Raises:
-        ValueError: an attribute is not finite.
-    """
-    raw, pivots = _finite(gaussians), grid.pivots
-    quats, rows = raw["quats"], np.arange(len(pivots))
+def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
+    """Return what `Grid.values` of other `attributes` would be without rounding, float64 [C, N]; N as in `grid`."""
+    pivots, rows = grid.pivots, np.arange(len(grid.pivots))
+    quats, sh = raw["quats"], raw["sh_coeffs"]
     others = np.stack([quats[rows, k + (k >= pivots)] for k in range(3)], axis=1)
     pivot = quats[rows, pivots][:, None]
     # A turn by 180 degrees away from where the pivot was chosen divides by zero: then "very far" is what is meant.
     turn = others / np.where(np.abs(pivot) < 1e-12, 1e-12, pivot)
-    parts = [
-        raw["means"],
-        raw["log_scales"],
-        np.clip(turn, -_MOST_TURN, _MOST_TURN),
-        np.clip(raw["logit_opacities"], -_MOST_LOGIT, _MOST_LOGIT)[:, None],
-        raw["sh_coeffs"].reshape(len(pivots), 3 * raw["sh_coeffs"].shape[1]),
-    ]
-    if "logit_confidence" in raw:
-        parts.append(np.clip(raw["logit_confidence"], -_MOST_CONFIDENCE, _MOST_CONFIDENCE)[:, None])
-    return np.clip(np.concatenate(parts, axis=1) / grid.steps, 1 - LIMIT, LIMIT - 1)
+    parts = {
+        "position": raw["means"],
+        "size": raw["log_scales"],
+        "rotation": np.clip(turn, -_MOST_TURN, _MOST_TURN),
+        "opacity": np.clip(raw["logit_opacities"], -_MOST_LOGIT, _MOST_LOGIT)[:, None],
+        "color": sh[:, 0],
+        "shine": sh[:, 1:].reshape(len(sh), 3 * sh.shape[1] - 3),
+    }
+    if grid.has_confidence:
+        parts["confidence"] = np.clip(raw["logit_confidence"], -_MOST_CONFIDENCE, _MOST_CONFIDENCE)[:, None]
+    real = np.empty((max(at.stop for at in grid.columns.values()), len(pivots)))
+    for name, at in grid.columns.items():
+        np.divide(parts[name].T, grid.steps(name).T, out=real[at])
+    return np.clip(real, 1 - LIMIT, LIMIT - 1, out=real)
 
 
-def _exponents(raw: dict[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> np.ndarray:
+def _exponents(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> np.ndarray:
     """Return quarter octaves int8 [N, 8 or 9]: steps whose half is the error that `config` tolerates."""
     precision = config.quality * config.birth_precision
     error, color = 2 * config.error_px / precision, 2 * config.error_color / precision
@@ -189,25 +220,3 @@ def _world_per_pixel(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray
     seen = pixel[np.isfinite(pixel)]
     # Behind every camera there is nothing to see; it may come into view.
     return np.where(np.isfinite(pixel), pixel, np.median(seen) if len(seen) else 1e-3)
-
-
-def _exponent_of_column(columns: dict[str, slice]) -> np.ndarray:
-    """Return which exponent each column takes."""
-    which, used = np.zeros(max(at.stop for at in columns.values()), np.intp), 0
-    for name in GROUPS:
-        own = 3 if name == "size" else 1
-        if name in columns:
-            which[columns[name]] = used + np.arange(own) if own == 3 else used
-        used += own
-    return which
-
-
-def _finite(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    raw = {name: np.asarray(value, np.float64) for name, value in gaussians.numpy().items() if name != "motion"}
-    for name, value in raw.items():
-        if not np.isfinite(value).all():
-            row = np.argwhere(~np.isfinite(value))[0][0]
-            raise ValueError(
-                f"the stream: `{name}` must be finite, that of Gaussian {row} is not; lower the learning rates."
-            )
-    return raw

@@ -161,8 +161,8 @@ def test_nothing_moves_nothing_is_written() -> None:
 def test_only_what_moves_more_than_half_a_step_is_written() -> None:
     state = decode(None, keyframe_packet(cloud(), 0, CAMERAS, CodecConfig(birth_precision=1)))
     means = state.gaussians.numpy()["means"].astype(np.float64)
-    means[7] += 10 * state.grid.steps[7, 0]
-    means[8] += 0.4 * state.grid.steps[8, 0]
+    means[7] += 10 * state.grid.steps("position")[7, 0]
+    means[8] += 0.4 * state.grid.steps("position")[8, 0]
     packet = residual_packet(
         state, replace(state.gaussians, means=means), None, CAMERAS, CodecConfig(birth_precision=1)
     )
