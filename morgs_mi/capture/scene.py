@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from morgs_mi.capture.camera import Camera
 
-__all__ = ["Object", "Rig", "Scene", "load_scene", "rotate", "translate"]
+__all__ = ["Light", "Object", "Rig", "Scene", "load_scene", "rotate", "translate"]
 
 Pose = Callable[[float], np.ndarray]
 
@@ -34,6 +34,19 @@ class Object:
     """
 
     shapes: Mapping[str, dict[str, Any]]
+    pose: Pose | None = None
+
+
+@dataclass(frozen=True)
+class Light:
+    """A lamp. It has no id in the ground truth: keep it out of view.
+
+    Attributes:
+        shape: Mitsuba dictionary of an emitter, or of a shape that carries one, placed in the lamp's own space.
+        pose: seconds -> rigid lamp-to-world matrix [4, 4]; None for what never moves, whose own space is the world.
+    """
+
+    shape: dict[str, Any]
     pose: Pose | None = None
 
 
@@ -77,14 +90,16 @@ class Scene:
     Attributes:
         name: what the capture calls it.
         objects: by name; an object's position in this mapping is its id in the ground truth.
-        lights: Mitsuba emitters, or shapes that carry one, by name. They have no id: keep them out of view.
+        lights: lamps by name.
         rig: where the cameras stand.
+        exposure: seconds -> factor on the light that every camera receives; None for 1.
     """
 
     name: str
     objects: Mapping[str, Object]
-    lights: Mapping[str, dict[str, Any]]
+    lights: Mapping[str, Light]
     rig: Rig = field(default_factory=Rig)
+    exposure: Callable[[float], float] | None = None
 
 
 def load_scene(scene: str | Path, seed: int = 0) -> Scene:

@@ -37,6 +37,7 @@ def synthesize(
     width: int = 320,
     height: int = 240,
     spp: int = 16,
+    noise: float = 0.0,
     fps: float = 30.0,
     lossless: bool = False,
     seed: int = 0,
@@ -57,6 +58,7 @@ def synthesize(
         width: in pixels, even.
         height: in pixels, even.
         spp: samples per pixel; 16 leaves noise at 42 dB, below that of a good camera.
+        noise: standard deviation of the sensor's noise, of white; 0.01, 2.5 grey levels, is that of a camera indoors.
         fps: frames per second.
         lossless: also write ``frames/cam00/0000.png`` ....
         seed: of textures, sampling noise and the choice of points.
@@ -91,6 +93,8 @@ def synthesize(
         raise ValueError(f"synthesize(): `width` and `height` must be even, got {width}x{height}.")
     if not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"synthesize(): `fps` must be positive, got {fps}.")
+    if not 0 <= noise < 1:
+        raise ValueError(f"synthesize(): `noise` must be at least 0 and below 1, got {noise}.")
 
     scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
     cameras = scene.rig.cameras(num_cameras, width, height)
@@ -106,8 +110,8 @@ def synthesize(
             for frame, time in enumerate(times):
                 stage.move(time)
                 # Noise must differ between views and frames, or it would look like texture that moves along.
-                noise = int(np.random.SeedSequence([seed, index, frame]).generate_state(1)[0])
-                yield stage.picture(cameras[index], spp, noise)
+                grain = int(np.random.SeedSequence([seed, index, frame]).generate_state(1)[0])
+                yield stage.picture(cameras[index], spp, grain, noise)
                 done += 1
                 if progress is not None:
                     progress(done, num_cameras * num_frames)
@@ -130,6 +134,7 @@ def synthesize(
             "width": width,
             "height": height,
             "spp": spp,
+            "noise": noise,
             "seed": seed,
             "objects": list(scene.objects),
             "versions": {name: metadata.version(name) for name in ("morgs-mi", "mitsuba", "drjit")},

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from morgs_mi.capture.scene import Object
+from morgs_mi.capture.scene import Light, Object
 
 __all__ = ["lights", "pattern", "room", "textured"]
 
@@ -45,11 +45,20 @@ def pattern(seed: int, first: RGB, second: RGB, cells: int, finest: float, size:
     return np.clip(texture, 0.03, 0.85).astype(np.float32)
 
 
-def textured(texture: np.ndarray, roughness: float | None = None) -> dict[str, Any]:
-    """Return a Mitsuba material: diffuse, or plastic of that `roughness` over the same colours."""
+def textured(
+    texture: np.ndarray, roughness: float | None = None, repeat: tuple[float, float] = (1, 1)
+) -> dict[str, Any]:
+    """Return a Mitsuba material: diffuse, or plastic of that `roughness` over the same colours.
+
+    Args:
+        texture: [size, size, 3], linear.
+        roughness: of the plastic; None for diffuse.
+        repeat: how often the texture lies along u and v, so that it is not stretched on what is long and thin.
+    """
     import mitsuba as mi
 
-    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texture), "raw": True}
+    to_uv = mi.ScalarTransform4f().scale([*repeat, 1])
+    bitmap = {"type": "bitmap", "bitmap": mi.Bitmap(texture), "raw": True, "to_uv": to_uv}
     if roughness is None:
         return {"type": "twosided", "bsdf": {"type": "diffuse", "reflectance": bitmap}}
     return {
@@ -91,7 +100,7 @@ def room(seed: int, half_width: float = 2.4, height: float = 3.2, depth: float =
     }
 
 
-def lights() -> dict[str, dict[str, Any]]:
+def lights() -> dict[str, Light]:
     """Return a lamp above the room and a weaker one beside the cameras, which lights the shadows."""
     import mitsuba as mi
 
@@ -99,11 +108,13 @@ def lights() -> dict[str, dict[str, Any]]:
     lamp = T().look_at(origin=[1.6, 5.0, 2.6], target=[0, 0.4, 0], up=[0, 0, 1]).scale([0.6, 0.6, 1])
     fill = T().look_at(origin=[-2.0, 3.6, 5.5], target=[0, 0.8, 0], up=[0, 1, 0]).scale([0.8, 0.8, 1])
     return {
-        name: {
-            "type": "rectangle",
-            "to_world": to_world,
-            "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
-        }
+        name: Light(
+            {
+                "type": "rectangle",
+                "to_world": to_world,
+                "emitter": {"type": "area", "radiance": {"type": "rgb", "value": radiance}},
+            }
+        )
         for name, to_world, radiance in (
             ("lamp", lamp, [50.0, 46.0, 40.0]),
             ("fill", fill, [14.0, 15.0, 17.0]),

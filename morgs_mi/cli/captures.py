@@ -21,7 +21,7 @@ class Synth:
     """Path-trace a moving scene into a multi-view capture with exact ground truth."""
 
     scene: Positional[str]
-    """Name of a scene (spheres, arm) or the path of its Python file."""
+    """Name of a scene (spheres, arm, thin, flicker) or the path of its Python file."""
     out: Positional[Path]
     """Folder to make."""
     cameras: int = 10
@@ -34,6 +34,8 @@ class Synth:
     """Of the images in pixels, even."""
     spp: int = 16
     """Samples per pixel; 16 leaves noise at 42 dB."""
+    noise: float = 0.0
+    """Standard deviation of the sensor's noise, of white; 0.01, 2.5 grey levels, is that of a camera indoors."""
     fps: float = 30.0
     """Frames per second."""
     lossless: bool = False
@@ -55,6 +57,7 @@ class Synth:
                 width=self.width,
                 height=self.height,
                 spp=self.spp,
+                noise=self.noise,
                 fps=self.fps,
                 lossless=self.lossless,
                 seed=self.seed,

@@ -20,7 +20,7 @@ from morgs_mi.codec.entropy import column_bits
 from morgs_mi.codec.gaussians import CodedFrame, coded_frames, decode, residual_packet
 from morgs_mi.codec.grid import step_sizes
 from morgs_mi.evaluate.judge import evaluate_stream
-from morgs_mi.evaluate.report import machine, versions
+from morgs_mi.evaluate.report import blank_figure, label_points, machine, markdown, save_figure, versions
 from morgs_mi.evaluate.stream import open_stream
 from morgs_mi.recorder import stream_capture
 from morgs_mi.stream_loop import StreamConfig
@@ -97,13 +97,13 @@ def markdown_table(clip: Mapping[str, Any]) -> str:
         "decode ms",
         "lzma ms",
     )
-    lines = [f"| {' | '.join(titles)} |", "|" + "---:|" * len(titles)]
+    rows = []
     for row in clip["rows"]:
         cells = [f"{row['quality']:g}", f"{row['psnr']['later']:.2f}", f"{row['loss']:.2f}", _kilo(row["first"])]
         cells += [_kilo(row["later"]), _kilo(row["lzma"]), f"{row['moved']:.0f}"]
         cells += [f"{row[name]:.0f}" for name in ("encode_ms", "decode_ms", "lzma_ms")]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+        rows.append(cells)
+    return markdown(titles, rows, left=0)
 
 
 def plot_codec(result: Mapping[str, Any], path: str | Path) -> None:
@@ -112,14 +112,8 @@ def plot_codec(result: Mapping[str, Any], path: str | Path) -> None:
     Raises:
         ValueError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ValueError(
-            "plot_codec(): expected matplotlib, found none; install it: pip install matplotlib."
-        ) from error
     clips = result["clips"]
-    figure = Figure(figsize=(10, 3.8 * len(clips)), layout="constrained")
+    figure = blank_figure(10, 3.8 * len(clips))
     for (left, right), clip in zip(figure.subplots(len(clips), 2, squeeze=False), clips, strict=True):
         rows = clip["rows"]
         quality, later, loss = ([row[name] for row in rows] for name in ("quality", "later", "psnr"))
@@ -132,13 +126,13 @@ def plot_codec(result: Mapping[str, Any], path: str | Path) -> None:
             axis.set(xscale="log", xlabel="kB per later frame")
             axis.grid(alpha=0.3, which="both")
             axis.tick_params(axis="x", which="minor", labelsize=6, rotation=45)
-            for x, y, name in zip(later, own, quality, strict=True):
-                axis.annotate(f"{name:g}", (x / 1e3, y), textcoords="offset points", xytext=(4, -12), fontsize=8)
+            points = zip(np.array(later) / 1e3, own, strict=True)
+            label_points(axis, points, [f"{value:g}" for value in quality], (4, -12), 8)
         left.set(ylabel="PSNR of later frames, dB", title=f"{clip['name']}: quality at each byte rate")
         right.set(ylabel="ms to encode a frame", yscale="log", title="and the time it takes")
         left.ticklabel_format(axis="y", useOffset=False)
         left.legend(fontsize=8)
-    figure.savefig(path, dpi=90)
+    save_figure(figure, path)
 
 
 def _clip(

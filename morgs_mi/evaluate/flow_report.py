@@ -19,7 +19,7 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.truth import Truth, load_truth
-from morgs_mi.evaluate.report import machine, versions
+from morgs_mi.evaluate.report import blank_figure, machine, markdown, save_figure, versions
 from morgs_mi.motion.cues import choose_key_views
 from morgs_mi.motion.flow import FLOW_METHODS, consistent
 from morgs_mi.motion.flow_sources import FramePair, flow_source
@@ -91,15 +91,15 @@ def markdown_table(clip: dict[str, Any]) -> str:
         "their error",
         "moving",
     )
-    lines = [f"| {' | '.join(titles)} |", "|---" + "|---:" * (len(titles) - 1) + "|"]
+    rows = []
     for row in clip["rows"]:
         both = (row["all"], row["moving"])
         cells = [f"`{row['method']}`", f"{row['ms']:.1f}"]
         cells += [_cell(figures["error"], "{:.2f}") for figures in both]
         cells += [_cell(figures[name], "{:.1%}") for name in ("within_1px", "reliable") for figures in both]
         cells += [_cell(figures["reliable_error"], "{:.2f}") for figures in both]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+        rows.append(cells)
+    return markdown(titles, rows)
 
 
 def plot_flow(result: dict[str, Any], path: str | Path) -> None:
@@ -108,12 +108,8 @@ def plot_flow(result: dict[str, Any], path: str | Path) -> None:
     Raises:
         ValueError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ValueError("plot_flow(): expected matplotlib, found none; install it: pip install matplotlib.") from error
     clips = result["clips"]
-    figure = Figure(figsize=(6.2 * len(clips), 4.8), layout="constrained")
+    figure = blank_figure(6.2 * len(clips), 4.8)
     for axis, clip in zip(figure.subplots(1, len(clips), squeeze=False).flat, clips, strict=True):
         for row in clip["rows"]:
             moving = row["moving"]
@@ -134,7 +130,7 @@ def plot_flow(result: dict[str, Any], path: str | Path) -> None:
     marks[1].set_fillstyle("none")
     labels += ["all pixels that move", "those that pass the check"]
     figure.legend(handles + marks, labels, loc="outside lower center", ncols=5, fontsize=8)
-    figure.savefig(path, dpi=90)
+    save_figure(figure, path)
 
 
 def _cell(value: float | None, form: str) -> str:

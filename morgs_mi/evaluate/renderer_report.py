@@ -21,7 +21,7 @@ import numpy as np
 
 from morgs_mi.capture.camera import Camera
 from morgs_mi.evaluate.reference64 import ATTRIBUTES, Twin
-from morgs_mi.evaluate.report import machine, versions
+from morgs_mi.evaluate.report import blank_figure, label_points, machine, markdown, save_figure, versions
 from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
@@ -164,15 +164,15 @@ def report_renderer(
 def markdown_table(result: dict[str, Any]) -> str:
     """Return the rows as a table for documentation: times, exact errors, and those of float32 and the stop alone."""
     titles = ("setting", "forward, ms", "step, ms", "x default", "image RMS", "max", "gradients", "RMS", "gradients")
-    lines = [f"| {' | '.join(titles)} |", "|---" * len(titles) + "|"]
+    rows = []
     for row in result["rows"]:
         name = f"`{row['knob']}` {row['value']}"
         cells = [f"**{name}**" if row["default"] else name]
         cells += [f"{row['forward_ms']:.1f}", f"{row['step_ms']:.1f}", f"{row['step_ratio']:.2f}"]
         cells += [f"{row['image']['rms']:.1e}", f"{row['image']['max']:.1e}", f"{worst_gradient(row):.1e}"]
         cells += [f"{row['rounding']['image']['rms']:.1e}", f"{worst_gradient(row['rounding']):.1e}"]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines) + "\n"
+        rows.append(cells)
+    return markdown(titles, rows, left=len(titles))
 
 
 def worst_gradient(errors: dict[str, Any]) -> float:
@@ -186,13 +186,7 @@ def plot_renderer(result: dict[str, Any], path: str | Path) -> None:
     Raises:
         ValueError: matplotlib is not installed.
     """
-    try:
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ValueError(
-            "plot_renderer(): expected matplotlib, found none; install it: pip install matplotlib."
-        ) from error
-    figure = Figure(figsize=(12, 8.5), layout="constrained")
+    figure = blank_figure(12, 8.5)
     panels = (
         ("image RMS, against no cut-off at all", lambda row: row["image"]["rms"]),
         ("image RMS, against the same alpha_min", lambda row: row["rounding"]["image"]["rms"]),
@@ -207,9 +201,8 @@ def plot_renderer(result: dict[str, Any], path: str | Path) -> None:
             axis.plot(*zip(*points, strict=True), _MARKS.get(knob, "o-"), label=knob, alpha=0.8, markersize=5)
             # Where a knob changes nothing, its labels would lie on one another.
             spread = max(y for _, y in points) > 1.5 * min(y for _, y in points)
-            for row, point in zip(rows, points, strict=True):
-                if spread and not row["default"]:
-                    axis.annotate(row["value"], point, xytext=(5, 3), textcoords="offset points", fontsize=7)
+            named = [(row, point) for row, point in zip(rows, points, strict=True) if spread and not row["default"]]
+            label_points(axis, [point for _, point in named], [row["value"] for row, _ in named], (5, 3))
         axis.plot(1, error(default), "k*", markersize=13, label="default", zorder=5)
         axis.set(
             title=title,
@@ -220,7 +213,7 @@ def plot_renderer(result: dict[str, Any], path: str | Path) -> None:
         axis.margins(x=0.1)
         axis.grid(alpha=0.3)
         axis.legend(fontsize=8)
-    figure.savefig(path, dpi=90)
+    save_figure(figure, path)
 
 
 def _rendered(

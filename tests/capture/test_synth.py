@@ -13,7 +13,7 @@ import pytest
 
 from morgs_mi.capture.colmap import read_colmap
 from morgs_mi.capture.poses_bounds import read_poses_bounds
-from morgs_mi.capture.scene import Object, Scene, load_scene, translate
+from morgs_mi.capture.scene import Light, Object, Scene, load_scene, translate
 from morgs_mi.capture.stage import Stage
 from morgs_mi.capture.synth import synthesize
 from morgs_mi.capture.truth import carry, load_tracks, load_truth, project, truth_of
@@ -167,7 +167,8 @@ def test_pixels_that_see_nothing_are_marked():
 
 @pytest.mark.parametrize("radiance", [0.001, 0.18, 0.6, 3.0])
 def test_pictures_are_srgb_encoded(radiance):
-    scene = Scene("sky", {}, {"sky": {"type": "constant", "radiance": {"type": "rgb", "value": radiance}}})
+    light = Light({"type": "constant", "radiance": {"type": "rgb", "value": radiance}})
+    scene = Scene("sky", {}, {"sky": light})
     picture = Stage(scene).picture(scene.rig.cameras(2, 8, 8)[0], 1, 0)
     linear = min(radiance, 1.0)
     encoded = 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
@@ -196,7 +197,7 @@ def test_points_lie_on_the_surface_within_their_noise(clip):
     assert np.percentile(best, 95) < 4
 
 
-@pytest.mark.parametrize("name", ["spheres", "arm"])
+@pytest.mark.parametrize("name", ["spheres", "arm", "thin", "flicker"])
 def test_poses_are_rigid_and_repeatable(name):
     for thing in load_scene(name).objects.values():
         if thing.pose is not None:
@@ -217,6 +218,44 @@ def test_balls_roll_without_slipping(name, radius):
         assert abs(contact[1]) < 1e-12
         assert np.linalg.norm(ahead - behind) / (2 * step) < 1e-6
         assert np.linalg.norm(pose(time + step)[:3, 3] - here[:3, 3]) / step > 0.1
+
+
+def test_thin_parts_move_farther_than_they_are_wide():
+    stage = Stage(load_scene("thin"))
+    camera = stage.scene.rig.cameras(3, 320, 240)[0]
+    _, truth = look(stage, camera, 5)
+    speed = np.linalg.norm(truth.motion, axis=-1)
+    assert 0.03 < truth.mask.mean() < 0.08
+    assert 8 < np.percentile(speed[truth.mask], 90) < 12
+    # Nothing that moves is wider than 10 pixels: an opening of 11 leaves none of it.
+    opened = cv2.morphologyEx(truth.mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((11, 11)))
+    assert opened.sum() < 0.15 * truth.mask.sum()
+
+
+def test_where_light_flickers_pictures_change_and_surfaces_do_not():
+    stage = Stage(load_scene("flicker"))
+    camera = stage.scene.rig.cameras(3, 160, 120)[0]
+    pictures, truths = zip(*(look(stage, camera, frame) for frame in range(6)), strict=True)
+    still = ~np.any([truth.mask for truth in truths], axis=0)
+    assert still.mean() > 0.8
+    assert all((truth.motion[still] == 0).all() for truth in truths)
+    means = np.array([picture[still].mean() for picture in pictures])
+    assert (np.abs(np.diff(means)) / means[1:] > 0.01).sum() >= 4
+    # The lamp swings: apart from a common factor, shading changes as well.
+    first, last = (picture[still].mean(-1) / picture[still].mean() for picture in (pictures[0], pictures[-1]))
+    assert np.percentile(np.abs(first - last), 95) > 0.05
+
+
+def test_sensor_noise_has_the_size_asked_for(stage):
+    stage.move(0.0)
+    camera = stage.scene.rig.cameras(3, 160, 120)[0]
+    clean = stage.picture(camera, 64, 0).astype(float)
+    noisy, again = (stage.picture(camera, 64, 0, 0.02).astype(float) for _ in range(2))
+    np.testing.assert_array_equal(noisy, again)
+    inside = (clean > 30) & (clean < 225)
+    # Rounding to bytes twice adds 1/6 of a grey level squared to 26.
+    assert abs((noisy - clean)[inside].std() / (255 * 0.02) - 1) < 0.03
+    assert abs((noisy - clean)[inside].mean()) < 0.15
 
 
 def test_rig_has_its_test_view_in_the_middle():
@@ -262,7 +301,8 @@ def test_a_failed_run_leaves_nothing(tmp_path, monkeypatch):
         ({"seed": -1}, "`seed` must be at least 0"),
         ({"width": 63}, "must be even, got 63x240"),
         ({"fps": 0}, "`fps` must be positive"),
-        ({"scene": "nowhere"}, "no scene 'nowhere'; name one of .*'arm', 'spheres'"),
+        ({"noise": -0.1}, "`noise` must be at least 0 and below 1, got -0.1"),
+        ({"scene": "nowhere"}, "no scene 'nowhere'; name one of .*'arm', 'flicker', 'spheres', 'thin'"),
     ],
 )
 def test_bad_arguments_are_refused(tmp_path, arguments, message):
