@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,11 +17,12 @@ from tyro.conf import Positional, arg
 from morgs_mi.cli.console import OUT, progress, say
 from morgs_mi.evaluate.codec_report import CodecReportConfig
 from morgs_mi.evaluate.flow_report import FlowReportConfig
+from morgs_mi.evaluate.method_report import MethodReportConfig
 from morgs_mi.evaluate.renderer_report import RendererReportConfig
 from morgs_mi.evaluate.tables import figure
 from morgs_mi.files import finite, write_json
 
-__all__ = ["CodecReport", "FlowReport", "Measure", "RendererReport"]
+__all__ = ["CodecReport", "FlowReport", "Measure", "MethodReport", "RendererReport"]
 
 
 @dataclass(frozen=True)
@@ -96,13 +98,42 @@ class CodecReport:
 
 
 @dataclass(frozen=True)
+class MethodReport:
+    """Measure the method: its parts one after the other, key views, and quality against run time, over several seeds.
+
+    What OUT holds already is not fitted again, so that an interrupted report goes on.
+    """
+
+    captures: Positional[tuple[Path, ...]]
+    """Folders of captures."""
+    out: Path = Path("out/method")
+    """Folder for method.md, method.json and, with matplotlib, method.png, and for what was fitted."""
+    config: Annotated[MethodReportConfig, arg(name="")] = field(default_factory=MethodReportConfig)
+
+    def run(self) -> None:
+        from morgs_mi.evaluate.method_report import report_method
+        from morgs_mi.evaluate.method_tables import method_page, plot_method
+
+        def keep(result: Mapping[str, Any]) -> None:
+            write_json(self.out / "method.json", result)
+            (self.out / "method.md").write_text(method_page(result), encoding="utf-8")
+            if find_spec("matplotlib"):
+                plot_method(result, self.out / "method.png")
+
+        with progress() as report:
+            result = report_method(self.captures, self.out, self.config, report, keep)
+        say(f"{method_page(result)}\nAll figures: {self.out / 'method.json'}")
+
+
+@dataclass(frozen=True)
 class Measure:
     """Measure a part of the package: error beside run time."""
 
     subject: Annotated[
         Annotated[RendererReport, tyro.conf.subcommand("renderer")]
         | Annotated[FlowReport, tyro.conf.subcommand("flow")]
-        | Annotated[CodecReport, tyro.conf.subcommand("codec")],
+        | Annotated[CodecReport, tyro.conf.subcommand("codec")]
+        | Annotated[MethodReport, tyro.conf.subcommand("method")],
         arg(name=""),
     ]
 

@@ -9,10 +9,8 @@ from morgs_mi.codec.container import (
     encode_packet,
 )
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.codec.salvage import Gap, salvage
 
 __all__ = [
-    "Gap",
     "Packet",
     "PacketKind",
     "StreamReader",
@@ -20,5 +18,4 @@ __all__ = [
     "TruncatedStreamError",
     "decode_packet",
     "encode_packet",
-    "salvage",
 ]

@@ -1,0 +1,152 @@
+"""The report on the method for people: tables for documentation, and plots of quality against run time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from morgs_mi.evaluate.report import blank_figure, label_points, markdown, save_figure
+from morgs_mi.evaluate.tables import figure
+
+__all__ = ["ablation_table", "best_rows", "epochs_table", "key_views_table", "method_page", "plot_method"]
+
+Row = Mapping[str, Any]
+
+_COLUMNS = (
+    ("PSNR, dB", "psnr", 2, 1),
+    ("moving", "psnr_moving", 2, 1),
+    ("still", "psnr_still", 2, 1),
+    ("motion error, px", "motion_error_moving", 2, 1),
+    ("still", "motion_error_still", 2, 1),
+    ("in 3D, %", "motion_3d_relative_error", 0, 100),
+    ("IoU", "confidence_iou", 2, 1),
+    ("mTV", "mtv", 3, 1),
+    ("slope, dB", "psnr_slope", 3, 1),
+    ("kB", "num_bytes", 1, 1e-3),
+    ("s", "seconds", 2, 1),
+)
+_PANELS = (
+    ("PSNR of the held-out view, dB", "psnr", None),
+    ("PSNR where things move, dB", "psnr_moving", None),
+    ("motion error where things move, px", "motion_error_moving", "cue"),
+    ("3D motion error, share of the true length", "motion_3d_relative_error", None),
+)
+
+
+def best_rows(clip: Mapping[str, Any]) -> list[Row]:
+    """Return each preset's rows at its best rate, by preset and epochs."""
+    rows = [row for row in clip["rows"] if row["best"]]
+    order = list(dict.fromkeys(row["preset"] for row in rows))
+    return sorted(rows, key=lambda row: (order.index(row["preset"]), row["epochs"]))
+
+
+def ablation_table(clip: Mapping[str, Any], epochs: int) -> str:
+    """Return the paper's Table 4 on a clip: one row per preset at so many epochs."""
+    rows = [row for row in best_rows(clip) if row["epochs"] == epochs]
+    return _table(("preset", "rates"), rows, lambda row: (f"`{row['preset']}`", f"{row['rates']:g}x"))
+
+
+def epochs_table(clip: Mapping[str, Any]) -> str:
+    """Return quality against run time: one row per preset and number of epochs."""
+    words = ("preset", "epochs", "rates")
+    return _table(words, best_rows(clip), lambda r: (f"`{r['preset']}`", str(r["epochs"]), f"{r['rates']:g}x"))
+
+
+def key_views_table(clip: Mapping[str, Any]) -> str:
+    """Return the paper's Table 5 on a clip: motion without and with offset by key views."""
+    titles = {"ml": "without offset", "ml-mo": "with offset"}
+    rows = sorted(clip["key_view_rows"], key=lambda row: (row["preset"], row["key_views"]))
+    return _table(("", "key views"), rows, lambda row: (titles[row["preset"]], str(row["key_views"])))
+
+
+def method_page(result: Mapping[str, Any]) -> str:
+    """Return all tables of all clips in Markdown; docs/method.md says how to read them."""
+    epochs, parts = result["table_epochs"], []
+    for clip in result["clips"]:
+        size = f"{clip['views']} views of {clip['width']}x{clip['height']}, {clip['frames']} frames"
+        runs = max(row["runs"] for row in clip["rows"])
+        parts.append(f"## {clip['name']}\n\n{size}; mean and standard deviation over {runs} runs. {_yardsticks(clip)}")
+        parts.append(f"### Parts of the method, {epochs} epochs\n\n{ablation_table(clip, epochs)}")
+        if clip["key_view_rows"]:
+            parts.append(f"### Key views, {epochs} epochs\n\n{key_views_table(clip)}")
+        parts.append(f"### Quality against run time\n\n{epochs_table(clip)}")
+        if clip["scratch"]:
+            parts.append(f"### Frames fitted from scratch\n\n{_scratch_table(clip, epochs)}")
+    return "\n".join(parts)
+
+
+def plot_method(result: Mapping[str, Any], path: str | Path) -> None:
+    """Draw quality against run time: a row of panels per clip, a line per preset, its points labelled by epochs.
+
+    Raises:
+        ValueError: matplotlib is not installed.
+    """
+    clips = result["clips"]
+    drawing = blank_figure(4.6 * len(_PANELS), 4.0 * len(clips) + 0.6)
+    grid = drawing.subplots(len(clips), len(_PANELS), squeeze=False)
+    for axes, clip in zip(grid, clips, strict=True):
+        rows = best_rows(clip)
+        for axis, (title, name, yardstick) in zip(axes, _PANELS, strict=True):
+            for preset in dict.fromkeys(row["preset"] for row in rows):
+                _draw_line(axis, preset, name, [row for row in rows if row["preset"] == preset])
+            if yardstick and clip[yardstick]:
+                axis.axhline(clip[yardstick]["error"], color="k", linestyle=":", label="the flow's own error")
+            axis.set(title=f"{clip['name']}: {title}", xlabel="seconds per later frame", xscale="log")
+            axis.title.set_fontsize(10)
+            axis.grid(alpha=0.3, which="both")
+            axis.tick_params(axis="x", which="minor", labelsize=6)
+    handles = {label: line for axis in grid.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    drawing.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=8, fontsize=9)
+    save_figure(drawing, path)
+
+
+def _draw_line(axis: Any, preset: str, name: str, rows: Sequence[Row]) -> None:
+    seconds, values = (np.array([row["mean"][key] for row in rows], float) for key in ("seconds", name))
+    spread = np.nan_to_num(np.array([row["std"][name] for row in rows], float))
+    axis.errorbar(seconds, values, spread, fmt="o-", markersize=4, capsize=2, label=preset, alpha=0.85)
+    label_points(axis, zip(seconds, values, strict=True), [str(row["epochs"]) for row in rows], (4, 3))
+
+
+def _table(words: Sequence[str], rows: Sequence[Row], name: Any) -> str:
+    """Return a table of all scores that are known in any of the rows."""
+    columns = [column for column in _COLUMNS if any(_known(row["mean"][column[1]]) for row in rows)]
+    cells = [(*name(row), *(_spread(row, key, digits, unit) for _, key, digits, unit in columns)) for row in rows]
+    return markdown((*words, *(column[0] for column in columns)), cells, len(words))
+
+
+def _scratch_table(clip: Mapping[str, Any], epochs: int) -> str:
+    titles = ("frame", "preset", "steps", "PSNR, dB", "moving")
+    rows = []
+    for found in clip["scratch"]:
+        frame = found["frame"]
+        scores = (figure(found[name], 2) for name in ("psnr", "psnr_moving"))
+        rows.append((str(frame), "from scratch", str(found["steps"]), *scores))
+        for row in best_rows(clip):
+            if row["epochs"] == epochs:
+                values = (row["by_frame"][name][frame - 1] for name in ("psnr", "psnr_moving"))
+                steps = epochs * (clip["views"] - clip["held_out"])
+                rows.append((str(frame), f"`{row['preset']}`", str(steps), *(figure(value, 2) for value in values)))
+    return markdown(titles, rows, 2)
+
+
+def _yardsticks(clip: Mapping[str, Any]) -> str:
+    mean = next(row["mean"] for row in clip["rows"])
+    words = [f"The recording's own mTV is {figure(mean['mtv_input'], 3)}"]
+    if clip["cue"]:
+        words.append(f"motion is {figure(mean['true_motion_moving'], 1)} px where things move")
+        words.append(f"the flow that guides it is off by {figure(clip['cue']['error'], 2)} px there")
+    return ", ".join(words) + ".\n"
+
+
+def _spread(row: Row, name: str, digits: int, unit: float) -> str:
+    mean, std = (row[part][name] for part in ("mean", "std"))
+    if not _known(mean):
+        return "-"
+    return figure(unit * mean, digits) + (f" ± {figure(unit * std, digits)}" if _known(std) else "")
+
+
+def _known(value: float | None) -> bool:
+    return value is not None and value == value
