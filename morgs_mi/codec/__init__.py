@@ -9,8 +9,10 @@ from morgs_mi.codec.container import (
     encode_packet,
 )
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.salvage import Gap, salvage
 
 __all__ = [
+    "Gap",
     "Packet",
     "PacketKind",
     "StreamReader",
@@ -18,4 +20,5 @@ __all__ = [
     "TruncatedStreamError",
     "decode_packet",
     "encode_packet",
+    "salvage",
 ]

@@ -43,7 +43,7 @@ class ColumnWriter:
         tokens, bits, rest = _tokens(values)
         counts = _PRIOR.copy()
         for block in _blocks(len(tokens)):
-            self._encoder.encode(tokens[block], _model(counts))
+            self._encoder.encode(tokens[block], _model(counts) if block.start else _FIRST)
             counts += _WEIGHT * np.bincount(tokens[block], minlength=_TOKENS)
         for shift, some in _parts(bits):
             part = (rest[some] >> shift) & (2**_LOW - 1)
@@ -74,7 +74,9 @@ class ColumnReader:
         tokens, counts = np.zeros(count, np.int64), _PRIOR.copy()
         try:
             for block in _blocks(count):
-                tokens[block] = self._decoder.decode(_model(counts), block.stop - block.start)
+                tokens[block] = self._decoder.decode(
+                    _model(counts) if block.start else _FIRST, block.stop - block.start
+                )
                 counts += _WEIGHT * np.bincount(tokens[block], minlength=_TOKENS)
             m = (tokens + 1) // 2
             if not np.any(m >= _DIRECT):
@@ -130,3 +132,6 @@ def _parts(bits: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
 
 def _model(counts: np.ndarray) -> Any:
     return _MODEL.Categorical(counts.astype(np.float64), perfect=False)
+
+
+_FIRST = _model(_PRIOR)  # every column begins with it

@@ -95,19 +95,17 @@ class StreamReader:
                 number, at = k + 1, offset
         return self._packets(number, at)
 
+    def closed(self) -> bool:
+        """Tell whether the file ends with its index; otherwise it is still written, or was cut off."""
+        with open(self.path, "rb") as file:
+            return self._last_index(file) is not None
+
     def index(self) -> list[tuple[int, int, int]]:
         """Return (kind, frame, offset) of every whole packet but the header, from the file's index if it has one."""
         with open(self.path, "rb") as file:
-            size = file.seek(0, 2)
-            file.seek(max(size - TRAILER.size, 0))
-            at, magic = TRAILER.unpack(file.read(TRAILER.size))
-            if magic == INDEX_MAGIC and self._first <= at < size:
-                file.seek(at)
-                with contextlib.suppress(ValueError, struct.error):  # a payload that looks like an index by chance
-                    kind, _, payload = open_packet(file.read(size - at))
-                    if kind == PacketKind.INDEX:
-                        return list(ENTRY.iter_unpack(payload[: -TRAILER.size]))
-            entries, at = [], self._first
+            if (entries := self._last_index(file)) is not None:
+                return entries
+            entries, at, size = [], self._first, file.seek(0, 2)
             while at + PAYLOAD <= size:
                 file.seek(at)
                 kind, frame, length = HEAD.unpack(file.read(HEAD.size))
@@ -115,6 +113,19 @@ class StreamReader:
                     entries.append((kind, frame, at))
                 at += PAYLOAD + length
             return entries
+
+    def _last_index(self, file: BinaryIO) -> list[tuple[int, int, int]] | None:
+        """Return what the index at the file's end says, None if there is none."""
+        size = file.seek(0, 2)
+        file.seek(max(size - TRAILER.size, 0))
+        at, magic = TRAILER.unpack(file.read(TRAILER.size))
+        if magic == INDEX_MAGIC and self._first <= at < size:
+            file.seek(at)
+            with contextlib.suppress(ValueError, struct.error):  # a payload that looks like an index by chance
+                kind, _, payload = open_packet(file.read(size - at))
+                if kind == PacketKind.INDEX:
+                    return list(ENTRY.iter_unpack(payload[: -TRAILER.size]))
+        return None
 
     def whole(self) -> tuple[list[tuple[int, int, int]], int]:
         """Check every packet and return the (kind, frame, offset) of all but the header, and where the last one ends.
