@@ -13,7 +13,7 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.synth import synthesize
-from morgs_mi.capture.video import write_video
+from morgs_mi.capture.video_writer import write_video
 from morgs_mi.evaluate.drawings import motion_scale
 from morgs_mi.evaluate.frames import PLAYABLE, even
 from morgs_mi.evaluate.judge import evaluate_stream

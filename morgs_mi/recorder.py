@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from hashlib import blake2b
 from itertools import chain
 from pathlib import Path
@@ -19,7 +19,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.capture.capture import Capture, Frame
+from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.capture.rig_check import find_common, with_points
 from morgs_mi.codec.container import PacketKind, StreamWriter, TruncatedStreamError, header_json
 from morgs_mi.codec.gaussians import CodedFrame, restated, seek
@@ -58,7 +58,7 @@ def stream_capture(
         ValueError: as `StreamLoop`; or what is to be resumed is damaged, or another capture's or other settings'.
     """
     config, out, train = config or StreamConfig(), Path(out), capture.train_views
-    frames = capture.frames()
+    frames = capture.partial_frames()
     first = next(frames)
     metadata = _metadata(capture, first, config)
     begun = _begun(out, capture, metadata) if resume else None
@@ -77,7 +77,7 @@ def stream_capture(
         writer, reports = StreamWriter(out / "stream.morgs", capture.cameras, capture.fps, metadata), []
         frames = chain((first,), frames)
     else:
-        frames = capture.frames(begun.coded.frame)
+        frames = capture.partial_frames(begun.coded.frame)
         last = next(frames)
         loop.resume(begun.coded, [last.images[v] for v in train])
         writer, reports = StreamWriter.continued(out / "stream.morgs", begun.index, begun.end), begun.reports
@@ -88,7 +88,8 @@ def stream_capture(
         for frame in frames:
             tick = None if on_step is None else _frame_ticker(on_step, frame.index)
             packet, report = loop.push([frame.images[v] for v in train], tick)
-            reports.append(report)
+            status = "; ".join([*([report.status] if report.status != "ok" else []), *frame.problems]) or "ok"
+            reports.append(replace(report, status=status))
             write_json(out / "report.json", {**metadata, "frames": [asdict(r) for r in reports]})
             writer.write(packet)
             _restate(writer, loop.state.coded, interval)
@@ -143,7 +144,7 @@ def _begun(out: Path, capture: Capture, metadata: Mapping[str, Any]) -> _Begun |
     return _Begun(index, end, coded, _reports(out / "report.json", coded.frame + 1))
 
 
-def _metadata(capture: Capture, first: Frame, config: StreamConfig) -> dict[str, Any]:
+def _metadata(capture: Capture, first: PartialFrame, config: StreamConfig) -> dict[str, Any]:
     """Return what the stream's header says about the fit; one that is resumed must say the same."""
     train = capture.train_views
     key_views = choose_key_views([capture.cameras[v] for v in train], config.motion.key_views)
@@ -152,6 +153,7 @@ def _metadata(capture: Capture, first: Frame, config: StreamConfig) -> dict[str,
         "fingerprint": _fingerprint([*first.images, capture.points, capture.point_colors]),
         "downscale": capture.downscale,
         "test_view": capture.test_view,
+        "reading": asdict(capture.reading),
         "train_views": list(train),
         "num_frames": capture.num_frames,
         "key_views": [train[v] for v in key_views],

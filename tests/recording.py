@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi import Camera, RenderConfig
-from morgs_mi.capture.capture import Capture, Frame
+from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.codec import container
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.fit.config import DensityConfig, FitConfig
@@ -42,11 +42,11 @@ CONFIG = StreamConfig(
 class Recording(Capture):
     """Noise that drifts to the right."""
 
-    def frames(self, start=0, stop=None):
+    def partial_frames(self, start=0, stop=None):
         rng = np.random.default_rng(0)
         first = [np.repeat(np.repeat(rng.integers(0, 255, (6, 8, 3), np.uint8), 4, 0), 4, 1) for _ in self.cameras]
         for t in range(start, FRAMES if stop is None else stop):
-            yield Frame(t, tuple(np.roll(image, t, 1) for image in first))
+            yield PartialFrame(t, tuple(np.roll(image, t, 1) for image in first))
 
     def record(self):
         return {"layout": "noise"}

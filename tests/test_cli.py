@@ -19,6 +19,7 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.gaussians import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.gaussians.gaussians import Gaussians
+from morgs_mi.stream_loop import StreamLoop
 
 WIDTH, HEIGHT, FRAMES = 48, 32, 3
 NAMES = ("cam0", "cam1", "cam2")
@@ -128,14 +129,33 @@ def test_a_broken_capture(capture: Path, tmp_path: Path, capsys, spoil) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_clip_cut_off_meanwhile_leaves_a_stream_that_says_it_is_not_whole(
+def test_a_clip_cut_off_meanwhile_leaves_its_camera_out_of_the_rest(
     capture: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     truncated_clip(capture)
     monkeypatch.setattr("morgs_mi.capture.video._count_packets", lambda path: FRAMES)
-    status, _, error = run(capsys, "fit", capture, tmp_path / "out", *QUICK)
-    assert status == 1
-    assert_one_sentence(error, "cam1.mkv: frame ", "cannot be decoded", "truncated")
+    assert run(capsys, "fit", capture, tmp_path / "out", *QUICK)[0] == 0
+    frames = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
+    assert [frame["left_out"] for frame in frames] == [[], ["cam1"], ["cam1"]]
+    assert "cam1.mkv: frame 1 of 3 cannot be decoded" in frames[2]["status"]
+    assert run(capsys, "eval", tmp_path / "out", "--json", tmp_path / "eval.json")[0] == 0
+    frames = json.loads((tmp_path / "eval.json").read_text())["frames"]
+    assert [frame["views"]["cam1"]["psnr"] is None for frame in frames] == [False, True, True]
+    assert all(frame["psnr"] > 0 for frame in frames)
+
+
+def test_an_interrupted_fit_leaves_a_stream_that_says_it_is_not_whole(
+    capture: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    push = StreamLoop.push
+
+    def interrupted(loop: StreamLoop, *args: object):
+        if loop.state.frame == 2:
+            raise KeyboardInterrupt
+        return push(loop, *args)
+
+    monkeypatch.setattr(StreamLoop, "push", interrupted)
+    assert run(capsys, "fit", capture, tmp_path / "out", *QUICK)[0] == 130
     status, _, error = run(capsys, "eval", tmp_path / "out", "--json", tmp_path / "eval.json")
     assert status == 0
     assert "the fit was not finished" in error

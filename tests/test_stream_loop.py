@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize, stream_loop
-from morgs_mi.capture.capture import Capture, Frame
+from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.codec.container import PacketKind, encode_packet
 from morgs_mi.codec.gaussians import coded_frames, decode, play
 from morgs_mi.codec.reader import StreamReader
@@ -231,8 +231,8 @@ def test_a_frame_that_nobody_saw_stands_still(clip):
 
 def test_a_capture_becomes_a_file(clip, tmp_path):
     class Recorded(Capture):
-        def frames(self, start=0, stop=None):
-            yield from (Frame(i, tuple(images)) for i, images in enumerate(clip[:2]))
+        def partial_frames(self, start=0, stop=None):
+            yield from (PartialFrame(i, tuple(images)) for i, images in enumerate(clip[:2]))
 
         def record(self):
             return {"layout": "in memory"}

@@ -6,10 +6,9 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,14 +16,16 @@ import cv2
 import numpy as np
 
 from morgs_mi.capture.camera import Camera
+from morgs_mi.capture.color import ColorFit, Tone, fit_colors
 from morgs_mi.capture.layouts import Calibration, read_calibration
 from morgs_mi.capture.lens import Lens, Undistortion, undistortion
-from morgs_mi.capture.video import FrameReader, open_frames
+from morgs_mi.capture.prefetch import prefetched
+from morgs_mi.capture.reading import ReadConfig, read_settings, timeline
+from morgs_mi.capture.video import FrameReader, Picture, open_clips
 
-__all__ = ["Capture", "Frame", "load_capture"]
+__all__ = ["Capture", "Frame", "PartialFrame", "load_capture"]
 
 _LOG = logging.getLogger(__name__)
-_DEFAULT_FPS = 30.0
 
 
 @dataclass(frozen=True)
@@ -41,16 +42,38 @@ class Frame:
 
 
 @dataclass(frozen=True)
+class PartialFrame:
+    """One instant in those views that have a picture of it.
+
+    Attributes:
+        index: position in the recording, from 0.
+        images: as in `Frame`, None where there is no picture.
+        problems: a sentence for each of these.
+    """
+
+    index: int
+    images: tuple[np.ndarray | None, ...]
+    problems: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class _Source:
-    """Where one camera's frames come from and what undoes its lens."""
+    """Where one camera's frames come from, which of them count, and what makes a pinhole camera's of them."""
 
     reader: FrameReader
     lens: Lens
     undo: Undistortion | None
+    picks: np.ndarray
+    tone: Tone | None = None
 
-    def images(self, camera: Camera, start: int, stop: int) -> Iterator[np.ndarray]:
-        for image in self.reader.frames(start, stop):
-            yield _shrunk(self.undo(image) if self.undo else image, camera)
+    def pictures(self, camera: Camera, start: int, stop: int) -> Iterator[Picture]:
+        for picture in self.reader.pick(self.picks[start:stop].tolist()):
+            yield self.seen(picture, camera) if isinstance(picture, np.ndarray) else picture
+
+    def seen(self, image: np.ndarray, camera: Camera) -> np.ndarray:
+        """Return a recorded picture as the pinhole camera would have taken it."""
+        image = _shrunk(self.undo(image) if self.undo else image, camera)
+        return self.tone(image) if self.tone else image
 
     def mask(self, camera: Camera) -> np.ndarray | None:
         if self.undo is None or self.undo.mask.all():
@@ -75,6 +98,8 @@ class Capture:
         truth: folder of ground truth, or None.
         downscale: the factor that it was opened with.
         layout: how its folder is laid out, e.g. ``COLMAP``.
+        reading: how its clips are put together.
+        colors: how the cameras' colours are corrected, or None.
     """
 
     path: Path
@@ -89,6 +114,8 @@ class Capture:
     _sources: tuple[_Source, ...] = field(repr=False)
     downscale: float = 1
     layout: str = ""
+    reading: ReadConfig = field(default_factory=ReadConfig)
+    colors: ColorFit | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -100,9 +127,20 @@ class Capture:
         """Indices of the cameras that are not held out."""
         return tuple(i for i in range(len(self.cameras)) if i != self.test_view)
 
+    @property
+    def recorded_sizes(self) -> tuple[tuple[int, int], ...]:
+        """Width and height of the cameras' clips."""
+        return tuple((source.reader.width, source.reader.height) for source in self._sources)
+
+    def seen(self, view: int, image: np.ndarray) -> np.ndarray:
+        """Return a picture that a camera has recorded as its frames are: undistorted, downscaled, corrected."""
+        return self._sources[view].seen(image, self.cameras[view])
+
     def record(self) -> dict[str, Any]:
         """Return how the frames come about, for `capture.json` beside a stream: what JSON takes, and small."""
         views = zip(self.cameras, self._sources, self.masks, strict=True)
+        fit = self.colors
+        colors = fit and {"reference": self.names[fit.reference], "delta_e_before": fit.before, "delta_e": fit.after}
         return {
             "capture": str(self.path),
             "layout": self.layout,
@@ -112,9 +150,12 @@ class Capture:
             "filter": "none" if self.downscale == 1 else "area",
             "test_view": self.test_view,
             "points": len(self.points),
+            "reading": asdict(self.reading),
+            "colors": colors,
             "cameras": [
                 {
                     "name": camera.name,
+                    "first_frame": int(source.picks[0]),
                     "recorded_size": [source.reader.width, source.reader.height],
                     "size": [camera.width, camera.height],
                     "K": camera.K.tolist(),
@@ -128,15 +169,37 @@ class Capture:
         }
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
-        """Yield frames start..stop-1, one decoded at a time.
+        """Yield frames start..stop-1, decoded in the background as they are needed.
 
         Raises:
             ValueError: a file is truncated or broken (named with the frame).
+            FileNotFoundError: an image is missing.
         """
-        stop = self.num_frames if stop is None else min(stop, self.num_frames)
-        streams = [s.images(c, start, stop) for s, c in zip(self._sources, self.cameras, strict=True)]
-        for index, images in enumerate(zip(*streams, strict=True), start=start):
+        for index, images, _ in prefetched(self._decoded(start, stop, True)):
             yield Frame(index, images)
+
+    def partial_frames(self, start: int = 0, stop: int | None = None) -> Iterator[PartialFrame]:
+        """Yield what can be had of frames start..stop-1, as `frames` does: what is missing is None, and logged."""
+        for frame in prefetched(self._decoded(start, stop, False)):
+            yield PartialFrame(*frame)
+
+    def _decoded(self, start: int, stop: int | None, strict: bool) -> Iterator[tuple[int, tuple, tuple[str, ...]]]:
+        stop = self.num_frames if stop is None else min(stop, self.num_frames)
+        streams = [s.pictures(c, start, stop) for s, c in zip(self._sources, self.cameras, strict=True)]
+        gone: set[str] = set()
+        try:
+            for index, pictures in enumerate(zip(*streams, strict=True), start=start):
+                errors = {n: p for n, p in zip(self.names, pictures, strict=True) if isinstance(p, Exception)}
+                if strict and errors:
+                    raise next(iter(errors.values()))
+                for name in errors.keys() - gone:
+                    _LOG.warning("frame %d: %s is left out: %s", index, name, errors[name])
+                gone = set(errors)
+                images = tuple(None if isinstance(p, Exception) else p for p in pictures)
+                yield index, images, tuple(f"{name}: {error}" for name, error in errors.items())
+        finally:
+            for stream in streams:
+                stream.close()
 
 
 def load_capture(
@@ -144,6 +207,7 @@ def load_capture(
     downscale: float = 1,
     test_view: int | Literal["auto"] | None = "auto",
     max_frames: int | None = None,
+    reading: ReadConfig | None = None,
 ) -> Capture:
     """Open a capture folder: read the calibration and the head of every clip.
 
@@ -153,6 +217,7 @@ def load_capture(
         test_view: index of the camera to hold out, None for none; "auto" takes `capture.json`'s, else the
             layout's, else 0 as N3DV does, or none with fewer than six cameras.
         max_frames: use at most this many frames from the start.
+        reading: what to do with clips that do not fit each other.
 
     Raises:
         FileNotFoundError: the folder, the calibration or a camera's clip is missing.
@@ -166,34 +231,56 @@ def load_capture(
         raise ValueError(f"load_capture(): `downscale` must be at least 1, got {downscale}.")
     if max_frames is not None and max_frames < 1:
         raise ValueError(f"load_capture(): `max_frames` must be at least 1 or None, got {max_frames}.")
-    settings = _settings(path / "capture.json")
+    reading, settings = reading or ReadConfig(), read_settings(path / "capture.json")
     calibration = read_calibration(path)
-    readers = [open_frames(clip) for clip in calibration.clips]
+    readers = open_clips(calibration.clips, reading.gaps)
     recorded = [_recorded(c, r) for c, r in zip(calibration.cameras, readers, strict=True)]
     if scaled := [new for old, new in zip(calibration.cameras, recorded, strict=True) if new is not old]:
         _LOG.warning(
             "%s: the clips of %s are not of the size that was calibrated, %dx%d for one: the intrinsics are scaled.",
             *(path, ", ".join(c.name for c in scaled), scaled[0].width, scaled[0].height),
         )
+    names = [camera.name for camera in recorded]
+    clock = timeline(path, names, readers, reading, max_frames, settings.get("fps"))
     sources = tuple(
-        _Source(reader, lens, undistortion(camera, lens))
-        for reader, lens, camera in zip(readers, calibration.lenses, recorded, strict=True)
+        _Source(reader, lens, undistortion(camera, lens), picks)
+        for reader, lens, camera, picks in zip(readers, calibration.lenses, recorded, clock.picks, strict=True)
     )
     cameras = tuple(_resized(camera, downscale) for camera in recorded)
-    return Capture(
+    capture = Capture(
         path=path,
         cameras=cameras,
-        num_frames=_num_frames(path, readers, max_frames),
-        fps=_fps(path, readers, settings.get("fps")),
+        num_frames=len(clock.picks[0]),
+        fps=clock.fps,
         points=calibration.points,
         point_colors=calibration.point_colors,
         masks=tuple(s.mask(c) for s, c in zip(sources, cameras, strict=True)),
         test_view=_test_view(path, test_view, settings, calibration),
-        truth=path / "truth" if (path / "truth").is_dir() else None,
+        # Its frames are the clips', counted from their beginning.
+        truth=path / "truth" if clock.plain and (path / "truth").is_dir() else None,
         _sources=sources,
         downscale=downscale,
         layout=calibration.layout,
+        reading=reading,
     )
+    return _toned(capture, reading) if reading.color != "none" or reading.exposure else capture
+
+
+def _toned(capture: Capture, reading: ReadConfig) -> Capture:
+    """Return the capture with colours that agree between its cameras and over time, as far as that is asked for."""
+    if reading.color_reference not in ("", *capture.names):
+        raise ValueError(
+            f"{capture.path}: `color_reference` must be one of {', '.join(capture.names)}, got "
+            f"{reading.color_reference!r}."
+        )
+    firsts = next(capture.partial_frames(0, 1)).images
+    reference = capture.names.index(reading.color_reference) if reading.color_reference else None
+    fit = None
+    if reading.color != "none":
+        fit = fit_colors(capture.cameras, firsts, capture.masks, reading.color, reference)
+    tones = [Tone.of(fit, view, first if reading.exposure else None) for view, first in enumerate(firsts)]
+    sources = tuple(replace(s, tone=tone) for s, tone in zip(capture._sources, tones, strict=True))
+    return replace(capture, _sources=sources, colors=fit)
 
 
 def _recorded(camera: Camera, reader: FrameReader) -> Camera:
@@ -220,57 +307,6 @@ def _shrunk(image: np.ndarray, camera: Camera) -> np.ndarray:
     if image.shape[:2] == (camera.height, camera.width):
         return image
     return cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
-
-
-def _num_frames(path: Path, readers: list[FrameReader], max_frames: int | None) -> int:
-    for reader in readers:
-        wanted = min(reader.num_frames, max_frames or reader.num_frames)
-        if wanted > reader.num_held:
-            raise ValueError(
-                f"{reader.path}: frame {reader.num_held} of {reader.num_frames} cannot be read: the file is truncated "
-                f"or broken; copy it again or use the first {reader.num_held} frames (max_frames)."
-            )
-    lengths = [reader.num_frames for reader in readers]
-    shortest = min(lengths)
-    if max_frames is not None and max_frames <= shortest:
-        return max_frames
-    if shortest < max(lengths):
-        table = ", ".join(f"{r.path.name} {n}" for r, n in zip(readers, lengths, strict=True))
-        raise ValueError(
-            f"{path}: all cameras must have the same number of frames, got {table}; "
-            f"synchronise them, or use the first frames with max_frames={shortest}."
-        )
-    return shortest
-
-
-def _fps(path: Path, readers: list[FrameReader], given: float | None) -> float:
-    if given is not None:
-        return float(given)
-    rates = [reader.fps for reader in readers if reader.fps]
-    # 29.97 and 30 are one camera written by two programs.
-    if rates and max(rates) > 1.01 * min(rates):
-        raise ValueError(
-            f"{path}: all cameras must have the same frame rate, got {sorted(set(rates))}; resample the "
-            "clips, or give the true one as `fps` in capture.json."
-        )
-    return rates[0] if rates else _DEFAULT_FPS
-
-
-def _settings(path: Path) -> dict[str, Any]:
-    if not path.exists():
-        return {}
-    try:
-        settings = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: expected JSON, got a broken file ({error}); correct it.") from None
-    if not isinstance(settings, dict):
-        raise ValueError(f"{path}: expected a JSON object, got {type(settings).__name__}; correct it.")
-    fps, view = settings.get("fps"), settings.get("test_view")
-    if fps is not None and not (isinstance(fps, int | float) and fps > 0):
-        raise ValueError(f"{path}: `fps` must be a positive number, got {fps!r}; correct it.")
-    if view is not None and type(view) is not int:
-        raise ValueError(f"{path}: `test_view` must be a camera's index or null, got {view!r}; correct it.")
-    return settings
 
 
 def _test_view(

@@ -52,8 +52,11 @@ class Match:
     features: np.ndarray
 
 
-def detect(image: np.ndarray, mask: np.ndarray | None = None) -> Features:
-    """Find SIFT features in an image uint8 [H, W, 3], only where the `mask` [H, W] is true."""
+def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features:
+    """Find SIFT features in an image uint8 [H, W, 3], only where the `mask` [H, W] is true; none where it is None."""
+    nothing = Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3), np.float32))
+    if image is None:
+        return nothing
     height, width = image.shape[:2]
     scale = min(1.0, np.sqrt(_DETECTION_PIXELS / (width * height)))
     size = (round(width * scale), round(height * scale))
@@ -63,7 +66,7 @@ def detect(image: np.ndarray, mask: np.ndarray | None = None) -> Features:
     sift = cv2.SIFT_create(nfeatures=_MAX_FEATURES, enable_precise_upscale=True)
     found, descriptors = sift.detectAndCompute(grey, where)
     if descriptors is None:
-        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3), np.float32))
+        return nothing
     points = (np.array([k.pt for k in found]) + 0.5) * (width / size[0], height / size[1])
     # Square roots of what sums to 1: distances between them tell matches apart better (Arandjelovic 2012).
     descriptors = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))

@@ -71,10 +71,9 @@ def find_common(capture: Capture, progress: Callable[[int, int], None] | None = 
         capture: at any size; errors will be in its pixels.
         progress: is called with (views done, views).
 
-    Raises:
-        ValueError: the first frame cannot be decoded.
+    A view without a picture has nothing in common with the others.
     """
-    images, count = next(capture.frames(0, 1)).images, len(capture.cameras)
+    images, count = next(capture.partial_frames(0, 1)).images, len(capture.cameras)
     features = []
     for done, (image, mask) in enumerate(zip(images, capture.masks, strict=True)):
         if progress is not None:

@@ -19,7 +19,8 @@ from morgs_mi.capture.poses_bounds import write_poses_bounds
 from morgs_mi.capture.scene import Scene, load_scene
 from morgs_mi.capture.stage import Stage
 from morgs_mi.capture.truth import Tracks, carry, project, save_truth, truth_of
-from morgs_mi.capture.video import VideoReader, write_video
+from morgs_mi.capture.video import VideoReader
+from morgs_mi.capture.video_writer import write_video
 from morgs_mi.files import whole, write_json
 
 __all__ = ["synthesize"]

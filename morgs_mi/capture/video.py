@@ -1,4 +1,4 @@
-"""Frames in and out of video files and of folders of images.
+"""Frames out of video files and of folders of images.
 
 A frame is an RGB uint8 array [H, W, 3]. `VideoReader` and `FolderReader` offer the same members.
 """
@@ -6,14 +6,12 @@ A frame is an RGB uint8 array [H, W, 3]. `VideoReader` and `FolderReader` offer 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-
-from morgs_mi.files import new_folder, whole
 
 __all__ = [
     "Clip",
@@ -22,8 +20,8 @@ __all__ = [
     "VideoReader",
     "natural_key",
     "numbering_gap",
+    "open_clips",
     "open_frames",
-    "write_video",
 ]
 
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
@@ -95,25 +93,37 @@ class VideoReader:
         return cls(path, promised, fps if fps > 0 else None, first.shape[1], first.shape[0], held)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
-        """Yield frames start..stop-1; those before `start` are decoded too, for seeking is inexact.
+        """Yield frames start..stop-1, by default up to the promised end.
 
         Raises:
-            ValueError: a frame before `stop` (by default the promised end) cannot be decoded.
+            ValueError: a frame before `stop` cannot be decoded.
         """
-        stop = self.num_frames if stop is None else min(stop, self.num_frames)
+        return _demanded(self.pick(range(start, self.num_frames if stop is None else min(stop, self.num_frames))))
+
+    def pick(self, indices: Sequence[int]) -> Iterator[Picture]:
+        """Yield the frames of rising `indices`, an error in place of each that cannot be decoded.
+
+        Those between are decoded too, for seeking is inexact.
+        """
         stream = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
+        done, ok = 0, True
         try:
-            for index in range(stop):
-                ok, frame = stream.read() if index >= start else (stream.grab(), None)
-                if not ok:
-                    raise ValueError(
-                        f"{self.path}: frame {index} of {self.num_frames} cannot be decoded: the file is "
-                        f"truncated or broken; copy it again or use the first {index} frames (max_frames)."
-                    )
-                if frame is not None:
-                    yield cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+            for index in indices:
+                while ok and done <= index:
+                    ok = stream.grab()
+                    done += ok
+                frame = stream.retrieve()[1] if ok else None
+                yield self._missing(done) if frame is None else cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
         finally:
             stream.release()
+
+    def _missing(self, index: int) -> ValueError:
+        if index >= self.num_frames:
+            return ValueError(f"{self.path}: it has ended after {self.num_frames} frames; record longer.")
+        return ValueError(
+            f"{self.path}: frame {index} of {self.num_frames} cannot be decoded: the file is truncated or broken; copy "
+            f"it again or use the first {index} frames (max_frames)."
+        )
 
 
 @dataclass(frozen=True)
@@ -137,27 +147,17 @@ class FolderReader:
             FileNotFoundError: the folder or the images are missing.
             ValueError: a number is missing or given twice, or the first image cannot be decoded.
         """
-        path = Path(path)
-        if not path.is_dir():
-            raise FileNotFoundError(f"{path}: expected a folder of images, found none; check the path.")
-        files = sorted(
-            (f for f in path.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES),
-            key=lambda f: natural_key(f.stem),
-        )
-        if not files:
-            raise FileNotFoundError(
-                f"{path}: expected images ({', '.join(IMAGE_SUFFIXES)}), found none; extract the frames."
-            )
+        path, files = Path(path), _images(Path(path))
         if gap := numbering_gap([f.stem for f in files]):
             raise ValueError(
                 f"{path}: the images must be numbered without gaps, got {files[gap - 1].name} followed by "
-                f"{files[gap].name}; extract the frames again."
+                f"{files[gap].name}; extract the frames again, or go on without what is missing (--gaps)."
             )
         return cls.of_files(files)
 
     @classmethod
-    def of_files(cls, files: Sequence[Path]) -> FolderReader:
-        """Take the images `files` in their order and decode the first.
+    def of_files(cls, files: Sequence[Path], gaps: bool = False) -> FolderReader:
+        """Take the images `files` in their order and decode the first, with `gaps` the first that is there and whole.
 
         Raises:
             FileNotFoundError: a file is missing.
@@ -165,9 +165,10 @@ class FolderReader:
         """
         if not files:
             raise ValueError("FolderReader.of_files(): expected at least one image, got none; list the frames.")
-        if missing := next((f for f in files if not f.is_file()), None):
-            raise FileNotFoundError(f"{missing}: expected an image, found none; extract the frames again.")
-        first = _read_image(files[0])
+        if not gaps and (missing := next((f for f in files if not f.is_file()), None)):
+            raise _no_image(missing)
+        readable = (f for f in files if not isinstance(_image_or_error(f), Exception)) if gaps else iter(files)
+        first = _read_image(next(readable, files[0]))
         return cls(files[0].parent, tuple(files), first.shape[1], first.shape[0])
 
     @property
@@ -184,11 +185,18 @@ class FolderReader:
         Raises:
             ValueError: an image cannot be decoded or has another size than the first.
         """
-        for file in self.files[start:stop]:
-            frame = _read_image(file)
-            if frame.shape[:2] != (self.height, self.width):
-                raise ValueError(
-                    f"{file}: expected {self.width}x{self.height} as in {self.files[0].name}, got "
+        return _demanded(self.pick(range(self.num_frames)[start:stop]))
+
+    def pick(self, indices: Sequence[int]) -> Iterator[Picture]:
+        """Yield the frames `indices`, an error in place of each that is missing, broken or of another size."""
+        for index in indices:
+            if index >= self.num_frames:
+                yield ValueError(f"{self.path}: it has ended after {self.num_frames} images; record longer.")
+                continue
+            frame = _image_or_error(self.files[index])
+            if isinstance(frame, np.ndarray) and frame.shape[:2] != (self.height, self.width):
+                frame = ValueError(
+                    f"{self.files[index]}: expected {self.width}x{self.height} as in {self.files[0].name}, got "
                     f"{frame.shape[1]}x{frame.shape[0]}; extract the frames again."
                 )
             yield frame
@@ -197,6 +205,32 @@ class FolderReader:
 FrameReader = VideoReader | FolderReader
 # A video file, a folder of images, or images that lie anywhere.
 Clip = Path | tuple[Path, ...]
+# A frame, or why there is none.
+Picture = np.ndarray | ValueError | FileNotFoundError
+
+
+def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
+    """Open one clip per camera; with `gaps`, images may be missing or broken.
+
+    The images of folders are then aligned by their numbers: one that another camera has is missing, not skipped.
+
+    Raises:
+        FileNotFoundError: a clip is missing, or one of its images.
+        ValueError: as `VideoReader.open` and `FolderReader.open`.
+    """
+    folders = [clip for clip in clips if isinstance(clip, Path) and clip.is_dir()]
+    if not gaps or not folders:
+        return [FolderReader.of_files(c, gaps) if isinstance(c, tuple) else open_frames(c) for c in clips]
+    numbered = {folder: {_number(file): file for file in _images(folder)} for folder in folders}
+    numbers = sorted(set().union(*numbered.values()))
+    step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
+    instants = range(numbers[0], numbers[-1] + 1, step)
+    return [
+        FolderReader.of_files([numbered[clip].get(n, _unseen(clip, numbered[clip], n)) for n in instants], gaps)
+        if clip in numbered
+        else open_clips([clip], gaps)[0]
+        for clip in clips
+    ]
 
 
 def open_frames(path: str | Path | tuple[Path, ...]) -> FrameReader:
@@ -204,80 +238,6 @@ def open_frames(path: str | Path | tuple[Path, ...]) -> FrameReader:
     if isinstance(path, tuple):
         return FolderReader.of_files(path)
     return FolderReader.open(path) if Path(path).is_dir() else VideoReader.open(path)
-
-
-def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float, codec: str = "FFV1") -> None:
-    """Write RGB uint8 frames [H, W, 3] as a video, or as a folder of PNGs where `path` has no suffix.
-
-    The file gets its name only when all of it can be read back, so there is never a half-written one.
-
-    Args:
-        path: ``.mp4``, ``.mkv``, ``.avi``, ... or a folder that does not exist yet.
-        frames: at least one, all of one even width and height (any size in a folder).
-        fps: frames per second; a folder does not keep it.
-        codec: OpenCV's four letters. ``FFV1`` is lossless, in .mp4 too, but no browser plays it. On a
-            path-traced box at 304x224, 4:2:0 chroma alone allows 42.4 dB; ``vp09`` reaches 39.2 dB and plays
-            in browsers at 37 ms a frame, ``mp4v`` 37.6 dB at 0.6 ms. ``avc1`` is not in OpenCV's wheels.
-
-    Raises:
-        ValueError: there are no frames, or a frame is not as described.
-        OSError: the encoder is missing, the folder exists, or what was written cannot be read back.
-    """
-    path = Path(path)
-    if path.suffix:
-        with whole(path, "write_video()") as partial:
-            partial.parent.mkdir(parents=True, exist_ok=True)
-            _write_file(partial, path, frames, fps, codec)
-        return
-    with new_folder(path, "write_video()") as folder:
-        for i, frame in enumerate(_checked(path, frames)):
-            # Not cv2.imwrite, which says nothing of why it failed.
-            png = cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))[1]
-            (folder / f"{i:04d}.png").write_bytes(png.tobytes())
-
-
-def _write_file(partial: Path, path: Path, frames: Iterable[np.ndarray], fps: float, codec: str) -> None:
-    count, encoder = 0, None
-    try:
-        for frame in _checked(path, frames):
-            if encoder is None:
-                height, width = frame.shape[:2]
-                if width % 2 or height % 2:
-                    raise ValueError(
-                        f"write_video({path}): the width and height must be even, for OpenCV drops the last "
-                        f"column or row otherwise, got {width}x{height}; crop, or write a folder of PNGs."
-                    )
-                fourcc = cv2.VideoWriter.fourcc(*codec)
-                encoder = cv2.VideoWriter(str(partial), cv2.CAP_FFMPEG, fourcc, fps, (width, height))
-                if not encoder.isOpened():
-                    raise OSError(f"OpenCV could not open it with the encoder {codec!r}; try the codec FFV1 or mp4v")
-            encoder.write(cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))
-            count += 1
-    finally:
-        if encoder is not None:
-            encoder.release()
-    # OpenCV reports no failure of its writer, a full disk included: count what can be decoded.
-    stream = cv2.VideoCapture(str(partial), cv2.CAP_FFMPEG)
-    readable = 0
-    while stream.grab():
-        readable += 1
-    stream.release()
-    if readable != count:
-        raise OSError(f"{count} frames were written but {readable} can be read back")
-
-
-def _checked(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
-    shape = None
-    for i, frame in enumerate(frames):
-        shape = frame.shape if shape is None else shape
-        if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3 or frame.shape != shape:
-            raise ValueError(
-                f"write_video({path}): frame {i} must be uint8 [H, W, 3] of the first frame's size "
-                f"{shape[:2]}, got {frame.dtype} {frame.shape}; convert it first."
-            )
-        yield frame
-    if shape is None:
-        raise ValueError(f"write_video({path}): at least one frame was expected, got none; pass frames.")
 
 
 def _count_packets(path: Path) -> int:
@@ -290,7 +250,55 @@ def _count_packets(path: Path) -> int:
     return count
 
 
+def _demanded(pictures: Iterator[Picture]) -> Iterator[np.ndarray]:
+    for picture in pictures:
+        if isinstance(picture, Exception):
+            raise picture
+        yield picture
+
+
+def _images(path: Path) -> list[Path]:
+    """Return a folder's images in the order of their numbers."""
+    if not path.is_dir():
+        raise FileNotFoundError(f"{path}: expected a folder of images, found none; check the path.")
+    found = (f for f in path.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES)
+    files = sorted(found, key=lambda f: natural_key(f.stem))
+    if not files:
+        raise FileNotFoundError(
+            f"{path}: expected images ({', '.join(IMAGE_SUFFIXES)}), found none; extract the frames."
+        )
+    return files
+
+
+def _number(file: Path) -> int:
+    numbers = re.findall(r"[0-9]+", file.stem)
+    if not numbers:
+        raise ValueError(f"{file}: expected an image whose name ends in a number, got none; extract the frames again.")
+    return int(numbers[-1])
+
+
+def _unseen(folder: Path, files: dict[int, Path], number: int) -> Path:
+    """Return the name that an image that is missing would have beside the others."""
+    other = next(iter(files.values()))
+    return folder / re.sub(r"[0-9]+(?=[^0-9]*\.)", lambda old: str(number).zfill(len(old[0])), other.name, count=1)
+
+
+def _no_image(file: Path) -> FileNotFoundError:
+    return FileNotFoundError(
+        f"{file}: expected an image, found none; extract the frames again, or go on without it (--gaps)."
+    )
+
+
+def _image_or_error(file: Path) -> Picture:
+    try:
+        return _read_image(file)
+    except (ValueError, FileNotFoundError) as error:
+        return error
+
+
 def _read_image(file: Path) -> np.ndarray:
+    if not file.is_file():
+        raise _no_image(file)
     # The stored pixels, not turned by EXIF: calibrations are made on those.
     image = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:

@@ -11,6 +11,7 @@ from rich.table import Table
 from tyro.conf import Positional, arg
 
 from morgs_mi.capture.calibrate import CalibrateConfig
+from morgs_mi.capture.reading import ReadConfig
 from morgs_mi.cli.console import OUT, progress, say, warn
 
 __all__ = ["Calibrate", "Info", "Synth"]
@@ -77,13 +78,14 @@ class Info:
     """Picture of the rig, .png or .jpg."""
     check: bool = True
     """Compare the poses with what the views of the first frame have in common."""
+    reading: Annotated[ReadConfig, arg(name="")] = field(default_factory=ReadConfig)
 
     def run(self) -> None:
         from morgs_mi.capture.capture import load_capture
         from morgs_mi.capture.rig_check import check_rig, find_common, with_points
         from morgs_mi.capture.rig_plot import write_rig
 
-        capture, found = load_capture(self.capture), None
+        capture, found = load_capture(self.capture, reading=self.reading), None
         origin = "" if len(capture.points) else "without points"
         if self.check:
             with progress() as report:
@@ -115,6 +117,10 @@ class Info:
         if found:
             error = f"median {found.error:.2f} px over " if found.matches else ""
             say(f"Reprojection check: {error}{found.matches} matches in {found.pairs} pairs; {found.advice}")
+        if fit := capture.colors:
+            changes = zip(capture.names, fit.before, fit.after, fit.samples, strict=True)
+            table = ", ".join(f"{name} {a:.1f} -> {b:.1f} ({n} points)" for name, a, b, n in changes)
+            say(f"Colours towards {capture.names[fit.reference]}, dE2000 before -> after: {table}.")
         if self.plot is not None:
             write_rig(self.plot, capture)
             say(f"The rig: {self.plot}")

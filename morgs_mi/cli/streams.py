@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
+from morgs_mi.capture.reading import ReadConfig
 from morgs_mi.cli.console import OUT, progress, say, warn
 from morgs_mi.demo import DemoConfig
 from morgs_mi.evaluate.tables import figure, judgement_sentences, judgement_tables
@@ -35,6 +36,7 @@ class Fit:
     """Average the images down by this factor."""
     test_view: int | Literal["auto"] | None = "auto"
     """Index of the camera to hold out; auto takes the capture's own choice, or camera 0 of six or more."""
+    reading: Annotated[ReadConfig, arg(name="")] = field(default_factory=ReadConfig)
     preset: PresetName | None = None
     """The paper's variants (l: 8 passes over the views, s: 5), the rows of its ablation (residuals only, with motion,
     with offset, with confidence), or all of it without lifted flow; what it does not set stays as given."""
@@ -51,7 +53,7 @@ class Fit:
         if self.preset is not None:
             fit, motion = apply_preset(self.preset, config.fit, config.motion)
             config = replace(config, fit=fit, motion=motion)
-        capture = load_capture(self.capture, self.downscale, self.test_view, self.frames)
+        capture = load_capture(self.capture, self.downscale, self.test_view, self.frames, self.reading)
         count = capture.num_frames
         with progress() as report:
             reports = stream_capture(

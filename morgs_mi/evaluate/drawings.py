@@ -71,10 +71,11 @@ def draw_stream(
     shown, recorded, motions, confidences = [], [], [], []
     trusted = has_confidence(stream)
     played = render_stream(stream, camera, ("color", "motion", *(("confidence",) if trusted else ())))
-    for (index, images), frame in zip(played, recording.frames(frames[0], frames[-1] + 1), strict=False):
+    for (index, images), frame in zip(played, recording.partial_frames(frames[0], frames[-1] + 1), strict=False):
         # Copies, for the pictures of a long clip do not all fit in memory.
         shown.append(as_picture(images["color"])[:, column].copy())
-        recorded.append(frame.images[view][:, column].copy())
+        seen = frame.images[view]
+        recorded.append(np.zeros_like(shown[-1]) if seen is None else seen[:, column].copy())
         if index in chosen:
             truth = truth_on(recording, camera, index)
             true_motion, mask = (None, None) if truth is None else (truth.motion, truth.mask)
@@ -105,8 +106,10 @@ def motion_scale(capture: Capture, camera: Camera) -> float:
 def _busiest_column(recording: Capture, view: int, frames: Sequence[int]) -> tuple[int, np.ndarray]:
     """Return the column of a view in which the recording changes most, and the last picture of it."""
     change, last = np.zeros(recording.cameras[view].width), None
-    for frame in recording.frames(frames[0], frames[-1] + 1):
-        picture = frame.images[view].astype(float)
+    for frame in recording.partial_frames(frames[0], frames[-1] + 1):
+        if (seen := frame.images[view]) is None:
+            continue
+        picture = seen.astype(float)
         if last is not None:
             change += np.abs(picture - last).sum((0, 2))
         last = picture

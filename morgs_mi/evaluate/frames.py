@@ -9,7 +9,7 @@ import numpy as np
 
 from morgs_mi.capture.camera import Camera
 from morgs_mi.capture.exr import write_exr
-from morgs_mi.capture.video import write_video
+from morgs_mi.capture.video_writer import write_video
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.evaluate.pictures import side_by_side, write_png
 from morgs_mi.evaluate.stream import channel_picture, render_stream

@@ -109,14 +109,17 @@ def evaluate_stream(
     rows, before, last = [], None, None
     # The file may have grown meanwhile.
     decoded = coded_frames(islice(stream, read))
-    recorded = recording.frames(min(packets), max(packets) + 1)
+    recorded = recording.partial_frames(min(packets), max(packets) + 1)
     for coded, frame in zip(decoded, recorded, strict=True):
         index, gaussians, scores = coded.frame, coded.gaussians, {}
         kind, num_bytes = packets[index]
         for view in views:
-            camera = stream.cameras[view]
+            camera, picture_then = stream.cameras[view], frame.images[view]
+            if picture_then is None:
+                scores[camera.name] = dict.fromkeys(_SCORES, _NAN)
+                continue
             images = render(gaussians, camera, channels, config)
-            seen = _seen(recording, camera, index, frame.images[view], last and last[view], recording.masks[view])
+            seen = _seen(recording, camera, index, picture_then, last and last[view], recording.masks[view])
             # A decoder shows 8 bits.
             picture = as_picture(images["color"])
             variations[view].add(picture, seen.recorded, _or_nothing(seen))

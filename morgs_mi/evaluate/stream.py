@@ -15,6 +15,7 @@ import numpy as np
 
 from morgs_mi.capture.camera import Camera
 from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.reading import ReadConfig
 from morgs_mi.capture.truth import Truth, load_truth
 from morgs_mi.codec.gaussians import play
 from morgs_mi.codec.reader import StreamReader
@@ -191,7 +192,8 @@ def open_recording(stream: StreamReader, capture: str | Path | None, frames: Seq
     if capture is None and "capture" not in about:
         raise ValueError(f"{stream.path}: its header names no capture to compare with; give one (--capture).")
     path = capture or about["capture"]
-    recording = load_capture(path, about.get("downscale", 1), about.get("test_view", "auto"), frames[-1] + 1)
+    reading = ReadConfig(**about.get("reading", {}))
+    recording = load_capture(path, about.get("downscale", 1), about.get("test_view", "auto"), frames[-1] + 1, reading)
     expected, found = _sizes(stream.cameras), _sizes(recording.cameras)
     if found != expected:
         raise ValueError(

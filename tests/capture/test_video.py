@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.capture.video import FolderReader, VideoReader, natural_key, open_frames, write_video
+from morgs_mi.capture.video import FolderReader, VideoReader, natural_key, open_frames
+from morgs_mi.capture.video_writer import write_video
 
 HEIGHT, WIDTH, COUNT = 32, 48, 6
 
@@ -180,7 +181,7 @@ def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path: Path, name: str) -
     limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))"
     program = f"""{limit}
 import numpy as np
-from morgs_mi.capture.video import write_video
+from morgs_mi.capture.video_writer import write_video
 noise = np.random.default_rng(0).integers(0, 256, (6, 32, 48, 3), dtype=np.uint8)
 try:
     write_video({str(tmp_path / name)!r}, noise, 30)
