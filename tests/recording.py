@@ -45,7 +45,7 @@ class Recording(Capture):
     def partial_frames(self, start=0, stop=None):
         rng = np.random.default_rng(0)
         first = [np.repeat(np.repeat(rng.integers(0, 255, (6, 8, 3), np.uint8), 4, 0), 4, 1) for _ in self.cameras]
-        for t in range(start, FRAMES if stop is None else stop):
+        for t in range(start, self.num_frames if stop is None else stop):
             yield PartialFrame(t, tuple(np.roll(image, t, 1) for image in first))
 
     def record(self):

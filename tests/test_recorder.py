@@ -16,14 +16,16 @@ import numpy as np
 import pytest
 
 from morgs_mi.codec.config import CodecConfig
-from morgs_mi.codec.container import PAYLOAD, TRAILER
-from morgs_mi.codec.gaussians import play
+from morgs_mi.codec.container import PAYLOAD, TRAILER, StreamWriter
+from morgs_mi.codec.gaussians import CodedFrame, coded_frames, play, restated, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.recorder import stream_capture
+from morgs_mi.stream_loop import StreamLoop
+from tests.codec.test_gaussians import history
 from tests.recording import CONFIG, FRAMES, Recording, recording
 
-# Longer than the fit takes here by half; on a slower machine all kills come early.
-SECONDS = 1.5
+# About what the fit takes here; on a slower machine all kills come early.
+SECONDS = 0.8
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +88,27 @@ def test_a_fit_that_is_killed_and_resumed_is_the_same(whole: Path, tmp_path: Pat
 @pytest.mark.slow
 def test_a_fit_that_is_killed_60_times_is_the_same(whole: Path, tmp_path: Path) -> None:
     kill_and_resume(whole, tmp_path, 60)
+
+
+@pytest.mark.slow
+def test_300_frames_of_the_loop_play_as_they_were_fitted(tmp_path: Path) -> None:
+    """What the loop had after each frame, with births and deaths, is what a reader gets, from any frame on."""
+    capture = recording(num_frames=300)
+    loop = StreamLoop(capture.cameras, capture.points, capture.point_colors, CONFIG)
+    states: list[CodedFrame] = []
+    with StreamWriter(tmp_path / "s", capture.cameras, 25) as writer:
+        for frame in capture.frames():
+            packet, _ = loop.push(frame.images)
+            writer.write(packet)
+            assert loop.state.coded is not None
+            states.append(loop.state.coded)
+            if frame.index and frame.index % 50 == 0:
+                writer.write(restated(states[-1]))
+    assert states[-1].next_id > 90 > len(states[-1]), "some were born, some died"
+    reader = StreamReader(tmp_path / "s")
+    assert history(coded_frames(reader)) == history(states)
+    for frame in range(0, 300, 23):
+        assert history([seek(reader, frame)]) == history([states[frame]])
 
 
 def cuts(whole: Path) -> list[int]:

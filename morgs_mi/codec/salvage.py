@@ -55,11 +55,11 @@ def salvage(path: str | Path) -> Iterator[CodedFrame | Gap]:
 
 def _states(data: mmap.mmap) -> Iterator[CodedFrame | Gap]:
     coded, at = None, 0
-    for start, stop in _intact(data):
+    for kind, start, stop in _intact(data):
         if start > at:
             yield Gap(at, start, "the bytes are damaged")
         at = stop
-        if HEAD.unpack_from(data, start)[0] in (PacketKind.KEYFRAME, PacketKind.RESIDUAL):
+        if kind in (PacketKind.KEYFRAME, PacketKind.RESIDUAL):
             try:
                 packet = decode_packet(data[start:stop])
                 if coded is None or packet.frame != coded.frame:
@@ -71,19 +71,19 @@ def _states(data: mmap.mmap) -> Iterator[CodedFrame | Gap]:
         yield Gap(at, len(data), "the bytes are damaged or cut off")
 
 
-def _intact(data: mmap.mmap) -> Iterator[tuple[int, int]]:
-    """Yield (start, stop) of the preamble and of every packet whose CRC is right."""
+def _intact(data: mmap.mmap) -> Iterator[tuple[int, int, int]]:
+    """Yield (kind, start, stop) of the preamble, as a part of the header, and of every packet whose CRC is right."""
     at = PREAMBLE.size
     if data[:at] == PREAMBLE.pack(MAGIC, VERSION):
-        yield 0, at
+        yield PacketKind.HEADER, 0, at
     if (stop := _end(data, at)) is not None:
-        yield at, stop
+        yield data[at], at, stop
         at = stop
     while (found := _KIND.search(data, at)) is not None:
         start = found.start()
         stop = _end(data, start)
         if stop is not None:
-            yield start, stop
+            yield data[start], start, stop
         at = stop or start + 1
 
 
