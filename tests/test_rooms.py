@@ -23,6 +23,7 @@ ROOMS = (
     "stream_loop",
     "recorder",
     "evaluate",
+    "export",
     "viewer",
     "demo",
     "cli",

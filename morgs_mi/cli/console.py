@@ -11,8 +11,9 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, Ti
 
 __all__ = ["ERR", "OUT", "Report", "progress", "say", "warn"]
 
-# Rich would wrap paths and sentences at 80 columns where there is no terminal.
-OUT, ERR = Console(soft_wrap=True, highlight=False), Console(stderr=True, soft_wrap=True, highlight=False)
+# Rich would wrap paths and sentences at 80 columns where there is no terminal, and make a picture of `:100:`.
+OUT = Console(soft_wrap=True, highlight=False, emoji=False)
+ERR = Console(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 Report = Callable[[str, float, float], None]
 
 

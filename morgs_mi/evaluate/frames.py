@@ -15,7 +15,7 @@ from morgs_mi.evaluate.pictures import side_by_side, write_png
 from morgs_mi.evaluate.stream import channel_picture, render_stream
 from morgs_mi.files import new_folder
 
-__all__ = ["PLAYABLE", "even", "exr_channels", "write_frames"]
+__all__ = ["PLAYABLE", "even", "exr_channels", "linear_light", "write_frames"]
 
 # Of what OpenCV's wheels can encode, what every browser plays: H.264 is not among it, and none plays mp4v.
 PLAYABLE = "vp09"
@@ -83,7 +83,7 @@ def exr_channels(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
     Colour becomes linear light (R, G, B), as EXR readers expect; motion stays in pixels, depth in world units.
     """
-    planes = {**images, **({"color": _linear(images["color"])} if "color" in images else {})}
+    planes = {**images, **({"color": linear_light(images["color"])} if "color" in images else {})}
     return {name: plane[..., i] for key, plane in planes.items() for i, name in enumerate(_EXR_NAMES[key])}
 
 
@@ -97,6 +97,6 @@ def _picture(images: Mapping[str, np.ndarray]) -> np.ndarray:
     return side_by_side([channel_picture(name, image) for name, image in images.items()])
 
 
-def _linear(encoded: np.ndarray) -> np.ndarray:
+def linear_light(encoded: np.ndarray) -> np.ndarray:
     """Undo sRGB's encoding (IEC 61966-2-1), beyond 1 too, where splats overshoot."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0) + 0.055) / 1.055) ** 2.4)

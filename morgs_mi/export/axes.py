@@ -1,0 +1,30 @@
+"""The axes that glTF asks for: x right, y up, and the viewer before the scene on the positive z side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from morgs_mi.capture.camera import Camera
+
+__all__ = ["gltf_axes", "up_direction"]
+
+
+def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the unit vector [3] that is up to the cameras on average, or to the first where they disagree."""
+    ups = np.stack([-np.asarray(camera.viewmat, np.float64)[1, :3] for camera in cameras])
+    mean = ups.mean(axis=0)
+    up = mean if np.linalg.norm(mean) > 0.1 else ups[0]
+    return up / np.linalg.norm(up)
+
+
+def gltf_axes(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the rotation [3, 3] from world axes to glTF's: the cameras' up is y, the first one's right nearly x."""
+    up = up_direction(cameras)
+    views = np.asarray(cameras[0].viewmat, np.float64)
+    right, forward = (side - (side @ up) * up for side in (views[0, :3], views[2, :3]))
+    if np.linalg.norm(right) < 0.5:  # it lies on its side, so what is up lies to its right
+        right = forward
+    right /= np.linalg.norm(right)
+    return np.stack([right, up, np.cross(right, up)])

@@ -1,0 +1,137 @@
+"""Parts of a stream as files: one file per frame, or a video along a camera path."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.capture.video import write_video
+from morgs_mi.codec.gaussians import play, seek
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.evaluate.frames import PLAYABLE, even
+from morgs_mi.evaluate.pictures import side_by_side
+from morgs_mi.evaluate.stream import channel_picture, render, render_config
+from morgs_mi.export.paths import CameraPath
+from morgs_mi.files import new_folder
+from morgs_mi.gaussians.gaussians import Gaussians
+
+__all__ = ["chosen_frames", "frame_numbers", "write_each", "write_flight"]
+
+Progress = Callable[[int, int], None] | None
+
+
+def frame_numbers(stream: StreamReader) -> list[int]:
+    """Return the indices of a stream's frames, without decoding any.
+
+    Raises:
+        ValueError: it has none.
+    """
+    numbers = list(dict.fromkeys(frame for _, frame, _ in stream.index()))
+    if not numbers:
+        raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has a header alone.")
+    return numbers
+
+
+def chosen_frames(stream: StreamReader, span: str | None) -> list[int]:
+    """Return those of a stream's frames that `span` names: ``12``, ``10:20`` (without 20), ``::5``; None is all.
+
+    Raises:
+        ValueError: it is not written so, or names no frame of the stream.
+    """
+    numbers = frame_numbers(stream)
+    if span is None:
+        return numbers
+    try:
+        start, stop, step = (*(int(part) if part.strip() else None for part in span.split(":")), *([None] * 2))[:3]
+        if span.count(":") > 2 or (step is not None and step < 1):
+            raise ValueError
+    except ValueError:
+        raise ValueError(f"the frames must be given as 12, 10:20 or 0:100:5, got {span!r}.") from None
+    if ":" not in span:
+        start, stop = start, None if start is None else start + 1
+    low, high = numbers[0] if start is None else start, numbers[-1] + 1 if stop is None else stop
+    wanted = set(range(low, high, step or 1))
+    if not (found := [number for number in numbers if number in wanted]):
+        raise ValueError(f"{stream.path}: the frames must lie in {numbers[0]}..{numbers[-1]}, got {span!r}.")
+    return found
+
+
+def write_each(
+    stream: StreamReader,
+    folder: str | Path,
+    suffix: str,
+    write: Callable[[Path, Gaussians], None],
+    frames: Sequence[int],
+    progress: Progress = None,
+) -> None:
+    """Write frames as ``0000.ply``, ``0001.ply``, ... into a new folder, which appears whole or not at all.
+
+    Args:
+        stream: the file.
+        folder: it must not exist yet.
+        suffix: of the files, e.g. ``.ply``.
+        write: writes the Gaussians of one frame.
+        frames: their indices, ascending.
+        progress: called with the number of files done and to do.
+
+    Raises:
+        ValueError: a broken packet.
+        OSError: the folder exists, or a file cannot be written.
+    """
+    wanted, done = set(frames), 0
+    with new_folder(folder, "write_each()") as partial:
+        for frame, gaussians in play(stream):
+            if frame in wanted:
+                write(partial / f"{frame:04d}{suffix}", gaussians)
+                done += 1
+                if progress is not None:
+                    progress(done, len(wanted))
+            if done == len(wanted):
+                break
+
+
+def write_flight(
+    stream: StreamReader,
+    path: CameraPath,
+    output: str | Path,
+    channels: Sequence[str] = ("color",),
+    freeze: int | None = None,
+    progress: Progress = None,
+) -> None:
+    """Render a stream along a camera path into a video at the stream's frame rate; whole or not at all.
+
+    Time goes on while the camera moves, and starts over after the last frame.
+
+    Args:
+        stream: the file.
+        path: where the camera goes; its length is the video's.
+        output: ``FILE.mp4``.
+        channels: out of `CHANNELS`, side by side.
+        freeze: index of the one frame to show; None lets time go on.
+        progress: called with the number of pictures done and to do.
+
+    Raises:
+        ValueError: another kind of file, an unknown channel or frame, or a broken packet.
+        OSError: the file cannot be written.
+    """
+    if Path(output).suffix.lower() != ".mp4":
+        raise ValueError(f"{output}: the output must be FILE.mp4, got {Path(output).suffix!r}.")
+    frame_numbers(stream)
+    count, config = max(1, round(path.seconds * stream.fps)), render_config(stream)
+
+    def pictures() -> Iterator[np.ndarray]:
+        for i, gaussians in zip(range(count), _over_time(stream, freeze), strict=False):
+            images = render(gaussians, path.at(i / stream.fps), channels, config)
+            yield even(side_by_side([channel_picture(name, image) for name, image in images.items()]))
+            if progress is not None:
+                progress(i + 1, count)
+
+    write_video(output, pictures(), stream.fps, PLAYABLE)
+
+
+def _over_time(stream: StreamReader, freeze: int | None) -> Iterator[Gaussians]:
+    frozen = None if freeze is None else seek(stream, freeze).gaussians
+    while True:
+        yield from (frozen,) if frozen is not None else (gaussians for _, gaussians in play(stream))

@@ -1,0 +1,128 @@
+"""Gaussians as a binary glTF 2.0 file with the extension `KHR_gaussian_splatting`.
+
+A .glb file is a header, a JSON chunk and a chunk of bytes. The Gaussians are one point primitive; each attribute has an
+accessor and a view of the bytes of its own, little-endian float32:
+
+    POSITION                                        VEC3    centre
+    KHR_gaussian_splatting:ROTATION                 VEC4    unit quaternion, xyzw
+    KHR_gaussian_splatting:SCALE                    VEC3    standard deviations
+    KHR_gaussian_splatting:OPACITY                  SCALAR  0 to 1
+    KHR_gaussian_splatting:SH_DEGREE_l_COEF_n       VEC3    RGB coefficient of degree l and order n - l
+    COLOR_0                                         VEC4    linear RGB and opacity, for viewers that draw points
+
+glTF wants y up. Centres, rotations and harmonics are turned, not the node: a viewer need not turn harmonics then.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from morgs_mi.evaluate.frames import linear_light
+from morgs_mi.files import whole
+from morgs_mi.gaussians.gaussians import Gaussians
+from morgs_mi.gaussians.shape import rotated, unit_quats
+
+__all__ = ["glb", "write_gltf"]
+
+_NAME = "KHR_gaussian_splatting"
+_FLOAT, _ARRAY_BUFFER, _POINTS = 5126, 34962, 0
+_TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+_Y00 = 0.28209479177387814
+
+
+def write_gltf(path: str | Path, gaussians: Gaussians, axes: np.ndarray | None = None) -> None:
+    """Write Gaussians as a .glb file that needs no other and appears whole or not at all.
+
+    Motion and confidence have no place in the extension and are left out.
+
+    Args:
+        path: the file.
+        gaussians: N Gaussians in world axes.
+        axes: rotation [3, 3] from world axes to glTF's, see `gltf_axes`; None where the world has y up already.
+
+    Raises:
+        ValueError: no Gaussians, or more than the 4 GiB of a .glb file hold.
+        OSError: the file cannot be written.
+    """
+    data = glb(gaussians, axes)
+    with whole(path, "write_gltf()") as partial:
+        partial.write_bytes(data)
+
+
+def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
+    """Return the bytes of the file that `write_gltf` writes.
+
+    Raises:
+        ValueError: as there.
+    """
+    if not len(gaussians):  # an accessor has at least one element
+        raise ValueError("write_gltf(): at least one Gaussian was expected, got none; glTF cannot hold an empty set.")
+    columns = _attributes(gaussians if axes is None else rotated(gaussians, axes))
+    binary = b"".join(column.tobytes() for column in columns.values())
+    document = json.dumps(_document(columns, axes), separators=(",", ":"), allow_nan=False).encode()
+    document += b" " * (-len(document) % 4)
+    size = 12 + 8 + len(document) + 8 + len(binary)
+    if size >= 2**32:
+        raise ValueError(
+            f"write_gltf(): {len(gaussians)} Gaussians take {size} bytes, a .glb file holds 2^32; use PLY."
+        )
+    head = struct.pack("<4sII", b"glTF", 2, size)
+    chunks = ((b"JSON", document), (b"BIN\0", binary))
+    return head + b"".join(struct.pack("<I4s", len(data), kind) + data for kind, data in chunks)
+
+
+def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    raw = gaussians.numpy()
+    opacities = np.asarray(gaussians.opacities, np.float32)
+    diffuse = linear_light(np.clip(0.5 + _Y00 * raw["sh_coeffs"][:, 0], 0, 1))
+    columns = {
+        "POSITION": raw["means"],
+        f"{_NAME}:ROTATION": np.roll(unit_quats(gaussians), -1, axis=1),
+        f"{_NAME}:SCALE": np.exp(raw["log_scales"]),
+        f"{_NAME}:OPACITY": np.clip(opacities, 0, 1)[:, None],
+    }
+    for degree in range(gaussians.sh_degree + 1):
+        for n in range(2 * degree + 1):
+            columns[f"{_NAME}:SH_DEGREE_{degree}_COEF_{n}"] = raw["sh_coeffs"][:, degree * degree + n]
+    columns["COLOR_0"] = np.concatenate([diffuse, np.clip(opacities, 0, 1)[:, None]], axis=1)
+    return {name: np.ascontiguousarray(column, "<f4") for name, column in columns.items()}
+
+
+def _document(columns: dict[str, np.ndarray], axes: np.ndarray | None) -> dict[str, Any]:
+    sizes = [column.nbytes for column in columns.values()]
+    starts = np.cumsum([0, *sizes])
+    accessors = [
+        {"bufferView": i, "componentType": _FLOAT, "count": len(column), "type": _TYPES[column.shape[1]]}
+        for i, column in enumerate(columns.values())
+    ]
+    place = columns["POSITION"]
+    accessors[0] |= {"min": place.min(axis=0).tolist(), "max": place.max(axis=0).tolist()}
+    splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
+    primitive = {
+        "mode": _POINTS,
+        "attributes": {name: i for i, name in enumerate(columns)},
+        "extensions": {_NAME: {**splats, "sortingMethod": "cameraDistance"}},
+    }
+    document: dict[str, Any] = {
+        "asset": {"version": "2.0", "generator": "morgs_mi"},
+        "extensionsUsed": [_NAME],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": int(start), "byteLength": size, "target": _ARRAY_BUFFER}
+            for start, size in zip(starts[:-1], sizes, strict=True)
+        ],
+        "buffers": [{"byteLength": int(starts[-1])}],
+    }
+    if axes is not None:
+        # How to come back to the capture's axes: x_world = M x_gltf.
+        document["nodes"][0]["extras"] = {"world_from_gltf": np.asarray(axes, float).T.tolist()}
+    return document

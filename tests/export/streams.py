@@ -1,0 +1,51 @@
+"""A small stream for the tests of what is made of streams: splats that move, are born and die."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.capture.camera import Camera
+from morgs_mi.codec.container import StreamWriter
+from morgs_mi.codec.gaussians import CodedFrame, decode, keyframe_packet, residual_packet
+from morgs_mi.gaussians.gaussians import Gaussians
+
+NAMES = ("left", "middle", "right")
+
+
+def rig(width: int = 64, height: int = 48) -> tuple[Camera, ...]:
+    places = zip(((-1, -4, 1), (0, -4, 1), (1, -4, 1)), NAMES, strict=True)
+    return tuple(Camera.look_at(place, (0, 0, 0.2), (0, 0, 1), 45, width, height, name) for place, name in places)
+
+
+def splats(N: int = 40, degree: int = 1, seed: int = 0) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    return Gaussians.from_activated(
+        means=rng.uniform(-0.8, 0.8, (N, 3)),
+        scales=rng.uniform(0.05, 0.2, (N, 3)),
+        quats=rng.normal(size=(N, 4)),
+        opacities=rng.uniform(0.3, 0.95, N),
+        sh_coeffs=0.4 * rng.normal(size=(N, (degree + 1) ** 2, 3)),
+        logit_confidence=np.where(np.arange(N) < N // 2, 3.0, -3.0),
+    )
+
+
+def write_stream(path: Path, frames: int = 4, start: Gaussians | None = None) -> list[CodedFrame]:
+    """Write a stream and return its states. From frame 1 the first half moves; in frame 2 one dies, two are born."""
+    cameras, states = rig(), []
+    with StreamWriter(path, cameras, 10) as writer:
+        packet = keyframe_packet(start or splats(), 0, cameras)
+        for t in range(frames):
+            writer.write(packet)
+            states.append(decode(states[-1] if states else None, packet))
+            before, source = states[-1].gaussians, np.arange(len(states[-1]))
+            moves = np.asarray(before.logit_confidence) > 0
+            after = replace(before, means=before.numpy()["means"] + 0.1 * moves[:, None] * np.float32([1, 0, 0]))
+            if t == 1:
+                born = splats(2, before.sh_degree, seed=9)
+                after = Gaussians.concatenate([replace(after.select(source[1:]), motion=None), born])
+                source = np.concatenate([source[1:], [-1, -1]])
+            packet = residual_packet(states[-1], after, source, cameras)
+    return states

@@ -1,0 +1,123 @@
+"""glTF: the file is read back by a reader written from the specifications, and shows the same picture."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morgs_mi.export.axes import gltf_axes
+from morgs_mi.export.gltf import glb, write_gltf
+from morgs_mi.gaussians.gaussians import Gaussians
+from morgs_mi.render.rasterize import rasterize
+from tests.export.streams import rig, splats
+
+KHR = "KHR_gaussian_splatting"
+SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+# KHR_gaussian_splatting's table of attributes; all may be float, whose component type is 5126. All others are VEC3.
+TYPES = {f"{KHR}:ROTATION": "VEC4", f"{KHR}:OPACITY": "SCALAR", "COLOR_0": "VEC4"}
+
+
+def opened(data: bytes) -> tuple[dict, bytes]:
+    """Return the JSON and the bytes of a .glb file, by glTF 2.0's section on the binary format."""
+    assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data))
+    chunks, at = [], 12
+    while at < len(data):
+        size, kind = struct.unpack_from("<I4s", data, at)
+        assert (at % 4, size % 4) == (0, 0)
+        chunks.append((kind, data[at + 8 : at + 8 + size]))
+        at += 8 + size
+    assert at == len(data)
+    assert [kind for kind, _ in chunks] == [b"JSON", b"BIN\0"]
+    document = json.loads(chunks[0][1].decode())
+    assert 0 <= len(chunks[1][1]) - document["buffers"][0]["byteLength"] <= 3
+    return document, chunks[1][1]
+
+
+def attributes(document: dict, binary: bytes) -> dict[str, np.ndarray]:
+    """Return the arrays of the one primitive, checked by glTF 2.0's rules on accessors and views."""
+    arrays = {}
+    for name, index in document["meshes"][0]["primitives"][0]["attributes"].items():
+        accessor = document["accessors"][index]
+        view = document["bufferViews"][accessor["bufferView"]]
+        assert accessor["componentType"] == 5126
+        start, width = view.get("byteOffset", 0) + accessor.get("byteOffset", 0), SIZES[accessor["type"]]
+        assert start % 4 == 0
+        assert "byteStride" not in view
+        assert accessor["count"] * width * 4 <= view["byteLength"]
+        assert view.get("byteOffset", 0) + view["byteLength"] <= document["buffers"][0]["byteLength"]
+        assert view["target"] == 34962
+        arrays[name] = np.frombuffer(binary, "<f4", accessor["count"] * width, start).reshape(-1, width)
+    assert len({len(array) for array in arrays.values()}) == 1
+    return arrays
+
+
+def gaussians_of(arrays: dict[str, np.ndarray]) -> Gaussians:
+    harmonics = sorted(name for name in arrays if ":SH_DEGREE_" in name)
+    return Gaussians.from_activated(
+        arrays["POSITION"],
+        arrays[f"{KHR}:SCALE"],
+        arrays[f"{KHR}:ROTATION"][:, [3, 0, 1, 2]],  # glTF's order is xyzw
+        arrays[f"{KHR}:OPACITY"][:, 0],
+        np.stack([arrays[name] for name in harmonics], axis=1),
+    )
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_file_keeps_the_rules_of_the_extension(degree):
+    document, binary = opened(glb(splats(degree=degree), gltf_axes(rig())))
+    assert document["asset"]["version"] == "2.0"
+    assert document["extensionsUsed"] == [KHR]
+    assert "uri" not in document["buffers"][0]
+    (primitive,) = document["meshes"][0]["primitives"]
+    assert primitive["mode"] == 0
+    assert primitive["extensions"][KHR]["kernel"] == "ellipse"
+    assert primitive["extensions"][KHR]["colorSpace"] == "srgb_rec709_display"
+    arrays = attributes(document, binary)
+    bands = {f"{KHR}:SH_DEGREE_{d}_COEF_{n}" for d in range(degree + 1) for n in range(2 * d + 1)}
+    assert arrays.keys() == {"POSITION", f"{KHR}:SCALE", *TYPES, *bands}
+    for name, index in primitive["attributes"].items():
+        assert document["accessors"][index]["type"] == TYPES.get(name, "VEC3")
+    place = document["accessors"][primitive["attributes"]["POSITION"]]
+    np.testing.assert_array_equal(place["min"], arrays["POSITION"].min(0))
+    np.testing.assert_array_equal(place["max"], arrays["POSITION"].max(0))
+    np.testing.assert_allclose(np.linalg.norm(arrays[f"{KHR}:ROTATION"], axis=1), 1, atol=1e-6)
+    assert arrays[f"{KHR}:SCALE"].min() >= 0
+    for name in ("COLOR_0", f"{KHR}:OPACITY"):
+        assert arrays[name].min() >= 0
+        assert arrays[name].max() <= 1
+
+
+def test_the_fallback_colour_is_linear():
+    grey = replace(splats(1), sh_coeffs=np.zeros((1, 1, 3)))
+    # sRGB's 0.5 is 0.21404 in linear light.
+    assert attributes(*opened(glb(grey)))["COLOR_0"][0, :3] == pytest.approx([0.21404] * 3, abs=1e-5)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_a_viewer_with_y_up_sees_the_same_picture(tmp_path, degree):
+    gaussians, camera, axes = splats(degree=degree), rig()[0], gltf_axes(rig())
+    write_gltf(tmp_path / "g.glb", gaussians, axes)
+    document, binary = opened((tmp_path / "g.glb").read_bytes())
+    turn = np.eye(4)
+    turn[:3, :3] = axes.T
+    np.testing.assert_array_equal(document["nodes"][0]["extras"]["world_from_gltf"], axes.T)
+    seen = rasterize(gaussians_of(attributes(document, binary)), replace(camera, viewmat=camera.viewmat @ turn)).color
+    # float32 attributes are rounded once more by the rotation.
+    np.testing.assert_allclose(np.array(seen), np.array(rasterize(gaussians, camera).color), atol=2e-4)
+
+
+def test_axes_are_those_of_gltf():
+    axes = gltf_axes(rig())
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1)
+    assert (axes @ [0, 0, 1])[1] > 0.95  # the world's up is nearly y, for the cameras look down a little
+    assert (axes @ rig()[1].position)[2] > 3  # the cameras stand where z is positive
+
+
+def test_nothing_is_refused_in_a_sentence():
+    with pytest.raises(ValueError, match="at least one Gaussian was expected"):
+        glb(splats().select(np.zeros(0, int)))

@@ -1,0 +1,116 @@
+"""Camera paths go through their keys, smoothly, and look where they should."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morgs_mi.capture.camera import Camera
+from morgs_mi.export.axes import up_direction
+from morgs_mi.export.paths import CameraPath, between, focus, load_path, orbit
+from tests.export.streams import rig
+
+TARGET = np.array([0, 0, 0.2])
+
+
+def ring(count: int) -> tuple[Camera, ...]:
+    angles = 2 * np.pi * np.arange(count) / count
+    places = np.stack([3 * np.cos(angles), 3 * np.sin(angles), np.full(count, 1.0)], 1)
+    return tuple(Camera.look_at(p, TARGET, (0, 0, 1), 45, 64, 48, f"c{i}") for i, p in enumerate(places))
+
+
+def test_a_path_goes_through_its_keys_with_their_lenses():
+    wide = replace(rig()[2], K=np.array([[30.0, 0, 31], [0, 33, 25], [0, 0, 1]]))
+    path = CameraPath(np.array([0, 1, 2.5]), (*rig()[:2], wide))
+    for time, key in zip(path.times, path.keys, strict=True):
+        np.testing.assert_allclose(path.at(time).viewmat, key.viewmat, atol=1e-9)
+        np.testing.assert_allclose(path.at(time).K, key.K, atol=1e-9)
+    np.testing.assert_array_equal(path.at(9).viewmat, path.at(2.5).viewmat)
+    # No kinks: the steps to both sides of a key differ by the acceleration times their square.
+    before, at, after = (path.at(1 + h).position for h in (-1e-4, 0, 1e-4))
+    np.testing.assert_allclose(after - at, at - before, atol=1e-7)
+
+
+def test_rotations_stay_rotations():
+    path = between(ring(7), 3)
+    for time in np.linspace(0, 3, 40):
+        R = path.at(time).viewmat[:3, :3]
+        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(R) > 0
+
+
+def test_between_takes_the_nearest_next_and_an_even_pace():
+    cameras = rig()
+    path = between((cameras[0], cameras[2], cameras[1]), 2)
+    assert [key.name for key in path.keys] == ["left", "middle", "right"]
+    np.testing.assert_allclose(path.times, [0, 1, 2])
+
+
+def test_an_orbit_keeps_its_distance_and_looks_at_the_centre():
+    path = orbit(ring(8), TARGET, seconds=4)
+    np.testing.assert_allclose(path.at(0).position, path.at(4).position, atol=1e-9)  # no gap of 90 degrees: a full turn
+    for time in np.linspace(0, 4, 30):
+        camera = path.at(time)
+        x, y, z = camera.viewmat[:3, :3] @ TARGET + camera.viewmat[:3, 3]
+        # Splines through keys 10 degrees apart: off by less than a hundredth of a pixel at this lens.
+        assert np.hypot(x, y) / z < 1e-4
+        assert np.linalg.norm(camera.position - TARGET) == pytest.approx(np.hypot(3, 0.8), rel=1e-4)
+
+
+def test_an_orbit_of_a_frontal_rig_is_as_wide_as_the_rig():
+    path = orbit(rig(), TARGET, seconds=1)
+    a, b = (path.at(time).position - TARGET for time in (0, 1))
+    # Around the mean up of the rig, which is tilted against z by the 11 degrees that the cameras look down.
+    x, y = (rig()[k].position - TARGET for k in (0, 2))
+    assert np.arccos(a @ b / (a @ a)) == pytest.approx(np.arccos(x @ y / (x @ x)), abs=0.02)
+
+
+def test_focus_is_where_the_axes_meet_or_among_the_gaussians():
+    means = np.random.default_rng(0).normal(size=(99, 3))
+    np.testing.assert_allclose(focus(ring(8), means), TARGET, atol=0.02)
+    parallel = [Camera.look_at((x, -4, 0), (x, 0, 0), (0, 0, 1), 45, 64, 48) for x in (-1, 1)]
+    assert focus(parallel, means + np.array([0, 2, 0]))[1] == pytest.approx(np.median(means[:, 1]) + 2)
+
+
+def test_json_paths_take_cameras_matrices_and_places(tmp_path):
+    keys = [
+        {"time": 0, "camera": "right"},
+        {"time": 1, "viewmat": rig()[1].viewmat.tolist()},
+        {"time": 2, "position": [-1, -4, 1], "target": [0, 0, 0.2], "fov_x": 45},
+    ]
+    (tmp_path / "path.json").write_text(json.dumps({"width": 128, "height": 96, "up": [0, 0, 1], "keys": keys}))
+    path = load_path(tmp_path / "path.json", rig())
+    for key, camera in zip(path.keys, rig()[::-1], strict=True):
+        np.testing.assert_allclose(key.viewmat, camera.viewmat, atol=1e-12)
+        np.testing.assert_allclose(key.K, camera.resized(128, 96).K, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[", "expected a JSON object with a list `keys`"),
+        ('{"cameras": []}', "expected a JSON object with a list `keys`"),
+        ('{"keys": [{"time": 0, "camera": "left"}]}', "at least two key views"),
+        ('{"keys": [{"time": 0, "camera": "up"}]}', "key 0: `camera` must be one of left, middle, right, got 'up'"),
+        ('{"keys": [{"camera": "left"}]}', "key 0: 'time' is missing"),
+        ('{"keys": [{"time": 0}]}', "key 0: 'position' is missing"),
+        ('{"keys": [{"time": 0, "position": [0, 0], "target": [0, 0, 1]}]}', "key 0: `position`, `target`"),
+        ('{"keys": [{"time": 0, "viewmat": [[1, 0], [0, 1]]}]}', "key 0: `viewmat`: the pose must be a matrix"),
+        ('{"keys": [{"time": 1, "camera": "left"}, {"time": 0, "camera": "left"}]}', "must rise from 0"),
+    ],
+)
+def test_broken_json_is_named(tmp_path, text, message):
+    (tmp_path / "path.json").write_text(text)
+    with pytest.raises(ValueError, match=r"path\.json: ") as caught:
+        load_path(tmp_path / "path.json", rig())
+    assert message in str(caught.value)
+
+
+def test_a_camera_right_above_has_no_orbit():
+    top = Camera.look_at((0, 0, 5), (0, 0, 0), (0, 1, 0), 45, 64, 48, "top")
+    rig = (top, *ring(4))
+    with pytest.raises(ValueError, match="'top' must stand beside the scene"):
+        orbit(rig, top.position - 5 * up_direction(rig))
