@@ -135,6 +135,22 @@ def test_wherever_the_stream_was_cut_off_it_is_resumed_to_the_same(whole: Path, 
         assert_same(out, whole)
 
 
+def test_a_fit_that_was_interrupted_by_hand_is_resumed_to_the_same(whole: Path, tmp_path: Path) -> None:
+    """It has closed its stream, with an index that must not stay in the middle."""
+
+    def stop(frame: int, step: int, steps: int) -> None:
+        if frame == 3 and step == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        stream_capture(recording(), tmp_path / "out", CONFIG, stop)
+    reader = StreamReader(tmp_path / "out" / "stream.morgs")
+    assert reader.closed()
+    assert [frame for frame, _ in play(reader)] == [0, 1, 2]
+    stream_capture(recording(), tmp_path / "out", CONFIG, resume=True)
+    assert_same(tmp_path / "out", whole)
+
+
 def interrupted(whole: Path, out: Path, at: int) -> Path:
     shutil.copytree(whole, out)
     os.truncate(out / "stream.morgs", at)

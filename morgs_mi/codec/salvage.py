@@ -6,7 +6,6 @@ its packet is intact and its parent plays, or from a keyframe on.
 
 from __future__ import annotations
 
-import mmap
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -45,15 +44,9 @@ def salvage(path: str | Path) -> Iterator[CodedFrame | Gap]:
     Raises:
         FileNotFoundError: there is no such file.
     """
-    with open(path, "rb") as file:
-        if not file.seek(0, 2):
-            yield Gap(0, 0, "the file is empty")
-            return
-        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-            yield from _states(data)
-
-
-def _states(data: mmap.mmap) -> Iterator[CodedFrame | Gap]:
+    data = Path(path).read_bytes()  # a map of the file would end the process if somebody cut it off meanwhile
+    if not data:
+        yield Gap(0, 0, "the file is empty")
     coded, at = None, 0
     for kind, start, stop in _intact(data):
         if start > at:
@@ -71,7 +64,7 @@ def _states(data: mmap.mmap) -> Iterator[CodedFrame | Gap]:
         yield Gap(at, len(data), "the bytes are damaged or cut off")
 
 
-def _intact(data: mmap.mmap) -> Iterator[tuple[int, int, int]]:
+def _intact(data: bytes) -> Iterator[tuple[int, int, int]]:
     """Yield (kind, start, stop) of the preamble, as a part of the header, and of every packet whose CRC is right."""
     at = PREAMBLE.size
     if data[:at] == PREAMBLE.pack(MAGIC, VERSION):
@@ -87,7 +80,7 @@ def _intact(data: mmap.mmap) -> Iterator[tuple[int, int, int]]:
         at = stop or start + 1
 
 
-def _end(data: mmap.mmap, start: int) -> int | None:
+def _end(data: bytes, start: int) -> int | None:
     """Return where the packet ends that begins at `start`, None if none does."""
     if start + PAYLOAD > len(data):
         return None

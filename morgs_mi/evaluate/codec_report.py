@@ -43,6 +43,8 @@ class CodecReportConfig:
     """Use at most this many frames from the start."""
     stream: StreamConfig = field(default_factory=StreamConfig)
     """The fit."""
+    resume: bool = False
+    """Keep the streams that a report with the same settings has left, and go on with one that is not whole."""
 
     def __post_init__(self) -> None:
         if not self.qualities or not all(0 < quality < self.reference for quality in self.qualities):
@@ -146,7 +148,7 @@ def _clip(
         progress(f"Fitting {name}", done, len(qualities))
         folder = out / name / f"{quality:g}"
         settings = replace(config.stream, codec=replace(config.stream.codec, quality=quality))
-        stream_capture(capture, folder, settings)
+        stream_capture(capture, folder, settings, resume=config.resume)
         rows.append({"quality": quality, **_judged(folder, capture), **_measured(folder, settings)})
     progress(f"Fitting {name}", len(qualities), len(qualities))
     best = rows[-1]["psnr"]["later"]

@@ -45,6 +45,10 @@ def test_coarser_streams_are_smaller_and_lzma_is_larger(clip: Path, tmp_path: Pa
     table = markdown_table(found).splitlines()
     assert len({line.count("|") for line in table}) == 1
     assert len(table) == 2 + len(rows)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("stream.morgs")}
+    (again,) = report_codec([clip / "capture"], tmp_path, replace(QUICK, resume=True))["clips"]
+    assert {path: path.read_bytes() for path in before} == before, "nothing was fitted again"
+    assert [row["psnr"] for row in again["rows"]] == [row["psnr"] for row in rows]
     plot_codec(result, tmp_path / "codec.png")
     assert (tmp_path / "codec.png").stat().st_size > 10_000
 
