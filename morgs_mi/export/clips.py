@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.capture.video import write_video
+from morgs_mi.capture.video_writer import write_video
 from morgs_mi.codec.gaussians import play, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.evaluate.frames import PLAYABLE, even
