@@ -170,3 +170,17 @@ def test_instructions_are_counted(workload: Path, tmp_path: Path):
         assert found["kinds"]["multiply-add"] >= least * pixels, name
         assert found["memory"]["stack stores"] > pixels, name
         assert result["milliseconds"][name] > 0
+
+
+def test_the_codec_is_timed(tmp_path: Path):
+    out, tool = tmp_path / "out.json", ROOT / "benchmarks" / "codec_speed.py"
+    command = [sys.executable, tool, "--json", out, "--sizes", "300", "100", "--repeats", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stderr
+    (row,) = json.loads(out.read_text())["rows"]
+    assert (row["gaussians"], row["moving"]) == (300, 100)
+    assert min(row["encode_ms"], row["decode_ms"]) > 0
+    # At least a flag and some bits for each of the numbers that change.
+    assert 100 * 20 / 8 < row["bytes"] < 300 * 100
+    # Half a step of 0.08 px in each of three directions.
+    assert 0 < row["error_px_rms"] < row["error_px_max"] < 0.04 * 3**0.5

@@ -10,7 +10,7 @@ come first in ascending order, births after them. Each keeps its number in `ids`
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import blake2b
@@ -131,15 +131,17 @@ def residual_packet(
     source = _checked(np.arange(len(grid)) if source is None else source, len(grid), len(gaussians))
     survivors, births = source[source >= 0], int((source < 0).sum())
     raw, count = attributes(gaussians), len(survivors)
-    change = real_values({name: value[:count] for name, value in raw.items()}, grid.select(survivors))
-    change -= grid.values[survivors].T
+    touched = _touched(raw, previous.gaussians.numpy(), survivors)
+    rows = survivors[touched]
+    change = real_values({name: value[touched] for name, value in raw.items()}, grid.select(rows))
+    change -= grid.values[rows].T
     born = new_grid({name: value[count:] for name, value in raw.items()}, cameras, config) if births else None
     dead = np.ones(len(grid), bool)
     dead[survivors] = False
 
     def columns(coarseness: int) -> Iterator[np.ndarray]:
         r, scaled = np.zeros((len(change), len(grid)), np.int32), change / step_sizes(np.array(coarseness))
-        r[:, survivors] = np.clip(np.rint(scaled, out=scaled), 1 - LIMIT, LIMIT - 1, out=scaled)
+        r[:, rows] = np.clip(np.rint(scaled, out=scaled), 1 - LIMIT, LIMIT - 1, out=scaled)
         return columns_of_change(r, dead, grid)
 
     coarseness = least = round(4 * np.log2(config.birth_precision))
@@ -262,6 +264,14 @@ def _taken_grid(reader: ColumnReader, N: int, degree: int, has_confidence: bool)
     exponents = bounded(columns[:, 1:first], 128, "exponent").astype(np.int8)
     values = bounded(columns[:, first:], LIMIT, "value").astype(np.int32)
     return Grid(values, exponents, columns[:, 0].astype(np.uint8), degree)
+
+
+def _touched(now: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray], survivors: np.ndarray) -> np.ndarray:
+    """Return who of the survivors has any attribute that differs: the others need not be looked at."""
+    differs = np.zeros(len(survivors), bool)
+    for name, value in now.items():
+        differs |= (value[: len(survivors)] != before[name][survivors]).reshape(len(survivors), -1).any(1)
+    return np.flatnonzero(differs)
 
 
 def _fitting(columns: Callable[[int], Iterator[np.ndarray]], low: int, target: int) -> int:

@@ -138,12 +138,12 @@ def bounded(values: np.ndarray, limit: int, what: str) -> np.ndarray:
 
 
 def attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """Return the raw attributes that a stream holds, by name, as float64.
+    """Return the raw attributes that a stream holds, by name.
 
     Raises:
         ValueError: one is not finite.
     """
-    raw = {name: np.asarray(value, np.float64) for name, value in gaussians.numpy().items() if name != "motion"}
+    raw = {name: value for name, value in gaussians.numpy().items() if name != "motion"}
     for name, value in raw.items():
         if not np.isfinite(value).all():
             row = np.argwhere(~np.isfinite(value))[0][0]
@@ -155,6 +155,7 @@ def attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
 
 def new_grid(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> Grid:
     """Choose the steps of Gaussians that are new, given by their `attributes`, and round them to these."""
+    raw = {name: np.asarray(value, np.float64) for name, value in raw.items()}
     pivots = np.abs(raw["quats"]).argmax(1).astype(np.uint8)
     degree = round(raw["sh_coeffs"].shape[1] ** 0.5) - 1
     grid = Grid(np.zeros((0, 0), np.int32), _exponents(raw, cameras, config), pivots, degree)
@@ -165,7 +166,7 @@ def new_grid(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: C
 def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
     """Return what `Grid.values` of other `attributes` would be without rounding, float64 [C, N]; N as in `grid`."""
     pivots, rows = grid.pivots, np.arange(len(grid.pivots))
-    quats, sh = raw["quats"], raw["sh_coeffs"]
+    quats, sh = np.asarray(raw["quats"], np.float64), raw["sh_coeffs"]
     others = np.stack([quats[rows, k + (k >= pivots)] for k in range(3)], axis=1)
     pivot = quats[rows, pivots][:, None]
     # A turn by 180 degrees away from where the pivot was chosen divides by zero: then "very far" is what is meant.
