@@ -67,8 +67,9 @@ def method_page(result: Mapping[str, Any]) -> str:
     epochs, parts = result["table_epochs"], []
     for clip in result["clips"]:
         size = f"{clip['views']} views of {clip['width']}x{clip['height']}, {clip['frames']} frames"
-        runs = max(row["runs"] for row in clip["rows"])
-        parts.append(f"## {clip['name']}\n\n{size}; mean and standard deviation over {runs} runs. {_yardsticks(clip)}")
+        seeds = clip["rows"][0]["runs"]
+        spread = "one run" if seeds == 1 else f"mean ± standard deviation of {seeds} runs"
+        parts.append(f"## {clip['name']}\n\n{size}; {spread}. {_yardsticks(clip)}{_edges(clip)}")
         parts.append(f"### Parts of the method, {epochs} epochs\n\n{ablation_table(clip, epochs)}")
         if clip["key_view_rows"]:
             parts.append(f"### Key views, {epochs} epochs\n\n{key_views_table(clip)}")
@@ -97,7 +98,9 @@ def plot_method(result: Mapping[str, Any], path: str | Path) -> None:
             axis.set(title=f"{clip['name']}: {title}", xlabel="seconds per later frame", xscale="log")
             axis.title.set_fontsize(10)
             axis.grid(alpha=0.3, which="both")
-            axis.tick_params(axis="x", which="minor", labelsize=6)
+            axis.tick_params(axis="x", which="both", labelsize=7)
+            for ticks in (axis.xaxis.set_major_formatter, axis.xaxis.set_minor_formatter):
+                ticks("{x:g}")
     handles = {label: line for axis in grid.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     drawing.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=8, fontsize=9)
     save_figure(drawing, path)
@@ -139,6 +142,18 @@ def _yardsticks(clip: Mapping[str, Any]) -> str:
         words.append(f"motion is {figure(mean['true_motion_moving'], 1)} px where things move")
         words.append(f"the flow that guides it is off by {figure(clip['cue']['error'], 2)} px there")
     return ", ".join(words) + ".\n"
+
+
+def _edges(clip: Mapping[str, Any]) -> str:
+    """Return a warning about presets whose best rate is the largest that was tried, empty if there are none."""
+    tried = {row["preset"]: set() for row in clip["rows"]}
+    for row in clip["rows"]:
+        tried[row["preset"]].add(row["rates"])
+    edges = [
+        row for row in best_rows(clip) if len(tried[row["preset"]]) > 1 and row["rates"] == max(tried[row["preset"]])
+    ]
+    found = ", ".join(f"`{row['preset']}` at {row['epochs']} epochs" for row in edges)
+    return f"Larger rates than were tried may be better for {found}.\n" if found else ""
 
 
 def _spread(row: Row, name: str, digits: int, unit: float) -> str:

@@ -16,7 +16,7 @@ from morgs_mi.capture.synth import synthesize
 from morgs_mi.evaluate import method_cells
 from morgs_mi.evaluate.method_cells import Cell, Clip, method_version, scores_of
 from morgs_mi.evaluate.method_report import MethodReportConfig, aggregate, cells_of, report_method
-from morgs_mi.evaluate.method_tables import ablation_table, best_rows, epochs_table, key_views_table
+from morgs_mi.evaluate.method_tables import ablation_table, best_rows, epochs_table, key_views_table, method_page
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.stream_loop import StreamConfig
 
@@ -187,6 +187,18 @@ def test_the_mean_over_seeds_decides_which_rate_is_best():
     assert rows[1]["std"]["psnr"] == pytest.approx(2**0.5)
     assert rows[1]["by_frame"]["psnr"] == [32, 1]
     assert rows[1]["mean"]["ssim"] != rows[1]["mean"]["ssim"]
+
+
+def test_a_best_rate_at_the_edge_of_what_was_tried_is_told(interrupted):
+    def told(best: float) -> bool:
+        rows = [{**row, "best": row["rates"] == best or row["preset"] == "default"} for row in found["rows"]]
+        page = method_page({**result, "clips": [{**found, "rows": rows}]})
+        return "Larger rates than were tried may be better for `baseline` at 1 epochs, `baseline` at 2 epochs." in page
+
+    result = interrupted[0]
+    (found,) = result["clips"]
+    assert told(2.0)
+    assert not told(1.0)
 
 
 def test_every_preset_is_tuned_or_not_and_views_are_at_most_all():
