@@ -144,6 +144,19 @@ def test_a_clip_cut_off_meanwhile_leaves_its_camera_out_of_the_rest(
     assert all(frame["psnr"] > 0 for frame in frames)
 
 
+def test_a_fit_and_its_evaluation_put_the_clips_on_the_same_clock(capture: Path, tmp_path: Path, capsys) -> None:
+    other_length(capture)
+    out, options = tmp_path / "out", ("--offset", "cam1", "-1", "cam2", "1", "--exposure")
+    assert run(capsys, "info", capture, "--no-check", *options)[1].count("2 frames at 25 fps") == 1
+    assert run(capsys, "fit", capture, out, *options, *QUICK)[0] == 0
+    record = json.loads((out / "capture.json").read_text())
+    assert (record["frames"], record["reading"]["offset"]) == (2, {"cam1": -1, "cam2": 1})
+    assert [camera["first_frame"] for camera in record["cameras"]] == [1, 0, 2]
+    assert run(capsys, "eval", out, "--json", tmp_path / "eval.json")[0] == 0
+    result = json.loads((tmp_path / "eval.json").read_text())
+    assert (result["complete"], result["num_frames"]) == (True, 2)
+
+
 def test_an_interrupted_fit_leaves_a_stream_that_says_it_is_not_whole(
     capture: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:

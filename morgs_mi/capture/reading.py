@@ -101,7 +101,7 @@ def timeline(
     first, last = np.ceil(np.max(-offsets / rates)), np.floor(np.min((lengths - 1 - offsets) / rates))
     instants = np.arange(first, last + 1)[:max_frames]
     if not len(instants):
-        spans = zip(names, -offsets / rates / lowest, (lengths - offsets) / rates / lowest, strict=True)
+        spans = zip(names, (0 - offsets) / rates / lowest, (lengths - offsets) / rates / lowest, strict=True)
         table = ", ".join(f"{name} {start:.2f} to {stop:.2f} s" for name, start, stop in spans)
         raise ValueError(f"{path}: the clips have no instant in common, {table}; check `offset`.")
     exact = offsets[:, None] + rates[:, None] * instants

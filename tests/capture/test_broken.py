@@ -14,7 +14,7 @@ from morgs_mi import cli
 from morgs_mi.capture import write_video
 from tests.capture import layouts
 
-Spoil = Callable[[Path], None]
+Spoil = Callable[[Path], object]
 
 
 # ---- what goes wrong with clips --------------------------------------------------------------------------
@@ -121,6 +121,16 @@ def moving(values: dict) -> None:
     values["w2c"][2][values["cam_id"][2].index(10)][0][3] += 0.5
 
 
+def faster(name: str, i: int) -> Spoil:
+    return lambda path: write_video(path / name, layouts.frames(i), 2 * layouts.FPS)
+
+
+def told(*options: str) -> Spoil:
+    """Spoil nothing but what `fit` is told."""
+    return lambda path: OPTIONS.extend(options)
+
+
+OPTIONS: list[str] = []
 NAN = float("nan")
 POSES_BOUNDS = {
     "no file": (missing("poses_bounds.npy"), "expected a calibration .*poses_bounds.npy.* run `morgs-mi calibrate`"),
@@ -133,12 +143,24 @@ POSES_BOUNDS = {
     "no focal length": (entry(0, 14, 0), r"row 0 \(cam00\): .* positive focal lengths"),
     "truncated clip": (truncated("cam11.mkv"), r"cam11.mkv: frame \d of 4 cannot be read: the file is truncated"),
     "shorter clip": (shorter("cam11.mkv", 2), "the same number of frames, got cam00.mkv 4, cam02.mkv 4, cam11.mkv 3"),
+    "faster clip": (faster("cam11.mkv", 2), "frame rate, got cam00.mkv 25, cam02.mkv 25, cam11.mkv 50; .* --trim"),
+    "unknown offset": (told("--offset", "cam01", "2"), "`offset` must name cameras of cam00, cam02, cam11, got cam01"),
+    "far offset": (told("--offset", "cam02", "9"), "no instant in common, cam00 0.00 to 0.16 s, cam02 -0.36 to -0.20"),
+    "unknown reference": (
+        told("--color", "linear", "--color-reference", "cam01"),
+        "`color_reference` must be one of cam00, cam02, cam11, got 'cam01'",
+    ),
+    "gaps and no clip": (lambda path: (empty("cam00.mkv")(path), told("--gaps")(path)), "got an empty file"),
     "empty clip": (empty("cam00.mkv"), "cam00.mkv: expected a video, got an empty file"),
     "clip of no frames": (headers_only("cam00.mkv"), "cam00.mkv: .* cannot decode one frame"),
 }
 BY_FRAME = {
     "no image": (missing("frame000002/cam_2.png"), "frame000002/cam_2.png: expected an image, found none"),
     "no camera": (missing("frame000000/cam_10.png"), "got 3 rows for 4 videos"),
+    "no image at all": (
+        lambda path: ([f.write_bytes(b"") for f in path.glob("frame*/cam_2.png")], told("--gaps")(path)),
+        "frame000000/cam_2.png: expected an image, got 0 bytes",
+    ),
     "no frame": (
         lambda path: (path / "frame000001").rename(path / "frame000007"),
         "the folders of the frames must be numbered without gaps, got frame000000 followed by frame000002",
@@ -222,9 +244,10 @@ def test_a_broken_capture_gets_one_sentence_and_nothing_is_written(
     tmp_path: Path, capsys, build, spoil: Spoil, sentence: str
 ) -> None:
     path = build(tmp_path / "capture")
+    OPTIONS.clear()
     spoil(path)
     before = sorted(tmp_path.rglob("*"))
-    status = cli.main(["fit", str(path), str(tmp_path / "out")])
+    status = cli.main(["fit", str(path), str(tmp_path / "out"), *OPTIONS])
     lines = [line for line in capsys.readouterr().err.splitlines() if line.strip() and "━" not in line]
     assert status == 1
     assert len(lines) == 1, lines
