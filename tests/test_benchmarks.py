@@ -184,3 +184,13 @@ def test_the_codec_is_timed(tmp_path: Path):
     assert 100 * 20 / 8 < row["bytes"] < 300 * 100
     # Half a step of 0.08 px in each of three directions.
     assert 0 < row["error_px_rms"] < row["error_px_max"] < 0.04 * 3**0.5
+
+
+def test_reading_a_capture_takes_the_same_memory_however_long_it_is(tmp_path: Path):
+    """Of 60 frames of 2.6 MiB a few are held at a time; if all were kept, the last 54 would show."""
+    script, out = ROOT / "benchmarks" / "capture_memory.py", tmp_path / "memory.json"
+    sizes = ["--cameras", "3", "--frames", "60", "--width", "640", "--height", "480", "--downscale", "1"]
+    subprocess.run([sys.executable, str(script), "--json", str(out), *sizes], check=True, cwd=ROOT, capture_output=True)
+    result = json.loads(out.read_text())
+    assert len(result["rows"]) == 30
+    assert result["growth_mib"] < 6 * result["frame_mib"]

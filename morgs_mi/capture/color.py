@@ -34,8 +34,15 @@ _MIN_SAMPLES, _MAX_ERROR = 30, 2.0
 _DARK, _BRIGHT = 12, 243
 _BLUR = 0.008  # of the width
 _THUMB = 96  # pixels across that are enough for a median
-_CODES = np.arange(256) / 255
-_LINEAR = np.where(_CODES <= 0.04045, _CODES / 12.92, ((_CODES + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def _decoded(codes: np.ndarray) -> np.ndarray:
+    """Return the light, 0 to 1, of sRGB's codes, 0 to 255 and between (IEC 61966-2-1)."""
+    signal = codes / np.float32(255)
+    return np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+_LINEAR = _decoded(np.arange(256, dtype=np.float32))
 _LIGHT = np.arange(65536) / 65535
 _ENCODED = np.where(_LIGHT <= 0.0031308, 12.92 * _LIGHT, 1.055 * _LIGHT ** (1 / 2.4) - 0.055)
 _ENCODED = np.rint(255 * _ENCODED).astype(np.uint8)
@@ -92,7 +99,7 @@ class Tone:
         now = _thumb(image)
         both = np.stack([self.first, now])
         good = ((both > _DARK) & (both < _BRIGHT)).all((0, -1))
-        return float(np.median(_LINEAR[now[good]] / _LINEAR[self.first[good]])) if good.sum() >= _MIN_SAMPLES else 1.0
+        return float(np.median(_decoded(now[good]) / _decoded(self.first[good]))) if good.sum() >= _MIN_SAMPLES else 1.0
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the picture uint8 [H, W, 3] as it should have been."""
@@ -223,9 +230,12 @@ def _differences(pairs: Sequence[Match], colors: Sequence[np.ndarray]) -> tuple[
 
 
 def _thumb(image: np.ndarray) -> np.ndarray:
+    """Return the picture some pixels small, as float32: rounded codes would round the gain to 2 %."""
     height, width = image.shape[:2]
     across = min(_THUMB, width)
-    return cv2.resize(image, (across, max(1, round(height * across / width))), interpolation=cv2.INTER_AREA)
+    return cv2.resize(
+        image.astype(np.float32), (across, max(1, round(height * across / width))), interpolation=cv2.INTER_AREA
+    )
 
 
 def _encode(light: np.ndarray) -> np.ndarray:

@@ -119,7 +119,9 @@ class Info:
             say(f"Reprojection check: {error}{found.matches} matches in {found.pairs} pairs; {found.advice}")
         if fit := capture.colors:
             changes = zip(capture.names, fit.before, fit.after, fit.samples, strict=True)
-            table = ", ".join(f"{name} {a:.1f} -> {b:.1f} ({n} points)" for name, a, b, n in changes)
+            table = ", ".join(
+                f"{name} {a:.1f} -> {b:.1f} ({n} points)" if n else f"{name} -" for name, a, b, n in changes
+            )
             say(f"Colours towards {capture.names[fit.reference]}, dE2000 before -> after: {table}.")
         if self.plot is not None:
             write_rig(self.plot, capture)
