@@ -1,7 +1,7 @@
-"""Thin parts that move fast: a propeller, a rope, pendulums and a baton, 4 to 8 pixels wide at 320x240.
+"""Thin parts that move fast: a propeller, a rope, pendulums and a baton, 4 to 9 pixels wide at 320x240.
 
-Their tips go 8 to 12 pixels a frame, farther than they are wide, so that what a part covers in one frame and in the
-next hardly overlaps. The rope is a chain of rigid links, each hinged to the one before.
+Their tips go 8 to 12 pixels a frame, farther than they are wide, so that there what a part covers in one frame and in
+the next hardly overlaps. The rope is a chain of rigid links, each hinged to the one before.
 """
 
 from __future__ import annotations
@@ -36,8 +36,10 @@ def build(seed: int = 0) -> Scene:
         **{f"blade{k}": Object({"blade": blade}, partial(propeller, blade=k)) for k in range(BLADES)},
         "hub": Object({"hub": ball(0.075, steel)}, propeller),
         **{
-            f"link{k}": Object({"link": rod((0, 0, 0), (0, -LINK, 0), 0.026, hemp), "knot": ball(0.036, hemp)}, pose)
-            for k, pose in enumerate(_links())
+            f"link{k}": Object(
+                {"link": rod((0, 0, 0), (0, -LINK, 0), 0.026, hemp), "knot": ball(0.036, hemp)}, partial(link, index=k)
+            )
+            for k in range(LINKS)
         },
         "pendulum": _pendulum(blue, wood, pendulum),
         "far_pendulum": _pendulum(green, wood, far_pendulum),
@@ -77,10 +79,6 @@ def baton(time: float) -> np.ndarray:
     """Tumble while it hovers above the floor."""
     place = translate(-0.1 + 0.15 * np.sin(2 * time), 0.42 + 0.12 * np.sin(3 * time), 0.75)
     return place @ rotate("y", 0.5) @ rotate("z", 6.0 * time)
-
-
-def _links() -> list[Callable[[float], np.ndarray]]:
-    return [partial(link, index=k) for k in range(LINKS)]
 
 
 def _pendulum(string: dict, bob: dict, pose: Callable[[float], np.ndarray]) -> Object:

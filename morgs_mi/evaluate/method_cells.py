@@ -37,7 +37,6 @@ _MEANS = ("psnr", "psnr_moving", "psnr_still", "ssim", "motion_error_moving", "m
 _MEANS += ("true_motion_moving", "confidence_iou", "num_bytes")
 _BY_FRAME = ("psnr", "psnr_moving", "motion_error_moving")
 _MOTION_3D = ("error", "relative_error", "length_ratio", "angle")
-_METHOD = ("fit", "motion", "render", "codec", "gaussians", "stream_loop.py")
 _JUDGES = ("judge.py", "metrics.py", "motion3d.py", "temporal.py")
 
 Scores = dict[str, Any]
@@ -116,14 +115,38 @@ class Clip:
 
 
 def method_version(package: Path = Path(__file__).parents[1]) -> str:
-    """Return a digest of the method's and its judges' sources, whatever their layout and comments."""
-    rooms = [package / name for name in _METHOD]
-    files = [file for room in rooms for file in (sorted(room.rglob("*.py")) if room.is_dir() else [room])]
-    files += [package / "evaluate" / name for name in _JUDGES]
+    """Return a digest of the judges' sources, of the loop's, and of all that the loop imports from this package.
+
+    Layout and comments do not count.
+    """
+    trees: dict[Path, ast.Module] = {}
+    waiting = [package / "stream_loop.py"]
+    while waiting:
+        file = waiting.pop()
+        if file not in trees:
+            trees[file] = ast.parse(file.read_text(encoding="utf-8"))
+            waiting += _imported(trees[file], package)
+    for file in (package / "evaluate" / name for name in _JUDGES):
+        trees[file] = ast.parse(file.read_text(encoding="utf-8"))
     sources = hashlib.sha256()
-    for file in files:
-        sources.update(ast.dump(ast.parse(file.read_text(encoding="utf-8"))).encode())
+    for file in sorted(trees):
+        sources.update(ast.dump(trees[file]).encode())
     return sources.hexdigest()[:16]
+
+
+def _imported(tree: ast.Module, package: Path) -> list[Path]:
+    """Return the files of the package that a module imports anything from."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == package.name:
+            room = package.joinpath(*(node.module or "").split(".")[1:])
+            files = [
+                room.with_suffix(".py"),
+                room / "__init__.py",
+                *(room / f"{alias.name}.py" for alias in node.names),
+            ]
+            found += [file for file in files if file.is_file()]
+    return found
 
 
 def scores_of(clip: Clip, cell: Cell, base: StreamConfig, version: str, out: Path) -> Scores:

@@ -122,10 +122,7 @@ def report_method(
 
 
 def cells_of(config: MethodReportConfig, num_views: int) -> tuple[list[Cell], list[Cell]]:
-    """Return the cells of the presets, and those that compare numbers of key views; some are in both.
-
-    One seed comes after the other, so that an interruption leaves whole rows with fewer runs.
-    """
+    """Return the cells of the presets, and those that compare numbers of key views; some are in both."""
     usual = min(config.stream.motion.key_views, num_views)
     presets = [
         Cell(preset, epochs, usual, rate, seed)
@@ -181,7 +178,8 @@ def _clip(
         raise ValueError(f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}.")
     clip, base = Clip.read(capture), config.base
     presets, key_views = cells_of(config, len(capture.train_views))
-    cells, found = dict.fromkeys(presets + key_views), {}
+    # Seed by seed: after an interruption, a report with fewer seeds has all that it needs.
+    cells, found = sorted(dict.fromkeys(presets + key_views), key=lambda cell: cell.seed), {}
     for done, cell in enumerate(cells):
         progress(f"Fitting {clip.name}", done, len(cells))
         found[cell] = scores_of(clip, cell, base, version, out)

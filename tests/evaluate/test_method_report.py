@@ -157,13 +157,23 @@ def test_another_version_or_setting_is_fitted_again(clip, tmp_path, monkeypatch)
 
 
 def test_a_comment_is_no_other_version_and_a_number_is(tmp_path):
-    package = shutil.copytree(Path(morgs_mi.__file__).parent, tmp_path / "package")
-    assert method_version(package) == method_version()
-    file = package / "motion" / "lift.py"
-    file.write_text(file.read_text() + "\n# Why.\n")
-    assert method_version(package) == method_version()
-    file.write_text(file.read_text() + "\nnumber = 1\n")
-    assert method_version(package) != method_version()
+    package = shutil.copytree(Path(morgs_mi.__file__).parent, tmp_path / "morgs_mi")
+    first = method_version(package)
+    assert first == method_version()
+    for file, text, other in (
+        ("motion/lift.py", "# Why.", False),
+        ("viewer/__init__.py", "number = 1", False),
+        ("evaluate/report.py", "number = 1", False),
+        ("motion/lift.py", "number = 1", True),
+        ("evaluate/judge.py", "number = 1", True),
+        ("render/loops.py", "number = 1", True),
+    ):
+        path = package / file
+        path.parent.mkdir(exist_ok=True)
+        before = path.read_text() if path.exists() else ""
+        path.write_text(f"{before}\n{text}\n")
+        assert (method_version(package) != first) == other, (file, text)
+        path.write_text(before)
 
 
 def test_a_cell_changes_what_it_says_and_no_more():
