@@ -49,9 +49,9 @@ def test_speed_is_that_of_the_committed_benchmark():
 
 
 def test_every_command_of_the_readme_exists():
-    from morgs_mi.cli import Demo, Eval, Export, Fit, Info, Render, Synth
+    from morgs_mi.cli import Demo, Eval, Export, Fit, Info, Render, Synth, View
 
-    known = {c.__name__.lower() for c in (Demo, Eval, Export, Fit, Info, Render, Synth)}
+    known = {c.__name__.lower() for c in (Demo, Eval, Export, Fit, Info, Render, Synth, View)}
     named = set(re.findall(r"^ {4}morgs-mi (\w+)", README, re.MULTILINE))
     assert named
     assert named <= known

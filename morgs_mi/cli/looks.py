@@ -1,8 +1,8 @@
-"""`morgs-mi export`: a stream for other programs to look at."""
+"""`morgs-mi export` and `view`: a stream for other programs, and for your own eyes."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -10,8 +10,9 @@ import tyro
 from tyro.conf import Positional, arg
 
 from morgs_mi.cli.console import progress, say
+from morgs_mi.viewer.viewer import ViewerConfig
 
-__all__ = ["Export"]
+__all__ = ["Export", "View"]
 
 
 @dataclass(frozen=True)
@@ -159,3 +160,25 @@ class Export:
 
     def run(self) -> None:
         self.kind.run()
+
+
+@dataclass(frozen=True)
+class View:
+    """Look at a stream in the browser, also while it is still being fitted."""
+
+    out: Positional[Path]
+    """Folder of a fit, or a stream file."""
+    open_browser: bool = True
+    """Open the page in this machine's browser."""
+    config: Annotated[ViewerConfig, arg(name="")] = field(default_factory=ViewerConfig)
+
+    def run(self) -> None:
+        import webbrowser
+
+        from morgs_mi.viewer.viewer import Viewer
+
+        viewer = Viewer(self.out, self.config)
+        say(f"{viewer.url} (Ctrl-C ends it)")
+        if self.open_browser:
+            webbrowser.open(viewer.url)
+        viewer.run()

@@ -1,0 +1,140 @@
+"""The page in headless Chromium: it loads, scrubs, switches, follows a growing file, shows the renderer's picture."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.capture.camera import Camera
+from morgs_mi.codec.gaussians import CodedFrame
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.evaluate.stream import channel_picture, open_stream, render, render_config
+from morgs_mi.export.axes import up_direction
+from tests.export.streams import write_stream
+
+pytest.importorskip("viser", reason="comes with the extra `viewer`")
+playwright = pytest.importorskip("playwright.sync_api", reason="comes with the extra `viewer-test`")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
+
+WIDTH, HEIGHT = 480, 360
+# viser's own: its quads have flat positions, of which three.js cannot make a bounding sphere.
+KNOWN = "THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN"
+# A software rasteriser on a busy machine is slow to begin.
+PATIENCE_MS = 60_000
+
+
+@pytest.fixture
+def page(tmp_path):
+    """Serve a stream of which the last frame is still to come, and open it; give (page, states, grow)."""
+    states = write_stream(tmp_path / "stream.morgs")
+    whole = (tmp_path / "stream.morgs").read_bytes()
+    last = open_stream(tmp_path).index()[-1][2]
+    (tmp_path / "stream.morgs").write_bytes(whole[:last])
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    code = "import sys; from morgs_mi.cli import main; sys.exit(main())"
+    arguments = ["view", str(tmp_path), "--port", str(port), "--no-open-browser"]
+    server = subprocess.Popen([sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, stdout=subprocess.PIPE)
+    complaints = []
+    try:
+        with playwright.sync_playwright() as driver:
+            options = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+            browser = driver.chromium.launch(executable_path=CHROMIUM, args=options)
+            page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+            page.set_default_timeout(PATIENCE_MS)
+            page.on("console", lambda m: complaints.append(m.text) if m.type == "error" else None)
+            page.on("pageerror", lambda error: complaints.append(str(error)))
+            for _ in range(100):
+                with socket.socket() as probe:
+                    if probe.connect_ex(("127.0.0.1", port)) == 0:
+                        break
+                page.wait_for_timeout(200)
+            page.goto(f"http://127.0.0.1:{port}")
+            yield page, states, lambda: (tmp_path / "stream.morgs").write_bytes(whole)
+            browser.close()
+    finally:
+        server.send_signal(signal.SIGINT)
+        try:
+            _, errors = server.communicate(timeout=20)
+        finally:
+            server.kill()
+    assert server.returncode == 130, errors
+    assert not [text for text in complaints if not text.startswith(KNOWN)]
+
+
+def seen(page) -> np.ndarray:
+    """Return what the page shows behind its controls."""
+    style = page.add_style_tag(content="body *:not(canvas):not(:has(canvas)) {visibility: hidden !important}")
+    picture = cv2.cvtColor(cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), 1), cv2.COLOR_BGR2RGB)
+    style.evaluate("node => node.remove()")
+    return picture
+
+
+def wait_for(page, expected: np.ndarray, least: float) -> None:
+    """Wait until the page shows a picture, at least that alike (dB): it comes some draws after the controls."""
+    found = 0.0
+    for _ in range(300):
+        found = psnr(seen(page) / 255, expected / 255)
+        if found >= least:
+            return
+        page.wait_for_timeout(100)
+    raise AssertionError(f"{found:.1f} dB, expected {least}")
+
+
+def drawn(stream: StreamReader, state: CodedFrame, mode: str) -> np.ndarray:
+    """Return the renderer's picture from where the page begins: the first camera, held upright to the rig's mean up."""
+    first = stream.cameras[0]
+    ahead = first.position + first.viewmat[2, :3]
+    camera = Camera.look_at(first.position, ahead, up_direction(stream.cameras), 45, WIDTH, HEIGHT)
+    return channel_picture(mode, render(state.gaussians, camera, (mode,), render_config(stream))[mode])
+
+
+def choose(page, mode: str) -> None:
+    page.get_by_label("Mode", exact=True).click()
+    page.get_by_role("option", name=mode).click()
+
+
+def test_the_page_shows_what_the_renderer_shows(page, tmp_path):
+    page, states, grow = page
+    stream = open_stream(tmp_path)
+
+    page.get_by_text("Frame 0 of 2, 40 Gaussians").wait_for()
+    # Half-precision covariances, 8-bit colours and opacities: 47 dB. A camera off by a degree makes it 22.
+    wait_for(page, drawn(stream, states[0], "color"), 40)
+
+    frame = page.locator("input[inputmode=decimal]").first
+    frame.fill("1")
+    frame.press("Enter")
+    page.get_by_text("Frame 1 of 2, 40 Gaussians").wait_for()
+    wait_for(page, drawn(stream, states[1], "color"), 40)
+
+    page.get_by_label("Exact picture").check()
+    for mode in ("motion", "confidence", "depth", "color"):
+        choose(page, mode)
+        wait_for(page, drawn(stream, states[1], mode), np.inf)  # to the last bit
+    page.get_by_label("Exact picture").uncheck()
+    choose(page, "confidence")
+    wait_for(page, drawn(stream, states[1], "confidence"), 17)  # the picture colours the blend, the page blends colours
+
+    choose(page, "color")
+    still = seen(page)
+    page.get_by_label("Trajectories").check()
+    page.wait_for_timeout(1000)
+    lines = np.abs(seen(page).astype(int) - still).max(-1) > 40
+    assert 0 < lines.mean() < 0.2
+
+    grow()
+    page.get_by_label("Follow the fit").check()
+    page.get_by_text("Frame 3 of 3, 41 Gaussians").wait_for()
+    page.get_by_label("Play").check()
+    page.get_by_text("Frame 2 of 3, 41 Gaussians").wait_for()
