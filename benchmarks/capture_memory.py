@@ -3,7 +3,7 @@
     python benchmarks/capture_memory.py --json out.json
 
 One noisy clip is written once and stands for every camera. Its frames are read as a fit reads them; memory is the
-process's resident set, MiB, after every tenth. Flat means that from the second tenth on it does not grow by a frame.
+process's resident set, MiB, after every tenth. It may grow by the few frames that wait at a time, not with the clip.
 """
 
 from __future__ import annotations

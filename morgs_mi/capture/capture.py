@@ -12,16 +12,16 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import cv2
 import numpy as np
 
 from morgs_mi.capture.camera import Camera
 from morgs_mi.capture.color import ColorFit, Tone, fit_colors
+from morgs_mi.capture.feed import Feed, at_clip_size
 from morgs_mi.capture.layouts import Calibration, read_calibration
-from morgs_mi.capture.lens import Lens, Undistortion, undistortion
+from morgs_mi.capture.lens import undistortion
 from morgs_mi.capture.prefetch import prefetched
 from morgs_mi.capture.reading import ReadConfig, read_settings, timeline
-from morgs_mi.capture.video import FrameReader, Picture, open_clips
+from morgs_mi.capture.video import open_clips
 
 __all__ = ["Capture", "Frame", "PartialFrame", "load_capture"]
 
@@ -57,32 +57,6 @@ class PartialFrame:
 
 
 @dataclass(frozen=True)
-class _Source:
-    """Where one camera's frames come from, which of them count, and what makes a pinhole camera's of them."""
-
-    reader: FrameReader
-    lens: Lens
-    undo: Undistortion | None
-    picks: np.ndarray
-    tone: Tone | None = None
-
-    def pictures(self, camera: Camera, start: int, stop: int) -> Iterator[Picture]:
-        for picture in self.reader.pick(self.picks[start:stop].tolist()):
-            yield self.seen(picture, camera) if isinstance(picture, np.ndarray) else picture
-
-    def seen(self, image: np.ndarray, camera: Camera) -> np.ndarray:
-        """Return a recorded picture as the pinhole camera would have taken it."""
-        image = _shrunk(self.undo(image) if self.undo else image, camera)
-        return self.tone(image) if self.tone else image
-
-    def mask(self, camera: Camera) -> np.ndarray | None:
-        if self.undo is None or self.undo.mask.all():
-            return None
-        # A shrunk pixel is valid if all that it averages is.
-        return _shrunk(self.undo.mask.astype(np.float32), camera) > 1 - 1e-4
-
-
-@dataclass(frozen=True)
 class Capture:
     """A recording of a scene; frames are decoded when asked for.
 
@@ -111,7 +85,7 @@ class Capture:
     masks: tuple[np.ndarray | None, ...]
     test_view: int | None
     truth: Path | None
-    _sources: tuple[_Source, ...] = field(repr=False)
+    _sources: tuple[Feed, ...] = field(repr=False)
     downscale: float = 1
     layout: str = ""
     reading: ReadConfig = field(default_factory=ReadConfig)
@@ -234,7 +208,7 @@ def load_capture(
     reading, settings = reading or ReadConfig(), read_settings(path / "capture.json")
     calibration = read_calibration(path)
     readers = open_clips(calibration.clips, reading.gaps)
-    recorded = [_recorded(c, r) for c, r in zip(calibration.cameras, readers, strict=True)]
+    recorded = [at_clip_size(c, r) for c, r in zip(calibration.cameras, readers, strict=True)]
     if scaled := [new for old, new in zip(calibration.cameras, recorded, strict=True) if new is not old]:
         _LOG.warning(
             "%s: the clips of %s are not of the size that was calibrated, %dx%d for one: the intrinsics are scaled.",
@@ -243,7 +217,7 @@ def load_capture(
     names = [camera.name for camera in recorded]
     clock = timeline(path, names, readers, reading, max_frames, settings.get("fps"))
     sources = tuple(
-        _Source(reader, lens, undistortion(camera, lens), picks)
+        Feed(reader, lens, undistortion(camera, lens), picks)
         for reader, lens, camera, picks in zip(readers, calibration.lenses, recorded, clock.picks, strict=True)
     )
     cameras = tuple(_resized(camera, downscale) for camera in recorded)
@@ -283,30 +257,10 @@ def _toned(capture: Capture, reading: ReadConfig) -> Capture:
     return replace(capture, _sources=sources, colors=fit)
 
 
-def _recorded(camera: Camera, reader: FrameReader) -> Camera:
-    """Return the camera at the size of its clip, which may be the calibrated one made smaller or larger."""
-    if (reader.width, reader.height) == (camera.width, camera.height):
-        return camera
-    x, y = reader.width / camera.width, reader.height / camera.height
-    # Both sides were rounded to whole pixels.
-    if abs(camera.width * y - reader.width) > 1 or abs(camera.height * x - reader.height) > 1:
-        raise ValueError(
-            f"{reader.path}: expected {camera.width}x{camera.height} as the calibration of {camera.name} says, or "
-            f"that scaled, got {reader.width}x{reader.height}; calibrate at the recorded size."
-        )
-    return camera.resized(reader.width, reader.height)
-
-
 def _resized(camera: Camera, downscale: float) -> Camera:
     if downscale == 1:
         return camera
     return camera.resized(max(1, round(camera.width / downscale)), max(1, round(camera.height / downscale)))
-
-
-def _shrunk(image: np.ndarray, camera: Camera) -> np.ndarray:
-    if image.shape[:2] == (camera.height, camera.width):
-        return image
-    return cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)
 
 
 def _test_view(
