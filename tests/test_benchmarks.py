@@ -13,6 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from morgs_mi.capture import Camera, write_colmap, write_video
+
 ROOT = Path(__file__).parent.parent
 TOOL = ROOT / "benchmarks" / "render_speed.py"
 # What a yardstick prints, from a program that checks what it is given: 60 Gaussians on 40x24 pixels.
@@ -194,3 +196,20 @@ def test_reading_a_capture_takes_the_same_memory_however_long_it_is(tmp_path: Pa
     result = json.loads(out.read_text())
     assert len(result["rows"]) == 30
     assert result["growth_mib"] < 6 * result["frame_mib"]
+
+
+def test_a_recording_is_fitted_and_measured(tmp_path: Path):
+    names, rng = ("cam0", "cam1"), np.random.default_rng(0)
+    views = [Camera.look_at((i - 0.5, 0, -3), (0, 0, 0), (0, -1, 0), 60, 48, 32, name) for i, name in enumerate(names)]
+    write_colmap(tmp_path / "clip" / "sparse" / "0", views, rng.uniform(-1, 1, (150, 3)), rng.uniform(size=(150, 3)))
+    for name in names:
+        write_video(tmp_path / "clip" / name, rng.integers(0, 255, (2, 32, 48, 3), np.uint8), 25)
+    script, out = ROOT / "benchmarks" / "real_capture.py", tmp_path / "figures.json"
+    quick = ["--fit.num-gaussians", "120", "--fit.first-frame-steps", "4", "--fit.epochs", "1", "--fit.sh-degree", "0"]
+    args = [tmp_path / "clip", tmp_path / "out", "--json", out, *quick]
+    subprocess.run([sys.executable, str(script), *map(str, args)], check=True, cwd=ROOT, capture_output=True)
+    result = json.loads(out.read_text())
+    assert (result["capture"], result["complete"], result["num_frames"]) == ("clip", True, 2)
+    assert set(result["views"]) == set(names)
+    assert all(row["resident_mib"] > 50 and row["seconds"] > 0 for row in result["frames"])
+    assert str(tmp_path) not in out.read_text()
