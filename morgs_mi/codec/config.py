@@ -12,6 +12,10 @@ __all__ = ["CodecConfig"]
 class CodecConfig:
     """Settings of the stream; a decoder needs none of them.
 
+    A step is twice an error that is tolerated, so that rounding stays within. In a later frame a group of numbers that
+    all change by less than a step is left as it is, for that is mostly the fit's jitter, but for colours: such a group
+    may be off by the step.
+
     Raises:
         ValueError: a number is out of range.
     """

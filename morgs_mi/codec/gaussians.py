@@ -39,6 +39,8 @@ __all__ = [
 
 # A packet has at least a word per 16 Gaussians that it brings, so that no damaged number can ask for much memory.
 _PER_WORD = 16
+# Where no number of a group changes by so many steps, that is the fit's jitter; colours show every bit of it.
+_LEAST = {"color": 0.5}
 _COARSEST = 80  # quarter octaves: a million times the step
 
 
@@ -109,7 +111,8 @@ def residual_packet(
 ) -> Packet:
     """Return the packet that leads from `previous` to `gaussians` (eq. 3); only those that changed are written.
 
-    What changed by less than half a step did not change. With a `target_size`, steps are widened until it is kept.
+    What changed by less than a step, a colour by less than half of one, did not change. With a `target_size`, steps
+    are widened until it is kept.
 
     Args:
         previous: state that the decoder has, N Gaussians.
@@ -141,6 +144,8 @@ def residual_packet(
 
     def columns(coarseness: int) -> Iterator[np.ndarray]:
         r, scaled = np.zeros((len(change), len(grid)), np.int32), change / step_sizes(np.array(coarseness))
+        for name, at in grid.columns.items():
+            scaled[at][:, np.abs(scaled[at]).max(0) < _LEAST.get(name, 1.0)] = 0
         r[:, rows] = np.clip(np.rint(scaled, out=scaled), 1 - LIMIT, LIMIT - 1, out=scaled)
         return columns_of_change(r, dead, grid)
 
