@@ -113,7 +113,7 @@ class VideoReader:
                     ok = stream.grab()
                     done += ok
                 frame = stream.retrieve()[1] if ok else None
-                yield self._missing(done) if frame is None else cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+                yield self._missing(index if ok else done) if frame is None else cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
         finally:
             stream.release()
 

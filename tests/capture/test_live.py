@@ -76,6 +76,7 @@ def test_an_endless_source_is_taken_as_it_comes(rig: Capture) -> None:
     ("sources", "error", "message"),
     [
         ([[]], ValueError, r"`sources` must be one for each of 3 cameras \(cam1, cam2, cam3\), got 1"),
+        ([63, [], []], OSError, "the source 63 cannot be opened; check that it is there and not in use"),
         ([[], [], "/nowhere/cam.sdp"], OSError, "the source /nowhere/cam.sdp cannot be opened"),
         ([[np.zeros((8, 8, 3), np.uint8)], [], []], ValueError, r"of cam1 must be uint8 \[46, 62, 3\] as in its clip"),
     ],
