@@ -39,8 +39,9 @@ __all__ = [
 
 # A packet has at least a word per 16 Gaussians that it brings, so that no damaged number can ask for much memory.
 _PER_WORD = 16
-# Where no number of a group changes by so many steps, that is the fit's jitter; colours show every bit of it.
-_LEAST = {"color": 0.5}
+# Where no number of a group changes by a step, that is the fit's jitter, but colours show every bit of it. A little
+# less than a step, for a decoded state is rounded to float32, and must give the packet that it came from.
+_LEAST, _LEAST_COLOR = 0.99, 0.5
 _COARSEST = 80  # quarter octaves: a million times the step
 
 
@@ -145,7 +146,7 @@ def residual_packet(
     def columns(coarseness: int) -> Iterator[np.ndarray]:
         r, scaled = np.zeros((len(change), len(grid)), np.int32), change / step_sizes(np.array(coarseness))
         for name, at in grid.columns.items():
-            scaled[at][:, np.abs(scaled[at]).max(0) < _LEAST.get(name, 1.0)] = 0
+            scaled[at][:, np.abs(scaled[at]).max(0) < (_LEAST_COLOR if name == "color" else _LEAST)] = 0
         r[:, rows] = np.clip(np.rint(scaled, out=scaled), 1 - LIMIT, LIMIT - 1, out=scaled)
         return columns_of_change(r, dead, grid)
 
