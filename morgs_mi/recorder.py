@@ -11,7 +11,7 @@ import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from hashlib import blake2b
-from itertools import chain
+from itertools import chain, islice
 from pathlib import Path
 from reprlib import repr as shortened
 from typing import Any
@@ -77,9 +77,11 @@ def stream_capture(
         writer, reports = StreamWriter(out / "stream.morgs", capture.cameras, capture.fps, metadata), []
         frames = chain((first,), frames)
     else:
-        frames = capture.partial_frames(begun.coded.frame)
-        last = next(frames)
-        loop.resume(begun.coded, [last.images[v] for v in train])
+        # What has changed is told from all pictures up to now.
+        start, now = 0 if config.fit.leave_out_still else begun.coded.frame, begun.coded.frame
+        frames = capture.partial_frames(start)
+        past = islice(frames, now + 1 - start)
+        loop.resume(begun.coded, ([frame.images[v] for v in train] for frame in past))
         writer, reports = StreamWriter.continued(out / "stream.morgs", begun.index, begun.end), begun.reports
     interval = config.codec.keyframe_interval
     with writer:

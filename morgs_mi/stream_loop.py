@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -22,8 +22,10 @@ from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.losses import Target
 from morgs_mi.fit.next_frame import fit_next_frame
+from morgs_mi.fit.part import Part, changing_part, whole_part
 from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.gaussians.initialise import from_points, resample_points, scene_extent, seed_points
+from morgs_mi.motion.change import around, changed, renewed
 from morgs_mi.motion.config import MotionConfig
 from morgs_mi.motion.cues import MotionCue, choose_key_views, motion_cues
 from morgs_mi.motion.flow_sources import FramePair
@@ -62,6 +64,7 @@ class FrameReport:
         num_gaussians: how many the frame has.
         status: "ok", or a sentence about what was done instead.
         left_out: names of the views that had no picture.
+        effort: what the frame worked on, as shares of everything, by name: Gaussians, views, their pixels, epochs.
     """
 
     frame: int
@@ -71,6 +74,7 @@ class FrameReport:
     num_gaussians: int
     status: str = "ok"
     left_out: tuple[str, ...] = ()
+    effort: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +85,7 @@ class StreamState:
         frame: index of the next frame.
         coded: what a decoder has after the last frame; None before the first.
         images: the pictures of the last frame, None where a view had none.
+        references: what the next pictures are compared with to find what has changed; None before the first.
 
     Nothing else crosses frames, and all of it follows from the stream and the recording, so that a fit that was
     interrupted goes on as if it had not been (`recorder`).
@@ -89,6 +94,7 @@ class StreamState:
     frame: int
     coded: CodedFrame | None
     images: tuple[np.ndarray | None, ...]
+    references: tuple[np.ndarray | None, ...] = ()
 
     @property
     def gaussians(self) -> Gaussians | None:
@@ -119,35 +125,46 @@ def step(
     start = time.perf_counter()
     config, render = setup.config.fit, setup.config.render
     rng = np.random.default_rng([setup.config.seed, state.frame])  # a frame's own: it needs no state
-    targets = [Target(image, mask) for image, mask in zip(images, setup.masks, strict=True)]
     if state.coded is None:
+        targets = [Target(image, mask) for image, mask in zip(images, setup.masks, strict=True)]
         gaussians, status = _first_gaussians(setup, images, rng)
-        tick = _ticker(on_step, config.first_frame_steps)
+        tick = None if on_step is None else lambda done: on_step(done, config.first_frame_steps)
         gaussians, losses = fit_first_frame(gaussians, setup.cameras, targets, setup.extent, config, render, rng, tick)
         packet = keyframe_packet(gaussians, state.frame, setup.cameras, setup.config.codec)
-        decoded = decode(None, packet)
+        decoded, effort = decode(None, packet), {}
     else:
         previous, status = state.coded.gaussians, "ok"
-        cues = _cues(setup, state, images)
+        changes = _changes(setup, state, images)
+        cues = _cues(setup, state, images, changes)
         if state.frame == 1 and cues and setup.config.motion.learn_confidence:
             previous = _first_confidence(setup, state, cues, rng)
-        gaussians, source, losses = fit_next_frame(
-            previous,
-            setup.cameras,
-            targets,
-            cues,
-            setup.extent,
-            config,
-            setup.config.motion,
-            render,
-            rng,
-            _ticker(on_step, config.epochs * len(setup.cameras)),
-        )
-        packet = residual_packet(state.coded, gaussians, source, setup.cameras, setup.config.codec)
-        decoded = decode(state.coded, packet)
+        part = _part(setup, previous, changes)
+        targets = {view: Target(images[view], setup.masks[view]) for view in part.windows}
+        fitted = fit_next_frame(previous, part, targets, cues, setup.extent, config, setup.config.motion, rng, on_step)
+        packet = residual_packet(state.coded, fitted.gaussians, fitted.source, setup.cameras, setup.config.codec)
+        decoded, losses = decode(state.coded, packet), fitted.losses
+        effort = {**part.shares, "epochs": fitted.epochs / config.epochs}
     seconds = time.perf_counter() - start
-    report = FrameReport(state.frame, seconds, len(encode_packet(packet)), losses, len(decoded), status)
+    report = FrameReport(state.frame, seconds, len(encode_packet(packet)), losses, len(decoded), status, effort=effort)
     return StreamState(state.frame + 1, decoded, tuple(images)), packet, report
+
+
+def _changes(setup: Setup, state: StreamState, images: Sequence[np.ndarray]) -> list[np.ndarray] | None:
+    """Return what has changed in each view; None: everything may have."""
+    if not setup.config.fit.leave_out_still:
+        return None
+    # What has not been seen before changes nothing: it is compared from the next frame on.
+    references = (image if known is None else known for known, image in zip(state.references, images, strict=True))
+    return [changed(*pictures) for pictures in zip(references, images, setup.masks, strict=True)]
+
+
+def _part(setup: Setup, gaussians: Gaussians, changes: Sequence[np.ndarray] | None) -> Part:
+    """Return what of the scene has to do with that."""
+    if changes is None:
+        return whole_part(gaussians, setup.cameras, setup.config.render)
+    maps = ("motion", "confidence")
+    channels = [("color", *(maps if v in setup.key_views else ())) for v in range(len(setup.cameras))]
+    return changing_part(gaussians, setup.cameras, changes, channels, setup.config.render)
 
 
 def _first_gaussians(setup: Setup, images: Sequence[np.ndarray], rng: np.random.Generator) -> tuple[Gaussians, str]:
@@ -172,22 +189,21 @@ def _first_confidence(
     return fitted
 
 
-def _cues(setup: Setup, state: StreamState, images: Sequence[np.ndarray]) -> Mapping[int, MotionCue]:
-    """Compute flow on the key views if anything uses it, and masks at keyframes."""
+def _cues(
+    setup: Setup, state: StreamState, images: Sequence[np.ndarray], changes: Sequence[np.ndarray] | None
+) -> Mapping[int, MotionCue]:
+    """Compute flow on the key views where something has changed, if anything uses it, and masks at keyframes."""
     motion = setup.config.motion
     with_masks = motion.learn_confidence and state.frame % motion.keyframe_interval == 0
     first_masks = motion.learn_confidence and state.frame == 1
     if not (motion.learn_motion or with_masks or first_masks):
         return {}
-    pairs = {
-        v: FramePair(images[v], state.images[v], setup.cameras[v].name, state.frame, setup.masks[v])
-        for v in setup.key_views
-    }
+    pairs = {}
+    for v in setup.key_views:
+        box = None if changes is None else around(changes[v])
+        if changes is None or box is not None:
+            pairs[v] = FramePair(images[v], state.images[v], setup.cameras[v].name, state.frame, setup.masks[v], box)
     return motion_cues(pairs, motion, with_masks)
-
-
-def _ticker(on_step: Callable[[int, int], None] | None, steps: int) -> Callable[[int], None] | None:
-    return None if on_step is None else lambda done: on_step(done, steps)
 
 
 def _seen_only(setup: Setup, state: StreamState, views: Sequence[int]) -> tuple[Setup, StreamState]:
@@ -201,7 +217,11 @@ def _seen_only(setup: Setup, state: StreamState, views: Sequence[int]) -> tuple[
         cameras = [setup.cameras[views[i]] for i in both]
         key_views = tuple(both[k] for k in choose_key_views(cameras, len(setup.key_views)))
     cameras, masks = (tuple(values[v] for v in views) for values in (setup.cameras, setup.masks))
-    return replace(setup, cameras=cameras, masks=masks, key_views=key_views), replace(state, images=tuple(before))
+    references = tuple(state.references[v] for v in views) if state.references else ()
+    return (
+        replace(setup, cameras=cameras, masks=masks, key_views=key_views),
+        replace(state, images=tuple(before), references=references),
+    )
 
 
 def _hold(setup: Setup, state: StreamState) -> tuple[StreamState, Packet, FrameReport]:
@@ -267,14 +287,26 @@ class StreamLoop:
         """The decoded Gaussians of the last frame, None before the first."""
         return self.state.gaussians
 
-    def resume(self, coded: CodedFrame, images: Sequence[np.ndarray | None]) -> None:
+    def resume(self, coded: CodedFrame, frames: Iterable[Sequence[np.ndarray | None]]) -> None:
         """Go on behind a frame that a stream holds, as if it had just been pushed.
 
         Args:
             coded: what the stream says of it.
-            images: its pictures, as for `push`.
+            frames: the pictures of all frames up to it, as for `push`; the last ones do where nothing is left out.
         """
-        self.state = StreamState(coded.frame + 1, coded, tuple(images))
+        images, references = (), ()
+        for pictures in frames:
+            images, references = tuple(pictures), self._renewed(references, pictures)
+        self.state = StreamState(coded.frame + 1, coded, images, references)
+
+    def _renewed(
+        self, references: Sequence[np.ndarray | None], images: Sequence[np.ndarray | None]
+    ) -> tuple[np.ndarray | None, ...]:
+        """Return what the next frame's pictures are compared with."""
+        if not self.setup.config.fit.leave_out_still:
+            return ()
+        views = zip(references or (None,) * len(images), images, self.setup.masks, strict=True)
+        return tuple(renewed(*pictures) for pictures in views)
 
     def push(
         self, images: Sequence[np.ndarray | None], on_step: Callable[[int, int], None] | None = None
@@ -298,7 +330,7 @@ class StreamLoop:
             state, packet, report = step(setup, state, tuple(seen.values()), on_step)
         else:
             state, packet, report = _hold(self.setup, self.state)
-        self.state = replace(state, images=tuple(images))
+        self.state = replace(state, images=tuple(images), references=self._renewed(self.state.references, images))
         left_out = tuple(camera.name for v, camera in enumerate(self.setup.cameras) if v not in seen)
         return packet, replace(report, left_out=left_out)
 

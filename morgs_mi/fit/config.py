@@ -97,6 +97,10 @@ class FitConfig:
     """Steps that learn the confidence of the first frame from the masks of its key views."""
     epochs: int = 8
     """Passes over all training views for every later frame; the paper's small variant takes 5."""
+    leave_out_still: bool = True
+    """Leave out of a later frame which Gaussians, blocks of pixels and views cannot have changed; see `part`."""
+    settled: float = 0.0
+    """A later frame ends once a pass over its views lessens L_recon by less than this share of it; 0: when it grows."""
     dssim_weight: float = 0.2
     """lambda of eq. 2."""
     density: DensityConfig = field(default_factory=DensityConfig)

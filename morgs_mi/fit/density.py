@@ -24,14 +24,11 @@ import drjit as dr
 import numpy as np
 from drjit.opt import Adam
 
-from morgs_mi.capture.camera import Camera
 from morgs_mi.fit.config import DensityConfig
 from morgs_mi.fit.losses import Target
 from morgs_mi.fit.optimise import replace_parameter
 from morgs_mi.gaussians.gaussians import Gaussians
-from morgs_mi.render.backproject import backproject
-from morgs_mi.render.config import RenderConfig
-from morgs_mi.render.rasterize import rasterize
+from morgs_mi.render.window import Window
 
 __all__ = ["NOISE", "Need", "Plan", "apply_plan", "find_need", "plan_additions", "plan_growth", "regrow"]
 
@@ -81,28 +78,23 @@ class Plan:
 
 
 def find_need(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    targets: Sequence[Target],
-    render: RenderConfig,
-    tolerance: float = 0.0,
+    gaussians: Gaussians, windows: Sequence[Window], targets: Sequence[Target], tolerance: float = 0.0
 ) -> Need:
     """Render every view, and give each Gaussian its share of the errors and of the pixels (E and W).
 
     Args:
         gaussians: N of them.
-        cameras: V views.
+        windows: onto V views.
         targets: their pictures.
-        render: cut-offs.
         tolerance: in medians of a picture's error; what does not exceed it does not count.
     """
     gaussians = gaussians.detached()
     error, weight = np.zeros((2, len(gaussians)), np.float32)
-    for camera, target in zip(cameras, targets, strict=True):
-        wrong = target.error(rasterize(gaussians, camera, ("color",), config=render).color)
+    for window, target in zip(windows, targets, strict=True):
+        wrong = np.abs(target.difference(window.draw(gaussians).color, window.region)).mean(axis=-1)
         seen = wrong[wrong > 0]  # where masked, it is 0
         wrong = np.maximum(wrong - tolerance * np.median(seen), 0) if tolerance and len(seen) else wrong
-        sums = backproject(gaussians, camera, np.stack([wrong, np.ones_like(wrong)], axis=2), render)
+        sums = window.backproject(gaussians, np.stack([wrong, np.ones_like(wrong)], axis=-1))
         error, weight = np.maximum(error, sums[:, 0]), np.maximum(weight, sums[:, 1])
     return Need(error, weight)
 
@@ -136,7 +128,9 @@ def plan_growth(
     return _plan(gaussians, survivors, chosen, np.where(wide, -_SHRINK, 0), fainter, rng)
 
 
-def plan_additions(gaussians: Gaussians, need: Need, config: DensityConfig, rng: np.random.Generator) -> Plan:
+def plan_additions(
+    gaussians: Gaussians, need: Need, config: DensityConfig, rng: np.random.Generator, num_others: int = 0
+) -> Plan:
     """Decide who dies and beside whom a faint Gaussian is added in a later frame.
 
     Args:
@@ -144,9 +138,10 @@ def plan_additions(gaussians: Gaussians, need: Need, config: DensityConfig, rng:
         need: of the same.
         config: thresholds.
         rng: draws where the births lie.
+        num_others: how many there are besides, who are not to be touched.
     """
-    births = round(config.births * len(gaussians))
-    survivors, chosen = _choose(gaussians, need, births, config.max_gaussians, config.min_error, config)
+    births, limit = round(config.births * (len(gaussians) + num_others)), max(config.max_gaussians - num_others, 0)
+    survivors, chosen = _choose(gaussians, need, births, limit, config.min_error, config)
     born = np.arange(len(survivors) + len(chosen)) >= len(survivors)
     logits = np.asarray(gaussians.logit_opacities)[np.concatenate([survivors, chosen])]
     fainter = np.where(born, _logit(config.birth_opacity) - logits, 0)

@@ -21,6 +21,7 @@ from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.motion.residual import join_sh, split_sh
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
+from morgs_mi.render.window import Window
 
 __all__ = ["fit_confidence", "fit_first_frame"]
 
@@ -61,19 +62,20 @@ def fit_first_frame(
     rates = config.first_rates.by_parameter(extent)
     views = view_order(len(cameras), steps, rng)
     optimizer = adam(_static(gaussians))
+    windows = [Window(camera, render) for camera in cameras]
     for start, stop in pairwise(cuts):
         for _ in range(raises.count(start)):
             _add_band(optimizer, gaussians)
         if start in rounds:
             now = _assemble(gaussians, values_of(optimizer))
-            need = find_need(now, cameras, targets, render)
+            need = find_need(now, windows, targets)
             births = -(-max(config.num_gaussians - len(now), 0) // (len(rounds) - rounds.index(start)))
             plan = plan_growth(now, need, births, config.num_gaussians, extent, config.density, rng)
             gaussians = gaussians.select(plan.parent)
             regrow(optimizer, plan, plan.edits)
 
         def losses_of(values: Mapping, view: int, shape: Gaussians = gaussians) -> dict:
-            image = rasterize(_assemble(shape, values), cameras[view], ("color",), config=render)
+            image = windows[view].draw(_assemble(shape, values))
             return {"recon": recon_loss(image.color, targets[view], config.dssim_weight)}
 
         losses = optimise(

@@ -62,16 +62,28 @@ class Target:
         self.variance = self._planes(_blur(pixels * pixels) - mean * mean)
         self.windows, self.lines = self.planes.runs(None, RADIUS), self.planes.runs(None, 0)
         self.surroundings: Any = None
+        self.parts: dict[Region, tuple[Any, ...]] = {}
 
     def _planes(self, picture: np.ndarray) -> Any:
         planes = self.planes.of(owned(mi.Float(picture.ravel())))
         dr.eval(planes)
         return planes
 
-    def error(self, image: Any) -> np.ndarray:
-        """Return how far a picture [H, W, 3] is from this one at every pixel, mean |I - I*| over its colour [H, W]."""
-        wrong = dr.abs(self.weighed(self.planes.of(owned(dr.detach(image).array))) - self.pixels)
-        return np.asarray(self.planes.picture(wrong)).reshape(self.shape).mean(axis=2)
+    def difference(self, image: Any, region: Region | None = None) -> np.ndarray:
+        """Return this picture minus another, [H, W, 3] or on a region of it; 0 where masked."""
+        if region is None or region.whole:
+            wrong = self.pixels - self.weighed(self.planes.of(owned(dr.detach(image).array)))
+            return np.asarray(self.planes.picture(wrong)).reshape(self.shape)
+        places, inside, *_ = self.part(region)
+        own = dr.gather(mi.Float, self.pixels, places, active=inside)
+        return np.asarray(own - self.weighed(dr.detach(image).array, places)).reshape(region.shape(3))
+
+    def part(self, region: Region) -> tuple[Any, ...]:
+        """Return where the numbers of a picture on a region lie, which are in the view, and the runs of both passes."""
+        if region not in self.parts:
+            runs = self.planes.runs(region, RADIUS), self.planes.runs(region, 0)
+            self.parts[region] = (*self.planes.places_on(region), *runs)
+        return self.parts[region]
 
     def remember(self, image: Any) -> None:
         """Keep a rendered picture [H, W, 3]: it surrounds what is compared on a region from now on."""
@@ -98,11 +110,12 @@ def recon_loss(image: Any, target: Target, dssim_weight: float = 0.2, region: Re
         image: [H, W, 3], or a picture on the region.
         target: what it should show.
         dssim_weight: lambda.
-        region: only its pixels have changed since the target was told to `remember` a picture. The derivative is the
-            whole view's; the value leaves out what cannot have changed: pixels outside, windows that see none inside.
+        region: only its pixels have changed since the target was told to `remember` a picture; one that was not told
+            takes itself as what surrounds the region. The derivative is then the whole view's; the value leaves out
+            what cannot have changed: pixels outside, windows that see none inside.
 
     Raises:
-        ValueError: image and target differ in size, or nothing is known about what surrounds the region.
+        ValueError: image and target differ in size.
     """
     expected = tuple(target.shape if region is None else region.shape(3))
     if tuple(image.shape) != expected:
@@ -113,10 +126,6 @@ def recon_loss(image: Any, target: Target, dssim_weight: float = 0.2, region: Re
         raise ValueError(
             f"recon_loss(): `region` must be of a {target.shape[1]}x{target.shape[0]} view like its target, got "
             f"{region.width}x{region.height}."
-        )
-    if target.surroundings is None:
-        raise ValueError(
-            "recon_loss(): what surrounds `region` must be known, got nothing; call target.remember(image) once before."
         )
     return dr.custom(_Part, image.array, target, dssim_weight, region)
 
@@ -150,10 +159,11 @@ class _Whole(_Recon):
 
 class _Part(_Recon):
     def eval(self, x: Any, target: Target, weight: float, region: Region) -> Any:
-        planes, picture = target.planes, target.surroundings
-        places, inside = planes.places_on(region)
+        if target.surroundings is None:
+            target.surroundings = target.pixels + 0
+        picture, (places, inside, windows, pixels) = target.surroundings, target.part(region)
         dr.scatter(picture, target.weighed(x, places), places, active=inside, mode=dr.ReduceMode.NoConflicts)
-        gradient, loss = _passes(picture, target, weight, planes.runs(region, RADIUS), planes.runs(region, 0))
+        gradient, loss = _passes(picture, target, weight, windows, pixels)
         return self.finish(target.weighed(dr.gather(mi.Float, gradient, places, active=inside), places), loss)
 
 
@@ -288,15 +298,17 @@ def _walk(
     return targets, total
 
 
-def flow_loss(motion: Any, cue: Any, reliable: Any) -> Any:
+def flow_loss(motion: Any, cue: Any, reliable: Any, num_pixels: int | None = None) -> Any:
     """Return the mean endpoint error in px between the rendered motion map and the flow's motion (eq. 7).
 
     Args:
-        motion: rendered [H, W, 2], px, x_t - x_{t-1}.
-        cue: from optical flow on the same grid [H, W, 2], px, of the same sign.
-        reliable: [H, W] of 0 and 1; the mean is over all pixels, so that little evidence weighs little.
+        motion: rendered [H, W, 2], px, x_t - x_{t-1}; or on a region.
+        cue: from optical flow on the same grid and of the same shape, px, of the same sign.
+        reliable: [H, W] of 0 and 1, or on the region; the mean is over all pixels, so that little evidence weighs
+            little.
+        num_pixels: of the view; None: those given.
     """
-    n = int(motion.shape[0]) * int(motion.shape[1])
+    n = dr.width(motion) // 2
     lane = dr.arange(mi.UInt32, n) * 2
     x, y = (
         dr.gather(mi.Float, motion.array, lane + k, mode=dr.ReduceMode.NoConflicts)
@@ -304,14 +316,18 @@ def flow_loss(motion: Any, cue: Any, reliable: Any) -> Any:
         for k in range(2)
     )
     # A hundredth of a pixel keeps the derivative finite where both agree.
-    return dr.mean(dr.sqrt(x * x + y * y + 1e-4) * reliable.array)
+    return _mean(dr.sqrt(x * x + y * y + 1e-4) * reliable.array, num_pixels)
 
 
-def mask_loss(confidence: Any, mask: Any) -> Any:
-    """Return mean |M~ - M| of the rendered confidence [H, W, 1] and the motion mask [H, W] (eq. 11)."""
-    return dr.mean(dr.abs(confidence.array - mask.array))
+def mask_loss(confidence: Any, mask: Any, num_pixels: int | None = None) -> Any:
+    """Return mean |M~ - M| of the rendered confidence [H, W, 1] and the motion mask [H, W] (eq. 11), as `flow_loss`."""
+    return _mean(dr.abs(confidence.array - mask.array), num_pixels)
 
 
-def offset_loss(offset: Any, extent: float) -> Any:
-    """Return the mean L1 norm of the offsets [N, 3] over the scene's extent (L_off)."""
-    return dr.sum(dr.abs(offset.array)) / (int(offset.shape[0]) * extent)
+def offset_loss(offset: Any, extent: float, num_gaussians: int | None = None) -> Any:
+    """Return the mean L1 norm of the offsets [N, 3] over the scene's extent (L_off); N may be more than are given."""
+    return dr.sum(dr.abs(offset.array)) * dr.opaque(mi.Float, 1 / ((num_gaussians or int(offset.shape[0])) * extent))
+
+
+def _mean(values: Any, count: int | None) -> Any:
+    return dr.sum(values) * dr.opaque(mi.Float, 1 / (count or dr.width(values)))

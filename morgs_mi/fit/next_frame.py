@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -10,100 +11,155 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.capture.camera import Camera
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.density import NOISE, apply_plan, find_need, plan_additions, regrow
 from morgs_mi.fit.losses import Target, flow_loss, mask_loss, offset_loss, recon_loss
 from morgs_mi.fit.optimise import adam, optimise, values_of, view_order
+from morgs_mi.fit.part import Part, standing_still
 from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.motion.config import MotionConfig
 from morgs_mi.motion.cues import MotionCue
 from morgs_mi.motion.lift import lift_flow
 from morgs_mi.motion.residual import apply_residual, residual_parameters
-from morgs_mi.render.config import RenderConfig
-from morgs_mi.render.rasterize import rasterize
+from morgs_mi.render.window import Window
 
-__all__ = ["fit_next_frame"]
+__all__ = ["NextFrame", "fit_next_frame"]
+
+
+@dataclass(frozen=True, eq=False)
+class NextFrame:
+    """What a frame has become.
+
+    Attributes:
+        gaussians: M of them.
+        source: int [M], each one's index among the N of the frame before, survivors first in ascending order; -1 for
+            those born, who come last.
+        losses: means over the last pass over the views, by name.
+        epochs: passes over the views that were made.
+    """
+
+    gaussians: Gaussians
+    source: np.ndarray
+    losses: dict[str, float]
+    epochs: int
 
 
 def fit_next_frame(
     previous: Gaussians,
-    cameras: Sequence[Camera],
-    targets: Sequence[Target],
+    part: Part,
+    targets: Mapping[int, Target],
     cues: Mapping[int, MotionCue],
     extent: float,
     config: FitConfig,
     motion: MotionConfig,
-    render: RenderConfig,
     rng: np.random.Generator,
-    on_step: Callable[[int], None] | None = None,
-) -> tuple[Gaussians, np.ndarray, dict[str, float]]:
+    on_step: Callable[[int, int], None] | None = None,
+) -> NextFrame:
     """Fit one frame's residual (eq. 12) by L_recon + L_mask + L_flow + L_off (eq. 13).
 
     Args:
         previous: N Gaussians of the frame before, detached.
-        cameras: V views.
-        targets: their pictures.
+        part: those that may change, and windows onto the views where they may be seen.
+        targets: the pictures of these views.
         cues: flow on key views, by view, with masks at keyframes; empty without motion reasoning.
         extent: of the scene in world units.
         config: epochs and rates.
         motion: which modules are on, and their weights.
-        render: cut-offs.
         rng: draws the views.
-        on_step: called with the number of steps done.
-
-    Returns:
-        The M Gaussians of this frame; `source` [M], each one's index among the N of the frame before, survivors
-        first in ascending order, or -1 for those born, who come last; and the final losses.
+        on_step: called with (steps done, steps in all).
     """
-    evidence = {view: _Evidence(cue, motion) for view, cue in cues.items()}
-
-    def losses_of(base: Gaussians, values: Mapping[str, Any], view: int) -> dict[str, Any]:
-        gaussians, seen = apply_residual(base, values, motion), evidence.get(view)
-        maps = seen.channels if seen else ()
-        detached = maps if motion.detach_weights else ()
-        image = rasterize(gaussians, cameras[view], ("color", *maps), detach_weights=detached, config=render)
-        losses = {"recon": recon_loss(image.color, targets[view], config.dssim_weight)}
-        if seen and "motion" in maps:
-            losses["flow"] = flow_loss(image.motion, seen.motion, seen.reliable)
-        if seen and "confidence" in maps:
-            losses["mask"] = mask_loss(image.confidence, seen.mask)
-        if "offset" in values:
-            losses["offset"] = offset_loss(values["offset"], extent)
-        return losses
-
+    views = sorted(part.windows)
+    if not views or not len(part.rows):
+        return NextFrame(standing_still(previous), np.arange(len(previous)), {}, 0)
+    base = previous if len(part.rows) == len(previous) else previous.select(part.rows)
+    lifted = lift_flow(base, part.windows, cues) if motion.learn_motion and motion.lift_flow else None
+    optimizer, source = adam(residual_parameters(base, motion, lifted)), np.arange(len(base))
     weights = {"flow": motion.weight_flow, "mask": motion.weight_mask, "offset": motion.weight_offset}
-    rates = config.rates.by_parameter(extent)
-    views = view_order(len(cameras), config.epochs * len(cameras), rng)
-    lifted = lift_flow(previous, cameras, cues, render) if motion.learn_motion and motion.lift_flow else None
-    optimizer = adam(residual_parameters(previous, motion, lifted))
+    losses_of = partial(_losses_of, _evidence(part, cues, motion), part, targets, extent, config, motion)
+    order = view_order(len(views), config.epochs * len(views), rng)
+    tick = None if on_step is None else lambda done: on_step(done, len(order))
     # Enough is settled by then to tell what is missing, and enough is left to put it in its place.
-    cut = round(0.625 * config.epochs) * len(cameras) if config.density.later_frames else len(views)
-    losses = optimise(optimizer, rates, views[:cut], partial(losses_of, previous), weights, on_step=on_step)
-    source = np.arange(len(previous))
-    if cut < len(views):
-        with dr.suspend_grad():
-            now = apply_residual(previous, values_of(optimizer), motion)
-        plan = plan_additions(now, find_need(now, cameras, targets, render, NOISE), config.density, rng)
-        # What is born starts from its parent's past and shares its residual, so that its motion is the parent's.
-        previous, source = apply_plan(previous, plan), plan.source
-        regrow(optimizer, plan)
-        losses |= optimise(
-            optimizer, rates, views[cut:], partial(losses_of, previous), weights, on_step=on_step, first_step=cut
+    growth = round(0.625 * config.epochs) if config.density.later_frames else config.epochs
+    losses, done = {}, 0
+    for epoch in range(config.epochs):
+        if epoch == growth:
+            with dr.suspend_grad():
+                now = apply_residual(base, values_of(optimizer), motion)
+            need = find_need(now, [part.windows[v] for v in views], [targets[v] for v in views], NOISE)
+            plan = plan_additions(now, need, config.density, rng, len(previous) - len(part.rows))
+            # What is born starts from its parent's past and shares its residual, so that its motion is the parent's.
+            base, source = apply_plan(base, plan), plan.source
+            regrow(optimizer, plan)
+        steps = [views[k] for k in order[done : done + len(views)]]
+        last = losses.get("recon", np.inf)
+        losses = optimise(
+            optimizer,
+            config.rates.by_parameter(extent),
+            steps,
+            partial(losses_of, base),
+            weights,
+            None,
+            tick,
+            done,
+            len(views),
         )
+        done += len(views)
+        if epoch >= growth and losses["recon"] > (1 - config.settled) * last:
+            break
     with dr.suspend_grad():
-        return apply_residual(previous, values_of(optimizer), motion), source, losses
+        now = apply_residual(base, values_of(optimizer), motion)
+    return NextFrame(*_joined(previous, part, now, source), losses, done // len(views))
+
+
+def _losses_of(
+    evidence: Mapping[int, _Evidence],
+    part: Part,
+    targets: Mapping[int, Target],
+    extent: float,
+    config: FitConfig,
+    motion: MotionConfig,
+    base: Gaussians,
+    values: Mapping[str, Any],
+    view: int,
+) -> dict[str, Any]:
+    """Return the losses of one view by name."""
+    gaussians, seen, window = apply_residual(base, values, motion), evidence.get(view), part.windows[view]
+    maps, pixels = seen.channels if seen else (), window.camera.width * window.camera.height
+    image = window.draw(gaussians, ("color", *maps), maps if motion.detach_weights else ())
+    losses = {"recon": recon_loss(image.color, targets[view], config.dssim_weight, window.region)}
+    if seen and "motion" in maps:
+        losses["flow"] = flow_loss(image.motion, seen.motion, seen.reliable, pixels)
+    if seen and "confidence" in maps:
+        losses["mask"] = mask_loss(image.confidence, seen.mask, pixels)
+    if "offset" in values:
+        losses["offset"] = offset_loss(values["offset"], extent, part.num_gaussians)
+    return losses
+
+
+def _evidence(part: Part, cues: Mapping[int, MotionCue], motion: MotionConfig) -> dict[int, _Evidence]:
+    return {view: _Evidence(cue, part.windows[view], motion) for view, cue in cues.items() if view in part.windows}
 
 
 class _Evidence:
     """A key view's cue as tensors, and the channels that it supervises."""
 
-    def __init__(self, cue: MotionCue, config: MotionConfig) -> None:
+    def __init__(self, cue: MotionCue, window: Window, config: MotionConfig) -> None:
         self.channels: tuple[str, ...] = ()
         if config.learn_motion:
             self.channels += ("motion",)
-            self.motion = mi.TensorXf(cue.motion)
-            self.reliable = mi.TensorXf(cue.reliable.astype(np.float32))
+            self.motion = mi.TensorXf(window.cut(cue.motion))
+            self.reliable = mi.TensorXf(window.cut(cue.reliable.astype(np.float32)))
         if config.learn_confidence and cue.mask is not None:
             self.channels += ("confidence",)
-            self.mask = mi.TensorXf(cue.mask.astype(np.float32))
+            self.mask = mi.TensorXf(window.cut(cue.mask.astype(np.float32)))
+
+
+def _joined(previous: Gaussians, part: Part, changed: Gaussians, source: np.ndarray) -> tuple[Gaussians, np.ndarray]:
+    """Return those that have changed among those that stood still, survivors in order; and each one's `source`."""
+    if len(part.rows) == len(previous):
+        return changed, source
+    others = np.setdiff1d(np.arange(len(previous)), part.rows)
+    known = np.concatenate([others, np.where(source < 0, len(previous), part.rows[source])])
+    order = np.argsort(known, kind="stable")  # births come last
+    everyone = Gaussians.concatenate([standing_still(previous.select(others)), changed])
+    return everyone.select(order), np.where(known < len(previous), known, -1)[order]

@@ -52,6 +52,7 @@ def optimise(
     decay: Callable[[int], float] | None = None,
     on_step: Callable[[int], None] | None = None,
     first_step: int = 0,
+    last: int = 8,
 ) -> dict[str, float]:
     """Minimise the weighted sum of losses by one Adam step per view; the optimiser holds the parameters.
 
@@ -64,9 +65,10 @@ def optimise(
         decay: step -> factor on all rates; None: 1.
         on_step: called with the number of steps done.
         first_step: what the count of steps goes on from.
+        last: number of steps.
 
     Returns:
-        Each loss's mean over the last steps that had it.
+        Each loss's mean over so many last steps that had it.
 
     Raises:
         FloatingPointError: the losses of the last steps are not finite.
@@ -86,7 +88,7 @@ def optimise(
             history.setdefault(name, []).append(dr.detach(loss))
         if on_step is not None:
             on_step(step + 1)
-    final = {name: float(np.mean([np.asarray(v).item() for v in values[-8:]])) for name, values in history.items()}
+    final = {name: float(np.mean([np.asarray(v).item() for v in values[-last:]])) for name, values in history.items()}
     broken = [name for name, value in final.items() if not np.isfinite(value)]
     if broken:
         raise FloatingPointError(

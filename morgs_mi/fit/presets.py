@@ -2,7 +2,7 @@
 
     l, s                              8 and 5 passes over the views for every later frame
     baseline, ml, ml-mo, ml-mo-mc     residuals only; with motion; with its offset; with confidence
-    paper                             all three, motion starting from zero in place of the lifted flow
+    paper                             all three, motion starting from zero in place of the lifted flow, one gate
 
 How many key views there are (2, 4, 8 or 12 in the paper) is `MotionConfig.key_views`, and goes with all of them.
 """
@@ -32,7 +32,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
     "ml": _modules(True, False, False),
     "ml-mo": _modules(True, True, False),
     "ml-mo-mc": _modules(True, True, True),
-    "paper": {"epochs": 8, "lift_flow": False, **_modules(True, True, True)},
+    "paper": {"epochs": 8, "lift_flow": False, "two_gates": False, **_modules(True, True, True)},
 }
 
 

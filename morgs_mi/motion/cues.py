@@ -82,7 +82,11 @@ def _cue(pair: FramePair, source: FlowSource, with_mask: bool) -> MotionCue:
     """Return one view's cue (eq. 4, and 9 and 10 for the mask), from optical flow both ways."""
     flow, onward = source(pair)
     reliable, onward_reliable = consistent(flow, onward), consistent(onward, flow)
-    if pair.valid is not None:
-        reliable, onward_reliable = reliable & pair.valid, onward_reliable & pair.valid
+    known = pair.valid
+    if pair.box is not None:
+        known = np.zeros(reliable.shape, bool)
+        known[pair.box] = True if pair.valid is None else pair.valid[pair.box]
+    if known is not None:
+        reliable, onward_reliable = reliable & known, onward_reliable & known
     mask = motion_mask(pair.image, -flow, reliable) if with_mask else None
     return MotionCue(-flow, reliable, onward, onward_reliable, mask)

@@ -29,6 +29,7 @@ class FramePair:
         camera: the camera's name; flow from files needs it.
         frame: t; flow from files needs it.
         valid: [H, W] bool, False where undistortion left nothing; None: valid everywhere.
+        box: rows and columns outside which nothing has changed; None: there may be change everywhere.
     """
 
     image: np.ndarray
@@ -36,6 +37,7 @@ class FramePair:
     camera: str = ""
     frame: int = 1
     valid: np.ndarray | None = None
+    box: tuple[slice, slice] | None = None
 
 
 FlowSource = Callable[[FramePair], tuple[np.ndarray, np.ndarray]]
@@ -69,7 +71,12 @@ def _there_and_back(
     method: Callable[[np.ndarray, np.ndarray], np.ndarray], pair: FramePair
 ) -> tuple[np.ndarray, np.ndarray]:
     check_pictures("flow_source()", pair.image, pair.previous)
-    return method(pair.image, pair.previous), method(pair.previous, pair.image)
+    if pair.box is None:
+        return method(pair.image, pair.previous), method(pair.previous, pair.image)
+    now, then = (np.ascontiguousarray(image[pair.box]) for image in (pair.image, pair.previous))
+    flows = np.zeros((2, *pair.image.shape[:2], 2), np.float32)
+    flows[0][pair.box], flows[1][pair.box] = method(now, then), method(then, now)
+    return flows[0], flows[1]
 
 
 def _from_files(folder: FlowFolder, pair: FramePair) -> tuple[np.ndarray, np.ndarray]:

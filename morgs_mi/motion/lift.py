@@ -11,15 +11,14 @@ Adam moves a centre by its learning rate per step at most; starting from d_i, la
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 
 from morgs_mi.capture.camera import Camera
 from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.motion.cues import MotionCue
-from morgs_mi.render.backproject import backproject
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.window import Window
 
 __all__ = ["lift_flow"]
 
@@ -27,28 +26,22 @@ __all__ = ["lift_flow"]
 _PRIOR_PIXELS = 0.3
 
 
-def lift_flow(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    cues: Mapping[int, MotionCue],
-    render: RenderConfig | None = None,
-) -> np.ndarray:
+def lift_flow(gaussians: Gaussians, windows: Mapping[int, Window], cues: Mapping[int, MotionCue]) -> np.ndarray:
     """Return the displacement d [N, 3], world units, that explains the key views' flow best.
 
     Args:
         gaussians: N Gaussians of frame t - 1.
-        cameras: all views.
-        cues: of the key views, by view.
-        render: cut-offs.
+        windows: onto the views, by view.
+        cues: of the key views, by view; those without a window are not looked at.
     """
     means = gaussians.numpy()["means"].astype(np.float64)
     system, right = np.zeros((len(means), 3, 3)), np.zeros((len(means), 3))
     scale = []
-    for view, cue in cues.items():
-        camera = cameras[view]
+    for view in sorted(cues.keys() & windows.keys()):
+        cue, window = cues[view], windows[view]
         trusted = cue.onward_reliable[..., None].astype(np.float32)
-        sums = backproject(gaussians, camera, np.concatenate([cue.onward * trusted, trusted], axis=2), render)
-        J = projection_jacobian(camera, means)
+        sums = window.backproject(gaussians, window.cut(np.concatenate([cue.onward * trusted, trusted], axis=2)))
+        J = projection_jacobian(window.camera, means)
         system += sums[:, 2, None, None] * np.einsum("nij,nik->njk", J, J)
         right += np.einsum("nij,ni->nj", J, sums[:, :2])
         scale.append(np.median(np.sum(J[:, 0] ** 2, axis=1)))

@@ -2,6 +2,9 @@
 
     A_t = A_{t-1} + m R_t,        R of the centres = motion + offset,        m = sigmoid(logit_confidence)
 
+With two gates, m is about motion alone: it gates the geometry (centres, scales, rotations, opacities) and leaves the
+colour free, for shadows and light change where nothing moves. The paper has one gate for everything.
+
 The parameters are a dict of raw tensors, all zero at the start of a frame but for the confidence, which is
 carried on. The centres' colour of degree 0 (`sh_dc`) and the rest (`sh_rest`) have learning rates of their own.
 """
@@ -23,6 +26,7 @@ __all__ = ["apply_residual", "join_sh", "residual_parameters", "split_sh"]
 
 # Below this gate a lifted motion is not scaled up to pass it whole.
 _LEAST_GATE = 0.1
+_APPEARANCE = ("sh_dc", "sh_rest")
 _STATIC = ("log_scales", "quats", "logit_opacities")
 
 
@@ -65,7 +69,7 @@ def apply_residual(previous: Gaussians, parameters: Mapping[str, Any], config: M
 
     def gated(name: str) -> Any:
         change = parameters[name]
-        if gate is None:
+        if gate is None or (config.two_gates and name in _APPEARANCE):
             return change
         width = change.array.shape[0] // len(previous)
         return mi.TensorXf(repeated(gate, width) * change.array, tuple(change.shape))

@@ -13,14 +13,19 @@ from morgs_mi.gaussians.gaussians import ActivatedGaussians
 from morgs_mi.render.blocks import build_lists
 from morgs_mi.render.compositing import Channel, Layout, blend
 from morgs_mi.render.config import RenderConfig
-from morgs_mi.render.projection import project
-from morgs_mi.render.region import whole_view
+from morgs_mi.render.projection import Splats, project
+from morgs_mi.render.region import Region, whole_view
 
 __all__ = ["backproject"]
 
 
 def backproject(
-    gaussians: ActivatedGaussians, camera: Camera, picture: np.ndarray, config: RenderConfig | None = None
+    gaussians: ActivatedGaussians,
+    camera: Camera,
+    picture: np.ndarray,
+    config: RenderConfig | None = None,
+    region: Region | None = None,
+    backdrop: Splats | None = None,
 ) -> np.ndarray:
     """Return sum_x w_i(x) picture(x) for every Gaussian i, with the weights w_i = T_i alpha_i of eq. 1.
 
@@ -29,22 +34,26 @@ def backproject(
     Args:
         gaussians: N > 0 Gaussians.
         camera: the view.
-        picture: [H, W, C].
+        picture: [H, W, C], or on the region.
         config: cut-offs.
+        region: the pixels that are summed over; None: the whole view.
+        backdrop: splats of this view that stand among the Gaussians and take their share.
 
     Returns:
         float32 [N, C].
 
     Raises:
-        ValueError: the picture has another size than the camera.
+        ValueError: the picture has another size than the camera or the region.
     """
-    H, W, C = picture.shape
-    if (camera.width, camera.height) != (W, H):
-        raise ValueError(f"backproject(): `picture` must be {camera.height}x{camera.width}, got {H}x{W}.")
-    config = config or RenderConfig()
+    config, C = config or RenderConfig(), picture.shape[-1]
+    region = region or whole_view(camera.width, camera.height, config)
+    if picture.shape != region.shape(C):
+        raise ValueError(f"backproject(): `picture` must be {list(region.shape(C))}, got {list(picture.shape)}.")
     with dr.suspend_grad():
         splats = project(gaussians, camera, (), config)
-        region = whole_view(W, H, config)
+        N = len(splats)
+        if backdrop is not None:
+            splats = splats.followed_by(backdrop, None)
         columns = [dr.zeros(mi.Float, len(splats)) for _ in range(C)]
         lists = build_lists(splats, columns, region, config)
     dr.enable_grad(columns)
@@ -55,4 +64,4 @@ def backproject(
     dr.traverse(dr.ADMode.Backward)
     grads: list[Any] = [dr.grad(column) for column in columns]
     dr.eval(grads)
-    return np.stack([np.asarray(grad) for grad in grads], axis=1)
+    return np.stack([np.asarray(grad)[:N] for grad in grads], axis=1)

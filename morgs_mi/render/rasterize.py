@@ -58,6 +58,7 @@ def rasterize(
     region: Region | None = None,
     active: Any | None = None,
     features: Any | None = None,
+    backdrop: Splats | None = None,
     config: RenderConfig | None = None,
 ) -> Image:
     """Render Gaussians by depth-ordered alpha blending (eq. 1), differentiably.
@@ -76,6 +77,7 @@ def rasterize(
             touch none of its blocks are only projected.
         active: bool [N], the Gaussians that gradients reach; None: all.
         features: [N, F], whatever else is to be blended like colours, in `Image.features`; F is at most 12.
+        backdrop: splats of this view that are drawn as well and get no gradients; they must have the channels.
         config: cut-offs and block shape.
 
     Returns:
@@ -101,7 +103,9 @@ def rasterize(
     blended = tuple(c for c in channels if c != "alpha")
     if dr.prod(gaussians.means.shape[:1]) == 0:
         return _empty(channels, sizes, background, region)
-    if region.whole and active is None:
+    if backdrop is not None:
+        splats = project(gaussians, camera, blended, config, features=features).followed_by(backdrop, None)
+    elif region.whole and active is None:
         splats = project(gaussians, camera, blended, config, features=features)
     else:
         splats = _project_part(gaussians, camera, blended, region, active, features, config)

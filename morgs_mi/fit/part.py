@@ -1,0 +1,152 @@
+"""The part of a scene that a frame works on: who may change, and where the views may change with them.
+
+Let c_v be the pixels of view v that have changed, and b_iv the pixels of the box around Gaussian i's two standard
+deviations there. Who is responsible for a change is told by the views together: i may change if the mean of
+|b_iv and c_v| / |b_iv| over the views that look at i exceeds a quarter. What stands before something that moves has changed
+around it in one view, but not in the others. A change that nobody would explain so, such as something new before a still
+background, makes all those responsible who fill at least half of their box with it.
+
+A view is drawn where somebody who may change is, and left out where nobody is. The others stand still behind.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import cv2
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.capture.camera import Camera
+from morgs_mi.gaussians.gaussians import Gaussians
+from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.projection import Splats, project
+from morgs_mi.render.region import owned
+from morgs_mi.render.window import Window, open_window
+
+__all__ = ["Part", "changing_part", "standing_still", "whole_part"]
+
+_RESPONSIBLE, _FILLED = 0.25, 0.5
+# Two standard deviations of an opaque Gaussian, of whose extent three and a third reach the alpha cut-off.
+_CORE = 0.6
+# Pixels that nobody explains, in a cluster of 5x5 at least.
+_LEAST_CLUSTER = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """What a frame works on.
+
+    Attributes:
+        rows: int [M], ascending: the Gaussians that may change, out of N.
+        num_gaussians: N.
+        windows: onto the views where they may be seen, by view.
+        num_views: V, with those that are left out.
+    """
+
+    rows: np.ndarray
+    num_gaussians: int
+    windows: Mapping[int, Window]
+    num_views: int
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """What it takes of the whole, from 0 to 1: of the Gaussians, of the views and of all their pixels."""
+        pixels = sum(window.share for window in self.windows.values()) / self.num_views
+        return {
+            "gaussians": len(self.rows) / max(self.num_gaussians, 1),
+            "views": len(self.windows) / self.num_views,
+            "pixels": pixels,
+        }
+
+
+def whole_part(gaussians: Gaussians, cameras: Sequence[Camera], render: RenderConfig) -> Part:
+    """Return the part that leaves nothing out."""
+    windows = {view: Window(camera, render) for view, camera in enumerate(cameras)}
+    return Part(np.arange(len(gaussians)), len(gaussians), windows, len(cameras))
+
+
+def changing_part(
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    changes: Sequence[np.ndarray],
+    channels: Sequence[Sequence[str]],
+    render: RenderConfig,
+) -> Part:
+    """Return the part that may have to do with what has changed (see the module).
+
+    Args:
+        gaussians: N of them, of the frame before, detached.
+        cameras: V views.
+        changes: what has changed in them, bool [H, W].
+        channels: all that will be drawn in each of them.
+        render: cut-offs.
+    """
+    boxes = [_boxes(gaussians, camera, render) for camera in cameras]
+    filled, seen = np.zeros((2, len(gaussians)))
+    for box, change in zip(boxes, changes, strict=True):
+        share, visible = _filled(box, change)
+        filled, seen = filled + share, seen + visible
+    chosen = filled > _RESPONSIBLE * np.maximum(seen, 1)
+    drawn = [_painted(box, chosen, change.shape) for box, change in zip(boxes, changes, strict=True)]
+    more = np.zeros(len(gaussians), bool)
+    for box, change, known in zip(boxes, changes, drawn, strict=True):
+        unexplained = change & ~known
+        if unexplained.any() and cv2.erode(unexplained.astype(np.uint8), np.ones((_LEAST_CLUSTER,) * 2)).any():
+            more |= _filled(box, unexplained)[0] >= _FILLED
+    if (more & ~chosen).any():
+        chosen |= more
+        drawn = [_painted(box, chosen, change.shape) for box, change in zip(boxes, changes, strict=True)]
+    still = standing_still(gaussians.select(~chosen))
+    views = enumerate(zip(cameras, drawn, channels, strict=True))
+    windows = {view: open_window(c, mask, still, names, render) for view, (c, mask, names) in views if mask.any()}
+    return Part(np.flatnonzero(chosen), len(gaussians), windows, len(cameras))
+
+
+def standing_still(gaussians: Gaussians) -> Gaussians:
+    """Return Gaussians that have not moved since the frame before."""
+    return replace(gaussians, motion=np.zeros((len(gaussians), 3)))
+
+
+def _boxes(gaussians: Gaussians, camera: Camera, render: RenderConfig) -> tuple[Any, ...]:
+    """Return the corners (x0, y0, x1, y1) [N], in px, of the boxes around two standard deviations; empty if culled."""
+    with dr.suspend_grad():
+        splats: Splats = project(gaussians, camera, (), render)
+        corners = []
+        for axis, size in ((0, camera.width), (1, camera.height)):
+            center, half = splats.shape[axis], _CORE * splats.extent[axis]
+            low = dr.clip(dr.floor(center - half), 0, dr.opaque(mi.Float, size))
+            high = dr.clip(dr.floor(center + half) + 1, 0, dr.opaque(mi.Float, size))
+            corners.append((mi.UInt32(low), mi.UInt32(dr.select(splats.valid, high, low))))
+        (x0, x1), (y0, y1) = corners
+        dr.eval(x0, y0, x1, y1)
+    return x0, y0, x1, y1
+
+
+def _filled(box: tuple[Any, ...], mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the share of each box that a mask [H, W] fills [N], and whether the view looks at it at all."""
+    x0, y0, x1, y1 = box
+    pitch, area = dr.opaque(mi.UInt32, mask.shape[1] + 1), (x1 - x0) * (y1 - y0)
+    table = owned(mi.UInt32(cv2.integral(mask.astype(np.uint8)).astype(np.uint32).ravel()))
+
+    def before(x: Any, y: Any) -> Any:
+        return dr.gather(mi.UInt32, table, y * pitch + x)
+
+    count = before(x1, y1) - before(x0, y1) - before(x1, y0) + before(x0, y0)
+    share = dr.select(area > 0, mi.Float(count) / mi.Float(dr.maximum(area, 1)), 0)
+    return np.asarray(share, float), np.asarray(area) > 0
+
+
+def _painted(box: tuple[Any, ...], chosen: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the union [H, W] of the chosen boxes."""
+    x0, y0, x1, y1 = (np.asarray(v).astype(np.int64)[chosen] for v in box)
+    some = (x1 > x0) & (y1 > y0)
+    x0, y0, x1, y1 = (v[some] for v in (x0, y0, x1, y1))
+    H, W = shape
+    corners = np.concatenate([y0 * (W + 1) + x0, y1 * (W + 1) + x1, y0 * (W + 1) + x1, y1 * (W + 1) + x0])
+    signs = np.repeat([1.0, -1.0], 2 * len(x0))
+    steps = np.bincount(corners, signs, (H + 1) * (W + 1)).reshape(H + 1, W + 1)
+    return (steps.cumsum(0).cumsum(1) > 0.5)[:H, :W]
