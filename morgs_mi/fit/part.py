@@ -2,9 +2,9 @@
 
 Let c_v be the pixels of view v that have changed, and b_iv the pixels of the box around Gaussian i's two standard
 deviations there. Who is responsible for a change is told by the views together: i may change if the mean of
-|b_iv and c_v| / |b_iv| over the views that look at i exceeds a quarter. What stands before something that moves has changed
-around it in one view, but not in the others. A change that nobody would explain so, such as something new before a still
-background, makes all those responsible who fill at least half of their box with it.
+|b_iv and c_v| / |b_iv| over the views that look at i exceeds a quarter. What is hidden now and then by something that
+moves has changed around it in one view, but not in the others. A change that nobody would explain so, such as something
+new before a still background, makes all those responsible of whose box it fills at least half.
 
 A view is drawn where somebody who may change is, and left out where nobody is. The others stand still behind.
 """

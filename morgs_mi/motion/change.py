@@ -1,7 +1,8 @@
 """What changes from one picture of a fixed camera to another by more than noise, and who may be the cause.
 
 Changes of brightness are averaged over 5x5 pixels, in which noise averages out and what is seen does not. How much
-noise is left is told from the median absolute deviation over the picture, which holds while most of it stands still.
+noise is left is told from the median absolute deviation over the picture, which holds while most of it stands still;
+where it does not, a grey level is the bound, more than what is left of six in every pixel.
 """
 
 from __future__ import annotations
@@ -29,13 +30,14 @@ def change_map(before: np.ndarray, after: np.ndarray) -> np.ndarray:
         change = cv2.transform(change, np.full((1, 3), 1 / (3 * 255), np.float32))
     else:
         change = (after - before).mean(-1)
-    return cv2.blur(change, (_WINDOW, _WINDOW))
+    # Zeros around: at the border a mirror would double what noise there is.
+    return cv2.blur(change, (_WINDOW, _WINDOW), borderType=cv2.BORDER_CONSTANT)
 
 
 def noise_of(change: np.ndarray) -> float:
-    """Return the standard deviation of the noise in a map of changes, if most of the picture stands still."""
+    """Return the standard deviation of the noise in a map of changes, at most a grey level."""
     sample = change.ravel()[:: max(1, change.size // 100_000)]
-    return 1.4826 * float(np.median(np.abs(sample - np.median(sample))))
+    return min(1.4826 * float(np.median(np.abs(sample - np.median(sample)))), _GREY_LEVEL)
 
 
 def changed(before: np.ndarray, after: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:

@@ -27,7 +27,7 @@ class MotionConfig:
     learn_confidence: bool = True
     """MC: a learned confidence gates all residuals (eq. 12)."""
     two_gates: bool = True
-    """Let the confidence gate geometry alone, and colour change wherever it has to; False: one gate, as in the paper."""
+    """The confidence gates geometry alone, colour changes wherever it has to; False: one gate, as in the paper."""
     lift_flow: bool = True
     """Start each Gaussian's motion from the key views' flow in closed form; False: from zero, as in the paper."""
     flow_method: str = "dis-medium"

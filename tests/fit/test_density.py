@@ -9,11 +9,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.fit.config import DensityConfig
 from morgs_mi.fit.density import NOISE, Need, Plan, apply_plan, find_need, plan_additions, plan_growth, regrow
 from morgs_mi.fit.losses import Target
 from morgs_mi.fit.optimise import adam, values_of
+from morgs_mi.render.window import Window
 
 CONFIG = DensityConfig(max_gaussians=100, split_scale=0.1, min_opacity=0.005, births=1.0)
 
@@ -170,16 +171,16 @@ def test_need_points_at_the_gaussian_that_is_wrong():
     sh = np.full((6, 1, 3), 0.5, np.float32)
     sh[4] = -1.0
     wrong = dataclasses.replace(truth, sh_coeffs=sh)
-    found = find_need(wrong, [camera], [Target(image)], RenderConfig())
+    found = find_need(wrong, [Window(camera)], [Target(image)])
     assert found.error.argmax() == 4
     assert found.error[[0, 1, 2]].max() < 0.01 * found.error[4]
     # w sums to the alpha of the whole picture
     assert found.weight.sum() == pytest.approx(np.asarray(rasterize(wrong, camera, ("alpha",)).alpha).sum(), rel=1e-4)
     noisy = [Target(np.float32(image + rng.normal(0, 0.02, image.shape))) for rng in [np.random.default_rng(3)]]
-    assert find_need(truth, [camera], noisy, RenderConfig(), NOISE).error.max() < DensityConfig().min_error
+    assert find_need(truth, [Window(camera)], noisy, NOISE).error.max() < DensityConfig().min_error
     hidden = np.ones((48, 64), bool)
     hidden[:, 32:] = False
-    assert find_need(wrong, [camera], [Target(image, hidden)], RenderConfig()).error.max() < 0.01 * found.error[4]
+    assert find_need(wrong, [Window(camera)], [Target(image, hidden)]).error.max() < 0.01 * found.error[4]
 
 
 @pytest.mark.parametrize(

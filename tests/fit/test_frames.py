@@ -13,6 +13,7 @@ from morgs_mi.fit.config import DensityConfig, FitConfig
 from morgs_mi.fit.first_frame import density_rounds, fit_first_frame
 from morgs_mi.fit.losses import Target
 from morgs_mi.fit.next_frame import fit_next_frame
+from morgs_mi.fit.part import whole_part
 from morgs_mi.gaussians.initialise import from_points
 from morgs_mi.motion.config import MotionConfig
 
@@ -84,17 +85,17 @@ def test_a_later_frame_tells_who_is_new(truth, motion):
     results = {}
     for births in (0.0, 0.3):
         density = DensityConfig(later_frames=True, births=births, min_error=0)
-        found, source, losses = fit_next_frame(
+        fitted = fit_next_frame(
             before,
-            views(),
-            [Target(image) for image in images],
+            whole_part(before, views(), RENDER),
+            {view: Target(image) for view, image in enumerate(images)},
             {},
             EXTENT,
             FitConfig(sh_degree=0, epochs=24, density=density),
             motion,
-            RENDER,
             np.random.default_rng(0),
         )
+        found, source, losses = fitted.gaussians, fitted.source, fitted.losses
         survivors = source[source >= 0]
         assert len(source) == len(found)
         assert np.array_equal(survivors, np.unique(survivors))
@@ -106,24 +107,24 @@ def test_a_later_frame_tells_who_is_new(truth, motion):
 
 
 def test_without_density_control_everybody_stays(truth):
-    found, source, _ = fit_next_frame(
+    fitted = fit_next_frame(
         truth,
-        views(),
-        [Target(image) for image in pictures(truth)],
+        whole_part(truth, views(), RENDER),
+        {view: Target(image) for view, image in enumerate(pictures(truth))},
         {},
         EXTENT,
         FitConfig(sh_degree=0, epochs=1, density=DensityConfig(later_frames=False)),
         PLAIN,
-        RENDER,
         np.random.default_rng(0),
     )
-    assert isinstance(found, Gaussians)
-    assert np.array_equal(source, np.arange(400))
+    assert isinstance(fitted.gaussians, Gaussians)
+    assert np.array_equal(fitted.source, np.arange(400))
 
 
 def test_nobody_is_born_when_no_step_is_left_to_fit_them(truth):
     config = FitConfig(sh_degree=0, epochs=1, density=DensityConfig(min_error=0))
-    targets = [Target(image) for image in pictures(truth)]
+    targets = {view: Target(image) for view, image in enumerate(pictures(truth))}
     before = truth.select(np.arange(200))
-    _, source, _ = fit_next_frame(before, views(), targets, {}, EXTENT, config, PLAIN, RENDER, np.random.default_rng(0))
-    assert np.array_equal(source, np.arange(200))
+    part = whole_part(before, views(), RENDER)
+    fitted = fit_next_frame(before, part, targets, {}, EXTENT, config, PLAIN, np.random.default_rng(0))
+    assert np.array_equal(fitted.source, np.arange(200))

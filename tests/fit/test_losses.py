@@ -161,21 +161,35 @@ def test_recon_loss_on_a_region_teaches_what_the_whole_view_does(width, masked):
 
 
 @pytest.mark.parametrize("width", [23, 24])
-def test_error_is_that_of_every_pixel(width):
+def test_difference_is_that_of_every_pixel(width):
     rng = np.random.default_rng(0)
     image, truth = (np.float32(rng.uniform(size=(19, width, 3))) for _ in range(2))
     mask = rng.uniform(size=(19, width)) < 0.7
-    found = Target(truth, mask).error(mi.TensorXf(image))
-    assert np.allclose(found, np.abs(image - truth).mean(2) * mask, atol=1e-6)
+    target, expected = Target(truth, mask), (truth - image) * mask[..., None]
+    assert np.allclose(target.difference(mi.TensorXf(image)), expected, atol=1e-6)
+    drawn = np.zeros(mask.shape, bool)
+    drawn[-1, -1] = drawn[3, 5] = True
+    region = Region(drawn)
+    found = target.difference(mi.TensorXf(region.cut(image)), region)
+    assert np.allclose(found, region.cut(expected), atol=1e-6)
 
 
-def test_a_region_needs_surroundings(pictures):
+def test_a_region_stands_in_its_target_unless_told_otherwise():
+    rng = np.random.default_rng(0)
+    truth = np.float32(rng.uniform(size=(32, 40, 3)))
+    mask = np.zeros((32, 40), bool)
+    mask[3, 4] = True
+    region, told, untold = Region(mask), Target(truth), Target(truth)
+    told.remember(mi.TensorXf(truth))
+    image = mi.TensorXf(region.cut(truth) + 0.1)
+    assert item(recon_loss(image, untold, region=region)) == item(recon_loss(image, told, region=region)) > 0
+
+
+def test_a_picture_of_another_size_is_refused(pictures):
     image, target = (np.zeros((32, 40, 3), np.float32) for _ in range(2))
     mask = np.zeros((32, 40), bool)
     mask[3, 4] = True
     region = Region(mask)
-    with pytest.raises(ValueError, match=r"what surrounds `region` must be known, got nothing; call target.remember"):
-        recon_loss(mi.TensorXf(region.cut(image)), Target(target), region=region)
     with pytest.raises(ValueError, match=r"`image` must be \(1, 4, 8, 3\) like its target"):
         recon_loss(mi.TensorXf(image), Target(target), region=region)
     with pytest.raises(ValueError, match="`region` must be of a 23x19 view like its target, got 40x32"):

@@ -9,6 +9,7 @@ from morgs_mi import Camera, Gaussians
 from morgs_mi.capture.truth import project
 from morgs_mi.motion.cues import MotionCue, choose_key_views
 from morgs_mi.motion.lift import lift_flow, projection_jacobian
+from morgs_mi.render.window import Window
 
 SHIFT = np.array([0.03, -0.02, 0.015])
 
@@ -38,7 +39,7 @@ def uniform_cue(camera, shift):
 def test_uniform_motion_is_recovered_in_3d():
     cameras, gaussians = rig(), cloud()
     cues = {view: uniform_cue(camera, SHIFT) for view, camera in enumerate(cameras)}
-    lifted = lift_flow(gaussians, cameras, cues)
+    lifted = lift_flow(gaussians, {view: Window(camera) for view, camera in enumerate(cameras)}, cues)
     # The prior of 0.3 px weighs against some 10 px of evidence; a shift along the view shows least.
     error = np.abs(np.median(lifted, axis=0) - SHIFT) / np.linalg.norm(SHIFT)
     assert error[:2].max() < 0.05
@@ -50,7 +51,7 @@ def test_no_evidence_means_no_motion():
     cue = uniform_cue(cameras[0], SHIFT)
     nowhere = np.zeros_like(cue.onward_reliable)
     cues = {0: MotionCue(cue.motion, nowhere, cue.onward, nowhere)}
-    assert np.abs(lift_flow(gaussians, cameras, cues)).max() == 0
+    assert np.abs(lift_flow(gaussians, {view: Window(camera) for view, camera in enumerate(cameras)}, cues)).max() == 0
 
 
 def test_jacobian_agrees_with_central_differences():

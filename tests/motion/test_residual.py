@@ -31,10 +31,11 @@ def test_zero_residual_changes_nothing(degree, config):
     assert np.abs(current.numpy()["motion"]).max() == 0
 
 
+@pytest.mark.parametrize("two_gates", [False, True])
 @pytest.mark.parametrize("degree", [0, 2])
-def test_gate_scales_every_attribute(degree):
-    """A_t = A_{t-1} + m R_t (eq. 12), with the confidence as gate."""
-    config, previous = MotionConfig(), to_gaussians(make_scene(degree))
+def test_gate_scales_every_attribute(degree, two_gates):
+    """A_t = A_{t-1} + m R_t (eq. 12), with the confidence as gate; of two, colour has its own."""
+    config, previous = MotionConfig(two_gates=two_gates), to_gaussians(make_scene(degree))
     parameters = random_parameters(previous, config)
     m = 1 / (1 + np.exp(-np.asarray(parameters["logit_confidence"], np.float64)))
     current, before = apply_residual(previous, parameters, config).numpy(), previous.numpy()
@@ -44,6 +45,7 @@ def test_gate_scales_every_attribute(degree):
     assert current["log_scales"] - before["log_scales"] == pytest.approx(m[:, None] * R["log_scales"], abs=1e-6)
     assert current["logit_opacities"] - before["logit_opacities"] == pytest.approx(m * R["logit_opacities"], abs=1e-6)
     change = current["sh_coeffs"] - before["sh_coeffs"]
+    m = np.ones_like(m) if two_gates else m
     assert change[:, :1] == pytest.approx(m[:, None, None] * R["sh_dc"], abs=1e-6)
     if degree:
         assert change[:, 1:] == pytest.approx(m[:, None, None] * R["sh_rest"], abs=1e-6)

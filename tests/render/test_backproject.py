@@ -31,5 +31,5 @@ def test_weights_sum_to_alpha():
 
 
 def test_picture_of_another_size_is_refused():
-    with pytest.raises(ValueError, match="`picture` must be 18x21, got 4x5"):
+    with pytest.raises(ValueError, match=r"`picture` must be \[18, 21, 1\], got \[4, 5, 1\]"):
         backproject(to_gaussians(make_scene()), make_camera(), np.zeros((4, 5, 1), np.float32))
