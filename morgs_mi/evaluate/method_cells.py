@@ -218,7 +218,7 @@ def _fit(clip: Clip, config: StreamConfig, first: Path) -> Scores:
     loop, stream = clip.loop(config), open_stream(first)
     (packet,) = stream
     (coded,) = coded_frames([packet])
-    loop.state = StreamState(1, coded, clip.images[0])
+    loop.resume(coded, clip.images[:1])
     reports: list[FrameReport] = []
     with TemporaryDirectory() as folder:
         path = Path(folder) / "stream.morgs"
