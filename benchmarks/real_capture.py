@@ -2,8 +2,8 @@
 
     python benchmarks/real_capture.py CAPTURE OUT --downscale 2 --json out.json
 
-Memory is the process's resident set, MiB, after every frame. Without a held-out view, quality is that of the training
-views. What has been fitted into OUT already is gone on with.
+Memory is the process's resident set, MiB, when a frame has begun. Without a held-out view, quality is that of the
+training views. What has been fitted into OUT already is gone on with.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ def resident() -> float:
 
 
 def fit(options: Options) -> None:
-    """Fit what is not fitted yet, and note the memory of every frame in OUT/memory.jsonl."""
+    """Fit what is not fitted yet, and note the memory at every frame in OUT/memory.jsonl."""
     options.out.mkdir(parents=True, exist_ok=True)
     capture = load_capture(options.capture, options.downscale, "auto", options.frames, options.reading)
     with (options.out / "memory.jsonl").open("a", encoding="utf-8") as log:
 
         def note(frame: int, step: int, steps: int) -> None:
-            if step == steps:
+            if step == 1:  # a frame that has settled has no last one
                 log.write(json.dumps({"frame": frame, "resident_mib": resident()}) + "\n")
                 log.flush()
 
