@@ -177,7 +177,10 @@ class View:
 
         from morgs_mi.viewer.viewer import Viewer
 
-        viewer = Viewer(self.out, self.config)
+        try:
+            viewer = Viewer(self.out, self.config)
+        except ImportError as error:
+            raise ValueError(str(error)) from error
         say(f"{viewer.url} (Ctrl-C ends it)")
         if self.open_browser:
             webbrowser.open(viewer.url)

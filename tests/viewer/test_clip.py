@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 
+from morgs_mi import cli
 from morgs_mi.capture.camera import Camera
 from morgs_mi.codec.gaussians import CodedFrame
 from morgs_mi.evaluate.pictures import confidence_picture, motion_picture
@@ -92,3 +95,9 @@ def test_every_mode_colours_every_splat(states):
         assert (found.dtype, found.shape) == (np.uint8, (40, 3))
     with pytest.raises(ValueError, match="the mode must be one of color, motion, confidence, depth"):
         splat_colors(states[1].gaussians, rig()[0], "offset")
+
+
+def test_without_viser_there_is_a_sentence(tmp_path, states, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert cli.main(["view", str(tmp_path)]) == 1
+    assert "install it with pip install 'morgs-mi[viewer]'" in capsys.readouterr().err
