@@ -93,12 +93,18 @@ class Viewer:
         try:
             while not self._stopped.wait(_TICK):
                 now = time.monotonic()
-                if now - looked > _LOOK_AGAIN:
-                    looked = now
-                    if self._clip.refresh():
-                        self._grow()
-                self._play(now)
-                self._show(now)
+                try:
+                    if now - looked > _LOOK_AGAIN:
+                        looked = now
+                        if self._clip.refresh():
+                            self._grow()
+                    if self._clip.frames:  # else begun anew just now
+                        self._play(now)
+                        self._show(now)
+                except (ValueError, OSError) as error:
+                    # Damaged, or being replaced: say so on the page, and look again.
+                    self._status.content, self._shown = str(error), None
+                    self._stopped.wait(_LOOK_AGAIN)
         finally:
             self._server.stop()
 
@@ -147,15 +153,17 @@ class Viewer:
 
     def _grow(self) -> None:
         last = max(len(self._clip.frames) - 1, 1)
-        if self._slider.max != last:
-            self._slider.max = last
-        if self._follow.value:
-            self._slider.value = len(self._clip.frames) - 1
+        self._slider.value = min(int(self._slider.value), last)
+        self._slider.max = last
+        self._shown = None  # how many there are is shown too, and a file begun anew has other frames
 
     def _play(self, now: float) -> None:
         step = 1 / (self._clip.stream.fps * self._speed.value)
         if not self._playing.value:
             self._frame_time = now
+            last = len(self._clip.frames) - 1
+            if self._follow.value and self._slider.value != last:
+                self._slider.value = last
         elif now - self._frame_time >= step:
             # What is late is not caught up with: every frame is shown.
             self._frame_time = max(self._frame_time + step, now - step)

@@ -138,3 +138,8 @@ def test_the_page_shows_what_the_renderer_shows(page, tmp_path):
     page.get_by_text("Frame 3 of 3, 41 Gaussians").wait_for()
     page.get_by_label("Play").check()
     page.get_by_text("Frame 2 of 3, 41 Gaussians").wait_for()
+
+    (tmp_path / "stream.morgs").write_bytes(b"")
+    page.get_by_text("the header is missing").wait_for()
+    grow()
+    page.get_by_text("of 3, 4").wait_for()
