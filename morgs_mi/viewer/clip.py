@@ -40,17 +40,24 @@ class Clip:
         self._coded: CodedFrame | None = None
         self._ahead: Iterator[CodedFrame] = iter(())
         self._entries: list[tuple[int, int, int]] = []
+        self._size = 0
         self.frames: list[int] = []
         self.refresh()
 
     def refresh(self) -> bool:
-        """Look whether the file has grown; return whether it has. A file that was begun anew is read anew."""
+        """Look whether the file has grown; return whether it has. A file that was begun anew is read anew.
+
+        Raises:
+            OSError, ValueError: it is gone, or has no header yet.
+        """
+        size = self.stream.path.stat().st_size
+        if size < self._size:
+            self._begin_anew()
         entries = self.stream.index()
-        grown = entries != self._entries
         if entries[: len(self._entries)] != self._entries:
-            self.stream = open_stream(self.stream.path)
-            self._coded, self._ahead = None, iter(())
-            self._places.clear()
+            self._begin_anew()
+            entries = self.stream.index()
+        grown, self._size = entries != self._entries, size
         self._entries = entries
         self.frames = list(dict.fromkeys(frame for _, frame, _ in entries))
         return grown
@@ -100,6 +107,11 @@ class Clip:
         lines, ages = np.concatenate(segments)[shown], np.concatenate(ages)[shown]
         moved = (lines[:, 0] != lines[:, 1]).any(axis=1)
         return lines[moved], ages[moved]
+
+    def _begin_anew(self) -> None:
+        self.stream = open_stream(self.stream.path)
+        self._coded, self._ahead, self._entries = None, iter(()), []
+        self._places.clear()
 
     def _keyframe_before(self, frame: int) -> int:
         """Return the last keyframe that a frame can be entered from."""

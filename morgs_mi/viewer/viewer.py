@@ -7,6 +7,7 @@ wherever the camera comes to rest. All decoding and drawing happens in the one t
 
 from __future__ import annotations
 
+import struct
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -101,8 +102,8 @@ class Viewer:
                     if self._clip.frames:  # else begun anew just now
                         self._play(now)
                         self._show(now)
-                except (ValueError, OSError) as error:
-                    # Damaged, or being replaced: say so on the page, and look again.
+                except (ValueError, OSError, struct.error) as error:
+                    # Damaged, or being replaced (an index is not looked for in an empty file): say so, and look again.
                     self._status.content, self._shown = str(error), None
                     self._stopped.wait(_LOOK_AGAIN)
         finally:

@@ -55,6 +55,12 @@ def test_a_file_that_grows_is_followed_and_one_begun_anew_is_read_anew(tmp_path,
     assert clip.refresh()
     assert clip.frames == [0, 1]
     np.testing.assert_array_equal(clip.at(1).digest, others[1].digest)
+    growing.write_bytes(b"")
+    with pytest.raises(ValueError, match="the header is missing"):
+        clip.refresh()
+    growing.write_bytes(whole)
+    assert clip.refresh()
+    np.testing.assert_array_equal(clip.at(5).digest, states[5].digest)
 
 
 def test_trails_are_the_steps_of_what_moved(tmp_path, states):
