@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,10 +10,12 @@ import numpy as np
 import pytest
 
 from morgs_mi.evaluate.codec_report import CodecReportConfig, markdown_table, plot_codec, report_codec
+from morgs_mi.evaluate.report import markdown
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.motion.config import MotionConfig
 from morgs_mi.stream_loop import StreamConfig
 
+ROOT = Path(__file__).parent.parent.parent
 QUICK = CodecReportConfig(
     qualities=(4, 40),
     stream=StreamConfig(
@@ -60,3 +63,34 @@ def test_bad_settings_get_a_sentence(clip: Path, tmp_path: Path) -> None:
         report_codec([clip / "capture"], tmp_path, replace(QUICK, frames=1))
     with pytest.raises(ValueError, match="`qualities` must be positive and below the reference's 1000"):
         CodecReportConfig(qualities=(2000,))
+
+
+def groups_table(result: dict) -> str:
+    rows = [(clip["name"], next(row for row in clip["rows"] if row["quality"] == 1)) for clip in result["clips"]]
+    names = list(rows[0][1]["bytes_by_group"])
+    return markdown(
+        ["", *names], [[name, *(f"{row['bytes_by_group'][key] / 1e3:.1f}" for key in names)] for name, row in rows]
+    )
+
+
+def speed_table(result: dict) -> str:
+    titles = ("Gaussians", "moving", "kB", "encode ms", "decode ms", "error, px RMS", "largest")
+    cells = [
+        [f"{row['gaussians']}", f"{row['moving']}", f"{row['bytes'] / 1e3:.0f}"]
+        + [f"{row[name]:.0f}" for name in ("encode_ms", "decode_ms")]
+        + [f"{row[name]:.3f}" for name in ("error_px_rms", "error_px_max")]
+        for row in result["rows"]
+    ]
+    return markdown(titles, cells, left=0)
+
+
+def test_documentation_quotes_the_committed_figures() -> None:
+    text = (ROOT / "docs/stream.md").read_text(encoding="utf-8")
+    report, speed = (
+        json.loads((ROOT / f"benchmarks/results/{name}.json").read_text(encoding="utf-8"))
+        for name in ("codec_report", "codec_speed")
+    )
+    assert groups_table(report) in text
+    assert speed_table(speed) in text
+    for clip in report["clips"]:
+        assert markdown_table(clip) in text
