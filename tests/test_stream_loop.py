@@ -280,7 +280,7 @@ def test_a_capture_becomes_a_file(clip, tmp_path):
         (lambda clip: FitConfig(epochs=0), "`epochs` must be at least 1, got 0"),
         (lambda clip: Rates(means=np.nan), "`means` must be finite and not negative, got nan"),
         (lambda clip: FitConfig(sh_degree=4), "`sh_degree` must be 0 to 3, got 4"),
-        (lambda clip: MotionConfig(flow_method="raft"), "`flow_method` must be one of dis-ultrafast"),
+        (lambda clip: MotionConfig(flow_method="raft"), "`flow_method` must be one of dis, dis-fine"),
     ],
 )
 def test_bad_input_gets_a_sentence(clip, call, message):

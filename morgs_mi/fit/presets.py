@@ -32,7 +32,13 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
     "ml": _modules(True, False, False),
     "ml-mo": _modules(True, True, False),
     "ml-mo-mc": _modules(True, True, True),
-    "paper": {"epochs": 8, "lift_flow": False, "two_gates": False, **_modules(True, True, True)},
+    "paper": {
+        "epochs": 8,
+        "lift_flow": False,
+        "lift_confidence": False,
+        "two_gates": False,
+        **_modules(True, True, True),
+    },
 }
 
 

@@ -30,7 +30,9 @@ class MotionConfig:
     """The confidence gates geometry alone, colour changes wherever it has to; False: one gate, as in the paper."""
     lift_flow: bool = True
     """Start each Gaussian's motion from the key views' flow in closed form; False: from zero, as in the paper."""
-    flow_method: str = "dis-medium"
+    lift_confidence: bool = True
+    """Start each Gaussian's confidence from that evidence; False: from the frame before, as in the paper."""
+    flow_method: str = "dis"
     """Optical flow: the name of a method (see docs/flow.md), files:FOLDER for flow from files, or onnx:FILE for a
     network (onnx-unit:FILE or onnx-signed:FILE if it takes values from 0 or -1 to 1 in place of bytes)."""
     key_views: int = 4

@@ -48,7 +48,7 @@ def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
 def motion_cue(
     image: np.ndarray,
     previous: np.ndarray,
-    method: str = "dis-medium",
+    method: str = "dis",
     with_mask: bool = False,
     valid: np.ndarray | None = None,
 ) -> MotionCue:

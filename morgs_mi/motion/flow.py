@@ -20,6 +20,9 @@ MIN_SIDE = 16
 # PCAFlow writes its 18 x 14 coefficients into a quarter of the width and height: out of bounds below this size.
 _PCA_SIZE = (72, 56)
 
+# Up to this width, `dis` goes to full resolution.
+FINE_WIDTH = 800
+
 _Method = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -34,9 +37,13 @@ def _at_least(width: int, height: int, method: _Method, a: np.ndarray, b: np.nda
     return method(*padded)[: a.shape[0], : a.shape[1]]
 
 
-def _dis(preset: int) -> _Method:
+def _dis(preset: int, finest: Callable[[int], int] | None = None) -> _Method:
+    """Return DIS by its preset; `finest` tells the level that it ends on, 0 being the picture, by the width."""
+
     def flow(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         method = cv2.DISOpticalFlow_create(preset)
+        if finest is not None:
+            method.setFinestScale(finest(a.shape[1]))
         # DIS picks its coarsest level by the width alone and crashes where the height falls under a patch.
         return _at_least(0, a.shape[1] // 2, lambda a, b: method.calc(a, b, None), a, b)
 
@@ -62,6 +69,9 @@ def _rlof(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 # What OpenCV has beside these (sparse-to-dense, SimpleFlow, RLOF with other interpolations) crashes or gives NaN on
 # pictures with too little to match: see docs/flow.md. All take RGB as bytes.
 FLOW_METHODS: dict[str, _Method] = {
+    # Its presets end at half or quarter resolution, where patches of 8 pixels lose what is small in small pictures.
+    "dis": _dis(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM, lambda width: int(width > FINE_WIDTH)),
+    "dis-fine": _dis(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM, lambda width: 0),
     "dis-ultrafast": _dis(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST),
     "dis-fast": _dis(cv2.DISOPTICAL_FLOW_PRESET_FAST),
     "dis-medium": _dis(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM),
@@ -73,7 +83,7 @@ FLOW_METHODS: dict[str, _Method] = {
 }
 
 
-def optical_flow(image: np.ndarray, previous: np.ndarray, method: str = "dis-medium") -> np.ndarray:
+def optical_flow(image: np.ndarray, previous: np.ndarray, method: str = "dis") -> np.ndarray:
     """Return the flow [H, W, 2] in pixels, float32, from I_t to I_{t-1} on frame t's grid (eq. 4).
 
     Images with a side under 16 pixels have too little to match: their flow is zero.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-__all__ = ["flow_mask", "flow_threshold", "motion_mask", "refine_mask"]
+__all__ = ["flow_mask", "flow_threshold", "least_motion", "motion_mask", "refine_mask"]
 
 # The floor under the threshold is 0.5 px at N3DV's half resolution and shrinks with the width, as the motion
 # of a scene does; below 0.2 px it would be in the noise of the flow itself, whatever the width.
@@ -17,6 +17,11 @@ NOISE_FLOOR = 0.2
 GRABCUT_WIDTH = 320
 
 
+def least_motion(width: int) -> float:
+    """Return the motion in pixels, in a picture so many pixels wide, below which nothing is said to move."""
+    return max(FLOOR * width / REFERENCE_WIDTH, NOISE_FLOOR)
+
+
 def flow_threshold(motion: np.ndarray, reliable: np.ndarray | None = None) -> float:
     """Return the speed in pixels above which something moves: max(floor, median + 4 MAD) of the speeds.
 
@@ -26,8 +31,7 @@ def flow_threshold(motion: np.ndarray, reliable: np.ndarray | None = None) -> fl
     speed = speed[reliable] if reliable is not None and reliable.any() else speed.ravel()
     median = np.median(speed)
     spread = np.median(np.abs(speed - median))
-    floor = max(FLOOR * motion.shape[1] / REFERENCE_WIDTH, NOISE_FLOOR)
-    return float(max(floor, median + 4 * spread))
+    return float(max(least_motion(motion.shape[1]), median + 4 * spread))
 
 
 def flow_mask(motion: np.ndarray, reliable: np.ndarray | None = None) -> np.ndarray:

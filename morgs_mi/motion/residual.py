@@ -21,6 +21,7 @@ import numpy as np
 
 from morgs_mi.gaussians.gaussians import Gaussians, repeated, sigmoid
 from morgs_mi.motion.config import MotionConfig
+from morgs_mi.motion.lift import Lift
 
 __all__ = ["apply_residual", "join_sh", "residual_parameters", "split_sh"]
 
@@ -30,13 +31,13 @@ _APPEARANCE = ("sh_dc", "sh_rest")
 _STATIC = ("log_scales", "quats", "logit_opacities")
 
 
-def residual_parameters(previous: Gaussians, config: MotionConfig, lifted: np.ndarray | None = None) -> dict[str, Any]:
+def residual_parameters(previous: Gaussians, config: MotionConfig, lifted: Lift | None = None) -> dict[str, Any]:
     """Return the parameters of a frame's residual at their start: no change, confidence as before.
 
     Args:
         previous: N Gaussians of the frame before.
         config: which modules are on.
-        lifted: displacement [N, 3] to start from (see `lift_flow`), or None.
+        lifted: what to start from, or None: no motion, and the confidence as before.
     """
     sh_dc, sh_rest = split_sh(previous.sh_coeffs)
     shapes = {"motion": previous.means, **{name: getattr(previous, name) for name in _STATIC}, "sh_dc": sh_dc}
@@ -48,10 +49,13 @@ def residual_parameters(previous: Gaussians, config: MotionConfig, lifted: np.nd
     if config.learn_confidence:
         parameters["logit_confidence"] = previous.logit_confidence
     if lifted is not None:
-        start = lifted
+        start = lifted.displacement
         if config.learn_confidence:
+            if config.lift_confidence:
+                parameters["logit_confidence"] = mi.TensorXf(lifted.logit_confidence)
             # The gate would shrink what the flow says; who hardly moves may stay shrunk.
-            start = lifted / np.maximum(np.asarray(previous.confidence), _LEAST_GATE)[:, None]
+            gate = np.asarray(sigmoid(parameters["logit_confidence"].array))
+            start = start / np.maximum(gate, _LEAST_GATE)[:, None]
         parameters["motion"] = mi.TensorXf(start.astype(np.float32))
     return parameters
 

@@ -50,7 +50,7 @@ def test_the_true_flow_has_no_error(clip, perfect):
 
 
 def test_errors_are_those_of_the_cue(clip):
-    found = report_flow([clip], FlowReportConfig(("dis-medium",), views=1))["clips"][0]
+    found = report_flow([clip], FlowReportConfig(("dis",), views=1))["clips"][0]
     assert (found["name"], found["width"], found["height"], found["pairs"]) == ("spheres", 96, 72, 1)
     capture = load_capture(clip)
     frames, errors = list(capture.frames()), []

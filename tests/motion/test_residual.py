@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.motion.config import MotionConfig
+from morgs_mi.motion.lift import Lift
 from morgs_mi.motion.residual import apply_residual, join_sh, residual_parameters, split_sh
 from tests.render.test_rasterize import RAW, make_scene, to_gaussians
 
@@ -58,13 +59,16 @@ def test_modules_add_their_parameters():
     assert {"offset", "logit_confidence", "motion"} <= set(residual_parameters(previous, MotionConfig()))
 
 
-def test_lifted_motion_passes_the_gate_whole():
-    previous = to_gaussians(make_scene())
-    lifted = np.random.default_rng(1).normal(size=(10, 3)).astype(np.float32)
-    current = apply_residual(previous, residual_parameters(previous, MotionConfig(), lifted), MotionConfig())
-    gate = np.asarray(previous.confidence)
-    assert (gate > 0.1).all()
-    assert np.asarray(current.motion) == pytest.approx(lifted, rel=1e-5, abs=1e-6)
+@pytest.mark.parametrize("lift_confidence", [False, True])
+def test_lifted_motion_passes_the_gate_whole(lift_confidence):
+    previous, rng = to_gaussians(make_scene()), np.random.default_rng(1)
+    lifted = Lift(np.float32(rng.normal(size=(10, 3))), np.float32(rng.uniform(-2, 2, 10)))
+    config = MotionConfig(lift_confidence=lift_confidence)
+    current = apply_residual(previous, residual_parameters(previous, config, lifted), config)
+    assert (np.asarray(current.confidence) > 0.1).all()
+    assert np.asarray(current.motion) == pytest.approx(lifted.displacement, rel=1e-5, abs=1e-6)
+    logit = lifted.logit_confidence if lift_confidence else np.asarray(previous.logit_confidence)
+    assert np.array_equal(current.logit_confidence, logit)
 
 
 def test_gradient_of_the_gate_agrees_with_the_product_rule():
