@@ -21,7 +21,7 @@ MIN_SIDE = 16
 _PCA_SIZE = (72, 56)
 
 # Up to this width, `dis` goes to full resolution.
-FINE_WIDTH = 800
+FINE_WIDTH = 480
 
 _Method = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
