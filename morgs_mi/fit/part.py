@@ -1,10 +1,11 @@
 """The part of a scene that a frame works on: who may change, and where the views may change with them.
 
 Let c_v be the pixels of view v that have changed, and b_iv the pixels of the box around Gaussian i's two standard
-deviations there. Who is responsible for a change is told by the views together: i may change if the mean of
-|b_iv and c_v| / |b_iv| over the views that look at i exceeds a quarter. What is hidden now and then by something that
-moves has changed around it in one view, but not in the others. A change that nobody would explain so, such as something
-new before a still background, makes all those responsible of whose box it fills at least half.
+deviations there. Who is responsible for a change is told by the views together: i may change if the sum of
+|b_iv and c_v| / |b_iv| over the V_i views that look at i exceeds 5/4, but at least V_i / 10 and at most V_i / 2. What is
+hidden now and then by something that moves has changed around it in one view, but not in the others. A change that
+nobody would explain so, such as something new before a still background, makes all those responsible of whose box it
+fills at least half.
 
 A view is drawn where somebody who may change is, and left out where nobody is. The others stand still behind.
 """
@@ -29,7 +30,7 @@ from morgs_mi.render.window import Window, open_window
 
 __all__ = ["Part", "changing_part", "standing_still", "whole_part"]
 
-_RESPONSIBLE, _FILLED = 0.25, 0.5
+_LEAST_VIEWS, _LEAST_SHARE, _MOST_SHARE, _FILLED = 1.25, 0.1, 0.5, 0.5
 # Two standard deviations of an opaque Gaussian, of whose extent three and a third reach the alpha cut-off.
 _CORE = 0.6
 # Pixels that nobody explains, in a cluster of 5x5 at least.
@@ -90,7 +91,7 @@ def changing_part(
     for box, change in zip(boxes, changes, strict=True):
         share, visible = _filled(box, change)
         filled, seen = filled + share, seen + visible
-    chosen = filled > _RESPONSIBLE * np.maximum(seen, 1)
+    chosen = filled > np.clip(_LEAST_VIEWS, _LEAST_SHARE * seen, _MOST_SHARE * np.maximum(seen, 1))
     drawn = [_painted(box, chosen, change.shape) for box, change in zip(boxes, changes, strict=True)]
     more = np.zeros(len(gaussians), bool)
     for box, change, known in zip(boxes, changes, drawn, strict=True):
