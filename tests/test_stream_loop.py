@@ -286,3 +286,39 @@ def test_a_capture_becomes_a_file(clip, tmp_path):
 def test_bad_input_gets_a_sentence(clip, call, message):
     with pytest.raises(ValueError, match=message):
         call(clip)
+
+
+def test_a_clip_that_stands_still_costs_next_to_nothing(clip):
+    """Camera noise of 2 grey levels is no change: nothing is worked on, and the packets say so in a few bytes."""
+    rng = np.random.default_rng(0)
+
+    def recorded(frame):
+        return [np.uint8(np.clip(image + rng.normal(0, 2, image.shape), 0, 255)) for image in clip[frame][:4]]
+
+    loop = new_loop()
+    loop.push(recorded(0))
+    still = [loop.push(recorded(0))[1] for _ in range(3)]
+    _, moving = loop.push(recorded(1))
+    for report in still:
+        assert set(report.effort.values()) == {0}
+        assert report.losses == {}
+        assert report.num_bytes < 200  # heads of a packet and of its groups
+        assert report.seconds < 0.2 * moving.seconds  # a twentieth on pictures of a usual size
+    # It wakes when something moves.
+    assert 0.1 < moving.effort["gaussians"] < 0.9
+    assert moving.effort["views"] == 1
+
+
+def test_what_is_left_out_was_not_needed(clip):
+    """With and without: the held-out picture is as good, and what stands still is told in fewer bytes."""
+    everything = dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, leave_out_still=False))
+    quality, sizes = [], []
+    for config in (QUICK, everything):
+        loop = new_loop(config)
+        reports = [loop.push(images[:4])[1] for images in clip[:3]]
+        found = np.asarray(rasterize(loop.gaussians, cameras()[4], ("color",)).color)
+        quality.append(psnr(np.clip(found, 0, 1), clip[2][4] / 255))
+        sizes.append(sum(report.num_bytes for report in reports[1:]))
+        assert (reports[-1].effort["pixels"] < 1) == config.fit.leave_out_still
+    assert quality[0] > quality[1] - 0.5  # of five small views with a first frame that is far from done
+    assert sizes[0] < 0.9 * sizes[1]

@@ -2,8 +2,8 @@
 
 Let c_v be the pixels of view v that have changed, and b_iv the pixels of the box around Gaussian i's two standard
 deviations there. Who is responsible for a change is told by the views together: i may change if the sum of
-|b_iv and c_v| / |b_iv| over the V_i views that look at i exceeds 5/4, but at least V_i / 10 and at most V_i / 2. What is
-hidden now and then by something that moves has changed around it in one view, but not in the others. A change that
+|b_iv and c_v| / |b_iv| over the V_i views that look at i exceeds 5/4, but at least V_i / 10 and at most V_i / 2. What
+is hidden now and then by something that moves has changed around it in one view, but not in the others. A change that
 nobody would explain so, such as something new before a still background, makes all those responsible of whose box it
 fills at least half.
 
