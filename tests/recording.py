@@ -40,13 +40,15 @@ CONFIG = StreamConfig(
 
 
 class Recording(Capture):
-    """Noise that drifts to the right."""
+    """A bright square that wanders over a dull wall: something moves, something stands, something is missed."""
 
     def partial_frames(self, start=0, stop=None):
         rng = np.random.default_rng(0)
-        first = [np.repeat(np.repeat(rng.integers(0, 255, (6, 8, 3), np.uint8), 4, 0), 4, 1) for _ in self.cameras]
+        walls = [np.repeat(np.repeat(rng.integers(90, 110, (6, 8, 3), np.uint8), 4, 0), 4, 1) for _ in self.cameras]
         for t in range(start, self.num_frames if stop is None else stop):
-            yield PartialFrame(t, tuple(np.roll(image, t, 1) for image in first))
+            images = np.stack(walls)
+            images[:, 8:16, 2 * t % 24 : 2 * t % 24 + 8] = (255, 200, 40)
+            yield PartialFrame(t, tuple(images))
 
     def record(self):
         return {"layout": "noise"}
