@@ -184,7 +184,8 @@ def _first_confidence(
 ) -> Gaussians:
     """Learn who moves from the first frame's masks, which the flow to the second frame alone can tell."""
     assert state.gaussians is not None
-    masks = {v: motion_mask(state.images[v], cue.onward, cue.onward_reliable) for v, cue in cues.items()}
+    method = setup.config.motion.mask_method
+    masks = {v: motion_mask(state.images[v], cue.onward, cue.onward_reliable, method) for v, cue in cues.items()}
     fitted, _ = fit_confidence(state.gaussians, setup.cameras, masks, setup.config.fit, setup.config.render, rng)
     return fitted
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from morgs_mi.motion.flow_sources import flow_source
+from morgs_mi.motion.masks import mask_refiner
 
 __all__ = ["MotionConfig"]
 
@@ -16,8 +17,8 @@ class MotionConfig:
     With all three off, what is left is the residual-only baseline (eq. 3).
 
     Raises:
-        FileNotFoundError: `flow_method` names a file or folder that does not exist.
-        ValueError: `flow_method` names no source of flow, or a number is out of range.
+        FileNotFoundError: `flow_method` or `mask_method` names a file or folder that does not exist.
+        ValueError: `flow_method` names no source of flow, `mask_method` no refinement, or a number is out of range.
     """
 
     learn_motion: bool = True
@@ -35,6 +36,9 @@ class MotionConfig:
     flow_method: str = "dis"
     """Optical flow: the name of a method (see docs/flow.md), files:FOLDER for flow from files, or onnx:FILE for a
     network (onnx-unit:FILE or onnx-signed:FILE if it takes values from 0 or -1 to 1 in place of bytes)."""
+    mask_method: str = "grabcut"
+    """How flow masks become objects: none, grabcut, superpixels, superpixels+grabcut, or
+    sam2:ENCODER.onnx,DECODER.onnx for SAM2's two networks (see docs/masks.md)."""
     key_views: int = 4
     """Cameras that get optical flow and masks."""
     keyframe_interval: int = 5
@@ -49,7 +53,9 @@ class MotionConfig:
     """Keep the flow and mask losses from moving opacity and geometry: they are about motion and confidence."""
 
     def __post_init__(self) -> None:
-        flow_source(self.flow_method)  # what is wrong with it shall be said before the first frame is fitted
+        # What is wrong with either shall be said before the first frame is fitted.
+        flow_source(self.flow_method)
+        mask_refiner(self.mask_method)
         for name in ("key_views", "keyframe_interval"):
             if getattr(self, name) < 1:
                 raise ValueError(f"MotionConfig(): `{name}` must be at least 1, got {getattr(self, name)}.")

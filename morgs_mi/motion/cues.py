@@ -49,7 +49,7 @@ def motion_cue(
     image: np.ndarray,
     previous: np.ndarray,
     method: str = "dis",
-    with_mask: bool = False,
+    mask_method: str | None = None,
     valid: np.ndarray | None = None,
 ) -> MotionCue:
     """Return the cue of two pictures, whichever camera's they are.
@@ -58,13 +58,13 @@ def motion_cue(
         image: I_t [H, W, 3], RGB, uint8 or float in [0, 1].
         previous: I_{t-1}, likewise.
         method: as `flow_source` takes it.
-        with_mask: whether the mask is wanted.
+        mask_method: as `mask_refiner` takes it; None: no mask is wanted.
         valid: [H, W] bool, False where undistortion left nothing; None: valid everywhere.
 
     Raises:
-        ValueError: as `flow_source` and `optical_flow`.
+        ValueError: as `flow_source`, `optical_flow` and `mask_refiner`.
     """
-    return _cue(FramePair(np.asarray(image), np.asarray(previous), valid=valid), flow_source(method), with_mask)
+    return _cue(FramePair(np.asarray(image), np.asarray(previous), valid=valid), flow_source(method), mask_method)
 
 
 def motion_cues(pairs: Mapping[int, FramePair], config: MotionConfig, with_masks: bool) -> dict[int, MotionCue]:
@@ -72,13 +72,14 @@ def motion_cues(pairs: Mapping[int, FramePair], config: MotionConfig, with_masks
 
     Raises:
         OSError: flow that is read from files is missing.
-        ValueError: as `flow_source` and what it names.
+        ValueError: as `flow_source`, `mask_refiner` and what they name.
     """
     source = flow_source(config.flow_method)
-    return {view: _cue(pair, source, with_masks) for view, pair in pairs.items()}
+    mask_method = config.mask_method if with_masks else None
+    return {view: _cue(pair, source, mask_method) for view, pair in pairs.items()}
 
 
-def _cue(pair: FramePair, source: FlowSource, with_mask: bool) -> MotionCue:
+def _cue(pair: FramePair, source: FlowSource, mask_method: str | None) -> MotionCue:
     """Return one view's cue (eq. 4, and 9 and 10 for the mask), from optical flow both ways."""
     flow, onward = source(pair)
     reliable, onward_reliable = consistent(flow, onward), consistent(onward, flow)
@@ -88,5 +89,5 @@ def _cue(pair: FramePair, source: FlowSource, with_mask: bool) -> MotionCue:
         known[pair.box] = True if pair.valid is None else pair.valid[pair.box]
     if known is not None:
         reliable, onward_reliable = reliable & known, onward_reliable & known
-    mask = motion_mask(pair.image, -flow, reliable) if with_mask else None
+    mask = motion_mask(pair.image, -flow, reliable, mask_method) if mask_method else None
     return MotionCue(-flow, reliable, onward, onward_reliable, mask)

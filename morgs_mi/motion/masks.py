@@ -1,11 +1,31 @@
-"""Motion masks on key views at keyframes: what moves (eq. 9), grown to whole objects and united (eq. 10)."""
+"""Motion masks on key views at keyframes: what moves (eq. 9), refined to whole objects (eq. 10).
+
+How it is refined is named by one string, as optical flow is; docs/masks.md compares the ways.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
 
 import cv2
 import numpy as np
 
-__all__ = ["flow_mask", "flow_threshold", "least_motion", "motion_mask", "refine_mask"]
+from morgs_mi.motion.segment_network import SegmentNetwork
+
+__all__ = [
+    "MASK_METHODS",
+    "MaskRefiner",
+    "flow_mask",
+    "flow_threshold",
+    "least_motion",
+    "mask_refiner",
+    "motion_mask",
+    "refine_mask",
+    "vote_superpixels",
+]
+
+MaskRefiner = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 # The floor under the threshold is 0.5 px at N3DV's half resolution and shrinks with the width, as the motion
 # of a scene does; below 0.2 px it would be in the noise of the flow itself, whatever the width.
@@ -13,8 +33,12 @@ REFERENCE_WIDTH = 1352
 FLOOR = 0.5
 NOISE_FLOOR = 0.2
 
-# GrabCut's cost falls with the number of pixels and its mask is only a guide: objects, not hairs.
-GRABCUT_WIDTH = 320
+# The cost of GrabCut and superpixels grows with the number of pixels and a mask is only a guide: objects, not hairs.
+REFINED_WIDTH = 320
+
+SUPERPIXEL_SIDE = 8
+# Flow bleeds outwards, onto what stands still beside an object: a bare majority would keep all of that.
+SUPERPIXEL_SHARE = 0.75
 
 
 def least_motion(width: int) -> float:
@@ -69,37 +93,107 @@ def refine_mask(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
     if image.shape != (*mask.shape, 3):
         raise ValueError(f"refine_mask(): `image` must be [H, W, 3] with H, W = {mask.shape}, got {image.shape}.")
     clean = _cleaned(mask)
-    height, width = mask.shape
-    scale = min(1.0, GRABCUT_WIDTH / width)
-    size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    seed = cv2.resize(clean.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    near = cv2.dilate(seed, _disc(max(size) // 20))
+    small = _shrunk(image)
+    seed = cv2.resize(clean.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    near = cv2.dilate(seed, _disc(max(seed.shape) // 20))
     if not seed.any() or near.all() or seed.mean() > 0.9:
         return clean
-    if image.dtype != np.uint8:
-        image = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
     labels = np.where(near > 0, np.where(seed > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD).astype(np.uint8)
     cv2.setRNGSeed(0)  # its k-means starts at random
-    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     labels, _, _ = cv2.grabCut(small, labels, None, np.zeros((1, 65)), np.zeros((1, 65)), 2, cv2.GC_INIT_WITH_MASK)
-    objects = np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)).astype(np.uint8)
-    objects = cv2.resize(objects, (width, height), interpolation=cv2.INTER_NEAREST)
-    return _cleaned(objects > 0)
+    return _cleaned(_enlarged(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)), mask.shape))
 
 
-def motion_mask(image: np.ndarray, motion: np.ndarray, reliable: np.ndarray | None = None) -> np.ndarray:
-    """Return what moves, [H, W] bool: the flow mask united with its objects (eq. 10).
+def vote_superpixels(image: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Return the superpixels [H, W] bool three quarters of which are in a motion mask.
+
+    SLIC (Achanta et al., PAMI 2012) on colours in Lab. What the flow smeared over an edge is given up, and so is
+    what is thinner than a superpixel, 8 pixels in a picture 320 wide. A picture with a side under two superpixels has
+    none (OpenCV dies of a segmentation fault below one): its mask is returned as it is.
+
+    Args:
+        image: [H, W, 3], RGB, uint8 or float in [0, 1].
+        mask: [H, W] bool.
+
+    Raises:
+        ValueError: the sizes of image and mask differ.
+    """
+    if image.shape != (*mask.shape, 3):
+        raise ValueError(f"vote_superpixels(): `image` must be [H, W, 3] with H, W = {mask.shape}, got {image.shape}.")
+    small = _shrunk(image)
+    if min(small.shape[:2]) < 2 * SUPERPIXEL_SIDE:
+        return mask
+    lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
+    slic = cv2.ximgproc.createSuperpixelSLIC(lab, cv2.ximgproc.SLIC, SUPERPIXEL_SIDE, 10.0)
+    slic.iterate(5)
+    slic.enforceLabelConnectivity()
+    labels = slic.getLabels()
+    votes = cv2.resize(mask.astype(np.float32), labels.shape[::-1], interpolation=cv2.INTER_AREA)
+    shares = np.bincount(labels.ravel(), votes.ravel()) / np.maximum(np.bincount(labels.ravel()), 1)
+    return _enlarged(shares[labels] >= SUPERPIXEL_SHARE, mask.shape)
+
+
+# Each takes frame t [H, W, 3] and the flow mask [H, W] and returns the motion mask [H, W].
+MASK_METHODS: dict[str, MaskRefiner] = {
+    "none": lambda image, moves: moves,
+    "grabcut": lambda image, moves: moves | refine_mask(image, moves),
+    "superpixels": vote_superpixels,
+    "superpixels+grabcut": lambda image, moves: vote_superpixels(image, moves) | refine_mask(image, moves),
+}
+
+
+@lru_cache(maxsize=8)  # a network is loaded once
+def mask_refiner(mask_method: str) -> MaskRefiner:
+    """Return the refinement that a string names.
+
+    Args:
+        mask_method: a key of `MASK_METHODS`, or ``sam2:ENCODER.onnx,DECODER.onnx`` (see `segment_network`), whose
+            objects are united with the flow mask (eq. 10).
+
+    Raises:
+        FileNotFoundError: a file is missing.
+        ValueError: the string names no refinement, or as `SegmentNetwork`.
+    """
+    if mask_method in MASK_METHODS:
+        return MASK_METHODS[mask_method]
+    kind, _, paths = mask_method.partition(":")
+    encoder, _, decoder = paths.partition(",")
+    if kind == "sam2" and encoder and decoder:
+        network = SegmentNetwork(encoder, decoder)
+        return lambda image, moves: moves | network(image, _cleaned(moves))
+    known = ", ".join([*MASK_METHODS, "sam2:ENCODER.onnx,DECODER.onnx"])
+    raise ValueError(f"mask_refiner(): `mask_method` must be one of {known}, got {mask_method!r}.")
+
+
+def motion_mask(
+    image: np.ndarray, motion: np.ndarray, reliable: np.ndarray | None = None, method: str = "grabcut"
+) -> np.ndarray:
+    """Return what moves, [H, W] bool: the flow mask, refined (eq. 10).
 
     Args:
         image: frame t [H, W, 3], RGB, uint8 or float in [0, 1].
         motion: [H, W, 2] in pixels on frame t's grid.
         reliable: [H, W] bool, see `consistent`.
+        method: as `mask_refiner` takes it.
 
     Raises:
-        ValueError: as `flow_mask` and `refine_mask`.
+        ValueError: as `flow_mask`, `mask_refiner` and what it names.
     """
-    moves = flow_mask(motion, reliable)
-    return moves | refine_mask(image, moves)
+    return mask_refiner(method)(image, flow_mask(motion, reliable))
+
+
+def _shrunk(image: np.ndarray) -> np.ndarray:
+    """Return a picture of bytes no wider than `REFINED_WIDTH`."""
+    if image.dtype != np.uint8:
+        image = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+    height, width = image.shape[:2]
+    scale = min(1.0, REFINED_WIDTH / width)
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def _enlarged(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    return cv2.resize(mask.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
 
 
 def _cleaned(mask: np.ndarray) -> np.ndarray:

@@ -36,7 +36,7 @@ def export(path: Path, height: int | str = "h", width: int | str = "w", inputs: 
         helper.make_node("Add", ["sum", "no_flow"], ["flow_up"]),
     ]
     sizes = (1, 3, height, width), (1, channels, None, None)
-    return _write(
+    return write(
         path, nodes, dict.fromkeys(names, sizes[0]), dict.fromkeys(("flow_low", "flow_up"), sizes[1]), constants
     )
 
@@ -54,10 +54,11 @@ def export_lookup(path: Path, height: int, width: int) -> Path:
         helper.make_node("Conv", ["difference", "weights"], ["flow"]),
     ]
     pictures = dict.fromkeys(("image1", "image2"), (1, 3, height, width))
-    return _write(path, nodes, pictures, {"flow": [1, 2, height, width]}, {"weights": weights, "grid": grid})
+    return write(path, nodes, pictures, {"flow": [1, 2, height, width]}, {"weights": weights, "grid": grid})
 
 
-def _write(path: Path, nodes: list, inputs: dict, outputs: dict, constants: dict[str, np.ndarray]) -> Path:
+def write(path: Path, nodes: list, inputs: dict, outputs: dict, constants: dict[str, np.ndarray]) -> Path:
+    """Write nodes as a network; inputs and outputs are float32, their shapes by name."""
     ends = (
         [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in values.items()]
         for values in (inputs, outputs)
