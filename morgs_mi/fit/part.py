@@ -33,6 +33,7 @@ __all__ = ["Part", "changing_part", "standing_still", "whole_part"]
 _LEAST_VIEWS, _LEAST_SHARE, _MOST_SHARE, _FILLED = 1.25, 0.1, 0.5, 0.5
 # Two standard deviations of an opaque Gaussian, of whose extent three and a third reach the alpha cut-off.
 _CORE = 0.6
+_CELL = 8
 # Pixels that nobody explains, in a cluster of 5x5 at least.
 _LEAST_CLUSTER = 5
 
@@ -142,12 +143,14 @@ def _filled(box: tuple[Any, ...], mask: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _painted(box: tuple[Any, ...], chosen: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the union [H, W] of the chosen boxes."""
+    """Return the union [H, W] of the chosen boxes, in cells of 8 x 8 pixels, for blocks are drawn whole."""
     x0, y0, x1, y1 = (np.asarray(v).astype(np.int64)[chosen] for v in box)
     some = (x1 > x0) & (y1 > y0)
-    x0, y0, x1, y1 = (v[some] for v in (x0, y0, x1, y1))
-    H, W = shape
-    corners = np.concatenate([y0 * (W + 1) + x0, y1 * (W + 1) + x1, y0 * (W + 1) + x1, y1 * (W + 1) + x0])
+    x0, y0 = x0[some] // _CELL, y0[some] // _CELL
+    x1, y1 = -(-x1[some] // _CELL), -(-y1[some] // _CELL)
+    rows, columns = (-(-size // _CELL) + 1 for size in shape)
+    corners = np.concatenate([y0 * columns + x0, y1 * columns + x1, y0 * columns + x1, y1 * columns + x0])
     signs = np.repeat([1.0, -1.0], 2 * len(x0))
-    steps = np.bincount(corners, signs, (H + 1) * (W + 1)).reshape(H + 1, W + 1)
-    return (steps.cumsum(0).cumsum(1) > 0.5)[:H, :W]
+    steps = np.bincount(corners, signs, rows * columns).reshape(rows, columns)
+    cells = steps.cumsum(0).cumsum(1) > 0.5
+    return cells.repeat(_CELL, 0).repeat(_CELL, 1)[: shape[0], : shape[1]]
