@@ -4,8 +4,8 @@ Let c_v be the pixels of view v that have changed, and b_iv the pixels of the bo
 deviations there. Who is responsible for a change is told by the views together: i may change if the sum of
 |b_iv and c_v| / |b_iv| over the V_i views that look at i exceeds 5/4, but at least V_i / 10 and at most V_i / 2. What
 is hidden now and then by something that moves has changed around it in one view, but not in the others. A change that
-nobody would explain so, such as something new before a still background, makes all those responsible of whose box it
-fills at least half.
+nobody would explain so, such as something new before a still background, makes all those responsible who lie on it with
+at least half of their box changed.
 
 A view is drawn where somebody who may change is, and left out where nobody is. The others stand still behind.
 """
@@ -33,7 +33,7 @@ __all__ = ["Part", "changing_part", "standing_still", "whole_part"]
 _LEAST_VIEWS, _LEAST_SHARE, _MOST_SHARE, _FILLED = 1.25, 0.1, 0.5, 0.5
 # Two standard deviations of an opaque Gaussian, of whose extent three and a third reach the alpha cut-off.
 _CORE = 0.6
-_CELL = 8
+_CELL = 4
 # Pixels that nobody explains, in a cluster of 5x5 at least.
 _LEAST_CLUSTER = 5
 
@@ -88,17 +88,18 @@ def changing_part(
         render: cut-offs.
     """
     boxes = [_boxes(gaussians, camera, render) for camera in cameras]
-    filled, seen = np.zeros((2, len(gaussians)))
+    filled, seen, shares = np.zeros(len(gaussians)), np.zeros(len(gaussians)), []
     for box, change in zip(boxes, changes, strict=True):
         share, visible = _filled(box, change)
         filled, seen = filled + share, seen + visible
+        shares.append(share)
     chosen = filled > np.clip(_LEAST_VIEWS, _LEAST_SHARE * seen, _MOST_SHARE * np.maximum(seen, 1))
     drawn = [_painted(box, chosen, change.shape) for box, change in zip(boxes, changes, strict=True)]
     more = np.zeros(len(gaussians), bool)
-    for box, change, known in zip(boxes, changes, drawn, strict=True):
+    for box, change, share, known in zip(boxes, changes, shares, drawn, strict=True):
         unexplained = change & ~known
         if unexplained.any() and cv2.erode(unexplained.astype(np.uint8), np.ones((_LEAST_CLUSTER,) * 2)).any():
-            more |= _filled(box, unexplained)[0] >= _FILLED
+            more |= (share >= _FILLED) & (_filled(box, unexplained)[0] > 0)
     if (more & ~chosen).any():
         chosen |= more
         drawn = [_painted(box, chosen, change.shape) for box, change in zip(boxes, changes, strict=True)]
@@ -143,7 +144,7 @@ def _filled(box: tuple[Any, ...], mask: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _painted(box: tuple[Any, ...], chosen: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return the union [H, W] of the chosen boxes, in cells of 8 x 8 pixels, for blocks are drawn whole."""
+    """Return the union [H, W] of the chosen boxes, in cells of 4 x 4 pixels, for blocks are drawn whole."""
     x0, y0, x1, y1 = (np.asarray(v).astype(np.int64)[chosen] for v in box)
     some = (x1 > x0) & (y1 > y0)
     x0, y0 = x0[some] // _CELL, y0[some] // _CELL
