@@ -28,11 +28,11 @@ class MotionConfig:
     learn_confidence: bool = True
     """MC: a learned confidence gates all residuals (eq. 12)."""
     two_gates: bool = True
-    """The confidence gates geometry alone, colour changes wherever it has to; False: one gate, as in the paper."""
+    """The confidence gates places and rotations alone, the rest changes wherever it has to; False: one gate for all."""
     lift_flow: bool = True
     """Start each Gaussian's motion from the key views' flow in closed form; False: from zero, as in the paper."""
     lift_confidence: bool = True
-    """Start each Gaussian's confidence from that evidence; False: from the frame before, as in the paper."""
+    """Raise each Gaussian's confidence to that evidence; False: start from the frame before, as in the paper."""
     flow_method: str = "dis"
     """Optical flow: the name of a method (see docs/flow.md), files:FOLDER for flow from files, or onnx:FILE for a
     network (onnx-unit:FILE or onnx-signed:FILE if it takes values from 0 or -1 to 1 in place of bytes)."""

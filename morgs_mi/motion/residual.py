@@ -2,8 +2,9 @@
 
     A_t = A_{t-1} + m R_t,        R of the centres = motion + offset,        m = sigmoid(logit_confidence)
 
-With two gates, m is about motion alone: it gates the geometry (centres, scales, rotations, opacities) and leaves the
-colour free, for shadows and light change where nothing moves. The paper has one gate for everything.
+With two gates, m is about motion alone: it gates where Gaussians are and how they are turned, and leaves colour,
+opacity and size free, for shadows and light change where nothing moves, and what is uncovered has to be filled. The
+paper has one gate for everything.
 
 The parameters are a dict of raw tensors, all zero at the start of a frame but for the confidence, which is
 carried on. The centres' colour of degree 0 (`sh_dc`) and the rest (`sh_rest`) have learning rates of their own.
@@ -27,7 +28,9 @@ __all__ = ["apply_residual", "join_sh", "residual_parameters", "split_sh"]
 
 # Below this gate a lifted motion is not scaled up to pass it whole.
 _LEAST_GATE = 0.1
-_APPEARANCE = ("sh_dc", "sh_rest")
+# What a confidence loses in a frame without evidence: where something has moved there is more to be put right.
+_FORGOTTEN = 0.3
+_APPEARANCE = ("sh_dc", "sh_rest", "logit_opacities", "log_scales")
 _STATIC = ("log_scales", "quats", "logit_opacities")
 
 
@@ -52,7 +55,8 @@ def residual_parameters(previous: Gaussians, config: MotionConfig, lifted: Lift 
         start = lifted.displacement
         if config.learn_confidence:
             if config.lift_confidence:
-                parameters["logit_confidence"] = mi.TensorXf(lifted.logit_confidence)
+                kept = np.asarray(previous.logit_confidence) - _FORGOTTEN
+                parameters["logit_confidence"] = mi.TensorXf(np.maximum(lifted.logit_confidence, kept))
             # The gate would shrink what the flow says; who hardly moves may stay shrunk.
             gate = np.asarray(sigmoid(parameters["logit_confidence"].array))
             start = start / np.maximum(gate, _LEAST_GATE)[:, None]
