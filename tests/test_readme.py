@@ -48,6 +48,18 @@ def test_speed_is_that_of_the_committed_benchmark():
         assert f"| {run['step_ms']:.0f} ms | {run['ratio_to_yardstick']:.2f} x | {plain} |" in README
 
 
+def test_seconds_a_frame_are_those_of_the_committed_benchmark():
+    found = json.loads((ROOT / "benchmarks/results/frame_speed.json").read_text(encoding="utf-8"))
+    big, small = ([found[size]["runs"][f"default, {n} epochs"] for n in (1, 2)] for size in ("n3dv", "small"))
+    text = " ".join(README.split())
+    assert f"of whose pixels {100 * big[0]['pixels']:.0f} % have to be drawn, one pass over the views" in text
+    assert (
+        f"takes {big[0]['seconds']:.1f} s a frame, flow and packet included, two passes {big[1]['seconds']:.1f} s"
+        in text
+    )
+    assert f"640x480 {small[0]['seconds']:.1f} s and {small[1]['seconds']:.1f} s" in text
+
+
 def test_every_command_of_the_readme_exists():
     from morgs_mi.cli import Demo, Eval, Export, Fit, Info, Render, Synth, View
 
