@@ -2,16 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from math import inf, nan
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from morgs_mi.evaluate.method_cells import DEFAULT
 from morgs_mi.evaluate.report import blank_figure, label_points, markdown, save_figure
 from morgs_mi.evaluate.tables import figure
 
-__all__ = ["ablation_table", "best_rows", "epochs_table", "key_views_table", "method_page", "plot_method"]
+__all__ = [
+    "ablation_table",
+    "aims_table",
+    "best_rows",
+    "epochs_table",
+    "gains_table",
+    "key_views_table",
+    "method_page",
+    "plot_method",
+]
 
 Row = Mapping[str, Any]
 
@@ -34,6 +45,15 @@ _PANELS = (
     ("motion error where things move, px", "motion_error_moving", "cue"),
     ("3D motion error, share of the true length", "motion_3d_relative_error", None),
 )
+# What is compared at equal rates: presets with something, and without.
+_GAINS = (
+    ("motion", "ml", "baseline"),
+    ("offset", "ml-mo", "ml"),
+    ("confidence", "ml-mo-mc", "ml-mo"),
+    ("`paper`, to `baseline`", "paper", "baseline"),
+    ("`ml-mo-mc`, to `paper`", "ml-mo-mc", "paper"),
+)
+_GAINED = ("psnr", "psnr_moving", "motion_error_moving")
 
 
 def best_rows(clip: Mapping[str, Any]) -> list[Row]:
@@ -62,10 +82,37 @@ def key_views_table(clip: Mapping[str, Any]) -> str:
     return _table(("", "key views"), rows, lambda row: (titles[row["preset"]], str(row["key_views"])))
 
 
+def gains_table(clips: Sequence[Mapping[str, Any]]) -> str:
+    """Return what parts add at rates of 1x: PSNR, whole and where things move, in dB, and motion error there in px."""
+    table = []
+    for clip in clips:
+        rows = {(row["preset"], row["epochs"]): row["mean"] for row in clip["rows"] if row["rates"] == 1}
+        for epochs in sorted({epochs for _, epochs in rows}):
+            cells = []
+            for _, preset, without in _GAINS:
+                gains = [_score(rows, (preset, epochs), n) - _score(rows, (without, epochs), n) for n in _GAINED]
+                cells.append(" / ".join(f"{gain:+.2f}" if _known(gain) else "-" for gain in gains))
+            table.append((clip["name"], str(epochs), *cells))
+    return markdown(("clip", "epochs", *(words for words, *_ in _GAINS)), table, 2)
+
+
+def aims_table(clips: Sequence[Mapping[str, Any]]) -> str:
+    """Return what is asked of `default` and what it does, at the presets' best rates; bold where it is reached."""
+    columns = [list(_aims(clip)) for clip in clips]
+    table = []
+    for aims in zip(*columns, strict=True):
+        words, low, high, _ = aims[0]
+        asked = f"at most {high:g}" if low == -inf else f"at least {low:g}" if high == inf else f"{low:g} to {high:g}"
+        cells = (f"**{figure(found, 2)}**" if low <= found <= high else figure(found, 2) for *_, found in aims)
+        table.append((words, asked, *cells))
+    return markdown(("", "aim", *(clip["name"] for clip in clips)), table, 2)
+
+
 def method_page(result: Mapping[str, Any]) -> str:
     """Return all tables of all clips in Markdown; docs/method.md says how to read them."""
-    epochs, parts = result["table_epochs"], []
-    for clip in result["clips"]:
+    clips, epochs = result["clips"], result["table_epochs"]
+    parts = [f"## What the parts add\n\n{gains_table(clips)}", f"## Aims\n\n{aims_table(clips)}"]
+    for clip in clips:
         size = f"{clip['views']} views of {clip['width']}x{clip['height']}, {clip['frames']} frames"
         seeds = clip["rows"][0]["runs"]
         spread = "one run" if seeds == 1 else f"mean ± standard deviation of {seeds} runs"
@@ -104,6 +151,40 @@ def plot_method(result: Mapping[str, Any], path: str | Path) -> None:
     handles = {label: line for axis in grid.flat for line, label in zip(*axis.get_legend_handles_labels(), strict=True)}
     drawing.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=8, fontsize=9)
     save_figure(drawing, path)
+
+
+def _aims(clip: Mapping[str, Any]) -> Iterator[tuple[str, float, float, float]]:
+    """Yield each aim: what it is, the lowest and the highest that is asked, and the figure, NaN where unknown."""
+    rows = {(row["preset"], row["epochs"]): row["mean"] for row in best_rows(clip)}
+
+    def score(name: str, epochs: int = 8, preset: str = DEFAULT) -> float:
+        return _score(rows, (preset, epochs), name)
+
+    def share(name: str) -> float:
+        return score(name) / score(name, preset="baseline")
+
+    pictures = (("PSNR", "psnr"), ("PSNR where things move", "psnr_moving"))
+    for epochs, asked in ((2, (1.5, 3)), (8, (0.5, 1))):
+        for (words, name), low in zip(pictures, asked, strict=True):
+            gain = score(name, epochs) - score(name, epochs, "baseline")
+            yield f"{words} at {epochs} epochs over `baseline`, dB", low, inf, gain
+    for words, name in pictures:
+        gain = score(name, 2) - score(name, 8, "paper")
+        yield f"{words} at 2 epochs over `paper` at 8, dB", 0, inf, gain
+    cue = clip["cue"]["error"] if clip["cue"] else nan
+    yield "motion error as a share of the flow's own", -inf, 1.2, score("motion_error_moving") / cue
+    yield "motion error as a share of `baseline`'s", -inf, 0.33, share("motion_error_moving")
+    yield "motion error in 3D as a share of `baseline`'s", -inf, 0.33, share("motion_3d_error")
+    yield "IoU of confidence", 0.8, inf, score("confidence_iou")
+    yield "mTV as a share of `baseline`'s", -inf, 1, share("mtv")
+    yield "mTV as a share of the recording's", 0.9, 1.1, score("mtv") / score("mtv_input")
+    yield "slope, dB per frame", -0.01, inf, score("psnr_slope")
+
+
+def _score(rows: Mapping[tuple[str, int], Mapping[str, Any]], setting: tuple[str, int], name: str) -> float:
+    """Return a setting's mean, NaN where it is unknown."""
+    value = rows.get(setting, {}).get(name)
+    return nan if value is None else value
 
 
 def _draw_line(axis: Any, preset: str, name: str, rows: Sequence[Row]) -> None:

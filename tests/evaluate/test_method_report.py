@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,15 @@ from morgs_mi.capture.synth import synthesize
 from morgs_mi.evaluate import method_cells
 from morgs_mi.evaluate.method_cells import Cell, Clip, method_version, scores_of
 from morgs_mi.evaluate.method_report import MethodReportConfig, aggregate, cells_of, report_method
-from morgs_mi.evaluate.method_tables import ablation_table, best_rows, epochs_table, key_views_table, method_page
+from morgs_mi.evaluate.method_tables import (
+    ablation_table,
+    aims_table,
+    best_rows,
+    epochs_table,
+    gains_table,
+    key_views_table,
+    method_page,
+)
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.stream_loop import StreamConfig
 
@@ -135,6 +144,24 @@ def test_tables_are_whole(interrupted):
         assert "nan" not in table
 
 
+def test_gains_are_differences_at_equal_rates_and_aims_at_the_best():
+    def row(preset: str, epochs: int, rates: float, best: bool, psnr: float, error: float) -> dict:
+        mean = {"psnr": psnr, "psnr_moving": psnr - 10, "motion_error_moving": error, "mtv": None}
+        return {"preset": preset, "epochs": epochs, "rates": rates, "best": best, "mean": mean}
+
+    rows = [row("baseline", 8, 1, False, 30.0, 2.0), row("baseline", 8, 4, True, 31.0, 3.0)]
+    rows += [row("ml", 8, 1, True, 32.5, 1.5), row("default", 8, 2, True, 33.0, 0.9), row("default", 2, 1, True, 31, 1)]
+    clip = {"name": "balls", "rows": rows, "cue": {"error": 0.5}}
+    gains = [line.split(" | ") for line in gains_table([clip]).splitlines()]
+    assert gains[3][:4] == ["| balls", "8", "+2.50 / +2.50 / -0.50", "- / - / -"]
+    aims = {line.split(" | ")[0]: line.split(" | ")[1:] for line in aims_table([clip]).splitlines()}
+    assert aims["| PSNR at 8 epochs over `baseline`, dB"] == ["at least 0.5", "**2.00** |"]
+    assert aims["| PSNR at 2 epochs over `baseline`, dB"] == ["at least 1.5", "- |"]
+    assert aims["| motion error as a share of the flow's own"] == ["at most 1.2", "1.80 |"]
+    assert aims["| motion error as a share of `baseline`'s"] == ["at most 0.33", "**0.30** |"]
+    assert aims["| mTV as a share of the recording's"] == ["0.9 to 1.1", "- |"]
+
+
 def test_another_version_or_setting_is_fitted_again(clip, tmp_path, monkeypatch):
     fits = []
     monkeypatch.setattr(method_cells, "_first_frame", lambda *_: None)
@@ -249,3 +276,15 @@ def test_the_documentation_names_every_figure(interrupted):
     row = found["rows"][0]
     for names in (result, found, row, row["mean"], row["by_frame"], found["scratch"][0], found["cue"]):
         assert [name for name in names if f"`{name}`" not in text] == []
+
+
+def test_the_documentation_quotes_the_committed_figures():
+    result = json.loads((ROOT / "benchmarks/results/method_report.json").read_text(encoding="utf-8"))
+    text, tables = (ROOT / "docs/method.md").read_text(encoding="utf-8"), method_page(result).strip()
+    assert tables in text
+    # What is said about them holds no figure of its own.
+    (found,) = re.findall(r"^## What was found\n(.*?)^## ", text, re.DOTALL | re.MULTILINE)
+    assert set(re.findall(r"\d+\.\d+", found)) <= set(re.findall(r"\d+\.\d+", tables))
+    settings = result["settings"]
+    assert f"{settings['frames']} frames" in found
+    assert f"{settings['seeds']} seeds" in found
