@@ -35,8 +35,7 @@ NOISE_FLOOR = 0.2
 
 # The cost of GrabCut and superpixels grows with the number of pixels and a mask is only a guide: objects, not hairs.
 REFINED_WIDTH = 320
-
-SUPERPIXEL_SIDE = 8
+SUPERPIXEL_SIDE = 8  # pixels of that width
 # Flow bleeds outwards, onto what stands still beside an object: a bare majority would keep all of that.
 SUPERPIXEL_SHARE = 0.75
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -137,3 +140,21 @@ def test_unreliable_pixels_are_static():
 def test_bad_input_is_named(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def test_documented_figures_are_those_of_the_committed_result():
+    root = Path(__file__).parents[2]
+    clips = json.loads((root / "benchmarks/results/masks.json").read_text(encoding="utf-8"))["clips"]
+    text = (root / "docs/masks.md").read_text(encoding="utf-8")
+
+    def cell(row: dict) -> str:
+        return f"{row['iou']:.2f} ({row['found']:.2f}, {row['true']:.2f})"
+
+    lines = [[f"`{clip['name']}`" for clip in clips]]
+    lines += [[cell(clip["masks"][method]) for clip in clips] for method in (*MASK_METHODS, "lifted")]
+    for start in ("lifted", "as before"):
+        for method in clips[0]["loops"][start]:
+            rows = [clip["loops"][start][method]["held_out"] for clip in clips]
+            lines.append([f"{cell(row)}, {row['psnr_moving']:.2f} dB" for row in rows])
+    for line in lines:
+        assert f"| {' | '.join(line)} |" in text
