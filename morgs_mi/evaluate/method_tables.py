@@ -53,6 +53,8 @@ _GAINS = (
     ("`paper`, to `baseline`", "paper", "baseline"),
     ("`ml-mo-mc`, to `paper`", "ml-mo-mc", "paper"),
 )
+# Has all parts, as what is the default has.
+_WHOLE = "ml-mo-mc"
 _GAINED = ("psnr", "psnr_moving", "motion_error_moving")
 
 
@@ -97,7 +99,7 @@ def gains_table(clips: Sequence[Mapping[str, Any]]) -> str:
 
 
 def aims_table(clips: Sequence[Mapping[str, Any]]) -> str:
-    """Return what is asked of `default` and what it does, at the presets' best rates; bold where it is reached."""
+    """Return what is asked of the method and what it does, at the presets' best rates; bold where it is reached."""
     columns = [list(_aims(clip)) for clip in clips]
     table = []
     for aims in zip(*columns, strict=True):
@@ -156,12 +158,13 @@ def plot_method(result: Mapping[str, Any], path: str | Path) -> None:
 def _aims(clip: Mapping[str, Any]) -> Iterator[tuple[str, float, float, float]]:
     """Yield each aim: what it is, the lowest and the highest that is asked, and the figure, NaN where unknown."""
     rows = {(row["preset"], row["epochs"]): row["mean"] for row in best_rows(clip)}
+    whole = DEFAULT if any(preset == DEFAULT for preset, _ in rows) else _WHOLE
 
-    def score(name: str, epochs: int = 8, preset: str = DEFAULT) -> float:
+    def score(name: str, epochs: int = 8, preset: str = whole) -> float:
         return _score(rows, (preset, epochs), name)
 
     def share(name: str) -> float:
-        return score(name) / score(name, preset="baseline")
+        return _share(score(name), score(name, preset="baseline"))
 
     pictures = (("PSNR", "psnr"), ("PSNR where things move", "psnr_moving"))
     for epochs, asked in ((2, (1.5, 3)), (8, (0.5, 1))):
@@ -172,12 +175,12 @@ def _aims(clip: Mapping[str, Any]) -> Iterator[tuple[str, float, float, float]]:
         gain = score(name, 2) - score(name, 8, "paper")
         yield f"{words} at 2 epochs over `paper` at 8, dB", 0, inf, gain
     cue = clip["cue"]["error"] if clip["cue"] else nan
-    yield "motion error as a share of the flow's own", -inf, 1.2, score("motion_error_moving") / cue
+    yield "motion error as a share of the flow's own", -inf, 1.2, _share(score("motion_error_moving"), cue)
     yield "motion error as a share of `baseline`'s", -inf, 0.33, share("motion_error_moving")
     yield "motion error in 3D as a share of `baseline`'s", -inf, 0.33, share("motion_3d_error")
     yield "IoU of confidence", 0.8, inf, score("confidence_iou")
     yield "mTV as a share of `baseline`'s", -inf, 1, share("mtv")
-    yield "mTV as a share of the recording's", 0.9, 1.1, score("mtv") / score("mtv_input")
+    yield "mTV as a share of the recording's", 0.9, 1.1, _share(score("mtv"), score("mtv_input"))
     yield "slope, dB per frame", -0.01, inf, score("psnr_slope")
 
 
@@ -185,6 +188,10 @@ def _score(rows: Mapping[tuple[str, int], Mapping[str, Any]], setting: tuple[str
     """Return a setting's mean, NaN where it is unknown."""
     value = rows.get(setting, {}).get(name)
     return nan if value is None else value
+
+
+def _share(part: float, whole: float) -> float:
+    return part / whole if whole else nan
 
 
 def _draw_line(axis: Any, preset: str, name: str, rows: Sequence[Row]) -> None:

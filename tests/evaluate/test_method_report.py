@@ -160,6 +160,9 @@ def test_gains_are_differences_at_equal_rates_and_aims_at_the_best():
     assert aims["| motion error as a share of the flow's own"] == ["at most 1.2", "1.80 |"]
     assert aims["| motion error as a share of `baseline`'s"] == ["at most 0.33", "**0.30** |"]
     assert aims["| mTV as a share of the recording's"] == ["0.9 to 1.1", "- |"]
+    others = [{**row, "preset": row["preset"].replace("default", "ml-mo-mc")} for row in rows]
+    assert aims_table([{**clip, "rows": others}]) == aims_table([clip])
+    assert "flow's own | at most 1.2 | - |" in aims_table([{**clip, "cue": {"error": 0.0}}])  # of a perfect flow
 
 
 def test_another_version_or_setting_is_fitted_again(clip, tmp_path, monkeypatch):
