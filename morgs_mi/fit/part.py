@@ -5,7 +5,8 @@ deviations there. Who is responsible for a change is told by the views together:
 |b_iv and c_v| / |b_iv| over the V_i views that look at i exceeds 5/4, but at least V_i / 10 and at most V_i / 2. What
 is hidden now and then by something that moves has changed around it in one view, but not in the others. A change that
 nobody would explain so, such as something new before a still background, makes all those responsible who lie on it with
-at least half of their box changed.
+at least half of their box changed. Fewer than five views have too little in common to compare: there a sum of a tenth
+is enough.
 
 A view is drawn where somebody who may change is, and left out where nobody is. The others stand still behind.
 """
@@ -34,6 +35,7 @@ _LEAST_VIEWS, _LEAST_SHARE, _MOST_SHARE, _FILLED = 1.25, 0.1, 0.5, 0.5
 # Two standard deviations of an opaque Gaussian, of whose extent three and a third reach the alpha cut-off.
 _CORE = 0.6
 _CELL = 4
+_MANY_VIEWS = 5
 # Pixels that nobody explains, in a cluster of 5x5 at least.
 _LEAST_CLUSTER = 5
 
@@ -93,7 +95,9 @@ def changing_part(
         share, visible = _filled(box, change)
         filled, seen = filled + share, seen + visible
         shares.append(share)
-    chosen = filled > np.clip(_LEAST_VIEWS, _LEAST_SHARE * seen, _MOST_SHARE * np.maximum(seen, 1))
+    least = np.clip(_LEAST_VIEWS, _LEAST_SHARE * seen, _MOST_SHARE * np.maximum(seen, 1))
+    # A few views that look from far apart have little to compare: one that has seen a change is enough.
+    chosen = filled > (least if len(cameras) >= _MANY_VIEWS else _LEAST_SHARE)
     drawn = [_painted(box, chosen, change.shape) for box, change in zip(boxes, changes, strict=True)]
     more = np.zeros(len(gaussians), bool)
     for box, change, share, known in zip(boxes, changes, shares, drawn, strict=True):
