@@ -33,6 +33,8 @@ class CodecConfig:
     """What an opacity may be off where it is most sensitive, at 0.5."""
     error_confidence: float = 0.05
     """What a confidence may be off where it is most sensitive, at 0.5: it gates the fit, so all else shows its loss."""
+    offset: bool = False
+    """Also write the learned offset of what moves, for viewing: nothing is decoded from it but itself."""
     target_size: int = 0
     """Bytes that a later frame may take: it is coded more coarsely until it fits. 0: as many as the quality takes."""
     keyframe_interval: int = 30

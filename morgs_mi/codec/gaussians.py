@@ -54,7 +54,8 @@ class CodedFrame:
         grid: its N Gaussians as integers.
         ids: uint32 [N], ascending: which Gaussian each one is, from its birth to its death.
         next_id: what the next to be born gets.
-        gaussians: the same as numbers; `motion` is the displacement since the frame before, zero where there is none.
+        gaussians: the same as numbers; `motion` is the displacement since the frame before, zero where there is none,
+            `offset` its learned part, None if the packet does not tell.
     """
 
     frame: int
@@ -82,7 +83,7 @@ def keyframe_packet(
     """Return the packet that states every attribute of `gaussians`, which are new: their numbers count from zero.
 
     Args:
-        gaussians: N Gaussians; their `motion` is not written.
+        gaussians: N Gaussians; their `motion` and `offset` are not written.
         frame: index of the video frame.
         cameras: on whose screens errors count.
         config: what may be off.
@@ -117,7 +118,7 @@ def residual_packet(
 
     Args:
         previous: state that the decoder has, N Gaussians.
-        gaussians: of the frame after it, N'.
+        gaussians: of the frame after it, N'; their `offset` counts with `config.offset`, where positions change.
         source: int [N'], see above; None if nobody was born or died.
         cameras: on whose screens the errors of those born count.
         config: what may be off.
@@ -143,27 +144,42 @@ def residual_packet(
     dead = np.ones(len(grid), bool)
     dead[survivors] = False
 
-    def columns(coarseness: int) -> Iterator[np.ndarray]:
+    def rounded(coarseness: int) -> np.ndarray:
         r, scaled = np.zeros((len(change), len(grid)), np.int32), change / step_sizes(np.array(coarseness))
         for name, at in grid.columns.items():
             scaled[at][:, np.abs(scaled[at]).max(0) < (_LEAST_COLOR if name == "color" else _LEAST)] = 0
         r[:, rows] = np.clip(np.rint(scaled, out=scaled), 1 - LIMIT, LIMIT - 1, out=scaled)
-        return columns_of_change(r, dead, grid)
+        return r
+
+    def offsets(r: np.ndarray, coarseness: int) -> Iterator[np.ndarray]:
+        moved = np.flatnonzero(r[grid.columns["position"]].any(0)[survivors])
+        offset = np.zeros((len(gaussians), 3)) if gaussians.offset is None else np.asarray(gaussians.offset)
+        real = offset[moved] / _offset_steps(grid.select(survivors[moved]), coarseness)
+        yield from np.clip(np.rint(real), 1 - LIMIT, LIMIT - 1).astype(np.int32).T
+
+    def columns(coarseness: int) -> Iterator[np.ndarray]:
+        r = rounded(coarseness)
+        yield from columns_of_change(r, dead, grid)
+        if config.offset:
+            yield from offsets(r, coarseness)
 
     coarseness = least = round(4 * np.log2(config.birth_precision))
     if config.target_size:
         coarseness = _fitting(columns, least, config.target_size)
     while True:
-        writer = ColumnWriter()
-        for column in columns(coarseness):
+        r, writer = rounded(coarseness), ColumnWriter()
+        for column in columns_of_change(r, dead, grid):
             writer.put(column)
         if born is not None:
             _put_grid(writer, born)
-        code = _padded(writer.words(), births)
-        if not config.target_size or code.nbytes <= config.target_size or coarseness >= _COARSEST:
+        codes = {"code": _padded(writer.words(), births)}
+        if config.offset:
+            codes["offset"] = _words(offsets(r, coarseness))
+        size = sum(code.nbytes for code in codes.values())
+        if not config.target_size or size <= config.target_size or coarseness >= _COARSEST:
             break
         coarseness += 1
-    arrays = {"parent": previous.digest, "head": np.array([births, coarseness], np.uint32), "code": code}
+    arrays = {"parent": previous.digest, "head": np.array([births, coarseness], np.uint32), **codes}
     return Packet(PacketKind.RESIDUAL, previous.frame + 1, arrays)
 
 
@@ -179,7 +195,8 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
     """
     where = f"packet of frame {packet.frame}"
     names = {"head", "code"} | ({"parent"} if packet.kind == PacketKind.RESIDUAL else set())
-    if packet.arrays.keys() != names:
+    optional = {"offset"} if packet.kind == PacketKind.RESIDUAL else set()
+    if packet.arrays.keys() - optional != names:
         raise ValueError(f"{where}: expected the arrays {sorted(names)}, got {sorted(packet.arrays)}.")
     if any(array.ndim != 1 for array in packet.arrays.values()):
         raise ValueError(f"{where}: its arrays must have one axis each.")
@@ -246,11 +263,29 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
     motion = np.zeros((len(survivors) + births, 3), np.float32)
     before = np.asarray(previous.gaussians.means)[survivors]
     motion[: len(survivors)] = new.real("position").astype(np.float32) - before
+    offset = None
+    if "offset" in packet.arrays:
+        offset, at, words = np.zeros_like(motion), grid.columns["position"], ColumnReader(packet.arrays["offset"])
+        moved = np.flatnonzero((new.values[:, at] != grid.values[survivors, at]).any(1))
+        r = np.stack([words.take(len(moved)) for _ in range(3)], axis=1)
+        offset[moved] = r * _offset_steps(new.select(moved), coarseness)
     if births:
         new = new.concatenate(_taken_grid(reader, births, grid.degree, grid.has_confidence))
     ids = np.concatenate([previous.ids[survivors], previous.next_id + np.arange(births, dtype=np.uint32)])
-    gaussians = new.gaussians(motion)
+    gaussians = new.gaussians(motion, offset)
     return CodedFrame(packet.frame, new, ids.astype(np.uint32), previous.next_id + births, gaussians)
+
+
+def _offset_steps(grid: Grid, coarseness: int) -> np.ndarray:
+    """Return by how much the integers of an offset count, float64 [N, 1], world units: as those of a displacement."""
+    return grid.steps("position") * step_sizes(np.array(coarseness))
+
+
+def _words(columns: Iterable[np.ndarray]) -> np.ndarray:
+    writer = ColumnWriter()
+    for column in columns:
+        writer.put(column)
+    return writer.words()
 
 
 def _put_grid(writer: ColumnWriter, grid: Grid) -> None:

@@ -91,8 +91,11 @@ class Grid:
         both = {n: np.concatenate([getattr(self, n), getattr(other, n)]) for n in ("values", "exponents", "pivots")}
         return replace(self, **both)
 
-    def gaussians(self, motion: np.ndarray | None = None) -> Gaussians:
-        """Return what the integers stand for, with a displacement float32 [N, 3], zero if it is not given."""
+    def gaussians(self, motion: np.ndarray | None = None, offset: np.ndarray | None = None) -> Gaussians:
+        """Return what the integers stand for, with a displacement and its learned part float32 [N, 3].
+
+        Without a displacement nothing has moved; without an offset nothing is known of it.
+        """
         u, v, w = np.ascontiguousarray(self.real("rotation").T)
         length = np.sqrt(((1 + u * u) + v * v) + w * w)
         quats = np.empty((len(self), 4), np.float32)
@@ -111,6 +114,7 @@ class Grid:
             sh_coeffs=sh.astype(np.float32).reshape(len(self), (self.degree + 1) ** 2, 3),
             motion=np.zeros((len(self), 3), np.float32) if motion is None else motion,
             logit_confidence=self.real("confidence")[:, 0].astype(np.float32) if self.has_confidence else None,
+            offset=offset,
         )
 
 
@@ -143,7 +147,7 @@ def attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
     Raises:
         ValueError: one is not finite.
     """
-    raw = {name: value for name, value in gaussians.numpy().items() if name != "motion"}
+    raw = {name: value for name, value in gaussians.numpy().items() if name not in ("motion", "offset")}
     for name, value in raw.items():
         if not np.isfinite(value).all():
             row = np.argwhere(~np.isfinite(value))[0][0]

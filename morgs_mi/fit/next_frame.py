@@ -31,7 +31,7 @@ class NextFrame:
     """What a frame has become.
 
     Attributes:
-        gaussians: M of them.
+        gaussians: M of them, with the flow-guided `motion` and the learned `offset` that moved them.
         source: int [M], each one's index among the N of the frame before, survivors first in ascending order; -1 for
             those born, who come last.
         losses: means over the last pass over the views, by name.

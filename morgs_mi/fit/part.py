@@ -115,7 +115,8 @@ def changing_part(
 
 def standing_still(gaussians: Gaussians) -> Gaussians:
     """Return Gaussians that have not moved since the frame before."""
-    return replace(gaussians, motion=np.zeros((len(gaussians), 3)))
+    nothing = np.zeros((len(gaussians), 3))
+    return replace(gaussians, motion=nothing, offset=nothing)
 
 
 def _boxes(gaussians: Gaussians, camera: Camera, render: RenderConfig) -> tuple[Any, ...]:

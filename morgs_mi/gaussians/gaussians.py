@@ -135,6 +135,7 @@ class Gaussians:
         sh_coeffs: [N, K, 3] with K = (degree + 1)^2; colour = max(0.5 + SH(mean - camera), 0) as in 3DGS.
         motion: displacement since the last frame [N, 3] in world units, or None.
         logit_confidence: motion confidence [N] before the sigmoid, or None.
+        offset: the learned part of that displacement [N, 3] beside the one that flow guides (eq. 8), or None.
 
     Raises:
         ValueError: a shape that does not agree with `means`, or K that is no square of 1 to 4.
@@ -147,6 +148,7 @@ class Gaussians:
     sh_coeffs: Any
     motion: Any = None
     logit_confidence: Any = None
+    offset: Any = None
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -155,7 +157,7 @@ class Gaussians:
                 object.__setattr__(self, f.name, _aligned_tensor(value))
         N = len(self)
         tails = {"means": (3,), "log_scales": (3,), "quats": (4,), "logit_opacities": ()}
-        tails |= {"motion": (3,), "logit_confidence": ()}
+        tails |= {"motion": (3,), "logit_confidence": (), "offset": (3,)}
         for name, tail in tails.items():
             value = getattr(self, name)
             if value is not None and tuple(value.shape) != (N, *tail):
@@ -236,6 +238,6 @@ class Gaussians:
         if any(column.keys() != columns[0].keys() for column in columns):
             raise ValueError(
                 "Gaussians.concatenate(): all parts must carry the same attributes, got "
-                f"{[sorted(column) for column in columns]}; drop or add `motion` and `logit_confidence`."
+                f"{[sorted(column) for column in columns]}; drop or add `motion`, `offset` and `logit_confidence`."
             )
         return Gaussians(**{k: np.concatenate([column[k] for column in columns]) for k in columns[0]})

@@ -48,7 +48,7 @@ def colors_towards(gaussians: Gaussians, eye: np.ndarray) -> np.ndarray:
 
 
 def rotated(gaussians: Gaussians, R: np.ndarray) -> Gaussians:
-    """Return the same Gaussians in axes turned by R [3, 3]: centres, rotations, colours and motion.
+    """Return the same Gaussians in axes turned by R [3, 3]: centres, rotations, colours, motion and offset.
 
     A colour that was seen along d is now seen along R d. The harmonics of one degree stay among themselves under a
     rotation, so their new coefficients are found exactly, from as many directions as make the basis invertible.
@@ -57,11 +57,11 @@ def rotated(gaussians: Gaussians, R: np.ndarray) -> Gaussians:
     turn = Rotation.from_matrix(R)
     quats = (turn * Rotation.from_quat(unit_quats(gaussians), scalar_first=True)).as_quat(scalar_first=True)
     raw = gaussians.numpy()
-    motion = None if gaussians.motion is None else raw["motion"] @ R.T
+    vectors = {name: raw[name] @ R.T for name in ("means", "motion", "offset") if name in raw}
     # Golden spiral: evenly spread directions, twice as many as the 16 functions of degree 3.
     z, angle = 1 - (2 * np.arange(32) + 1) / 32, np.pi * (1 + 5**0.5) * np.arange(32)
     directions = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
     degree = gaussians.sh_degree
     change = np.linalg.pinv(sh_basis(directions, degree)) @ sh_basis(directions @ R, degree)
     coeffs = np.einsum("kl,nlc->nkc", change, raw["sh_coeffs"])
-    return replace(gaussians, means=raw["means"] @ R.T, quats=quats, sh_coeffs=coeffs, motion=motion)
+    return replace(gaussians, quats=quats, sh_coeffs=coeffs, **vectors)

@@ -65,7 +65,7 @@ def residual_parameters(previous: Gaussians, config: MotionConfig, lifted: Lift 
 
 
 def apply_residual(previous: Gaussians, parameters: Mapping[str, Any], config: MotionConfig) -> Gaussians:
-    """Return A_{t-1} + m R_t (eq. 12), whose `motion` is the gated flow-guided part alone.
+    """Return A_{t-1} + m R_t (eq. 12), whose `motion` and `offset` are the gated parts of what the centres have moved.
 
     Args:
         previous: N Gaussians of the frame before.
@@ -83,13 +83,14 @@ def apply_residual(previous: Gaussians, parameters: Mapping[str, Any], config: M
         return mi.TensorXf(repeated(gate, width) * change.array, tuple(change.shape))
 
     motion = gated("motion")
-    shift = motion + gated("offset") if "offset" in parameters else motion
+    offset = gated("offset") if "offset" in parameters else dr.zeros(mi.TensorXf, tuple(motion.shape))
     sh_dc, sh_rest = split_sh(previous.sh_coeffs)
     sh = join_sh(sh_dc + gated("sh_dc"), None if sh_rest is None else sh_rest + gated("sh_rest"))
     static = {name: getattr(previous, name) + gated(name) for name in _STATIC}
     confidence = previous.logit_confidence if logit is None else logit
+    means = previous.means + (motion + offset)
     return replace(
-        previous, means=previous.means + shift, sh_coeffs=sh, motion=motion, logit_confidence=confidence, **static
+        previous, means=means, sh_coeffs=sh, motion=motion, offset=offset, logit_confidence=confidence, **static
     )
 
 

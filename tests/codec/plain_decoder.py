@@ -128,6 +128,16 @@ def residual(state, payload):
                 r = code.column(len(changed))
                 values[changed, column] += np.rint(r * F[coarseness % 4] * 2.0 ** (coarseness // 4)).astype(np.int64)
     new = {**state, **{name: state[name][~dead] for name in ("ids", "pivots", "exponents")}, "values": values[~dead]}
+    new.pop("offset", None)
+    if "offset" in found:
+        new["offset"] = np.zeros((len(new["ids"]) + births, 3))
+        moved = np.flatnonzero((new["values"][:, :3] != state["values"][~dead, :3]).any(1))
+        code_of_offsets = RangeCode(found["offset"])
+        for axis in range(3):
+            for i, r in zip(moved, code_of_offsets.column(len(moved)), strict=True):
+                e = int(new["exponents"][i, 0])
+                step = (F[e % 4] * 2.0 ** (e // 4)) * (F[coarseness % 4] * 2.0 ** (coarseness // 4))
+                new["offset"][i, axis] = int(r) * step
     if births:
         parts = born(code, births, state["degree"], state["confidence"])
         for name, part in zip(("pivots", "exponents", "values"), parts, strict=True):
@@ -157,6 +167,8 @@ def numbers(state):
     found["sh_coeffs"] = real[:, 10:end].reshape(len(real), -1, 3)
     if state["confidence"]:
         found["logit_confidence"] = real[:, end]
+    if "offset" in state:
+        found["offset"] = state["offset"]
     return {name: value.astype(np.float32) for name, value in found.items()}
 
 

@@ -7,6 +7,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,7 +46,7 @@ class Clip(NamedTuple):
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
     """A stream of a handful of Gaussians that are born and die, with keyframes to start from."""
     path, rng = tmp_path_factory.mktemp("clip") / "s", np.random.default_rng(0)
-    config = CodecConfig(quality=0.3)
+    config = CodecConfig(quality=0.3, offset=True)
     with StreamWriter(path, CAMERAS[:1], 25, {"num_frames": FRAMES}) as writer:
         packet = keyframe_packet(cloud(6, 0), 0, CAMERAS, config)
         states = [decode(None, packet)]
@@ -54,6 +55,7 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
             before = states[-1]
             alive = np.arange(1, len(before))
             now = Gaussians.concatenate([jittered(before.gaussians, rng).select(alive), cloud(1, 0, seed=frame)])
+            now = replace(now, offset=rng.normal(0, 0.05, (len(now), 3)))
             packet = residual_packet(before, now, np.r_[alive, -1], CAMERAS, config)
             states.append(decode(before, packet))
             writer.write(packet)

@@ -51,7 +51,7 @@ def cloud(N: int = 60, degree: int = 1, confidence: bool = True, seed: int = 0) 
 
 def jittered(gaussians: Gaussians, rng: np.random.Generator, share: float = 0.4) -> Gaussians:
     """Move some of the Gaussians, in all attributes."""
-    raw = {name: value for name, value in gaussians.numpy().items() if name != "motion"}
+    raw = {name: value for name, value in gaussians.numpy().items() if name not in ("motion", "offset")}
     who = rng.random(len(gaussians)) < share
     change = {n: 0.05 * rng.normal(size=v.shape) * who.reshape(-1, *[1] * (v.ndim - 1)) for n, v in raw.items()}
     return Gaussians(**{name: value + change[name] for name, value in raw.items()})
@@ -70,6 +70,8 @@ def run(
         births = int(rng.integers(0, 5))
         moved = jittered(state.gaussians, rng).select(alive)
         now = Gaussians.concatenate([moved, cloud(births, degree, seed=frame)]) if births else moved
+        if config is not None and config.offset:
+            now = replace(now, offset=np.random.default_rng(frame).normal(0, 0.02, (len(now), 3)))
         source = np.concatenate([alive, np.full(births, -1)])
         packets.append(residual_packet(state, now, source, CAMERAS, config))
         states.append(decode(state, packets[-1]))
@@ -92,14 +94,16 @@ def assert_same(got: CodedFrame, expected: CodedFrame) -> None:
         assert np.array_equal(found[name], value), name
 
 
-def test_a_decoder_from_the_specification_gets_the_same_bits(tmp_path: Path) -> None:
-    packets, states = run(6)
+@pytest.mark.parametrize("config", [None, CodecConfig(offset=True)], ids=["", "offset"])
+def test_a_decoder_from_the_specification_gets_the_same_bits(tmp_path: Path, config: CodecConfig | None) -> None:
+    packets, states = run(6, config)
     write(tmp_path / "s", packets, states, every=3)
     plain = list(plain_decoder.states((tmp_path / "s").read_bytes()))
     assert [frame for frame, _ in plain] == [state.frame for state in states]
     for (_, found), state in zip(plain, states, strict=True):
         assert np.array_equal(found["ids"], state.ids)
         expected = state.gaussians.numpy()
+        assert plain_decoder.numbers(found).keys() == expected.keys() - {"motion"}
         for name, value in plain_decoder.numbers(found).items():
             assert np.array_equal(value, expected[name]), name
 
@@ -174,6 +178,35 @@ def test_only_what_changes_by_a_step_is_written_and_colours_by_half() -> None:
     found = decode(state, residual_packet(state, Gaussians(**raw), None, CAMERAS, config))
     assert np.flatnonzero((found.grid.values != state.grid.values).any(1)).tolist() == [7, 8, 17]
     assert np.flatnonzero(found.gaussians.numpy()["motion"].any(1)).tolist() == [7, 8]
+
+
+def test_offsets_are_told_of_those_that_move_and_change_nothing_else() -> None:
+    plain, before = run(4)
+    packets, states = run(4, CodecConfig(offset=True))
+    assert [state.gaussians.offset is None for state in states] == [True, False, False, False]
+    assert all(state.gaussians.offset is None for state in before)
+    for without, packet in zip(plain, packets, strict=True):
+        assert {"offset"} >= packet.arrays.keys() - without.arrays.keys()
+        for name, array in without.arrays.items():
+            assert np.array_equal(packet.arrays[name], array)
+    rng, state = np.random.default_rng(3), states[-1]
+    after = replace(jittered(state.gaussians, rng), offset=rng.normal(0, 0.02, (len(state), 3)))
+    found = decode(state, residual_packet(state, after, None, CAMERAS, CodecConfig(offset=True))).gaussians.numpy()
+    moved = found["motion"].any(1)
+    assert 0.2 < moved.mean() < 0.6
+    # A moved centre's step is four times that of its birth.
+    error = np.abs(found["offset"] - after.numpy()["offset"])[moved] / (4 * state.grid.steps("position")[moved])
+    assert 0.45 < error.max() <= 0.5 + 1e-4
+    assert not found["offset"][~moved].any()
+
+
+def test_offsets_count_towards_the_target() -> None:
+    state = decode(None, keyframe_packet(cloud(1500), 0, CAMERAS))
+    rng = np.random.default_rng(1)
+    after = replace(jittered(state.gaussians, rng, share=1), offset=rng.normal(0, 0.02, (1500, 3)))
+    arrays = residual_packet(state, after, None, CAMERAS, CodecConfig(target_size=8000, offset=True)).arrays
+    assert arrays["offset"].nbytes > 400
+    assert 0.75 * 8000 < arrays["code"].nbytes + arrays["offset"].nbytes <= 8000
 
 
 def test_a_decoded_state_leads_to_itself() -> None:
@@ -365,6 +398,11 @@ def with_head(packet: Packet, *head: int) -> Packet:
         (lambda _, residual: with_head(residual, 2**31, 8), "does not fit its"),
         (lambda _, residual: with_head(residual, 0, 81), "does not fit its"),
         (lambda key, _: Packet(key.kind, 0, {"head": key.arrays["head"]}), "expected the arrays"),
+        (lambda key, _: Packet(key.kind, 0, {**key.arrays, "offset": key.arrays["code"]}), "expected the arrays"),
+        (
+            lambda _, residual: Packet(residual.kind, 1, {**residual.arrays, "offset": np.full(60, 2**32 - 1, "u4")}),
+            "its code is broken",
+        ),
     ],
 )
 def test_packets_that_contradict_themselves_are_refused(change, message: str) -> None:
