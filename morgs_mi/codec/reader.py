@@ -85,6 +85,7 @@ class StreamReader:
         A frame's displacements are told by its residual, so a keyframe of that very frame is not the place.
 
         Raises:
+            TruncatedStreamError: as `index`.
             ValueError: it is a pipe, which cannot be turned back, or a packet is broken.
         """
         if self._pipe is not None:
@@ -96,12 +97,20 @@ class StreamReader:
         return self._packets(number, at)
 
     def closed(self) -> bool:
-        """Tell whether the file ends with its index; otherwise it is still written, or was cut off."""
+        """Tell whether the file ends with its index; otherwise it is still written, or was cut off.
+
+        Raises:
+            TruncatedStreamError: as `index`.
+        """
         with open(self.path, "rb") as file:
             return self._last_index(file) is not None
 
     def index(self) -> list[tuple[int, int, int]]:
-        """Return (kind, frame, offset) of every whole packet but the header, from the file's index if it has one."""
+        """Return (kind, frame, offset) of every whole packet but the header, from the file's index if it has one.
+
+        Raises:
+            TruncatedStreamError: the file has become shorter than the header that was read from it.
+        """
         with open(self.path, "rb") as file:
             if (entries := self._last_index(file)) is not None:
                 return entries
@@ -117,7 +126,10 @@ class StreamReader:
     def _last_index(self, file: BinaryIO) -> list[tuple[int, int, int]] | None:
         """Return what the index at the file's end says, None if there is none."""
         size = file.seek(0, 2)
-        file.seek(max(size - TRAILER.size, 0))
+        if size < self._first:
+            problem = f"the header ended at byte {self._first}, now the file has {size} bytes: replaced or cut off"
+            raise TruncatedStreamError(self._sentence(0, PREAMBLE.size, problem))
+        file.seek(size - TRAILER.size)
         at, magic = TRAILER.unpack(file.read(TRAILER.size))
         if magic == INDEX_MAGIC and self._first <= at < size:
             file.seek(at)

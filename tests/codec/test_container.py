@@ -205,6 +205,18 @@ def test_files_that_are_no_stream(tmp_path: Path) -> None:
     assert not (tmp_path / "t").exists()
 
 
+@pytest.mark.parametrize("length", [0, 5, 15, 16, 40])
+def test_a_file_that_becomes_shorter_than_its_header_is_named(tmp_path: Path, length: int) -> None:
+    path = tmp_path / "s"
+    write(path)
+    reader = StreamReader(path)
+    path.write_bytes(path.read_bytes()[:length])
+    sentence = rf"s: packet 0 at byte 12: the header ended at byte \d+, now the file has {length} bytes: "
+    for call in (reader.index, reader.closed, lambda: reader.near(1)):
+        with pytest.raises(TruncatedStreamError, match=sentence):
+            call()
+
+
 def test_a_full_disk_leaves_whole_packets_and_the_writer_usable(tmp_path: Path) -> None:
     path = tmp_path / "s"
     # A limit on the size of files fails a write in its middle, as a full disk does.
