@@ -16,10 +16,11 @@ from morgs_mi import cli
 from morgs_mi.capture import Camera, write_colmap, write_video
 from morgs_mi.capture.exr import read_exr
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.gaussians import keyframe_packet
+from morgs_mi.codec.gaussians import keyframe_packet, play, restated
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.stream_loop import StreamLoop
+from tests.export.streams import write_stream
 
 WIDTH, HEIGHT, FRAMES = 48, 32, 3
 NAMES = ("cam0", "cam1", "cam2")
@@ -279,6 +280,38 @@ def test_other_bad_streams(stream: Path, tmp_path: Path, capsys) -> None:
         assert status == 1
         assert_one_sentence(error, "at least one frame was expected, got none")
         assert not output.exists()
+
+
+def test_a_damaged_stream_is_salvaged_and_what_is_lost_is_named(tmp_path: Path, capsys) -> None:
+    path, new = tmp_path / "stream.morgs", tmp_path / "new.morgs"
+    states = write_stream(path, 5)
+    packets = list(StreamReader(path))
+    with StreamWriter(path, rig(), 25, {"num_frames": 5}) as writer:
+        for packet in packets:
+            writer.write(packet)
+    index, data = StreamReader(path).index(), bytearray(path.read_bytes())
+    data[index[2][2] + 40] ^= 1
+    path.write_bytes(data)
+    status, said, _ = run(capsys, "salvage", tmp_path, new)
+    assert status == 0
+    gap, behind, *_, result, lost = said.splitlines()
+    assert gap == f"{path}: bytes {index[2][2]} to {index[3][2]}: the bytes are damaged."
+    assert f"bytes {index[3][2]} to {index[4][2]}: packet of frame 3: it does not continue the state after" in behind
+    assert result == f"{new}: 2 frames, 0 to 1."
+    assert lost.startswith("3 frames cannot be played, 2 to 4: their packets are damaged, missing, or continue one")
+    assert [frame for frame, _ in play(StreamReader(new))] == [0, 1]
+
+    # Keyframes behind what is missing: it plays on.
+    with StreamWriter(path, rig(), 25, {"num_frames": 6}) as writer:
+        for state in (states[0], states[3], states[4]):
+            writer.write(restated(state))
+    status, said, _ = run(capsys, "salvage", tmp_path, new)
+    assert (status, said.splitlines()[0]) == (0, f"{new}: 3 frames, 0, 3 to 4.")
+    assert "3 frames cannot be played, 1 to 2, 5: " in said
+
+    status, _, error = run(capsys, "salvage", tmp_path, path)
+    assert status == 1
+    assert_one_sentence(error, "expected a new file, got the damaged stream itself")
 
 
 def test_a_stream_of_no_gaussians_is_black(tmp_path: Path, capsys) -> None:

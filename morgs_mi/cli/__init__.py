@@ -1,6 +1,6 @@
 """The command line, and the only argument parser.
 
-`morgs-mi synth`, `info`, `calibrate`, `fit`, `render`, `export`, `view`, `eval`, `demo` and `report`.
+`morgs-mi synth`, `info`, `calibrate`, `fit`, `render`, `export`, `view`, `eval`, `salvage`, `demo` and `report`.
 
 Results go to standard output; progress, warnings and complaints to standard error. What the user can set right is
 one sentence and exit status 1, an interruption 130; `--debug` shows where it came from. Arguments that the parser
@@ -23,7 +23,7 @@ from morgs_mi.cli.captures import Calibrate, Info, Synth
 from morgs_mi.cli.console import ERR, warn
 from morgs_mi.cli.looks import Export, View
 from morgs_mi.cli.reports import Measure
-from morgs_mi.cli.streams import Demo, Eval, Fit, Render
+from morgs_mi.cli.streams import Demo, Eval, Fit, Render, Salvage
 
 __all__ = ["main"]
 
@@ -36,6 +36,7 @@ Command = (
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
+    | Annotated[Salvage, tyro.conf.subcommand("salvage")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Measure, tyro.conf.subcommand("report")]
 )

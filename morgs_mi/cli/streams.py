@@ -1,4 +1,4 @@
-"""`morgs-mi fit`, `render`, `eval` and `demo`: from a capture to a stream, and what it is worth."""
+"""`morgs-mi fit`, `render`, `eval`, `salvage` and `demo`: from a capture to a stream, and what it is worth."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -19,7 +20,7 @@ from morgs_mi.evaluate.tables import figure, judgement_sentences, judgement_tabl
 from morgs_mi.fit.presets import PresetName, apply_preset
 from morgs_mi.stream_loop import StreamConfig
 
-__all__ = ["Demo", "Eval", "Fit", "Render"]
+__all__ = ["Demo", "Eval", "Fit", "Render", "Salvage"]
 
 
 @dataclass(frozen=True)
@@ -112,7 +113,8 @@ class Eval:
     json: Path | None = None
     """File for all figures; - prints them in place of the tables."""
     pictures: Path | None = None
-    """Folder for slice.png (one column over time), motion.png and confidence.png."""
+    """Folder for slice.png (one column over time), motion.png, confidence.png and, where the stream holds offsets,
+    offset.png."""
     lpips: Path | None = None
     """LPIPS network as ONNX with inputs in0 and in1, RGB [1, 3, H, W] from -1 to 1; none comes with the package."""
 
@@ -138,6 +140,32 @@ class Eval:
             say(f"All figures: {self.json}")
         if self.pictures is not None:
             say(f"Pictures: {self.pictures}")
+
+
+@dataclass(frozen=True)
+class Salvage:
+    """Write what still plays of a damaged stream as a new one, and name the bytes that do not."""
+
+    stream: Positional[Path]
+    """Stream file, or the folder of a fit."""
+    out: Positional[Path]
+    """The new stream file."""
+
+    def run(self) -> None:
+        from morgs_mi.codec.salvage import write_salvaged
+        from morgs_mi.evaluate.stream import open_stream
+
+        stream = open_stream(self.stream)
+        frames, gaps = write_salvaged(stream, self.out)
+        for gap in gaps:
+            say(f"{stream.path}: bytes {gap.start} to {gap.stop}: {gap.problem.rstrip('.')}.")
+        say(f"{self.out}: {len(frames)} frames, {_runs(frames)}.")
+        lost = sorted(set(range(stream.metadata.get("num_frames", max(frames) + 1))) - set(frames))
+        if lost:
+            say(
+                f"{len(lost)} frames cannot be played, {_runs(lost)}: their packets are damaged, missing, or continue "
+                "one that is; a stream plays on from the next intact keyframe."
+            )
 
 
 @dataclass(frozen=True)
@@ -181,6 +209,12 @@ def _show(result: Mapping[str, Any]) -> None:
         say(sentence)
     if not result["complete"]:
         warn(f"{result['stream']}: the fit was not finished, its stream holds {result['num_frames']} frames.")
+
+
+def _runs(numbers: Sequence[int]) -> str:
+    """Return ascending numbers in words, e.g. ``0 to 3, 7``."""
+    runs = [[n for _, n in run] for _, run in groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])]
+    return ", ".join(f"{run[0]} to {run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
 
 
 def _span(frames: Sequence[int]) -> str:

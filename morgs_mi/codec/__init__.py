@@ -9,7 +9,7 @@ from morgs_mi.codec.container import (
     encode_packet,
 )
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.codec.salvage import Gap, salvage
+from morgs_mi.codec.salvage import Gap, salvage, write_salvaged
 
 __all__ = [
     "Gap",
@@ -21,4 +21,5 @@ __all__ = [
     "decode_packet",
     "encode_packet",
     "salvage",
+    "write_salvaged",
 ]

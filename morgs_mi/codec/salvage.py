@@ -11,10 +11,25 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from morgs_mi.codec.container import HEAD, MAGIC, PAYLOAD, PREAMBLE, VERSION, PacketKind, decode_packet, open_packet
-from morgs_mi.codec.gaussians import CodedFrame, decode
+import numpy as np
 
-__all__ = ["Gap", "salvage"]
+from morgs_mi.codec.container import (
+    HEAD,
+    MAGIC,
+    PAYLOAD,
+    PREAMBLE,
+    VERSION,
+    Packet,
+    PacketKind,
+    StreamWriter,
+    decode_packet,
+    open_packet,
+)
+from morgs_mi.codec.gaussians import CodedFrame, decode
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.files import whole
+
+__all__ = ["Gap", "salvage", "write_salvaged"]
 
 # A packet begins with its kind, uint32. The header is not looked for: it has its place, and holes are full of zeros.
 _KIND = re.compile(rb"[\1-\3]\0\0\0")
@@ -44,7 +59,53 @@ def salvage(path: str | Path) -> Iterator[CodedFrame | Gap]:
     Raises:
         FileNotFoundError: there is no such file.
     """
-    data = Path(path).read_bytes()  # a map of the file would end the process if somebody cut it off meanwhile
+    last = None
+    for found in _playable(Path(path)):
+        if isinstance(found, Gap):
+            yield found
+        elif found[1].frame != last:
+            last = found[1].frame
+            yield found[1]
+
+
+def write_salvaged(stream: StreamReader, output: str | Path) -> tuple[list[int], list[Gap]]:
+    """Write what a damaged stream still says as a new one, which appears whole or not at all.
+
+    Its packets are those of the damaged one that play, as they are; behind a gap it goes on with a keyframe, whose
+    frame tells no displacements. An undamaged stream becomes a copy.
+
+    Args:
+        stream: the file; without its header nobody knows the cameras.
+        output: the file to write; an existing one is replaced, but for that of `stream`.
+
+    Returns:
+        The frames that play, and what is damaged or lost.
+
+    Raises:
+        OSError: the new one cannot be written.
+        ValueError: no frame plays, or `output` is the file of `stream`.
+    """
+    if Path(output).resolve() == stream.path.resolve():
+        raise ValueError(f"{output}: expected a new file, got the damaged stream itself; give another name.")
+    frames, gaps = [], []
+    with (
+        whole(output, "write_salvaged()") as partial,
+        StreamWriter(partial, stream.cameras, stream.fps, stream.metadata) as writer,
+    ):
+        for found in _playable(stream.path):
+            if isinstance(found, Gap):
+                gaps.append(found)
+            else:
+                writer.write(found[0])
+                frames.append(found[1].frame)
+        if not frames:
+            raise ValueError(f"{stream.path}: expected at least one frame that plays, got none; nothing was written.")
+    return list(dict.fromkeys(frames)), gaps
+
+
+def _playable(path: Path) -> Iterator[tuple[Packet, CodedFrame] | Gap]:
+    """Yield packets with the states that they lead to or, once more, restate, and what gives neither."""
+    data = path.read_bytes()  # a map of the file would end the process if somebody cut it off meanwhile
     if not data:
         yield Gap(0, 0, "the file is empty")
     coded, at = None, 0
@@ -57,7 +118,9 @@ def salvage(path: str | Path) -> Iterator[CodedFrame | Gap]:
                 packet = decode_packet(data[start:stop])
                 if coded is None or packet.frame != coded.frame:
                     coded = decode(coded, packet)
-                    yield coded
+                elif not np.array_equal(decode(None, packet).digest, coded.digest):
+                    raise ValueError(f"it restates another state than that of frame {coded.frame}")
+                yield packet, coded
             except ValueError as error:
                 yield Gap(start, stop, str(error))
     if at < len(data):

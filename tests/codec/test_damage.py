@@ -18,7 +18,7 @@ from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import PAYLOAD, StreamWriter
 from morgs_mi.codec.gaussians import CodedFrame, coded_frames, decode, keyframe_packet, residual_packet, restated, seek
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.codec.salvage import Gap, salvage
+from morgs_mi.codec.salvage import Gap, salvage, write_salvaged
 from morgs_mi.gaussians.gaussians import Gaussians
 from tests.codec.test_gaussians import CAMERAS, cloud, jittered
 
@@ -136,6 +136,10 @@ def check(clip: Clip, data: bytes, path: Path) -> None:
         assert whole or part.start >= end or any(g.start <= part.start and end <= g.stop for g in gaps), part
     for gap in gaps:
         assert 0 <= gap.start < gap.stop <= len(data) or not data
+    # All of that can be had as a stream that is whole, if there is anything.
+    if intact[0] and intact[1] and states:
+        again = rewritten(path)
+        assert again == ([state.frame for state in states], gaps, [state.digest.tobytes() for state in states])
     # A reader that trusts an intact index gets to the frames behind the damage, too.
     if intact[0] and intact[1] and intact[-1]:
         for part in clip.parts[first + 1 : -1]:
@@ -143,6 +147,18 @@ def check(clip: Clip, data: bytes, path: Path) -> None:
             if part.kind == 1 and part.frame + 1 < FRAMES and all(intact[clip.parts.index(p)] for p in behind):
                 state = seek(StreamReader(path), part.frame + 1)
                 assert np.array_equal(state.digest, clip.states[part.frame + 1].digest)
+
+
+def rewritten(path: Path) -> tuple[list[int], list[Gap], list[bytes]]:
+    """Return what `write_salvaged` says, and the digests of the states in the stream that it wrote."""
+    new = path.with_name("new")
+    frames, gaps = write_salvaged(StreamReader(path), new)
+    reader = StreamReader(new)
+    assert reader.closed()
+    states = list(coded_frames(reader))
+    assert [state.frame for state in states] == frames
+    assert np.array_equal(seek(reader, frames[-1]).digest, states[-1].digest)
+    return frames, gaps, [state.digest.tobytes() for state in states]
 
 
 def damage(clip: Clip, path: Path, count: int) -> None:
@@ -182,6 +198,8 @@ def lie(clip: Clip, path: Path, count: int) -> None:
             spoilt[part.start + 16 : part.start + PAYLOAD] = struct.pack("<I", zlib.crc32(head + payload))
             path.write_bytes(spoilt)
             found = list(salvage(path))
+            if part.kind:
+                assert rewritten(path)[0] == [one.frame for one in found if isinstance(one, CodedFrame)]
             try:
                 played = list(coded_frames(StreamReader(path)))
             except ValueError:
@@ -203,6 +221,22 @@ def test_packets_that_lie_deceive_about_their_own_frame_at_most(clip: Clip, tmp_
 @pytest.mark.slow
 def test_five_thousand_lies_deceive_about_their_own_frame_at_most(clip: Clip, tmp_path: Path) -> None:
     lie(clip, tmp_path / "s", 5_000)
+
+
+def test_a_stream_that_is_whole_is_salvaged_to_the_same_bytes(clip: Clip, tmp_path: Path) -> None:
+    (tmp_path / "s").write_bytes(clip.data)
+    assert write_salvaged(StreamReader(tmp_path / "s"), tmp_path / "new") == (list(range(FRAMES)), [])
+    assert (tmp_path / "new").read_bytes() == clip.data
+
+
+def test_what_cannot_be_salvaged_is_said_and_nothing_is_written(clip: Clip, tmp_path: Path) -> None:
+    (tmp_path / "s").write_bytes(clip.data[: clip.parts[2].start + 50])
+    reader = StreamReader(tmp_path / "s")
+    with pytest.raises(ValueError, match="expected at least one frame that plays, got none"):
+        write_salvaged(reader, tmp_path / "new")
+    with pytest.raises(ValueError, match="expected a new file, got the damaged stream itself"):
+        write_salvaged(reader, tmp_path / "." / "s")
+    assert [path.name for path in tmp_path.iterdir()] == ["s"]
 
 
 def test_an_empty_file_and_one_of_something_else_hold_nothing(tmp_path: Path) -> None:
