@@ -23,7 +23,7 @@ from morgs_mi.recorder import stream_capture
 from morgs_mi.stream_loop import StreamConfig
 
 FRAMES = 6
-# As little as a fit can do with all that it does: births, deaths, masks, keyframes.
+# As little as a fit can do with all that it does: births, deaths, masks, keyframes, offsets.
 CONFIG = StreamConfig(
     fit=FitConfig(
         sh_degree=0,
@@ -34,7 +34,7 @@ CONFIG = StreamConfig(
         density=DensityConfig(rounds=2, births=0.05, max_gaussians=84, min_error=0),
     ),
     motion=MotionConfig(key_views=1, keyframe_interval=2),
-    codec=CodecConfig(keyframe_interval=2),
+    codec=CodecConfig(keyframe_interval=2, offset=True),
     render=RenderConfig(reproducible=True),
 )
 

@@ -1,4 +1,4 @@
-"""What a judged stream looks like: one column over time, motion and confidence beside the truth, with legends."""
+"""What a judged stream looks like: one column over time, motion, confidence and offset, with truth and legends."""
 
 from __future__ import annotations
 
@@ -22,7 +22,16 @@ from morgs_mi.evaluate.pictures import (
     time_slice,
     write_png,
 )
-from morgs_mi.evaluate.stream import has_confidence, open_recording, open_stream, render_stream, truth_on
+from morgs_mi.evaluate.stream import (
+    OFFSET_SCALE,
+    channel_picture,
+    has_confidence,
+    has_offset,
+    open_recording,
+    open_stream,
+    render_stream,
+    truth_on,
+)
 
 __all__ = ["draw_stream", "motion_scale"]
 
@@ -40,7 +49,7 @@ def draw_stream(
 
     ``slice.png`` has one column over time, recorded and rendered: the column in which the recording changes most.
     ``motion.png`` and, where one was learned, ``confidence.png`` have up to four frames beside the truth, and
-    their legend. A stream holds no offsets of their own, they are part of the motion.
+    their legend; so has ``offset.png``, where the stream holds offsets, beside the motion that they are a part of.
 
     Args:
         out: the stream file or its folder.
@@ -68,9 +77,10 @@ def draw_stream(
     chosen = {later[i] for i in np.linspace(0, len(later) - 1, min(_ROWS, len(later))).astype(int)}
     scale = motion_scale(recording, camera)
     column, sight = _busiest_column(recording, view, frames)
-    shown, recorded, motions, confidences = [], [], [], []
-    trusted = has_confidence(stream)
-    played = render_stream(stream, camera, ("color", "motion", *(("confidence",) if trusted else ())))
+    shown, recorded, motions, confidences, offsets = [], [], [], [], []
+    trusted, corrected = has_confidence(stream), has_offset(stream)
+    maps = (*(("confidence",) if trusted else ()), *(("offset",) if corrected else ()))
+    played = render_stream(stream, camera, ("color", "motion", *maps))
     for (index, images), frame in zip(played, recording.partial_frames(frames[0], frames[-1] + 1), strict=False):
         # Copies, for the pictures of a long clip do not all fit in memory.
         shown.append(as_picture(images["color"])[:, column].copy())
@@ -84,11 +94,18 @@ def draw_stream(
             if trusted:
                 found = {"true mask": mask, "confidence": images["confidence"]}
                 confidences.append(_row(index, confidence_picture, found))
+            if corrected:
+                whole = channel_picture("motion", images["motion"], scale)
+                part = channel_picture("offset", images["offset"], scale)
+                offsets.append(_row(index, as_picture, {"motion": whole, "its offset": part}))
         if progress is not None:
             progress(len(shown), len(frames))
     sheets = {"slice": _slices(sight, column, recorded, shown), "motion": _with_legend(motions, motion_legend(scale))}
     if confidences:
         sheets["confidence"] = _with_legend(confidences, confidence_legend())
+    if offsets:
+        legends = [motion_legend(scale), motion_legend(OFFSET_SCALE * scale)]
+        sheets["offset"] = _with_legend(offsets, side_by_side(legends))
     paths = [Path(folder) / f"{name}.png" for name in sheets]
     for path, sheet in zip(paths, sheets.values(), strict=True):
         write_png(path, sheet)

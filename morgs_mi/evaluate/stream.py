@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from morgs_mi.capture.camera import Camera
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.reading import ReadConfig
 from morgs_mi.capture.truth import Truth, load_truth
+from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.gaussians import play
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.evaluate.pictures import as_picture, confidence_picture, depth_picture, motion_picture
@@ -26,9 +28,11 @@ from morgs_mi.render.rasterize import rasterize
 
 __all__ = [
     "CHANNELS",
+    "OFFSET_SCALE",
     "channel_picture",
     "find_camera",
     "has_confidence",
+    "has_offset",
     "open_recording",
     "open_stream",
     "playback",
@@ -38,7 +42,9 @@ __all__ = [
     "truth_on",
 ]
 
-CHANNELS = ("color", "motion", "confidence", "depth", "alpha")
+CHANNELS = ("color", "motion", "confidence", "offset", "depth", "alpha")
+# Of the speed at which motion is fully saturated: the learned offset is the smaller part of it.
+OFFSET_SCALE = 0.1
 _TIMED = 30
 
 
@@ -83,8 +89,8 @@ def render_stream(
         channels: out of `CHANNELS`; None for color, motion, depth and, where the stream has it, confidence.
 
     Yields:
-        (frame, images): per channel a float32 array [H, W, 1 to 3], colour display-referred, motion in pixels,
-        depth in world units.
+        (frame, images): per channel a float32 array [H, W, 1 to 3], colour display-referred, motion and offset in
+        pixels, depth in world units.
 
     Raises:
         ValueError: an unknown channel, one that the stream does not hold, or a broken packet.
@@ -100,17 +106,24 @@ def has_confidence(stream: StreamReader) -> bool:
     return learned and any(gaussians.logit_confidence is not None for _, gaussians in islice(play(stream), 1))
 
 
+def has_offset(stream: StreamReader) -> bool:
+    """Tell whether a stream's residuals hold the learned offset, which none does unless it was asked to."""
+    residuals = (packet for packet in stream if packet.kind == PacketKind.RESIDUAL)
+    return any("offset" in packet.arrays for packet in islice(residuals, 1))
+
+
 def channel_picture(name: str, image: np.ndarray, motion_scale: float | None = None) -> np.ndarray:
     """Return a rendered channel as a picture, uint8 RGB [H, W, 3].
 
     Args:
         name: one of `CHANNELS`.
         image: [H, W, 1 to 3].
-        motion_scale: speed of full saturation in pixels; by default 3 % of the width, so that the frames of a clip
-            compare.
+        motion_scale: speed of full saturation in pixels, of an offset a tenth of it; by default 3 % of the width, so
+            that the frames of a clip compare.
     """
-    if name == "motion":
-        return motion_picture(image, motion_scale or 0.03 * image.shape[1])
+    if name in ("motion", "offset"):
+        scale = motion_scale or 0.03 * image.shape[1]
+        return motion_picture(image, scale if name == "motion" else OFFSET_SCALE * scale)
     return {"confidence": confidence_picture, "depth": depth_picture}.get(name, as_picture)(image)
 
 
@@ -166,9 +179,14 @@ def _carried(gaussians: Gaussians) -> tuple[str, ...]:
 def render(
     gaussians: Gaussians, camera: Camera, channels: Sequence[str], config: RenderConfig
 ) -> dict[str, np.ndarray]:
-    """Render channels into float32 arrays [H, W, 1 to 3] by name."""
-    image = rasterize(gaussians, camera, channels, config=config)
-    return {name: np.array(getattr(image, name)) for name in channels}
+    """Render channels into float32 arrays [H, W, 1 to 3] by name; the offset is zero where nothing is known of it."""
+    maps = [name for name in channels if name != "offset"]
+    images = vars(rasterize(gaussians, camera, maps, config=config)) if maps else {}
+    if "offset" in channels:
+        offset = np.zeros((len(gaussians), 3)) if gaussians.offset is None else gaussians.offset
+        learned = rasterize(replace(gaussians, motion=offset), camera, ("motion",), config=config)
+        images = {**images, "offset": learned.motion}
+    return {name: np.array(images[name]) for name in channels}
 
 
 def render_config(stream: StreamReader) -> RenderConfig:

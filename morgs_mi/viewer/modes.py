@@ -6,22 +6,24 @@ import numpy as np
 
 from morgs_mi.capture.camera import Camera
 from morgs_mi.evaluate.pictures import as_picture, confidence_picture, depth_picture, motion_picture
+from morgs_mi.evaluate.stream import OFFSET_SCALE
 from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.gaussians.shape import colors_towards
 
 __all__ = ["BACKGROUNDS", "FULL_SPEED", "MODES", "splat_colors"]
 
-MODES = ("color", "motion", "confidence", "depth")
-# Behind splats that let light through: nothing, no motion, no confidence, no depth.
-BACKGROUNDS = {"color": 0, "motion": 255, "confidence": 0, "depth": 128}
+MODES = ("color", "motion", "confidence", "offset", "depth")
+# Behind splats that let light through: nothing, no motion, no confidence, no offset, no depth.
+BACKGROUNDS = {"color": 0, "motion": 255, "confidence": 0, "offset": 255, "depth": 128}
 # Of the picture's width per frame: the speed of full saturation, as in `channel_picture`.
-FULL_SPEED = 0.03
+FULL_SPEED = {"motion": 0.03, "offset": 0.03 * OFFSET_SCALE}
 
 
 def splat_colors(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray:
     """Return the colours of N Gaussians as a camera sees them, uint8 [N, 3].
 
-    Motion is what it is on the camera's screen, by the first-order projection of the displacement.
+    Motion is what it is on the camera's screen, by the first-order projection of the displacement; so is the offset,
+    none where nothing is known of it.
 
     Raises:
         ValueError: another mode than one of `MODES`, or one that the Gaussians carry nothing for.
@@ -32,11 +34,11 @@ def splat_colors(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray:
     x, y, z = (raw["means"] @ view[:3, :3].T + view[:3, 3]).T
     if mode == "depth":
         return depth_picture(z[:, None])[:, 0]
-    if mode == "motion" and gaussians.motion is not None:
-        dx, dy, dz = (raw["motion"] @ view[:3, :3].T).T
+    if mode == "offset" or (mode == "motion" and gaussians.motion is not None):
+        dx, dy, dz = (raw.get(mode, np.zeros_like(raw["means"])) @ view[:3, :3].T).T
         safe = np.where(z > camera.near, z, np.inf)  # what lies behind does not move on the screen
         screen = np.stack([camera.K[0, 0] * (dx - x / safe * dz) / safe, camera.K[1, 1] * (dy - y / safe * dz) / safe])
-        return motion_picture(screen.T[:, None], FULL_SPEED * camera.width)[:, 0]
+        return motion_picture(screen.T[:, None], FULL_SPEED[mode] * camera.width)[:, 0]
     if mode == "confidence" and gaussians.confidence is not None:
         return confidence_picture(np.asarray(gaussians.confidence)[:, None])[:, 0]
     raise ValueError(f"splat_colors(): the mode must be one of {', '.join(MODES)} that the stream holds, got {mode!r}.")

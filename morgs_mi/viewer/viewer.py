@@ -7,7 +7,6 @@ wherever the camera comes to rest. All decoding and drawing happens in the one t
 
 from __future__ import annotations
 
-import struct
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +30,7 @@ __all__ = ["Viewer", "ViewerConfig"]
 # splats down to 1/1000 of that distance, and the page's near and far planes fit.
 _DISTANCE = 10.0
 _HALF_MAX = 6e4
+_NO_OFFSET = ". It holds no offset: fit with --codec.offset, and each frame but the first holds one."
 _TICK, _LOOK_AGAIN, _REST = 0.01, 1.0, 0.2  # seconds
 
 
@@ -102,8 +102,7 @@ class Viewer:
                     if self._clip.frames:  # else begun anew just now
                         self._play(now)
                         self._show(now)
-                except (ValueError, OSError, struct.error) as error:
-                    # Damaged, or being replaced (an index is not looked for in an empty file): say so, and look again.
+                except (ValueError, OSError) as error:  # damaged, or being replaced: say so, and look again
                     self._status.content, self._shown = str(error), None
                     self._stopped.wait(_LOOK_AGAIN)
         finally:
@@ -187,7 +186,8 @@ class Viewer:
         if self._splats is not None:
             self._splats.visible = not self._exact.value
         self._show_trails(at)
-        self._status.content = f"Frame {at} of {self._clip.frames[-1]}, {len(coded)} Gaussians"
+        missing = self._mode.value == "offset" and coded.gaussians.offset is None
+        self._status.content = f"Frame {at} of {self._clip.frames[-1]}, {len(coded)} Gaussians{_NO_OFFSET * missing}"
         self._server.flush()
         self._shown = wanted
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,12 +33,19 @@ def moved(frame: float, logit: float | None = 0.0) -> Gaussians:
     return Gaussians.from_activated(means, np.full((5, 3), 0.2), np.tile([1, 0, 0, 0], (5, 1)), [0.9] * 5, sh, **more)
 
 
-def write_stream(path: Path, metadata: dict, logit: float | None = 0.0, shift: float = 0) -> list[Packet]:
-    """Write the splats' stream, `shift` steps ahead of them, and return its packets."""
+def write_stream(
+    path: Path, metadata: dict, logit: float | None = 0.0, shift: float = 0, offset: float | None = None
+) -> list[Packet]:
+    """Write the splats' stream, `shift` steps ahead of them, and return its packets.
+
+    With an `offset`, that share of each step along x was learned.
+    """
     first = keyframe_packet(moved(shift, logit), 0, CAMERAS, EXACT)
     state, packets = decode(None, first), [first]
     for frame in range(1, FRAMES):
-        packets.append(residual_packet(state, moved(frame + shift, logit), None, CAMERAS, EXACT))
+        now, config = moved(frame + shift, logit), replace(EXACT, offset=offset is not None)
+        now = replace(now, offset=np.tile((STEP * (offset or 0), 0, 0), (len(now), 1)))
+        packets.append(residual_packet(state, now, None, CAMERAS, config))
         state = decode(state, packets[-1])
     with StreamWriter(path, CAMERAS, 25, metadata) as writer:
         for packet in packets:

@@ -13,7 +13,8 @@ from morgs_mi.capture import load_capture
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.evaluate.drawings import draw_stream, motion_scale
 from morgs_mi.evaluate.pictures import GAP
-from tests.evaluate.splats import CAMERAS, FRAMES, HEIGHT, PIXELS, WIDTH
+from morgs_mi.evaluate.stream import open_stream
+from tests.evaluate.splats import CAMERAS, FRAMES, HEIGHT, PIXELS, WIDTH, write_stream
 
 LEGEND = 96
 
@@ -39,6 +40,20 @@ def test_without_truth_the_stream_alone_is_drawn(clip: Path, tmp_path: Path) -> 
     shutil.copytree(clip / "capture", tmp_path / "capture", ignore=shutil.ignore_patterns("truth"))
     paths = draw_stream(clip, tmp_path, tmp_path / "capture")
     assert cv2.imread(str(paths[1])).shape == (LEGEND + GAP + HEIGHT, WIDTH + GAP + LEGEND, 3)
+
+
+def test_offsets_are_drawn_beside_the_motion_that_they_are_a_part_of(clip: Path, tmp_path: Path) -> None:
+    write_stream(tmp_path / "s.morgs", open_stream(clip).metadata, offset=0.05)
+    path = draw_stream(tmp_path / "s.morgs", tmp_path)[-1]
+    assert path.name == "offset.png"
+    sheet = cv2.imread(str(path))[..., ::-1].astype(int)
+    # Two frames after the first: motion, its offset and both legends beside the first row.
+    assert sheet.shape == (LEGEND + GAP + HEIGHT, 2 * (WIDTH + GAP) + 2 * LEGEND + GAP, 3)
+    motion, offset = (sheet[LEGEND + GAP + 15 :, x : x + WIDTH][: HEIGHT - 15] for x in (0, WIDTH + GAP))
+    seen = motion[..., 1] < 128  # red: to the right, at full saturation
+    assert seen.any()
+    # A twentieth of it at a tenth of the scale is half saturated.
+    assert np.abs(offset[seen] - (255, 127, 127)).max() <= 3
 
 
 def test_the_scale_of_motion_is_that_of_the_truth(clip: Path, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from morgs_mi.evaluate.stream import (
     channel_picture,
     find_camera,
     has_confidence,
+    has_offset,
     open_stream,
     playback,
     render_stream,
@@ -61,6 +62,21 @@ def test_confidence_counts_where_it_was_learned(clip: Path, tmp_path: Path) -> N
     write_stream(tmp_path / "none.morgs", {}, logit=None)
     assert not has_confidence(open_stream(tmp_path / "off.morgs"))
     assert not has_confidence(open_stream(tmp_path / "none.morgs"))
+
+
+def test_offsets_are_drawn_as_the_share_of_motion_that_they_are(clip: Path, tmp_path: Path) -> None:
+    write_stream(tmp_path / "s.morgs", {}, offset=0.25)
+    assert has_offset(open_stream(tmp_path / "s.morgs"))
+    assert not has_offset(open_stream(clip))
+    played = list(render_stream(open_stream(tmp_path / "s.morgs"), CAMERAS[0], ("motion", "offset")))
+    assert not played[0][1]["offset"].any(), "nothing is known of the first frame"
+    for _, images in played[1:]:
+        assert np.abs(images["motion"]).max() > 0.4
+        np.testing.assert_allclose(images["offset"], 0.25 * images["motion"], atol=1e-4)
+    for _, images in render_stream(open_stream(clip), CAMERAS[0], ("offset",)):
+        assert not images["offset"].any()
+    tenth = channel_picture("offset", 0.1 * images["offset"] + 0.05)
+    np.testing.assert_array_equal(tenth, channel_picture("motion", images["offset"] + 0.5))
 
 
 def test_playback_is_the_time_of_a_frame(clip: Path, tmp_path: Path) -> None:

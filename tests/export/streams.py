@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.capture.camera import Camera
+from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.gaussians import CodedFrame, decode, keyframe_packet, residual_packet
 from morgs_mi.gaussians.gaussians import Gaussians
 
 NAMES = ("left", "middle", "right")
+# What of a step of 0.1 along x was learned: two steps of its grid.
+OFFSET = (0, 0, 0.008)
 
 
 def rig(width: int = 64, height: int = 48) -> tuple[Camera, ...]:
@@ -33,7 +36,10 @@ def splats(N: int = 40, degree: int = 1, seed: int = 0) -> Gaussians:
 
 
 def write_stream(path: Path, frames: int = 4, start: Gaussians | None = None) -> list[CodedFrame]:
-    """Write a stream and return its states. From frame 1 the first half moves; in frame 2 one dies, two are born."""
+    """Write a stream and return its states, with offsets.
+
+    From frame 1 the first half moves; in frame 2 one dies, two are born.
+    """
     cameras, states = rig(), []
     with StreamWriter(path, cameras, 10) as writer:
         packet = keyframe_packet(start or splats(), 0, cameras)
@@ -45,7 +51,8 @@ def write_stream(path: Path, frames: int = 4, start: Gaussians | None = None) ->
             after = replace(before, means=before.numpy()["means"] + 0.1 * moves[:, None] * np.float32([1, 0, 0]))
             if t == 1:
                 born = splats(2, before.sh_degree, seed=9)
-                after = Gaussians.concatenate([replace(after.select(source[1:]), motion=None), born])
+                after = Gaussians.concatenate([replace(after.select(source[1:]), motion=None, offset=None), born])
                 source = np.concatenate([source[1:], [-1, -1]])
-            packet = residual_packet(states[-1], after, source, cameras)
+            after = replace(after, offset=np.tile(np.float32(OFFSET), (len(after), 1)))
+            packet = residual_packet(states[-1], after, source, cameras, CodecConfig(offset=True))
     return states

@@ -102,6 +102,11 @@ def test_a_later_frame_tells_who_is_new(truth, motion):
         assert (source[len(survivors) :] == -1).all()
         assert (source == -1).sum() == round(births * len(before))
         assert np.isfinite(losses["recon"])
+        raw = found.numpy()
+        moved = raw["means"][: len(survivors)] - before.numpy()["means"][survivors]
+        parts = (raw["motion"] + raw["offset"])[: len(survivors)]
+        assert parts == pytest.approx(moved, abs=1e-6), "what moves a centre is told in its parts"
+        assert raw["offset"].any() == motion.learn_offset
         results[births] = quality(found, images)
     assert results[0.3] > results[0.0] + 0.05  # dB; runs differ by 1e-5
 

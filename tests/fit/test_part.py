@@ -110,6 +110,8 @@ def test_a_part_is_fitted_as_the_whole_is(before, after, grows):
     assert (fitted.source == -1).any() == grows
     still = np.setdiff1d(np.arange(len(before)), part.rows)
     where = np.searchsorted(fitted.source[fitted.source >= 0], still)
+    assert not np.asarray(fitted.gaussians.motion)[where].any()
+    assert not np.asarray(fitted.gaussians.offset)[where].any()
     for attribute in ("means", "quats", "log_scales", "sh_coeffs", "logit_opacities"):
         kept = np.asarray(getattr(fitted.gaussians, attribute))[where]
         assert np.array_equal(kept, np.asarray(getattr(before, attribute))[still]), attribute

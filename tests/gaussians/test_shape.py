@@ -57,6 +57,8 @@ def test_a_turned_world_looks_the_same_to_a_turned_camera(degree):
     turned = replace(camera, viewmat=camera.viewmat @ turn)
     gaussians, channels = some(degree=degree), ("color", "motion", "depth", "confidence")
     a, b = rasterize(gaussians, camera, channels), rasterize(rotated(gaussians, R), turned, channels)
+    vectors = replace(gaussians, offset=gaussians.motion)
+    np.testing.assert_array_equal(rotated(vectors, R).offset, rotated(vectors, R).motion)
     for name in channels:
         # Turning rounds every attribute once in float32; where depths nearly agree nothing may swap on these seeds.
         np.testing.assert_allclose(np.array(getattr(b, name)), np.array(getattr(a, name)), atol=2e-4, err_msg=name)

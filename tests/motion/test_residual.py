@@ -41,7 +41,8 @@ def test_gate_scales_every_attribute(degree, two_gates):
     m = 1 / (1 + np.exp(-np.asarray(parameters["logit_confidence"], np.float64)))
     current, before = apply_residual(previous, parameters, config).numpy(), previous.numpy()
     R = {name: np.asarray(value) for name, value in parameters.items()}
-    assert current["motion"] == pytest.approx(m[:, None] * R["motion"], abs=1e-6)
+    for name in ("motion", "offset"):
+        assert current[name] == pytest.approx(m[:, None] * R[name], abs=1e-6)
     assert current["means"] - before["means"] == pytest.approx(m[:, None] * (R["motion"] + R["offset"]), abs=1e-6)
     assert current["quats"] - before["quats"] == pytest.approx(m[:, None] * R["quats"], abs=1e-6)
     change = current["sh_coeffs"] - before["sh_coeffs"]

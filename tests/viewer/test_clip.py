@@ -11,7 +11,8 @@ from morgs_mi import cli
 from morgs_mi.capture.camera import Camera
 from morgs_mi.codec.gaussians import CodedFrame
 from morgs_mi.evaluate.pictures import confidence_picture, motion_picture
-from morgs_mi.evaluate.stream import open_stream
+from morgs_mi.evaluate.stream import channel_picture, open_stream, render
+from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.viewer.clip import Clip
 from morgs_mi.viewer.modes import FULL_SPEED, MODES, splat_colors
@@ -89,8 +90,11 @@ def test_one_splat_has_the_colour_that_the_renderer_gives_it(states):
         alpha = np.array(drawn.alpha)[24, 32]
         color = np.clip(np.array(drawn.color)[24, 32] / alpha, 0, 1)
         np.testing.assert_allclose(splat_colors(one, facing, "color")[0] / 255, color, atol=0.01)
-        motion = motion_picture(np.array(drawn.motion)[24:25, 32:33], FULL_SPEED * 65)[0, 0].astype(int)
+        motion = motion_picture(np.array(drawn.motion)[24:25, 32:33], FULL_SPEED["motion"] * 65)[0, 0].astype(int)
         np.testing.assert_allclose(splat_colors(one, facing, "motion")[0], motion, atol=2)
+        learned = channel_picture("offset", render(one, facing, ("offset",), RenderConfig())["offset"])[24, 32]
+        np.testing.assert_allclose(splat_colors(one, facing, "offset")[0].astype(int), learned, atol=2)
+        assert learned.astype(int).min() < 200, "the first half of the splats moves"
         confidence = confidence_picture(np.array(drawn.confidence)[24:25, 32:33] / alpha)[0, 0].astype(int)
         np.testing.assert_allclose(splat_colors(one, facing, "confidence")[0], confidence, atol=3)
 
@@ -99,8 +103,9 @@ def test_every_mode_colours_every_splat(states):
     for mode in MODES:
         found = splat_colors(states[1].gaussians, rig()[0], mode)
         assert (found.dtype, found.shape) == (np.uint8, (40, 3))
-    with pytest.raises(ValueError, match="the mode must be one of color, motion, confidence, depth"):
-        splat_colors(states[1].gaussians, rig()[0], "offset")
+    assert (splat_colors(states[0].gaussians, rig()[0], "offset") == 255).all(), "nothing is known of it"
+    with pytest.raises(ValueError, match="the mode must be one of color, motion, confidence, offset, depth"):
+        splat_colors(states[1].gaussians, rig()[0], "quats")
 
 
 def test_without_viser_there_is_a_sentence(tmp_path, states, monkeypatch, capsys):

@@ -113,19 +113,24 @@ def test_the_page_shows_what_the_renderer_shows(page, tmp_path):
     # Half-precision covariances, 8-bit colours and opacities: 47 dB. A camera off by a degree makes it 22.
     wait_for(page, drawn(stream, states[0], "color"), 40)
 
+    choose(page, "offset")
+    page.get_by_text("It holds no offset: fit with --codec.offset").wait_for()
     frame = page.locator("input[inputmode=decimal]").first
     frame.fill("1")
     frame.press("Enter")
-    page.get_by_text("Frame 1 of 2, 40 Gaussians").wait_for()
+    page.get_by_text("Frame 1 of 2, 40 Gaussians", exact=True).wait_for()
+    # The picture colours the blend, the page blends colours; a white page gives 13 dB.
+    wait_for(page, drawn(stream, states[1], "offset"), 16)
+    choose(page, "color")
     wait_for(page, drawn(stream, states[1], "color"), 40)
 
     page.get_by_label("Exact picture").check()
-    for mode in ("motion", "confidence", "depth", "color"):
+    for mode in ("motion", "confidence", "offset", "depth", "color"):
         choose(page, mode)
         wait_for(page, drawn(stream, states[1], mode), 50)  # the page rounds the camera: some pixels differ by one
     page.get_by_label("Exact picture").uncheck()
     choose(page, "confidence")
-    wait_for(page, drawn(stream, states[1], "confidence"), 17)  # the picture colours the blend, the page blends colours
+    wait_for(page, drawn(stream, states[1], "confidence"), 17)  # as above
 
     choose(page, "color")
     wait_for(page, drawn(stream, states[1], "color"), 40)
