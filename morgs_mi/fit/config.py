@@ -106,7 +106,7 @@ class FitConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
     """Births and deaths."""
     rates: Rates = field(default_factory=Rates)
-    """Learning rates of every later frame."""
+    """Learning rates of every later frame of 8 epochs; see `later_rates` for fewer and more."""
     first_rates: Rates = field(default_factory=lambda: Rates(means=2e-3, scales=0.02, quats=0.02, opacities=0.2))
     """Learning rates at the start of the first frame; they fall to a tenth of that to its end."""
 
@@ -116,6 +116,15 @@ class FitConfig:
                 raise ValueError(f"FitConfig(): `{name}` must be at least {low}, got {getattr(self, name)}.")
         if self.sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"FitConfig(): `sh_degree` must be 0 to 3, got {self.sh_degree}.")
+
+    @property
+    def later_rates(self) -> Rates:
+        """The rates of a frame of `epochs` epochs: all but those of places grow by (8 / epochs)^1/2.
+
+        Fewer steps have to go as far; where Gaussians are is known from the flow.
+        """
+        faster = (8 / self.epochs) ** 0.5
+        return Rates(**{name: rate if name == "means" else faster * rate for name, rate in asdict(self.rates).items()})
 
     @property
     def first_count(self) -> int:

@@ -16,10 +16,11 @@ from morgs_mi.fit.density import NOISE, apply_plan, find_need, plan_additions, r
 from morgs_mi.fit.losses import Target, flow_loss, mask_loss, offset_loss, recon_loss
 from morgs_mi.fit.optimise import adam, optimise, values_of, view_order
 from morgs_mi.fit.part import Part, standing_still
+from morgs_mi.fit.propagate import propagate_motion
 from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.motion.config import MotionConfig
 from morgs_mi.motion.cues import MotionCue
-from morgs_mi.motion.lift import lift_flow
+from morgs_mi.motion.lift import Lift, lift_flow
 from morgs_mi.motion.residual import apply_residual, residual_parameters
 from morgs_mi.render.window import Window
 
@@ -72,7 +73,7 @@ def fit_next_frame(
     if not views or not len(part.rows):
         return NextFrame(standing_still(previous), np.arange(len(previous)), {}, 0)
     base = previous if len(part.rows) == len(previous) else previous.select(part.rows)
-    lifted = lift_flow(base, part.windows, cues) if motion.learn_motion and motion.lift_flow else None
+    lifted = _lifted(base, part, targets, cues, motion, rng)
     optimizer, source = adam(residual_parameters(base, motion, lifted)), np.arange(len(base))
     weights = {"flow": motion.weight_flow, "mask": motion.weight_mask, "offset": motion.weight_offset}
     losses_of = partial(_losses_of, _evidence(part, cues, motion), part, targets, extent, config, motion)
@@ -94,7 +95,7 @@ def fit_next_frame(
         last = losses.get("recon", np.inf)
         losses = optimise(
             optimizer,
-            config.rates.by_parameter(extent),
+            config.later_rates.by_parameter(extent),
             steps,
             partial(losses_of, base),
             weights,
@@ -109,6 +110,24 @@ def fit_next_frame(
     with dr.suspend_grad():
         now = apply_residual(base, values_of(optimizer), motion)
     return NextFrame(*_joined(previous, part, now, source), losses, done // len(views))
+
+
+def _lifted(
+    base: Gaussians,
+    part: Part,
+    targets: Mapping[int, Target],
+    cues: Mapping[int, MotionCue],
+    motion: MotionConfig,
+    rng: np.random.Generator,
+) -> Lift | None:
+    """Return where motion starts; None: from zero."""
+    if not (motion.learn_motion and motion.lift_flow):
+        return None
+    lifted = lift_flow(base, part.windows, cues)
+    if not motion.propagate_motion:
+        return lifted
+    key_views = sorted(cues.keys() & part.windows.keys())
+    return propagate_motion(base, lifted, {v: part.windows[v] for v in key_views}, targets, rng)
 
 
 def _losses_of(

@@ -35,6 +35,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
     "paper": {
         "epochs": 8,
         "lift_flow": False,
+        "propagate_motion": False,
         "lift_confidence": False,
         "two_gates": False,
         **_modules(True, True, True),

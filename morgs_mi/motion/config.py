@@ -31,6 +31,8 @@ class MotionConfig:
     """The confidence gates places and rotations alone, the rest changes wherever it has to; False: one gate for all."""
     lift_flow: bool = True
     """Start each Gaussian's motion from the key views' flow in closed form; False: from zero, as in the paper."""
+    propagate_motion: bool = True
+    """Offer each Gaussian its own motion of the frame before and its neighbours', too; False: lifted flow alone."""
     lift_confidence: bool = True
     """Raise each Gaussian's confidence to that evidence; False: start from the frame before, as in the paper."""
     flow_method: str = "dis"

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, replace
 from typing import get_args
 
 import pytest
 
-from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.config import FitConfig, Rates
 from morgs_mi.fit.presets import PRESETS, PresetName, apply_preset
 from morgs_mi.motion.config import MotionConfig
 
@@ -31,7 +32,13 @@ def test_rows_of_the_paper(name, epochs, modules, lifted):
     fit, motion = apply_preset(name, FitConfig(num_gaussians=77), MotionConfig(key_views=12))
     assert fit == FitConfig(num_gaussians=77, epochs=epochs)
     assert (motion.learn_motion, motion.learn_offset, motion.learn_confidence) == modules
-    assert (motion.lift_flow, motion.key_views) == (lifted, 12)
+    assert (motion.lift_flow, motion.propagate_motion, motion.key_views) == (lifted, lifted, 12)
+
+
+def test_fewer_epochs_take_longer_strides_but_for_places():
+    rates = FitConfig(epochs=2).later_rates
+    assert rates == replace(Rates(), **{n: 2 * r for n, r in asdict(Rates()).items() if n != "means"})
+    assert FitConfig(epochs=8).later_rates == Rates()
 
 
 def test_a_contradiction_is_refused():
