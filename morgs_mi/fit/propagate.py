@@ -2,8 +2,8 @@
 
 Flow fails where parts are thin and fast, or alike; but what moves mostly goes on as before, and as what lies beside
 it. So each Gaussian is offered further displacements, as PatchMatch offers them to pixels (Barnes et al. 2009): first
-the one it had, then, twice, that of one of its nearest neighbours that move. All try theirs at once, are drawn so on the
-key views, and get their shares of the errors e(x) = |I - I*| back by the blend weights,
+the one it had, then, twice, that of one of its nearest neighbours that move. All try theirs at once, are drawn so on
+the key views, and get their shares of the errors e(x) = |I - I*| back by the blend weights,
 
     E_i = (0.01 px + sum_v sum_x w_i(x) e(x)) / (1 px + sum_v sum_x w_i(x)) .
 
