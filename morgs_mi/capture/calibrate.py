@@ -23,6 +23,7 @@ __all__ = ["CalibrateConfig", "Calibrated", "calibrate"]
 
 # Fewer features, or fewer matches that agree in a pair, leave COLMAP nothing to hold on to.
 _MIN_FEATURES = 100
+_TRIES = 3
 _MORE_TEXTURE = "light the scene evenly, put something with texture into it, or record a frame with it before the take"
 
 
@@ -158,8 +159,13 @@ def _map(
     tell("Matching views", 1, 1)
     _check_pairs(path, database)
     tell("Mapping", 0, 1)
-    options = pycolmap.IncrementalPipelineOptions(min_model_size=2, random_seed=config.seed)
-    models = pycolmap.incremental_mapping(database, folder, scratch, options)
+    models: list[Any] = []
+    # Which views it begins with, and who is tied in, is partly chance: another draw may find who was missed.
+    for attempt in range(_TRIES):
+        options = pycolmap.IncrementalPipelineOptions(min_model_size=2, random_seed=config.seed + attempt)
+        models += pycolmap.incremental_mapping(database, folder, scratch, options).values()
+        if any(model.num_reg_images() == len(images) for model in models):
+            break
     tell("Mapping", 1, 1)
     if not models:
         raise ValueError(
@@ -167,7 +173,7 @@ def _map(
             f"wide, or all that they share lies in one plane; try shared intrinsics (--shared-intrinsics), another "
             f"frame (--frame), or {_MORE_TEXTURE}."
         )
-    return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
+    return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
 
 
 def _check_features(path: Path, database: Path) -> None:
