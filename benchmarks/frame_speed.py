@@ -41,6 +41,7 @@ STAGES = {
     "part": "_part",
     "targets": "Target.__init__",
     "lift": "lift_flow",
+    "propagation": "propagate_motion",
     "steps": "optimise",
     "density": "find_need",
     "packet": "residual_packet",
