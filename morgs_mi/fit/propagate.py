@@ -34,8 +34,8 @@ _BETTER = 0.9
 _WAKE = 0.8
 # px of full contrast: who is hardly seen does not change its mind.
 _FLOOR = 0.01
-# A confidence of 0.73 for who moves.
-_SURE = 1.0
+# A confidence of 0.57 for who moves: chance lets some keep an offer that is wrong.
+_SURE = 0.3
 
 
 def propagate_motion(
