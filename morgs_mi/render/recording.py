@@ -11,6 +11,8 @@ import mitsuba as mi
 
 __all__ = ["recorded"]
 
+_MOST_RECORDINGS = 500
+
 
 def recorded(function: Callable[..., Any], *static: Any) -> Callable[..., Any]:
     """Return `function` with its first arguments fixed, as a recording of arrays alone; one per variant and `static`.
@@ -23,4 +25,5 @@ def recorded(function: Callable[..., Any], *static: Any) -> Callable[..., Any]:
 
 @cache
 def _recorded(function: Callable[..., Any], variant: str, static: tuple[Any, ...]) -> Callable[..., Any]:
-    return dr.freeze(lambda *arrays: function(*static, *arrays), warn_after=1000)
+    # A long fit meets ever new combinations of sizes; the least used recordings make room.
+    return dr.freeze(lambda *arrays: function(*static, *arrays), limit=_MOST_RECORDINGS, warn_after=2**31 - 1)
