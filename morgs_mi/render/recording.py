@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -26,4 +28,26 @@ def recorded(function: Callable[..., Any], *static: Any) -> Callable[..., Any]:
 @cache
 def _recorded(function: Callable[..., Any], variant: str, static: tuple[Any, ...]) -> Callable[..., Any]:
     # A long fit meets ever new combinations of sizes; the least used recordings make room.
-    return dr.freeze(lambda *arrays: function(*static, *arrays), limit=_MOST_RECORDINGS, warn_after=2**31 - 1)
+    recording = dr.freeze(lambda *arrays: function(*static, *arrays), limit=_MOST_RECORDINGS, warn_after=2**31 - 1)
+
+    def call(*arrays: Any) -> Any:
+        with _uncollected():
+            return recording(*arrays)
+
+    return call
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Keep Python from collecting garbage meanwhile, in whichever thread.
+
+    Dr.Jit 1.5 looks at a recording's arguments by Python code while it holds its own lock. Another thread that collects
+    arrays just then waits for that lock, but has the interpreter's: both would wait for ever.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
