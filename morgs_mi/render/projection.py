@@ -28,7 +28,7 @@ from morgs_mi.capture.camera import Camera
 from morgs_mi.gaussians.gaussians import ActivatedGaussians, tensor_rows
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["CHANNEL_SIZES", "Splats", "project"]
+__all__ = ["CHANNEL_SIZES", "Splats", "joined", "project"]
 
 # What a channel blends, and how many numbers that takes; `alpha` is blended with every call.
 CHANNEL_SIZES = {"color": 3, "depth": 1, "motion": 2, "confidence": 1}
@@ -68,17 +68,6 @@ class Splats:
 
     def followed_by(self, other: Splats, order: Any) -> Splats:
         """Return these splats and the others, to be blended in `order` where depths are equal."""
-        n, mode = dr.opaque(mi.UInt32, len(self)), dr.ReduceMode.NoConflicts
-        lane = dr.arange(mi.UInt32, len(self) + len(other))
-        ours = lane < n
-
-        def joined(a: Any, b: Any) -> Any:
-            # `dr.concat` would compile a kernel for every length.
-            if isinstance(a, tuple):
-                return tuple(joined(v, w) for v, w in zip(a, b, strict=True))
-            front = dr.gather(type(a), a, lane, active=ours, mode=mode)
-            return dr.select(ours, front, dr.gather(type(b), b, lane - n, active=~ours, mode=mode))
-
         return Splats(
             joined(self.shape, other.shape),
             {name: joined(value, other.channels[name]) for name, value in self.channels.items()},
@@ -88,6 +77,17 @@ class Splats:
             joined(self.finite, other.finite),
             order,
         )
+
+
+def joined(a: Any, b: Any) -> Any:
+    """Return two arrays, or tuples of them, end to end; `dr.concat` would compile a kernel for every length."""
+    if isinstance(a, tuple):
+        return tuple(joined(v, w) for v, w in zip(a, b, strict=True))
+    n, mode = dr.opaque(mi.UInt32, dr.width(a)), dr.ReduceMode.NoConflicts
+    lane = dr.arange(mi.UInt32, dr.width(a) + dr.width(b))
+    ours = lane < n
+    front = dr.gather(type(a), a, lane, active=ours, mode=mode)
+    return dr.select(ours, front, dr.gather(type(b), b, lane - n, active=~ours, mode=mode))
 
 
 def project(

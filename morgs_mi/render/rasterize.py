@@ -15,7 +15,7 @@ from morgs_mi.gaussians.gaussians import ActivatedGaussians, repeated
 from morgs_mi.render.blocks import build_lists, touches
 from morgs_mi.render.compositing import Channel, Layout, blend
 from morgs_mi.render.config import RenderConfig
-from morgs_mi.render.projection import CHANNEL_SIZES, Splats, project
+from morgs_mi.render.projection import CHANNEL_SIZES, Splats, joined, project
 from morgs_mi.render.region import Region, owned, whole_view
 
 __all__ = ["Image", "rasterize"]
@@ -172,7 +172,7 @@ def _project_part(
     ]
     if len(parts) < 2:
         return parts[0] if parts else None
-    return parts[0].followed_by(parts[1], dr.argsort(dr.concat(rows)))
+    return parts[0].followed_by(parts[1], dr.argsort(joined(*rows)))
 
 
 def _layout(
