@@ -309,6 +309,15 @@ def test_a_damaged_stream_is_salvaged_and_what_is_lost_is_named(tmp_path: Path, 
     assert (status, said.splitlines()[0]) == (0, f"{new}: 3 frames, 0, 3 to 4.")
     assert "3 frames cannot be played, 1 to 2, 5: " in said
 
+    # The metadata may say anything.
+    for total, named in ((10**30, f", 5 to {10**30 - 1}: "), ("many", ", 1 to 2: "), (2, ", 1 to 2: ")):
+        with StreamWriter(path, rig(), 25, {"num_frames": total}) as writer:
+            for state in (states[0], states[3], states[4]):
+                writer.write(restated(state))
+        status, said, _ = run(capsys, "salvage", tmp_path, new)
+        assert status == 0
+        assert named in said
+
     status, _, error = run(capsys, "salvage", tmp_path, path)
     assert status == 1
     assert_one_sentence(error, "expected a new file, got the damaged stream itself")

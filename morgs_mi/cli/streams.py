@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import groupby
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -159,11 +159,12 @@ class Salvage:
         frames, gaps = write_salvaged(stream, self.out)
         for gap in gaps:
             say(f"{stream.path}: bytes {gap.start} to {gap.stop}: {gap.problem.rstrip('.')}.")
-        say(f"{self.out}: {len(frames)} frames, {_runs(frames)}.")
-        lost = sorted(set(range(stream.metadata.get("num_frames", max(frames) + 1))) - set(frames))
+        say(f"{self.out}: {len(frames)} frames, {_in_words(_runs(frames))}.")
+        lost = _lost(sorted(frames), stream.metadata.get("num_frames"))
         if lost:
+            count = sum(run.stop - run.start for run in lost)
             say(
-                f"{len(lost)} frames cannot be played, {_runs(lost)}: their packets are damaged, missing, or continue "
+                f"{count} frames cannot be played, {_in_words(lost)}: their packets are damaged, missing, or continue "
                 "one that is; a stream plays on from the next intact keyframe."
             )
 
@@ -211,10 +212,21 @@ def _show(result: Mapping[str, Any]) -> None:
         warn(f"{result['stream']}: the fit was not finished, its stream holds {result['num_frames']} frames.")
 
 
-def _runs(numbers: Sequence[int]) -> str:
-    """Return ascending numbers in words, e.g. ``0 to 3, 7``."""
+def _runs(numbers: Sequence[int]) -> list[range]:
+    """Return ascending numbers as runs of consecutive ones."""
     runs = [[n for _, n in run] for _, run in groupby(enumerate(numbers), lambda pair: pair[1] - pair[0])]
-    return ", ".join(f"{run[0]} to {run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
+    return [range(run[0], run[-1] + 1) for run in runs]
+
+
+def _lost(frames: Sequence[int], total: Any) -> list[range]:
+    """Return the runs that ascending frames leave out, out of so many if the stream's metadata says a number."""
+    end = total if isinstance(total, int) else 0  # it may say anything, and be as large as it likes
+    return [range(a + 1, b) for a, b in pairwise([-1, *frames, end]) if b - a > 1]
+
+
+def _in_words(runs: Sequence[range]) -> str:
+    """Return runs as text, e.g. ``0 to 3, 7``."""
+    return ", ".join(f"{run[0]} to {run[-1]}" if run[-1] > run[0] else f"{run[0]}" for run in runs)
 
 
 def _span(frames: Sequence[int]) -> str:

@@ -106,7 +106,7 @@ class FitConfig:
     density: DensityConfig = field(default_factory=DensityConfig)
     """Births and deaths."""
     rates: Rates = field(default_factory=Rates)
-    """Learning rates of every later frame of 8 epochs; see `later_rates` for fewer and more."""
+    """Learning rates of every later frame; `rates_at` makes them those of an epoch."""
     first_rates: Rates = field(default_factory=lambda: Rates(means=2e-3, scales=0.02, quats=0.02, opacities=0.2))
     """Learning rates at the start of the first frame; they fall to a tenth of that to its end."""
 
@@ -117,14 +117,15 @@ class FitConfig:
         if self.sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"FitConfig(): `sh_degree` must be 0 to 3, got {self.sh_degree}.")
 
-    @property
-    def later_rates(self) -> Rates:
-        """The rates of a frame of `epochs` epochs: all but those of places grow by (8 / epochs)^1/2.
+    def rates_at(self, epoch: int) -> Rates:
+        """Return the learning rates of a later frame's epoch, counted from 0, out of E = `epochs`.
 
-        Fewer steps have to go as far; where Gaussians are is known from the flow.
+        Those of places fall from E^1/3 to E^-2/3 of `rates`: far at first, exact at last. All others are (8 / E)^1/2 of
+        them, since fewer steps have to go as far.
         """
-        faster = (8 / self.epochs) ** 0.5
-        return Rates(**{name: rate if name == "means" else faster * rate for name, rate in asdict(self.rates).items()})
+        places = self.epochs ** (1 / 3 - epoch / max(self.epochs - 1, 1))
+        others = (8 / self.epochs) ** 0.5
+        return Rates(**{n: (places if n == "means" else others) * rate for n, rate in asdict(self.rates).items()})
 
     @property
     def first_count(self) -> int:

@@ -30,7 +30,17 @@ from morgs_mi.fit.optimise import replace_parameter
 from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.render.window import Window
 
-__all__ = ["NOISE", "Need", "Plan", "apply_plan", "find_need", "plan_additions", "plan_growth", "regrow"]
+__all__ = [
+    "NOISE",
+    "Need",
+    "Plan",
+    "apply_plan",
+    "error_shares",
+    "find_need",
+    "plan_additions",
+    "plan_growth",
+    "regrow",
+]
 
 # Normal noise, independent in three colours, exceeds so many times its median error at 3 of 10,000 pixels.
 NOISE = 3.0
@@ -89,14 +99,24 @@ def find_need(
         tolerance: in medians of a picture's error; what does not exceed it does not count.
     """
     gaussians = gaussians.detached()
-    error, weight = np.zeros((2, len(gaussians)), np.float32)
-    for window, target in zip(windows, targets, strict=True):
-        wrong = np.abs(target.difference(window.draw(gaussians).color, window.region)).mean(axis=-1)
-        seen = wrong[wrong > 0]  # where masked, it is 0
-        wrong = np.maximum(wrong - tolerance * np.median(seen), 0) if tolerance and len(seen) else wrong
-        sums = window.backproject(gaussians, np.stack([wrong, np.ones_like(wrong)], axis=-1))
-        error, weight = np.maximum(error, sums[:, 0]), np.maximum(weight, sums[:, 1])
+    shares = [error_shares(gaussians, *view, tolerance) for view in zip(windows, targets, strict=True)]
+    error, weight = np.max([np.zeros((len(gaussians), 2), np.float32), *shares], axis=0).T
     return Need(error, weight)
+
+
+def error_shares(gaussians: Gaussians, window: Window, target: Target, tolerance: float = 0.0) -> np.ndarray:
+    """Render a view, and return each Gaussian's share of the error and of the pixels, E and W (see above), [N, 2].
+
+    Args:
+        gaussians: N of them, detached.
+        window: onto the view.
+        target: its picture.
+        tolerance: in medians of the picture's error; what does not exceed it does not count.
+    """
+    wrong = np.abs(target.difference(window.draw(gaussians).color, window.region)).mean(axis=-1)
+    seen = wrong[wrong > 0]  # where masked, it is 0
+    wrong = np.maximum(wrong - tolerance * np.median(seen), 0) if tolerance and len(seen) else wrong
+    return window.backproject(gaussians, np.stack([wrong, np.ones_like(wrong)], axis=-1))
 
 
 def plan_growth(

@@ -95,7 +95,7 @@ def fit_next_frame(
         last = losses.get("recon", np.inf)
         losses = optimise(
             optimizer,
-            config.later_rates.by_parameter(extent),
+            config.rates_at(epoch).by_parameter(extent),
             steps,
             partial(losses_of, base),
             weights,

@@ -2,10 +2,10 @@
 
 Flow fails where parts are thin and fast, or alike; but what moves mostly goes on as before, and as what lies beside
 it. So each Gaussian is offered further displacements, as PatchMatch offers them to pixels (Barnes et al. 2009): first
-the one it had, then, twice, that of one of its nearest neighbours that move. All try theirs at once, are drawn so on
-the key views, and get their shares of the errors e(x) = |I - I*| back by the blend weights,
+the one it had, then, twice, that of one of its nearest neighbours that move. All try theirs at once, and are drawn so
+on the key views; what each answers for there, E_iv of W_iv pixels (see `density`), makes its error
 
-    E_i = (0.01 px + sum_v sum_x w_i(x) e(x)) / (1 px + sum_v sum_x w_i(x)) .
+    (0.01 px + sum_v E_iv) / (1 px + sum_v W_iv) .
 
 Who answers for clearly less error than before keeps the offer.
 """
@@ -19,6 +19,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.spatial import cKDTree
 
+from morgs_mi.fit.density import error_shares
 from morgs_mi.fit.losses import Target
 from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.motion.lift import Lift
@@ -51,35 +52,35 @@ def propagate_motion(
         previous: N Gaussians of the frame before, detached; `motion` is how they came there.
         lifted: what the flow says of them.
         windows: onto the key views, by view.
-        targets: their pictures.
+        targets: their pictures, by view.
         rng: draws the neighbours.
+
+    Returns:
+        The same or another displacement [N, 3], world units; the confidence follows who has taken an offer.
     """
     d, logit = lifted.displacement, lifted.logit_confidence
     before = np.zeros_like(d) if previous.motion is None else np.asarray(previous.motion)
     if not windows or not (d.any() or before.any()):
         return lifted
-    error = _errors(previous, d, windows, targets)
-    near = _nearest(np.asarray(previous.means))
+    means = np.asarray(previous.means)
+
+    def error_of(d: np.ndarray) -> np.ndarray:
+        moved = replace(previous, means=mi.TensorXf(means + d))
+        sums = np.sum([error_shares(moved, windows[view], targets[view]) for view in windows], axis=0)
+        return (sums[:, 0] + _FLOOR) / (sums[:, 1] + 1)
+
+    error, near = error_of(d), _nearest(means)
     for k in range(1 + _ROUNDS):
         offer = d[_moving_neighbour(near, d, rng)] if k else np.where(before.any(axis=1)[:, None], before, d)
-        left = _errors(previous, offer, windows, targets) / error
-        better = (offer != d).any(axis=1) & (left < np.where(d.any(axis=1), _BETTER, _WAKE))
-        d, error = np.where(better[:, None], offer, d), np.where(better, left * error, error)
+        other = (offer != d).any(axis=1)
+        if not other.any():
+            continue
+        left = error_of(offer)
+        better = other & (left < np.where(d.any(axis=1), _BETTER, _WAKE) * error)
+        d, error = np.where(better[:, None], offer, d), np.where(better, left, error)
         moves = np.where(d.any(axis=1), np.maximum(logit, _SURE), np.minimum(logit, -_SURE))
         logit = np.where(better, moves, logit)
     return Lift(d, logit.astype(np.float32))
-
-
-def _errors(
-    previous: Gaussians, d: np.ndarray, windows: Mapping[int, Window], targets: Mapping[int, Target]
-) -> np.ndarray:
-    """Return E [N] of Gaussians that are moved by d [N, 3]."""
-    moved = replace(previous, means=mi.TensorXf(np.asarray(previous.means) + d))
-    sums = np.zeros((len(d), 2))
-    for view, window in windows.items():
-        wrong = np.abs(targets[view].difference(window.draw(moved).color, window.region)).mean(axis=-1)
-        sums += window.backproject(moved, np.stack([wrong, np.ones_like(wrong)], axis=-1))
-    return (sums[:, 0] + _FLOOR) / (sums[:, 1] + 1)
 
 
 def _nearest(means: np.ndarray) -> np.ndarray:

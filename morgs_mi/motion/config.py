@@ -32,7 +32,8 @@ class MotionConfig:
     lift_flow: bool = True
     """Start each Gaussian's motion from the key views' flow in closed form; False: from zero, as in the paper."""
     propagate_motion: bool = True
-    """Offer each Gaussian its own motion of the frame before and its neighbours', too; False: lifted flow alone."""
+    """Offer each Gaussian its own motion of the frame before and its neighbours', too, where motion starts from lifted
+    flow; False: that alone."""
     lift_confidence: bool = True
     """Raise each Gaussian's confidence to that evidence; False: start from the frame before, as in the paper."""
     flow_method: str = "dis"

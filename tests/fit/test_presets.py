@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import get_args
 
 import pytest
@@ -35,10 +35,14 @@ def test_rows_of_the_paper(name, epochs, modules, lifted):
     assert (motion.lift_flow, motion.propagate_motion, motion.key_views) == (lifted, lifted, 12)
 
 
-def test_fewer_epochs_take_longer_strides_but_for_places():
-    rates = FitConfig(epochs=2).later_rates
-    assert rates == replace(Rates(), **{n: 2 * r for n, r in asdict(Rates()).items() if n != "means"})
-    assert FitConfig(epochs=8).later_rates == Rates()
+def test_places_go_far_first_and_the_rest_takes_longer_strides_in_fewer_epochs():
+    first, last = (FitConfig(epochs=8).rates_at(k) for k in (0, 7))
+    assert asdict(first) == pytest.approx({**asdict(Rates()), "means": 2 * Rates().means})
+    assert asdict(last) == pytest.approx({**asdict(Rates()), "means": Rates().means / 4})
+    first, last = (FitConfig(epochs=2).rates_at(k) for k in (0, 1))
+    assert first.means == pytest.approx(2 * last.means)
+    assert asdict(first) == pytest.approx({**{n: 2 * r for n, r in asdict(Rates()).items()}, "means": first.means})
+    assert FitConfig(epochs=1).rates_at(0).means == Rates().means
 
 
 def test_a_contradiction_is_refused():

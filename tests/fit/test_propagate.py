@@ -48,7 +48,10 @@ def start(scene, lifted, motion=None):
 
 
 def found(lift, moves):
-    """The share of those that move which do so by SHIFT, and of the others which stand still."""
+    """The share of those that move which do so by SHIFT, and of the others which stand still.
+
+    Measured, all are 1 but for one of the 60, which hardly shows; the bounds below allow for two.
+    """
     right = np.linalg.norm(lift.displacement - SHIFT * moves[:, None], axis=1) < 0.05
     return right[moves].mean(), right[~moves].mean()
 
@@ -57,10 +60,10 @@ def test_what_moved_goes_on_where_flow_says_nothing(scene):
     moves = scene[1]
     lift = start(scene, still(460), SHIFT * moves[:, None])
     hit, stood = found(lift, moves)
-    assert hit > 0.8
-    assert stood > 0.97
-    assert (lift.logit_confidence[moves] > 0).mean() > 0.8
-    assert (lift.logit_confidence[~moves] < 0).mean() > 0.97
+    assert hit > 0.96
+    assert stood > 0.99
+    assert (lift.logit_confidence[moves] > 0).mean() > 0.96
+    assert (lift.logit_confidence[~moves] < 0).mean() > 0.99
 
 
 def test_what_stopped_does_not_go_on(scene):
@@ -76,15 +79,15 @@ def test_neighbours_of_the_few_that_flow_has_seen_follow(scene):
     seen = moves & (np.arange(460) % 3 == 0)
     lift = Lift((SHIFT * seen[:, None]).astype(np.float32), np.where(seen, 2, -2).astype(np.float32))
     hit, stood = found(start(scene, lift), moves)
-    assert hit > 0.7  # a third to begin with
-    assert stood > 0.97
+    assert hit > 0.96  # a third to begin with
+    assert stood > 0.99
 
 
 def test_true_motion_stays(scene):
     moves = scene[1]
     lift = Lift((SHIFT * moves[:, None]).astype(np.float32), np.where(moves, 2, -2).astype(np.float32))
     result = start(scene, lift, -SHIFT * moves[:, None])
-    assert found(result, moves)[0] > 0.95
+    assert found(result, moves)[0] > 0.96
 
 
 def test_without_motion_or_views_nothing_is_offered(scene):
