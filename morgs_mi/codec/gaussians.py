@@ -291,6 +291,7 @@ def _words(columns: Iterable[np.ndarray]) -> np.ndarray:
 def _put_grid(writer: ColumnWriter, grid: Grid) -> None:
     columns = np.concatenate([grid.pivots[:, None], grid.exponents, grid.values], axis=1, dtype=np.int64)
     middle = np.sort(columns, axis=0)[len(grid) // 2] if len(grid) else np.zeros(columns.shape[1], np.int64)
+    middle[np.abs(columns - middle).max(0, initial=0) >= LIMIT] = 0  # what is as large as can be is not made larger
     writer.put(middle)
     for column in (columns - middle).T:  # small numbers are coded one by one, large ones by their octave
         writer.put(column)

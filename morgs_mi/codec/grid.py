@@ -43,6 +43,8 @@ _DC = 0.28209479177387814  # basis function of degree 0
 # Beyond these nothing can be seen, and one wild number must not cost the others their steps.
 _MOST_TURN, _MOST_LOGIT, _MOST_CONFIDENCE = 4096.0, 16.0, 6.0
 _SMALLEST_PX = 0.5  # splats below are blurred to about this size when drawn
+_MOST_BITS = 24  # of an integer of who is new
+_FURTHEST = LIMIT - 2**20  # rounded to the coarsest change (see `gaussians`), it still lies within the limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +190,7 @@ def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
     real = np.empty((max(at.stop for at in grid.columns.values()), len(pivots)))
     for name, at in grid.columns.items():
         np.divide(parts[name].T, grid.steps(name).T, out=real[at])
-    return np.clip(real, 1 - LIMIT, LIMIT - 1, out=real)
+    return np.clip(real, -_FURTHEST, _FURTHEST, out=real)
 
 
 def _exponents(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> np.ndarray:
@@ -211,7 +213,12 @@ def _exponents(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config:
     ]
     # The latter in whole octaves, which take fewer bits than they save.
     e = [np.floor(4 * np.log2(shared)) + 4 * np.floor(np.log2(own)) for shared, own in steps]
-    return np.clip(np.stack(e, axis=1), -128, 127).astype(np.int8)[:, : 8 + ("logit_confidence" in raw)]
+    # Before a lens, and where splats are huge, that would be finer than float32 is, and its integers without bound.
+    sh = np.abs(raw["sh_coeffs"])
+    colors = sh[:, 0].max(1), sh[:, 1:].max((1, 2), initial=0)
+    largest = [np.abs(raw["means"]).max(1), *np.abs(raw["log_scales"]).T, one, one, *colors, one]
+    finest = [np.ceil(4 * (np.log2(np.maximum(most, 1e-38)) - _MOST_BITS)) for most in largest]
+    return np.clip(np.maximum(e, finest).T, -128, 127).astype(np.int8)[:, : 8 + ("logit_confidence" in raw)]
 
 
 def _world_per_pixel(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:

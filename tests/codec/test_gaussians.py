@@ -261,6 +261,29 @@ def test_a_turn_of_any_angle_is_followed() -> None:
         assert abs(state.gaussians.numpy()["quats"][0] @ q) > np.cos(np.deg2rad(2))
 
 
+def test_the_extremes_are_coded_as_exactly_as_float32_is() -> None:
+    """Right before a lens steps are tiny, and what is large, far away or bright would need integers without end."""
+    raw = cloud(40).numpy()
+    raw["means"][:8] = CAMERAS[0].position + 1.001 * CAMERAS[0].near * CAMERAS[0].viewmat[2, :3]
+    raw["log_scales"][:4] = 12, -30, 0
+    raw["means"][8:12] = -1e9
+    raw["sh_coeffs"][12:16] = -1e8
+    extreme = Gaussians(**raw)
+    first = decode(None, keyframe_packet(extreme, 0, CAMERAS))
+    for name in ("means", "log_scales", "sh_coeffs"):
+        before, now = (np.asarray(getattr(g, name)).astype(np.float64) for g in (extreme, first.gaussians))
+        largest = np.abs(before).reshape(40, -1).max(1).reshape(40, *[1] * (before.ndim - 1))
+        usual = 2 * np.abs(now[16:] - before[16:]).max()
+        assert np.all(np.abs(now - before) <= np.maximum(2.0**-23 * largest, usual)), name
+
+    # Who was born near and small and flies off stops where its integers end.
+    gone = replace(first.gaussians, means=first.gaussians.means + np.float32(1e30))
+    for config in (CodecConfig(), CodecConfig(birth_precision=1), CodecConfig(target_size=1)):
+        second = decode(first, residual_packet(first, gone, cameras=CAMERAS, config=config))
+        assert np.asarray(second.gaussians.means).min() > 100
+        assert np.array_equal(decode(None, restated(second)).digest, second.digest)
+
+
 def test_seeking_equals_playing_on_an_index_or_without(tmp_path: Path) -> None:
     packets, states = run(14)
     path = tmp_path / "s"
