@@ -118,13 +118,13 @@ class FitConfig:
             raise ValueError(f"FitConfig(): `sh_degree` must be 0 to 3, got {self.sh_degree}.")
 
     def rates_at(self, epoch: int) -> Rates:
-        """Return the learning rates of a later frame's epoch, counted from 0, out of E = `epochs`.
+        """Return the learning rates of a later frame's epoch, counted from 0.
 
-        Those of places fall from E^1/3 to E^-2/3 of `rates`: far at first, exact at last. All others are (8 / E)^1/2 of
-        them, since fewer steps have to go as far.
+        Those of places are those of `rates` in the first two epochs, and then fall like 1 / (epoch + 1): who is nearly
+        in its place must not leave it again. All others are larger by (8 / epochs)^1/2 throughout: fewer steps have to
+        go as far.
         """
-        places = self.epochs ** (1 / 3 - epoch / max(self.epochs - 1, 1))
-        others = (8 / self.epochs) ** 0.5
+        places, others = min(1.0, 2 / (epoch + 1)), (8 / self.epochs) ** 0.5
         return Rates(**{n: (places if n == "means" else others) * rate for n, rate in asdict(self.rates).items()})
 
     @property
