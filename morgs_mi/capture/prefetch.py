@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from queue import Empty, Full, Queue
@@ -58,6 +59,13 @@ def prefetched(items: Iterable[T], ahead: int = 2, newest: bool = False) -> Iter
         put(_End(error))
 
     worker = Thread(target=work, daemon=True, name="prefetch")
+
+    def stop() -> None:
+        closed.set()
+        worker.join(timeout=10 * _PATIENCE)  # a source may hang
+
+    # A thread that is within a library when the interpreter ends takes the process down with it.
+    atexit.register(stop)
     worker.start()
     try:
         while not isinstance(item := ready.get(), _End):
@@ -65,5 +73,5 @@ def prefetched(items: Iterable[T], ahead: int = 2, newest: bool = False) -> Iter
         if item.error is not None:
             raise item.error
     finally:
-        closed.set()
-        worker.join(timeout=10 * _PATIENCE)  # a source may hang
+        stop()
+        atexit.unregister(stop)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -94,3 +96,17 @@ def test_the_newest_is_taken_where_the_source_cannot_wait() -> None:
     wait_until(lambda: len(made) == 50)
     time.sleep(0.02)
     assert list(ahead) == [49]
+
+
+def test_the_interpreter_may_end_while_something_is_being_made() -> None:
+    """A thread that wakes within a library when the interpreter is gone aborts the process."""
+    script = (
+        "import cv2, numpy as np\n"
+        "from morgs_mi.capture.prefetch import prefetched\n"
+        "image = np.zeros((1500, 1500, 3), np.uint8)\n"
+        "frames = prefetched(cv2.medianBlur(image, 31) for _ in range(1000))\n"
+        "next(frames)\n"
+        "raise SystemExit(3)\n"
+    )
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stderr) == (3, "")
