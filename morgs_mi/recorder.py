@@ -187,7 +187,8 @@ def _reports(path: Path, count: int) -> list[FrameReport]:
         rows = json.loads(path.read_text(encoding="utf-8"))["frames"][:count]
         reports = [FrameReport(**{**row, "left_out": tuple(row["left_out"])}) for row in rows]
     except (OSError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path}: expected a fit's report, got a broken one ({error!r}); start again.") from None
+        found = f"a broken one ({error})" if path.exists() else "none"
+        raise ValueError(f"{path}: expected the report of what was fitted, got {found}; start again.") from None
     if [report.frame for report in reports] != list(range(count)):
         raise ValueError(f"{path}: expected the rows of {count} frames, got {len(reports)}; start again.")
     return reports

@@ -192,7 +192,12 @@ def test_another_fit_is_not_resumed(whole: Path, tmp_path: Path, capture, config
 def test_what_is_damaged_is_not_resumed(whole: Path, tmp_path: Path) -> None:
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)))
     (out / "report.json").write_text("{")
-    with pytest.raises(ValueError, match=r"report\.json: expected a fit's report, got a broken one"):
+    with pytest.raises(ValueError, match=r"report\.json: expected the report of what was fitted, got a broken one"):
+        stream_capture(recording(), out, CONFIG, resume=True)
+    (out / "report.json").unlink()
+    with pytest.raises(
+        ValueError, match=r"report\.json: expected the report of what was fitted, got none; start again"
+    ):
         stream_capture(recording(), out, CONFIG, resume=True)
     (out / "report.json").write_text('{"frames": []}')
     with pytest.raises(ValueError, match=r"report\.json: expected the rows of 6 frames, got 0"):
