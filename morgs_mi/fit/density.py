@@ -105,7 +105,7 @@ def find_need(
 
 
 def error_shares(gaussians: Gaussians, window: Window, target: Target, tolerance: float = 0.0) -> np.ndarray:
-    """Render a view, and return each Gaussian's share of the error and of the pixels, E and W (see above), [N, 2].
+    """Render a view, and return each Gaussian's E and W there (see above), [N, 2], in px of full contrast and in px.
 
     Args:
         gaussians: N of them, detached.

@@ -103,8 +103,8 @@ def test_the_interpreter_may_end_while_something_is_being_made() -> None:
     script = (
         "import cv2, numpy as np\n"
         "from morgs_mi.capture.prefetch import prefetched\n"
-        "image = np.zeros((1500, 1500, 3), np.uint8)\n"
-        "frames = prefetched(cv2.medianBlur(image, 31) for _ in range(1000))\n"
+        "image = np.zeros((500, 500, 3), np.uint8)\n"
+        "frames = prefetched((cv2.medianBlur(image, 31) for _ in range(10000)), ahead=10000)\n"
         "next(frames)\n"
         "raise SystemExit(3)\n"
     )
