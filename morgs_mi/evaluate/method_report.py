@@ -2,8 +2,8 @@
 
 A *setting* is a preset, a number of epochs, a number of key views and a factor on the learning rates; it is measured
 with several seeds, each of which has a first frame of its own that all settings share. Presets that are tuned are run
-at several rates. The rate that counts is the one with the best mean PSNR of the held-out view over the later frames: it
-is chosen on what is reported, in the same way for every tuned preset.
+at several rates with the first seed. The rate that counts is the one with the best mean PSNR of the held-out view over
+the later frames; all other seeds are run at that, and at 1x, where presets differ in nothing but their parts.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class MethodReportConfig:
     rates: tuple[float, ...] = (1, 2, 4)
     """Factors on the learning rates of the presets that are tuned; the others have 1."""
     tuned: tuple[str, ...] = ("baseline", DEFAULT)
-    """Presets that are run at all rates."""
+    """Presets that are run at all rates, with the first seed."""
     seeds: int = 3
     """Runs of every setting."""
     frames: int | None = None
@@ -122,27 +122,34 @@ def report_method(
 
 
 def cells_of(config: MethodReportConfig, num_views: int) -> tuple[list[Cell], list[Cell]]:
-    """Return the cells of the presets, and those that compare numbers of key views; some are in both."""
+    """Return the first seed's cells of the presets, and those that compare numbers of key views; some are in both."""
     usual = min(config.stream.motion.key_views, num_views)
     presets = [
-        Cell(preset, epochs, usual, rate, seed)
-        for seed in range(config.seeds)
+        Cell(preset, epochs, usual, rate, seed=0)
         for epochs in config.epochs
         for preset in config.presets
         for rate in (config.rates if preset in config.tuned else (1.0,))
     ]
     key_views = [
-        Cell(preset, config.table_epochs, views, 1.0, seed)
-        for seed in range(config.seeds)
+        Cell(preset, config.table_epochs, views, 1.0, seed=0)
         for views in sorted({min(count, num_views) for count in config.key_views})
         for preset in (_WITHOUT_OFFSET, _WITH_OFFSET)
     ]
     return list(dict.fromkeys(presets)), key_views
 
 
+def best_cells(found: Mapping[Cell, Scores]) -> set[Cell]:
+    """Return the first seed's cells whose rate is best for their preset, epochs and key views."""
+    best: dict[Cell, Cell] = {}
+    for cell in (cell for cell in found if cell.seed == 0):
+        setting = replace(cell, rates=1.0)
+        best[setting] = max(best.get(setting, cell), cell, key=lambda cell: found[cell]["psnr"])
+    return set(best.values())
+
+
 def aggregate(found: Mapping[Cell, Scores]) -> list[dict[str, Any]]:
     """Return one row per setting: mean and standard deviation of every score over the seeds, and which rate is best."""
-    groups: dict[Cell, list[Scores]] = {}
+    best, groups = best_cells(found), dict[Cell, list[Scores]]()
     for cell, scores in found.items():
         groups.setdefault(replace(cell, seed=0), []).append(scores)
     rows = []
@@ -157,12 +164,8 @@ def aggregate(found: Mapping[Cell, Scores]) -> list[dict[str, Any]]:
             {name: value for name, value in asdict(setting).items() if name != "seed"}
             | {"runs": len(runs), "mean": {name: float(values.mean()) for name, values in table.items()}}
             | {"std": {name: _spread(values) for name, values in table.items()}, "by_frame": over_time}
+            | {"best": setting in best}
         )
-    for row in rows:
-        rivals = [
-            r["mean"]["psnr"] for r in rows if all(r[key] == row[key] for key in ("preset", "epochs", "key_views"))
-        ]
-        row["best"] = row["mean"]["psnr"] == max(rivals)
     return rows
 
 
@@ -178,12 +181,24 @@ def _clip(
         raise ValueError(f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}.")
     clip, base = Clip.read(capture), config.base
     presets, key_views = cells_of(config, len(capture.train_views))
+    found: dict[Cell, Scores] = {}
+
+    def measure(cells: Sequence[Cell], seed: int) -> None:
+        stage = f"Fitting {clip.name}" + (f", seed {seed + 1} of {config.seeds}" if seed else "")
+        for done, cell in enumerate(replace(cell, seed=seed) for cell in cells):
+            progress(stage, done, len(cells))
+            found[cell] = scores_of(clip, cell, base, version, out)
+        progress(stage, len(cells), len(cells))
+
+    def rows_of(cells: Sequence[Cell]) -> list[dict[str, Any]]:
+        return aggregate({cell: scores for cell, scores in found.items() if replace(cell, seed=0) in cells})
+
+    first = list(dict.fromkeys(presets + key_views))
+    measure(first, seed=0)
+    best = best_cells(found)
     # Seed by seed: after an interruption, a report with fewer seeds has all that it needs.
-    cells, found = sorted(dict.fromkeys(presets + key_views), key=lambda cell: cell.seed), {}
-    for done, cell in enumerate(cells):
-        progress(f"Fitting {clip.name}", done, len(cells))
-        found[cell] = scores_of(clip, cell, base, version, out)
-    progress(f"Fitting {clip.name}", len(cells), len(cells))
+    for seed in range(1, config.seeds):
+        measure([cell for cell in first if cell in best or cell.rates == 1], seed)
     steps = _SCRATCH * _PAPER_EPOCHS * len(capture.train_views)
     chosen = np.linspace(capture.num_frames - 1, 1, config.scratch + 1)[: config.scratch].round().astype(int)
     scratch = []
@@ -200,8 +215,8 @@ def _clip(
         "held_out": capture.test_view is not None,
         "cue": _cue(path, config) if capture.truth is not None else None,
         "scratch": scratch,
-        "rows": aggregate({cell: found[cell] for cell in presets}),
-        "key_view_rows": aggregate({cell: found[cell] for cell in key_views}),
+        "rows": rows_of(presets),
+        "key_view_rows": rows_of(key_views),
     }
 
 

@@ -116,7 +116,7 @@ def method_page(result: Mapping[str, Any]) -> str:
     parts = [f"## What the parts add\n\n{gains_table(clips)}", f"## Aims\n\n{aims_table(clips)}"]
     for clip in clips:
         size = f"{clip['views']} views of {clip['width']}x{clip['height']}, {clip['frames']} frames"
-        seeds = clip["rows"][0]["runs"]
+        seeds = best_rows(clip)[0]["runs"]
         spread = "one run" if seeds == 1 else f"mean ± standard deviation of {seeds} runs"
         parts.append(f"## {clip['name']}\n\n{size}; {spread}. {_yardsticks(clip)}{_edges(clip)}")
         parts.append(f"### Parts of the method, {epochs} epochs\n\n{ablation_table(clip, epochs)}")

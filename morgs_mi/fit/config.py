@@ -107,6 +107,8 @@ class FitConfig:
     """Births and deaths."""
     rates: Rates = field(default_factory=Rates)
     """Learning rates of every later frame; `rates_at` makes them those of an epoch."""
+    falling_rates: bool = True
+    """Let the rates of places fall within a later frame, from its third epoch on."""
     first_rates: Rates = field(default_factory=lambda: Rates(means=2e-3, scales=0.02, quats=0.02, opacities=0.2))
     """Learning rates at the start of the first frame; they fall to a tenth of that to its end."""
 
@@ -120,11 +122,11 @@ class FitConfig:
     def rates_at(self, epoch: int) -> Rates:
         """Return the learning rates of a later frame's epoch, counted from 0.
 
-        Those of places are those of `rates` in the first two epochs, and then fall like 1 / (epoch + 1): who is nearly
-        in its place must not leave it again. All others are larger by (8 / epochs)^1/2 throughout: fewer steps have to
-        go as far.
+        Those of places are those of `rates` in the first two epochs, and then fall like 1 / (epoch + 1), if they shall:
+        who is nearly in its place must not leave it again. All others are larger by (8 / epochs)^1/2 throughout: fewer
+        steps have to go as far.
         """
-        places, others = min(1.0, 2 / (epoch + 1)), (8 / self.epochs) ** 0.5
+        places, others = min(1.0, 2 / (epoch + 1)) if self.falling_rates else 1.0, (8 / self.epochs) ** 0.5
         return Rates(**{n: (places if n == "means" else others) * rate for n, rate in asdict(self.rates).items()})
 
     @property

@@ -2,7 +2,8 @@
 
     l, s                              8 and 5 passes over the views for every later frame
     baseline, ml, ml-mo, ml-mo-mc     residuals only; with motion; with its offset; with confidence
-    paper                             all three, motion starting from zero in place of the lifted flow, one gate
+    paper                             all three, motion starting from zero in place of the lifted flow, one gate,
+                                      rates that stay
 
 How many key views there are (2, 4, 8 or 12 in the paper) is `MotionConfig.key_views`, and goes with all of them.
 """
@@ -34,6 +35,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
     "ml-mo-mc": _modules(True, True, True),
     "paper": {
         "epochs": 8,
+        "falling_rates": False,
         "lift_flow": False,
         "propagate_motion": False,
         "lift_confidence": False,
