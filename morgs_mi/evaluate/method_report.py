@@ -3,7 +3,7 @@
 A *setting* is a preset, a number of epochs, a number of key views and a factor on the learning rates; it is measured
 with several seeds, each of which has a first frame of its own that all settings share. Presets that are tuned are run
 at several rates with the first seed. The rate that counts is the one with the best mean PSNR of the held-out view over
-the later frames; all other seeds are run at that, and at 1x, where presets differ in nothing but their parts.
+the later frames; all other seeds are run at that alone.
 """
 
 from __future__ import annotations
@@ -195,10 +195,10 @@ def _clip(
 
     first = list(dict.fromkeys(presets + key_views))
     measure(first, seed=0)
-    best = best_cells(found)
+    later = best_cells({cell: found[cell] for cell in presets}) | set(key_views)
     # Seed by seed: after an interruption, a report with fewer seeds has all that it needs.
     for seed in range(1, config.seeds):
-        measure([cell for cell in first if cell in best or cell.rates == 1], seed)
+        measure([cell for cell in first if cell in later], seed)
     steps = _SCRATCH * _PAPER_EPOCHS * len(capture.train_views)
     chosen = np.linspace(capture.num_frames - 1, 1, config.scratch + 1)[: config.scratch].round().astype(int)
     scratch = []

@@ -45,7 +45,7 @@ _PANELS = (
     ("motion error where things move, px", "motion_error_moving", "cue"),
     ("3D motion error, share of the true length", "motion_3d_relative_error", None),
 )
-# What is compared at equal rates: presets with something, and without.
+# What is compared: presets with something, and without.
 _GAINS = (
     ("motion", "ml", "baseline"),
     ("offset", "ml-mo", "ml"),
@@ -85,10 +85,10 @@ def key_views_table(clip: Mapping[str, Any]) -> str:
 
 
 def gains_table(clips: Sequence[Mapping[str, Any]]) -> str:
-    """Return what parts add at rates of 1x: PSNR, whole and where things move, in dB, and motion error there in px."""
+    """Return what parts add at the best rates: PSNR, whole and where things move, in dB, and motion error in px."""
     table = []
     for clip in clips:
-        rows = {(row["preset"], row["epochs"]): row["mean"] for row in clip["rows"] if row["rates"] == 1}
+        rows = {(row["preset"], row["epochs"]): row["mean"] for row in best_rows(clip)}
         for epochs in sorted({epochs for _, epochs in rows}):
             cells = []
             for _, preset, without in _GAINS:
