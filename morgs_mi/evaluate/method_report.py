@@ -181,24 +181,11 @@ def _clip(
         raise ValueError(f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}.")
     clip, base = Clip.read(capture), config.base
     presets, key_views = cells_of(config, len(capture.train_views))
-    found: dict[Cell, Scores] = {}
-
-    def measure(cells: Sequence[Cell], seed: int) -> None:
-        stage = f"Fitting {clip.name}" + (f", seed {seed + 1} of {config.seeds}" if seed else "")
-        for done, cell in enumerate(replace(cell, seed=seed) for cell in cells):
-            progress(stage, done, len(cells))
-            found[cell] = scores_of(clip, cell, base, version, out)
-        progress(stage, len(cells), len(cells))
+    found = _measured(clip, presets, key_views, config, version, out, progress)
 
     def rows_of(cells: Sequence[Cell]) -> list[dict[str, Any]]:
         return aggregate({cell: scores for cell, scores in found.items() if replace(cell, seed=0) in cells})
 
-    first = list(dict.fromkeys(presets + key_views))
-    measure(first, seed=0)
-    later = best_cells({cell: found[cell] for cell in presets}) | set(key_views)
-    # Seed by seed: after an interruption, a report with fewer seeds has all that it needs.
-    for seed in range(1, config.seeds):
-        measure([cell for cell in first if cell in later], seed)
     steps = _SCRATCH * _PAPER_EPOCHS * len(capture.train_views)
     chosen = np.linspace(capture.num_frames - 1, 1, config.scratch + 1)[: config.scratch].round().astype(int)
     scratch = []
@@ -218,6 +205,34 @@ def _clip(
         "rows": rows_of(presets),
         "key_view_rows": rows_of(key_views),
     }
+
+
+def _measured(
+    clip: Clip,
+    presets: Sequence[Cell],
+    key_views: Sequence[Cell],
+    config: MethodReportConfig,
+    version: str,
+    out: Path,
+    progress: Callable[[str, float, float], None],
+) -> dict[Cell, Scores]:
+    """Return the scores of the first seed's cells, and of the other seeds' at the best rates and all key views."""
+    found: dict[Cell, Scores] = {}
+
+    def measure(cells: Sequence[Cell], seed: int) -> None:
+        stage = f"Fitting {clip.name}" + (f", seed {seed + 1} of {config.seeds}" if seed else "")
+        for done, cell in enumerate(replace(cell, seed=seed) for cell in cells):
+            progress(stage, done, len(cells))
+            found[cell] = scores_of(clip, cell, config.base, version, out)
+        progress(stage, len(cells), len(cells))
+
+    first = list(dict.fromkeys([*presets, *key_views]))
+    measure(first, seed=0)
+    later = best_cells({cell: found[cell] for cell in presets}) | set(key_views)
+    # Seed by seed: after an interruption, a report with fewer seeds has all that it needs.
+    for seed in range(1, config.seeds):
+        measure([cell for cell in first if cell in later], seed)
+    return found
 
 
 def _cue(path: str | Path, config: MethodReportConfig) -> dict[str, float]:

@@ -122,9 +122,9 @@ class FitConfig:
     def rates_at(self, epoch: int) -> Rates:
         """Return the learning rates of a later frame's epoch, counted from 0.
 
-        Those of places are those of `rates` in the first two epochs, and then fall like 1 / (epoch + 1), if they shall:
-        who is nearly in its place must not leave it again. All others are larger by (8 / epochs)^1/2 throughout: fewer
-        steps have to go as far.
+        Those of places are those of `rates` in the first two epochs, and then fall like 1 / (epoch + 1), for who is
+        nearly in its place must not leave it again; without `falling_rates` they stay. All others are larger by
+        (8 / epochs)^1/2 throughout: fewer steps have to go as far.
         """
         places, others = min(1.0, 2 / (epoch + 1)) if self.falling_rates else 1.0, (8 / self.epochs) ** 0.5
         return Rates(**{n: (places if n == "means" else others) * rate for n, rate in asdict(self.rates).items()})

@@ -1,0 +1,86 @@
+"""A stiff problem, a needle seen along its axis before an almost opaque disc: the fit stays finite and converges."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import numpy as np
+from drjit.opt import Adam
+
+from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from tests import reference
+
+# As in test_extremes, so that both share their kernels.
+CHANNELS = ("color", "alpha", "depth", "motion", "confidence")
+BACKGROUND = (0.2, 0.5, 0.9)
+CONFIG = RenderConfig(stop_transmittance=1e-12)
+Values = dict[str, np.ndarray]
+WINDOW = Camera(np.array([[60.0, 0, 16], [0, 60, 12], [0, 0, 1]]), np.eye(4), 32, 24)
+
+
+def stiff_truth() -> Values:
+    """Return raw attributes of a needle seen along its axis, and an almost opaque disc behind it."""
+    sh_coeffs = np.zeros((2, 4, 3))
+    sh_coeffs[:, 0] = [[1.0, 0.2, -0.5], [-0.5, 0.4, 1.0]]
+    return {
+        "means": np.array([[0.1, 0.05, 4.0], [-0.2, 0.1, 6.0]]),
+        "log_scales": np.log([[0.04, 0.04, 4.0], [1.0, 0.7, 0.01]]),
+        "quats": np.array([[1, 0.01, 0.02, 0], [1, 0.1, -0.1, 0.3]]),
+        "logit_opacities": np.array([0.5, 7.0]),
+        "sh_coeffs": sh_coeffs,
+        "motion": np.zeros((2, 3)),
+        "logit_confidence": np.zeros(2),
+    }
+
+
+def descend(rate: float, steps: int) -> tuple[list[float], Values]:
+    """Return the losses and the raw attributes at the end of Adam with one rate, falling, for everything."""
+
+    def picture(gaussians: Gaussians) -> Any:
+        return rasterize(gaussians, WINDOW, CHANNELS, BACKGROUND, config=CONFIG).color
+
+    truth, rng = stiff_truth(), np.random.default_rng(0)
+    target = dr.detach(picture(Gaussians(**truth)))
+    start = {name: value + 0.03 * rng.normal(size=value.shape) for name, value in truth.items()}
+    start["log_scales"] += 0.3 * rng.normal(size=(2, 3))
+    start["logit_opacities"] += (1, -3)
+    optimizer, losses = Adam(lr=rate, params=Gaussians(**start).items(), epsilon=1e-15), []
+    for step in range(steps):
+        optimizer.set_learning_rate(rate * 0.01 ** (step / steps))
+        loss = dr.mean(dr.square(picture(Gaussians(**dict(optimizer))) - target), axis=None)
+        dr.backward(loss)
+        optimizer.step()
+        losses.append(float(np.asarray(dr.detach(loss)).item()))
+    return losses, Gaussians(**dict(optimizer)).numpy()
+
+
+def test_the_stiff_problem_is_stiff():
+    """The diagonal of J'J of the picture spans more than 1e6, between tilts of the needle and the disc's opacity."""
+    truth, curvature = stiff_truth(), {}
+    for name in ("means", "quats", "log_scales", "logit_opacities"):
+        curvature[name] = np.zeros(truth[name].shape)
+        for index in np.ndindex(*truth[name].shape):
+            along = np.zeros(truth[name].shape)
+            along[index] = 1
+            slope = reference.directional(
+                lambda v: reference.rasterize(v, WINDOW.K, WINDOW.viewmat, 32, 24, BACKGROUND)["color"],
+                truth,
+                {name: along},
+            )
+            curvature[name][index] = np.sum(slope**2)
+    assert curvature["quats"][0].max() > 1e6 * curvature["logit_opacities"][1] > 0
+
+
+def test_stiff_problem_converges_within_bounds():
+    losses, found = descend(0.02, 150)
+    assert np.isfinite(losses).all()
+    assert losses[-1] < 1e-3 * losses[0]
+    for name, value in stiff_truth().items():
+        assert np.abs(found[name] - value).max() < (4 if name == "logit_opacities" else 1), name
+
+
+def test_absurd_learning_rate_does_no_worse_than_lose_the_scene():
+    losses, found = descend(10.0, 60)
+    assert np.isfinite(losses).all()
+    assert all(np.isfinite(value).all() for value in found.values())
