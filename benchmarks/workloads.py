@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi import Camera, Gaussians
-from morgs_mi.evaluate.renderer_report import ball
 
 TARGET = (0.4, 0.5, 0.6)
 SH_C0 = 0.28209479177387814
@@ -66,6 +65,21 @@ QUICK = (
     Rung("20k, 512x384, every channel", "channels", 20_000, (512, 384), 0.02, EVERY_CHANNEL),
     _BASE,
 )
+
+
+def ball(
+    seed: int, count: int, width: int, height: int, median_scale: float, sh_degree: int = 0
+) -> tuple[Gaussians, Camera]:
+    """Return Gaussians uniform in the unit ball, and a camera three units away that sees 50 degrees across."""
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=(count, 3))
+    means = direction / np.linalg.norm(direction, axis=1, keepdims=True) * np.cbrt(rng.uniform(size=(count, 1)))
+    sh = 0.1 * rng.normal(size=(count, (sh_degree + 1) ** 2, 3))
+    sh[:, 0] = (rng.uniform(size=(count, 3)) - 0.5) / 0.28209479177387814
+    scales = median_scale * np.exp(0.4 * rng.normal(size=(count, 3)))
+    quats = rng.normal(size=(count, 4))
+    gaussians = Gaussians.from_activated(means, scales, quats, rng.uniform(0.1, 0.95, count), sh)
+    return gaussians, Camera.look_at((0, 0, -3), (0, 0, 0), (0, -1, 0), 50.0, width, height)
 
 
 def build(rung: Rung, seed: int) -> tuple[Gaussians, Camera]:

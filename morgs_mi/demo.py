@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.capture.synth import synthesize
-from morgs_mi.capture.video_writer import write_video
-from morgs_mi.evaluate.drawings import motion_scale
-from morgs_mi.evaluate.frames import PLAYABLE, even
-from morgs_mi.evaluate.judge import evaluate_stream
-from morgs_mi.evaluate.pictures import contact_sheet, label, motion_legend, side_by_side, write_png
-from morgs_mi.evaluate.report import machine, versions
-from morgs_mi.evaluate.stream import channel_picture, open_stream, render_stream, truth_on
-from morgs_mi.files import write_json
+from morgs_mi.core.files import write_json
+from morgs_mi.evaluate.environment import machine, versions
+from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.evaluate.figures import motion_scale
+from morgs_mi.export.frames import PLAYABLE, even
 from morgs_mi.fit.config import FitConfig
+from morgs_mi.io.video_writer import write_video
+from morgs_mi.playback.player import channel_picture, open_stream, render_stream, truth_on
+from morgs_mi.playback.visualise import contact_sheet, label, motion_legend, side_by_side, write_png
 from morgs_mi.recorder import stream_capture
 from morgs_mi.stream_loop import StreamConfig
+from morgs_mi.synth.synthesize import synthesize
 
 __all__ = ["Clip", "DemoConfig", "run_demo"]
 

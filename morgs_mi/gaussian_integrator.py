@@ -27,8 +27,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.capture.camera import Camera
-from morgs_mi.gaussians.gaussians import ActivatedGaussians, tensor_rows
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import ActivatedGaussians, tensor_rows
 from morgs_mi.render.rasterize import rasterize
 
 __all__ = ["ellipsoids"]

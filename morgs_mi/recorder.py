@@ -19,13 +19,13 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.calibration.rig_check import find_common, with_points
 from morgs_mi.capture.capture import Capture, PartialFrame
-from morgs_mi.capture.rig_check import find_common, with_points
 from morgs_mi.codec.container import PacketKind, StreamWriter, TruncatedStreamError, header_json
-from morgs_mi.codec.gaussians import CodedFrame, restated, seek
+from morgs_mi.codec.packets import CodedFrame, restated, seek
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.files import write_json
-from morgs_mi.motion.cues import choose_key_views
+from morgs_mi.core.files import write_json
+from morgs_mi.method.flow import choose_key_views
 from morgs_mi.stream_loop import MIN_POINTS, FrameReport, StreamConfig, StreamLoop
 
 __all__ = ["stream_capture"]

@@ -14,22 +14,22 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from morgs_mi.capture.camera import Camera
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import Packet, encode_packet
-from morgs_mi.codec.gaussians import CodedFrame, decode, keyframe_packet, residual_packet
+from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, residual_packet
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
-from morgs_mi.fit.losses import Target
-from morgs_mi.fit.next_frame import fit_next_frame
-from morgs_mi.fit.part import Part, changing_part, whole_part
-from morgs_mi.gaussians.gaussians import Gaussians
-from morgs_mi.gaussians.initialise import from_points, resample_points, scene_extent, seed_points
-from morgs_mi.motion.change import around, changed, renewed
-from morgs_mi.motion.config import MotionConfig
-from morgs_mi.motion.cues import MotionCue, choose_key_views, motion_cues
-from morgs_mi.motion.flow_sources import FramePair
-from morgs_mi.motion.masks import motion_mask
+from morgs_mi.fit.initialise import from_points, resample_points, scene_extent, seed_points
+from morgs_mi.fit.later_frame import fit_next_frame
+from morgs_mi.losses.ssim import Target
+from morgs_mi.method.active_set import Part, changing_part, whole_part
+from morgs_mi.method.change import around, changed, renewed
+from morgs_mi.method.confidence import motion_mask
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.flow import MotionCue, choose_key_views, motion_cues
+from morgs_mi.method.flow_sources.registry import FramePair
 from morgs_mi.render.config import RenderConfig
 
 __all__ = ["MIN_POINTS", "FrameReport", "StreamConfig", "StreamLoop", "StreamState", "step"]

@@ -1,11 +1,21 @@
-"""One variant for all tests; its kernels are shared."""
+"""One variant for all tests, whose kernels are shared; and a capture beside a stream that reproduces it exactly."""
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
+
 import mitsuba as mi
+import numpy as np
 import pytest
 
 import morgs_mi  # noqa: F401  (finds a usable LLVM before the variant is set)
+from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.io.video_writer import write_video
+from morgs_mi.playback.visualise import as_picture
+from morgs_mi.render.rasterize import rasterize
+from morgs_mi.synth.ground_truth import Truth, save_truth
+from tests.moving_splats import CAMERAS, DISTANCE, FRAMES, PIXELS, STEP, moved, write_stream
 
 mi.set_variant("llvm_ad_rgb")
 
@@ -16,3 +26,26 @@ def llvm_variant():
     mi.set_variant("llvm_ad_rgb")
     yield
     mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture(scope="session")
+def fitted_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a recording, its truth and its stream; every picture is the stream's own."""
+    folder = tmp_path_factory.mktemp("clip")
+    write_colmap(folder / "capture" / "sparse", CAMERAS)
+    for camera in CAMERAS:
+        images = [rasterize(moved(t), camera) for t in range(FRAMES)]
+        write_video(folder / "capture" / camera.name, [as_picture(np.array(i.color)) for i in images], 25)
+        for t, image in enumerate(images):
+            seen = np.array(image.alpha)[..., 0] > 0
+            motion = seen[..., None] * np.float32([PIXELS, 0]) * (t > 0)
+            truth = Truth(motion, np.float32(DISTANCE * seen), np.where(seen, 0, -1), seen)
+            save_truth(folder / "capture" / "truth", camera.name, t, truth)
+    steps = np.arange(FRAMES)[:, None] * (STEP, 0, 0)
+    corners = np.array([(0.0, 0, 0), (1, 0, 0), (0, 1, 0)])
+    np.savez(folder / "capture" / "truth" / "tracks.npz", points=corners[:, None] + steps, ids=np.zeros(3, np.int32))
+    about = {"capture": str(folder / "capture"), "downscale": 1, "test_view": 0}
+    write_stream(folder / "stream.morgs", about)
+    rows = [{"frame": t, "seconds": 3.0 - t} for t in range(FRAMES)]
+    (folder / "report.json").write_text(json.dumps({"frames": rows}))
+    return folder

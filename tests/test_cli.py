@@ -13,12 +13,14 @@ import numpy as np
 import pytest
 
 from morgs_mi import cli
-from morgs_mi.capture import Camera, write_colmap, write_video
-from morgs_mi.capture.exr import read_exr
+from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.gaussians import keyframe_packet, play, restated
+from morgs_mi.codec.packets import keyframe_packet, play, restated
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.gaussians.gaussians import Gaussians
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.io.exr import read_exr
+from morgs_mi.io.video_writer import write_video
 from morgs_mi.stream_loop import StreamLoop
 from tests.export.streams import write_stream
 
@@ -134,7 +136,7 @@ def test_a_clip_cut_off_meanwhile_leaves_its_camera_out_of_the_rest(
     capture: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     truncated_clip(capture)
-    monkeypatch.setattr("morgs_mi.capture.video._count_packets", lambda path: FRAMES)
+    monkeypatch.setattr("morgs_mi.io.video._count_packets", lambda path: FRAMES)
     assert run(capsys, "fit", capture, tmp_path / "out", *QUICK)[0] == 0
     frames = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
     assert [frame["left_out"] for frame in frames] == [[], ["cam1"], ["cam1"]]
@@ -370,7 +372,7 @@ def test_an_interruption(stream: Path, tmp_path: Path, capsys, monkeypatch: pyte
     def interrupt(*args: object, **more: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("morgs_mi.evaluate.stream.rasterize", interrupt)
+    monkeypatch.setattr("morgs_mi.playback.player.rasterize", interrupt)
     status, _, error = run(capsys, "render", stream, "--camera", 0)
     assert status == 130
     assert_one_sentence(error, "Interrupted")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from morgs_mi.capture.synth import synthesize
+from morgs_mi.synth.synthesize import synthesize
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")

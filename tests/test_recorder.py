@@ -17,11 +17,11 @@ import pytest
 
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import PAYLOAD, TRAILER, StreamWriter
-from morgs_mi.codec.gaussians import CodedFrame, coded_frames, play, restated, seek
+from morgs_mi.codec.packets import CodedFrame, coded_frames, play, restated, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.recorder import stream_capture
 from morgs_mi.stream_loop import StreamLoop
-from tests.codec.test_gaussians import history
+from tests.codec.test_packets import history
 from tests.recording import CONFIG, FRAMES, Recording, recording
 
 # About what the fit takes here; on a slower machine all kills come early.

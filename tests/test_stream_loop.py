@@ -12,11 +12,11 @@ import pytest
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize, stream_loop
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.codec.container import PacketKind, encode_packet
-from morgs_mi.codec.gaussians import coded_frames, decode, play
+from morgs_mi.codec.packets import coded_frames, decode, play
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
 from morgs_mi.fit.config import DensityConfig, FitConfig, Rates
-from morgs_mi.motion.config import MotionConfig
+from morgs_mi.method.config import MotionConfig
 from morgs_mi.recorder import stream_capture
 from morgs_mi.stream_loop import StreamConfig, StreamLoop
 

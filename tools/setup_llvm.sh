@@ -4,7 +4,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 [ "$(uname -s)" = Linux ] || exit 0 # elsewhere Dr.Jit's own search serves
-find_llvm() { "$1" -P morgs_mi/llvm.py >/dev/null; } # as a file: importing the package needs LLVM already
+find_llvm() { "$1" -P morgs_mi/core/llvm.py >/dev/null; } # as a file: importing the package needs LLVM already
 
 if problem=$(find_llvm "$1" 2>&1); then
     [ -z "$problem" ] || echo "setup: $problem" >&2

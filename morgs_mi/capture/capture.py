@@ -14,14 +14,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from morgs_mi.capture.camera import Camera
-from morgs_mi.capture.color import ColorFit, Tone, fit_colors
-from morgs_mi.capture.feed import Feed, at_clip_size
-from morgs_mi.capture.layouts import Calibration, read_calibration
+from morgs_mi.capture.camera_source import Feed, at_clip_size
+from morgs_mi.capture.color_correction import ColorFit, Tone, fit_colors
+from morgs_mi.capture.layouts.registry import Calibration, read_calibration
 from morgs_mi.capture.lens import undistortion
-from morgs_mi.capture.prefetch import prefetched
-from morgs_mi.capture.reading import ReadConfig, read_settings, timeline
-from morgs_mi.capture.video import open_clips
+from morgs_mi.capture.timeline import ReadConfig, read_settings, timeline
+from morgs_mi.core.camera import Camera
+from morgs_mi.io.prefetch import prefetched
+from morgs_mi.io.video import open_clips
 
 __all__ = ["Capture", "Frame", "PartialFrame", "load_capture"]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from morgs_mi.capture.camera import Camera
+from morgs_mi.core.camera import Camera
 
 __all__ = ["Lens", "Undistortion", "lens_and_intrinsics", "undistortion"]
 

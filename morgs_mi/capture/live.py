@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
-from morgs_mi.capture.prefetch import prefetched
+from morgs_mi.io.prefetch import prefetched
 
 __all__ = ["Source", "live_frames"]
 

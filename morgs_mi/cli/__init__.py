@@ -1,6 +1,6 @@
 """The command line, and the only argument parser.
 
-`morgs-mi synth`, `info`, `calibrate`, `fit`, `render`, `export`, `view`, `eval`, `salvage`, `demo` and `report`.
+`morgs-mi synth`, `info`, `calibrate`, `fit`, `render`, `export`, `view`, `eval`, `salvage` and `demo`.
 
 Results go to standard output; progress, warnings and complaints to standard error. What the user can set right is
 one sentence and exit status 1, an interruption 130; `--debug` shows where it came from. Arguments that the parser
@@ -21,11 +21,10 @@ from tyro.conf import arg
 
 from morgs_mi.cli.captures import Calibrate, Info, Synth
 from morgs_mi.cli.console import ERR, warn
-from morgs_mi.cli.looks import Export, View
-from morgs_mi.cli.reports import Measure
+from morgs_mi.cli.exports import Export, View
 from morgs_mi.cli.streams import Demo, Eval, Fit, Render, Salvage
 
-__all__ = ["main"]
+__all__ = ["Common", "main", "run"]
 
 Command = (
     Annotated[Synth, tyro.conf.subcommand("synth")]
@@ -38,28 +37,38 @@ Command = (
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Salvage, tyro.conf.subcommand("salvage")]
     | Annotated[Demo, tyro.conf.subcommand("demo")]
-    | Annotated[Measure, tyro.conf.subcommand("report")]
 )
 
 
 @dataclass(frozen=True)
-class Options:
-    """Dynamic Gaussian splatting in Mitsuba 3: a multi-view clip goes in, a stream of moving Gaussians comes out."""
+class Common:
+    """Options of every command."""
 
-    command: Annotated[Command, arg(name="")]
     variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
     """Mitsuba's variant: llvm_ad_rgb runs on any processor, cuda_ad_rgb on an NVIDIA GPU."""
     debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Show where an error came from, and more of what happens."""
 
 
+@dataclass(frozen=True)
+class Options(Common):
+    """Dynamic Gaussian splatting in Mitsuba 3: a multi-view clip goes in, a stream of moving Gaussians comes out."""
+
+    command: Annotated[Command, arg(name="")] = tyro.MISSING
+
+
 def main(args: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status; `args` default to those of the process."""
+    return run(Options, "morgs-mi", args)
+
+
+def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None) -> int:
+    """Parse `args` into options with a `command`, run that, and return the exit status."""
     args = sys.argv[1:] if args is None else list(args)
     try:
         options = tyro.cli(
-            Options,
-            prog="morgs-mi",
+            options_type,
+            prog=prog,
             args=args,
             config=(tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes),
         )
@@ -76,7 +85,7 @@ def main(args: Sequence[str] | None = None) -> int:
         return 130 if interrupted else 1
 
 
-def _set_up(options: Options) -> None:
+def _set_up(options: Common) -> None:
     """Send warnings to standard error and choose Mitsuba's variant."""
     import mitsuba as mi
 

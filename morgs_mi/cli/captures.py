@@ -10,8 +10,8 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from morgs_mi.capture.calibrate import CalibrateConfig
-from morgs_mi.capture.reading import ReadConfig
+from morgs_mi.calibration.calibrate import CalibrateConfig
+from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cli.console import OUT, progress, say, warn
 
 __all__ = ["Calibrate", "Info", "Synth"]
@@ -47,7 +47,7 @@ class Synth:
     """Replace an earlier capture."""
 
     def run(self) -> None:
-        from morgs_mi.capture.synth import synthesize
+        from morgs_mi.synth.synthesize import synthesize
 
         with progress() as report:
             synthesize(
@@ -81,9 +81,9 @@ class Info:
     reading: Annotated[ReadConfig, arg(name="")] = field(default_factory=ReadConfig)
 
     def run(self) -> None:
+        from morgs_mi.calibration.rig_check import check_rig, find_common, with_points
+        from morgs_mi.calibration.rig_plot import write_rig
         from morgs_mi.capture.capture import load_capture
-        from morgs_mi.capture.rig_check import check_rig, find_common, with_points
-        from morgs_mi.capture.rig_plot import write_rig
 
         capture, found = load_capture(self.capture, reading=self.reading), None
         origin = "" if len(capture.points) else "without points"
@@ -139,7 +139,7 @@ class Calibrate:
     """Replace an earlier model."""
 
     def run(self) -> None:
-        from morgs_mi.capture.calibrate import calibrate
+        from morgs_mi.calibration.calibrate import calibrate
 
         with progress() as report:
             found = calibrate(

@@ -13,11 +13,11 @@ from typing import Annotated, Any, Literal
 from rich.table import Table
 from tyro.conf import FlagCreatePairsOff, Positional, arg
 
-from morgs_mi.capture.reading import ReadConfig
+from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cli.console import OUT, progress, say, warn
 from morgs_mi.demo import DemoConfig
 from morgs_mi.evaluate.tables import figure, judgement_sentences, judgement_tables
-from morgs_mi.fit.presets import PresetName, apply_preset
+from morgs_mi.presets import PresetName, apply_preset
 from morgs_mi.stream_loop import StreamConfig
 
 __all__ = ["Demo", "Eval", "Fit", "Render", "Salvage"]
@@ -88,8 +88,8 @@ class Render:
     B in linear light, motion.X, motion.Y in pixels, confidence.Y, depth.Y); by default OUT/CAMERA.mp4."""
 
     def run(self) -> None:
-        from morgs_mi.evaluate.frames import write_frames
-        from morgs_mi.evaluate.stream import find_camera, open_stream
+        from morgs_mi.export.frames import write_frames
+        from morgs_mi.playback.player import find_camera, open_stream
 
         stream = open_stream(self.out)
         camera = find_camera(stream, self.camera)
@@ -119,11 +119,11 @@ class Eval:
     """LPIPS network as ONNX with inputs in0 and in1, RGB [1, 3, H, W] from -1 to 1; none comes with the package."""
 
     def run(self) -> None:
-        from morgs_mi.evaluate.drawings import draw_stream
-        from morgs_mi.evaluate.judge import evaluate_stream
+        from morgs_mi.core.files import finite, write_json
+        from morgs_mi.evaluate.environment import machine, versions
+        from morgs_mi.evaluate.evaluate import evaluate_stream
+        from morgs_mi.evaluate.figures import draw_stream
         from morgs_mi.evaluate.lpips import Lpips
-        from morgs_mi.evaluate.report import machine, versions
-        from morgs_mi.files import finite, write_json
 
         network = None if self.lpips is None else Lpips(self.lpips)
         with progress() as report:
@@ -153,7 +153,7 @@ class Salvage:
 
     def run(self) -> None:
         from morgs_mi.codec.salvage import write_salvaged
-        from morgs_mi.evaluate.stream import open_stream
+        from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.stream)
         frames, gaps = write_salvaged(stream, self.out)

@@ -26,7 +26,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from morgs_mi.capture.camera import Camera
+from morgs_mi.core.camera import Camera
 
 __all__ = [
     "ENTRY",

@@ -25,9 +25,9 @@ from morgs_mi.codec.container import (
     decode_packet,
     open_packet,
 )
-from morgs_mi.codec.gaussians import CodedFrame, decode
+from morgs_mi.codec.packets import CodedFrame, decode
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.files import whole
+from morgs_mi.core.files import whole
 
 __all__ = ["Gap", "salvage", "write_salvaged"]
 

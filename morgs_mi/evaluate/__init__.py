@@ -1,0 +1,1 @@
+"""Scores of a stream against its recording and the ground truth."""

@@ -18,8 +18,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from morgs_mi.capture.camera import Camera
-from morgs_mi.capture.truth import Truth, project
+from morgs_mi.core.camera import Camera
+from morgs_mi.synth.ground_truth import Truth, project
 
 __all__ = ["compare_motion", "judge_motion", "rigid_motions", "surface_ids"]
 

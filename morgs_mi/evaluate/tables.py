@@ -8,7 +8,7 @@ from typing import Any
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from morgs_mi.evaluate.judge import REGIONS
+from morgs_mi.evaluate.evaluate import REGIONS
 
 __all__ = ["figure", "judgement_sentences", "judgement_tables"]
 

@@ -1,0 +1,1 @@
+"""Streams as files that other programs read."""

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from morgs_mi.capture.camera import Camera
+from morgs_mi.core.camera import Camera
 
 __all__ = ["gltf_axes", "up_direction"]
 

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.capture.video_writer import write_video
-from morgs_mi.codec.gaussians import play, seek
+from morgs_mi.codec.packets import play, seek
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.evaluate.frames import PLAYABLE, even
-from morgs_mi.evaluate.pictures import side_by_side
-from morgs_mi.evaluate.stream import channel_picture, render, render_config
+from morgs_mi.core.files import new_folder
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.export.frames import PLAYABLE, even
 from morgs_mi.export.paths import CameraPath
-from morgs_mi.files import new_folder
-from morgs_mi.gaussians.gaussians import Gaussians
+from morgs_mi.io.video_writer import write_video
+from morgs_mi.playback.player import channel_picture, render, render_config
+from morgs_mi.playback.visualise import side_by_side
 
 __all__ = ["chosen_frames", "frame_numbers", "write_each", "write_flight"]
 

@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from morgs_mi.evaluate.frames import linear_light
-from morgs_mi.files import whole
-from morgs_mi.gaussians.gaussians import Gaussians
-from morgs_mi.gaussians.shape import rotated, unit_quats
+from morgs_mi.core.files import whole
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.geometry import rotated, unit_quats
+from morgs_mi.export.frames import linear_light
 
 __all__ = ["glb", "write_gltf"]
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from morgs_mi.capture.camera import Camera, rigid
+from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.export.axes import up_direction
 
 __all__ = ["CameraPath", "between", "focus", "load_path", "orbit"]

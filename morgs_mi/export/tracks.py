@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.codec.container import PacketKind
-from morgs_mi.codec.gaussians import CodedFrame, decode
+from morgs_mi.codec.packets import CodedFrame, decode
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.files import whole
+from morgs_mi.core.files import whole
 
 __all__ = ["Tracks", "follow", "write_tracks"]
 

@@ -1,0 +1,1 @@
+"""The optimisation: the first frame, every later frame, and density control."""

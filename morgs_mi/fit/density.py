@@ -17,49 +17,29 @@ that noise asks for nobody.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import numpy as np
 from drjit.opt import Adam
 
+from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.config import DensityConfig
-from morgs_mi.fit.losses import Target
 from morgs_mi.fit.optimise import replace_parameter
-from morgs_mi.gaussians.gaussians import Gaussians
-from morgs_mi.render.window import Window
+from morgs_mi.losses.attribution import Need
 
 __all__ = [
-    "NOISE",
-    "Need",
     "Plan",
     "apply_plan",
-    "error_shares",
-    "find_need",
     "plan_additions",
     "plan_growth",
     "regrow",
 ]
 
-# Normal noise, independent in three colours, exceeds so many times its median error at 3 of 10,000 pixels.
-NOISE = 3.0
 _SHRINK = float(np.log(1.6))
 # float32 knows no opacity closer to 1.
 _MOST_OPAQUE = 1 - 1e-6
-
-
-@dataclass(frozen=True)
-class Need:
-    """What the pictures say of N Gaussians.
-
-    Attributes:
-        error: E [N], of the view where it is largest.
-        weight: W [N], pixels, of the view where it is largest; 0 for who is seen nowhere.
-    """
-
-    error: np.ndarray
-    weight: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -85,38 +65,6 @@ class Plan:
     def num_survivors(self) -> int:
         """How many live on."""
         return len(self.source) - self.num_births
-
-
-def find_need(
-    gaussians: Gaussians, windows: Sequence[Window], targets: Sequence[Target], tolerance: float = 0.0
-) -> Need:
-    """Render every view, and give each Gaussian its share of the errors and of the pixels (E and W).
-
-    Args:
-        gaussians: N of them.
-        windows: onto V views.
-        targets: their pictures.
-        tolerance: in medians of a picture's error; what does not exceed it does not count.
-    """
-    gaussians = gaussians.detached()
-    shares = [error_shares(gaussians, *view, tolerance) for view in zip(windows, targets, strict=True)]
-    error, weight = np.max([np.zeros((len(gaussians), 2), np.float32), *shares], axis=0).T
-    return Need(error, weight)
-
-
-def error_shares(gaussians: Gaussians, window: Window, target: Target, tolerance: float = 0.0) -> np.ndarray:
-    """Render a view, and return each Gaussian's E and W there (see above), [N, 2], in px of full contrast and in px.
-
-    Args:
-        gaussians: N of them, detached.
-        window: onto the view.
-        target: its picture.
-        tolerance: in medians of the picture's error; what does not exceed it does not count.
-    """
-    wrong = np.abs(target.difference(window.draw(gaussians).color, window.region)).mean(axis=-1)
-    seen = wrong[wrong > 0]  # where masked, it is 0
-    wrong = np.maximum(wrong - tolerance * np.median(seen), 0) if tolerance and len(seen) else wrong
-    return window.backproject(gaussians, np.stack([wrong, np.ones_like(wrong)], axis=-1))
 
 
 def plan_growth(

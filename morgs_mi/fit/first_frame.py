@@ -12,16 +12,18 @@ import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
-from morgs_mi.capture.camera import Camera
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.density import find_need, plan_growth, regrow
-from morgs_mi.fit.losses import Target, mask_loss, recon_loss
+from morgs_mi.fit.density import plan_growth, regrow
 from morgs_mi.fit.optimise import adam, optimise, replace_parameter, values_of, view_order
-from morgs_mi.gaussians.gaussians import Gaussians
-from morgs_mi.motion.residual import join_sh, split_sh
+from morgs_mi.losses.attribution import find_need
+from morgs_mi.losses.losses import mask_loss, recon_loss
+from morgs_mi.losses.ssim import Target
+from morgs_mi.method.residual import join_sh, split_sh
+from morgs_mi.render.active_view import Window
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
-from morgs_mi.render.window import Window
 
 __all__ = ["fit_confidence", "fit_first_frame"]
 

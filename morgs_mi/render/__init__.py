@@ -1,0 +1,1 @@
+"""The rasteriser: projection, lists of pixel blocks, traced blending and its adjoint."""

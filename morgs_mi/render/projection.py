@@ -24,8 +24,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.capture.camera import Camera
-from morgs_mi.gaussians.gaussians import ActivatedGaussians, tensor_rows
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import ActivatedGaussians, tensor_rows
 from morgs_mi.render.config import RenderConfig
 
 __all__ = ["CHANNEL_SIZES", "Splats", "joined", "project"]

@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.capture.camera import Camera
-from morgs_mi.gaussians.gaussians import ActivatedGaussians, repeated
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import ActivatedGaussians, repeated
 from morgs_mi.render.blocks import build_lists, touches
 from morgs_mi.render.compositing import Channel, Layout, blend
 from morgs_mi.render.config import RenderConfig

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.codec.container import PacketKind, TruncatedStreamError
-from morgs_mi.codec.gaussians import CodedFrame, coded_frames
-from morgs_mi.evaluate.stream import open_stream
+from morgs_mi.codec.packets import CodedFrame, coded_frames
+from morgs_mi.playback.player import open_stream
 
 __all__ = ["Clip", "Trails"]
 

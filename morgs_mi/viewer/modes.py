@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from morgs_mi.capture.camera import Camera
-from morgs_mi.evaluate.pictures import as_picture, confidence_picture, depth_picture, motion_picture
-from morgs_mi.evaluate.stream import OFFSET_SCALE
-from morgs_mi.gaussians.gaussians import Gaussians
-from morgs_mi.gaussians.shape import colors_towards
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.geometry import colors_towards
+from morgs_mi.playback.player import OFFSET_SCALE
+from morgs_mi.playback.visualise import as_picture, confidence_picture, depth_picture, motion_picture
 
 __all__ = ["BACKGROUNDS", "FULL_SPEED", "MODES", "splat_colors"]
 

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from morgs_mi.capture.camera import Camera
-from morgs_mi.evaluate.stream import channel_picture, render, render_config
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.geometry import covariances
 from morgs_mi.export.axes import up_direction
 from morgs_mi.export.paths import focus
-from morgs_mi.gaussians.shape import covariances
+from morgs_mi.playback.player import channel_picture, render, render_config
 from morgs_mi.viewer.clip import Clip
 from morgs_mi.viewer.modes import BACKGROUNDS, MODES, splat_colors
 

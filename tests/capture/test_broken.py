@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from morgs_mi import cli
-from morgs_mi.capture import write_video
-from tests.capture import layouts
+from morgs_mi.io.video_writer import write_video
+from tests.capture import small_captures as layouts
 
 Spoil = Callable[[Path], object]
 

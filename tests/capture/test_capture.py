@@ -10,7 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morgs_mi.capture import Camera, Lens, load_capture, write_colmap, write_poses_bounds, write_video
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
+from morgs_mi.capture.lens import Lens
+from morgs_mi.core.camera import Camera
+from morgs_mi.io.video_writer import write_video
 
 WIDTH, HEIGHT, COUNT = 62, 46, 3
 

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 from plyfile import PlyData, PlyElement
 
-from morgs_mi.capture import load_capture, write_video
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.io.video_writer import write_video
 
 TEXT = (Path(__file__).parents[2] / "docs" / "captures.md").read_text(encoding="utf-8")
 TRANSFORMS, META = re.findall(r"```json\n(.*?)```", TEXT, re.DOTALL)

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.capture.camera import Camera
 from morgs_mi.capture.lens import Lens, lens_and_intrinsics, undistortion
+from morgs_mi.core.camera import Camera
 
 WIDTH, HEIGHT = 160, 120
 LENSES = {

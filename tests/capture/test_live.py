@@ -13,8 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morgs_mi.capture import Capture, Lens, live_frames, load_capture, write_colmap, write_video
-from tests.capture import layouts
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.capture.lens import Lens
+from morgs_mi.capture.live import live_frames
+from morgs_mi.io.video_writer import write_video
+from tests.capture import small_captures as layouts
 
 NAMES = ("cam1", "cam2", "cam3")
 
@@ -109,7 +113,7 @@ def test_the_example_of_the_page_runs(rig: Capture, monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr("subprocess.Popen", popen)
     monkeypatch.setattr("morgs_mi.stream_loop.StreamLoop", Loop)
-    monkeypatch.setattr("morgs_mi.capture.load_capture", lambda path, downscale: rig)
+    monkeypatch.setattr("morgs_mi.capture.capture.load_capture", lambda path, downscale: rig)
     monkeypatch.setattr("mitsuba.set_variant", lambda name: None)
     exec(compile(example, "captures.md", "exec"), {})
     assert len(pushed) == 3

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from morgs_mi.capture import Camera
+from morgs_mi.core.camera import Camera
 
 _TEXTURE = 512
 # Corner, and the edges that span it; far ones first, for the near ones hide them.

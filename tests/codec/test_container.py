@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morgs_mi.capture.camera import Camera
 from morgs_mi.codec.container import (
     Packet,
     PacketKind,
@@ -21,6 +20,7 @@ from morgs_mi.codec.container import (
     encode_packet,
 )
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.camera import Camera
 
 RNG = np.random.default_rng(5)
 PACKETS = [

@@ -16,11 +16,11 @@ import pytest
 
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import PAYLOAD, StreamWriter
-from morgs_mi.codec.gaussians import CodedFrame, coded_frames, decode, keyframe_packet, residual_packet, restated, seek
+from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, keyframe_packet, residual_packet, restated, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.codec.salvage import Gap, salvage, write_salvaged
-from morgs_mi.gaussians.gaussians import Gaussians
-from tests.codec.test_gaussians import CAMERAS, cloud, jittered
+from morgs_mi.core.gaussians import Gaussians
+from tests.codec.test_packets import CAMERAS, cloud, jittered
 
 FRAMES, EVERY = 8, 3
 # More than a trial takes with all that is cached, and far less than a damaged length or count may ask for.

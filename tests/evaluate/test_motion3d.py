@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morgs_mi.capture import Camera
-from morgs_mi.capture.truth import Truth
+from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.motion3d import compare_motion, judge_motion, rigid_motions, surface_ids
+from morgs_mi.synth.ground_truth import Truth
 
 rng = np.random.default_rng(0)
 WIDTH, HEIGHT = 40, 30

@@ -7,16 +7,16 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from morgs_mi.evaluate.judge import evaluate_stream
+from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.tables import figure, judgement_sentences, judgement_tables
-from tests.evaluate.splats import write_stream
+from tests.moving_splats import write_stream
 
 
 @pytest.fixture(scope="module")
-def result(clip: Path, tmp_path_factory: pytest.TempPathFactory) -> dict:
+def result(fitted_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> dict:
     path = tmp_path_factory.mktemp("tables") / "s.morgs"
     write_stream(path, {"test_view": 0}, shift=1)
-    return evaluate_stream(path, clip / "capture")
+    return evaluate_stream(path, fitted_clip / "capture")
 
 
 def test_tables_fit_eighty_columns(result: dict) -> None:

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.capture.camera import Camera
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.gaussians import CodedFrame, decode, keyframe_packet, residual_packet
-from morgs_mi.gaussians.gaussians import Gaussians
+from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, residual_packet
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
 
 NAMES = ("left", "middle", "right")
 # What of a step of 0.1 along x was learned: two steps of its grid.

@@ -11,9 +11,9 @@ import pytest
 
 from morgs_mi import cli
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.evaluate.frames import linear_light
 from morgs_mi.export.clips import chosen_frames
-from morgs_mi.gaussians.ply import read_ply
+from morgs_mi.export.frames import linear_light
+from morgs_mi.io.ply import read_ply
 from morgs_mi.render.rasterize import rasterize
 from tests.export.streams import rig, write_stream
 

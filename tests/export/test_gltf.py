@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.export.axes import gltf_axes
 from morgs_mi.export.gltf import glb, write_gltf
-from morgs_mi.gaussians.gaussians import Gaussians
 from morgs_mi.render.rasterize import rasterize
 from tests.export.streams import rig, splats
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morgs_mi.capture.camera import Camera
+from morgs_mi.core.camera import Camera
 from morgs_mi.export.axes import up_direction
 from morgs_mi.export.paths import CameraPath, between, focus, load_path, orbit
 from tests.export.streams import rig

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.gaussians import keyframe_packet
+from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.export.tracks import follow, write_tracks
 from tests.export.streams import rig, splats, write_stream

@@ -11,10 +11,11 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.fit.config import DensityConfig
-from morgs_mi.fit.density import NOISE, Need, Plan, apply_plan, find_need, plan_additions, plan_growth, regrow
-from morgs_mi.fit.losses import Target
+from morgs_mi.fit.density import Plan, apply_plan, plan_additions, plan_growth, regrow
 from morgs_mi.fit.optimise import adam, values_of
-from morgs_mi.render.window import Window
+from morgs_mi.losses.attribution import NOISE, Need, find_need
+from morgs_mi.losses.ssim import Target
+from morgs_mi.render.active_view import Window
 
 CONFIG = DensityConfig(max_gaussians=100, split_scale=0.1, min_opacity=0.005, births=1.0)
 

@@ -11,11 +11,11 @@ from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.fit.config import DensityConfig, FitConfig
 from morgs_mi.fit.first_frame import density_rounds, fit_first_frame
-from morgs_mi.fit.losses import Target
-from morgs_mi.fit.next_frame import fit_next_frame
-from morgs_mi.fit.part import whole_part
-from morgs_mi.gaussians.initialise import from_points
-from morgs_mi.motion.config import MotionConfig
+from morgs_mi.fit.initialise import from_points
+from morgs_mi.fit.later_frame import fit_next_frame
+from morgs_mi.losses.ssim import Target
+from morgs_mi.method.active_set import whole_part
+from morgs_mi.method.config import MotionConfig
 
 RENDER, EXTENT = RenderConfig(), 3.0
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
-from morgs_mi.gaussians.gaussians import tensor_rows
+from morgs_mi.core.gaussians import tensor_rows
 from tests import reference
 from tests import tolerances as tol
 

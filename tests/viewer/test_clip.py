@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from morgs_mi import cli
-from morgs_mi.capture.camera import Camera
-from morgs_mi.codec.gaussians import CodedFrame
-from morgs_mi.evaluate.pictures import confidence_picture, motion_picture
-from morgs_mi.evaluate.stream import channel_picture, open_stream, render
+from morgs_mi.codec.packets import CodedFrame
+from morgs_mi.core.camera import Camera
+from morgs_mi.playback.player import channel_picture, open_stream, render
+from morgs_mi.playback.visualise import confidence_picture, motion_picture
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.viewer.clip import Clip

@@ -12,12 +12,12 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.capture.camera import Camera
-from morgs_mi.codec.gaussians import CodedFrame
+from morgs_mi.codec.packets import CodedFrame
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.metrics import psnr
-from morgs_mi.evaluate.stream import channel_picture, open_stream, render, render_config
 from morgs_mi.export.axes import up_direction
+from morgs_mi.playback.player import channel_picture, open_stream, render, render_config
 from tests.export.streams import write_stream
 
 pytest.importorskip("viser", reason="comes with the extra `viewer`")

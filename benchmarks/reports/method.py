@@ -1,0 +1,248 @@
+"""What the method's parts are worth: presets by epochs, key views with and without offset, and how sure that is.
+
+A *setting* is a preset, a number of epochs, a number of key views and a factor on the learning rates; it is measured
+with several seeds, each of which has a first frame of its own that all settings share. Presets that are tuned are run
+at several rates with the first seed. The rate that counts is the one with the best mean PSNR of the held-out view over
+the later frames; all other seeds are run at that alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.reports.flow import FlowReportConfig, report_flow
+from benchmarks.reports.method_cells import DEFAULT, Cell, Clip, Scores, method_version, scores_of, scratch_scores
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.evaluate.environment import machine, versions
+from morgs_mi.fit.config import FitConfig
+from morgs_mi.presets import PRESETS
+from morgs_mi.stream_loop import StreamConfig
+
+__all__ = ["MethodReportConfig", "report_method"]
+
+# The paper's table of key views has these two rows.
+_WITHOUT_OFFSET, _WITH_OFFSET = "ml", "ml-mo"
+_PAPER_EPOCHS = 8
+_SCRATCH = 20
+
+
+@dataclass(frozen=True)
+class MethodReportConfig:
+    """Which settings are fitted, and how."""
+
+    presets: tuple[str, ...] = ("baseline", "ml", "ml-mo", "ml-mo-mc", "paper", DEFAULT)
+    """Presets of morgs-mi fit; default stands for none."""
+    epochs: tuple[int, ...] = (1, 2, 3, 5, 8, 12)
+    """Passes over the views for every later frame."""
+    key_views: tuple[int, ...] = (2, 4, 8, 12)
+    """Numbers of key views that are compared, with and without offset; more than there are views count as all."""
+    rates: tuple[float, ...] = (1, 2, 4)
+    """Factors on the learning rates of the presets that are tuned; the others have 1."""
+    tuned: tuple[str, ...] = ("baseline", DEFAULT)
+    """Presets that are run at all rates, with the first seed."""
+    seeds: int = 3
+    """Runs of every setting."""
+    frames: int | None = None
+    """Use at most this many frames from the start."""
+    num_gaussians: int = 10_000
+    """Gaussians of the first frame, in place of stream.fit's."""
+    scratch: int = 0
+    """Frames of each clip that are also fitted from scratch, each with 20 times the steps of 8 epochs."""
+    version: str | None = None
+    """What stands for the method's sources: kept results of the same version are taken as they are."""
+    stream: StreamConfig = field(default_factory=StreamConfig)
+    """The fit; presets, epochs, key views, rates and seeds are set in it."""
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in (*self.presets, *self.tuned) if name not in (DEFAULT, *PRESETS)]
+        if unknown or not self.presets:
+            raise ValueError(
+                f"MethodReportConfig(): `presets` and `tuned` must be out of {', '.join((DEFAULT, *PRESETS))}, got "
+                f"{', '.join(unknown) or 'none'}."
+            )
+        for name in ("epochs", "rates", "seeds", "num_gaussians"):
+            values = np.atleast_1d(getattr(self, name))
+            if not len(values) or not (values > 0).all():
+                raise ValueError(f"MethodReportConfig(): `{name}` must be positive, got {getattr(self, name)}.")
+        if self.scratch < 0 or any(count < 1 for count in self.key_views):
+            raise ValueError("MethodReportConfig(): `scratch` must be at least 0 and `key_views` at least 1.")
+
+    @property
+    def base(self) -> StreamConfig:
+        """What every cell is a variation of."""
+        fit = replace(self.stream.fit, num_gaussians=self.num_gaussians, epochs=FitConfig.epochs)
+        return replace(self.stream, fit=fit)
+
+    @property
+    def table_epochs(self) -> int:
+        """The epochs of the tables: the paper's 8, or what is nearest to them."""
+        return min(self.epochs, key=lambda epochs: abs(epochs - _PAPER_EPOCHS))
+
+
+def report_method(
+    captures: Sequence[str | Path],
+    out: str | Path,
+    config: MethodReportConfig,
+    progress: Callable[[str, float, float], None] = lambda *_: None,
+    finished: Callable[[Mapping[str, Any]], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Fit every clip with every setting and seed, as far as that was not done before.
+
+    Args:
+        captures: folders of captures, two frames or more.
+        out: folder that keeps first frames and cells, so that an interrupted report goes on.
+        config: which settings.
+        progress: called with (stage, done, total).
+        finished: called with the result after each clip.
+
+    Returns:
+        See docs/method.md.
+
+    Raises:
+        OSError: a capture cannot be read, or a result not written.
+        ValueError: no captures, two of one name, one with a single frame, or a setting does not go with a preset.
+    """
+    names = [Path(path).resolve().name for path in captures]
+    if not names or len(set(names)) < len(names):
+        raise ValueError(
+            f"report_method(): `captures` must be one folder or more, each of another name, got {', '.join(names)}."
+        )
+    version = config.version or method_version()
+    result: dict[str, Any] = {"clips": [], "table_epochs": config.table_epochs, "version": version}
+    result |= {"settings": asdict(config), "machine": machine(), "versions": versions()}
+    for path in captures:
+        result["clips"].append(_clip(path, Path(out), config, version, progress))
+        finished(result)
+    return result
+
+
+def cells_of(config: MethodReportConfig, num_views: int) -> tuple[list[Cell], list[Cell]]:
+    """Return the first seed's cells of the presets, and those that compare numbers of key views; some are in both."""
+    usual = min(config.stream.motion.key_views, num_views)
+    presets = [
+        Cell(preset, epochs, usual, rate, seed=0)
+        for epochs in config.epochs
+        for preset in config.presets
+        for rate in (config.rates if preset in config.tuned else (1.0,))
+    ]
+    key_views = [
+        Cell(preset, config.table_epochs, views, 1.0, seed=0)
+        for views in sorted({min(count, num_views) for count in config.key_views})
+        for preset in (_WITHOUT_OFFSET, _WITH_OFFSET)
+    ]
+    return list(dict.fromkeys(presets)), key_views
+
+
+def best_cells(found: Mapping[Cell, Scores]) -> set[Cell]:
+    """Return the first seed's cells whose rate is best for their preset, epochs and key views."""
+    best: dict[Cell, Cell] = {}
+    for cell in (cell for cell in found if cell.seed == 0):
+        setting = replace(cell, rates=1.0)
+        best[setting] = max(best.get(setting, cell), cell, key=lambda cell: found[cell]["psnr"])
+    return set(best.values())
+
+
+def aggregate(found: Mapping[Cell, Scores]) -> list[dict[str, Any]]:
+    """Return one row per setting: mean and standard deviation of every score over the seeds, and which rate is best."""
+    best, groups = best_cells(found), dict[Cell, list[Scores]]()
+    for cell, scores in found.items():
+        groups.setdefault(replace(cell, seed=0), []).append(scores)
+    rows = []
+    for setting, runs in groups.items():
+        names = [name for name in runs[0] if name != "by_frame"]
+        table = {name: np.array([run[name] for run in runs], float) for name in names}
+        over_time = {
+            name: np.mean([np.array(run["by_frame"][name], float) for run in runs], axis=0).tolist()
+            for name in runs[0]["by_frame"]
+        }
+        rows.append(
+            {name: value for name, value in asdict(setting).items() if name != "seed"}
+            | {"runs": len(runs), "mean": {name: float(values.mean()) for name, values in table.items()}}
+            | {"std": {name: _spread(values) for name, values in table.items()}, "by_frame": over_time}
+            | {"best": setting in best}
+        )
+    return rows
+
+
+def _clip(
+    path: str | Path,
+    out: Path,
+    config: MethodReportConfig,
+    version: str,
+    progress: Callable[[str, float, float], None],
+) -> dict[str, Any]:
+    capture = load_capture(path, max_frames=config.frames)
+    if capture.num_frames < 2:
+        raise ValueError(f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}.")
+    clip, base = Clip.read(capture), config.base
+    presets, key_views = cells_of(config, len(capture.train_views))
+    found = _measured(clip, presets, key_views, config, version, out, progress)
+
+    def rows_of(cells: Sequence[Cell]) -> list[dict[str, Any]]:
+        return aggregate({cell: scores for cell, scores in found.items() if replace(cell, seed=0) in cells})
+
+    steps = _SCRATCH * _PAPER_EPOCHS * len(capture.train_views)
+    chosen = np.linspace(capture.num_frames - 1, 1, config.scratch + 1)[: config.scratch].round().astype(int)
+    scratch = []
+    for done, frame in enumerate(dict.fromkeys(chosen.tolist())):
+        progress(f"Fitting {clip.name} from scratch", done, config.scratch)
+        scratch.append({"frame": frame, "steps": steps, **scratch_scores(clip, frame, base, steps, version, out)})
+    camera = capture.cameras[0]
+    return {
+        "name": clip.name,
+        "views": len(capture.cameras),
+        "frames": capture.num_frames,
+        "width": camera.width,
+        "height": camera.height,
+        "held_out": capture.test_view is not None,
+        "cue": _cue(path, config) if capture.truth is not None else None,
+        "scratch": scratch,
+        "rows": rows_of(presets),
+        "key_view_rows": rows_of(key_views),
+    }
+
+
+def _measured(
+    clip: Clip,
+    presets: Sequence[Cell],
+    key_views: Sequence[Cell],
+    config: MethodReportConfig,
+    version: str,
+    out: Path,
+    progress: Callable[[str, float, float], None],
+) -> dict[Cell, Scores]:
+    """Return the scores of the first seed's cells, and of the other seeds' at the best rates and all key views."""
+    found: dict[Cell, Scores] = {}
+
+    def measure(cells: Sequence[Cell], seed: int) -> None:
+        stage = f"Fitting {clip.name}" + (f", seed {seed + 1} of {config.seeds}" if seed else "")
+        for done, cell in enumerate(replace(cell, seed=seed) for cell in cells):
+            progress(stage, done, len(cells))
+            found[cell] = scores_of(clip, cell, config.base, version, out)
+        progress(stage, len(cells), len(cells))
+
+    first = list(dict.fromkeys([*presets, *key_views]))
+    measure(first, seed=0)
+    later = best_cells({cell: found[cell] for cell in presets}) | set(key_views)
+    # Seed by seed: after an interruption, a report with fewer seeds has all that it needs.
+    for seed in range(1, config.seeds):
+        measure([cell for cell in first if cell in later], seed)
+    return found
+
+
+def _cue(path: str | Path, config: MethodReportConfig) -> dict[str, float]:
+    """Return the error of the flow that guides the motion, in px where things move, and of what passes its check."""
+    motion = config.stream.motion
+    flow = FlowReportConfig((motion.flow_method,), motion.key_views, config.frames)
+    moving = report_flow([path], flow)["clips"][0]["rows"][0]["moving"]
+    return {"error": moving["error"], "reliable_error": moving["reliable_error"]}
+
+
+def _spread(values: np.ndarray) -> float:
+    """Return the standard deviation of runs, NaN of a single one."""
+    return float(values.std(ddof=1)) if len(values) > 1 else float("nan")

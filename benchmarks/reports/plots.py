@@ -1,0 +1,49 @@
+"""Tables for documentation, and plots."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["blank_figure", "label_points", "markdown", "save_figure"]
+
+
+def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
+    """Return a table in Markdown; the first `left` columns are words, the others numbers."""
+    rule = "|---" * left + "|---:" * (len(titles) - left) + "|"
+    lines = [f"| {' | '.join(cells)} |" for cells in (titles, *rows)]
+    return "\n".join([lines[0], rule, *lines[1:]]) + "\n"
+
+
+def blank_figure(width: float, height: float) -> Figure:
+    """Return an empty figure that needs no display; sizes in inches.
+
+    Raises:
+        ValueError: matplotlib is not installed.
+    """
+    try:
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise ValueError("plot: expected matplotlib, found none; install it: pip install matplotlib.") from error
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def save_figure(figure: Figure, path: str | Path) -> None:
+    """Write a figure as .png or .svg.
+
+    Raises:
+        OSError: it cannot be written.
+    """
+    figure.savefig(path, dpi=90)
+
+
+def label_points(
+    axis: Any, points: Iterable[tuple[float, float]], names: Iterable[str], shift: tuple[float, float], size: float = 7
+) -> None:
+    """Write a name beside each point, `shift` typographic points away from it."""
+    for name, point in zip(names, points, strict=True):
+        axis.annotate(name, point, xytext=shift, textcoords="offset points", fontsize=size)

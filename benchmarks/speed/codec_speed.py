@@ -1,0 +1,104 @@
+"""Time the stream's encoder and decoder on frames in which some Gaussians move.
+
+    python -m benchmarks.speed.codec_speed --json out.json
+
+A ball of Gaussians as for the renderer, with SH of degree 1 and a confidence. Those that move change in every
+attribute, by about a pixel and by some percent; a hundredth of all dies and as many are born. The figures also tell the
+bytes, and what is lost: how far the centres of all are from where they should be on screen.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import tyro
+
+from benchmarks.workloads import ball
+from morgs_mi import Camera, Gaussians
+from morgs_mi.codec.container import decode_packet, encode_packet
+from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, residual_packet
+from morgs_mi.evaluate.environment import machine, versions
+
+# Gaussians, and how many of them move.
+LADDER = ((20_000, 10_000), (200_000, 10_000), (200_000, 200_000))
+
+
+@dataclass(frozen=True)
+class Options:
+    """Time the stream's encoder and decoder."""
+
+    json: Path | None = None
+    """File for the figures; they are printed too."""
+    sizes: tuple[tuple[int, int], ...] = LADDER
+    """Gaussians, and how many of them move."""
+    repeats: int = 7
+    """Medians are over so many runs, after one that does not count."""
+
+
+def change(gaussians: Gaussians, moving: int, pixel: float) -> tuple[Gaussians, np.ndarray]:
+    """Return the next frame, and who is who in it (`source`)."""
+    rng, N = np.random.default_rng(0), len(gaussians)
+    raw = {name: value.copy() for name, value in gaussians.numpy().items() if name != "motion"}
+    who = rng.permutation(N)[:moving]
+    for name, value in raw.items():
+        value[who] += rng.normal(0, pixel if name == "means" else 0.03, value[who].shape).astype(value.dtype)
+    now, births = Gaussians(**raw), N // 100
+    survivors = np.sort(rng.permutation(N)[births:])
+    source = np.concatenate([survivors, np.full(births, -1)])
+    return now.select(np.concatenate([survivors, np.arange(births)])), source
+
+
+def measure(count: int, moving: int, repeats: int) -> dict[str, Any]:
+    """Return the figures of one size."""
+    gaussians, camera = ball(0, count, 1352, 1014, 0.01, sh_degree=1)
+    gaussians = replace(gaussians, logit_confidence=np.random.default_rng(1).normal(0, 2, count))
+    before = decode(None, keyframe_packet(gaussians, 0, [camera]))
+    now, source = change(before.gaussians, moving, float(np.median(depths(before.gaussians, camera)) / camera.K[0, 0]))
+    encode_ms, decode_ms, data, after = [], [], b"", before
+    for _ in range(repeats + 1):
+        parent = CodedFrame(before.frame, before.grid, before.ids, before.next_id, before.gaussians)  # no digest yet
+        start = time.perf_counter()
+        data = encode_packet(residual_packet(parent, now, source, [camera]))
+        encoded = time.perf_counter()
+        after = decode(parent, decode_packet(data))
+        encode_ms.append(1e3 * (encoded - start))
+        decode_ms.append(1e3 * (time.perf_counter() - encoded))
+    off = np.linalg.norm(np.asarray(after.gaussians.means) - np.asarray(now.means), axis=1)
+    pixels = off * camera.K[0, 0] / depths(now, camera)
+    return {
+        "gaussians": count,
+        "moving": moving,
+        "encode_ms": round(median(encode_ms[1:]), 1),
+        "decode_ms": round(median(decode_ms[1:]), 1),
+        "bytes": len(data),
+        "error_px_rms": float(f"{np.sqrt(np.mean(pixels**2)):.3g}"),
+        "error_px_max": float(f"{pixels.max():.3g}"),
+    }
+
+
+def depths(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """Return the centres' distances [N] along the camera's axis."""
+    return np.asarray(gaussians.means) @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
+
+
+def main() -> None:
+    """Run the benchmark."""
+    options = tyro.cli(Options)
+    mi.set_variant("llvm_ad_rgb")
+    rows = [measure(count, moving, options.repeats) for count, moving in options.sizes]
+    result = {"rows": rows, "seed": 0, "machine": machine(), "versions": versions()}
+    text = json.dumps(result, indent=2) + "\n"
+    print(text, end="")
+    if options.json is not None:
+        options.json.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

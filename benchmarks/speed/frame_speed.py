@@ -1,0 +1,217 @@
+"""Time a later frame of the loop, stage by stage, at two sizes, and say what it is worth.
+
+    python -m benchmarks.speed.frame_speed --json out.json [--sizes small n3dv] [--frames 3]
+
+The scene is made of Gaussians, and so are its pictures, with the noise of a camera: a wall, a floor, 40 balls of
+which some move and turn. The loop starts from the scene at frame 0 with its colours disturbed a little, as a fit
+would leave them. `small` is 640x480, 12 views, 50,000 Gaussians; `n3dv` 1352x1014, 20 views, 200,000 Gaussians.
+One more view is held out. Each setting is run on the same pictures: the default at several numbers of epochs, with
+nothing left out, and the paper's scheme.
+"""
+
+from __future__ import annotations
+
+import cProfile
+import json
+import pstats
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import tyro
+
+from morgs_mi import Camera, Gaussians, rasterize
+from morgs_mi.codec.config import CodecConfig
+from morgs_mi.codec.packets import decode, keyframe_packet
+from morgs_mi.core.files import write_json
+from morgs_mi.evaluate.environment import machine, versions
+from morgs_mi.fit.config import DensityConfig, FitConfig
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.presets import apply_preset
+from morgs_mi.stream_loop import StreamConfig, StreamLoop
+
+# What a frame spends its time in, by the function that does it.
+STAGES = {
+    "change": "_changes",
+    "flow": "_cues",
+    "part": "_part",
+    "targets": "Target.__init__",
+    "lift": "lift_flow",
+    "propagation": "propagate_motion",
+    "steps": "optimise",
+    "density": "find_need",
+    "packet": "residual_packet",
+    "decoding": "decode",
+}
+NOISE = 2.0  # grey levels
+
+
+@dataclass(frozen=True)
+class Size:
+    """A rig and a scene.
+
+    Attributes:
+        width: in px.
+        height: in px.
+        views: that are trained on.
+        gaussians: in all.
+        movers: balls that move, out of 40.
+    """
+
+    width: int
+    height: int
+    views: int
+    gaussians: int
+    movers: int
+
+
+SIZES = {"small": Size(640, 480, 12, 50_000, 3), "n3dv": Size(1352, 1014, 20, 200_000, 2)}
+
+
+@dataclass(frozen=True)
+class Options:
+    """What to time and where to write it."""
+
+    json: Path | None = None
+    """Where the figures go; standard output if left out."""
+    sizes: tuple[str, ...] = ("small", "n3dv")
+    """Out of small and n3dv."""
+    frames: int = 3
+    """Later frames; the first compiles and does not count, medians of the others do."""
+    epochs: tuple[int, ...] = (1, 2, 4, 8)
+    """Of the default settings."""
+    full: tuple[str, ...] = ("small",)
+    """Sizes at which the paper's scheme and a fit that leaves nothing out are run, too; they take minutes."""
+    seed: int = 0
+    """Of scene and noise."""
+
+
+class Scene:
+    """Gaussians on a wall, a floor and 40 balls, at any frame."""
+
+    def __init__(self, size: Size, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.size, count = size, size.gaussians
+        flat, each = count // 3, (count - 2 * (count // 3)) // 40
+        wall = np.stack([rng.uniform(-3, 3, flat), rng.uniform(-2, 1, flat), np.full(flat, 1.5)], 1)
+        floor = np.stack([rng.uniform(-3, 3, flat), np.full(flat, 1.0), rng.uniform(-1.5, 1.5, flat)], 1)
+        centers = np.stack([rng.uniform(-1.8, 1.8, 40), rng.uniform(-1.2, 0.6, 40), rng.uniform(-0.8, 1.0, 40)], 1)
+        self.owner = np.concatenate([np.full(2 * flat, -1), np.repeat(np.arange(40), each)])
+        self.local = rng.normal(size=(40 * each, 3))
+        self.local *= 0.22 / np.linalg.norm(self.local, axis=1, keepdims=True)
+        self.centers, self.ground = centers, np.concatenate([wall, floor])
+        rest = np.concatenate([self.ground, centers.repeat(each, 0) + self.local])
+        waves = np.sin(rest @ rng.normal(0, 6, (3, 3)) + rng.uniform(0, 6, 3)) * np.sin(
+            rest @ rng.normal(0, 15, (3, 3))
+        )
+        self.sh = (0.9 * waves)[:, None, :].astype(np.float32)
+        spacing = np.where(self.owner < 0, (18 / flat) ** 0.5, (4 * np.pi * 0.22**2 / each) ** 0.5)
+        self.scales = np.repeat(0.7 * spacing[:, None], 3, 1)
+        # Those that are nearest to the middle move: a compact part of the picture.
+        self.moving = np.argsort(np.linalg.norm(centers[:, :2], axis=1))[: size.movers]
+        self.direction = rng.normal(size=(40, 3)) * (0.02, 0.02, 0.01)
+
+    def at(self, frame: int) -> Gaussians:
+        """Return the truth."""
+        angle = 0.05 * frame
+        turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        own = self.owner[len(self.ground) :]
+        moves = np.isin(own, self.moving)[:, None]
+        balls = self.centers[own] + np.where(moves, self.local @ turn.T + frame * self.direction[own], self.local)
+        return self.gaussians(np.concatenate([self.ground, balls]))
+
+    def gaussians(self, means: np.ndarray, noise: float = 0.0, seed: int = 0) -> Gaussians:
+        rng, count = np.random.default_rng(seed), len(means)
+        sh = self.sh + noise * rng.normal(size=self.sh.shape)
+        quats, opacities = np.tile([1.0, 0, 0, 0], (count, 1)), np.full(count, 0.9)
+        return Gaussians.from_activated(means, self.scales, quats, opacities, sh, logit_confidence=np.zeros(count))
+
+    def cameras(self) -> list[Camera]:
+        """Return the held-out view and then the others, on an arc in two rows."""
+        angles = np.linspace(-0.5, 0.5, self.size.views)
+        places = [(5 * np.sin(a), -0.6 + 0.5 * (i % 2), -4.5 * np.cos(a)) for i, a in enumerate(angles)]
+        size = (self.size.width, self.size.height)
+        return [Camera.look_at(p, (0, -0.2, 0.3), (0, -1, 0), 38, *size) for p in [(0.1, -0.4, -4.5), *places]]
+
+
+def film(gaussians: Gaussians, cameras: list[Camera], rng: np.random.Generator) -> list[np.ndarray]:
+    """Return what the cameras record."""
+    pictures = []
+    for camera in cameras:
+        image = np.asarray(rasterize(gaussians, camera, ("color",)).color)
+        noisy = 255 * image + rng.normal(0, NOISE, image.shape)
+        pictures.append(np.clip(noisy + 0.5, 0, 255).astype(np.uint8))
+    return pictures
+
+
+def measure(size: Size, config: StreamConfig, recorded: list[list[np.ndarray]], scene: Scene) -> dict[str, Any]:
+    """Fit the later frames and return seconds by stage, shares of what was worked on, bytes and held-out PSNR."""
+    cameras = scene.cameras()
+    loop = StreamLoop(cameras[1:], np.zeros((200, 3)), np.zeros((200, 3)), config)
+    start = scene.gaussians(np.asarray(scene.at(0).means), 0.02)
+    loop.resume(decode(None, keyframe_packet(start, 0, cameras, config.codec)), [recorded[0][1:]])
+    rows = []
+    for images in recorded[1:]:
+        profile = cProfile.Profile()
+        dr.sync_thread()
+        _, report = profile.runcall(loop.push, images[1:])
+        found = np.asarray(rasterize(loop.gaussians, cameras[0], ("color",)).color)
+        squares = (np.clip(found, 0, 1) - images[0] / 255.0) ** 2
+        rows.append(
+            {
+                "seconds": report.seconds,
+                **{f"{name}_s": value for name, value in stages(profile).items()},
+                **report.effort,
+                "bytes": report.num_bytes,
+                "psnr": -10 * np.log10(squares.mean()),
+            }
+        )
+    return {name: float(f"{median(row[name] for row in rows[1:]):.4g}") for name in rows[0]}
+
+
+def stages(profile: cProfile.Profile) -> dict[str, float]:
+    """Return the seconds of each stage; what no stage claims is the rest."""
+    timed = pstats.Stats(profile).stats  # type: ignore[attr-defined]
+    seconds = dict.fromkeys(STAGES, 0.0)
+    for (file, _, function), (_, _, _, cumulative, _) in timed.items():
+        for name, wanted in STAGES.items():
+            owner = "losses.py" if wanted == "Target.__init__" else ""
+            if "morgs_mi" in file and file.endswith(owner) and function == wanted.split(".")[-1]:
+                seconds[name] += cumulative
+    return seconds
+
+
+def settings(options: Options, name: str, base: StreamConfig) -> dict[str, StreamConfig]:
+    """Return what is run at a size, by name."""
+    runs = {f"default, {e} epochs": replace(base, fit=replace(base.fit, epochs=e)) for e in options.epochs}
+    if name in options.full:
+        runs["8 epochs, nothing left out"] = replace(base, fit=replace(base.fit, leave_out_still=False))
+        fit, motion = apply_preset("paper", base.fit, base.motion)
+        runs["paper, 8 epochs"] = replace(base, fit=replace(fit, leave_out_still=False), motion=motion)
+    return runs
+
+
+def main(options: Options) -> None:
+    mi.set_variant("llvm_ad_rgb")
+    result: dict[str, Any] = {"seed": options.seed, "noise": NOISE, "machine": machine(), "versions": versions()}
+    for name in options.sizes:
+        size = SIZES[name]
+        scene, rng = Scene(size, options.seed), np.random.default_rng(options.seed)
+        recorded = [film(scene.at(t), scene.cameras(), rng) for t in range(options.frames + 1)]
+        density = DensityConfig(max_gaussians=round(1.1 * size.gaussians))
+        base = StreamConfig(FitConfig(sh_degree=0, density=density), MotionConfig(), codec=CodecConfig())
+        rows = {}
+        for label, config in settings(options, name, base).items():
+            rows[label] = measure(size, config, recorded, scene)
+            print(f"{name:6s} {label:28s}", json.dumps(rows[label]), flush=True)
+        result[name] = {"size": vars(size), "runs": rows}
+    if options.json is not None:
+        write_json(options.json, result)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

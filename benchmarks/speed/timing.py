@@ -1,0 +1,243 @@
+"""Timing, peak memory and error of one workload, and the programs it is compared with."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from benchmarks.reports.reference64 import Twin
+from benchmarks.speed import plain
+from benchmarks.workloads import TARGET, write_bin
+from morgs_mi import Camera, Gaussians, RenderConfig, ellipsoids, rasterize
+from morgs_mi.losses.losses import recon_loss
+from morgs_mi.losses.ssim import Target
+from morgs_mi.render.blocks import build_lists
+from morgs_mi.render.projection import project
+from morgs_mi.render.region import Region, whole_view
+
+# Pairs of pixel and Gaussian that the float64 twin is asked for.
+_TWIN_PAIRS = 20_000_000
+# Mitsuba's integrator traces rays through a hierarchy: beyond this a step takes many seconds.
+VOLPRIM_GAUSSIANS, VOLPRIM_PIXELS = 20_000, 512 * 384
+
+
+def timed(work: Callable[[], Any], repeats: int, patience: float = float("inf")) -> float:
+    """Return the median time of `work` in ms, synchronised, after two runs of warm-up.
+
+    Work that returns a function is what comes before the work: the function is timed alone. Once `patience` seconds are
+    spent, one run of warm-up and one timed one have to do.
+    """
+    times: list[float] = []
+    while len(times) < repeats + 2 and (len(times) < 2 or sum(times) < 1e3 * patience):
+        dr.sync_thread()
+        start = time.perf_counter()
+        result = work()
+        if callable(result):
+            dr.sync_thread()
+            start = time.perf_counter()
+            result = result()
+        dr.eval(result)
+        dr.sync_thread()
+        times.append(1e3 * (time.perf_counter() - start))
+    return median(times[2:] or times[1:])
+
+
+def stages(
+    gaussians: Gaussians, camera: Camera, channels: tuple[str, ...] = ("color",), num_features: int = 0, seed: int = 1
+) -> dict[str, Callable[[], Any]]:
+    """Return what is timed.
+
+    Lists (with projection), forward (with lists), adjoint (from the image's gradient to the attributes'), and the whole
+    step; for colour alone also the step on a tenth of the tiles, drawn at random, and the L1 + D-SSIM loss with its
+    derivative.
+    """
+    config = RenderConfig()
+    target = np.broadcast_to(np.float32(TARGET), (camera.height, camera.width, 3)).copy()
+    attributes, full, features = list(gaussians.items().values()), mi.TensorXf(target), None
+    if num_features:
+        features = mi.TensorXf(np.full((len(gaussians), num_features), 0.3, np.float32))
+        attributes.append(features)
+    named = (*channels, "features") if num_features else channels
+    dr.enable_grad(attributes)
+
+    def lists() -> Any:
+        with dr.suspend_grad():
+            region = whole_view(camera.width, camera.height, config)
+            splats = project(gaussians, camera, named, config, features=features)
+            built = build_lists(splats, [v for name in named for v in splats.channels.get(name, ())], region, config)
+        return built.words, built.order
+
+    def forward() -> Any:
+        with dr.suspend_grad():
+            image = rasterize(gaussians, camera, channels, features=features)
+            return [getattr(image, name) for name in named]
+
+    def gradients(loss: Any) -> Any:
+        dr.backward(loss)
+        grads = [dr.grad(value) for value in attributes]
+        dr.eval(grads)
+        dr.clear_grad(attributes)
+        return grads
+
+    def step(region: Region | None = None, wanted: Any = None) -> Any:
+        image = rasterize(gaussians, camera, channels, features=features, region=region)
+        return gradients(_distance(image, named, full if wanted is None else wanted, target.size))
+
+    def adjoint() -> Callable[[], Any]:
+        image = rasterize(gaussians, camera, channels, features=features)
+        loss = _distance(image, named, full, target.size)
+        dr.eval(image, loss)
+        return lambda: gradients(loss)
+
+    works = {"lists": lists, "forward": forward, "adjoint": adjoint, "step": step}
+    if named != ("color",):
+        return works
+    tiles = np.random.default_rng(seed).uniform(size=(-(-camera.height // 32), -(-camera.width // 32)))
+    mask = np.kron(tiles <= np.quantile(tiles, 0.1), np.ones((32, 32), bool))[: camera.height, : camera.width]
+
+    @cache
+    def tenth() -> tuple[Region, Any]:
+        region = Region(mask, config)
+        return region, mi.TensorXf(region.cut(target))
+
+    @cache
+    def compared() -> tuple[Any, Target]:
+        image = dr.detach(forward()[0])
+        dr.enable_grad(image)
+        return image, Target(target)
+
+    def loss() -> Any:
+        image, matched = compared()
+        dr.backward(recon_loss(image, matched))
+        grad = dr.grad(image)
+        dr.clear_grad(image)
+        return grad
+
+    return works | {"tenth_step": lambda: step(*tenth()), "loss": loss}
+
+
+def _distance(image: Any, channels: tuple[str, ...], target: Any, size: int) -> Any:
+    """Return the L1 distance of the colour to its target and of the other channels to 0.5, summed up, over `size`."""
+    errors = (dr.abs(getattr(image, name) - (target if name == "color" else 0.5)) for name in channels)
+    return sum(dr.sum(error, axis=None) for error in errors) / size
+
+
+def measure(works: dict[str, Callable[[], Any]], repeats: int, patience: float = float("inf")) -> dict[str, float]:
+    """Return the median ms of every piece of work."""
+    return {name: timed(work, repeats, patience) for name, work in works.items()}
+
+
+def extent(gaussians: Gaussians, camera: Camera) -> dict[str, float]:
+    """Return how much there is to draw: pairs of Gaussian and block, their pixels in millions, and the lists' bytes."""
+    config = RenderConfig()
+    with dr.suspend_grad():
+        region = whole_view(camera.width, camera.height, config)
+        lists = build_lists(project(gaussians, camera, (), config), [], region, config)
+        pairs = int(dr.sum(mi.UInt64(lists.count))[0])
+    width, height = region.block
+    size = 4 * (dr.width(lists.words) + dr.width(lists.entries))
+    return {"pairs": pairs, "listed_megapixels": round(1e-6 * pairs * width * height, 3), "list_bytes": size}
+
+
+def peak_megabytes(work: Callable[[], Any]) -> float:
+    """Return the most memory that Dr.Jit has held at once while `work` was done, in MB, inputs included."""
+    dr.sync_thread()
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    dr.eval(work())
+    dr.sync_thread()
+    return round(1e-6 * dr.detail.malloc_watermark(dr.backend_v(mi.Float)), 1)
+
+
+def error(gaussians: Gaussians, camera: Camera, seed: int) -> dict[str, float]:
+    """Return the colour's largest and RMS error against float64 at a sample of pixels."""
+    count = max(16, min(256, _TWIN_PAIRS // len(gaussians)))
+    chosen = np.random.default_rng(seed).choice(camera.width * camera.height, count, replace=False)
+    pixels = np.stack([chosen % camera.width, chosen // camera.width], axis=1)
+    with dr.suspend_grad():
+        image = np.asarray(rasterize(gaussians, camera, ("color",)).color, np.float64)
+    twin = Twin(gaussians.numpy(), camera, RenderConfig()).render(pixels)[:, :3]
+    difference = image[pixels[:, 1], pixels[:, 0]] - twin
+    figures = {"error_max": np.abs(difference).max(), "error_rms": np.sqrt(np.mean(difference**2))}
+    return {name: float(f"{value:.3g}") for name, value in figures.items()}
+
+
+def plain_stages(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[], Any]]:
+    """Return forward and whole step of the one-lane-per-pixel renderer."""
+    config = RenderConfig()
+    return {
+        "plain_forward": lambda: plain.render(gaussians, camera, config),
+        "plain_step": lambda: plain.step(gaussians, camera, TARGET, config),
+    }
+
+
+def volprim_stages(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[], Any]]:
+    """Return forward and whole step of Mitsuba's own `volprim_rf_basic` over the same Gaussians, one sample a pixel."""
+    scene: Any = mi.load_dict(
+        {
+            "type": "scene",
+            "gaussians": ellipsoids(gaussians),
+            "sensor": camera.sensor(),
+            "integrator": {"type": "volprim_rf_basic", "srgb_primitives": False},
+        }
+    )
+    params = mi.traverse(scene)
+    names = [f"gaussians.{name}" for name in ("data", "opacities", "sh_coeffs")]
+    dr.enable_grad([params[name] for name in names])
+    params.update()
+
+    def forward() -> Any:
+        with dr.suspend_grad():
+            return mi.render(scene, spp=1)
+
+    def step() -> Any:
+        image = mi.render(scene, params, spp=1)[..., :3]
+        dr.backward(dr.mean(dr.abs(image - 0.5), axis=None))
+        grads = [dr.grad(params[name]) for name in names]
+        dr.eval(grads)
+        for name in names:
+            dr.clear_grad(params[name])
+        return grads
+
+    return {"volprim_forward": forward, "volprim_step": step}
+
+
+def baselines(gaussians: Gaussians, camera: Camera, channels: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return the baselines' stages for this workload, and why others are left out."""
+    if channels != ("color",):
+        return {}, {"baselines": "they render colour only"}
+    works = plain_stages(gaussians, camera)
+    if len(gaussians) > VOLPRIM_GAUSSIANS or camera.width * camera.height > VOLPRIM_PIXELS:
+        reason = f"a step beyond {VOLPRIM_GAUSSIANS} Gaussians or {VOLPRIM_PIXELS} pixels takes many seconds"
+        return works, {"volprim": reason}
+    return works | volprim_stages(gaussians, camera), {}
+
+
+class Yardstick:
+    """A program `BIN FILE.bin REPETITIONS THREADS` that prints the median of its own whole step."""
+
+    def __init__(self, program: Path) -> None:
+        self.program = program.resolve()
+
+    def step(self, gaussians: Gaussians, camera: Camera, repeats: int) -> float:
+        """Return its own median of its whole step in ms."""
+        with tempfile.TemporaryDirectory() as folder:
+            workload = Path(folder) / "workload.bin"
+            write_bin(gaussians, camera, workload)
+            command = [self.program, workload, str(repeats), str(dr.thread_count())]
+            output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        found = re.search(r"fwd\+bwd ms: median ([\d.]+)", output)
+        if not found:
+            raise SystemExit(f"{self.program}: expected a line 'fwd+bwd ms: median ...', got {output!r}")
+        return float(found[1])

@@ -1,0 +1,1 @@
+"""Cameras from videos by COLMAP, and checks of given poses."""

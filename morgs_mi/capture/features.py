@@ -1,0 +1,225 @@
+"""Points that several views of one instant have in common: features, matches, triangulation.
+
+Notation: a feature x [2] lies in pixels with centres at +0.5, as in `Camera`; a match is a row (view, feature, view,
+feature). Matches are found without looking at the poses, so the poses can be checked against them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+
+__all__ = ["Features", "Match", "detect", "match_views", "reprojection_errors", "triangulate"]
+
+# Larger images have no more corners that are seen from elsewhere, and SIFT takes its time.
+_DETECTION_PIXELS = 1.3e6
+_MAX_FEATURES = 2500
+# Lowe's ratio; beyond this many cameras each is matched with its nearest only.
+_RATIO, _ALL_PAIRS, _NEIGHBOURS = 0.8, 24, 8
+_MIN_MATCHES = 16
+
+
+@dataclass(frozen=True)
+class Features:
+    """What stands out in one image.
+
+    Attributes:
+        points: [K, 2] float64, pixels.
+        descriptors: [K, 128] float32 of length 1.
+        colors: [K, 3] float32 in [0, 1], of the pixel.
+    """
+
+    points: np.ndarray
+    descriptors: np.ndarray
+    colors: np.ndarray
+
+
+@dataclass(frozen=True)
+class Match:
+    """What two views have in common.
+
+    Attributes:
+        views: indices of the two.
+        features: [M, 2] int, the feature in either.
+    """
+
+    views: tuple[int, int]
+    features: np.ndarray
+
+
+def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features:
+    """Find SIFT features in an image uint8 [H, W, 3], only where the `mask` [H, W] is true; none where it is None."""
+    nothing = Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3), np.float32))
+    if image is None:
+        return nothing
+    height, width = image.shape[:2]
+    scale = min(1.0, np.sqrt(_DETECTION_PIXELS / (width * height)))
+    size = (round(width * scale), round(height * scale))
+    grey = cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
+    where = None if mask is None else cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
+    # Without the precise upscaling OpenCV's features are off by a quarter of a pixel.
+    sift = cv2.SIFT_create(nfeatures=_MAX_FEATURES, enable_precise_upscale=True)
+    found, descriptors = sift.detectAndCompute(grey, where)
+    if descriptors is None:
+        return nothing
+    points = (np.array([k.pt for k in found]) + 0.5) * (width / size[0], height / size[1])
+    # Square roots of what sums to 1: distances between them tell matches apart better (Arandjelovic 2012).
+    descriptors = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
+    columns, rows = np.clip(points.astype(int), 0, (width - 1, height - 1)).T
+    return Features(points, descriptors, image[rows, columns].astype(np.float32) / 255)
+
+
+def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list[Match]:
+    """Match features between all views, or between near ones where there are many cameras.
+
+    Only matches that agree with one epipolar geometry, whichever it is, are kept.
+    """
+    matches = (Match((i, j), _matches(features[i], features[j])) for i, j in _pairs(cameras))
+    return [match for match in matches if len(match.features)]
+
+
+def _pairs(cameras: Sequence[Camera]) -> Iterator[tuple[int, int]]:
+    count = len(cameras)
+    positions = np.array([camera.position for camera in cameras])
+    distances = np.linalg.norm(positions[:, None] - positions, axis=2)
+    ranks = distances.argsort(axis=1).argsort(axis=1)
+    for i in range(count):
+        for j in range(i + 1, count):
+            if count <= _ALL_PAIRS or min(ranks[i, j], ranks[j, i]) <= _NEIGHBOURS:
+                yield i, j
+
+
+def _matches(a: Features, b: Features) -> np.ndarray:
+    """Return the pairs [M, 2] that are mutually nearest and clearly so."""
+    none = np.zeros((0, 2), int)
+    if min(len(a.points), len(b.points)) < 2:
+        return none
+    distance = np.sqrt(np.maximum(2 - 2 * a.descriptors @ b.descriptors.T, 0))
+    forth, back = distance.argmin(1), distance.argmin(0)
+    rows = np.arange(len(forth))
+    first, second = np.partition(distance, 1, axis=1)[:, :2].T
+    good = (back[forth] == rows) & (first < _RATIO * second)
+    pairs = np.stack([rows, forth], axis=1)[good]
+    if len(pairs) < _MIN_MATCHES:
+        return none
+    points = a.points[pairs[:, 0]], b.points[pairs[:, 1]]
+    _, inliers = cv2.findFundamentalMat(*points, cv2.USAC_MAGSAC, 2.0, 0.999, 5000)
+    kept = pairs[inliers.ravel() > 0] if inliers is not None else none
+    return kept if len(kept) >= _MIN_MATCHES else none
+
+
+def reprojection_errors(match: Match, features: Sequence[Features], cameras: Sequence[Camera]) -> np.ndarray:
+    """Return how far each match [M] is from the projections of its own point in the two views, px.
+
+    It is the mean of both views' distances, and infinite for a point behind a camera.
+    """
+    count = len(match.features)
+    tracks = np.tile(np.arange(count), 2)
+    views = np.repeat(match.views, count)
+    pixels = np.concatenate([features[v].points[match.features[:, k]] for k, v in enumerate(match.views)])
+    points = _intersect(tracks, views, pixels, cameras, count)
+    errors = _distances(points[tracks], views, pixels, cameras)
+    return errors.reshape(2, count).mean(0)
+
+
+def triangulate(
+    matches: Sequence[Match],
+    features: Sequence[Features],
+    cameras: Sequence[Camera],
+    max_error: float = 2.0,
+    min_angle: float = 1.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the points [P, 3] float32, world units, on which the views agree, and their colours [P, 3] in [0, 1].
+
+    Args:
+        matches: from `match_views`.
+        features: per view.
+        cameras: per view.
+        max_error: farthest that a point may project from any of its features, px.
+        min_angle: least angle between two rays to a point, degrees.
+    """
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    starts = np.concatenate([[0], np.cumsum([len(f.points) for f in features])])
+    total = int(starts[-1])
+    edges = [
+        match.features[reprojection_errors(match, features, cameras) <= max_error] + starts[list(match.views)]
+        for match in matches
+    ]
+    edges = np.concatenate(edges) if edges else np.zeros((0, 2), int)
+    none = np.zeros((0, 3), np.float32)
+    if not len(edges):
+        return none, none
+    graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(total, total))
+    _, track = connected_components(graph, directed=False)
+    views = np.repeat(np.arange(len(features)), np.diff(starts))
+    pixels = np.concatenate([f.points for f in features])
+    colors = np.concatenate([f.colors for f in features])
+    # A track is whole if it has at least two features, all in different views.
+    sizes = np.bincount(track)
+    distinct = np.bincount(np.unique(np.stack([track, views]), axis=1)[0])
+    used = np.flatnonzero(((sizes >= 2) & (distinct == sizes))[track])
+    if not len(used):
+        return none, none
+    _, track = np.unique(track[used], return_inverse=True)
+    views, pixels, colors = views[used], pixels[used], colors[used]
+    count = int(track.max()) + 1
+    points = _intersect(track, views, pixels, cameras, count)
+    worst = np.zeros(count)
+    np.maximum.at(worst, track, _distances(points[track], views, pixels, cameras))
+    mean = np.stack([np.bincount(track, band) for band in colors.T], axis=1) / np.bincount(track)[:, None]
+    good = (worst <= max_error) & (_widest_angles(points, track, views, cameras) >= min_angle)
+    return points[good].astype(np.float32), mean[good].astype(np.float32)
+
+
+def _intersect(
+    track: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera], count: int
+) -> np.ndarray:
+    """Return the points [count, 3] nearest, in the algebraic sense, to the rays of their observations.
+
+    Observation k says that point `track[k]` is seen in `views[k]` at `pixels[k]`.
+    """
+    K = np.array([camera.K for camera in cameras])[views]
+    V = np.array([np.asarray(camera.viewmat, np.float64)[:3] for camera in cameras])
+    # In units of the rig around its middle, for the sake of the conditioning.
+    positions = np.array([camera.position for camera in cameras])
+    middle, scale = positions.mean(0), np.linalg.norm(positions - positions.mean(0), axis=1).max() or 1.0
+    V = np.concatenate([V[:, :, :3], ((V[:, :, :3] @ middle + V[:, :, 3]) / scale)[..., None]], axis=2)[views]
+    x = (pixels - K[:, :2, 2]) / K[:, [0, 1], [0, 1]]
+    rows = x[:, :, None] * V[:, 2:3] - V[:, :2]
+    system = np.zeros((count, 4, 4))
+    np.add.at(system, track, np.einsum("kri,krj->kij", rows, rows))
+    solution = np.linalg.eigh(system)[1][:, :, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return solution[:, :3] / solution[:, 3:] * scale + middle
+
+
+def _distances(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """Return how far each point [n, 3] projects from its pixel, infinite behind the camera."""
+    K = np.array([camera.K for camera in cameras])[views]
+    V = np.array([np.asarray(camera.viewmat, np.float64) for camera in cameras])[views]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        local = np.einsum("nij,nj->ni", V[:, :3, :3], points) + V[:, :3, 3]
+        projected = np.einsum("nij,nj->ni", K, local)
+        error = np.linalg.norm(projected[:, :2] / projected[:, 2:] - pixels, axis=1)
+    return np.where((local[:, 2] > 0) & np.isfinite(error), error, np.inf)
+
+
+def _widest_angles(points: np.ndarray, track: np.ndarray, views: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
+    """Return twice the widest angle [P] between a point's rays and their mean, degrees: the spread of its views."""
+    positions = np.array([camera.position for camera in cameras])[views]
+    with np.errstate(invalid="ignore"):
+        rays = points[track] - positions
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        mean = np.stack([np.bincount(track, axis) for axis in rays.T], axis=1)
+        mean /= np.linalg.norm(mean, axis=1, keepdims=True)
+        angle = np.rad2deg(np.arccos(np.clip((rays * mean[track]).sum(1), -1, 1)))
+    widest = np.zeros(len(points))
+    np.maximum.at(widest, track, np.nan_to_num(angle))
+    return 2 * widest

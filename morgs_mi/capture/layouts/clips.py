@@ -1,0 +1,92 @@
+"""Finding each camera's clip in a capture folder, by what lies there.
+
+A clip is a video file, a folder of numbered images, or a list of image files (one per frame). Clips are laid out per
+camera or per frame; cameras are ordered numerically, cam_2 before cam_10:
+
+- per camera: ``cam01.mp4``, ``cam01/0000.png`` or ``cam01/images/0000.png``, in the capture or in a folder of it
+  (``videos/cam01.mp4``, ``images/cam01/0000.png``). Of several clips of a name the lossless one in ``frames/``
+  wins, then a video, then a folder, and those in the capture itself win over those in a folder;
+- per frame: ``0000/cam01.png`` or ``0000/images/cam01.png``, every folder with the same cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+
+from morgs_mi.io.video import IMAGE_SUFFIXES, VIDEO_SUFFIXES, natural_key, numbering_gap
+
+__all__ = ["check_frames", "clips_by_camera", "clips_by_frame", "view_of_image"]
+
+# Folders that hold no clips at all, and those whose own images are no camera's.
+_NOT_CLIPS = {"sparse", "truth", "masks", "seg"}
+_NOT_CAMERAS = _NOT_CLIPS | {"frames", "images"}
+
+
+def clips_by_camera(path: Path) -> dict[str, Path]:
+    """Return each camera's video or folder of images by the camera's name, in numerical order."""
+    inner = [f for f in path.iterdir() if f.is_dir() and f.name not in _NOT_CLIPS and not f.name.startswith(".")]
+    found: dict[str, Path] = {}
+    # The last one to name a camera wins.
+    for folder in [*sorted(f for f in inner if f.name != "frames"), path]:
+        found |= _folders(folder) | {f.stem: f for f in folder.iterdir() if _is_video(f)}
+    if (path / "frames").is_dir():
+        found |= {f.stem: f for f in (path / "frames").iterdir() if _is_video(f)} | _folders(path / "frames")
+    return {name: found[name] for name in sorted(found, key=natural_key)}
+
+
+def clips_by_frame(path: Path) -> dict[str, tuple[Path, ...]]:
+    """Return each camera's images, one per frame folder, by the camera's name; empty where there are no such folders.
+
+    The first frame says which cameras there are; an image that a later one lacks is listed all the same.
+    """
+    frames = sorted(_folders(path).values(), key=lambda f: natural_key(str(f)))
+    if not frames:
+        return {}
+    images = sorted((f for f in frames[0].iterdir() if _is_image(f)), key=lambda f: natural_key(f.stem))
+    return {f.stem: tuple(folder / f.name for folder in frames) for f in images}
+
+
+def check_frames(path: Path, clips: Mapping[str, Sequence[Path]]) -> None:
+    """Check that the folders of `clips_by_frame` are numbered without gaps.
+
+    Raises:
+        ValueError: they are not.
+    """
+    folders = [f.relative_to(path).parts[0] for f in next(iter(clips.values()))]
+    if gap := numbering_gap(folders):
+        raise ValueError(
+            f"{path}: the folders of the frames must be numbered without gaps, got {folders[gap - 1]} followed by "
+            f"{folders[gap]}; extract the frames again."
+        )
+
+
+def view_of_image(views: Collection[str], image: str) -> str | None:
+    """Return which of the cameras `views` an image of a calibration belongs to, or None.
+
+    That is cam01 for ``cam01.png``, ``cam01.mp4``, ``cam01/0000.png`` and ``cam01/images/0000.png``.
+    """
+    place = PurePosixPath(image.replace("\\", "/"))
+    names = (place.stem, *(parent.name for parent in place.parents))
+    return next((name for name in names if name in views), None)
+
+
+def _folders(folder: Path) -> dict[str, Path]:
+    inner = [f for f in folder.iterdir() if f.is_dir() and f.name not in _NOT_CAMERAS and not f.name.startswith(".")]
+    return {f.name: found for f in inner if (found := _image_folder(f))}
+
+
+def _image_folder(folder: Path) -> Path | None:
+    """Return where a camera's or a frame's images lie: in its folder or in `images` there."""
+    for place in (folder, folder / "images"):
+        if place.is_dir() and any(_is_image(f) for f in place.iterdir()):
+            return place
+    return None
+
+
+def _is_image(file: Path) -> bool:
+    return file.suffix.lower() in IMAGE_SUFFIXES
+
+
+def _is_video(file: Path) -> bool:
+    return file.is_file() and file.suffix.lower() in VIDEO_SUFFIXES

@@ -1,0 +1,283 @@
+"""COLMAP's sparse models: text or binary in, text out.
+
+A model is a folder of cameras, images and points3D (newer ones add rigs and frames, which repeat the
+poses). COLMAP's pixel centres lie at +0.5 and its axes are OpenCV's, as in `Camera`: nothing is flipped.
+
+Reading is done here and not by pycolmap because pycolmap 4.2 never returns from a truncated binary file
+and silently drops every second image of a text model without blank lines.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.capture.lens import MODELS, Lens, lens_and_intrinsics
+from morgs_mi.core.camera import Camera
+
+__all__ = ["ColmapModel", "find_colmap", "read_colmap", "write_colmap"]
+
+_FILES = ("cameras", "images", "points3D")
+
+
+@dataclass(frozen=True)
+class ColmapModel:
+    """A COLMAP model as it was recorded, before the lenses are undone.
+
+    Attributes:
+        cameras: one camera per image in the order of the file; `name` is the image's name.
+        lenses: one lens per camera.
+        points: [P, 3] float32, world units.
+        point_colors: [P, 3] float32 in [0, 1], display-referred.
+    """
+
+    cameras: tuple[Camera, ...]
+    lenses: tuple[Lens, ...]
+    points: np.ndarray
+    point_colors: np.ndarray
+
+
+def find_colmap(folder: Path) -> Path | None:
+    """Return the folder of the COLMAP model in a capture, or None.
+
+    It lies in `sparse/0`, `sparse`, `colmap/sparse/0` or the folder itself, the first of these that has one.
+    """
+    for place in (folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0"):
+        if any((place / f"cameras.{kind}").exists() for kind in ("bin", "txt")):
+            return place
+    # Among other files the name of one says little.
+    here = any(all((folder / f"{name}.{kind}").exists() for name in _FILES) for kind in ("bin", "txt"))
+    return folder if here else None
+
+
+def read_colmap(folder: str | Path) -> ColmapModel:
+    """Read the COLMAP model in `folder`, binary if present, else text.
+
+    Raises:
+        FileNotFoundError: one of the three files is missing.
+        ValueError: a file is broken, names a camera that is not there, holds a pose that is not one,
+            or a lens that is not supported.
+    """
+    folder = Path(folder)
+    kind = "bin" if (folder / "cameras.bin").exists() else "txt"
+    for name in _FILES:
+        if not (folder / f"{name}.{kind}").exists():
+            raise FileNotFoundError(
+                f"{folder}: a COLMAP model needs cameras, images and points3D (.txt or .bin), "
+                f"{name}.{kind} is missing; export the whole model."
+            )
+    cameras_path, images_path, points_path = (folder / f"{name}.{kind}" for name in _FILES)
+    text = kind == "txt"
+    intrinsics = {}
+    for camera_id, model, width, height, params in (_text_cameras if text else _binary_cameras)(cameras_path):
+        try:
+            intrinsics[camera_id] = (*lens_and_intrinsics(model, params), width, height)
+        except ValueError as error:
+            raise ValueError(f"{cameras_path}: camera {camera_id}: {error}") from None
+    cameras, lenses = [], []
+    for name, camera_id, pose in (_text_images if text else _binary_images)(images_path):
+        if camera_id not in intrinsics:
+            raise ValueError(
+                f"{images_path}: image {name!r} refers to camera {camera_id}, {cameras_path.name} has "
+                f"{sorted(intrinsics)}; export both files from the same model."
+            )
+        lens, K, width, height = intrinsics[camera_id]
+        try:
+            cameras.append(Camera(K, _viewmat(pose), width, height, name))
+        except ValueError as error:
+            raise ValueError(f"{images_path}, image {name!r}: {error}") from None
+        lenses.append(lens)
+    if not cameras:
+        raise ValueError(f"{images_path}: at least one image was expected, got none; register the images.")
+    points = np.array(list((_text_points if text else _binary_points)(points_path)), dtype=np.float64)
+    points = points.reshape(-1, 6)
+    if not np.isfinite(points).all():
+        raise ValueError(f"{points_path}: the points must be finite, got NaN or Inf; export the model again.")
+    return ColmapModel(
+        tuple(cameras),
+        tuple(lenses),
+        points[:, :3].astype(np.float32),
+        (points[:, 3:] / 255).astype(np.float32),
+    )
+
+
+def write_colmap(
+    folder: str | Path,
+    cameras: Sequence[Camera],
+    points: np.ndarray | None = None,
+    point_colors: np.ndarray | None = None,
+    lenses: Sequence[Lens] | None = None,
+) -> None:
+    """Write a COLMAP text model that COLMAP itself can read.
+
+    Args:
+        folder: made if need be.
+        cameras: the views; an image is called `name`, with ``.png`` added where it has no suffix.
+        points: [P, 3] world units, or None for no points.
+        point_colors: [P, 3] in [0, 1]; grey where None.
+        lenses: one per camera, as in `ColmapModel`; pinholes where None.
+
+    Raises:
+        OSError: a file could not be written.
+    """
+    import pycolmap  # takes 0.3 s to import, which only writing needs
+
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    model = pycolmap.Reconstruction()
+    lenses = [Lens()] * len(cameras) if lenses is None else lenses
+    for i, (camera, lens) in enumerate(zip(cameras, lenses, strict=True), start=1):
+        K, one_focal = camera.K, lens.model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
+        focals = [K[0, 0]] if one_focal else [K[0, 0], K[1, 1]]
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(
+                camera_id=i,
+                model=lens.model,
+                width=camera.width,
+                height=camera.height,
+                params=[*focals, K[0, 2], K[1, 2], *lens.distortion],
+            )
+        )
+        name = camera.name if Path(camera.name).suffix else f"{camera.name}.png"
+        pose = pycolmap.Rigid3d(np.asarray(camera.viewmat, dtype=np.float64)[:3])
+        model.add_image_with_trivial_frame(pycolmap.Image(image_id=i, camera_id=i, name=name), pose)
+    points = np.zeros((0, 3)) if points is None else np.asarray(points)
+    colors = np.full(points.shape, 0.5) if point_colors is None else np.asarray(point_colors)
+    bytes_ = np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
+    for xyz, rgb in zip(points, bytes_, strict=True):
+        model.add_point3D(xyz.astype(np.float64), pycolmap.Track(), rgb)
+    try:
+        model.write_text(str(folder))
+    except (RuntimeError, ValueError) as error:
+        raise OSError(f"{folder}: the COLMAP model could not be written ({error}).") from None
+
+
+def _viewmat(pose: Sequence[float]) -> np.ndarray:
+    """Return world -> camera [4, 4] of a wxyz quaternion and a translation."""
+    quat, t = np.array(pose[:4]), np.array(pose[4:])
+    norm = np.linalg.norm(quat)
+    # COLMAP writes unit quaternions; Camera refuses one that is not finite.
+    if np.isfinite(norm) and abs(norm - 1) > 1e-2:
+        raise ValueError(f"its quaternion must have length 1, got {quat.tolist()}; check the order of the columns.")
+    w, x, y, z = quat / norm
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    viewmat[:3, 3] = t
+    return viewmat
+
+
+# ---- text ------------------------------------------------------------------------------------------------
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield (number from 1, line) of all lines that are not comments, blank ones included."""
+    text = path.read_text(encoding="utf-8", errors="replace")
+    return ((i, s) for i, s in enumerate(text.splitlines(), start=1) if not s.startswith("#"))
+
+
+def _broken(path: Path, number: int, expected: str, line: str) -> ValueError:
+    return ValueError(f"{path}, line {number}: expected `{expected}`, got {line[:80]!r}; export the model again.")
+
+
+def _text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]:
+    for number, line in _lines(path):
+        if fields := line.split():
+            try:
+                camera_id, width, height = int(fields[0]), int(fields[2]), int(fields[3])
+                yield camera_id, fields[1], width, height, [float(f) for f in fields[4:]]
+            except (ValueError, IndexError):
+                raise _broken(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line) from None
+
+
+def _text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
+    lines = _lines(path)
+    for number, line in lines:
+        if not line.strip():
+            continue
+        fields = line.split(maxsplit=9)
+        try:
+            name, camera_id, pose = fields[9].strip(), int(fields[8]), [float(f) for f in fields[1:8]]
+        except (ValueError, IndexError):
+            raise _broken(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line) from None
+        number, line = next(lines, (number, ""))
+        if len(line.split()) % 3:
+            raise _broken(path, number, "POINTS2D[] as (X, Y, POINT3D_ID), or a blank line", line)
+        yield name, camera_id, pose
+
+
+def _text_points(path: Path) -> Iterator[list[float]]:
+    for number, line in _lines(path):
+        if fields := line.split():
+            try:
+                xyz_rgb = [float(f) for f in fields[1:7]]
+                float(fields[7])
+            except (ValueError, IndexError):
+                raise _broken(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK[]", line) from None
+            yield xyz_rgb
+
+
+# ---- binary ----------------------------------------------------------------------------------------------
+
+
+class _Bytes:
+    """A file read from its front; every read is bounded by what is left."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.data, self.at = path, path.read_bytes(), 0
+
+    def take(self, layout: str) -> tuple:
+        """Unpack one little-endian record."""
+        layout = "<" + layout
+        self.skip(struct.calcsize(layout))
+        return struct.unpack_from(layout, self.data, self.at - struct.calcsize(layout))
+
+    def skip(self, count: int) -> None:
+        if count > len(self.data) - self.at:
+            raise ValueError(
+                f"{self.path}: {count} more bytes expected at byte {self.at}, got "
+                f"{len(self.data) - self.at}: the file is truncated or broken; export the model again."
+            )
+        self.at += count
+
+    def string(self) -> str:
+        start, end = self.at, self.data.find(b"\0", self.at)
+        self.skip((end if end >= 0 else len(self.data)) + 1 - start)
+        return self.data[start:end].decode("utf-8", errors="replace")
+
+
+def _binary_cameras(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
+    file, names = _Bytes(path), list(MODELS)
+    for _ in range(*file.take("Q")):
+        camera_id, model, width, height = file.take("IiQQ")
+        if not 0 <= model < len(names):
+            # Refused by name in lens_and_intrinsics; what follows it cannot be read.
+            yield camera_id, f"number {model}", width, height, ()
+            return
+        focals, coefficients = MODELS[names[model]]
+        yield camera_id, names[model], width, height, file.take(f"{focals + 2 + coefficients}d")
+
+
+def _binary_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
+    file = _Bytes(path)
+    for _ in range(*file.take("Q")):
+        _, *pose, camera_id = file.take("I7dI")
+        name = file.string()
+        (count,) = file.take("Q")
+        file.skip(24 * count)
+        yield name, camera_id, tuple(pose)
+
+
+def _binary_points(path: Path) -> Iterator[list[float]]:
+    file = _Bytes(path)
+    for _ in range(*file.take("Q")):
+        _, *xyz_rgb, _, track = file.take("Q3d3BdQ")
+        file.skip(8 * track)
+        yield xyz_rgb

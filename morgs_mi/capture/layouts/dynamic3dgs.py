@@ -1,0 +1,117 @@
+"""The layout of Dynamic 3D Gaussians: images in `ims/`, cameras in `train_meta.json`, points in `init_pt_cld.npz`.
+
+`train_meta.json` has `w` and `h`, and per frame and camera `fn` (the image below `ims/`), `cam_id`, `k` [3, 3] in
+pixels with centres at +0.5, and `w2c` [4, 4], world -> camera with OpenCV's axes: nothing is flipped.
+`test_meta.json` lists the cameras that are held out in the same way. The rows of `init_pt_cld.npz` are x, y, z,
+r, g, b in [0, 1] and a label.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.io.video import natural_key
+
+__all__ = ["MetaCamera", "read_meta", "read_point_cloud"]
+
+_KEYS = ("w", "h", "k", "w2c", "fn", "cam_id")
+
+
+@dataclass(frozen=True)
+class MetaCamera:
+    """A camera of the file and its images, one per frame."""
+
+    camera: Camera
+    files: tuple[Path, ...]
+
+
+def read_meta(path: Path) -> list[MetaCamera]:
+    """Read `train_meta.json` or `test_meta.json`: the fixed cameras in the order of their ids, named by them.
+
+    Raises:
+        ValueError: the file is broken, a key or an entry is missing, a pose is not rigid, or a camera moves.
+    """
+    try:
+        meta = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: expected JSON, got a broken file ({error}); export it again.") from None
+    missing = [key for key in _KEYS if not isinstance(meta, dict) or key not in meta]
+    if missing:
+        raise ValueError(f"{path}: expected the keys {', '.join(_KEYS)}, {', '.join(missing)} missing; export again.")
+    _check_counts(path, meta)
+    ids = meta["cam_id"][0]
+    return [_camera(path, meta, camera_id) for camera_id in sorted(ids, key=lambda i: natural_key(str(i)))]
+
+
+def _check_counts(path: Path, meta: dict[str, Any]) -> None:
+    rows = {key: meta[key] for key in ("fn", "cam_id", "k", "w2c")}
+    if not all(isinstance(row, list) and row and all(isinstance(e, list) for e in row) for row in rows.values()):
+        raise ValueError(f"{path}: `fn`, `cam_id`, `k` and `w2c` must be lists of frames of cameras; export it again.")
+    counts = {key: [len(entry) for entry in row] for key, row in rows.items()}
+    if any(count != counts["fn"] for count in counts.values()) or len(set(counts["fn"])) > 1 or not counts["fn"][0]:
+        table = ", ".join(f"{key} {len(c)} frames of {min(c)} to {max(c)} cameras" for key, c in counts.items())
+        raise ValueError(f"{path}: expected as many cameras in every frame and list, got {table}; export it again.")
+    ids = [sorted(map(str, row)) for row in meta["cam_id"]]
+    wrong = next((t for t, row in enumerate(ids) if row != ids[0] or len(set(row)) < len(row)), None)
+    if wrong is not None:
+        raise ValueError(
+            f"{path}: frame {wrong}: `cam_id` must name each camera of frame 0 once, got {meta['cam_id'][wrong]}; "
+            "export it again."
+        )
+
+
+def _camera(path: Path, meta: dict[str, Any], camera_id: Any) -> MetaCamera:
+    columns = [row.index(camera_id) for row in meta["cam_id"]]
+    where = f"{path}, camera {camera_id}"
+    try:
+        K, w2c = (
+            np.array([row[c] for row, c in zip(meta[key], columns, strict=True)], dtype=np.float64)
+            for key in ("k", "w2c")
+        )
+    except (TypeError, ValueError):
+        K = w2c = np.zeros(0)
+    if K.shape[1:] != (3, 3) or w2c.shape[1:] not in ((4, 4), (3, 4)):
+        raise ValueError(f"{where}: `k` must be [3, 3] and `w2c` [4, 4] in every frame; export it again.")
+    for values, what in ((w2c, "pose"), (K, "intrinsics")):
+        wrong = np.flatnonzero(~np.isfinite(values).all((1, 2)))
+        if len(wrong):
+            raise ValueError(f"{where}, frame {wrong[0]}: the {what} must be finite, got NaN or Inf; calibrate again.")
+        moved = np.flatnonzero(np.abs(values - values[0]).max((1, 2)) > 1e-4 * (1 + np.abs(values[0]).max()))
+        if len(moved):
+            raise ValueError(
+                f"{where}: its {what} in frame {moved[0]} must be that of frame 0, for cameras must not move here; "
+                "use a recording of fixed cameras."
+            )
+    sizes = meta["w"], meta["h"]
+    if not all(isinstance(size, int) and size > 0 for size in sizes):
+        raise ValueError(f"{path}: `w` and `h` must be positive whole numbers, got {sizes}; export it again.")
+    try:
+        camera = Camera(K[0], rigid(where, w2c[0]), *sizes, name=str(camera_id))
+    except ValueError as error:
+        message = str(error)
+        raise ValueError(message if message.startswith(where) else f"{where}: {message}") from None
+    names = [row[c] for row, c in zip(meta["fn"], columns, strict=True)]
+    return MetaCamera(camera, tuple(path.parent / "ims" / str(name) for name in names))
+
+
+def read_point_cloud(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read `init_pt_cld.npz`: positions [P, 3] and colours [P, 3] in [0, 1].
+
+    Raises:
+        ValueError: it is no NumPy archive with an array `data` [P, 6 or more] of finite numbers.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            rows = archive["data"]
+    except (ValueError, EOFError, KeyError, BadZipFile) as error:
+        raise ValueError(f"{path}: expected an array `data` [P, 7], got a broken file ({error}).") from None
+    if rows.ndim != 2 or rows.shape[1] < 6 or rows.dtype.kind not in "fiu" or not np.isfinite(rows).all():
+        raise ValueError(f"{path}: `data` must be [P, 7], finite, got {rows.dtype} {rows.shape}; export it again.")
+    return rows[:, :3].astype(np.float32), np.clip(rows[:, 3:6], 0, 1).astype(np.float32)

@@ -1,0 +1,123 @@
+"""Nerfstudio's `transforms.json`: poses as camera -> world with OpenGL's axes.
+
+Each of its `frames` names a file and gives `transform_matrix` [4, 4]: camera -> world, x right, y up, z backward.
+Intrinsics (`fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`) and lens coefficients stand at the top or with the frame, which
+wins. Pixel centres lie at +0.5, as in `Camera`. The world is that of the matrices: `applied_transform` and
+`applied_scale` say how they came about and are not undone.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from morgs_mi.capture.lens import Lens
+from morgs_mi.core.camera import Camera, rigid
+
+__all__ = ["read_points_ply", "read_transforms"]
+
+_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+# Nerfstudio takes all of these for its one perspective model.
+_PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
+
+
+def read_transforms(path: Path) -> tuple[list[Camera], list[Lens], Path | None]:
+    """Read the cameras, named by their `file_path`, their lenses, and where the points lie if it says so.
+
+    Raises:
+        ValueError: the file is broken, a key is missing or no number, a pose is not rigid, or the camera model is
+            not supported.
+    """
+    try:
+        meta = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: expected JSON, got a broken file ({error}); export it again.") from None
+    frames = meta.get("frames") if isinstance(meta, dict) else None
+    if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
+        raise ValueError(f"{path}: expected an object with a list of `frames`, got none; export it again.")
+    cameras, lenses = [], []
+    for index, frame in enumerate(frames):
+        where = f"{path}, frame {index}"
+        name = frame.get("file_path")
+        if not isinstance(name, str) or not name:
+            raise ValueError(f"{where}: `file_path` must name a file, got {name!r}; export it again.")
+        where += f" ({name})"
+        values = meta | frame
+        cameras.append(_camera(where, values, name))
+        lenses.append(_lens(where, values))
+    points = meta.get("ply_file_path")
+    return cameras, lenses, path.parent / points if points else None
+
+
+def _camera(where: str, values: Mapping[str, Any], name: str) -> Camera:
+    width, height = (_number(where, values, key) for key in ("w", "h"))
+    if "fl_x" not in values and "camera_angle_x" in values:
+        angle = _number(where, values, "camera_angle_x")
+        fx = 0.5 * width / np.tan(0.5 * angle)
+    else:
+        fx = _number(where, values, "fl_x")
+    fy = _number(where, values, "fl_y", fx)
+    cx, cy = _number(where, values, "cx", width / 2), _number(where, values, "cy", height / 2)
+    try:
+        matrix = np.array(values.get("transform_matrix"), dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
+    to_world = rigid(where, matrix)
+    viewmat = np.linalg.inv(to_world @ _OPENGL_FROM_OPENCV)
+    try:
+        return Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), viewmat, round(width), round(height), name)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def _lens(where: str, values: Mapping[str, Any]) -> Lens:
+    model = values.get("camera_model", "OPENCV")
+    k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
+    if model == "OPENCV_FISHEYE":
+        return Lens(model, (k1, k2, k3, k4))
+    if model not in _PERSPECTIVE:
+        raise ValueError(
+            f"{where}: `camera_model` must be OPENCV_FISHEYE or one of {', '.join(_PERSPECTIVE)}, got {model!r}; "
+            "undistort the images first."
+        )
+    if k4:
+        # Nerfstudio's k4 is the factor of r^8, OpenCV's divides: no model of ours has the former.
+        raise ValueError(f"{where}: `k4` must be 0 in a perspective camera, got {k4}; undistort the images first.")
+    return Lens("FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)) if k3 else Lens("OPENCV", (k1, k2, p1, p2))
+
+
+def _number(where: str, values: Mapping[str, Any], key: str, default: float | None = None) -> float:
+    value = values.get(key, default)
+    if not isinstance(value, int | float) or isinstance(value, bool) or not np.isfinite(value):
+        got = "none" if value is None else repr(value)
+        raise ValueError(f"{where}: `{key}` must be a finite number, here or at the top of the file, got {got}.")
+    return float(value)
+
+
+def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
+    """Read a point cloud: positions [P, 3] and colours [P, 3] in [0, 1], grey where the file has none.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is no PLY file with vertices x, y, z, or they are not finite.
+    """
+    from plyfile import PlyData, PlyParseError
+
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected the points' PLY file, found none; copy it or drop `ply_file_path`.")
+    try:
+        vertices = PlyData.read(str(path))["vertex"].data
+        points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
+    except (PlyParseError, KeyError, ValueError) as error:
+        raise ValueError(f"{path}: expected a PLY file with vertices x, y, z, got {error}; export it again.") from None
+    if not np.isfinite(points).all():
+        raise ValueError(f"{path}: the points must be finite, got NaN or Inf; export them again.")
+    if not {"red", "green", "blue"} <= set(vertices.dtype.names or ()):
+        return points, np.full(points.shape, 0.5, np.float32)
+    colors = np.stack([vertices[band] for band in ("red", "green", "blue")], axis=1)
+    scale = 255 if colors.dtype.kind in "iu" else 1
+    return points, np.clip(colors.astype(np.float32) / scale, 0, 1)

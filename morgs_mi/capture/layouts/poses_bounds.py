@@ -1,0 +1,104 @@
+"""`poses_bounds.npy`, the calibration of LLFF and of Neural 3D Video (N3DV).
+
+One row [17] per camera, in the order of the sorted videos that exist: a 3x5 matrix in row-major order,
+whose columns are the camera's down, right and backward axes, its centre (all in the world) and
+(height, width, focal length); then the nearest and farthest depth. The principal point is the image's middle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+
+__all__ = ["count_rows", "read_poses_bounds", "write_poses_bounds"]
+
+
+def read_poses_bounds(path: str | Path, names: Sequence[str]) -> tuple[tuple[Camera, ...], np.ndarray]:
+    """Read one camera per name, and their depth bounds [C, 2] in world units.
+
+    Args:
+        path: the file.
+        names: the cameras' names, in the order of the rows.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is not a NumPy array [C, 17] with one row per name, or a row is no pose.
+    """
+    path = Path(path)
+    rows = _rows(path)
+    if len(rows) != len(names):
+        raise ValueError(
+            f"{path}: expected one row per camera, got {len(rows)} rows for {len(names)} videos "
+            f"({', '.join(names)}); remove the rows of the videos that are missing."
+        )
+    cameras = tuple(_camera(path, i, row, name) for i, (row, name) in enumerate(zip(rows, names, strict=True)))
+    return cameras, rows[:, 15:].astype(np.float64)
+
+
+def count_rows(path: Path) -> int:
+    """Return the number of cameras in the file; raises what `read_poses_bounds` raises."""
+    return len(_rows(path))
+
+
+def _rows(path: Path) -> np.ndarray:
+    try:
+        rows = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ValueError(
+            f"{path}: expected a NumPy array [C, 17], got a broken file ({error}); export it again."
+        ) from None
+    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
+        what = f"{rows.dtype} {rows.shape}" if isinstance(rows, np.ndarray) else "an archive"
+        raise ValueError(f"{path}: expected a float array [C, 17], got {what}; export it again.")
+    return rows
+
+
+def _camera(path: Path, index: int, row: np.ndarray, name: str) -> Camera:
+    where = f"{path}, row {index} ({name})"
+    if not np.isfinite(row).all():
+        raise ValueError(f"{where}: the pose must be finite, got {row.tolist()}; calibrate again.")
+    pose = row[:15].reshape(3, 5).astype(np.float64)
+    down, right, back, centre, (height, width, focal) = pose.T
+    R = np.stack([right, down, -back])
+    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
+        raise ValueError(
+            f"{where}: the axes (down, right, back) must be a right-handed orthonormal frame, got "
+            f"{pose[:, :3].round(4).tolist()}; check the order of the columns."
+        )
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = R, -R @ centre
+    K = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])
+    try:
+        return Camera(K, viewmat, round(width), round(height), name)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+
+
+def write_poses_bounds(path: str | Path, cameras: Sequence[Camera], bounds: np.ndarray) -> None:
+    """Write the cameras, in the order of their sorted videos, with their depth bounds [C, 2].
+
+    Raises:
+        ValueError: a camera has two focal lengths or an off-centre principal point, which the format
+            cannot hold, or `bounds` is not [C, 2].
+        OSError: the file could not be written.
+    """
+    bounds = np.asarray(bounds, dtype=np.float64)
+    if bounds.shape != (len(cameras), 2):
+        raise ValueError(f"write_poses_bounds(): `bounds` must be [C, 2] with C={len(cameras)}, got {bounds.shape}.")
+    rows = []
+    for camera, near_far in zip(cameras, bounds, strict=True):
+        K, size = camera.K, np.array([camera.width, camera.height])
+        if not np.allclose(K[0, 0], K[1, 1], rtol=1e-6) or not np.allclose(K[:2, 2], size / 2, atol=1e-3):
+            raise ValueError(
+                f"write_poses_bounds(): camera {camera.name!r} must have one focal length and a centred "
+                f"principal point, got K={K.tolist()}; use write_colmap()."
+            )
+        right, down, forward = np.asarray(camera.viewmat, dtype=np.float64)[:3, :3]
+        hwf = [camera.height, camera.width, K[0, 0]]
+        rows.append([*np.stack([down, right, -forward, camera.position, hwf], axis=1).ravel(), *near_far])
+    with open(path, "wb") as file:
+        np.save(file, np.array(rows))

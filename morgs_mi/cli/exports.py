@@ -1,0 +1,187 @@
+"""`morgs-mi export` and `view`: a stream for other programs, and for your own eyes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+from morgs_mi.cli.console import progress, say
+from morgs_mi.viewer.viewer import ViewerConfig
+
+__all__ = ["Export", "View"]
+
+
+@dataclass(frozen=True)
+class Ply:
+    """Write a PLY file per frame in the layout of 3D Gaussian Splatting, in the capture's axes."""
+
+    out: Positional[Path]
+    """Folder of a fit, or a stream file."""
+    output: Path | None = None
+    """New folder for 0000.ply, ...; by default OUT/ply."""
+    frames: str | None = None
+    """Which frames: 12, 10:20 (without 20) or 0:100:5; all by default."""
+
+    def run(self) -> None:
+        from morgs_mi.export.clips import chosen_frames, write_each
+        from morgs_mi.io.ply import write_ply
+        from morgs_mi.playback.player import open_stream
+
+        stream = open_stream(self.out)
+        frames, output = chosen_frames(stream, self.frames), self.output or stream.path.with_name("ply")
+        with progress() as report:
+            write_each(stream, output, ".ply", write_ply, frames, lambda done, of: report("Writing", done, of))
+        say(f"{output}: {len(frames)} PLY files.")
+
+
+@dataclass(frozen=True)
+class Gltf:
+    """Write a .glb file per frame: glTF 2.0 with KHR_gaussian_splatting, turned so that y is up."""
+
+    out: Positional[Path]
+    """Folder of a fit, or a stream file."""
+    output: Path | None = None
+    """New folder for 0000.glb, ...; by default OUT/gltf."""
+    frames: str | None = None
+    """Which frames: 12, 10:20 (without 20) or 0:100:5; all by default."""
+
+    def run(self) -> None:
+        from morgs_mi.export.axes import gltf_axes
+        from morgs_mi.export.clips import chosen_frames, write_each
+        from morgs_mi.export.gltf import write_gltf
+        from morgs_mi.playback.player import open_stream
+
+        stream = open_stream(self.out)
+        frames, output = chosen_frames(stream, self.frames), self.output or stream.path.with_name("gltf")
+        axes = gltf_axes(stream.cameras)
+        with progress() as report:
+            write_each(
+                stream,
+                output,
+                ".glb",
+                lambda path, gaussians: write_gltf(path, gaussians, axes),
+                frames,
+                lambda done, of: report("Writing", done, of),
+            )
+        say(f"{output}: {len(frames)} glTF files.")
+
+
+@dataclass(frozen=True)
+class Flight:
+    """Render a stream along a moving camera into an mp4."""
+
+    out: Positional[Path]
+    """Folder of a fit, or a stream file."""
+    path: str = "between"
+    """between: through the rig's cameras; orbit: around the scene; or a JSON file of key views, see docs/exports.md."""
+    output: Path | None = None
+    """FILE.mp4; by default OUT/PATH.mp4."""
+    seconds: float | None = None
+    """How long the camera takes; by default as long as the clip, or what the JSON file says."""
+    degrees: float | None = None
+    """How far an orbit goes; less than 360 is a swing to both sides, by default as far as the rig reaches."""
+    freeze: int | None = None
+    """Stop time at this frame; by default it goes on, and starts over where the clip ends."""
+    width: int | None = None
+    """Width of the video; by default that of the first camera or the JSON file."""
+    channels: tuple[Literal["color", "motion", "confidence", "depth", "alpha"], ...] = ("color",)
+    """What to render, side by side."""
+
+    def run(self) -> None:
+        from morgs_mi.codec.packets import play
+        from morgs_mi.export.clips import frame_numbers, write_flight
+        from morgs_mi.export.paths import between, focus, load_path, orbit
+        from morgs_mi.playback.player import open_stream
+
+        stream = open_stream(self.out)
+        clip = len(frame_numbers(stream)) / stream.fps
+        if self.path == "between":
+            path = between(stream.cameras, clip)
+        elif self.path == "orbit":
+            means = next(gaussians for _, gaussians in play(stream)).numpy()["means"]
+            path = orbit(stream.cameras, focus(stream.cameras, means), self.degrees, clip)
+        else:
+            path = load_path(self.path, stream.cameras)
+        path = path if self.seconds is None else path.lasting(self.seconds)
+        if self.width is not None:
+            height = round(self.width * path.keys[0].height / path.keys[0].width)
+            path = replace(path, keys=tuple(key.resized(self.width, height) for key in path.keys))
+        output = self.output or stream.path.with_name(f"{Path(self.path).stem}.mp4")
+        with progress() as report:
+            write_flight(
+                stream,
+                path,
+                output,
+                self.channels,
+                self.freeze,
+                lambda done, of: report("Rendering", done, of),
+            )
+        say(f"{output}: {path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}.")
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Write where every Gaussian is in every frame, for NumPy: ids, frames, positions, confidence."""
+
+    out: Positional[Path]
+    """Folder of a fit, or a stream file."""
+    output: Path | None = None
+    """FILE.npz; by default OUT/tracks.npz."""
+
+    def run(self) -> None:
+        from morgs_mi.export.clips import frame_numbers
+        from morgs_mi.export.tracks import follow, write_tracks
+        from morgs_mi.playback.player import open_stream
+
+        stream = open_stream(self.out)
+        output, total = self.output or stream.path.with_name("tracks.npz"), len(frame_numbers(stream))
+        with progress() as report:
+            tracks = follow(stream, lambda done: report("Following", done, total))
+        write_tracks(output, tracks)
+        T, N = tracks.positions.shape[:2]
+        say(f"{output}: {N} Gaussians through {T} frames.")
+
+
+@dataclass(frozen=True)
+class Export:
+    """Write a stream for other programs."""
+
+    kind: Annotated[
+        Annotated[Ply, tyro.conf.subcommand("ply")]
+        | Annotated[Gltf, tyro.conf.subcommand("gltf")]
+        | Annotated[Flight, tyro.conf.subcommand("video")]
+        | Annotated[Tracks, tyro.conf.subcommand("tracks")],
+        arg(name=""),
+    ]
+
+    def run(self) -> None:
+        self.kind.run()
+
+
+@dataclass(frozen=True)
+class View:
+    """Look at a stream in the browser, also while it is still being fitted."""
+
+    out: Positional[Path]
+    """Folder of a fit, or a stream file."""
+    open_browser: bool = True
+    """Open the page in this machine's browser."""
+    config: Annotated[ViewerConfig, arg(name="")] = field(default_factory=ViewerConfig)
+
+    def run(self) -> None:
+        import webbrowser
+
+        from morgs_mi.viewer.viewer import Viewer
+
+        try:
+            viewer = Viewer(self.out, self.config)
+        except ImportError as error:
+            raise ValueError(str(error)) from error
+        say(f"{viewer.url} (Ctrl-C ends it)")
+        if self.open_browser:
+            webbrowser.open(viewer.url)
+        viewer.run()

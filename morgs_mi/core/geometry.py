@@ -1,0 +1,67 @@
+"""What Gaussians look like to other programs, in NumPy: covariances, colours towards a place, another frame of axes.
+
+N Gaussians, K = (degree + 1)^2 SH coefficients; R [3, 3] is a rotation that takes column vectors, x' = R x.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from morgs_mi.core.gaussians import Gaussians
+
+__all__ = ["colors_towards", "covariances", "rotated", "sh_basis", "unit_quats"]
+
+
+def unit_quats(gaussians: Gaussians) -> np.ndarray:
+    """Return the rotations as unit quaternions wxyz, float64 [N, 4]; one of length 0 does not rotate."""
+    quats = np.asarray(gaussians.numpy()["quats"], np.float64)
+    lengths = np.linalg.norm(quats, axis=1, keepdims=True)
+    return np.where(lengths > 0, quats / np.maximum(lengths, 1e-300), (1.0, 0, 0, 0))
+
+
+def covariances(gaussians: Gaussians) -> np.ndarray:
+    """Return the covariances in world axes, float64 [N, 3, 3]."""
+    axes = Rotation.from_quat(unit_quats(gaussians), scalar_first=True).as_matrix()
+    axes = axes * np.exp(np.asarray(gaussians.numpy()["log_scales"], np.float64))[:, None]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
+    """Return the spherical harmonics of unit directions [M, 3] with 3DGS's signs, [M, K]."""
+    return np.stack(
+        [np.broadcast_to(b, len(directions)) for b in dr.sh_eval(mi.Vector3f(directions.T), degree)], axis=1
+    )
+
+
+def colors_towards(gaussians: Gaussians, eye: np.ndarray) -> np.ndarray:
+    """Return the display-referred colours [N, 3] that a camera at `eye` [3] sees, not clamped from above."""
+    raw = gaussians.numpy()
+    directions = raw["means"] - np.asarray(eye, np.float32)
+    directions /= np.maximum(np.linalg.norm(directions, axis=1, keepdims=True), 1e-30)
+    basis = sh_basis(directions, gaussians.sh_degree)
+    return np.maximum(0.5 + np.einsum("nk,nkc->nc", basis, raw["sh_coeffs"]), 0)
+
+
+def rotated(gaussians: Gaussians, R: np.ndarray) -> Gaussians:
+    """Return the same Gaussians in axes turned by R [3, 3]: centres, rotations, colours, motion and offset.
+
+    A colour that was seen along d is now seen along R d. The harmonics of one degree stay among themselves under a
+    rotation, so their new coefficients are found exactly, from as many directions as make the basis invertible.
+    """
+    R = np.asarray(R, np.float64)
+    turn = Rotation.from_matrix(R)
+    quats = (turn * Rotation.from_quat(unit_quats(gaussians), scalar_first=True)).as_quat(scalar_first=True)
+    raw = gaussians.numpy()
+    vectors = {name: raw[name] @ R.T for name in ("means", "motion", "offset") if name in raw}
+    # Golden spiral: evenly spread directions, twice as many as the 16 functions of degree 3.
+    z, angle = 1 - (2 * np.arange(32) + 1) / 32, np.pi * (1 + 5**0.5) * np.arange(32)
+    directions = np.stack([np.sqrt(1 - z * z) * np.cos(angle), np.sqrt(1 - z * z) * np.sin(angle), z], axis=1)
+    degree = gaussians.sh_degree
+    change = np.linalg.pinv(sh_basis(directions, degree)) @ sh_basis(directions @ R, degree)
+    coeffs = np.einsum("kl,nlc->nkc", change, raw["sh_coeffs"])
+    return replace(gaussians, quats=quats, sh_coeffs=coeffs, **vectors)

@@ -1,0 +1,159 @@
+"""Find a libLLVM that Dr.Jit can use, before Dr.Jit looks for one itself.
+
+Dr.Jit compiles its CPU kernels with the LLVM it finds when `drjit` is first imported. Version 14 and older
+it refuses; 15 and 16 abort the whole process on recent CPUs (``LLVM ERROR: Cannot select: f32 = fminimum``);
+17 and newer work. This module needs the standard library only, so that set-up can ask it before anything
+is installed: ``python -P morgs_mi/core/llvm.py`` prints the library in use, or a sentence and status 1.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import re
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterable
+from contextlib import suppress
+from pathlib import Path
+
+__all__ = ["choose_llvm", "ensure_llvm", "find_llvm", "llvm_major", "usable"]
+
+VARIABLE = "DRJIT_LIBLLVM_PATH"
+SAFE_MAJOR = 17
+DOUBTFUL_MAJOR = 15
+REMEDY = (
+    "install one (Debian: apt-get install libllvm19; Ubuntu: the newest of libllvm17 to libllvm20; "
+    f"conda: conda install -c conda-forge libllvm19) or set {VARIABLE} to its path"
+)
+# Dr.Jit turns a path that cannot be opened into an exception; a library that it cannot use ends the process.
+_NOWHERE = f"/nonexistent/libLLVM-{SAFE_MAJOR}-or-newer.so"
+_NAME = re.compile(r"libLLVM(?:-(\d+)[\d.]*)?\.so(?:\.(\d+)[\d.]*)?")
+_TRIAL = "import drjit as dr; from drjit.llvm import Float; dr.eval(dr.minimum(dr.arange(Float, 4), 2))"
+
+
+def llvm_major(path: Path) -> int | None:
+    """Return the major version that the file name (links followed) gives, None where it gives none."""
+    for name in (path.name, path.resolve().name):
+        if (match := _NAME.fullmatch(name)) and (major := match[1] or match[2]):
+            return int(major)
+    return None
+
+
+def search_folders() -> list[Path]:
+    """Return the folders where distributions, LLVM's own packages and conda put libLLVM."""
+    prefixes = [os.environ.get("CONDA_PREFIX"), sys.prefix, sys.base_prefix]
+    folders = [Path(p, "lib") for p in prefixes if p]
+    folders += [Path(p) for p in os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep) if p]
+    folders += [Path("/usr/lib64"), Path("/usr/local/lib"), Path("/usr/lib")]
+    usr = Path("/usr/lib")
+    return [*folders, usr / f"{os.uname().machine}-linux-gnu", *sorted(usr.glob("llvm-*/lib"))]
+
+
+def find_llvm(folders: Iterable[Path] | None = None) -> list[Path]:
+    """Return the libLLVM files in `folders` (default: the usual places), newest first, one per file."""
+    folders = search_folders() if folders is None else folders
+    files = {path.resolve(): path for folder in folders for path in folder.glob("libLLVM*.so*")}
+    named = [path for path in files.values() if _NAME.fullmatch(path.name)]
+    return sorted(named, key=lambda path: llvm_major(path) or 0, reverse=True)
+
+
+def works(path: Path) -> bool:
+    """Return whether Dr.Jit compiles a kernel with this library, tried in a process of its own.
+
+    A yes is remembered per file and machine under ``~/.cache/morgs_mi``; a no is asked again, since an
+    update of Dr.Jit may change it.
+    """
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "morgs_mi", "llvm.txt")
+    key = f"{os.uname().nodename} {sys.executable} {path.resolve()} {path.stat().st_mtime_ns}"
+    with suppress(OSError):
+        if key in cache.read_text().splitlines():
+            return True
+    environment = os.environ | {VARIABLE: str(path)}
+    trial = subprocess.run([sys.executable, "-c", _TRIAL], env=environment, capture_output=True)
+    if trial.returncode != 0:
+        return False
+    with suppress(OSError):
+        cache.parent.mkdir(parents=True, exist_ok=True)
+        with cache.open("a") as file:
+            file.write(key + "\n")
+    return True
+
+
+def usable(path: Path) -> bool:
+    """Return whether Dr.Jit can use this libLLVM: by its version, by trial where the version leaves doubt."""
+    if not path.is_file():
+        return False
+    major = llvm_major(path)
+    if major is None or DOUBTFUL_MAJOR <= major < SAFE_MAJOR:
+        return works(path)
+    return major >= SAFE_MAJOR
+
+
+def choose_llvm(wanted: str | None = None, folders: Iterable[Path] | None = None) -> tuple[Path | None, str]:
+    """Return the library to use (None if there is none) and a sentence on what is wrong (empty if nothing).
+
+    Args:
+        wanted: the user's own choice; it wins if it is usable.
+        folders: where to look otherwise, default the usual places.
+    """
+    if wanted and usable(Path(wanted)):
+        return Path(wanted), ""
+    found = find_llvm(folders)
+    best = next((path for path in found if usable(path)), None)
+    if wanted:
+        rest = f"{best} is used instead." if best else f"No other was found: {REMEDY}."
+        return best, f"{VARIABLE}={wanted} is not a libLLVM that Dr.Jit can use here. {rest}"
+    if best:
+        return best, ""
+    seen = f" (only {', '.join(map(str, found))}, too old for this CPU)" if found else ""
+    return None, f"Dr.Jit's CPU backend needs LLVM {SAFE_MAJOR} or newer and none was found{seen}: {REMEDY}."
+
+
+def has_cuda() -> bool:
+    """Return whether an NVIDIA driver can be loaded, so that the variants cuda_* may work without LLVM."""
+    try:
+        ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    return True
+
+
+def ensure_llvm() -> None:
+    """Point Dr.Jit to a usable libLLVM through ``DRJIT_LIBLLVM_PATH``; Linux only, elsewhere do nothing.
+
+    With a CUDA driver a missing LLVM is a warning, and choosing a variant ``llvm_*`` then raises
+    Mitsuba's ImportError instead of ending the process.
+
+    Raises:
+        RuntimeError: no usable LLVM and no CUDA driver.
+    """
+    if not sys.platform.startswith("linux"):
+        return
+    wanted = os.environ.get(VARIABLE)
+    if wanted == _NOWHERE:  # a parent process has already said it
+        return
+    path, problem = choose_llvm(wanted)
+    if not path and not has_cuda():
+        raise RuntimeError(problem)
+    if problem:
+        warnings.warn(problem, RuntimeWarning, stacklevel=3)
+    os.environ[VARIABLE] = str(path or _NOWHERE)
+    # Dr.Jit reads the variable once, when it is imported.
+    if "drjit" in sys.modules:
+        major = sys.modules["drjit"].detail.llvm_version()[0]
+        if 0 < major < SAFE_MAJOR:
+            warnings.warn(
+                f"Dr.Jit was imported before morgs_mi and has loaded LLVM {major}, which can abort the "
+                "process; import morgs_mi before mitsuba and drjit.",
+                RuntimeWarning,
+                stacklevel=3,
+            )
+
+
+if __name__ == "__main__":
+    chosen, sentence = choose_llvm(os.environ.get(VARIABLE))
+    sys.stderr.write(f"{sentence}\n" if sentence else "")
+    sys.stdout.write(f"{chosen}\n" if chosen else "")
+    sys.exit(chosen is None)

@@ -1,0 +1,37 @@
+"""The machine and the versions that every measured figure comes with."""
+
+from __future__ import annotations
+
+import os
+import platform
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+
+__all__ = ["machine", "versions"]
+
+
+def machine() -> dict[str, Any]:
+    """Return what the figures were measured on: processor, its number of threads, system and variant."""
+    return {
+        "processor": _processor(),
+        "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "variant": mi.variant(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of this package, of Python and of the libraries that the figures depend on."""
+    packages = ("morgs-mi", "mitsuba", "drjit", "numpy", "opencv-contrib-python-headless", "colour-science")
+    return {"python": platform.python_version()} | {name: metadata.version(name) for name in packages}
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.split(":")[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor()

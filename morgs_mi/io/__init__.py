@@ -1,0 +1,1 @@
+"""Files of pixels and of Gaussians: videos, image folders, EXR, PLY."""

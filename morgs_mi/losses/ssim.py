@@ -1,0 +1,277 @@
+"""L_recon (eq. 2) and its derivative in two traced passes.
+
+L_recon is (1 - lambda) L1 + lambda (1 - SSIM). SSIM (Wang et al. 2004) has the 11x11 Gaussian window of sigma 1.5 and
+takes what is outside the picture as black. With x the picture, y its target and M the mean over a window,
+
+    SSIM = (2 Mx My + C1) (2 (Mxy - Mx My) + C2) / ((Mx^2 + My^2 + C1) (Mxx - Mx^2 + Myy - My^2 + C2)).
+
+Two traced passes, over a whole view or a region of it: the first computes SSIM's derivatives D by Mx, Mxx and Mxy at
+every window, the second sends them back through the window, which is its own transpose:
+
+    dL/dx = (1 - lambda) sign(x - y) - lambda (M D_x + 2 x M D_xx + y M D_xy).
+
+In both, a SIMD lane walks down a run of rows of a strip (see `planes`). It blurs each row across as it comes, and adds
+it to the 11 windows that the row is part of: every number is read once, and no blurred row goes to memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import cv2
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.losses.ssim_layout import (
+    COLUMN,
+    RADIUS,
+    STRIP,
+    Lanes,
+    Planes,
+    Runs,
+    packet_type,
+    read_packet,
+    write_packet,
+)
+from morgs_mi.render.loops import on_aligned_stack
+from morgs_mi.render.recording import recorded
+from morgs_mi.render.region import Region, owned
+
+__all__ = ["OnRegion", "Target", "WholeView"]
+
+_Read = Callable[[Any], list[Any]]  # plane -> its numbers around the lane's row
+
+_C1, _C2 = 0.01**2, 0.03**2
+_WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
+_WINDOW = (_WINDOW / _WINDOW.sum()).astype(np.float32)
+_TAPS = [float(tap) for tap in _WINDOW]
+
+
+class Target:
+    """A picture to be matched, with what SSIM needs of it computed once.
+
+    Args:
+        image: [H, W, 3], RGB, uint8 or float in [0, 1], display-referred.
+        mask: [H, W] bool; what is False does not count. None: everything counts.
+    """
+
+    def __init__(self, image: np.ndarray, mask: np.ndarray | None = None) -> None:
+        pixels = image.astype(np.float32) / 255 if image.dtype == np.uint8 else image.astype(np.float32)
+        self.shape: tuple[int, ...] = pixels.shape
+        self.planes = Planes(*pixels.shape[:2])
+        self.weight: Any = None
+        if mask is not None and not mask.all():
+            weight = np.repeat(mask[..., None], 3, axis=2).astype(np.float32)
+            pixels, self.weight = pixels * weight, self._planes(weight)
+        mean = _blur(pixels)
+        self.pixels, self.mean = self._planes(pixels), self._planes(mean)
+        self.variance = self._planes(_blur(pixels * pixels) - mean * mean)
+        self.windows, self.lines = self.planes.runs(None, RADIUS), self.planes.runs(None, 0)
+        self.surroundings: Any = None
+        self.parts: dict[Region, tuple[Any, ...]] = {}
+
+    def _planes(self, picture: np.ndarray) -> Any:
+        planes = self.planes.of(owned(mi.Float(picture.ravel())))
+        dr.eval(planes)
+        return planes
+
+    def difference(self, image: Any, region: Region | None = None) -> np.ndarray:
+        """Return this picture minus another, [H, W, 3] or on a region of it; 0 where masked."""
+        if region is None or region.whole:
+            wrong = self.pixels - self.weighed(self.planes.of(owned(dr.detach(image).array)))
+            return np.asarray(self.planes.picture(wrong)).reshape(self.shape)
+        places, inside, *_ = self.part(region)
+        own = dr.gather(mi.Float, self.pixels, places, active=inside)
+        return np.asarray(own - self.weighed(dr.detach(image).array, places)).reshape(region.shape(3))
+
+    def part(self, region: Region) -> tuple[Any, ...]:
+        """Return where the numbers of a picture on a region lie, which are in the view, and the runs of both passes."""
+        if region not in self.parts:
+            runs = self.planes.runs(region, RADIUS), self.planes.runs(region, 0)
+            self.parts[region] = (*self.planes.places_on(region), *runs)
+        return self.parts[region]
+
+    def remember(self, image: Any) -> None:
+        """Keep a rendered picture [H, W, 3]: it surrounds what is compared on a region from now on."""
+        self.surroundings = self.weighed(self.planes.of(owned(dr.detach(image).array)))
+        dr.eval(self.surroundings)
+
+    def weighed(self, values: Any, places: Any = None) -> Any:
+        """Return planes, or the numbers of them at `places`, without what does not count."""
+        if self.weight is None:
+            return values
+        return values * (self.weight if places is None else dr.gather(mi.Float, self.weight, places))
+
+
+def _blur(image: np.ndarray) -> np.ndarray:
+    return cv2.sepFilter2D(image, -1, _WINDOW, _WINDOW, borderType=cv2.BORDER_CONSTANT)
+
+
+class _Recon(dr.CustomOp):
+    gradient: Any
+
+    def finish(self, gradient: Any, loss: Any) -> Any:
+        """Keep the derivative for `backward`, and return the value."""
+        self.gradient = gradient
+        dr.eval(gradient, loss)
+        return loss
+
+    def backward(self) -> None:
+        self.set_grad_in("x", self.gradient * self.grad_out())
+
+    def forward(self) -> None:
+        self.set_grad_out(dr.dot(self.gradient, self.grad_in("x")))
+
+    def name(self) -> str:
+        return "morgs_mi.recon_loss"
+
+
+class WholeView(_Recon):
+    def eval(self, x: Any, target: Target, weight: float) -> Any:
+        planes = target.planes
+        picture = target.weighed(planes.of(x * dr.opaque(mi.Float, 1)))  # in memory of our own
+        gradient, loss = _passes(picture, target, weight, target.windows, target.lines)
+        return self.finish(planes.picture(target.weighed(gradient)), loss)
+
+
+class OnRegion(_Recon):
+    def eval(self, x: Any, target: Target, weight: float, region: Region) -> Any:
+        if target.surroundings is None:
+            target.surroundings = target.pixels + 0
+        picture, (places, inside, windows, pixels) = target.surroundings, target.part(region)
+        dr.scatter(picture, target.weighed(x, places), places, active=inside, mode=dr.ReduceMode.NoConflicts)
+        gradient, loss = _passes(picture, target, weight, windows, pixels)
+        return self.finish(target.weighed(dr.gather(mi.Float, gradient, places, active=inside), places), loss)
+
+
+def _passes(picture: Any, target: Target, weight: float, windows: Runs, pixels: Runs) -> tuple[Any, Any]:
+    """Return dL/dx in planes, set on the runs of `pixels`, and L over the runs of `windows` and `pixels`."""
+    planes, scale = target.planes, dr.opaque(mi.Float, 1 / int(np.prod(target.shape)))
+    height = dr.opaque(mi.Int32, planes.height)
+    dr.eval(picture)
+    given = (windows.lanes, height, picture, target.pixels, target.mean, target.variance)
+    derivatives, ssim = recorded(_similarity_pass, planes.size)(*given)
+    given = (pixels.lanes, height, picture, target.pixels, derivatives, scale)
+    (gradient,), error = recorded(_gradient_pass, planes.size, weight)(*given)
+    structure = dr.opaque(mi.Float, windows.num_pixels) - dr.sum(ssim)
+    return gradient, scale * ((1 - weight) * dr.sum(error) + weight * structure)
+
+
+def _similarity_pass(
+    size: int, lanes: Lanes, height: Any, picture: Any, target: Any, mean: Any, variance: Any
+) -> tuple[list[Any], Any]:
+    """Return the planes of SSIM's derivatives by M x, M xx and M xy, and the sum of SSIM over each run."""
+
+    def products(read: _Read) -> list[list[Any]]:
+        x, y = read(picture), read(target)
+        return [x, [v * v for v in x], [v * w for v, w in zip(x, y, strict=True)]]
+
+    def similarity(read: _Read, blurred: list[list[Any]]) -> tuple[list[list[Any]], list[Any]]:
+        terms = [_similarity(*values) for values in zip(*blurred, read(mean), read(variance), strict=True)]
+        ssim, *derivatives = map(list, zip(*terms, strict=True))
+        return derivatives, ssim
+
+    return _walk(size, lanes, height, products, similarity, 3)
+
+
+def _similarity(mx: Any, xx: Any, xy: Any, my: Any, variance: Any) -> tuple[Any, Any, Any, Any]:
+    """Return SSIM of a window and its derivatives by M x, M xx and M xy."""
+    a1, a2 = dr.fma(2 * mx, my, _C1), dr.fma(2.0, dr.fma(-mx, my, xy), _C2)
+    b1, b2 = dr.fma(mx, mx, dr.fma(my, my, _C1)), dr.fma(-mx, mx, xx) + (variance + _C2)
+    r1, r2 = dr.rcp(b1), dr.rcp(b2)
+    r12 = r1 * r2
+    ssim = a1 * a2 * r12
+    d_x = 2 * dr.fma(my * r12, a2 - a1, mx * ssim * (r2 - r1))
+    return ssim, d_x, -ssim * r2, 2 * a1 * r12
+
+
+def _gradient_pass(
+    size: int, weight: float, lanes: Lanes, height: Any, picture: Any, target: Any, derivatives: list[Any], scale: Any
+) -> tuple[list[Any], Any]:
+    """Return the planes of dL/dx, and the sum of |x - y| over each run."""
+
+    def as_they_are(read: _Read) -> list[list[Any]]:
+        return [read(plane) for plane in derivatives]
+
+    def gradient(read: _Read, blurred: list[list[Any]]) -> tuple[list[list[Any]], list[Any]]:
+        row, errors = [], []
+        for x, y, d_x, d_xx, d_xy in zip(read(picture), read(target), *blurred, strict=True):
+            error, structure = x - y, dr.fma(y, d_xy, dr.fma(2 * x, d_xx, d_x))
+            sign = dr.select(error > 0, 1.0, dr.select(error < 0, -1.0, 0.0))
+            row.append(scale * ((1 - weight) * sign - weight * structure))
+            errors.append(dr.abs(error))
+        return [row], errors
+
+    return _walk(size, lanes, height, as_they_are, gradient, 1)
+
+
+def _walk(
+    size: int,
+    lanes: Lanes,
+    height: Any,
+    across: Callable[[_Read], list[list[Any]]],
+    finish: Callable[[_Read, list[list[Any]]], tuple[list[list[Any]], list[Any]]],
+    outputs: int,
+) -> tuple[list[Any], Any]:
+    """Walk down the runs with a window: blur what `across` reads of each row, and write what `finish` makes of it.
+
+    Args:
+        size: of the planes.
+        lanes: the runs.
+        height: of the picture.
+        across: read -> three rows of numbers, 5 more on both sides than a strip is wide.
+        finish: (read, three blurred rows of a strip) -> (rows of a strip to write, row of a strip to sum up).
+        outputs: how many rows it writes.
+
+    Returns:
+        The planes that were written, set on the runs, and the sum over the pixels of each run.
+    """
+    many = packet_type()
+    targets = [dr.empty(mi.Float, size) for _ in range(outputs)]
+
+    def blurred(row: Any, height: Any, places: Any) -> Any:
+        inside, down = (row >= 0) & (row < height), mi.UInt32(row) * COLUMN
+
+        def wide(plane: Any) -> list[Any]:
+            numbers = [v for place in places for v in read_packet(plane, place + down, inside)]
+            return numbers[STRIP - RADIUS : 2 * STRIP + RADIUS]
+
+        sums = []
+        for values in across(wide):
+            shifted = [many(values[k : k + STRIP]) for k in range(2 * RADIUS + 1)]
+            total = shifted[0] * _TAPS[0]
+            for tap, v in zip(_TAPS[1:], shifted[1:], strict=True):
+                total = dr.fma(v, tap, total)
+            sums += list(total)
+        return many(sums)
+
+    def body(row, end, first, places, columns, height, windows, total, targets):
+        # Two rows at a time, so that the windows are read and written half as often. Window k ends k rows further down.
+        a, b, w = blurred(row, height, places), blurred(row + 1, height, places), _TAPS
+        done = dr.fma(a, w[0], windows[0]), dr.fma(b, w[0], dr.fma(a, w[1], windows[1]))
+        windows = [dr.fma(a, w[k], dr.fma(b, w[k - 1], windows[k])) for k in range(2, 2 * RADIUS)]
+        windows += [dr.fma(a, w[-1], b * w[-2]), b * w[-1]]
+
+        there = [columns > k for k in range(STRIP)]
+        for k in range(2):
+            at = row + k - RADIUS
+            center, ready = places[1] + mi.UInt32(at) * COLUMN, (at >= first) & (at < end)
+
+            def narrow(plane: Any, center: Any = center, ready: Any = ready) -> list[Any]:
+                return list(read_packet(plane, center, ready))
+
+            sums = list(done[k])
+            written, summed = finish(narrow, [sums[STRIP * c : STRIP * (c + 1)] for c in range(3)])
+            for target, values in zip(targets, written, strict=True):
+                write_packet(target, [dr.select(t, v, 0) for t, v in zip(there, values, strict=True)], center, ready)
+            for t, v in zip(there, summed, strict=True):
+                total = total + dr.select(t & ready, v, 0)
+        return row + 2, end, first, places, columns, height, windows, total, targets
+
+    windows = [many([mi.Float(0) for _ in range(3 * STRIP)]) for _ in range(2 * RADIUS)]
+    end = on_aligned_stack(lanes.end)
+    state = (lanes.first - RADIUS, end, lanes.first, lanes.places, lanes.columns, height, windows, mi.Float(0), targets)
+    *_, total, targets = dr.while_loop(state, lambda row, end, *_: row < end + RADIUS, body, label="window")
+    return targets, total

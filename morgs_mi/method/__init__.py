@@ -1,0 +1,1 @@
+"""The method of the paper, one module for each of its parts."""

@@ -1,0 +1,93 @@
+"""What the key views say about a frame: motion where it can be trusted, and masks at keyframes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.method.confidence import motion_mask
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.flow_sources.opencv import consistent
+from morgs_mi.method.flow_sources.registry import FlowSource, FramePair, flow_source
+
+__all__ = ["MotionCue", "choose_key_views", "motion_cue", "motion_cues"]
+
+
+@dataclass(frozen=True, eq=False)
+class MotionCue:
+    """One key view's evidence at one frame.
+
+    Attributes:
+        motion: x_t - x_{t-1} [H, W, 2] in px on frame t's grid.
+        reliable: [H, W] bool, where the flow there and back agree.
+        onward: x_t - x_{t-1} again, but on frame t - 1's grid [H, W, 2].
+        onward_reliable: [H, W] bool, likewise.
+        mask: what moves [H, W] bool (eq. 10), or None where it was not asked for.
+    """
+
+    motion: np.ndarray
+    reliable: np.ndarray
+    onward: np.ndarray
+    onward_reliable: np.ndarray
+    mask: np.ndarray | None = None
+
+
+def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
+    """Return `count` views spread over the rig: the most central one, then always the farthest from those chosen."""
+    positions = np.array([camera.position for camera in cameras])
+    chosen = [int(np.argmin(np.linalg.norm(positions - positions.mean(0), axis=1)))]
+    while len(chosen) < min(count, len(cameras)):
+        gap = np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(1)
+        chosen.append(int(np.argmax(gap)))
+    return tuple(sorted(chosen))
+
+
+def motion_cue(
+    image: np.ndarray,
+    previous: np.ndarray,
+    method: str = "dis",
+    mask_method: str | None = None,
+    valid: np.ndarray | None = None,
+) -> MotionCue:
+    """Return the cue of two pictures, whichever camera's they are.
+
+    Args:
+        image: I_t [H, W, 3], RGB, uint8 or float in [0, 1].
+        previous: I_{t-1}, likewise.
+        method: as `flow_source` takes it.
+        mask_method: as `mask_refiner` takes it; None: no mask is wanted.
+        valid: [H, W] bool, False where undistortion left nothing; None: valid everywhere.
+
+    Raises:
+        ValueError: as `flow_source`, `optical_flow` and `mask_refiner`.
+    """
+    return _cue(FramePair(np.asarray(image), np.asarray(previous), valid=valid), flow_source(method), mask_method)
+
+
+def motion_cues(pairs: Mapping[int, FramePair], config: MotionConfig, with_masks: bool) -> dict[int, MotionCue]:
+    """Return the cue of every key view from its two pictures, by view.
+
+    Raises:
+        OSError: flow that is read from files is missing.
+        ValueError: as `flow_source`, `mask_refiner` and what they name.
+    """
+    source = flow_source(config.flow_method)
+    mask_method = config.mask_method if with_masks else None
+    return {view: _cue(pair, source, mask_method) for view, pair in pairs.items()}
+
+
+def _cue(pair: FramePair, source: FlowSource, mask_method: str | None) -> MotionCue:
+    """Return one view's cue (eq. 4, and 9 and 10 for the mask), from optical flow both ways."""
+    flow, onward = source(pair)
+    reliable, onward_reliable = consistent(flow, onward), consistent(onward, flow)
+    known = pair.valid
+    if pair.box is not None:
+        known = np.zeros(reliable.shape, bool)
+        known[pair.box] = True if pair.valid is None else pair.valid[pair.box]
+    if known is not None:
+        reliable, onward_reliable = reliable & known, onward_reliable & known
+    mask = motion_mask(pair.image, -flow, reliable, mask_method) if mask_method else None
+    return MotionCue(-flow, reliable, onward, onward_reliable, mask)

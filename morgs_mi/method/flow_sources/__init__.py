@@ -1,0 +1,1 @@
+"""Sources of optical flow: OpenCV, files, ONNX networks."""

@@ -1,0 +1,171 @@
+"""Optical flow that another program has computed, read from files.
+
+Layout of a folder of flow, one folder per camera of the capture and direction:
+
+    FLOW/cam00/forward/0000.flo     from frame 0 to frame 1, on frame 0's grid
+    FLOW/cam00/backward/0001.flo    from frame 1 to frame 0, on frame 1's grid
+
+so a file bears the number of the frame whose grid it lives on, as flow tools name their output after the first
+image of a pair: run one over the frames in order, then once more over the frames in reverse. The number is the last
+one in the file's name, whatever stands before it or how many zeros (`frame_0001.flo`); frames count from 0.
+
+Flow is in pixels of the pictures as the package sees them (undistorted, downscaled), x to the right and y down. A
+`.flo` file (Middlebury) holds the float32 202021.25, width and height as int32, then x and y of every pixel row by
+row as float32, all little-endian. An EXR file holds the channels `flow.X` and `flow.Y`, `X` and `Y`, `u` and `v`, or
+`R` and `G`. The renderer's own `motion.X` and `motion.Y` point the other way and are not taken for a flow.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.core.files import whole
+from morgs_mi.io.exr import read_exr, write_exr
+
+__all__ = ["SUFFIXES", "FlowFolder", "read_flow", "write_flow"]
+
+SUFFIXES = (".flo", ".exr")
+
+_MAGIC = 202021.25
+_HEADER = np.dtype([("magic", "<f4"), ("width", "<i4"), ("height", "<i4")])
+_CHANNELS = (("flow.X", "flow.Y"), ("X", "Y"), ("u", "v"), ("R", "G"))
+# Middlebury's files mark a pixel whose flow is not known by a value beyond this.
+_UNKNOWN = 1e9
+
+
+class FlowFolder:
+    """A folder of flow files in the layout above.
+
+    Args:
+        folder: holds one folder per camera; files may still be coming.
+
+    Raises:
+        FileNotFoundError: there is no such folder.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.folder = Path(folder)
+        if not self.folder.is_dir():
+            raise FileNotFoundError(f"{folder}: expected a folder of flow files, found none; check the path.")
+
+    def flows(self, camera: str, frame: int, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the flow from frame t to t - 1 on frame t's grid, and that from t - 1 to t on frame t - 1's.
+
+        Args:
+            camera: name of the camera.
+            frame: t, from 1.
+            size: height and width of the camera's pictures.
+
+        Raises:
+            FileNotFoundError: a file or its folder is missing.
+            ValueError: two files claim one frame, a flow has another size, or as `read_flow`.
+        """
+        back, onward = self._read(camera, "backward", frame, size), self._read(camera, "forward", frame - 1, size)
+        return back, onward
+
+    def _read(self, camera: str, direction: str, frame: int, size: tuple[int, int]) -> np.ndarray:
+        path = self._find(self.folder / camera / direction, frame)
+        flow = read_flow(path)
+        if flow.shape[:2] != size:
+            (height, width), (rows, columns) = size, flow.shape[:2]
+            raise ValueError(
+                f"{path}: expected {width}x{height} pixels as the pictures of {camera} have, got {columns}x{rows}; "
+                "compute the flow on undistorted and downscaled pictures."
+            )
+        return flow
+
+    def _find(self, folder: Path, frame: int) -> Path:
+        numbered = {}
+        for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+            if path.suffix.lower() in SUFFIXES and (digits := re.findall(r"\d+", path.stem)):
+                numbered.setdefault(int(digits[-1]), []).append(path)
+        found = numbered.get(frame, [])
+        if not found:
+            got = f"those of frames {min(numbered)} to {max(numbered)}" if numbered else "no flow at all"
+            raise FileNotFoundError(
+                f"{folder}: expected a .flo or .exr file of frame {frame}, found {got}; name each file after the frame "
+                "on whose grid it lives, counting from 0."
+            )
+        if len(found) > 1:
+            names = ", ".join(path.name for path in found)
+            raise ValueError(f"{folder}: expected one file of frame {frame}, got {names}; keep one.")
+        return found[0]
+
+
+def read_flow(path: str | Path) -> np.ndarray:
+    """Return the flow [H, W, 2] in pixels, float32, of a `.flo` or EXR file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        OSError: an EXR file cannot be read.
+        ValueError: neither kind of file, a `.flo` file that does not begin with its magic number or has not the
+            length that its header says, an EXR file without one known pair of channels, or pixels without flow.
+    """
+    path = Path(path)
+    reader = _read_flo if _suffix("read_flow()", path) == ".flo" else _read_exr
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a flow file, found none; check the path.")
+    flow = reader(path)
+    unknown = ~(np.abs(flow) < _UNKNOWN).all(axis=2)
+    if unknown.any():
+        y, x = np.argwhere(unknown)[0]
+        raise ValueError(
+            f"{path}: expected a flow at every pixel, got none at {unknown.sum()} of {unknown.size}, the first at "
+            f"x={x}, y={y}; use a method that fills its gaps."
+        )
+    return flow
+
+
+def write_flow(path: str | Path, flow: np.ndarray) -> None:
+    """Write a flow [H, W, 2] in pixels as a `.flo` or EXR file that appears whole or not at all.
+
+    Raises:
+        ValueError: the suffix is neither `.flo` nor `.exr`, or the flow has another shape.
+        OSError: the file cannot be written.
+    """
+    path, flow = Path(path), np.asarray(flow)
+    suffix = _suffix("write_flow()", path)
+    if flow.ndim != 3 or flow.shape[2] != 2 or not flow.size:
+        raise ValueError(f"write_flow(): `flow` must be [H, W, 2], got {flow.shape}.")
+    if suffix == ".exr":
+        write_exr(path, dict(zip(_CHANNELS[0], np.moveaxis(flow, 2, 0), strict=True)))
+        return
+    height, width = flow.shape[:2]
+    header = np.array([(_MAGIC, width, height)], _HEADER)
+    with whole(path, "write_flow()") as partial:
+        partial.write_bytes(header.tobytes() + flow.astype("<f4").tobytes())
+
+
+def _read_flo(path: Path) -> np.ndarray:
+    data = path.read_bytes()
+    header = np.frombuffer(data[: _HEADER.itemsize].ljust(_HEADER.itemsize, b"\0"), _HEADER)[0]
+    if header["magic"] != np.float32(_MAGIC):
+        raise ValueError(f"{path}: expected a .flo file, which begins with the float {_MAGIC}, got {data[:4]!r}.")
+    width, height = int(header["width"]), int(header["height"])
+    length = _HEADER.itemsize + 8 * width * height
+    if min(width, height) < 1 or len(data) != length:
+        raise ValueError(
+            f"{path}: expected {length} bytes for {width}x{height} pixels, got {len(data)}; the file may be cut short."
+        )
+    return np.frombuffer(data, "<f4", offset=_HEADER.itemsize).reshape(height, width, 2).astype(np.float32)
+
+
+def _read_exr(path: Path) -> np.ndarray:
+    channels = read_exr(path)
+    pairs = [pair for pair in _CHANNELS if set(pair) <= channels.keys()]
+    # The renderer's files hold colours beside the motion, whose R and G are no flow.
+    if len(pairs) != 1 or "motion.X" in channels:
+        names = ", ".join("/".join(pair) for pair in _CHANNELS)
+        raise ValueError(
+            f"{path}: expected one pair of the channels {names}, and no motion map, got {', '.join(sorted(channels))}."
+        )
+    return np.stack([channels[name] for name in pairs[0]], axis=-1)
+
+
+def _suffix(place: str, path: Path) -> str:
+    if path.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"{place}: `path` must end in {' or '.join(SUFFIXES)}, got {path.name!r}.")
+    return path.suffix.lower()

@@ -1,0 +1,1 @@
+"""Streams decoded and rendered, and channels visualised as images."""

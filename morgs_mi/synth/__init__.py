@@ -1,0 +1,1 @@
+"""Synthetic captures: moving scenes, path-traced with exact ground truth."""

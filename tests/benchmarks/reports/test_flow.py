@@ -1,0 +1,113 @@
+"""The report on optical flow: its errors are those of the flow, and the documentation quotes what was measured."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.reports import __main__ as cli
+from benchmarks.reports.flow import FlowReportConfig, markdown_table, report_flow
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.evaluate.metrics import endpoint_error
+from morgs_mi.method.flow import motion_cue
+from morgs_mi.method.flow_sources.files import write_flow
+from morgs_mi.method.flow_sources.opencv import FLOW_METHODS
+from morgs_mi.synth.ground_truth import load_truth
+from morgs_mi.synth.synthesize import synthesize
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory):
+    """A clip of two cameras and two frames."""
+    folder = tmp_path_factory.mktemp("clip") / "spheres"
+    synthesize("spheres", folder, num_cameras=2, num_frames=2, width=96, height=72, spp=4)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def perfect(clip):
+    """The clip's true flow as files, one direction exact and the other the best that it tells."""
+    flow = clip.parent / "flow"
+    for camera in ("cam00", "cam01"):
+        motion = load_truth(clip / "truth", camera, 1).motion
+        for direction, frame, sign in (("backward", 1, -1), ("forward", 0, 1)):
+            (flow / camera / direction).mkdir(parents=True)
+            write_flow(flow / camera / direction / f"{frame:04d}.flo", sign * motion)
+    return flow
+
+
+def test_the_true_flow_has_no_error(clip, perfect):
+    row = report_flow([clip], FlowReportConfig((f"files:{perfect}",)))["clips"][0]["rows"][0]
+    for figures in (row["all"], row["moving"]):
+        assert figures["error"] == figures["reliable_error"] == 0
+        assert figures["within_1px"] == 1
+
+
+def test_errors_are_those_of_the_cue(clip):
+    found = report_flow([clip], FlowReportConfig(("dis",), views=1))["clips"][0]
+    assert (found["name"], found["width"], found["height"], found["pairs"]) == ("spheres", 96, 72, 1)
+    capture = load_capture(clip)
+    frames, errors = list(capture.frames()), []
+    for view, camera in enumerate(capture.cameras):
+        truth = load_truth(clip / "truth", camera.name, 1)
+        cue = motion_cue(frames[1].images[view], frames[0].images[view])
+        moving = truth.mask
+        errors.append(
+            {
+                "error": endpoint_error(cue.motion, truth.motion, moving),
+                "within_1px": np.mean(np.linalg.norm(cue.motion - truth.motion, axis=-1)[moving] < 1),
+                "reliable": cue.reliable[moving].mean(),
+                "reliable_error": endpoint_error(cue.motion, truth.motion, moving & cue.reliable),
+            }
+        )
+    # Figures are rounded to four digits; which of the two cameras is the more central one does not matter.
+    moving = found["rows"][0]["moving"]
+    assert any(all(abs(moving[name] - each[name]) < 1e-4 for name in moving) for each in errors)
+
+
+def test_the_command_compares_methods_in_all_three_forms(clip, tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    path, plot = tmp_path / "flow.json", tmp_path / "flow.png"
+    methods = ["--methods", "dis-ultrafast", "farneback"]
+    assert cli.main(["flow", str(clip), str(clip), *methods, "--json", str(path), "--plot", str(plot)]) == 0
+    result = json.loads(path.read_text())
+    assert markdown_table(result["clips"][1]) in capsys.readouterr().out
+    assert [row["method"] for row in result["clips"][0]["rows"]] == methods[1:]
+    assert all(row["ms"] > 0 for row in result["clips"][0]["rows"])
+    assert {"settings", "machine", "versions"} <= result.keys()
+    assert plot.stat().st_size > 1000
+
+
+def test_a_clip_without_truth_is_refused(clip, tmp_path, capsys):
+    shutil.copytree(clip, tmp_path / "clip", ignore=shutil.ignore_patterns("truth"))
+    assert cli.main(["flow", str(tmp_path / "clip")]) == 1
+    assert "with ground truth, got 2 frames and no folder truth" in capsys.readouterr().err
+    assert cli.main(["flow"]) == 1
+    assert "at least one folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"methods": ()}, "`methods` must name at least one"),
+        ({"views": 0}, "`views` must be at least 1, got 0"),
+        ({"frames": 1}, "`frames` must be at least 2, got 1"),
+    ],
+)
+def test_nothing_cannot_be_measured(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        FlowReportConfig(**arguments)
+
+
+def test_documentation_quotes_the_committed_figures():
+    result = json.loads((ROOT / "benchmarks/results/flow_report.json").read_text(encoding="utf-8"))
+    text = (ROOT / "docs/flow.md").read_text(encoding="utf-8")
+    for clip in result["clips"]:
+        assert markdown_table(clip) in text
+        assert [row["method"] for row in clip["rows"]] == list(FLOW_METHODS)

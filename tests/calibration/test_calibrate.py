@@ -1,0 +1,129 @@
+"""Clips alone give the rig back, up to the world's scale, and what cannot work is said in a sentence."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi import cli
+from morgs_mi.calibration.calibrate import CalibrateConfig, calibrate
+from morgs_mi.calibration.rig_check import check_rig, find_common
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.core.camera import Camera
+from morgs_mi.io.video_writer import write_video
+from tests.capture import textured
+
+
+def film(path: Path, cameras: list[Camera], suffix: str = ".mkv") -> Path:
+    planes = textured.textures()
+    for camera in cameras:
+        write_video(path / f"{camera.name}{suffix}", [textured.render(camera, planes)] * 2, 30)
+    return path
+
+
+def aligned(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return `found` [n, 3] moved, turned and scaled onto `true`, and the rotation."""
+    a, b = found - found.mean(0), true - true.mean(0)
+    U, _, Vt = np.linalg.svd(a.T @ b)
+    R = (U @ Vt).T
+    return np.sqrt((b**2).sum() / (a**2).sum()) * a @ R.T + true.mean(0), R
+
+
+def test_a_rig_is_found_again(tmp_path: Path, capsys) -> None:
+    cameras = [camera.resized(240, 180) for camera in textured.rig()]
+    film(tmp_path, cameras)
+    assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
+    assert "sparse/0: 6 cameras, " in capsys.readouterr().out
+    capture = load_capture(tmp_path)
+    assert capture.names == tuple(camera.name for camera in cameras)
+    assert len(capture.points) > 500
+    true = np.array([camera.position for camera in cameras])
+    found, R = aligned(np.array([camera.position for camera in capture.cameras]), true)
+    # Features are good to 0.1 px of 208 px focal length; the rig is 2.8 wide and 4 from the scene.
+    np.testing.assert_allclose(found, true, atol=5e-3)
+    for camera, expected in zip(capture.cameras, cameras, strict=True):
+        np.testing.assert_allclose(camera.viewmat[:3, :3] @ R.T, expected.viewmat[:3, :3], atol=3e-3)
+        np.testing.assert_allclose(camera.K[0, 0], expected.K[0, 0], rtol=5e-3)
+    assert check_rig(capture, find_common(capture)).fits
+    status = cli.main(["calibrate", str(tmp_path)])
+    assert status == 1
+    assert "sparse: expected none, got one" in capsys.readouterr().err
+
+
+def test_a_camera_that_sees_something_else_is_named(tmp_path: Path) -> None:
+    film(tmp_path, [camera.resized(240, 180) for camera in textured.rig()[1:5]])
+    noise = np.random.default_rng(1).integers(0, 255, (90, 120, 3), np.uint8)
+    write_video(tmp_path / "other.mkv", [cv2.resize(noise, (240, 180), interpolation=cv2.INTER_CUBIC)] * 2, 30)
+    with pytest.raises(
+        ValueError, match=r"4 of 5 cameras were found, other could not be tied to them: .* or keep what"
+    ):
+        calibrate(tmp_path)
+    assert not (tmp_path / "sparse").exists()
+    found = calibrate(tmp_path, CalibrateConfig(partial=True))
+    assert (found.cameras, found.left_out) == (("cam1", "cam2", "cam3", "cam4"), ("other",))
+    assert found.error < 0.5
+    assert load_capture(tmp_path).names == found.cameras
+
+
+def noise_clips(path: Path) -> None:
+    for name in ("a", "b", "c"):
+        noise = np.random.default_rng(ord(name)).integers(0, 255, (60, 80, 3), np.uint8)
+        write_video(path / f"{name}.mkv", [cv2.resize(noise, (160, 120), interpolation=cv2.INTER_CUBIC)], 30)
+
+
+def grey(path: Path) -> None:
+    noise_clips(path)
+    write_video(path / "b.mkv", [np.full((120, 160, 3), 90, np.uint8)], 30)
+
+
+def one_clip(path: Path) -> None:
+    noise_clips(path)
+    (path / "a.mkv").unlink()
+    (path / "c.mkv").unlink()
+
+
+def no_clip(path: Path) -> None:
+    path.mkdir()
+
+
+def other_size(path: Path) -> None:
+    noise_clips(path)
+    write_video(path / "b.mkv", [np.full((100, 160, 3), 90, np.uint8)], 30)
+
+
+def calibrated(path: Path) -> None:
+    noise_clips(path)
+    (path / "sparse").mkdir()
+
+
+def empty_clip(path: Path) -> None:
+    noise_clips(path)
+    (path / "c.mkv").write_bytes(b"")
+
+
+@pytest.mark.parametrize(
+    ("build", "config", "error", "message"),
+    [
+        (lambda path: None, {}, FileNotFoundError, "expected a folder of clips, found none"),
+        (no_clip, {}, ValueError, "the clips of at least two cameras, found none"),
+        (one_clip, {}, ValueError, "the clips of at least two cameras, found b"),
+        (empty_clip, {}, ValueError, "c.mkv: expected a video, got an empty file"),
+        (calibrated, {}, FileExistsError, "sparse: expected none, got one"),
+        (noise_clips, {"frame": 1}, ValueError, "frame 1 is not in the clips of a, b, c"),
+        (noise_clips, {"frame": -1}, ValueError, "frame -1 is not in the clips of a, b, c"),
+        (other_size, {"shared_intrinsics": True}, ValueError, "clips of one size, got 160x100, 160x120"),
+        (grey, {}, ValueError, "at least 100 features in every view, got 0 in b: too dark"),
+        (noise_clips, {}, ValueError, "no two of the 3 views match"),
+    ],
+)
+def test_what_cannot_work(tmp_path: Path, build, config: dict, error: type[Exception], message: str) -> None:
+    path = tmp_path / "clips"
+    build(path)
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(error, match=message):
+        calibrate(path, dataclasses.replace(CalibrateConfig(), **config))
+    assert sorted(tmp_path.rglob("*")) == before

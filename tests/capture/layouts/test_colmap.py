@@ -1,0 +1,129 @@
+"""COLMAP models: what pycolmap writes we read, what we write pycolmap reads."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from morgs_mi.capture.layouts.colmap import find_colmap, read_colmap, write_colmap
+from morgs_mi.capture.lens import MODELS, Lens
+from morgs_mi.core.camera import Camera
+
+RNG = np.random.default_rng(1)
+POINTS = RNG.normal(size=(7, 3))
+COLORS = RNG.integers(0, 256, (7, 3)) / 255
+
+
+def cameras() -> list[Camera]:
+    views = [
+        Camera.look_at((np.cos(a), np.sin(a), 0.5), (0, 0, 0), (0, 0, 1), 60 + a, 64, 48, f"cam0{i}")
+        for i, a in enumerate((0.0, 0.7, 2.0))
+    ]
+    return [Camera(v.K + np.array([[0, 0, 3], [0, 0, -2], [0, 0, 0]]), v.viewmat, 64, 48, v.name) for v in views]
+
+
+def write(folder: Path, kind: str = "txt") -> Path:
+    lenses = [Lens(), Lens("OPENCV", (0.1, -0.02, 0.003, 0.004)), Lens("OPENCV_FISHEYE", (0.1, 0, 0, 0.01))]
+    write_colmap(folder, cameras(), POINTS, COLORS, lenses)
+    if kind == "bin":
+        model = pycolmap.Reconstruction(str(folder))
+        for file in folder.iterdir():
+            file.unlink()
+        model.write_binary(str(folder))
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["txt", "bin"])
+def test_round_trip(tmp_path: Path, kind: str) -> None:
+    model = read_colmap(write(tmp_path, kind))
+    order = np.argsort([camera.name for camera in model.cameras])
+    for i, expected in zip(order, cameras(), strict=True):
+        camera = model.cameras[i]
+        assert camera.name == f"{expected.name}.png"
+        assert (camera.width, camera.height) == (64, 48)
+        np.testing.assert_allclose(camera.K, expected.K, rtol=1e-12)
+        np.testing.assert_allclose(camera.viewmat, expected.viewmat, atol=1e-12)
+    assert [model.lenses[i].model for i in order] == ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"]
+    assert model.lenses[order[1]].distortion == (0.1, -0.02, 0.003, 0.004)
+    assert model.points.dtype == np.float32
+    rows = np.lexsort(model.points.T), np.lexsort(POINTS.T)
+    np.testing.assert_allclose(model.points[rows[0]], POINTS[rows[1]], rtol=1e-6)
+    np.testing.assert_allclose(model.point_colors[rows[0]], COLORS[rows[1]], atol=1e-6)
+
+
+def test_projection_agrees_with_pycolmap(tmp_path: Path) -> None:
+    model = read_colmap(write(tmp_path))
+    theirs = pycolmap.Reconstruction(str(tmp_path))
+    camera = model.cameras[0]
+    image = next(i for i in theirs.images.values() if i.name == camera.name)
+    for point in POINTS * 0.2:
+        x = camera.K @ (camera.viewmat[:3, :3] @ point + camera.viewmat[:3, 3])
+        np.testing.assert_allclose(x[:2] / x[2], image.project_point(point), atol=1e-9)
+
+
+def test_the_models_are_numbered_as_in_colmap() -> None:
+    for i, name in enumerate(MODELS):
+        # INVALID is -1 and not every later id is public; the first seven are fixed by the file format.
+        assert int(getattr(pycolmap.CameraModelId, name)) == i
+        assert len(pycolmap.Camera.create_from_model_name(1, name, 50.0, 64, 48).params) == sum(MODELS[name]) + 2
+
+
+def test_blank_lines_and_no_points(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "sparse" / "0", cameras())
+    assert find_colmap(tmp_path) == tmp_path / "sparse" / "0"
+    model = read_colmap(tmp_path / "sparse" / "0")
+    assert len(model.cameras) == 3
+    assert model.points.shape == model.point_colors.shape == (0, 3)
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_every_truncation_of_a_binary_file_is_refused(tmp_path: Path, name: str) -> None:
+    file = write(tmp_path, "bin") / name
+    whole = file.read_bytes()
+    for length in range(len(whole)):
+        file.write_bytes(whole[:length])
+        with pytest.raises(ValueError, match=rf"{name}: \d+ more bytes expected at byte \d+, got \d+"):
+            read_colmap(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("cameras.txt", " OPENCV ", " WHAT ", "cameras.txt: camera 2: the camera model must be one of"),
+        (
+            "cameras.txt",
+            " OPENCV ",
+            " PINHOLE ",
+            "camera 2: the camera model PINHOLE takes 4 parameters, got 8",
+        ),
+        ("cameras.txt", " 64 ", " wide ", "cameras.txt, line 4: expected `CAMERA_ID MODEL"),
+        (
+            "images.txt",
+            " 2 cam01",
+            " 9 cam01",
+            r"'cam01.png' refers to camera 9, cameras.txt has \[1, 2, 3\]",
+        ),
+        ("images.txt", "\n\n", "\n", "images.txt, line 6: expected `POINTS2D"),
+        ("images.txt", r"\n1 \S+", "\n1 nan", r"image 'cam00.png': Camera\('cam00.png'\): `viewmat` must"),
+        ("images.txt", r"\n1 \S+", "\n1 word", "images.txt, line 5: expected `IMAGE_ID"),
+        ("points3D.txt", "\n1 ", "\n1 red ", "points3D.txt, line 4: expected `POINT3D_ID"),
+        ("points3D.txt", "\n1 ", "\n1 inf ", "points3D.txt: the points must be finite"),
+    ],
+)
+def test_broken_text(tmp_path: Path, file: str, old: str, new: str, message: str) -> None:
+    path = write(tmp_path) / file
+    text, count = re.subn(old, new, path.read_text())
+    assert count
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_colmap(tmp_path)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    (write(tmp_path) / "points3D.txt").unlink()
+    with pytest.raises(FileNotFoundError, match=r"points3D.txt is missing"):
+        read_colmap(tmp_path)

@@ -1,0 +1,273 @@
+"""Every layout is found by what lies in the folder, and gives the same cameras and frames."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from plyfile import PlyData, PlyElement
+
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
+from morgs_mi.capture.lens import MODELS
+from morgs_mi.io.video_writer import write_video
+from tests.capture import small_captures as layouts
+from tests.capture.small_captures import COUNT, FPS, HEIGHT, WIDTH, folder_per_camera, folder_per_frame, rig
+
+# Files keep poses in text or float64; the focal length of a rig is near 50 px.
+POSE_ABS, PIXEL_ABS = 1e-9, 1e-6
+
+
+def assert_holds(capture: Capture, names: tuple[str, ...], order: tuple[int, ...], shift: float = 0.0) -> None:
+    """Camera `names[j]` must be the rig's camera `order[j]`, in poses, intrinsics and pictures."""
+    cameras = rig(names, shift)
+    assert capture.names == tuple(names[i] for i in order)
+    assert capture.num_frames == COUNT
+    for camera, i in zip(capture.cameras, order, strict=True):
+        np.testing.assert_allclose(camera.viewmat, cameras[i].viewmat, atol=POSE_ABS)
+        np.testing.assert_allclose(camera.K, cameras[i].K, atol=PIXEL_ABS)
+    for t, frame in enumerate(capture.frames()):
+        assert [tuple(image[20, 30, :2]) for image in frame.images] == [(i, t) for i in order]
+
+
+def test_n3dv_with_cameras_missing_from_the_numbering(tmp_path: Path) -> None:
+    capture = load_capture(layouts.n3dv(tmp_path / "a"))
+    assert (capture.layout, capture.fps) == ("poses_bounds", FPS)
+    assert_holds(capture, ("cam00", "cam02", "cam11"), (0, 1, 2))
+
+
+def test_n3dv_at_its_own_size_is_halved(tmp_path: Path) -> None:
+    camera = rig(("cam00",))[0].resized(2704, 2028)
+    K = np.array([[1460.0, 0, 1352], [0, 1460, 1014], [0, 0, 1]])
+    camera = type(camera)(K, camera.viewmat, 2704, 2028, "cam00")
+    write_poses_bounds(tmp_path / "poses_bounds.npy", [camera], [[1, 9]])
+    image = np.zeros((2028, 2704, 3), np.uint8)
+    image[::2] = 200  # the area filter averages rows, picking them would give 0 or 200
+    write_video(tmp_path / "cam00.mp4", [image], 30)
+    capture = load_capture(tmp_path, downscale=2)
+    half = capture.cameras[0]
+    assert (half.width, half.height) == (1352, 1014)
+    np.testing.assert_allclose(half.K, [[730, 0, 676], [0, 730, 507], [0, 0, 1]])
+    assert (next(capture.frames()).images[0] == 100).all()
+
+
+@pytest.mark.parametrize(
+    "clips",
+    [
+        layouts.videos,
+        lambda path, names: layouts.videos(path / "videos", names),
+        folder_per_camera,
+        lambda path, names: folder_per_camera(path / "images", names),
+        layouts.images_in_folder_per_camera,
+        folder_per_frame,
+        lambda path, names: folder_per_frame(path, names, "images"),
+    ],
+    ids=["videos", "inner videos", "folders", "inner folders", "cam/images", "frames", "frames/images"],
+)
+def test_meet_room(tmp_path: Path, clips) -> None:
+    assert_holds(load_capture(layouts.meet_room(tmp_path / "a", clips)), ("cam_0", "cam_2", "cam_10"), (0, 1, 2))
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("kind", ["txt", "bin"])
+def test_colmap(tmp_path: Path, model: str, shared: bool, kind: str) -> None:
+    names, (focals, coefficients) = ("cam10", "cam2", "cam1"), MODELS[model]
+    cameras = rig(names)
+    lens = [0.01 * (k + 1) for k in range(coefficients)]
+    params = [[50.0 + i] * focals + [33.0, 20.0 + i, *lens] for i in range(3)]
+    folder = tmp_path / "sparse" / "0"
+    layouts.colmap_text(folder, cameras, model, params, shared)
+    if kind == "bin":
+        theirs = pycolmap.Reconstruction(str(folder))
+        for file in folder.iterdir():
+            file.unlink()
+        theirs.write_binary(str(folder))
+    (folder_per_camera if shared else layouts.videos)(tmp_path, names)
+    capture = load_capture(tmp_path)
+    assert (capture.layout, capture.names) == ("COLMAP", ("cam1", "cam2", "cam10"))
+    for camera, i in zip(capture.cameras, (2, 1, 0), strict=True):
+        np.testing.assert_allclose(camera.viewmat, cameras[i].viewmat, atol=POSE_ABS)
+        own = 0 if shared else i
+        np.testing.assert_allclose(camera.K, [[50 + own, 0, 33], [0, 50 + own, 20 + own], [0, 0, 1]])
+    record = capture.record()
+    assert [view["lens"] for view in record["cameras"]] == [model] * 3
+    np.testing.assert_allclose(record["cameras"][0]["distortion"], lens)
+    np.testing.assert_allclose(capture.points, [[0.1, 0.2, 0.3]], rtol=1e-6)
+    np.testing.assert_allclose(capture.point_colors, [[1, 0, 0.2]], atol=1e-6)
+
+
+@pytest.mark.parametrize("place", ["sparse", "colmap/sparse/0", "."])
+def test_colmap_models_lie_in_several_places(tmp_path: Path, place: str) -> None:
+    layouts.colmap(tmp_path / "a")
+    for file in (tmp_path / "a/sparse/0").iterdir():
+        (tmp_path / "a" / place).mkdir(parents=True, exist_ok=True)
+        file.rename(tmp_path / "a" / place / file.name)
+    assert_holds(load_capture(tmp_path / "a"), ("cam1", "cam2", "cam10"), (0, 1, 2), shift=3)
+
+
+def test_the_first_calibration_that_is_there_counts(tmp_path: Path) -> None:
+    """COLMAP before Nerfstudio before Dynamic 3D Gaussians before poses_bounds, binary before text."""
+    path = layouts.nerfstudio(tmp_path / "a")
+    write_poses_bounds(path / "poses_bounds.npy", rig(("cam1", "cam2", "cam10")), [[1, 9]] * 3)
+    assert load_capture(path).layout == "Nerfstudio"
+    layouts.colmap_text(path / "sparse", rig(("cam1", "cam2")), "PINHOLE", [[50.0, 50, 31, 23]], shared=True)
+    assert load_capture(path).names == ("cam1", "cam2")
+    model = pycolmap.Reconstruction(str(path / "sparse"))
+    model.cameras[1].params = [60.0, 60, 31, 23]
+    model.write_binary(str(path / "sparse"))
+    assert load_capture(path).cameras[0].K[0, 0] == 60
+    meta = layouts.dynamic3dgs(tmp_path / "b")
+    layouts.videos(meta, ("cam1",))
+    write_poses_bounds(meta / "poses_bounds.npy", rig(("cam1",)), [[1, 9]])
+    assert load_capture(meta).layout == "Dynamic 3D Gaussians"
+    (meta / "transforms.json").write_text((path / "transforms.json").read_text())
+    layouts.videos(meta, ("cam1", "cam2", "cam10"))
+    assert load_capture(meta).layout == "Nerfstudio"
+
+
+def test_folders_that_hold_no_clips(tmp_path: Path) -> None:
+    path = layouts.n3dv(tmp_path / "a")
+    for place in (
+        "images/cam05.png",
+        "frames/cam05.png",
+        "truth/cam05/0000.png",
+        "masks/cam05/0.png",
+        "seg/cam05/0.png",
+    ):
+        layouts.write_image(path / place, 0, 0)
+    assert load_capture(path).names == ("cam00", "cam02", "cam11")
+
+
+def test_frame_rates_may_differ_by_a_hundredth(tmp_path: Path) -> None:
+    path = layouts.n3dv(tmp_path / "a")
+    write_video(path / "cam02.mkv", layouts.frames(1), 1.005 * FPS)
+    assert load_capture(path).fps == FPS
+
+
+def test_nerfstudio(tmp_path: Path) -> None:
+    path = layouts.nerfstudio(tmp_path / "a")
+    capture = load_capture(path)
+    assert (capture.layout, len(capture.points)) == ("Nerfstudio", 0)
+    assert_holds(capture, ("cam1", "cam2", "cam10"), (0, 1, 2), shift=3)
+    assert capture.record()["cameras"][0]["distortion"] == [0.01, 0, 0, 0]
+
+
+def test_nerfstudios_axes_are_opengls(tmp_path: Path) -> None:
+    path = layouts.nerfstudio(tmp_path / "a")
+    # A camera at (5, 6, 7) that looks along world +y with world +x to its right and world +z up.
+    pose = [[1, 0, 0, 5], [0, 0, -1, 6], [0, 1, 0, 7], [0, 0, 0, 1]]
+    edit(path, lambda meta: meta["frames"][0].update(transform_matrix=pose))
+    camera = load_capture(path).cameras[0]
+    np.testing.assert_allclose(camera.position, (5, 6, 7), atol=1e-12)
+    np.testing.assert_allclose((camera.viewmat @ [5 + 1, 6 + 10, 7 + 2, 1])[:3], (1, -2, 10), atol=1e-12)
+
+
+def edit(path: Path, change, name: str = "transforms.json") -> None:
+    meta = json.loads((path / name).read_text())
+    change(meta)
+    (path / name).write_text(json.dumps(meta))
+
+
+def test_nerfstudios_frames_override_the_top_of_the_file(tmp_path: Path) -> None:
+    path = layouts.nerfstudio(tmp_path / "a")
+
+    def change(meta: dict) -> None:
+        meta.update(fl_x=40.0, k1=0.02, k3=0.05, p2=0.03)
+        for key in ("fl_x", "fl_y", "cx", "cy"):
+            del meta["frames"][1][key]
+        meta["frames"][0].update(k1=0.07, camera_model="OPENCV_FISHEYE", k4=0.09)
+
+    edit(path, change)
+    capture = load_capture(path)
+    np.testing.assert_allclose(capture.cameras[1].K, [[40, 0, WIDTH / 2], [0, 40, HEIGHT / 2], [0, 0, 1]])
+    first, second, _ = capture.record()["cameras"]
+    assert (first["lens"], first["distortion"]) == ("OPENCV_FISHEYE", [0.07, 0, 0.05, 0.09])
+    assert (second["lens"], second["distortion"]) == ("FULL_OPENCV", [0.02, 0, 0, 0.03, 0.05, 0, 0, 0])
+
+
+def test_nerfstudio_from_a_field_of_view_with_all_frames_listed_and_points(tmp_path: Path) -> None:
+    path = layouts.nerfstudio(tmp_path / "a")
+    for file in path.glob("*.mkv"):
+        file.unlink()
+    folder_per_camera(path / "images", ("cam1", "cam2", "cam10"))
+
+    def change(meta: dict) -> None:
+        meta.update(camera_angle_x=np.pi / 2, ply_file_path="cloud.ply")
+        single, meta["frames"] = meta["frames"], []
+        for frame in single:
+            del frame["fl_x"], frame["fl_y"]
+            folder = frame["file_path"].removesuffix(".png")
+            meta["frames"] += [frame | {"file_path": f"{folder}/{t:04d}.png"} for t in range(COUNT)]
+
+    edit(path, change)
+    vertex = np.array(
+        [(1, 2, 3, 255, 0, 51)], [(n, "f4") for n in "xyz"] + [(n, "u1") for n in ("red", "green", "blue")]
+    )
+    PlyData([PlyElement.describe(vertex, "vertex")]).write(str(path / "cloud.ply"))
+    capture = load_capture(path)
+    assert capture.names == ("cam1", "cam2", "cam10")
+    np.testing.assert_allclose(capture.cameras[0].K[0, 0], WIDTH / 2)
+    np.testing.assert_array_equal(capture.points, [[1, 2, 3]])
+    np.testing.assert_allclose(capture.point_colors, [[1, 0, 0.2]])
+    assert [image[20, 30, 0] for image in next(capture.frames()).images] == [0, 1, 2]
+
+
+def test_nerfstudio_with_a_folder_per_frame(tmp_path: Path) -> None:
+    path = layouts.nerfstudio(tmp_path / "a")
+    for file in path.glob("*.mkv"):
+        file.unlink()
+    folder_per_frame(path, ("cam1", "cam2", "cam10"))
+    edit(path, lambda meta: [f.update(file_path="frame000000/" + Path(f["file_path"]).name) for f in meta["frames"]])
+    assert_holds(load_capture(path), ("cam1", "cam2", "cam10"), (0, 1, 2), shift=3)
+
+
+def test_dynamic3dgs(tmp_path: Path) -> None:
+    capture = load_capture(layouts.dynamic3dgs(tmp_path / "a"))
+    assert (capture.layout, capture.test_view, capture.fps) == ("Dynamic 3D Gaussians", None, 30)
+    assert_holds(capture, ("2", "1", "10"), (1, 0, 2), shift=3)
+    np.testing.assert_array_equal(capture.points, [[1, 2, 3]])
+    np.testing.assert_allclose(capture.point_colors, [[0.1, 0.2, 0.3]], rtol=1e-6)
+
+
+def test_the_first_test_camera_of_dynamic3dgs_is_held_out(tmp_path: Path) -> None:
+    path = layouts.dynamic3dgs(tmp_path / "a")
+    meta = json.loads((path / "train_meta.json").read_text())
+    for name, kept in (("train_meta", (1,)), ("test_meta", (10, 2))):
+        picks = [[row.index(i) for i in kept] for row in meta["cam_id"]]
+        lists = {
+            key: [[row[c] for c in pick] for row, pick in zip(meta[key], picks, strict=True)]
+            for key in ("k", "w2c", "fn", "cam_id")
+        }
+        (path / f"{name}.json").write_text(json.dumps(meta | lists))
+    capture = load_capture(path)
+    assert (capture.names, capture.test_view) == (("1", "2"), 1)
+    assert load_capture(path, test_view=None).test_view is None
+
+
+def test_smaller_clips_scale_the_intrinsics(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = layouts.colmap(tmp_path / "a")
+    small = np.full((HEIGHT // 2, WIDTH // 2, 3), 7, np.uint8)
+    write_video(path / "frames" / "cam2", [small] * COUNT, FPS)
+    with caplog.at_level(logging.WARNING):
+        capture = load_capture(path)
+    assert "the clips of cam2 are not of the size that was calibrated, 31x23 for one: the intrinsics" in caplog.text
+    assert [(c.width, c.height) for c in capture.cameras] == [(62, 46), (31, 23), (62, 46)]
+    np.testing.assert_allclose(capture.cameras[1].K[:2], rig(("a", "b"), shift=3)[1].K[:2] / 2, atol=PIXEL_ABS)
+
+
+def test_the_record_says_how_frames_come_about(tmp_path: Path) -> None:
+    path = layouts.nerfstudio(tmp_path / "a")
+    record = load_capture(path, downscale=2, test_view=1, max_frames=3).record()
+    assert json.loads(json.dumps(record)) == record
+    assert (record["filter"], record["downscale"], record["test_view"], record["frames"]) == ("area", 2, 1, 3)
+    assert (record["layout"], record["fps"], record["points"]) == ("Nerfstudio", FPS, 0)
+    view = record["cameras"][2]
+    assert (view["name"], view["recorded_size"], view["size"]) == ("cam10", [WIDTH, HEIGHT], [WIDTH // 2, HEIGHT // 2])
+    assert (view["lens"], view["undistortion"]) == ("OPENCV", "cubic, same intrinsics")
+    assert 0.5 < view["valid_share"] <= 1
+    assert load_capture(path).record()["filter"] == "none"

@@ -1,0 +1,84 @@
+"""The axes and the round trip of poses_bounds.npy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds, write_poses_bounds
+from morgs_mi.core.camera import Camera
+
+BOUNDS = np.array([[1.0, 9.0], [2.0, 8.0]])
+
+
+def cameras() -> list[Camera]:
+    return [
+        Camera.look_at((3, 1, 2), (0, 0, 0), (0, 0, 1), 50, 64, 48, "cam00"),
+        Camera.look_at((-2, 1, 1), (0, 0.5, 0), (0, 0, 1), 70, 60, 50, "cam01"),
+    ]
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    path = tmp_path / "poses_bounds.npy"
+    write_poses_bounds(path, cameras(), BOUNDS)
+    assert np.load(path).shape == (2, 17)
+    read, bounds = read_poses_bounds(path, ["cam00", "cam01"])
+    np.testing.assert_array_equal(bounds, BOUNDS)
+    for got, expected in zip(read, cameras(), strict=True):
+        assert (got.name, got.width, got.height) == (expected.name, expected.width, expected.height)
+        np.testing.assert_allclose(got.K, expected.K, rtol=1e-12)
+        np.testing.assert_allclose(got.viewmat, expected.viewmat, atol=1e-12)
+
+
+def test_columns_are_down_right_back(tmp_path: Path) -> None:
+    # A camera at (5, 6, 7) that looks along world +y with world +x to its right: down is -z, back is -y.
+    pose = [[0, 1, 0, 5, 48], [0, 0, -1, 6, 64], [-1, 0, 0, 7, 100]]
+    np.save(tmp_path / "p.npy", [[*np.ravel(pose).astype(float), 1.0, 2.0]])
+    (camera,), _ = read_poses_bounds(tmp_path / "p.npy", ["cam"])
+    np.testing.assert_allclose(camera.position, (5, 6, 7))
+    seen = camera.viewmat @ [5 + 1, 6 + 10, 7 + 2, 1]
+    np.testing.assert_allclose(seen[:3], (1, -2, 10), atol=1e-12)
+    assert (camera.width, camera.height, camera.K[0, 0]) == (64, 48, 100)
+
+
+def broken(path: Path, change) -> Path:
+    write_poses_bounds(path, cameras(), BOUNDS)
+    rows = np.load(path)
+    np.save(path, change(rows))
+    return path
+
+
+def with_nan(rows: np.ndarray) -> np.ndarray:
+    rows[1, 3] = np.nan
+    return rows
+
+
+def mirrored(rows: np.ndarray) -> np.ndarray:
+    rows[0, [0, 5, 10]] *= -1
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (with_nan, r"row 1 \(cam01\): the pose must be finite"),
+        (mirrored, r"row 0 \(cam00\): the axes .* right-handed"),
+        (lambda rows: rows[:1], r"got 1 rows for 2 videos \(cam00, cam01\)"),
+        (lambda rows: rows[:, :16], r"expected a float array \[C, 17\], got float64 \(2, 16\)"),
+        (lambda rows: rows.astype(object), "got a broken file"),
+    ],
+)
+def test_bad_files(tmp_path: Path, change, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        read_poses_bounds(broken(tmp_path / "poses_bounds.npy", change), ["cam00", "cam01"])
+
+
+def test_what_the_format_cannot_hold_is_refused(tmp_path: Path) -> None:
+    K = np.array([[50, 0, 30], [0, 50, 24], [0, 0, 1.0]])
+    camera = Camera(K, np.eye(4), 64, 48, "cam00")
+    with pytest.raises(ValueError, match=r"'cam00' must have one focal length .* use write_colmap"):
+        write_poses_bounds(tmp_path / "p.npy", [camera], BOUNDS[:1])
+    with pytest.raises(ValueError, match=r"`bounds` must be \[C, 2\] with C=1, got \(2, 2\)"):
+        write_poses_bounds(tmp_path / "p.npy", [camera], BOUNDS)

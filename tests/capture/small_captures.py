@@ -1,0 +1,131 @@
+"""Small captures in every layout, all of the same three cameras; frame t of camera i is filled with (i, t, 0)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
+from morgs_mi.core.camera import Camera
+from morgs_mi.io.video_writer import write_video
+
+WIDTH, HEIGHT, COUNT, FPS = 62, 46, 4, 25
+
+
+def rig(names: tuple[str, ...], shift: float = 0.0) -> list[Camera]:
+    """Cameras on a circle, each with another focal length, their principal points off the middle by `shift` px."""
+    views = [
+        Camera.look_at((np.cos(i), np.sin(i), 0.5), (0, 0, 0), (0, 0, 1), 60 + i, WIDTH, HEIGHT, name)
+        for i, name in enumerate(names)
+    ]
+    moved = np.array([[0, 0, shift], [0, 0, -shift], [0, 0, 0]])
+    return [Camera(view.K + moved, view.viewmat, WIDTH, HEIGHT, view.name) for view in views]
+
+
+def frames(i: int, count: int = COUNT) -> list[np.ndarray]:
+    return [np.full((HEIGHT, WIDTH, 3), (i, t, 0), np.uint8) for t in range(count)]
+
+
+def write_image(file: Path, i: int, t: int) -> None:
+    file.parent.mkdir(parents=True, exist_ok=True)
+    cv2.imwrite(str(file), frames(i)[t][..., ::-1])
+
+
+def videos(path: Path, names: tuple[str, ...], suffix: str = ".mkv") -> None:
+    """Write .mkv, for what is left of it after a cut can still be read."""
+    for i, name in enumerate(names):
+        write_video(path / f"{name}{suffix}", frames(i), FPS)
+
+
+def n3dv(path: Path, names: tuple[str, ...] = ("cam00", "cam02", "cam11"), clips: Callable = videos) -> Path:
+    path.mkdir(parents=True)
+    clips(path, names)
+    write_poses_bounds(path / "poses_bounds.npy", rig(names), [[1, 9]] * len(names))
+    return path
+
+
+def folder_per_camera(path: Path, names: tuple[str, ...]) -> None:
+    for i, name in enumerate(names):
+        write_video(path / name, frames(i), FPS)
+
+
+def images_in_folder_per_camera(path: Path, names: tuple[str, ...]) -> None:
+    for i, name in enumerate(names):
+        write_video(path / name / "images", frames(i), FPS)
+
+
+def folder_per_frame(path: Path, names: tuple[str, ...], inner: str = "") -> None:
+    for t in range(COUNT):
+        for i, name in enumerate(names):
+            write_image(path / f"frame{t:06d}" / inner / f"{name}.png", i, t)
+
+
+def meet_room(path: Path, clips: Callable = videos) -> Path:
+    return n3dv(path, ("cam_0", "cam_2", "cam_10"), clips)
+
+
+def colmap_text(folder: Path, cameras: list[Camera], model: str, params: list[list[float]], shared: bool) -> None:
+    """Write a model whose cameras have the parameters `params`, the first for all of them if `shared`."""
+    folder.mkdir(parents=True)
+    rows = [
+        f"{i + 1} {model} {WIDTH} {HEIGHT} {' '.join(map(repr, p))}"
+        for i, p in enumerate(params[: 1 if shared else None])
+    ]
+    (folder / "cameras.txt").write_text("# cameras\n" + "\n".join(rows) + "\n")
+    images = []
+    for i, camera in enumerate(cameras):
+        x, y, z, w = Rotation.from_matrix(camera.viewmat[:3, :3]).as_quat()
+        pose = " ".join(repr(float(v)) for v in (w, x, y, z, *camera.viewmat[:3, 3]))
+        images.append(f"{i + 1} {pose} {1 if shared else i + 1} {camera.name}.png\n\n")
+    (folder / "images.txt").write_text("# images\n" + "".join(images))
+    (folder / "points3D.txt").write_text("1 0.1 0.2 0.3 255 0 51 0.5\n")
+
+
+def colmap(path: Path) -> Path:
+    names = ("cam1", "cam2", "cam10")
+    cameras = rig(names, shift=3)
+    params = [[c.K[0, 0], c.K[1, 1], c.K[0, 2], c.K[1, 2]] for c in cameras]
+    colmap_text(path / "sparse/0", cameras, "PINHOLE", np.array(params).tolist(), shared=False)
+    videos(path, names)
+    return path
+
+
+def nerfstudio(path: Path) -> Path:
+    path.mkdir(parents=True)
+    names = ("cam1", "cam2", "cam10")
+    entries = []
+    for camera in rig(names, shift=3):
+        to_world = np.linalg.inv(camera.viewmat) @ np.diag([1, -1, -1, 1])
+        K = camera.K
+        focal = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+        entries.append({"file_path": f"./images/{camera.name}.png", "transform_matrix": to_world.tolist(), **focal})
+    meta = {"camera_model": "OPENCV", "w": WIDTH, "h": HEIGHT, "k1": 0.01, "frames": entries}
+    (path / "transforms.json").write_text(json.dumps(meta))
+    videos(path, names)
+    return path
+
+
+def dynamic3dgs(path: Path) -> Path:
+    ids = (2, 1, 10)
+    cameras = rig(tuple(map(str, ids)), shift=3)
+    for i, camera in enumerate(cameras):
+        for t in range(COUNT):
+            write_image(path / "ims" / camera.name / f"{t:06d}.png", i, t)
+    # The order of the cameras may change from frame to frame.
+    orders = [np.roll(np.arange(3), t).tolist() for t in range(COUNT)]
+    meta = {
+        "w": WIDTH,
+        "h": HEIGHT,
+        "k": [[cameras[i].K.tolist() for i in order] for order in orders],
+        "w2c": [[cameras[i].viewmat.tolist() for i in order] for order in orders],
+        "fn": [[f"{ids[i]}/{t:06d}.png" for i in order] for t, order in enumerate(orders)],
+        "cam_id": [[ids[i] for i in order] for order in orders],
+    }
+    (path / "train_meta.json").write_text(json.dumps(meta))
+    np.savez(path / "init_pt_cld.npz", data=[[1, 2, 3, 0.1, 0.2, 0.3, 1]])
+    return path

@@ -1,0 +1,161 @@
+"""Files and folders appear whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from morgs_mi.core.files import new_folder, whole, write_json
+
+
+def tree(path: Path) -> dict[str, str | None]:
+    """Return the text of every file below `path` by its name, hidden ones too, and None for folders."""
+    return {str(p.relative_to(path)): p.read_text() if p.is_file() else None for p in sorted(path.rglob("*"))}
+
+
+def write(partial: Path, kind: str, text: str = "new") -> None:
+    """Write what `whole` is asked for: a file, or a folder with one in it."""
+    if kind == "folder":
+        partial.mkdir()
+    (partial / "a" if kind == "folder" else partial).write_text(text)
+
+
+@contextmanager
+def file_size_limit(size: int) -> Iterator[None]:
+    """A limit on the size of files fails writes as a full disk does."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+@pytest.mark.parametrize("old", [False, True])
+def test_it_appears_at_the_end_and_in_place_of_the_old(tmp_path: Path, kind: str, old: bool) -> None:
+    if old:
+        write(tmp_path / "x", kind, "old")
+    before = tree(tmp_path)
+    with whole(tmp_path / "x", "test()") as partial:
+        write(partial, kind)
+        assert {name: text for name, text in tree(tmp_path).items() if not name.startswith(".")} == before
+    assert tree(tmp_path) == ({"x": "new"} if kind == "file" else {"x": None, "x/a": "new"})
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+@pytest.mark.parametrize("old", [False, True])
+@pytest.mark.parametrize("error", [ValueError("bad"), KeyboardInterrupt("stop"), OSError(28, "No space left")])
+def test_a_failing_body_leaves_nothing_and_keeps_the_old(tmp_path: Path, kind: str, old: bool, error) -> None:
+    if old:
+        write(tmp_path / "x", kind, "old")
+    before = tree(tmp_path)
+
+    def fail() -> None:
+        with whole(tmp_path / "x", "test()") as partial:
+            write(partial, kind)
+            raise error
+
+    message = r"^test\(\): cannot write .*/x, .*: No space left; check .* disk has room\.$"
+    with pytest.raises(type(error), match=message if isinstance(error, OSError) else str(error)):
+        fail()
+    assert tree(tmp_path) == before
+
+
+def test_a_full_disk(tmp_path: Path) -> None:
+    write_json(tmp_path / "x.json", {"a": 1})
+    before = tree(tmp_path)
+    with file_size_limit(100), pytest.raises(OSError, match=r"x\.json, .*: File too large; check"):
+        write_json(tmp_path / "x.json", {"a": "b" * 1000})
+    assert tree(tmp_path) == before
+
+
+@pytest.mark.parametrize("case", ["a file", "read-only", "a folder", "missing"])
+def test_a_place_that_cannot_be_written(tmp_path: Path, case: str) -> None:
+    folder = tmp_path / "folder"
+    if case == "a file":
+        folder.touch()
+    elif case == "read-only":
+        folder.mkdir(mode=0o500)
+        if os.access(folder, os.W_OK):
+            pytest.skip("root may write everywhere")
+    elif case == "a folder":
+        (folder / "x").mkdir(parents=True)
+    before = tree(tmp_path)
+    with (
+        pytest.raises(OSError, match=rf"test\(\): cannot write {folder}/x, "),
+        whole(folder / "x", "test()") as partial,
+    ):
+        partial.write_text("new")
+    assert tree(tmp_path) == before
+
+
+def test_a_failed_swap_puts_the_old_folder_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path / "x", "folder", "old")
+    before = tree(tmp_path)
+
+    def failing(*_: Path) -> None:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(Path, "replace", failing)
+    with pytest.raises(OSError, match="Input/output error"), whole(tmp_path / "x", "test()") as partial:
+        write(partial, "folder")
+    assert tree(tmp_path) == before
+
+
+def test_what_a_killed_run_left_is_no_hindrance(tmp_path: Path) -> None:
+    """What others are still writing stays: another name's, and that of a process that lives."""
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    for number in (os.getpid(), gone.pid):
+        write(tmp_path / f".partial-{number}-x", "folder", "half")
+    theirs = {f".partial-{os.getppid()}-x": "", f".partial-{os.getpid()}-y-x": ""}
+    for name in theirs:
+        (tmp_path / name).touch()
+    with new_folder(tmp_path / "x", "test()") as partial:
+        (partial / "b").touch()
+    assert tree(tmp_path) == theirs | {"x": None, "x/b": ""}
+
+
+def test_a_link_stays_a_link(tmp_path: Path) -> None:
+    (tmp_path / "link.json").symlink_to(tmp_path / "x.json")
+    write_json(tmp_path / "link.json", {})
+    assert (tmp_path / "link.json").is_symlink()
+    assert (tmp_path / "x.json").read_text() == "{}\n"
+
+
+def test_a_new_folder_replaces_nothing_not_even_what_came_meanwhile(tmp_path: Path) -> None:
+    write(tmp_path / "x", "folder", "old")
+    with (
+        pytest.raises(FileExistsError, match="x: expected a new folder, got one that exists; remove it first"),
+        new_folder(tmp_path / "x", "test()"),
+    ):
+        pass
+    with pytest.raises(OSError, match=r"y, .*not empty"), new_folder(tmp_path / "y", "test()"):
+        write(tmp_path / "y", "folder", "theirs")
+    assert tree(tmp_path) == {"x": None, "x/a": "old", "y": None, "y/a": "theirs"}
+
+
+def test_a_file_in_a_folder_fails_with_one_sentence(tmp_path: Path) -> None:
+    with (
+        file_size_limit(10),
+        pytest.raises(OSError, match=r"^test\(\): .*/new/x, [^(]*: File too large; [^:]*$"),
+        new_folder(tmp_path / "new" / "x", "test()") as folder,
+    ):
+        write_json(folder / "a.json", {"a": "b" * 1000})
+    assert tree(tmp_path) == {"new": None}
+
+
+def test_json_knows_no_infinity(tmp_path: Path) -> None:
+    write_json(tmp_path / "new" / "a.json", {"psnr": [float("inf"), 1.0], "deep": {"nan": float("nan")}})
+    assert json.loads((tmp_path / "new" / "a.json").read_text()) == {"psnr": [None, 1.0], "deep": {"nan": None}}
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OSError, match=r"cannot write .*b.json"):
+        write_json(tmp_path / "file" / "b.json", {})

@@ -1,0 +1,113 @@
+"""The choice of libLLVM: newest usable first, the user's own if it is usable, words instead of a crash."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from morgs_mi.core import llvm
+
+linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the search is for Linux alone")
+pytestmark = linux
+
+
+@pytest.fixture
+def libraries(tmp_path):
+    """Return a function that puts empty files of the given names into a folder."""
+
+    def make(*names: str) -> list[Path]:
+        for name in names:
+            (tmp_path / name).touch()
+        return [tmp_path]
+
+    return make
+
+
+@pytest.fixture
+def old_fails(monkeypatch):
+    monkeypatch.setattr(llvm, "works", lambda path: False)
+
+
+@pytest.mark.parametrize(
+    ("name", "major"),
+    [
+        ("libLLVM-14.so.1", 14),
+        ("libLLVM-14.0.6.so", 14),
+        ("libLLVM-19.so", 19),
+        ("libLLVM.so.19.1", 19),
+        ("libLLVM.so.22.1", 22),
+        ("libLLVM.so", None),
+        ("libLLVMPolly.so", None),
+    ],
+)
+def test_major_from_file_name(tmp_path, name, major):
+    assert llvm.llvm_major(tmp_path / name) == major
+
+
+def test_major_follows_links(libraries, tmp_path):
+    libraries("libLLVM.so.20.1")
+    (tmp_path / "libLLVM.so").symlink_to(tmp_path / "libLLVM.so.20.1")
+    assert llvm.llvm_major(tmp_path / "libLLVM.so") == 20
+    assert len(llvm.find_llvm([tmp_path])) == 1
+
+
+def test_newest_first(libraries):
+    folders = libraries("libLLVM-9.so.1", "libLLVM-15.so.1", "libLLVM.so.22.1", "libLLVM.so.19.1", "libLLVMx.so")
+    assert [llvm.llvm_major(path) for path in llvm.find_llvm(folders)] == [22, 19, 15, 9]
+    assert llvm.choose_llvm(folders=folders) == (folders[0] / "libLLVM.so.22.1", "")
+
+
+@pytest.mark.usefixtures("old_fails")
+def test_users_choice_wins_unless_it_is_bad(libraries):
+    folders = libraries("libLLVM.so.19.1", "libLLVM.so.22.1", "libLLVM-15.so.1")
+    good, bad = folders[0] / "libLLVM.so.19.1", folders[0] / "libLLVM-15.so.1"
+    assert llvm.choose_llvm(str(good), folders) == (good, "")
+    path, problem = llvm.choose_llvm(str(bad), folders)
+    assert path == folders[0] / "libLLVM.so.22.1"
+    assert "libLLVM-15" in problem
+    assert "libLLVM.so.22.1 is used instead" in problem
+
+
+@pytest.mark.usefixtures("old_fails")
+def test_only_old_ones_is_said_in_words(libraries):
+    path, problem = llvm.choose_llvm(folders=libraries("libLLVM-15.so.1", "libLLVM-14.so.1"))
+    assert path is None
+    assert "libLLVM-15.so.1" in problem
+    assert "apt-get install libllvm" in problem
+
+
+def test_missing_llvm_raises_without_cuda_and_warns_with_it(monkeypatch):
+    monkeypatch.setattr(llvm, "find_llvm", lambda folders=None: [])
+    monkeypatch.delenv(llvm.VARIABLE, raising=False)
+    monkeypatch.setattr(llvm, "has_cuda", lambda: False)
+    with pytest.raises(RuntimeError, match="LLVM 17 or newer"):
+        llvm.ensure_llvm()
+    monkeypatch.setattr(llvm, "has_cuda", lambda: True)
+    monkeypatch.delitem(sys.modules, "drjit", raising=False)
+    with pytest.warns(RuntimeWarning, match="LLVM 17 or newer"):
+        llvm.ensure_llvm()
+    # The unusable path keeps Dr.Jit from loading an old library by itself.
+    assert not Path(llvm.os.environ[llvm.VARIABLE]).exists()
+
+
+def test_search_is_cheap():
+    start = time.perf_counter()
+    llvm.find_llvm()
+    assert time.perf_counter() - start < 0.03
+
+
+def test_import_survives_a_bad_choice(tmp_path):
+    """A library that Dr.Jit cannot use is replaced, with a warning, before Dr.Jit loads it."""
+    bad = next((p for p in llvm.find_llvm() if (llvm.llvm_major(p) or 99) < 17), tmp_path / "libLLVM-15.so.1")
+    if llvm.usable(bad):
+        pytest.skip(f"{bad} works on this CPU")
+    code = "import morgs_mi; import drjit as dr; from drjit.llvm import Float; print(dr.minimum(Float(1, 3), 2))"
+    environment = llvm.os.environ | {llvm.VARIABLE: str(bad)}
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+    assert run.stdout.strip() == "[1, 2]"
+    assert "RuntimeWarning" in run.stderr

@@ -1,0 +1,70 @@
+"""Drawings of a stream: which files, how large, and that they show the stream beside the truth."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.codec.container import StreamWriter
+from morgs_mi.evaluate.figures import draw_stream, motion_scale
+from morgs_mi.playback.player import open_stream
+from morgs_mi.playback.visualise import GAP
+from tests.moving_splats import CAMERAS, FRAMES, HEIGHT, PIXELS, WIDTH, write_stream
+
+LEGEND = 96
+
+
+def test_every_picture_of_a_stream(fitted_clip: Path, tmp_path: Path) -> None:
+    done = []
+    paths = draw_stream(fitted_clip, tmp_path / "new", progress=lambda *count: done.append(count))
+    assert [path.name for path in paths] == ["slice.png", "motion.png", "confidence.png"]
+    assert done == [(t + 1, FRAMES) for t in range(FRAMES)]
+    slices, motion, confidence = (cv2.imread(str(path))[..., ::-1] for path in paths)
+    # Three frames fill 320 pixels when each is repeated 107 times; the recording is the rendering.
+    assert slices.shape == (HEIGHT, WIDTH + 2 * (GAP + 321), 3)
+    recorded, rendered = slices[:, WIDTH + GAP :][:, :321], slices[:, -321:]
+    np.testing.assert_array_equal(recorded[20:], rendered[20:])
+    # Two frames after the first: truth, rendering, and a legend beside the first row.
+    assert motion.shape == confidence.shape == (LEGEND + GAP + HEIGHT, 2 * (WIDTH + GAP) + LEGEND, 3)
+    seen = confidence[LEGEND + GAP + 15 :, :WIDTH].max(-1) > 128
+    true, found = (motion[LEGEND + GAP + 15 :, x : x + WIDTH][seen[: HEIGHT - 15]] for x in (0, WIDTH + GAP))
+    assert np.abs(true.astype(int) - found).max() <= 2
+
+
+def test_without_truth_the_stream_alone_is_drawn(fitted_clip: Path, tmp_path: Path) -> None:
+    shutil.copytree(fitted_clip / "capture", tmp_path / "capture", ignore=shutil.ignore_patterns("truth"))
+    paths = draw_stream(fitted_clip, tmp_path, tmp_path / "capture")
+    assert cv2.imread(str(paths[1])).shape == (LEGEND + GAP + HEIGHT, WIDTH + GAP + LEGEND, 3)
+
+
+def test_offsets_are_drawn_beside_the_motion_that_they_are_a_part_of(fitted_clip: Path, tmp_path: Path) -> None:
+    write_stream(tmp_path / "s.morgs", open_stream(fitted_clip).metadata, offset=0.05)
+    path = draw_stream(tmp_path / "s.morgs", tmp_path)[-1]
+    assert path.name == "offset.png"
+    sheet = cv2.imread(str(path))[..., ::-1].astype(int)
+    # Two frames after the first: motion, its offset and both legends beside the first row.
+    assert sheet.shape == (LEGEND + GAP + HEIGHT, 2 * (WIDTH + GAP) + 2 * LEGEND + GAP, 3)
+    motion, offset = (sheet[LEGEND + GAP + 15 :, x : x + WIDTH][: HEIGHT - 15] for x in (0, WIDTH + GAP))
+    seen = motion[..., 1] < 128  # red: to the right, at full saturation
+    assert seen.any()
+    # A twentieth of it at a tenth of the scale is half saturated.
+    assert np.abs(offset[seen] - (255, 127, 127)).max() <= 3
+
+
+def test_the_scale_of_motion_is_that_of_the_truth(fitted_clip: Path, tmp_path: Path) -> None:
+    capture = load_capture(fitted_clip / "capture")
+    assert motion_scale(capture, capture.cameras[0]) == pytest.approx(PIXELS)
+    shutil.copytree(fitted_clip / "capture", tmp_path / "capture", ignore=shutil.ignore_patterns("truth"))
+    assert motion_scale(load_capture(tmp_path / "capture"), capture.cameras[0]) == pytest.approx(0.03 * WIDTH)
+
+
+def test_a_stream_without_a_frame_is_refused(fitted_clip: Path, tmp_path: Path) -> None:
+    with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25):
+        pass
+    with pytest.raises(ValueError, match="got a header alone"):
+        draw_stream(tmp_path / "s.morgs", tmp_path, fitted_clip / "capture")

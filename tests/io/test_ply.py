@@ -1,0 +1,141 @@
+"""PLY: what is written comes back, what other tools write is read, what is broken is named."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+from numpy.lib.recfunctions import repack_fields
+from plyfile import PlyData, PlyElement
+
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.io.ply import read_ply, write_ply
+
+LAYOUT = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
+
+
+def some(N: int = 20, degree: int = 3) -> Gaussians:
+    rng = np.random.default_rng(degree)
+    quats = rng.normal(size=(N, 4))
+    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
+    sh = rng.normal(size=(N, (degree + 1) ** 2, 3))
+    return Gaussians(rng.normal(size=(N, 3)), rng.normal(size=(N, 3)), quats, rng.normal(size=N), sh)
+
+
+def table(gaussians: Gaussians) -> np.ndarray:
+    """Return one record per Gaussian as other tools hold them."""
+    raw = gaussians.numpy()
+    columns = {"x": raw["means"][:, 0], "y": raw["means"][:, 1], "z": raw["means"][:, 2]}
+    columns |= {f"f_dc_{c}": raw["sh_coeffs"][:, 0, c] for c in range(3)}
+    bands = raw["sh_coeffs"].shape[1] - 1
+    columns |= {f"f_rest_{c * bands + k}": raw["sh_coeffs"][:, 1 + k, c] for c in range(3) for k in range(bands)}
+    columns |= {"opacity": raw["logit_opacities"]} | {f"scale_{i}": raw["log_scales"][:, i] for i in range(3)}
+    columns |= {f"rot_{i}": raw["quats"][:, i] for i in range(4)}
+    records = np.empty(len(gaussians), [(name, "f4") for name in columns])
+    for name, column in columns.items():
+        records[name] = column
+    return records
+
+
+def assert_same(a: Gaussians, b: Gaussians, **tolerance: float) -> None:
+    for name, value in a.numpy().items():
+        np.testing.assert_allclose(b.numpy()[name], value, err_msg=name, **({"rtol": 0} | tolerance))
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_what_is_written_comes_back(tmp_path, degree):
+    gaussians = some(degree=degree)
+    write_ply(tmp_path / "g.ply", gaussians)
+    # Quaternions are normalised once more: one rounding.
+    assert_same(gaussians, read_ply(tmp_path / "g.ply"), rtol=3e-7)
+
+
+def test_bytes_are_those_of_the_layout(tmp_path):
+    gaussians = some(2, degree=1)
+    write_ply(tmp_path / "g.ply", gaussians)
+    head, body = (tmp_path / "g.ply").read_bytes().split(b"end_header\n")
+    lines = head.decode().splitlines()
+    assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 2"]
+    names = [*LAYOUT, *(f"f_rest_{i}" for i in range(9)), "opacity", *(f"scale_{i}" for i in range(3))]
+    names += [f"rot_{i}" for i in range(4)]
+    assert lines[3:] == [f"property float {name}" for name in names]
+    first = dict(zip(names, struct.unpack_from(f"<{len(names)}f", body), strict=True))
+    sh = gaussians.numpy()["sh_coeffs"][0]
+    assert len(body) == 2 * 4 * len(names)
+    assert [first["f_rest_0"], first["f_rest_2"], first["f_rest_3"], first["f_rest_8"]] == [
+        sh[1, 0],
+        sh[3, 0],
+        sh[1, 1],
+        sh[3, 2],
+    ]
+
+
+@pytest.mark.parametrize("degree", range(4))
+@pytest.mark.parametrize(
+    "form", [{"text": True}, {"byte_order": ">"}, {"byte_order": "<"}], ids=["text", "big", "little"]
+)
+def test_reads_what_other_tools_write(tmp_path, degree, form):
+    gaussians = some(degree=degree)
+    records = table(gaussians)
+    # No normals, properties in another order and of other types, and some of another tool's own; a second element too.
+    extra = [("label", "u1"), *reversed(records.dtype.descr), ("time", "f8")]
+    vertices = np.zeros(len(records), extra)
+    for name in records.dtype.names:
+        vertices[name] = records[name]
+    camera = PlyElement.describe(np.zeros(1, [("focal", "f4")]), "camera")
+    PlyData([camera, PlyElement.describe(vertices, "vertex")], comments=["by another tool"], **form).write(
+        str(tmp_path / "g.ply")
+    )
+    assert_same(gaussians, read_ply(tmp_path / "g.ply"), rtol=1e-6 if "text" in form else 0)  # 9 digits may be fewer
+
+
+def test_a_zero_quaternion_does_not_rotate(tmp_path):
+    write_ply(
+        tmp_path / "g.ply", Gaussians(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 4)), [0], np.zeros((1, 1, 3)))
+    )
+    assert read_ply(tmp_path / "g.ply").numpy()["quats"].tolist() == [[1, 0, 0, 0]]
+
+
+def without(*names):
+    return lambda records: repack_fields(records[[name for name in records.dtype.names if name not in names]])
+
+
+def with_nan(records):
+    records["scale_1"][3] = np.nan
+    return records
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (without("rot_3", "opacity"), "without opacity, rot_3; points alone"),
+        (without("f_rest_4"), "expected f_rest_0 to f_rest_8, 23 or 44 .* got 44 of them"),
+        (with_nan, "expected finite numbers, got others in scale_1"),
+        (lambda _: np.zeros(4, [("packed_position", "u4")]), "SuperSplat's compressed one"),
+    ],
+)
+def test_refuses_in_a_sentence(tmp_path, change, message):
+    vertices = change(table(some()))
+    PlyData([PlyElement.describe(vertices, "vertex")]).write(str(tmp_path / "g.ply"))
+    with pytest.raises(ValueError, match=message):
+        read_ply(tmp_path / "g.ply")
+
+
+@pytest.mark.parametrize("keep", [0, 3, 60, -5])
+def test_a_file_cut_short_is_named(tmp_path, keep):
+    path = tmp_path / "g.ply"
+    write_ply(path, some())
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(ValueError, match=r"g\.ply: expected a whole PLY file"):
+        read_ply(path)
+
+
+def test_no_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="expected a PLY file, found none"):
+        read_ply(tmp_path / "none.ply")
+
+
+def test_no_gaussians_are_a_file_too(tmp_path):
+    write_ply(tmp_path / "g.ply", some(0))
+    assert len(read_ply(tmp_path / "g.ply")) == 0

@@ -1,0 +1,112 @@
+"""Making things ahead in the background: order, bound, errors, and an end that leaves no thread behind."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+
+from morgs_mi.io.prefetch import prefetched
+
+
+def wait_until(true: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 10
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.005)
+
+
+def workers() -> int:
+    return sum(thread.name == "prefetch" for thread in threading.enumerate())
+
+
+def test_the_order_is_kept_and_work_is_done_elsewhere() -> None:
+    made_by = set()
+
+    def items():
+        for i in range(20):
+            made_by.add(threading.current_thread().name)
+            yield i
+
+    assert list(prefetched(items())) == list(range(20))
+    assert made_by == {"prefetch"}
+    wait_until(lambda: workers() == 0)
+
+
+def test_no_more_is_made_than_asked_for() -> None:
+    made = []
+
+    def items():
+        for i in range(100):
+            made.append(i)
+            yield i
+
+    ahead = prefetched(items(), ahead=3)
+    assert next(ahead) == 0
+    wait_until(lambda: len(made) >= 5)
+    time.sleep(0.2)
+    assert made == [0, 1, 2, 3, 4]  # one is in use, three wait, one is being handed over
+    ahead.close()
+    wait_until(lambda: workers() == 0)
+
+
+def test_an_error_comes_where_the_item_would_have() -> None:
+    def items():
+        yield 1
+        raise ValueError("the disk is gone")
+
+    ahead = prefetched(items())
+    assert next(ahead) == 1
+    with pytest.raises(ValueError, match="the disk is gone"):
+        next(ahead)
+
+
+def test_closing_closes_the_source() -> None:
+    closed = []
+
+    def items():
+        try:
+            while True:
+                yield 0
+        finally:
+            closed.append(True)
+
+    ahead = prefetched(items())
+    next(ahead)
+    ahead.close()
+    wait_until(lambda: closed == [True])
+
+
+def test_the_newest_is_taken_where_the_source_cannot_wait() -> None:
+    made, taken = [], threading.Event()
+
+    def items():
+        for i in range(50):
+            made.append(i)
+            yield i
+            taken.wait(10)
+
+    ahead = prefetched(items(), newest=True)
+    assert next(ahead) == 0
+    taken.set()
+    wait_until(lambda: len(made) == 50)
+    time.sleep(0.02)
+    assert list(ahead) == [49]
+
+
+def test_the_interpreter_may_end_while_something_is_being_made() -> None:
+    """A thread that wakes within a library when the interpreter is gone aborts the process."""
+    script = (
+        "import cv2, numpy as np\n"
+        "from morgs_mi.io.prefetch import prefetched\n"
+        "image = np.zeros((500, 500, 3), np.uint8)\n"
+        "frames = prefetched((cv2.medianBlur(image, 31) for _ in range(10000)), ahead=10000)\n"
+        "next(frames)\n"
+        "raise SystemExit(3)\n"
+    )
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stderr) == (3, "")

@@ -1,0 +1,194 @@
+"""Videos and folders of images: round trips, order, and what happens to broken ones."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.io.video import FolderReader, VideoReader, natural_key, open_frames
+from morgs_mi.io.video_writer import write_video
+
+HEIGHT, WIDTH, COUNT = 32, 48, 6
+
+
+def clip(height: int = HEIGHT, width: int = WIDTH, count: int = COUNT) -> list[np.ndarray]:
+    return list(np.random.default_rng(0).integers(0, 256, (count, height, width, 3), dtype=np.uint8))
+
+
+def smooth_clip() -> list[np.ndarray]:
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    return [np.stack([120 + 80 * np.sin((x + t) / 9), 100 + 2 * y, 90 + x], -1).astype(np.uint8) for t in range(COUNT)]
+
+
+@pytest.mark.parametrize("name", ["cam.mp4", "cam.mkv", "cam"])
+def test_the_default_is_lossless(tmp_path: Path, name: str) -> None:
+    write_video(tmp_path / name, clip(), fps=12.5)
+    reader = open_frames(tmp_path / name)
+    assert (reader.num_frames, reader.width, reader.height) == (COUNT, WIDTH, HEIGHT)
+    assert reader.fps == (12.5 if "." in name else None)
+    np.testing.assert_array_equal(list(reader.frames()), clip())
+    np.testing.assert_array_equal(list(reader.frames(2, 5)), clip()[2:5])
+    assert [f.name for f in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("codec", ["mp4v", "vp09"])
+def test_lossy_codecs_keep_rgb_order_and_most_of_the_picture(tmp_path: Path, codec: str) -> None:
+    write_video(tmp_path / "cam.mp4", smooth_clip(), 30, codec)
+    got = np.array(list(VideoReader.open(tmp_path / "cam.mp4").frames()), float)
+    # 4:2:0 chroma and the encoders' default rates; a swap of red and blue would give 13 dB.
+    assert 10 * np.log10(255**2 / np.mean((got - smooth_clip()) ** 2)) > 30
+
+
+def test_names_sort_by_their_numbers() -> None:
+    names = ["cam_10", "cam_2", "cam_0", "2", "b", "10", "cam"]
+    assert sorted(names, key=natural_key) == ["2", "10", "b", "cam", "cam_0", "cam_2", "cam_10"]
+
+
+def test_a_folder_is_read_in_numerical_order(tmp_path: Path) -> None:
+    for i, frame in enumerate(clip(count=12)):
+        cv2.imwrite(str(tmp_path / f"{i}.png"), frame[..., ::-1])
+    np.testing.assert_array_equal(list(FolderReader.open(tmp_path).frames()), clip(count=12))
+
+
+def cut(path: Path, length: int) -> Path:
+    path.write_bytes(path.read_bytes()[:length])
+    return path
+
+
+def test_a_truncated_video_gives_what_it_holds_and_then_names_the_frame(tmp_path: Path) -> None:
+    path = tmp_path / "cam.mkv"
+    write_video(path, clip(), 30)
+    reader = VideoReader.open(cut(path, path.stat().st_size // 2))
+    frames = []
+    with pytest.raises(ValueError, match=rf"cam.mkv: frame \d of {COUNT} cannot be decoded.*max_frames"):
+        frames.extend(reader.frames())
+    assert 0 < len(frames) < COUNT
+    np.testing.assert_array_equal(frames, clip()[: len(frames)])
+
+
+def make_bad(tmp_path: Path, case: str) -> Path:
+    path = tmp_path / "cam.mp4"
+    write_video(path, clip(), 30)
+    if case == "empty":
+        cut(path, 0)
+    elif case == "truncated":
+        cut(path, path.stat().st_size // 2)
+    elif case == "text":
+        path.write_text("no video")
+    else:
+        path = tmp_path / "cam"
+        write_video(path, clip(), 30)
+        if case == "gap":
+            (path / "0002.png").unlink()
+        elif case == "no image":
+            cut(path / "0000.png", 20)
+        elif case == "size":
+            cv2.imwrite(str(path / "0003.png"), np.zeros((8, 8, 3), np.uint8))
+        elif case == "no images":
+            [f.unlink() for f in path.iterdir()]
+        elif case == "missing":
+            path = tmp_path / "cam7.mp4"
+    return path
+
+
+@pytest.mark.parametrize(
+    ("case", "error", "message"),
+    [
+        ("missing", FileNotFoundError, "cam7.mp4: expected a video file, found none"),
+        ("empty", ValueError, "cam.mp4: expected a video, got an empty file"),
+        ("truncated", ValueError, r"cam.mp4: expected a video, got \d+ bytes .* truncated or no video"),
+        ("text", ValueError, "cam.mp4: expected a video, got 8 bytes"),
+        ("no images", FileNotFoundError, r"cam: expected images \(.png"),
+        ("gap", ValueError, "numbered without gaps, got 0001.png followed by 0003.png"),
+        ("no image", ValueError, "0000.png: expected an image, got 20 bytes"),
+        ("size", ValueError, "0003.png: expected 48x32 as in 0000.png, got 8x8"),
+    ],
+)
+def test_bad_input(tmp_path: Path, case: str, error: type[Exception], message: str) -> None:
+    with pytest.raises(error, match=message):
+        list(open_frames(make_bad(tmp_path, case)).frames())
+
+
+def test_the_frames_that_a_cut_file_holds_are_counted(tmp_path: Path) -> None:
+    for name, codec in (("cam.mp4", "FFV1"), ("cam.mkv", "FFV1"), ("cam.avi", "MJPG")):
+        write_video(tmp_path / name, clip(), 30, codec)
+        reader = open_frames(tmp_path / name)
+        assert reader.num_held == reader.num_frames == len(clip())
+    cut(tmp_path / "cam.mkv", (tmp_path / "cam.mkv").stat().st_size * 2 // 3)
+    reader = open_frames(tmp_path / "cam.mkv")
+    assert reader.num_frames == len(clip())
+    assert 0 < reader.num_held < len(clip())
+    assert len(list(reader.frames(0, reader.num_held))) == reader.num_held
+
+
+def test_images_are_not_turned_by_exif(tmp_path: Path) -> None:
+    jpeg = cv2.imencode(".jpg", np.zeros((16, 32, 3), np.uint8))[1].tobytes()
+    # One entry, orientation (0x112) 6: turned by 90 degrees.
+    tiff = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
+    exif = b"Exif\0\0" + tiff
+    (tmp_path / "0.jpg").write_bytes(jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:])
+    assert cv2.imread(str(tmp_path / "0.jpg")).shape == (32, 16, 3), "OpenCV turns it by itself"
+    assert next(open_frames(tmp_path).frames()).shape == (16, 32, 3)
+
+
+def interrupted():
+    yield clip()[0]
+    raise KeyboardInterrupt("Ctrl-C")
+
+
+@pytest.mark.parametrize(
+    ("name", "frames", "codec", "error", "message"),
+    [
+        ("cam.mp4", [], "FFV1", ValueError, "at least one frame was expected"),
+        ("cam", [], "FFV1", ValueError, "at least one frame was expected"),
+        ("cam.mp4", clip(31), "FFV1", ValueError, "must be even.*got 48x31"),
+        ("cam.mp4", [clip()[0].astype(float)], "FFV1", ValueError, r"frame 0 must be uint8 .* got float64"),
+        (
+            "cam.mp4",
+            [clip()[0], clip(30)[0]],
+            "FFV1",
+            ValueError,
+            r"frame 1 must be .*\(32, 48\), got uint8 \(30",
+        ),
+        ("cam.mp4", clip(), "av01", OSError, "could not open it with the encoder 'av01'"),
+        ("cam.mp4", interrupted(), "FFV1", KeyboardInterrupt, "Ctrl-C"),
+    ],
+)
+def test_a_failed_write_leaves_nothing(tmp_path: Path, name, frames, codec, error, message) -> None:
+    with pytest.raises(error, match=message):
+        write_video(tmp_path / name, frames, 30, codec)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
+    write_video(tmp_path / "cam.mp4", clip(), 30)
+    with pytest.raises(ValueError, match="at least one frame"):
+        write_video(tmp_path / "cam.mp4", [], 30)
+    assert VideoReader.open(tmp_path / "cam.mp4").num_frames == COUNT
+    write_video(tmp_path / "cam", clip(), 30)
+    with pytest.raises(FileExistsError, match="cam: expected a new folder"):
+        write_video(tmp_path / "cam", clip(), 30)
+
+
+@pytest.mark.parametrize("name", ["cam.mp4", "cam.mkv", "cam"])
+def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path: Path, name: str) -> None:
+    # A limit on the size of files fails writes as a full disk does.
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))"
+    program = f"""{limit}
+import numpy as np
+from morgs_mi.io.video_writer import write_video
+noise = np.random.default_rng(0).integers(0, 256, (6, 32, 48, 3), dtype=np.uint8)
+try:
+    write_video({str(tmp_path / name)!r}, noise, 30)
+except OSError as error:
+    print("OSError:", error)
+"""
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert result.stdout.startswith("OSError:")
+    assert name in result.stdout
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,149 @@
+"""Flow from files: what is written is read, and what is wrong is named."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.io.exr import write_exr
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.flow import motion_cues
+from morgs_mi.method.flow_sources.files import FlowFolder, read_flow, write_flow
+from morgs_mi.method.flow_sources.registry import FramePair, flow_source
+
+
+def random_flow(height=6, width=9, seed=0):
+    return np.random.default_rng(seed).normal(0, 30, (height, width, 2)).astype(np.float32)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Flow of one camera between frames 0, 1 and 2, named as flow tools do."""
+    for direction, frames in (("forward", (0, 1)), ("backward", (1, 2))):
+        (tmp_path / "cam00" / direction).mkdir(parents=True)
+        for frame in frames:
+            seed = frame + 10 * (direction == "forward")
+            write_flow(tmp_path / "cam00" / direction / f"v2_frame_{frame:04d}.flo", random_flow(seed=seed))
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", ["a.flo", "a.exr", "A.FLO"])
+@pytest.mark.parametrize("size", [(6, 9), (1, 1), (33, 2)])
+def test_reading_gives_what_was_written(tmp_path, name, size):
+    flow = random_flow(*size)
+    write_flow(tmp_path / name, flow)
+    read = read_flow(tmp_path / name)
+    np.testing.assert_array_equal(read, flow)
+    assert read.dtype == np.float32
+
+
+def test_flo_files_are_those_of_opencv(tmp_path):
+    flow = random_flow()
+    write_flow(tmp_path / "ours.flo", flow)
+    np.testing.assert_array_equal(cv2.readOpticalFlow(str(tmp_path / "ours.flo")), flow)
+    cv2.writeOpticalFlow(str(tmp_path / "theirs.flo"), flow)
+    assert (tmp_path / "ours.flo").read_bytes() == (tmp_path / "theirs.flo").read_bytes()
+
+
+@pytest.mark.parametrize("names", ["XY", "uv", "RG", "RGB"])
+def test_exr_files_of_other_programs(tmp_path, names):
+    flow = random_flow()
+    x, y = flow[..., 0], flow[..., 1]
+    write_exr(tmp_path / "a.exr", dict(zip(names, (x, y, 0 * x), strict=False)))
+    np.testing.assert_array_equal(read_flow(tmp_path / "a.exr"), flow)
+
+
+def test_a_frame_gets_its_own_flow_in_both_directions(folder):
+    for frame in (1, 2):
+        pictures = np.zeros((2, 6, 9, 3), np.uint8)
+        pair = FramePair(*pictures, camera="cam00", frame=frame)
+        back, onward = flow_source(f"files:{folder}")(pair)
+        np.testing.assert_array_equal(back, random_flow(seed=frame))
+        np.testing.assert_array_equal(onward, random_flow(seed=frame - 1 + 10))
+
+
+def test_cues_from_files_move_the_other_way_and_are_checked(tmp_path):
+    onward = np.full((40, 60, 2), (3, 1), np.float32)
+    back = -onward
+    back[:, :10] = (5, 5)  # leads nowhere that leads back
+    for direction, frame, flow in (("backward", 7, back), ("forward", 6, onward)):
+        (tmp_path / "cam01" / direction).mkdir(parents=True)
+        write_flow(tmp_path / "cam01" / direction / f"{frame}.exr", flow)
+    pictures = np.zeros((2, 40, 60, 3), np.uint8)
+    pair = FramePair(*pictures, camera="cam01", frame=7)
+    cue = motion_cues({5: pair}, MotionConfig(flow_method=f"files:{tmp_path}"), with_masks=False)[5]
+    np.testing.assert_array_equal(cue.motion[:, 10:], onward[:, 10:])
+    np.testing.assert_array_equal(cue.onward, onward)
+    assert cue.reliable[3:, 12:].all()
+    assert not cue.reliable[:, :10].any()
+
+
+def flo(magic=202021.25, width=3, height=2, values=12):
+    header = np.array([magic], "<f4").tobytes() + np.array([width, height], "<i4").tobytes()
+    return header + np.zeros(values, "<f4").tobytes()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (flo(magic=1.0), "begins with the float 202021.25, got b'"),
+        (b"", "begins with the float 202021.25"),
+        (flo()[:8], "12 bytes for 3x0 pixels, got 8"),
+        (flo(values=11), "60 bytes for 3x2 pixels, got 56; the file may be cut short"),
+        (flo(values=14), "60 bytes for 3x2 pixels, got 68"),
+        (flo(width=-3), "for -3x2 pixels"),
+        (flo()[:-4] + np.float32(np.nan).tobytes(), "none at 1 of 6, the first at x=2, y=1"),
+        (flo()[:-4] + np.float32(1.7e9).tobytes(), "none at 1 of 6"),
+    ],
+)
+def test_a_broken_flo_file_is_named(tmp_path, content, message):
+    (tmp_path / "bad.flo").write_bytes(content)
+    with pytest.raises(ValueError, match=rf"bad\.flo: expected (.* )?{message}"):
+        read_flow(tmp_path / "bad.flo")
+
+
+def test_bad_files_are_named(tmp_path, folder):
+    with pytest.raises(FileNotFoundError, match="expected a flow file, found none"):
+        read_flow(tmp_path / "none.flo")
+    with pytest.raises(ValueError, match=r"must end in \.flo or \.exr, got 'a\.png'"):
+        read_flow(tmp_path / "a.png")
+    with pytest.raises(ValueError, match=r"`flow` must be \[H, W, 2\], got \(4, 5\)"):
+        write_flow(tmp_path / "a.flo", np.zeros((4, 5)))
+    (tmp_path / "a.exr").write_bytes(b"no picture")
+    with pytest.raises(OSError, match="cannot read"):
+        read_flow(tmp_path / "a.exr")
+
+
+@pytest.mark.parametrize(
+    "names", [("motion.X", "motion.Y"), ("B", "G", "R", "motion.X", "motion.Y"), ("X", "Y", "u", "v"), ("u",)]
+)
+def test_channels_that_are_no_flow_are_named(tmp_path, names):
+    # The renderer's motion points the other way, and the colours beside it are no flow.
+    write_exr(tmp_path / "b.exr", dict.fromkeys(names, np.zeros((2, 2))))
+    with pytest.raises(ValueError, match=rf"flow\.X/flow\.Y.*, got {', '.join(names)}\."):
+        read_flow(tmp_path / "b.exr")
+
+
+@pytest.mark.parametrize(
+    ("camera", "frame", "size", "exception", "message"),
+    [
+        ("cam00", 3, (6, 9), FileNotFoundError, "cam00/backward: .* of frame 3, found those of frames 1 to 2; name"),
+        ("cam01", 1, (6, 9), FileNotFoundError, "cam01/backward: .* of frame 1, found no flow at all"),
+        ("cam00", 1, (9, 6), ValueError, r"0001\.flo: expected 6x9 pixels as the pictures of cam00 have, got 9x6"),
+    ],
+)
+def test_a_flow_that_does_not_fit_is_named(folder, camera, frame, size, exception, message):
+    with pytest.raises(exception, match=message):
+        FlowFolder(folder).flows(camera, frame, size)
+
+
+def test_two_files_of_one_frame_are_named(folder):
+    write_flow(folder / "cam00/backward/frame_1.exr", random_flow())
+    with pytest.raises(ValueError, match=r"one file of frame 1, got frame_1\.exr, v2_frame_0001\.flo"):
+        FlowFolder(folder).flows("cam00", 1, (6, 9))
+
+
+def test_a_missing_folder_is_refused_before_the_first_frame(tmp_path):
+    with pytest.raises(FileNotFoundError, match="expected a folder of flow files, found none"):
+        MotionConfig(flow_method=f"files:{tmp_path / 'flow'}")

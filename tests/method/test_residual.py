@@ -1,0 +1,97 @@
+"""The gated residual: eq. 12, and what reaches which parameter."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.lift import Lift
+from morgs_mi.method.residual import apply_residual, join_sh, residual_parameters, split_sh
+from tests.render.test_rasterize import RAW, make_scene, to_gaussians
+
+OFF = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
+
+
+def random_parameters(previous, config, seed=0):
+    rng = np.random.default_rng(seed)
+    start = residual_parameters(previous, config)
+    return {k: mi.TensorXf(rng.normal(0, 0.1, tuple(v.shape)).astype(np.float32)) for k, v in start.items()}
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("config", [MotionConfig(), OFF])
+def test_zero_residual_changes_nothing(degree, config):
+    previous = to_gaussians(make_scene(degree))
+    current = apply_residual(previous, residual_parameters(previous, config), config)
+    for name in RAW:
+        if name != "motion":
+            assert np.array_equal(current.numpy()[name], previous.numpy()[name]), name
+    assert np.abs(current.numpy()["motion"]).max() == 0
+
+
+@pytest.mark.parametrize("two_gates", [False, True])
+@pytest.mark.parametrize("degree", [0, 2])
+def test_gate_scales_every_attribute(degree, two_gates):
+    """A_t = A_{t-1} + m R_t (eq. 12), with the confidence as gate; of two, colour has its own."""
+    config, previous = MotionConfig(two_gates=two_gates), to_gaussians(make_scene(degree))
+    parameters = random_parameters(previous, config)
+    m = 1 / (1 + np.exp(-np.asarray(parameters["logit_confidence"], np.float64)))
+    current, before = apply_residual(previous, parameters, config).numpy(), previous.numpy()
+    R = {name: np.asarray(value) for name, value in parameters.items()}
+    for name in ("motion", "offset"):
+        assert current[name] == pytest.approx(m[:, None] * R[name], abs=1e-6)
+    assert current["means"] - before["means"] == pytest.approx(m[:, None] * (R["motion"] + R["offset"]), abs=1e-6)
+    assert current["quats"] - before["quats"] == pytest.approx(m[:, None] * R["quats"], abs=1e-6)
+    change = current["sh_coeffs"] - before["sh_coeffs"]
+    m = np.ones_like(m) if two_gates else m
+    assert current["log_scales"] - before["log_scales"] == pytest.approx(m[:, None] * R["log_scales"], abs=1e-6)
+    assert current["logit_opacities"] - before["logit_opacities"] == pytest.approx(m * R["logit_opacities"], abs=1e-6)
+    assert change[:, :1] == pytest.approx(m[:, None, None] * R["sh_dc"], abs=1e-6)
+    if degree:
+        assert change[:, 1:] == pytest.approx(m[:, None, None] * R["sh_rest"], abs=1e-6)
+
+
+def test_modules_add_their_parameters():
+    previous = to_gaussians(make_scene())
+    assert "offset" not in residual_parameters(previous, MotionConfig(learn_offset=False))
+    assert "logit_confidence" not in residual_parameters(previous, MotionConfig(learn_confidence=False))
+    assert {"offset", "logit_confidence", "motion"} <= set(residual_parameters(previous, MotionConfig()))
+
+
+@pytest.mark.parametrize("lift_confidence", [False, True])
+def test_lifted_motion_passes_the_gate_whole(lift_confidence):
+    previous, rng = to_gaussians(make_scene()), np.random.default_rng(1)
+    lifted = Lift(np.float32(rng.normal(size=(10, 3))), np.float32(rng.uniform(-2, 2, 10)))
+    config = MotionConfig(lift_confidence=lift_confidence)
+    current = apply_residual(previous, residual_parameters(previous, config, lifted), config)
+    assert (np.asarray(current.confidence) > 0.1).all()
+    assert np.asarray(current.motion) == pytest.approx(lifted.displacement, rel=1e-5, abs=1e-6)
+    before = np.asarray(previous.logit_confidence)
+    logit = np.maximum(lifted.logit_confidence, before - np.float32(0.3)) if lift_confidence else before
+    assert np.array_equal(current.logit_confidence, logit)
+
+
+def test_gradient_of_the_gate_agrees_with_the_product_rule():
+    config, previous = MotionConfig(), to_gaussians(make_scene())
+    parameters = random_parameters(previous, config)
+    dr.enable_grad(parameters["logit_confidence"], parameters["motion"])
+    dr.backward(dr.sum(apply_residual(previous, parameters, config).means, axis=None))
+    logit = np.asarray(parameters["logit_confidence"], np.float64)
+    m = 1 / (1 + np.exp(-logit))
+    R = sum(np.asarray(parameters[name], np.float64) for name in ("motion", "offset"))
+    assert np.asarray(dr.grad(parameters["motion"])) == pytest.approx(np.repeat(m[:, None], 3, 1), rel=1e-5)
+    expected = m * (1 - m) * R.sum(1)
+    assert np.asarray(dr.grad(parameters["logit_confidence"])) == pytest.approx(expected, abs=1e-6)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_joining_split_sh_is_the_identity_with_gradient(degree):
+    sh = to_gaussians(make_scene(degree)).sh_coeffs
+    dr.enable_grad(sh)
+    joined = join_sh(*split_sh(sh))
+    assert np.array_equal(np.asarray(joined), np.asarray(sh))
+    dr.backward(dr.sum(dr.square(joined), axis=None))
+    assert np.asarray(dr.grad(sh)) == pytest.approx(2 * np.asarray(sh), rel=1e-6)

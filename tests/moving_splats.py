@@ -1,0 +1,53 @@
+"""Five splats that step along x, their stream, and cameras that see them: what the room's tests have in common."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.codec.config import CodecConfig
+from morgs_mi.codec.container import Packet, StreamWriter
+from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
+
+WIDTH, HEIGHT, DISTANCE, STEP, FRAMES = 40, 30, 4.0, 0.05, 3
+CAMERAS = [
+    Camera.look_at((0, 0, -DISTANCE), (0, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT, "cam0"),
+    Camera.look_at((0.5, 0, -DISTANCE), (0.5, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT, "cam1"),
+]
+# As good as float32: what is judged is the judge.
+EXACT = CodecConfig(quality=1e5)
+# Pixels per frame of a step along x in a plane that is parallel to both images.
+PIXELS = CAMERAS[0].K[0, 0] * STEP / DISTANCE
+
+
+def moved(frame: float, logit: float | None = 0.0) -> Gaussians:
+    """Five splats in the plane z = 0 that have gone `frame` steps along x, with a confidence unless `logit` is None."""
+    rng = np.random.default_rng(0)
+    means = np.float32(rng.uniform(-1, 1, (5, 3)) * (1, 1, 0) + (frame * STEP, 0, 0))
+    sh = np.float32(rng.uniform(-1, 1.5, (5, 1, 3)))
+    more = {} if logit is None else {"logit_confidence": np.full(5, logit, np.float32)}
+    return Gaussians.from_activated(means, np.full((5, 3), 0.2), np.tile([1, 0, 0, 0], (5, 1)), [0.9] * 5, sh, **more)
+
+
+def write_stream(
+    path: Path, metadata: dict, logit: float | None = 0.0, shift: float = 0, offset: float | None = None
+) -> list[Packet]:
+    """Write the splats' stream, `shift` steps ahead of them, and return its packets.
+
+    With an `offset`, that share of each step along x was learned.
+    """
+    first = keyframe_packet(moved(shift, logit), 0, CAMERAS, EXACT)
+    state, packets = decode(None, first), [first]
+    for frame in range(1, FRAMES):
+        now, config = moved(frame + shift, logit), replace(EXACT, offset=offset is not None)
+        now = replace(now, offset=np.tile((STEP * (offset or 0), 0, 0), (len(now), 1)))
+        packets.append(residual_packet(state, now, None, CAMERAS, config))
+        state = decode(state, packets[-1])
+    with StreamWriter(path, CAMERAS, 25, metadata) as writer:
+        for packet in packets:
+            writer.write(packet)
+    return packets

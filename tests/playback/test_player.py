@@ -1,0 +1,90 @@
+"""Streams played: channels, cameras, truth on the stream's grid, time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.codec.container import StreamWriter
+from morgs_mi.codec.packets import keyframe_packet
+from morgs_mi.playback.player import (
+    channel_picture,
+    find_camera,
+    has_confidence,
+    has_offset,
+    open_stream,
+    playback,
+    render_stream,
+    truth_on,
+)
+from tests.moving_splats import CAMERAS, FRAMES, HEIGHT, WIDTH, moved, write_stream
+
+
+def test_truth_on_a_coarser_grid(fitted_clip: Path) -> None:
+    small = load_capture(fitted_clip / "capture", downscale=2)
+    full, half = (truth_on(small, c, 1) for c in (CAMERAS[0], small.cameras[0]))
+    assert full is not None
+    assert half is not None
+    np.testing.assert_array_equal(half.mask, full.mask[1::2, 1::2])
+    np.testing.assert_allclose(half.motion, full.motion[1::2, 1::2] / 2)
+    assert truth_on(small, CAMERAS[0], FRAMES) is None
+
+
+def test_every_carried_channel_is_rendered(fitted_clip: Path, tmp_path: Path) -> None:
+    reader = open_stream(fitted_clip)
+    frames = list(render_stream(reader, find_camera(reader, 1)))
+    assert [index for index, _ in frames] == list(range(FRAMES))
+    shapes = {name: image.shape for name, image in frames[0][1].items()}
+    assert shapes == {n: (HEIGHT, WIDTH, k) for n, k in (("color", 3), ("motion", 2), ("depth", 1), ("confidence", 1))}
+    assert all(channel_picture(n, i).shape == (HEIGHT, WIDTH, 3) for n, i in frames[0][1].items())
+    write_stream(tmp_path / "s.morgs", {}, logit=None)
+    assert "confidence" not in next(render_stream(open_stream(tmp_path / "s.morgs"), CAMERAS[0]))[1]
+
+
+@pytest.mark.parametrize(("camera", "name"), [(1, "cam1"), ("1", "cam1"), ("cam0", "cam0")])
+def test_cameras_by_index_and_name(fitted_clip: Path, camera: int | str, name: str) -> None:
+    assert find_camera(open_stream(fitted_clip), camera).name == name
+
+
+@pytest.mark.parametrize("camera", [2, -1, "7", "-1", "cam7", ""])
+def test_cameras_that_are_not_there(fitted_clip: Path, camera: int | str) -> None:
+    with pytest.raises(ValueError, match=r"index in 0..1 or one of cam0, cam1, got"):
+        find_camera(open_stream(fitted_clip), camera)
+
+
+def test_confidence_counts_where_it_was_learned(fitted_clip: Path, tmp_path: Path) -> None:
+    assert has_confidence(open_stream(fitted_clip))
+    off = {"config": {"motion": {"learn_confidence": False}}}
+    write_stream(tmp_path / "off.morgs", off)
+    write_stream(tmp_path / "none.morgs", {}, logit=None)
+    assert not has_confidence(open_stream(tmp_path / "off.morgs"))
+    assert not has_confidence(open_stream(tmp_path / "none.morgs"))
+
+
+def test_offsets_are_drawn_as_the_share_of_motion_that_they_are(fitted_clip: Path, tmp_path: Path) -> None:
+    write_stream(tmp_path / "s.morgs", {}, offset=0.25)
+    assert has_offset(open_stream(tmp_path / "s.morgs"))
+    assert not has_offset(open_stream(fitted_clip))
+    played = list(render_stream(open_stream(tmp_path / "s.morgs"), CAMERAS[0], ("motion", "offset")))
+    assert not played[0][1]["offset"].any(), "nothing is known of the first frame"
+    for _, images in played[1:]:
+        assert np.abs(images["motion"]).max() > 0.4
+        np.testing.assert_allclose(images["offset"], 0.25 * images["motion"], atol=1e-4)
+    for _, images in render_stream(open_stream(fitted_clip), CAMERAS[0], ("offset",)):
+        assert not images["offset"].any()
+    tenth = channel_picture("offset", 0.1 * images["offset"] + 0.05)
+    np.testing.assert_array_equal(tenth, channel_picture("motion", images["offset"] + 0.5))
+
+
+def test_playback_is_the_time_of_a_frame(fitted_clip: Path, tmp_path: Path) -> None:
+    reader = open_stream(fitted_clip)
+    times = playback(reader, reader.cameras[0])
+    assert times["fps"] == pytest.approx(1e3 / (times["decode_ms"] + times["render_ms"]))
+    assert min(times.values()) > 0
+    with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25) as writer:
+        assert np.isnan(playback(open_stream(tmp_path / "s.morgs"), CAMERAS[0])["fps"])
+        writer.write(keyframe_packet(moved(0), 0))
+    assert playback(open_stream(tmp_path / "s.morgs"), CAMERAS[0])["fps"] > 0

@@ -1,0 +1,24 @@
+"""One tiny capture, and one scene on stage, shared by the tests of this room."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from morgs_mi.synth.path_tracer import Stage
+from morgs_mi.synth.scene import load_scene
+from morgs_mi.synth.synthesize import synthesize
+
+
+@pytest.fixture(scope="session")
+def stage() -> Stage:
+    """The balls, at whatever time the last test left them."""
+    return Stage(load_scene("spheres"))
+
+
+@pytest.fixture(scope="session")
+def clip(tmp_path_factory) -> Path:
+    """The arm from 3 cameras in 3 frames of 64x48, with lossless frames."""
+    out = tmp_path_factory.mktemp("synth") / "arm"
+    return synthesize("arm", out, num_cameras=3, num_frames=3, width=64, height=48, spp=4, lossless=True)

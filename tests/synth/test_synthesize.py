@@ -1,0 +1,320 @@
+"""Synthetic captures: the files, and the ground truth against routes that share no code with it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import replace
+
+import cv2
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi.capture.layouts.colmap import read_colmap
+from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds
+from morgs_mi.io.video import open_frames
+from morgs_mi.synth.ground_truth import carry, load_tracks, load_truth, project, truth_of
+from morgs_mi.synth.path_tracer import Stage
+from morgs_mi.synth.scene import Light, Object, Scene, load_scene, translate
+from morgs_mi.synth.synthesize import synthesize
+
+FPS = 30.0
+
+
+def psnr(a: np.ndarray, b: np.ndarray) -> float:
+    return float(10 * np.log10(255**2 / np.mean((a.astype(float) - b) ** 2)))
+
+
+def look(stage: Stage, camera, frame: int):
+    """Return the picture and the truth of a frame."""
+    time = frame / FPS
+    stage.move(time)
+    points, ids = stage.surface(camera)
+    poses = [stage.poses(time + step / FPS) for step in (0, -1, 1)]
+    return stage.picture(camera, 16, frame), truth_of(camera, points, ids, *poses)
+
+
+@pytest.fixture(scope="module")
+def pair(stage):
+    camera = stage.scene.rig.cameras(3, 320, 240)[1]
+    return camera, look(stage, camera, 4), look(stage, camera, 5)
+
+
+def test_layout_is_n3dvs_with_a_colmap_model(clip):
+    about = json.loads((clip / "capture.json").read_text())
+    assert about["test_view"] == 0
+    assert (about["fps"], about["num_frames"], about["seed"]) == (30.0, 3, 0)
+    names = [f"cam{i:02d}" for i in range(3)]
+    cameras, bounds = read_poses_bounds(clip / "poses_bounds.npy", names)
+    model = read_colmap(clip / "sparse" / "0")
+    expected = load_scene("arm").rig.cameras(3, 64, 48)
+    for ours, theirs, colmaps in zip(expected, cameras, model.cameras, strict=True):
+        np.testing.assert_allclose(theirs.viewmat, ours.viewmat, atol=1e-6)
+        np.testing.assert_allclose(colmaps.viewmat, ours.viewmat, atol=1e-6)
+        np.testing.assert_allclose(colmaps.K, ours.K)
+        assert colmaps.name == f"{ours.name}.png"
+    assert (bounds[:, 0] > 0).all()
+    assert (bounds[:, 1] > bounds[:, 0]).all()
+    for name in names:
+        assert open_frames(clip / f"{name}.mp4").num_frames == 3
+        assert len(list((clip / "frames" / name).glob("*.png"))) == 3
+        assert len(list((clip / "truth" / name).glob("*.exr"))) == 3
+
+
+def test_lossless_frames_are_what_was_rendered(clip):
+    scene = load_scene("arm")
+    stage = Stage(scene)
+    stage.move(1 / FPS)
+    noise = int(np.random.SeedSequence([0, 1, 1]).generate_state(1)[0])
+    picture = stage.picture(scene.rig.cameras(3, 64, 48)[1], 4, noise)
+    stored = list(open_frames(clip / "frames" / "cam01").frames())[1]
+    np.testing.assert_array_equal(stored, picture)
+
+
+def test_warping_by_the_motion_map_brings_the_last_frame_onto_this_one(pair):
+    _, (before, truth_before), (now, truth) = pair
+    grid = np.stack(np.meshgrid(np.arange(320), np.arange(240)), axis=-1).astype(np.float32)
+    source = grid - truth.motion
+    # Seen in both frames: all neighbours of the source belong to the same object.
+    corners = [np.floor(source).astype(int) + corner for corner in ((0, 0), (0, 1), (1, 0), (1, 1))]
+    seen = [truth_before.ids[np.clip(c[..., 1], 0, 239), np.clip(c[..., 0], 0, 319)] for c in corners]
+    same = truth.mask & (np.stack(seen) == truth.ids).all(axis=0)
+    same = cv2.erode(same.astype(np.uint8), np.ones((3, 3))) > 0
+    assert same.sum() > 5000
+
+    def score(motion: np.ndarray) -> float:
+        warped = cv2.remap(before, grid - motion, None, cv2.INTER_CUBIC)
+        return psnr(warped[same], now[same])
+
+    # Resampling and light that falls differently leave 31 dB; noise costs 0.2 of it (measured).
+    assert score(truth.motion) > 29
+    for wrong in (
+        0 * truth.motion,
+        -truth.motion,
+        truth.motion + np.float32([0.5, 0]),
+        truth.motion[..., ::-1],
+    ):
+        assert score(wrong) < score(truth.motion) - 1.5
+
+
+def test_only_moving_objects_move(pair, stage):
+    _, _, (_, truth) = pair
+    moves = np.array([thing.pose is not None for thing in stage.scene.objects.values()])
+    assert (truth.ids >= 0).all()
+    np.testing.assert_array_equal(truth.mask, moves[truth.ids])
+    assert (truth.motion[~moves[truth.ids]] == 0).all()
+    assert 2 < np.linalg.norm(truth.motion[truth.mask], axis=-1).mean() < 6
+
+
+def test_first_frame_has_no_motion_but_the_mask_of_the_second_step(clip):
+    first, second = (load_truth(clip / "truth", "cam01", frame) for frame in (0, 1))
+    assert (first.motion == 0).all()
+    assert first.mask.any()
+    assert (first.mask == np.isin(first.ids, np.unique(second.ids[second.mask]))).all()
+
+
+def test_tracks_reproject_to_the_motion_map(clip):
+    tracks = load_tracks(clip / "truth")
+    assert tracks.points.shape == (len(tracks.ids), 3, 3)
+    compared = 0
+    for camera in load_scene("arm").rig.cameras(3, 64, 48):
+        for frame in (1, 2):
+            truth = load_truth(clip / "truth", camera.name, frame)
+            now, depth = project(camera, tracks.points[:, frame])
+            before, _ = project(camera, tracks.points[:, frame - 1])
+            # Points that were picked at a pixel centre of this view and frame.
+            col, row = (np.floor(now).astype(int) * [1, 1]).T
+            at_centre = np.abs(now - np.floor(now) - 0.5).max(axis=1) < 1e-3
+            at_centre &= (col >= 0) & (col < 64) & (row >= 0) & (row < 48)
+            col, row = np.clip(col, 0, 63), np.clip(row, 0, 47)
+            at_centre &= np.abs(depth - truth.depth[row, col]) < 1e-4
+            np.testing.assert_array_equal(truth.ids[row, col][at_centre], tracks.ids[at_centre])
+            np.testing.assert_allclose((now - before)[at_centre], truth.motion[row, col][at_centre], atol=2e-3)
+            compared += int((truth.mask[row, col] & at_centre).sum())
+    assert compared > 100
+
+
+def test_depth_and_points_agree_with_rays_of_the_mitsuba_sensor(stage):
+    camera = stage.scene.rig.cameras(3, 64, 48)[2]
+    K = camera.K.copy()
+    K[:2, 2] += 7, -5
+    camera = replace(camera, K=K)
+    points, ids = stage.surface(camera)
+    y, x = np.mgrid[:48, :64].reshape(2, -1) + 0.5
+    rays, _ = mi.load_dict(camera.sensor()).sample_ray(0, 0, mi.Point2f(x / 64, y / 48), 0)
+    hit = stage._scene.ray_intersect(mi.Ray3f(rays.o, rays.d))
+    np.testing.assert_allclose(np.array(hit.p).T.reshape(48, 64, 3)[5:-5, 5:-5], points[5:-5, 5:-5], atol=2e-3)
+    pixels, depth = project(camera, points)
+    np.testing.assert_allclose(pixels, np.stack([x, y], axis=-1).reshape(48, 64, 2), atol=1e-3)
+    poses = stage.poses(0)
+    np.testing.assert_allclose(truth_of(camera, points, ids, poses, None, poses).depth, depth, rtol=1e-6)
+
+
+def test_pixels_that_see_nothing_are_marked():
+    square = {"type": "rectangle"}
+    scene = Scene("square", {"square": Object({"square": square}, lambda t: translate(t, 0.8, 0))}, {})
+    stage = Stage(scene)
+    camera = scene.rig.cameras(2, 64, 48)[0]
+    points, ids = stage.surface(camera)
+    truth = truth_of(camera, points, ids, stage.poses(0), None, stage.poses(1))
+    assert set(np.unique(truth.ids)) == {-1, 0}
+    nothing = truth.ids < 0
+    assert (truth.depth[nothing] == 0).all()
+    assert not truth.mask[nothing].any()
+    assert truth.mask[~nothing].all()
+
+
+@pytest.mark.parametrize("radiance", [0.001, 0.18, 0.6, 3.0])
+def test_pictures_are_srgb_encoded(radiance):
+    light = Light({"type": "constant", "radiance": {"type": "rgb", "value": radiance}})
+    scene = Scene("sky", {}, {"sky": light})
+    picture = Stage(scene).picture(scene.rig.cameras(2, 8, 8)[0], 1, 0)
+    linear = min(radiance, 1.0)
+    encoded = 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
+    np.testing.assert_array_equal(picture, np.uint8(round(255 * encoded)))
+
+
+def test_noise_stays_below_that_of_a_camera(stage):
+    camera = stage.scene.rig.cameras(3, 96, 72)[1]
+    stage.move(0.1)
+    # Measured: 41 dB at 320x240. A small picture has coarser pixels, hence more texture in each.
+    assert psnr(stage.picture(camera, 16, 1), stage.picture(camera, 1024, 2)) > 38
+
+
+def test_points_lie_on_the_surface_within_their_noise(clip):
+    model = read_colmap(clip / "sparse" / "0")
+    assert len(model.points) > 1000
+    best = np.full(len(model.points), np.inf)
+    for camera in load_scene("arm").rig.cameras(3, 64, 48)[1:]:
+        depth = load_truth(clip / "truth", camera.name, 0).depth
+        pixels, z = project(camera, model.points.astype(float))
+        col, row = np.clip(np.floor(pixels).astype(int), 0, [63, 47]).T
+        footprint = z / camera.K[0, 0]
+        best = np.minimum(best, np.abs(z - depth[row, col]) / footprint)
+    # Half a pixel of noise, and up to a pixel's width of slope under it.
+    assert np.median(best) < 1
+    assert np.percentile(best, 95) < 4
+
+
+@pytest.mark.parametrize("name", ["spheres", "arm", "thin", "flicker"])
+def test_poses_are_rigid_and_repeatable(name):
+    for thing in load_scene(name).objects.values():
+        if thing.pose is not None:
+            for time in (0.0, 0.31, 7.7):
+                pose = thing.pose(time)
+                np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+                assert np.linalg.det(pose[:3, :3]) > 0
+                np.testing.assert_array_equal(pose, thing.pose(time))
+
+
+@pytest.mark.parametrize(("name", "radius"), [("roller", 0.38), ("circler", 0.28)])
+def test_balls_roll_without_slipping(name, radius):
+    pose, step = load_scene("spheres").objects[name].pose, 1e-5
+    for time in (0.0, 0.4, 2.0):
+        here = pose(time)
+        contact = here[:3, 3] - [0, radius, 0]
+        ahead, behind = (carry(contact[None], np.zeros(1, int), [here], [pose(time + s)])[0] for s in (step, -step))
+        assert abs(contact[1]) < 1e-12
+        assert np.linalg.norm(ahead - behind) / (2 * step) < 1e-6
+        assert np.linalg.norm(pose(time + step)[:3, 3] - here[:3, 3]) / step > 0.1
+
+
+def test_thin_parts_move_farther_than_they_are_wide():
+    stage = Stage(load_scene("thin"))
+    camera = stage.scene.rig.cameras(3, 320, 240)[0]
+    _, truth = look(stage, camera, 5)
+    speed = np.linalg.norm(truth.motion, axis=-1)
+    assert 0.03 < truth.mask.mean() < 0.08
+    assert 8 < np.percentile(speed[truth.mask], 90) < 12
+    # Nothing that moves is wider than 10 pixels: an opening of 11 leaves none of it.
+    opened = cv2.morphologyEx(truth.mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((11, 11)))
+    assert opened.sum() < 0.15 * truth.mask.sum()
+
+
+def test_where_light_flickers_pictures_change_and_surfaces_do_not():
+    stage = Stage(load_scene("flicker"))
+    camera = stage.scene.rig.cameras(3, 160, 120)[0]
+    pictures, truths = zip(*(look(stage, camera, frame) for frame in range(6)), strict=True)
+    still = ~np.any([truth.mask for truth in truths], axis=0)
+    assert still.mean() > 0.8
+    assert all((truth.motion[still] == 0).all() for truth in truths)
+    means = np.array([picture[still].mean() for picture in pictures])
+    assert (np.abs(np.diff(means)) / means[1:] > 0.01).sum() >= 4
+    # The lamp swings: apart from a common factor, shading changes as well.
+    first, last = (picture[still].mean(-1) / picture[still].mean() for picture in (pictures[0], pictures[-1]))
+    assert np.percentile(np.abs(first - last), 95) > 0.05
+
+
+def test_sensor_noise_has_the_size_asked_for(stage):
+    stage.move(0.0)
+    camera = stage.scene.rig.cameras(3, 160, 120)[0]
+    clean = stage.picture(camera, 64, 0).astype(float)
+    noisy, again = (stage.picture(camera, 64, 0, 0.02).astype(float) for _ in range(2))
+    np.testing.assert_array_equal(noisy, again)
+    inside = (clean > 30) & (clean < 225)
+    # Rounding to bytes twice adds 1/6 of a grey level squared to 26.
+    assert abs((noisy - clean)[inside].std() / (255 * 0.02) - 1) < 0.03
+    assert abs((noisy - clean)[inside].mean()) < 0.15
+
+
+def test_rig_has_its_test_view_in_the_middle():
+    cameras = load_scene("spheres").rig.cameras(10, 320, 240)
+    others = np.mean([camera.position for camera in cameras[1:]], axis=0)
+    assert np.linalg.norm(cameras[0].position - others) < 0.5
+    for camera in cameras:
+        np.testing.assert_allclose(project(camera, np.array([0, 0.8, 0]))[0], [160, 120], atol=1e-9)
+
+
+def test_a_full_folder_is_refused_and_a_capture_replaced_on_demand(tmp_path, clip):
+    small = {"num_cameras": 2, "num_frames": 1, "width": 16, "height": 16, "spp": 1}
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(FileExistsError, match="not empty; give another folder"):
+        synthesize("spheres", tmp_path, **small)
+    with pytest.raises(FileExistsError, match="holds no capture"):
+        synthesize("spheres", tmp_path, **small, overwrite=True)
+    out = shutil.copytree(clip, tmp_path / "clip")
+    seen = []
+    synthesize("spheres", out, **small, overwrite=True, progress=lambda done, total: seen.append((done, total)))
+    assert json.loads((out / "capture.json").read_text())["scene"] == "spheres"
+    assert not (out / "cam02.mp4").exists()
+    assert seen == [(1, 2), (2, 2)]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["clip", "notes.txt"]
+
+
+def test_a_failed_run_leaves_nothing(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("morgs_mi.synth.synthesize.write_colmap", full)
+    with pytest.raises(OSError, match=r"cannot write .*nothing is left.*No space left"):
+        synthesize("spheres", tmp_path / "clip", num_cameras=2, num_frames=1, width=16, height=16, spp=1)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"num_cameras": 1}, "`num_cameras` must be at least 2, got 1"),
+        ({"num_frames": 0}, "`num_frames` must be at least 1, got 0"),
+        ({"spp": 0}, "`spp` must be at least 1"),
+        ({"seed": -1}, "`seed` must be at least 0"),
+        ({"width": 63}, "must be even, got 63x240"),
+        ({"fps": 0}, "`fps` must be positive"),
+        ({"noise": -0.1}, "`noise` must be at least 0 and below 1, got -0.1"),
+        ({"scene": "nowhere"}, "no scene 'nowhere'; name one of .*'arm', 'flicker', 'spheres', 'thin'"),
+    ],
+)
+def test_bad_arguments_are_refused(tmp_path, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        synthesize(**{"scene": "spheres", "out": tmp_path / "clip", **arguments})
+
+
+def test_a_scene_file_may_lie_anywhere(tmp_path):
+    (tmp_path / "mine.py").write_text(
+        "from morgs_mi.synth.scene import Scene\n\n\ndef build(seed):\n    return Scene('mine', {}, {})\n"
+    )
+    assert load_scene(tmp_path / "mine.py").name == "mine"
+    (tmp_path / "empty.py").write_text("")
+    with pytest.raises(ValueError, match=r"must define `build\(seed\) -> Scene`"):
+        load_scene(tmp_path / "empty.py")
