@@ -19,7 +19,7 @@ from morgs_mi.evaluate.figures import motion_scale
 from morgs_mi.export.frames import PLAYABLE, even
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.io.video_writer import write_video
-from morgs_mi.playback.player import channel_picture, open_stream, render_stream, truth_on
+from morgs_mi.playback.player import channel_image, open_stream, render_stream, truth_for_camera
 from morgs_mi.playback.visualise import contact_sheet, label, motion_legend, side_by_side, write_png
 from morgs_mi.recorder import stream_capture
 from morgs_mi.stream_loop import StreamConfig
@@ -174,12 +174,12 @@ def _panels(capture: Capture, stream: Path, scale: float, note: str = "") -> lis
     camera = reader.cameras[view]
     frames = []
     for recorded, (index, images) in zip(capture.frames(), render_stream(reader, camera), strict=False):
-        truth, picture = truth_on(capture, camera, index), channel_picture("color", images["color"])
+        truth, picture = truth_for_camera(capture, camera, index), channel_image("color", images["color"])
         error = np.abs(picture.astype(float) - recorded.images[view]) * _ERROR_GAIN / 255
-        panels = {"truth": recorded.images[view], "render": picture, "error": channel_picture("color", error)}
+        panels = {"truth": recorded.images[view], "render": picture, "error": channel_image("color", error)}
         if truth is not None:
-            panels["true motion"] = channel_picture("motion", truth.motion, scale)
-        panels |= {name: channel_picture(name, images[name], scale) for name in _moving(images)}
+            panels["true motion"] = channel_image("motion", truth.motion, scale)
+        panels |= {name: channel_image(name, images[name], scale) for name in _moving(images)}
         labels = {"truth": f"truth, frame {index}", "error": f"error x{_ERROR_GAIN}", "true motion": "true motion"}
         frames.append({name: label(panel, labels.get(name, name + note)) for name, panel in panels.items()})
     return frames

@@ -35,7 +35,7 @@ PRESETS: dict[PresetName, dict[str, Any]] = {
     "ml-mo-mc": _modules(True, True, True),
     "paper": {
         "epochs": 8,
-        "falling_rates": False,
+        "decay_means_rate": False,
         "lift_flow": False,
         "propagate_motion": False,
         "lift_confidence": False,

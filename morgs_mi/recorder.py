@@ -19,10 +19,10 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.calibration.rig_check import find_common, with_points
+from morgs_mi.calibration.rig_check import match_capture, triangulate_points
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.codec.container import PacketKind, StreamWriter, TruncatedStreamError, header_json
-from morgs_mi.codec.packets import CodedFrame, restated, seek
+from morgs_mi.codec.packets import CodedFrame, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import write_json
 from morgs_mi.method.flow import choose_key_views
@@ -63,7 +63,7 @@ def stream_capture(
     metadata = _metadata(capture, first, config)
     begun = _begun(out, capture, metadata) if resume else None
     if begun is None and len(capture.points) < MIN_POINTS:
-        capture = with_points(capture, find_common(capture))
+        capture = triangulate_points(capture, match_capture(capture))
     loop = StreamLoop(
         [capture.cameras[v] for v in train],
         capture.points,
@@ -78,7 +78,7 @@ def stream_capture(
         frames = chain((first,), frames)
     else:
         # What has changed is told from all pictures up to now.
-        start, now = 0 if config.fit.leave_out_still else begun.coded.frame, begun.coded.frame
+        start, now = 0 if config.fit.skip_static else begun.coded.frame, begun.coded.frame
         frames = capture.partial_frames(start)
         past = islice(frames, now + 1 - start)
         loop.resume(begun.coded, ([frame.images[v] for v in train] for frame in past))
@@ -86,7 +86,7 @@ def stream_capture(
     interval = config.codec.keyframe_interval
     with writer:
         if begun is not None and begun.index[-1][0] == PacketKind.RESIDUAL:
-            _restate(writer, begun.coded, interval)
+            _reemit_keyframe(writer, begun.coded, interval)
         for frame in frames:
             tick = None if on_step is None else _frame_ticker(on_step, frame.index)
             packet, report = loop.push([frame.images[v] for v in train], tick)
@@ -94,7 +94,7 @@ def stream_capture(
             reports.append(replace(report, status=status))
             write_json(out / "report.json", {**metadata, "frames": [asdict(r) for r in reports]})
             writer.write(packet)
-            _restate(writer, loop.state.coded, interval)
+            _reemit_keyframe(writer, loop.state.coded, interval)
     return reports
 
 
@@ -194,10 +194,10 @@ def _reports(path: Path, count: int) -> list[FrameReport]:
     return reports
 
 
-def _restate(writer: StreamWriter, coded: CodedFrame | None, interval: int) -> None:
+def _reemit_keyframe(writer: StreamWriter, coded: CodedFrame | None, interval: int) -> None:
     """Write the whole state once more where it is time for that."""
     if coded is not None and interval and coded.frame and coded.frame % interval == 0:
-        writer.write(restated(coded))
+        writer.write(reemitted_keyframe(coded))
 
 
 def _frame_ticker(on_step: Callable[[int, int, int], None], frame: int) -> Callable[[int, int], None]:

@@ -22,13 +22,13 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.initialise import from_points, resample_points, scene_extent, seed_points
-from morgs_mi.fit.later_frame import fit_next_frame
+from morgs_mi.fit.later_frame import fit_later_frame
 from morgs_mi.losses.ssim import Target
-from morgs_mi.method.active_set import Part, changing_part, whole_part
+from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
 from morgs_mi.method.change import around, changed, renewed
 from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.config import MotionConfig
-from morgs_mi.method.flow import MotionCue, choose_key_views, motion_cues
+from morgs_mi.method.flow import FlowObservation, choose_key_views, observe_key_views
 from morgs_mi.method.flow_sources.registry import FramePair
 from morgs_mi.render.config import RenderConfig
 
@@ -139,11 +139,11 @@ def step(
         if state.frame == 1 and cues and setup.config.motion.learn_confidence:
             previous = _first_confidence(setup, state, cues, rng)
         part = _part(setup, previous, changes)
-        targets = {view: Target(images[view], setup.masks[view]) for view in part.windows}
-        fitted = fit_next_frame(previous, part, targets, cues, setup.extent, config, setup.config.motion, rng, on_step)
+        targets = {view: Target(images[view], setup.masks[view]) for view in part.views}
+        fitted = fit_later_frame(previous, part, targets, cues, setup.extent, config, setup.config.motion, rng, on_step)
         packet = residual_packet(state.coded, fitted.gaussians, fitted.source, setup.cameras, setup.config.codec)
         decoded, losses = decode(state.coded, packet), fitted.losses
-        effort = {**part.shares, "epochs": fitted.epochs / config.epochs}
+        effort = {**part.fractions, "epochs": fitted.epochs / config.epochs}
     seconds = time.perf_counter() - start
     report = FrameReport(state.frame, seconds, len(encode_packet(packet)), losses, len(decoded), status, effort=effort)
     return StreamState(state.frame + 1, decoded, tuple(images)), packet, report
@@ -151,20 +151,20 @@ def step(
 
 def _changes(setup: Setup, state: StreamState, images: Sequence[np.ndarray]) -> list[np.ndarray] | None:
     """Return what has changed in each view; None: everything may have."""
-    if not setup.config.fit.leave_out_still:
+    if not setup.config.fit.skip_static:
         return None
     # What has not been seen before changes nothing: it is compared from the next frame on.
     references = (image if known is None else known for known, image in zip(state.references, images, strict=True))
     return [changed(*pictures) for pictures in zip(references, images, setup.masks, strict=True)]
 
 
-def _part(setup: Setup, gaussians: Gaussians, changes: Sequence[np.ndarray] | None) -> Part:
+def _part(setup: Setup, gaussians: Gaussians, changes: Sequence[np.ndarray] | None) -> ActiveSet:
     """Return what of the scene has to do with that."""
     if changes is None:
-        return whole_part(gaussians, setup.cameras, setup.config.render)
+        return full_active_set(gaussians, setup.cameras, setup.config.render)
     maps = ("motion", "confidence")
     channels = [("color", *(maps if v in setup.key_views else ())) for v in range(len(setup.cameras))]
-    return changing_part(gaussians, setup.cameras, changes, channels, setup.config.render)
+    return find_active_set(gaussians, setup.cameras, changes, channels, setup.config.render)
 
 
 def _first_gaussians(setup: Setup, images: Sequence[np.ndarray], rng: np.random.Generator) -> tuple[Gaussians, str]:
@@ -180,22 +180,22 @@ def _first_gaussians(setup: Setup, images: Sequence[np.ndarray], rng: np.random.
 
 
 def _first_confidence(
-    setup: Setup, state: StreamState, cues: Mapping[int, MotionCue], rng: np.random.Generator
+    setup: Setup, state: StreamState, cues: Mapping[int, FlowObservation], rng: np.random.Generator
 ) -> Gaussians:
     """Learn who moves from the first frame's masks, which the flow to the second frame alone can tell."""
     assert state.gaussians is not None
     method = setup.config.motion.mask_method
-    masks = {v: motion_mask(state.images[v], cue.onward, cue.onward_reliable, method) for v, cue in cues.items()}
+    masks = {v: motion_mask(state.images[v], cue.forward_flow, cue.forward_reliable, method) for v, cue in cues.items()}
     fitted, _ = fit_confidence(state.gaussians, setup.cameras, masks, setup.config.fit, setup.config.render, rng)
     return fitted
 
 
 def _cues(
     setup: Setup, state: StreamState, images: Sequence[np.ndarray], changes: Sequence[np.ndarray] | None
-) -> Mapping[int, MotionCue]:
+) -> Mapping[int, FlowObservation]:
     """Compute flow on the key views where something has changed, if anything uses it, and masks at keyframes."""
     motion = setup.config.motion
-    with_masks = motion.learn_confidence and state.frame % motion.keyframe_interval == 0
+    with_masks = motion.learn_confidence and state.frame % motion.mask_interval == 0
     first_masks = motion.learn_confidence and state.frame == 1
     if not (motion.learn_motion or with_masks or first_masks):
         return {}
@@ -204,7 +204,7 @@ def _cues(
         box = None if changes is None else around(changes[v])
         if changes is None or box is not None:
             pairs[v] = FramePair(images[v], state.images[v], setup.cameras[v].name, state.frame, setup.masks[v], box)
-    return motion_cues(pairs, motion, with_masks)
+    return observe_key_views(pairs, motion, with_masks)
 
 
 def _seen_only(setup: Setup, state: StreamState, views: Sequence[int]) -> tuple[Setup, StreamState]:
@@ -304,7 +304,7 @@ class StreamLoop:
         self, references: Sequence[np.ndarray | None], images: Sequence[np.ndarray | None]
     ) -> tuple[np.ndarray | None, ...]:
         """Return what the next frame's pictures are compared with."""
-        if not self.setup.config.fit.leave_out_still:
+        if not self.setup.config.fit.skip_static:
             return ()
         views = zip(references or (None,) * len(images), images, self.setup.masks, strict=True)
         return tuple(renewed(*pictures) for pictures in views)

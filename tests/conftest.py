@@ -12,9 +12,9 @@ import pytest
 import morgs_mi  # noqa: F401  (finds a usable LLVM before the variant is set)
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.io.video_writer import write_video
-from morgs_mi.playback.visualise import as_picture
+from morgs_mi.playback.visualise import to_uint8
 from morgs_mi.render.rasterize import rasterize
-from morgs_mi.synth.ground_truth import Truth, save_truth
+from morgs_mi.synth.ground_truth import GroundTruth, save_truth
 from tests.moving_splats import CAMERAS, DISTANCE, FRAMES, PIXELS, STEP, moved, write_stream
 
 mi.set_variant("llvm_ad_rgb")
@@ -35,11 +35,11 @@ def fitted_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_colmap(folder / "capture" / "sparse", CAMERAS)
     for camera in CAMERAS:
         images = [rasterize(moved(t), camera) for t in range(FRAMES)]
-        write_video(folder / "capture" / camera.name, [as_picture(np.array(i.color)) for i in images], 25)
+        write_video(folder / "capture" / camera.name, [to_uint8(np.array(i.color)) for i in images], 25)
         for t, image in enumerate(images):
             seen = np.array(image.alpha)[..., 0] > 0
             motion = seen[..., None] * np.float32([PIXELS, 0]) * (t > 0)
-            truth = Truth(motion, np.float32(DISTANCE * seen), np.where(seen, 0, -1), seen)
+            truth = GroundTruth(motion, np.float32(DISTANCE * seen), np.where(seen, 0, -1), seen)
             save_truth(folder / "capture" / "truth", camera.name, t, truth)
     steps = np.arange(FRAMES)[:, None] * (STEP, 0, 0)
     corners = np.array([(0.0, 0, 0), (1, 0, 0), (0, 1, 0)])

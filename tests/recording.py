@@ -33,7 +33,7 @@ CONFIG = StreamConfig(
         epochs=2,
         density=DensityConfig(rounds=2, births=0.05, max_gaussians=84, min_error=0),
     ),
-    motion=MotionConfig(key_views=1, keyframe_interval=2),
+    motion=MotionConfig(key_views=1, mask_interval=2),
     codec=CodecConfig(keyframe_interval=2, offset=True),
     render=RenderConfig(reproducible=True),
 )

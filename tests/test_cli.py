@@ -15,7 +15,7 @@ import pytest
 from morgs_mi import cli
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.packets import keyframe_packet, play, restated
+from morgs_mi.codec.packets import keyframe_packet, play, reemitted_keyframe
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
@@ -306,7 +306,7 @@ def test_a_damaged_stream_is_salvaged_and_what_is_lost_is_named(tmp_path: Path, 
     # Keyframes behind what is missing: it plays on.
     with StreamWriter(path, rig(), 25, {"num_frames": 6}) as writer:
         for state in (states[0], states[3], states[4]):
-            writer.write(restated(state))
+            writer.write(reemitted_keyframe(state))
     status, said, _ = run(capsys, "salvage", tmp_path, new)
     assert (status, said.splitlines()[0]) == (0, f"{new}: 3 frames, 0, 3 to 4.")
     assert "3 frames cannot be played, 1 to 2, 5: " in said
@@ -315,7 +315,7 @@ def test_a_damaged_stream_is_salvaged_and_what_is_lost_is_named(tmp_path: Path, 
     for total, named in ((10**30, f", 5 to {10**30 - 1}: "), ("many", ", 1 to 2: "), (2, ", 1 to 2: ")):
         with StreamWriter(path, rig(), 25, {"num_frames": total}) as writer:
             for state in (states[0], states[3], states[4]):
-                writer.write(restated(state))
+                writer.write(reemitted_keyframe(state))
         status, said, _ = run(capsys, "salvage", tmp_path, new)
         assert status == 0
         assert named in said

@@ -7,7 +7,7 @@ from typing import get_args
 
 import pytest
 
-from morgs_mi.fit.config import FitConfig, Rates
+from morgs_mi.fit.config import FitConfig, LearningRates
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.presets import PRESETS, PresetName, apply_preset
 
@@ -30,16 +30,16 @@ def test_names_are_those_that_are_offered():
 )
 def test_rows_of_the_paper(name, epochs, modules, lifted):
     fit, motion = apply_preset(name, FitConfig(num_gaussians=77), MotionConfig(key_views=12))
-    assert fit == FitConfig(num_gaussians=77, epochs=epochs, falling_rates=lifted)
+    assert fit == FitConfig(num_gaussians=77, epochs=epochs, decay_means_rate=lifted)
     assert (motion.learn_motion, motion.learn_offset, motion.learn_confidence) == modules
     assert (motion.lift_flow, motion.propagate_motion, motion.key_views) == (lifted, lifted, 12)
 
 
 def test_rates_of_places_fall_and_all_others_are_larger_in_fewer_epochs():
-    places = [FitConfig(epochs=8).rates_at(k).means / Rates().means for k in range(8)]
+    places = [FitConfig(epochs=8).rates_at(k).means / LearningRates().means for k in range(8)]
     assert places == pytest.approx([1, 1, 2 / 3, 1 / 2, 2 / 5, 1 / 3, 2 / 7, 1 / 4])
-    assert all(FitConfig(falling_rates=False).rates_at(k) == Rates() for k in range(8))
-    others = {name: rate for name, rate in asdict(Rates()).items() if name != "means"}
+    assert all(FitConfig(decay_means_rate=False).rates_at(k) == LearningRates() for k in range(8))
+    others = {name: rate for name, rate in asdict(LearningRates()).items() if name != "means"}
     for epochs, factor in ((8, 1), (2, 2)):
         for k in range(epochs):
             rates = asdict(FitConfig(epochs=epochs).rates_at(k))

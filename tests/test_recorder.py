@@ -17,7 +17,7 @@ import pytest
 
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import PAYLOAD, TRAILER, StreamWriter
-from morgs_mi.codec.packets import CodedFrame, coded_frames, play, restated, seek
+from morgs_mi.codec.packets import CodedFrame, coded_frames, play, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.recorder import stream_capture
 from morgs_mi.stream_loop import StreamLoop
@@ -103,7 +103,7 @@ def test_300_frames_of_the_loop_play_as_they_were_fitted(tmp_path: Path) -> None
             assert loop.state.coded is not None
             states.append(loop.state.coded)
             if frame.index and frame.index % 50 == 0:
-                writer.write(restated(states[-1]))
+                writer.write(reemitted_keyframe(states[-1]))
     assert states[0].next_id < states[-1].next_id, "some were born"
     assert len(states[-1]) < states[-1].next_id, "some died"
     reader = StreamReader(tmp_path / "s")

@@ -15,7 +15,7 @@ from morgs_mi.codec.container import PacketKind, encode_packet
 from morgs_mi.codec.packets import coded_frames, decode, play
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
-from morgs_mi.fit.config import DensityConfig, FitConfig, Rates
+from morgs_mi.fit.config import DensityConfig, FitConfig, LearningRates
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.recorder import stream_capture
 from morgs_mi.stream_loop import StreamConfig, StreamLoop
@@ -170,7 +170,7 @@ def test_modules_can_be_switched_off(clip):
     )
     _, _, reports = run(clip, off, frames=2)
     assert reports[1].losses.keys() == {"recon"}
-    masked = dataclasses.replace(QUICK, motion=MotionConfig(key_views=2, keyframe_interval=1, learn_offset=False))
+    masked = dataclasses.replace(QUICK, motion=MotionConfig(key_views=2, mask_interval=1, learn_offset=False))
     _, _, reports = run(clip, masked, frames=2)
     assert reports[1].losses.keys() == {"recon", "flow", "mask"}
 
@@ -191,10 +191,10 @@ def without(images, *views):
 def test_a_view_that_drops_out_is_left_out_of_its_frame_and_of_the_next_flow(clip, monkeypatch):
     """Flow on two key views, of those that have both pictures: never of the view that is away, nor when it is back."""
     flowed = []
-    cues = stream_loop.motion_cues
+    cues = stream_loop.observe_key_views
     monkeypatch.setattr(
         stream_loop,
-        "motion_cues",
+        "observe_key_views",
         lambda pairs, *more: flowed.append({p.camera for p in pairs.values()}) or cues(pairs, *more),
     )
     loop = new_loop()
@@ -278,7 +278,7 @@ def test_a_capture_becomes_a_file(clip, tmp_path):
             r"`point_colors` must be \(200, 3\)",
         ),
         (lambda clip: FitConfig(epochs=0), "`epochs` must be at least 1, got 0"),
-        (lambda clip: Rates(means=np.nan), "`means` must be finite and not negative, got nan"),
+        (lambda clip: LearningRates(means=np.nan), "`means` must be finite and not negative, got nan"),
         (lambda clip: FitConfig(sh_degree=4), "`sh_degree` must be 0 to 3, got 4"),
         (lambda clip: MotionConfig(flow_method="raft"), "`flow_method` must be one of dis, dis-fine"),
     ],
@@ -312,7 +312,7 @@ def test_a_clip_that_stands_still_costs_next_to_nothing(clip):
 def test_what_is_left_out_was_not_needed(clip):
     """With and without: the held-out picture is as good, and what stands still is told in fewer bytes."""
     some = dataclasses.replace(QUICK, render=RenderConfig(reproducible=True))
-    everything = dataclasses.replace(some, fit=dataclasses.replace(QUICK.fit, leave_out_still=False))
+    everything = dataclasses.replace(some, fit=dataclasses.replace(QUICK.fit, skip_static=False))
     quality, sizes = [], []
     for config in (some, everything):
         loop = new_loop(config)
@@ -320,6 +320,6 @@ def test_what_is_left_out_was_not_needed(clip):
         found = np.asarray(rasterize(loop.gaussians, cameras()[4], ("color",)).color)
         quality.append(psnr(np.clip(found, 0, 1), clip[2][4] / 255))
         sizes.append(sum(report.num_bytes for report in reports[1:]))
-        assert (reports[-1].effort["pixels"] < 1) == config.fit.leave_out_still
+        assert (reports[-1].effort["pixels"] < 1) == config.fit.skip_static
     assert quality[0] > quality[1] - 0.5  # of five small views with a first frame that is far from done
     assert sizes[0] < 0.9 * sizes[1]

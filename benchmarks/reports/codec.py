@@ -222,7 +222,7 @@ def _frame(before: CodedFrame, now: CodedFrame, cameras: Sequence[Any], settings
 
 def _birth_bytes(state: CodedFrame, born: np.ndarray) -> float:
     new = state.grid.select(np.flatnonzero(born))
-    columns = np.concatenate([new.pivots[:, None], new.exponents, new.values], axis=1, dtype=np.int64)
+    columns = np.concatenate([new.largest_components[:, None], new.exponents, new.values], axis=1, dtype=np.int64)
     return _bytes(*(columns - np.median(columns, axis=0).astype(np.int64)).T)
 
 

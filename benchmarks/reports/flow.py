@@ -21,9 +21,9 @@ from benchmarks.reports.plots import blank_figure, markdown, save_figure
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.method.flow import choose_key_views
-from morgs_mi.method.flow_sources.opencv import FLOW_METHODS, consistent
+from morgs_mi.method.flow_sources.opencv import FLOW_METHODS, consistency_mask
 from morgs_mi.method.flow_sources.registry import FramePair, flow_source
-from morgs_mi.synth.ground_truth import Truth, load_truth
+from morgs_mi.synth.ground_truth import GroundTruth, load_truth
 
 __all__ = ["FlowReportConfig", "markdown_table", "plot_flow", "report_flow"]
 
@@ -157,9 +157,9 @@ def _clip(capture: Capture, config: FlowReportConfig, progress: Callable[[str, f
             if not done:
                 source(pair)
             start = time.perf_counter()
-            flow, onward = source(pair)
+            flow, forward_flow = source(pair)
             milliseconds = 1e3 * (time.perf_counter() - start)
-            found[method].append({"ms": milliseconds, **_errors(-flow, consistent(flow, onward), truth)})
+            found[method].append({"ms": milliseconds, **_errors(-flow, consistency_mask(flow, forward_flow), truth)})
     progress(f"Flow of {name}", total, total)
     camera = capture.cameras[views[0]]
     return {
@@ -172,7 +172,7 @@ def _clip(capture: Capture, config: FlowReportConfig, progress: Callable[[str, f
     }
 
 
-def _pairs(capture: Capture, views: Sequence[int]) -> Iterator[tuple[FramePair, Truth]]:
+def _pairs(capture: Capture, views: Sequence[int]) -> Iterator[tuple[FramePair, GroundTruth]]:
     """Yield each chosen view's successive pictures with the truth on the later one's grid."""
     assert capture.truth is not None
     for previous, frame in pairwise(capture.frames()):
@@ -182,7 +182,7 @@ def _pairs(capture: Capture, views: Sequence[int]) -> Iterator[tuple[FramePair, 
             yield pair, load_truth(capture.truth, camera, frame.index)
 
 
-def _errors(motion: np.ndarray, reliable: np.ndarray, truth: Truth) -> dict[str, dict[str, float]]:
+def _errors(motion: np.ndarray, reliable: np.ndarray, truth: GroundTruth) -> dict[str, dict[str, float]]:
     """Return sums over the pixels of one picture, by subset, so that pictures can be added up."""
     error = np.linalg.norm(motion.astype(np.float64) - truth.motion, axis=-1)
     figures = {}

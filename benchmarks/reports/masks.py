@@ -34,10 +34,10 @@ from morgs_mi.core.files import write_json
 from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.evaluate.metrics import iou, psnr
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.method.active_set import whole_part
+from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.confidence import MASK_METHODS, flow_mask
 from morgs_mi.method.config import MotionConfig
-from morgs_mi.method.flow import MotionCue, motion_cue
+from morgs_mi.method.flow import FlowObservation, observe_flow
 from morgs_mi.method.lift import lift_flow
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.stream_loop import StreamConfig, StreamLoop
@@ -73,9 +73,9 @@ def confidence_mask(gaussians: Gaussians, camera: Camera) -> np.ndarray:
     return np.asarray(rasterize(gaussians, camera, ("confidence",)).confidence)[..., 0] > 0.5
 
 
-def carried(gaussians: Gaussians, cameras: Sequence[Camera], cues: Mapping[int, MotionCue]) -> Gaussians:
+def carried(gaussians: Gaussians, cameras: Sequence[Camera], cues: Mapping[int, FlowObservation]) -> Gaussians:
     """Return the Gaussians where the key views' flow carries them, sure of who moves and who does not."""
-    lift = lift_flow(gaussians, whole_part(gaussians, cameras, RenderConfig()).windows, cues)
+    lift = lift_flow(gaussians, full_active_set(gaussians, cameras, RenderConfig()).views, cues)
     sure = np.where(lift.logit_confidence > 0, 6, -6).astype(np.float32)
     return replace(gaussians, means=np.asarray(gaussians.means) + lift.displacement, logit_confidence=sure)
 
@@ -88,7 +88,7 @@ def means(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
 
 def processor_ms(image: np.ndarray, previous: np.ndarray) -> dict[str, float]:
     """Return the processor time of each method on one picture, all threads together, ms: medians of 9."""
-    cue, costs = motion_cue(image, previous), {}
+    cue, costs = observe_flow(image, previous), {}
     moves = flow_mask(cue.motion, cue.reliable)
     for method, refine in MASK_METHODS.items():
         times = []
@@ -134,7 +134,7 @@ class Clip:
         loop.resume(self.first, [self._images(0)])
         for t in range(1, len(self.frames)):
             key_views, images, before = loop.setup.key_views, self._images(t), self._images(t - 1)
-            cues = {k: motion_cue(images[k], before[k], valid=loop.setup.masks[k]) for k in key_views}
+            cues = {k: observe_flow(images[k], before[k], valid=loop.setup.masks[k]) for k in key_views}
             assert loop.gaussians is not None
             lifted = carried(loop.gaussians, self.cameras, cues)
             for k, cue in cues.items():
@@ -147,7 +147,7 @@ class Clip:
 
     def fitted(self, method: str, lift_confidence: bool) -> dict[str, dict[str, float]]:
         """Return the figures of the confidence that the loop learns from a method's masks."""
-        loop = self._loop(MotionConfig(mask_method=method, keyframe_interval=1, lift_confidence=lift_confidence))
+        loop = self._loop(MotionConfig(mask_method=method, mask_interval=1, lift_confidence=lift_confidence))
         loop.resume(self.first, [self._images(0)])
         key_views, held_out = [], []
         for t in range(1, len(self.frames)):

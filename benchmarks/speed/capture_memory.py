@@ -82,13 +82,13 @@ def measure(options: Options) -> dict[str, Any]:
         for frame in islice(capture.frames(), 0, None, every):
             rows.append({"frame": frame.index, "resident_mib": resident()})
         seconds = time.perf_counter() - start
-    settled = [row["resident_mib"] for row in rows[len(rows) // 10 :]]
+    early_stopping_tolerance = [row["resident_mib"] for row in rows[len(rows) // 10 :]]
     one = sum(camera.width * camera.height * 3 for camera in capture.cameras) / 2**20
     return {
         "before_mib": before,
-        "settled_mib": settled[0],
-        "largest_mib": max(settled),
-        "growth_mib": settled[-1] - settled[0],
+        "settled_mib": early_stopping_tolerance[0],
+        "largest_mib": max(early_stopping_tolerance),
+        "growth_mib": early_stopping_tolerance[-1] - early_stopping_tolerance[0],
         "frame_mib": one,
         "seconds_per_frame": seconds / options.frames,
         "rows": rows,

@@ -40,7 +40,7 @@ from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.render import loops
 from morgs_mi.render.blocks import BlockLists, build_lists, fetch_record
 from morgs_mi.render.projection import project
-from morgs_mi.render.region import whole_view
+from morgs_mi.render.region import full_view
 
 # Labels of the traced loops.
 LOOPS = {"blend": "blend", "adjoint": "blend (adjoint)"}
@@ -116,7 +116,7 @@ def work(gaussians: Gaussians, camera: Camera, lanes: int) -> dict[str, Any]:
     config = RenderConfig()
     layout = loops.Layout((loops.Channel(3, True),), False, False, config)
     with dr.suspend_grad():
-        region = whole_view(camera.width, camera.height, config)
+        region = full_view(camera.width, camera.height, config)
         splats = project(gaussians, camera, ("color",), config)
         lists = build_lists(splats, list(splats.channels["color"]), region, config)
         walked, reached = walk_counts(lists, loops.Blocks.of(region, lists), layout)

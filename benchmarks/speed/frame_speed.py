@@ -43,7 +43,7 @@ STAGES = {
     "lift": "lift_flow",
     "propagation": "propagate_motion",
     "steps": "optimise",
-    "density": "find_need",
+    "density": "densification_scores",
     "packet": "residual_packet",
     "decoding": "decode",
 }
@@ -189,15 +189,20 @@ def settings(options: Options, name: str, base: StreamConfig) -> dict[str, Strea
     """Return what is run at a size, by name."""
     runs = {f"default, {e} epochs": replace(base, fit=replace(base.fit, epochs=e)) for e in options.epochs}
     if name in options.full:
-        runs["8 epochs, nothing left out"] = replace(base, fit=replace(base.fit, leave_out_still=False))
+        runs["8 epochs, nothing left out"] = replace(base, fit=replace(base.fit, skip_static=False))
         fit, motion = apply_preset("paper", base.fit, base.motion)
-        runs["paper, 8 epochs"] = replace(base, fit=replace(fit, leave_out_still=False), motion=motion)
+        runs["paper, 8 epochs"] = replace(base, fit=replace(fit, skip_static=False), motion=motion)
     return runs
 
 
 def main(options: Options) -> None:
     mi.set_variant("llvm_ad_rgb")
-    result: dict[str, Any] = {"seed": options.seed, "noise": NOISE, "machine": machine(), "versions": versions()}
+    result: dict[str, Any] = {
+        "seed": options.seed,
+        "noise": NOISE,
+        "machine": machine(),
+        "versions": versions(),
+    }
     for name in options.sizes:
         size = SIZES[name]
         scene, rng = Scene(size, options.seed), np.random.default_rng(options.seed)

@@ -24,7 +24,7 @@ from morgs_mi.losses.losses import recon_loss
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.blocks import build_lists
 from morgs_mi.render.projection import project
-from morgs_mi.render.region import Region, whole_view
+from morgs_mi.render.region import Region, full_view
 
 # Pairs of pixel and Gaussian that the float64 twin is asked for.
 _TWIN_PAIRS = 20_000_000
@@ -73,7 +73,7 @@ def stages(
 
     def lists() -> Any:
         with dr.suspend_grad():
-            region = whole_view(camera.width, camera.height, config)
+            region = full_view(camera.width, camera.height, config)
             splats = project(gaussians, camera, named, config, features=features)
             built = build_lists(splats, [v for name in named for v in splats.channels.get(name, ())], region, config)
         return built.words, built.order
@@ -109,7 +109,7 @@ def stages(
     @cache
     def tenth() -> tuple[Region, Any]:
         region = Region(mask, config)
-        return region, mi.TensorXf(region.cut(target))
+        return region, mi.TensorXf(region.crop(target))
 
     @cache
     def compared() -> tuple[Any, Target]:
@@ -142,7 +142,7 @@ def extent(gaussians: Gaussians, camera: Camera) -> dict[str, float]:
     """Return how much there is to draw: pairs of Gaussian and block, their pixels in millions, and the lists' bytes."""
     config = RenderConfig()
     with dr.suspend_grad():
-        region = whole_view(camera.width, camera.height, config)
+        region = full_view(camera.width, camera.height, config)
         lists = build_lists(project(gaussians, camera, (), config), [], region, config)
         pairs = int(dr.sum(mi.UInt64(lists.count))[0])
     width, height = region.block

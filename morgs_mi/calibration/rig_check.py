@@ -15,7 +15,7 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.features import Features, Match, detect, match_views, reprojection_errors, triangulate
 from morgs_mi.core.camera import Camera
 
-__all__ = ["MAX_ERROR", "Common", "RigCheck", "check_rig", "find_common", "with_points"]
+__all__ = ["MAX_ERROR", "Common", "RigCheck", "check_rig", "match_capture", "triangulate_points"]
 
 # Distortion that a layout cannot express costs about a pixel; a wrong pose costs tens.
 MAX_ERROR = 2.0
@@ -64,7 +64,7 @@ class Common:
     matches: tuple[Match, ...]
 
 
-def find_common(capture: Capture, progress: Callable[[int, int], None] | None = None) -> Common:
+def match_capture(capture: Capture, progress: Callable[[int, int], None] | None = None) -> Common:
     """Match the views of the first frame: about 0.6 s per view and 0.03 s per pair.
 
     Args:
@@ -93,7 +93,7 @@ def check_rig(capture: Capture, common: Common) -> RigCheck:
     return RigCheck(len(errors), len(common.matches), error, counts, by_camera, fits, advice)
 
 
-def with_points(capture: Capture, common: Common) -> Capture:
+def triangulate_points(capture: Capture, common: Common) -> Capture:
     """Return the capture with the points that its training views have in common in place of those that it had.
 
     Where the views have little in common there are few or none, and the fit says so. The held-out view takes no part.

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from morgs_mi.capture.color_correction import Tone
+from morgs_mi.capture.color_correction import ColorCorrection
 from morgs_mi.capture.lens import Lens, Undistortion
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video import FrameReader, Picture
 
-__all__ = ["Feed", "at_clip_size"]
+__all__ = ["CameraSource", "at_clip_size"]
 
 
 @dataclass(frozen=True)
-class Feed:
+class CameraSource:
     """One camera's clip, and what is done to its pictures.
 
     Attributes:
@@ -32,7 +32,7 @@ class Feed:
     lens: Lens
     undo: Undistortion | None
     picks: np.ndarray
-    tone: Tone | None = None
+    tone: ColorCorrection | None = None
 
     def pictures(self, camera: Camera, start: int, stop: int) -> Iterator[Picture]:
         """Yield what `camera` would have seen at the instants start..stop-1, an error in place of what is missing."""

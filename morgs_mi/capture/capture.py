@@ -14,8 +14,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from morgs_mi.capture.camera_source import Feed, at_clip_size
-from morgs_mi.capture.color_correction import ColorFit, Tone, fit_colors
+from morgs_mi.capture.camera_source import CameraSource, at_clip_size
+from morgs_mi.capture.color_correction import ColorCorrection, ColorFit, fit_colors
 from morgs_mi.capture.layouts.registry import Calibration, read_calibration
 from morgs_mi.capture.lens import undistortion
 from morgs_mi.capture.timeline import ReadConfig, read_settings, timeline
@@ -85,7 +85,7 @@ class Capture:
     masks: tuple[np.ndarray | None, ...]
     test_view: int | None
     truth: Path | None
-    _sources: tuple[Feed, ...] = field(repr=False)
+    _sources: tuple[CameraSource, ...] = field(repr=False)
     downscale: float = 1
     layout: str = ""
     reading: ReadConfig = field(default_factory=ReadConfig)
@@ -217,7 +217,7 @@ def load_capture(
     names = [camera.name for camera in recorded]
     clock = timeline(path, names, readers, reading, max_frames, settings.get("fps"))
     sources = tuple(
-        Feed(reader, lens, undistortion(camera, lens), picks)
+        CameraSource(reader, lens, undistortion(camera, lens), picks)
         for reader, lens, camera, picks in zip(readers, calibration.lenses, recorded, clock.picks, strict=True)
     )
     cameras = tuple(_resized(camera, downscale) for camera in recorded)
@@ -252,7 +252,7 @@ def _toned(capture: Capture, reading: ReadConfig) -> Capture:
     fit = None
     if reading.color != "none":
         fit = fit_colors(capture.cameras, firsts, capture.masks, reading.color, reference)
-    tones = [Tone.of(fit, view, first if reading.exposure else None) for view, first in enumerate(firsts)]
+    tones = [ColorCorrection.of(fit, view, first if reading.exposure else None) for view, first in enumerate(firsts)]
     sources = tuple(replace(s, tone=tone) for s, tone in zip(capture._sources, tones, strict=True))
     return replace(capture, _sources=sources, colors=fit)
 

@@ -18,7 +18,7 @@ import numpy as np
 from morgs_mi.capture.features import Features, Match, detect, match_views, reprojection_errors
 from morgs_mi.core.camera import Camera
 
-__all__ = ["COLOR_METHODS", "ColorFit", "Tone", "fit_colors"]
+__all__ = ["COLOR_METHODS", "ColorCorrection", "ColorFit", "fit_colors"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -70,7 +70,7 @@ class ColorFit:
 
 
 @dataclass(frozen=True)
-class Tone:
+class ColorCorrection:
     """What one camera's pictures need to agree with the other cameras' and with its own first.
 
     Attributes:
@@ -84,7 +84,7 @@ class Tone:
     first: np.ndarray | None = None
 
     @classmethod
-    def of(cls, fit: ColorFit | None, view: int, first: np.ndarray | None) -> Tone:
+    def of(cls, fit: ColorFit | None, view: int, first: np.ndarray | None) -> ColorCorrection:
         """Return the tone of a view, relative to its `first` picture if that is given."""
         matrix = None if fit is None else fit.matrices[view]
         return cls(fit.method if fit else "linear", matrix, None if first is None else _thumb(first))

@@ -81,7 +81,7 @@ class Info:
     reading: Annotated[ReadConfig, arg(name="")] = field(default_factory=ReadConfig)
 
     def run(self) -> None:
-        from morgs_mi.calibration.rig_check import check_rig, find_common, with_points
+        from morgs_mi.calibration.rig_check import check_rig, match_capture, triangulate_points
         from morgs_mi.calibration.rig_plot import write_rig
         from morgs_mi.capture.capture import load_capture
 
@@ -89,10 +89,10 @@ class Info:
         origin = "" if len(capture.points) else "without points"
         if self.check:
             with progress() as report:
-                common = find_common(capture, lambda done, total: report("Matching views", done, total))
+                common = match_capture(capture, lambda done, total: report("Matching views", done, total))
             found = check_rig(capture, common)
             if origin:
-                capture = with_points(capture, common)
+                capture = triangulate_points(capture, common)
                 origin += f" ({len(capture.points)} can be triangulated)"
         table = Table(title=f"{self.capture}: {capture.layout}", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
         for column in ("", "camera", "size", "focal, px", "centre, px", "seen", "use", "matches", "error, px"):

@@ -16,7 +16,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cli.console import OUT, progress, say, warn
 from morgs_mi.demo import DemoConfig
-from morgs_mi.evaluate.tables import figure, judgement_sentences, judgement_tables
+from morgs_mi.evaluate.tables import evaluation_summary, evaluation_tables, figure
 from morgs_mi.presets import PresetName, apply_preset
 from morgs_mi.stream_loop import StreamConfig
 
@@ -204,9 +204,9 @@ class Demo:
 
 def _show(result: Mapping[str, Any]) -> None:
     """Print what `evaluate_stream` has found."""
-    for table in judgement_tables(result):
+    for table in evaluation_tables(result):
         OUT.print(table)
-    for sentence in judgement_sentences(result):
+    for sentence in evaluation_summary(result):
         say(sentence)
     if not result["complete"]:
         warn(f"{result['stream']}: the fit was not finished, its stream holds {result['num_frames']} frames.")

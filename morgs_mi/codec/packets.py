@@ -32,8 +32,8 @@ __all__ = [
     "decode",
     "keyframe_packet",
     "play",
+    "reemitted_keyframe",
     "residual_packet",
-    "restated",
     "seek",
 ]
 
@@ -71,7 +71,12 @@ class CodedFrame:
     def digest(self) -> np.ndarray:
         """BLAKE2b of all integers, uint8 [8]: what a residual names as its parent."""
         grid, hashed = self.grid, blake2b(digest_size=8)
-        for array, dtype in ((self.ids, "<u4"), (grid.pivots, "u1"), (grid.exponents, "i1"), (grid.values, "<i4")):
+        for array, dtype in (
+            (self.ids, "<u4"),
+            (grid.largest_components, "u1"),
+            (grid.exponents, "i1"),
+            (grid.values, "<i4"),
+        ):
             hashed.update(np.ascontiguousarray(array, dtype))
         hashed.update(np.array([self.next_id, grid.degree], "<u4"))
         return np.frombuffer(hashed.digest(), np.uint8)
@@ -92,10 +97,10 @@ def keyframe_packet(
         ValueError: an attribute is not finite.
     """
     grid = new_grid(attributes(gaussians), cameras, config or CodecConfig())
-    return restated(CodedFrame(frame, grid, np.arange(len(grid), dtype=np.uint32), len(grid), gaussians))
+    return reemitted_keyframe(CodedFrame(frame, grid, np.arange(len(grid), dtype=np.uint32), len(grid), gaussians))
 
 
-def restated(coded: CodedFrame) -> Packet:
+def reemitted_keyframe(coded: CodedFrame) -> Packet:
     """Return the keyframe that leads to the very state `coded`: a place to start from, with nothing lost."""
     grid, writer = coded.grid, ColumnWriter()
     writer.put(np.diff(coded.ids.astype(np.int64), prepend=-1) - 1)
@@ -289,7 +294,7 @@ def _words(columns: Iterable[np.ndarray]) -> np.ndarray:
 
 
 def _put_grid(writer: ColumnWriter, grid: Grid) -> None:
-    columns = np.concatenate([grid.pivots[:, None], grid.exponents, grid.values], axis=1, dtype=np.int64)
+    columns = np.concatenate([grid.largest_components[:, None], grid.exponents, grid.values], axis=1, dtype=np.int64)
     middle = np.sort(columns, axis=0)[len(grid) // 2] if len(grid) else np.zeros(columns.shape[1], np.int64)
     middle[np.abs(columns - middle).max(0, initial=0) >= LIMIT] = 0  # what is as large as can be is not made larger
     writer.put(middle)

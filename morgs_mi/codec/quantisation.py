@@ -6,7 +6,7 @@ The columns of `values` [N, C], C = 11 + 3 K (one less without confidence), stan
 
     position 3   means, world units
     size 3       log_scales
-    rotation 3   quats without the component at `pivots`, divided by it: (u, v, w) stands for (1, u, v, w) / length
+    rotation 3   quats without their largest component, divided by it: (u, v, w) stands for (1, u, v, w) / length
     opacity 1    logit_opacities
     color 3      SH of degree 0
     shine 3 K-3  SH of degree 1 and up
@@ -54,13 +54,13 @@ class Grid:
     Attributes:
         values: int32 [N, C].
         exponents: int8 [N, 8 or 9].
-        pivots: uint8 [N], the component of each quaternion that is not written.
+        largest_components: uint8 [N], the component of each quaternion that is not written.
         degree: of the spherical harmonics, 0 to 3.
     """
 
     values: np.ndarray
     exponents: np.ndarray
-    pivots: np.ndarray
+    largest_components: np.ndarray
     degree: int
 
     def __len__(self) -> int:
@@ -86,11 +86,19 @@ class Grid:
 
     def select(self, index: np.ndarray) -> Grid:
         """Return the Gaussians at `index`."""
-        return replace(self, values=self.values[index], exponents=self.exponents[index], pivots=self.pivots[index])
+        return replace(
+            self,
+            values=self.values[index],
+            exponents=self.exponents[index],
+            largest_components=self.largest_components[index],
+        )
 
     def concatenate(self, other: Grid) -> Grid:
         """Return these Gaussians and then those of `other`, which have the same columns."""
-        both = {n: np.concatenate([getattr(self, n), getattr(other, n)]) for n in ("values", "exponents", "pivots")}
+        both = {
+            n: np.concatenate([getattr(self, n), getattr(other, n)])
+            for n in ("values", "exponents", "largest_components")
+        }
         return replace(self, **both)
 
     def gaussians(self, motion: np.ndarray | None = None, offset: np.ndarray | None = None) -> Gaussians:
@@ -102,9 +110,9 @@ class Grid:
         length = np.sqrt(((1 + u * u) + v * v) + w * w)
         quats = np.empty((len(self), 4), np.float32)
         rows = np.arange(len(self))
-        quats[rows, self.pivots] = 1 / length
+        quats[rows, self.largest_components] = 1 / length
         for k, part in enumerate((u, v, w)):
-            quats[rows, k + (k >= self.pivots)] = part / length
+            quats[rows, k + (k >= self.largest_components)] = part / length
         sh = np.concatenate(
             [self.real(name) for name in ("color", "shine") if name in self.columns], 1, dtype=np.float32
         )
@@ -162,19 +170,19 @@ def attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
 def new_grid(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> Grid:
     """Choose the steps of Gaussians that are new, given by their `attributes`, and round them to these."""
     raw = {name: np.asarray(value, np.float64) for name, value in raw.items()}
-    pivots = np.abs(raw["quats"]).argmax(1).astype(np.uint8)
+    largest_components = np.abs(raw["quats"]).argmax(1).astype(np.uint8)
     degree = round(raw["sh_coeffs"].shape[1] ** 0.5) - 1
-    grid = Grid(np.zeros((0, 0), np.int32), _exponents(raw, cameras, config), pivots, degree)
+    grid = Grid(np.zeros((0, 0), np.int32), _exponents(raw, cameras, config), largest_components, degree)
     values = np.rint(real_values(raw, grid)).astype(np.int32)
     return replace(grid, values=np.ascontiguousarray(values.T))
 
 
 def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
     """Return what `Grid.values` of other `attributes` would be without rounding, float64 [C, N]; N as in `grid`."""
-    pivots, rows = grid.pivots, np.arange(len(grid.pivots))
+    largest_components, rows = grid.largest_components, np.arange(len(grid.largest_components))
     quats, sh = np.asarray(raw["quats"], np.float64), raw["sh_coeffs"]
-    others = np.stack([quats[rows, k + (k >= pivots)] for k in range(3)], axis=1)
-    pivot = quats[rows, pivots][:, None]
+    others = np.stack([quats[rows, k + (k >= largest_components)] for k in range(3)], axis=1)
+    pivot = quats[rows, largest_components][:, None]
     # A turn by 180 degrees away from where the pivot was chosen divides by zero: then "very far" is what is meant.
     turn = others / np.where(np.abs(pivot) < 1e-12, 1e-12, pivot)
     parts = {
@@ -187,7 +195,7 @@ def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
     }
     if grid.has_confidence:
         parts["confidence"] = np.clip(raw["logit_confidence"], -_MOST_CONFIDENCE, _MOST_CONFIDENCE)[:, None]
-    real = np.empty((max(at.stop for at in grid.columns.values()), len(pivots)))
+    real = np.empty((max(at.stop for at in grid.columns.values()), len(largest_components)))
     for name, at in grid.columns.items():
         np.divide(parts[name].T, grid.steps(name).T, out=real[at])
     return np.clip(real, -_FURTHEST, _FURTHEST, out=real)

@@ -29,14 +29,14 @@ from morgs_mi.codec.packets import CodedFrame, decode
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import whole
 
-__all__ = ["Gap", "salvage", "write_salvaged"]
+__all__ = ["DamagedRange", "salvage", "write_salvaged"]
 
 # A packet begins with its kind, uint32. The header is not looked for: it has its place, and holes are full of zeros.
 _KIND = re.compile(rb"[\1-\3]\0\0\0")
 
 
 @dataclass(frozen=True)
-class Gap:
+class DamagedRange:
     """Bytes of a stream that give no frame.
 
     Attributes:
@@ -50,7 +50,7 @@ class Gap:
     problem: str
 
 
-def salvage(path: str | Path) -> Iterator[CodedFrame | Gap]:
+def salvage(path: str | Path) -> Iterator[CodedFrame | DamagedRange]:
     """Yield what a stream file still says, in its order: the states of frames, and what is damaged or lost.
 
     A file that is cut off behind a whole packet is shorter and no more: `StreamReader.closed` tells. Cameras are not
@@ -61,14 +61,14 @@ def salvage(path: str | Path) -> Iterator[CodedFrame | Gap]:
     """
     last = None
     for found in _playable(Path(path)):
-        if isinstance(found, Gap):
+        if isinstance(found, DamagedRange):
             yield found
         elif found[1].frame != last:
             last = found[1].frame
             yield found[1]
 
 
-def write_salvaged(stream: StreamReader, output: str | Path) -> tuple[list[int], list[Gap]]:
+def write_salvaged(stream: StreamReader, output: str | Path) -> tuple[list[int], list[DamagedRange]]:
     """Write what a damaged stream still says as a new one, which appears whole or not at all.
 
     Its packets are those of the damaged one that play, as they are; behind a gap it goes on with a keyframe, whose
@@ -93,7 +93,7 @@ def write_salvaged(stream: StreamReader, output: str | Path) -> tuple[list[int],
         StreamWriter(partial, stream.cameras, stream.fps, stream.metadata) as writer,
     ):
         for found in _playable(stream.path):
-            if isinstance(found, Gap):
+            if isinstance(found, DamagedRange):
                 gaps.append(found)
             else:
                 writer.write(found[0])
@@ -103,15 +103,15 @@ def write_salvaged(stream: StreamReader, output: str | Path) -> tuple[list[int],
     return list(dict.fromkeys(frames)), gaps
 
 
-def _playable(path: Path) -> Iterator[tuple[Packet, CodedFrame] | Gap]:
+def _playable(path: Path) -> Iterator[tuple[Packet, CodedFrame] | DamagedRange]:
     """Yield packets with the states that they lead to or, once more, restate, and what gives neither."""
     data = path.read_bytes()  # a map of the file would end the process if somebody cut it off meanwhile
     if not data:
-        yield Gap(0, 0, "the file is empty")
+        yield DamagedRange(0, 0, "the file is empty")
     coded, at = None, 0
     for kind, start, stop in _intact(data):
         if start > at:
-            yield Gap(at, start, "the bytes are damaged")
+            yield DamagedRange(at, start, "the bytes are damaged")
         at = stop
         if kind in (PacketKind.KEYFRAME, PacketKind.RESIDUAL):
             try:
@@ -122,9 +122,9 @@ def _playable(path: Path) -> Iterator[tuple[Packet, CodedFrame] | Gap]:
                     raise ValueError(f"it restates another state than that of frame {coded.frame}")
                 yield packet, coded
             except ValueError as error:
-                yield Gap(start, stop, str(error))
+                yield DamagedRange(start, stop, str(error))
     if at < len(data):
-        yield Gap(at, len(data), "the bytes are damaged or cut off")
+        yield DamagedRange(at, len(data), "the bytes are damaged or cut off")
 
 
 def _intact(data: bytes) -> Iterator[tuple[int, int, int]]:

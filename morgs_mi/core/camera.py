@@ -1,4 +1,4 @@
-"""The camera value that every other room speaks.
+"""The pinhole camera.
 
 Notation: x_cam = R x_world + t with `viewmat = [R t; 0 1]` (OpenCV: x right, y down, z forward), and a
 pixel is (fx x/z + cx, fy y/z + cy). Pixel centres lie at +0.5, so the image spans [0, width] x [0, height].
@@ -93,6 +93,36 @@ class Camera:
     def to_world(self) -> np.ndarray:
         """Mitsuba's `to_world` matrix [4, 4]: camera -> world with x to the left and y up."""
         return np.linalg.inv(np.asarray(self.viewmat, dtype=np.float64)) @ _OPENCV_FROM_MITSUBA
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pixel positions [..., 2] and the depths z [...] of world points [..., 3].
+
+        A point with z <= 0 is behind the camera and its pixel position is meaningless.
+        """
+        V = np.asarray(self.viewmat, dtype=np.float64)
+        local = points @ V[:3, :3].T + V[:3, 3]
+        return (local @ self.K.T)[..., :2] / local[..., 2:], local[..., 2]
+
+    def unproject(self, pixels: np.ndarray, depths: np.ndarray) -> np.ndarray:
+        """Return the world points [..., 3] at pixel positions [..., 2] and depths z [...]: the inverse of `project`."""
+        V, K = np.asarray(self.viewmat, dtype=np.float64), self.K
+        x, y = (pixels[..., 0] - K[0, 2]) / K[0, 0], (pixels[..., 1] - K[1, 2]) / K[1, 1]
+        local = np.stack([x, y, np.ones_like(x)], axis=-1) * np.asarray(depths)[..., None]
+        return (local - V[:3, 3]) @ V[:3, :3]
+
+    def rays(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the origin [3] and the unit directions [..., 3] of the rays through pixel positions [..., 2]."""
+        directions = self.unproject(pixels, np.ones(np.shape(pixels)[:-1])) - self.position
+        return self.position, directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+
+    def projection_jacobian(self, points: np.ndarray) -> np.ndarray:
+        """Return d(pixel) / d(point) [N, 2, 3] at world points [N, 3]; zero for points behind the near plane."""
+        V = np.asarray(self.viewmat, dtype=np.float64)
+        x, y, z = (points @ V[:3, :3].T + V[:3, 3]).T
+        inverse = np.where(z > self.near, 1 / np.maximum(z, self.near), 0)
+        fx, fy, zero = self.K[0, 0] * inverse, self.K[1, 1] * inverse, np.zeros_like(z)
+        J = np.stack([fx, zero, -fx * x * inverse, zero, fy, -fy * y * inverse], axis=1).reshape(-1, 2, 3)
+        return J @ V[:3, :3]
 
     def resized(self, width: int, height: int) -> Camera:
         """Return the same view on a grid of width x height pixels (intrinsics scaled to match)."""

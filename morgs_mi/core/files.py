@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-__all__ = ["finite", "new_folder", "whole", "write_json"]
+__all__ = ["atomic_folder", "finite", "whole", "write_json"]
 
 
 @contextmanager
@@ -51,7 +51,7 @@ def whole(path: str | os.PathLike[str], place: str) -> Iterator[Path]:
 
 
 @contextmanager
-def new_folder(path: str | os.PathLike[str], place: str) -> Iterator[Path]:
+def atomic_folder(path: str | os.PathLike[str], place: str) -> Iterator[Path]:
     """Make a folder, and those above, under another name, which becomes `path` as in `whole`.
 
     Raises:

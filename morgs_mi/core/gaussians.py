@@ -13,7 +13,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-__all__ = ["ActivatedGaussians", "Gaussians", "repeated", "sigmoid", "tensor_rows"]
+from morgs_mi.core.attributes import ATTRIBUTES, BY_ACTIVATED_NAME, sigmoid
+
+__all__ = ["ActivatedGaussians", "Gaussians", "repeat_each", "tensor_rows"]
 
 
 class ActivatedGaussians(Protocol):
@@ -72,12 +74,7 @@ def tensor_rows(tensor: Any, index: Any) -> list[Any]:
     return [dr.gather(mi.Float, tensor.array, index * size + k, mode=mode) for k in range(size)]
 
 
-def sigmoid(x: Any) -> Any:
-    """Return 1 / (1 + exp(-x)); finite with a finite gradient for every finite x."""
-    return 0.5 + 0.5 * dr.tanh(0.5 * x)
-
-
-def repeated(x: Any, count: int) -> Any:
+def repeat_each(x: Any, count: int) -> Any:
     """Return every element of a float [N] `count` times in a row, [N * count].
 
     Dr.Jit's own `repeat` gathers, so its adjoint adds atomically, in an order of its own; this one sums blocks.
@@ -111,14 +108,6 @@ def _aligned_tensor(value: Any) -> Any:
         tensor = tensor * dr.opaque(mi.Float, 1)
         dr.eval(tensor)
     return tensor
-
-
-# Activated name -> what is optimised, and the function between them.
-_ACTIVATIONS = {
-    "scales": ("log_scales", dr.exp),
-    "opacities": ("logit_opacities", sigmoid),
-    "confidence": ("logit_confidence", sigmoid),
-}
 
 
 @dataclass(frozen=True)
@@ -156,14 +145,14 @@ class Gaussians:
             if value is not None and not dr.is_tensor_v(value):
                 object.__setattr__(self, f.name, _aligned_tensor(value))
         N = len(self)
-        tails = {"means": (3,), "log_scales": (3,), "quats": (4,), "logit_opacities": ()}
-        tails |= {"motion": (3,), "logit_confidence": (), "offset": (3,)}
-        for name, tail in tails.items():
-            value = getattr(self, name)
+        for attribute in ATTRIBUTES:
+            if attribute.activated_name == "sh_coeffs":  # two rows in one tensor, checked below
+                continue
+            value, tail = getattr(self, attribute.name), attribute.shape
             if value is not None and tuple(value.shape) != (N, *tail):
                 expected = ", ".join(["N", *map(str, tail)])
                 raise ValueError(
-                    f"Gaussians(): `{name}` must be [{expected}] with N={N}, got {tuple(value.shape)}; "
+                    f"Gaussians(): `{attribute.name}` must be [{expected}] with N={N}, got {tuple(value.shape)}; "
                     "all attributes describe the same Gaussians."
                 )
         shape = tuple(self.sh_coeffs.shape)
@@ -204,6 +193,16 @@ class Gaussians:
         """Motion confidence [N] in (0, 1), or None."""
         return None if self.logit_confidence is None else sigmoid(self.logit_confidence)
 
+    def __getattr__(self, name: str) -> Any:
+        """Return the activated value of an attribute of the table that has no property of its own, or None."""
+        attribute = BY_ACTIVATED_NAME.get(name)
+        if attribute is None or attribute.name == name:
+            raise AttributeError(
+                f"Gaussians has no attribute {name!r}; see morgs_mi.core.attributes for those that exist."
+            )
+        value = getattr(self, attribute.name)
+        return None if value is None else attribute.activation.function(value)
+
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""
@@ -223,9 +222,10 @@ class Gaussians:
 
     def rows(self, name: str, index: Any) -> list[Any]:
         """Return an activated attribute of the Gaussians at `index` (see `tensor_rows`): read first, then activated."""
-        raw, activation = _ACTIVATIONS.get(name, (name, None))
-        columns = tensor_rows(getattr(self, raw), index)
-        return [activation(column) for column in columns] if activation else columns
+        if name == "sh_coeffs":
+            return tensor_rows(self.sh_coeffs, index)
+        attribute = BY_ACTIVATED_NAME[name]
+        return [attribute.activation.function(column) for column in tensor_rows(getattr(self, attribute.name), index)]
 
     def select(self, index: Any) -> Gaussians:
         """Return the Gaussians at `index` [M] (integers, or a mask [N]); gradients are not carried."""

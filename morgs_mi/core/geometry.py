@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.gaussians import Gaussians
 
-__all__ = ["colors_towards", "covariances", "rotated", "sh_basis", "unit_quats"]
+__all__ = ["colors_seen_from", "covariances", "rotated", "sh_basis", "unit_quats"]
 
 
 def unit_quats(gaussians: Gaussians) -> np.ndarray:
@@ -38,7 +38,7 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     )
 
 
-def colors_towards(gaussians: Gaussians, eye: np.ndarray) -> np.ndarray:
+def colors_seen_from(gaussians: Gaussians, eye: np.ndarray) -> np.ndarray:
     """Return the display-referred colours [N, 3] that a camera at `eye` [3] sees, not clamped from above."""
     raw = gaussians.numpy()
     directions = raw["means"] - np.asarray(eye, np.float32)

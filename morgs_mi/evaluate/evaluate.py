@@ -23,27 +23,27 @@ from morgs_mi.codec.packets import CodedFrame, coded_frames
 from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.metrics import WINDOW, endpoint_error, iou, mean_over, psnr_of, ssim_map, unit_pair
-from morgs_mi.evaluate.motion3d import judge_motion
+from morgs_mi.evaluate.motion3d import evaluate_motion
 from morgs_mi.evaluate.perception import delta_e_map, flip_map
 from morgs_mi.evaluate.temporal import StillVariation, recorded_change, slope
 from morgs_mi.playback.player import (
     has_confidence,
-    open_recording,
     open_stream,
+    open_stream_capture,
     playback,
     render,
     render_config,
-    truth_on,
+    truth_for_camera,
 )
-from morgs_mi.playback.visualise import as_picture
-from morgs_mi.synth.ground_truth import Tracks, Truth, load_tracks, load_truth
+from morgs_mi.playback.visualise import to_uint8
+from morgs_mi.synth.ground_truth import GroundTruth, Tracks, load_tracks, load_truth
 
-__all__ = ["MOTION_SCORES", "PICTURE_SCORES", "REGIONS", "SECONDS", "evaluate_stream"]
+__all__ = ["IMAGE_SCORES", "MOTION_SCORES", "REGIONS", "SECONDS", "evaluate_stream"]
 
 REGIONS = ("", "_moving", "_still")
-PICTURE_SCORES = ("psnr", "ssim", "flip", "delta_e", "lpips")
+IMAGE_SCORES = ("psnr", "ssim", "flip", "delta_e", "lpips")
 MOTION_SCORES = ("motion_error", "motion_error_moving", "motion_error_still", "true_motion_moving", "confidence_iou")
-_SCORES = (*(name + region for name in PICTURE_SCORES for region in REGIONS), *MOTION_SCORES)
+_SCORES = (*(name + region for name in IMAGE_SCORES for region in REGIONS), *MOTION_SCORES)
 _NAN = float("nan")
 # Compression flickers: after a hundred frames half the pixels of a real recording have changed once.
 _FALSE_ALARMS = 0.02
@@ -60,7 +60,7 @@ class _Seen:
     recorded: np.ndarray
     valid: np.ndarray | None
     moving: np.ndarray | None
-    truth: Truth | None
+    truth: GroundTruth | None
 
 
 def evaluate_stream(
@@ -99,7 +99,7 @@ def evaluate_stream(
         read += 1
     if not packets:
         raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
-    recording = open_recording(stream, capture, list(packets))
+    recording = open_stream_capture(stream, capture, list(packets))
     seconds = _seconds(stream.path)
     views = recording.train_views if recording.test_view is None else (recording.test_view,)
     channels = ("color", "motion", *(("confidence",) if has_confidence(stream) else ()))
@@ -121,7 +121,7 @@ def evaluate_stream(
             images = render(gaussians, camera, channels, config)
             seen = _seen(recording, camera, index, picture_then, last and last[view], recording.masks[view])
             # A decoder shows 8 bits.
-            picture = as_picture(images["color"])
+            picture = to_uint8(images["color"])
             variations[view].add(picture, seen.recorded, _or_nothing(seen))
             truth = seen.truth if kind == PacketKind.RESIDUAL else None
             scores[camera.name] = _picture_scores(picture, seen, lpips) | _motion_scores(images, truth)
@@ -159,7 +159,7 @@ def _seen(
     valid: np.ndarray | None,
 ) -> _Seen:
     """Gather what is known about a view of a frame."""
-    truth = truth_on(recording, camera, frame)
+    truth = truth_for_camera(recording, camera, frame)
     if truth is not None:
         return _Seen(recorded, valid, truth.mask, truth)
     moving = None if last is None or recording.truth is not None else recorded_change(last, recorded)
@@ -180,7 +180,7 @@ def _picture_scores(picture: np.ndarray, seen: _Seen, lpips: Lpips | None) -> di
     maps = {"psnr": np.square(a - b), "flip": flip_map(a, b), "delta_e": delta_e_map(a, b)}
     if min(picture.shape[:2]) >= WINDOW:
         maps["ssim"] = ssim_map(a, b)
-    scores = dict.fromkeys([name + region for name in PICTURE_SCORES for region in REGIONS], _NAN)
+    scores = dict.fromkeys([name + region for name in IMAGE_SCORES for region in REGIONS], _NAN)
     for name, values in maps.items():
         finish = psnr_of if name == "psnr" else float
         scores |= {name + r: finish(mean_over(values, mask)) for r, mask in zip(REGIONS, regions, strict=True)}
@@ -193,7 +193,7 @@ def _picture_scores(picture: np.ndarray, seen: _Seen, lpips: Lpips | None) -> di
     return scores
 
 
-def _motion_scores(images: Mapping[str, np.ndarray], truth: Truth | None) -> dict[str, float]:
+def _motion_scores(images: Mapping[str, np.ndarray], truth: GroundTruth | None) -> dict[str, float]:
     """Return how far rendered motion and confidence are from the truth."""
     if truth is None:
         return dict.fromkeys(MOTION_SCORES, _NAN)
@@ -207,7 +207,7 @@ def _motion_scores(images: Mapping[str, np.ndarray], truth: Truth | None) -> dic
 def _motion_3d(
     recording: Capture, tracks: Tracks | None, before: CodedFrame | None, now: CodedFrame
 ) -> dict[str, float]:
-    """Return `judge_motion` of those who live in both frames, empty without truth."""
+    """Return `evaluate_motion` of those who live in both frames, empty without truth."""
     frame = now.frame
     if tracks is None or recording.truth is None or before is None or frame >= tracks.points.shape[1]:
         return {}
@@ -219,7 +219,7 @@ def _motion_3d(
     old = before.gaussians.numpy()["means"][then].astype(float)
     new = now.gaussians.numpy()["means"][later].astype(float)
     points = tracks.points[:, frame - 1], tracks.points[:, frame], tracks.ids
-    return judge_motion(old, new - old, np.asarray(before.gaussians.opacities)[then], points, views)
+    return evaluate_motion(old, new - old, np.asarray(before.gaussians.opacities)[then], points, views)
 
 
 def _tracks(recording: Capture) -> Tracks | None:

@@ -12,24 +12,24 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.playback.player import (
     OFFSET_SCALE,
-    channel_picture,
+    channel_image,
     has_confidence,
     has_offset,
-    open_recording,
     open_stream,
+    open_stream_capture,
     render_stream,
-    truth_on,
+    truth_for_camera,
 )
 from morgs_mi.playback.visualise import (
-    as_picture,
+    confidence_image,
     confidence_legend,
-    confidence_picture,
     contact_sheet,
     label,
+    motion_image,
     motion_legend,
-    motion_picture,
     side_by_side,
     time_slice,
+    to_uint8,
     write_png,
 )
 
@@ -63,13 +63,13 @@ def draw_stream(
     Raises:
         FileNotFoundError: the stream or the capture is missing.
         OSError: a file cannot be written.
-        ValueError: as `open_recording`; or the stream is broken or has no frame.
+        ValueError: as `open_stream_capture`; or the stream is broken or has no frame.
     """
     stream = open_stream(out)
     frames = [packet.frame for packet in stream]
     if not frames:
         raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
-    recording = open_recording(stream, capture, frames)
+    recording = open_stream_capture(stream, capture, frames)
     view = recording.train_views[0] if recording.test_view is None else recording.test_view
     camera = stream.cameras[view]
     # Nothing moves up to the first frame.
@@ -83,21 +83,21 @@ def draw_stream(
     played = render_stream(stream, camera, ("color", "motion", *maps))
     for (index, images), frame in zip(played, recording.partial_frames(frames[0], frames[-1] + 1), strict=False):
         # Copies, for the pictures of a long clip do not all fit in memory.
-        shown.append(as_picture(images["color"])[:, column].copy())
+        shown.append(to_uint8(images["color"])[:, column].copy())
         seen = frame.images[view]
         recorded.append(np.zeros_like(shown[-1]) if seen is None else seen[:, column].copy())
         if index in chosen:
-            truth = truth_on(recording, camera, index)
+            truth = truth_for_camera(recording, camera, index)
             true_motion, mask = (None, None) if truth is None else (truth.motion, truth.mask)
             moved = {"true motion": true_motion, "motion": images["motion"]}
-            motions.append(_row(index, partial(motion_picture, scale_px=scale), moved))
+            motions.append(_row(index, partial(motion_image, scale_px=scale), moved))
             if trusted:
                 found = {"true mask": mask, "confidence": images["confidence"]}
-                confidences.append(_row(index, confidence_picture, found))
+                confidences.append(_row(index, confidence_image, found))
             if corrected:
-                whole = channel_picture("motion", images["motion"], scale)
-                part = channel_picture("offset", images["offset"], scale)
-                offsets.append(_row(index, as_picture, {"motion": whole, "its offset": part}))
+                whole = channel_image("motion", images["motion"], scale)
+                part = channel_image("offset", images["offset"], scale)
+                offsets.append(_row(index, to_uint8, {"motion": whole, "its offset": part}))
         if progress is not None:
             progress(len(shown), len(frames))
     sheets = {"slice": _slices(sight, column, recorded, shown), "motion": _with_legend(motions, motion_legend(scale))}
@@ -114,7 +114,7 @@ def draw_stream(
 
 def motion_scale(capture: Capture, camera: Camera) -> float:
     """Return a speed in pixels that few of the camera's pixels exceed; without truth 3 % of its width."""
-    truths = [truth_on(capture, camera, frame) for frame in range(capture.num_frames)]
+    truths = [truth_for_camera(capture, camera, frame) for frame in range(capture.num_frames)]
     speeds = [np.linalg.norm(truth.motion[truth.mask], axis=-1) for truth in truths[1:] if truth is not None]
     moving = np.concatenate(speeds) if speeds else np.zeros(0)
     return float(np.percentile(moving, 95)) if moving.size else 0.03 * camera.width

@@ -19,9 +19,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.synth.ground_truth import Truth, project
+from morgs_mi.synth.ground_truth import GroundTruth, project
 
-__all__ = ["compare_motion", "judge_motion", "rigid_motions", "surface_ids"]
+__all__ = ["compare_motion", "evaluate_motion", "rigid_motions", "surface_ids"]
 
 _DEPTH_TOLERANCE = 0.01
 _LEAST_OPACITY = 0.1
@@ -30,12 +30,12 @@ _LEAST_SHARE = 0.1
 _RIGID, _FLAT = 1e-4, 1e-3
 
 
-def judge_motion(
+def evaluate_motion(
     means: np.ndarray,
     displacements: np.ndarray,
     opacities: np.ndarray,
     tracks: tuple[np.ndarray, np.ndarray, np.ndarray],
-    views: Sequence[tuple[Camera, Truth]],
+    views: Sequence[tuple[Camera, GroundTruth]],
 ) -> dict[str, float]:
     """Compare the displacements of one frame with the truth; see the module for who is judged.
 
@@ -85,7 +85,7 @@ def compare_motion(motion: np.ndarray, truth: np.ndarray) -> dict[str, float]:
     }
 
 
-def surface_ids(points: np.ndarray, views: Sequence[tuple[Camera, Truth]]) -> np.ndarray:
+def surface_ids(points: np.ndarray, views: Sequence[tuple[Camera, GroundTruth]]) -> np.ndarray:
     """Return the id of the object on whose visible surface each point [N, 3] lies, -1 for none or for several."""
     ids = np.full(len(points), -1, np.int64)
     several = np.zeros(len(points), bool)

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from morgs_mi.evaluate.evaluate import REGIONS
 
-__all__ = ["figure", "judgement_sentences", "judgement_tables"]
+__all__ = ["evaluation_summary", "evaluation_tables", "figure"]
 
 _PICTURE = (("PSNR, dB", "psnr", 2), ("SSIM", "ssim", 4), ("FLIP", "flip", 4), ("dE2000", "delta_e", 2))
 _PICTURE += (("LPIPS", "lpips", 4), ("flow error, px", "motion_error", 2))
@@ -23,7 +23,7 @@ def figure(value: float | None, digits: int) -> str:
     return "-" if value is None or value != value else f"{value:.{digits}f}"
 
 
-def judgement_tables(result: Mapping[str, Any]) -> Iterator[Table]:
+def evaluation_tables(result: Mapping[str, Any]) -> Iterator[Table]:
     """Yield a table of the frames and one of the regions."""
     frames = _table("frame by frame", "frame", *(title for title, *_ in _FRAME), "kB", "s")
     for row in result["frames"]:
@@ -44,7 +44,7 @@ def judgement_tables(result: Mapping[str, Any]) -> Iterator[Table]:
     yield regions
 
 
-def judgement_sentences(result: Mapping[str, Any]) -> Iterator[str]:
+def evaluation_summary(result: Mapping[str, Any]) -> Iterator[str]:
     """Yield what fits no table: time, space, drift, 3D motion."""
     size, seconds, play, psnr = result["bytes"], result["seconds"], result["playback"], result["psnr"]
     if not result["held_out"]:

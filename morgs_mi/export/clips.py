@@ -9,12 +9,12 @@ import numpy as np
 
 from morgs_mi.codec.packets import play, seek
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.files import new_folder
+from morgs_mi.core.files import atomic_folder
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.export.frames import PLAYABLE, even
 from morgs_mi.export.paths import CameraPath
 from morgs_mi.io.video_writer import write_video
-from morgs_mi.playback.player import channel_picture, render, render_config
+from morgs_mi.playback.player import channel_image, render, render_config
 from morgs_mi.playback.visualise import side_by_side
 
 __all__ = ["chosen_frames", "frame_numbers", "write_each", "write_flight"]
@@ -81,7 +81,7 @@ def write_each(
         OSError: the folder exists, or a file cannot be written.
     """
     wanted, done = set(frames), 0
-    with new_folder(folder, "write_each()") as partial:
+    with atomic_folder(folder, "write_each()") as partial:
         for frame, gaussians in play(stream):
             if frame in wanted:
                 write(partial / f"{frame:04d}{suffix}", gaussians)
@@ -124,7 +124,7 @@ def write_flight(
     def pictures() -> Iterator[np.ndarray]:
         for i, gaussians in zip(range(count), _over_time(stream, freeze), strict=False):
             images = render(gaussians, path.at(i / stream.fps), channels, config)
-            yield even(side_by_side([channel_picture(name, image) for name, image in images.items()]))
+            yield even(side_by_side([channel_image(name, image) for name, image in images.items()]))
             if progress is not None:
                 progress(i + 1, count)
 

@@ -9,10 +9,10 @@ import numpy as np
 
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.files import new_folder
+from morgs_mi.core.files import atomic_folder
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import write_video
-from morgs_mi.playback.player import channel_picture, render_stream
+from morgs_mi.playback.player import channel_image, render_stream
 from morgs_mi.playback.visualise import side_by_side, write_png
 
 __all__ = ["PLAYABLE", "even", "exr_channels", "linear_light", "write_frames"]
@@ -68,7 +68,7 @@ def write_frames(
     if video:
         write_video(output, (even(_picture(images)) for _, images in frames()), stream.fps, PLAYABLE)
         return
-    with new_folder(output, "write_frames()") as folder:
+    with atomic_folder(output, "write_frames()") as folder:
         for frame, images in frames():
             if png:
                 write_png(folder / f"{frame:04d}.png", _picture(images))
@@ -94,7 +94,7 @@ def even(picture: np.ndarray) -> np.ndarray:
 
 
 def _picture(images: Mapping[str, np.ndarray]) -> np.ndarray:
-    return side_by_side([channel_picture(name, image) for name, image in images.items()])
+    return side_by_side([channel_image(name, image) for name, image in images.items()])
 
 
 def linear_light(encoded: np.ndarray) -> np.ndarray:

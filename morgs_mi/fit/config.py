@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from math import inf
 
-__all__ = ["DensityConfig", "FitConfig", "Rates"]
+__all__ = ["DensityConfig", "FitConfig", "LearningRates"]
 
 
 @dataclass(frozen=True)
-class Rates:
+class LearningRates:
     """Adam's learning rate of every parameter, per step.
 
     The defaults are those of a later frame. They were chosen on the clip `spheres`, held-out view, from 1x to
@@ -97,19 +97,21 @@ class FitConfig:
     """Steps that learn the confidence of the first frame from the masks of its key views."""
     epochs: int = 8
     """Passes over all training views for every later frame; the paper's small variant takes 5."""
-    leave_out_still: bool = True
+    skip_static: bool = True
     """Leave out of a later frame which Gaussians, blocks of pixels and views cannot have changed; see `part`."""
-    settled: float = 0.0
+    early_stopping_tolerance: float = 0.0
     """A later frame ends once a pass over its views lessens L_recon by less than this share of it; 0: when it grows."""
     dssim_weight: float = 0.2
     """lambda of eq. 2."""
     density: DensityConfig = field(default_factory=DensityConfig)
     """Births and deaths."""
-    rates: Rates = field(default_factory=Rates)
+    rates: LearningRates = field(default_factory=LearningRates)
     """Learning rates of every later frame; `rates_at` makes them those of an epoch."""
-    falling_rates: bool = True
+    decay_means_rate: bool = True
     """Let the rates of places fall within a later frame, from its third epoch on."""
-    first_rates: Rates = field(default_factory=lambda: Rates(means=2e-3, scales=0.02, quats=0.02, opacities=0.2))
+    first_frame_rates: LearningRates = field(
+        default_factory=lambda: LearningRates(means=2e-3, scales=0.02, quats=0.02, opacities=0.2)
+    )
     """Learning rates at the start of the first frame; they fall to a tenth of that to its end."""
 
     def __post_init__(self) -> None:
@@ -119,15 +121,17 @@ class FitConfig:
         if self.sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"FitConfig(): `sh_degree` must be 0 to 3, got {self.sh_degree}.")
 
-    def rates_at(self, epoch: int) -> Rates:
+    def rates_at(self, epoch: int) -> LearningRates:
         """Return the learning rates of a later frame's epoch, counted from 0.
 
         Those of places are those of `rates` in the first two epochs, and then fall like 1 / (epoch + 1), for who is
-        nearly in its place must not leave it again; without `falling_rates` they stay. All others are larger by
+        nearly in its place must not leave it again; without `decay_means_rate` they stay. All others are larger by
         (8 / epochs)^1/2 throughout: fewer steps have to go as far.
         """
-        places, others = min(1.0, 2 / (epoch + 1)) if self.falling_rates else 1.0, (8 / self.epochs) ** 0.5
-        return Rates(**{n: (places if n == "means" else others) * rate for n, rate in asdict(self.rates).items()})
+        places, others = min(1.0, 2 / (epoch + 1)) if self.decay_means_rate else 1.0, (8 / self.epochs) ** 0.5
+        return LearningRates(
+            **{n: (places if n == "means" else others) * rate for n, rate in asdict(self.rates).items()}
+        )
 
     @property
     def first_count(self) -> int:

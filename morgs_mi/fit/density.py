@@ -27,14 +27,14 @@ from drjit.opt import Adam
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.config import DensityConfig
 from morgs_mi.fit.optimise import replace_parameter
-from morgs_mi.losses.attribution import Need
+from morgs_mi.losses.attribution import DensificationScores
 
 __all__ = [
-    "Plan",
+    "DensityPlan",
     "apply_plan",
     "plan_additions",
     "plan_growth",
-    "regrow",
+    "resize_optimizer",
 ]
 
 _SHRINK = float(np.log(1.6))
@@ -43,7 +43,7 @@ _MOST_OPAQUE = 1 - 1e-6
 
 
 @dataclass(frozen=True)
-class Plan:
+class DensityPlan:
     """Who is there after a step of density control; see the module for the order.
 
     Attributes:
@@ -69,13 +69,13 @@ class Plan:
 
 def plan_growth(
     gaussians: Gaussians,
-    need: Need,
+    need: DensificationScores,
     births: int,
     limit: int,
     extent: float,
     config: DensityConfig,
     rng: np.random.Generator,
-) -> Plan:
+) -> DensityPlan:
     """Decide who dies and who is cloned or split in the first frame.
 
     Args:
@@ -97,8 +97,12 @@ def plan_growth(
 
 
 def plan_additions(
-    gaussians: Gaussians, need: Need, config: DensityConfig, rng: np.random.Generator, num_others: int = 0
-) -> Plan:
+    gaussians: Gaussians,
+    need: DensificationScores,
+    config: DensityConfig,
+    rng: np.random.Generator,
+    num_others: int = 0,
+) -> DensityPlan:
     """Decide who dies and beside whom a faint Gaussian is added in a later frame.
 
     Args:
@@ -117,7 +121,7 @@ def plan_additions(
 
 
 def _choose(
-    gaussians: Gaussians, need: Need, births: int, limit: int, least_error: float, config: DensityConfig
+    gaussians: Gaussians, need: DensificationScores, births: int, limit: int, least_error: float, config: DensityConfig
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return who lives on, and who of them becomes a parent: those with the largest error.
 
@@ -140,13 +144,13 @@ def _plan(
     log_scale: np.ndarray,
     logit_opacity: np.ndarray,
     rng: np.random.Generator,
-) -> Plan:
+) -> DensityPlan:
     """Return the plan that adds `log_scale` and `logit_opacity` [M] and draws the places of the births."""
     parent, source = np.concatenate([survivors, chosen]), np.concatenate([survivors, np.full(len(chosen), -1)])
     shift = np.zeros((len(parent), 3))
     shift[len(survivors) :] = _draw(np.asarray(gaussians.quats)[chosen], np.asarray(gaussians.scales)[chosen], rng)
     edits = {"means": shift, "log_scales": np.repeat(log_scale[:, None], 3, axis=1), "logit_opacities": logit_opacity}
-    return Plan(parent, source, {name: edit.astype(np.float32) for name, edit in edits.items()})
+    return DensityPlan(parent, source, {name: edit.astype(np.float32) for name, edit in edits.items()})
 
 
 def _draw(quats: np.ndarray, scales: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -163,14 +167,14 @@ def _logit(x: np.ndarray | float) -> np.ndarray:
     return np.log(x) - np.log1p(-np.asarray(x, float))
 
 
-def apply_plan(gaussians: Gaussians, plan: Plan) -> Gaussians:
+def apply_plan(gaussians: Gaussians, plan: DensityPlan) -> Gaussians:
     """Return the M Gaussians of a plan."""
     chosen = gaussians.select(plan.parent)
     columns = chosen.numpy()
     return replace(chosen, **{name: columns[name] + edit for name, edit in plan.edits.items()})
 
 
-def regrow(optimizer: Adam, plan: Plan, edits: Mapping[str, np.ndarray] | None = None) -> None:
+def resize_optimizer(optimizer: Adam, plan: DensityPlan, edits: Mapping[str, np.ndarray] | None = None) -> None:
     """Give an optimiser's parameters [N, ...] the rows of a plan [M, ...]; moments go along, those of births are 0.
 
     Args:

@@ -15,13 +15,13 @@ from drjit.opt import Adam
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.density import plan_growth, regrow
+from morgs_mi.fit.density import plan_growth, resize_optimizer
 from morgs_mi.fit.optimise import adam, optimise, replace_parameter, values_of, view_order
-from morgs_mi.losses.attribution import find_need
+from morgs_mi.losses.attribution import densification_scores
 from morgs_mi.losses.losses import mask_loss, recon_loss
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.residual import join_sh, split_sh
-from morgs_mi.render.active_view import Window
+from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 
@@ -61,23 +61,23 @@ def fit_first_frame(
     raises = [band * steps // 30 for band in range(1, degree + 1)]
     rounds = density_rounds(config)
     cuts = sorted({0, *raises, *rounds, steps})
-    rates = config.first_rates.by_parameter(extent)
+    rates = config.first_frame_rates.by_parameter(extent)
     views = view_order(len(cameras), steps, rng)
     optimizer = adam(_static(gaussians))
-    windows = [Window(camera, render) for camera in cameras]
+    windows = [ActiveView(camera, render) for camera in cameras]
     for start, stop in pairwise(cuts):
         for _ in range(raises.count(start)):
             _add_band(optimizer, gaussians)
         if start in rounds:
             now = _assemble(gaussians, values_of(optimizer))
-            need = find_need(now, windows, targets)
+            need = densification_scores(now, windows, targets)
             births = -(-max(config.num_gaussians - len(now), 0) // (len(rounds) - rounds.index(start)))
             plan = plan_growth(now, need, births, config.num_gaussians, extent, config.density, rng)
             gaussians = gaussians.select(plan.parent)
-            regrow(optimizer, plan, plan.edits)
+            resize_optimizer(optimizer, plan, plan.edits)
 
         def losses_of(values: Mapping, view: int, shape: Gaussians = gaussians) -> dict:
-            image = windows[view].draw(_assemble(shape, values))
+            image = windows[view].render(_assemble(shape, values))
             return {"recon": recon_loss(image.color, targets[view], config.dssim_weight)}
 
         losses = optimise(

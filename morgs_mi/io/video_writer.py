@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from morgs_mi.core.files import new_folder, whole
+from morgs_mi.core.files import atomic_folder, whole
 
 __all__ = ["write_video"]
 
@@ -36,7 +36,7 @@ def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float, code
             partial.parent.mkdir(parents=True, exist_ok=True)
             _write_file(partial, path, frames, fps, codec)
         return
-    with new_folder(path, "write_video()") as folder:
+    with atomic_folder(path, "write_video()") as folder:
         for i, frame in enumerate(_checked(path, frames)):
             # Not cv2.imwrite, which says nothing of why it failed.
             png = cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))[1]

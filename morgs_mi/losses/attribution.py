@@ -13,16 +13,16 @@ import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.losses.ssim import Target
-from morgs_mi.render.active_view import Window
+from morgs_mi.render.active_view import ActiveView
 
-__all__ = ["NOISE", "Need", "error_shares", "find_need"]
+__all__ = ["NOISE_TOLERANCE", "DensificationScores", "attribute_error", "densification_scores"]
 
 # Normal noise, independent in three colours, exceeds so many times its median error at 3 of 10,000 pixels.
-NOISE = 3.0
+NOISE_TOLERANCE = 3.0
 
 
 @dataclass(frozen=True)
-class Need:
+class DensificationScores:
     """What the pictures say of N Gaussians.
 
     Attributes:
@@ -34,9 +34,9 @@ class Need:
     weight: np.ndarray
 
 
-def find_need(
-    gaussians: Gaussians, windows: Sequence[Window], targets: Sequence[Target], tolerance: float = 0.0
-) -> Need:
+def densification_scores(
+    gaussians: Gaussians, windows: Sequence[ActiveView], targets: Sequence[Target], tolerance: float = 0.0
+) -> DensificationScores:
     """Render every view, and give each Gaussian its share of the errors and of the pixels (E and W).
 
     Args:
@@ -46,12 +46,12 @@ def find_need(
         tolerance: in medians of a picture's error; what does not exceed it does not count.
     """
     gaussians = gaussians.detached()
-    shares = [error_shares(gaussians, *view, tolerance) for view in zip(windows, targets, strict=True)]
+    shares = [attribute_error(gaussians, *view, tolerance) for view in zip(windows, targets, strict=True)]
     error, weight = np.max([np.zeros((len(gaussians), 2), np.float32), *shares], axis=0).T
-    return Need(error, weight)
+    return DensificationScores(error, weight)
 
 
-def error_shares(gaussians: Gaussians, window: Window, target: Target, tolerance: float = 0.0) -> np.ndarray:
+def attribute_error(gaussians: Gaussians, window: ActiveView, target: Target, tolerance: float = 0.0) -> np.ndarray:
     """Render a view, and return each Gaussian's E and W there (see above), [N, 2], in px of full contrast and in px.
 
     Args:
@@ -60,7 +60,7 @@ def error_shares(gaussians: Gaussians, window: Window, target: Target, tolerance
         target: its picture.
         tolerance: in medians of the picture's error; what does not exceed it does not count.
     """
-    wrong = np.abs(target.difference(window.draw(gaussians).color, window.region)).mean(axis=-1)
+    wrong = np.abs(target.difference(window.render(gaussians).color, window.region)).mean(axis=-1)
     seen = wrong[wrong > 0]  # where masked, it is 0
     wrong = np.maximum(wrong - tolerance * np.median(seen), 0) if tolerance and len(seen) else wrong
     return window.backproject(gaussians, np.stack([wrong, np.ones_like(wrong)], axis=-1))

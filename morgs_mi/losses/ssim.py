@@ -37,7 +37,7 @@ from morgs_mi.losses.ssim_layout import (
 )
 from morgs_mi.render.loops import on_aligned_stack
 from morgs_mi.render.recording import recorded
-from morgs_mi.render.region import Region, owned
+from morgs_mi.render.region import Region, owned_copy
 
 __all__ = ["OnRegion", "Target", "WholeView"]
 
@@ -73,14 +73,14 @@ class Target:
         self.parts: dict[Region, tuple[Any, ...]] = {}
 
     def _planes(self, picture: np.ndarray) -> Any:
-        planes = self.planes.of(owned(mi.Float(picture.ravel())))
+        planes = self.planes.of(owned_copy(mi.Float(picture.ravel())))
         dr.eval(planes)
         return planes
 
     def difference(self, image: Any, region: Region | None = None) -> np.ndarray:
         """Return this picture minus another, [H, W, 3] or on a region of it; 0 where masked."""
         if region is None or region.whole:
-            wrong = self.pixels - self.weighed(self.planes.of(owned(dr.detach(image).array)))
+            wrong = self.pixels - self.weighed(self.planes.of(owned_copy(dr.detach(image).array)))
             return np.asarray(self.planes.picture(wrong)).reshape(self.shape)
         places, inside, *_ = self.part(region)
         own = dr.gather(mi.Float, self.pixels, places, active=inside)
@@ -95,7 +95,7 @@ class Target:
 
     def remember(self, image: Any) -> None:
         """Keep a rendered picture [H, W, 3]: it surrounds what is compared on a region from now on."""
-        self.surroundings = self.weighed(self.planes.of(owned(dr.detach(image).array)))
+        self.surroundings = self.weighed(self.planes.of(owned_copy(dr.detach(image).array)))
         dr.eval(self.surroundings)
 
     def weighed(self, values: Any, places: Any = None) -> Any:

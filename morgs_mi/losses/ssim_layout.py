@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.render.region import Region, owned, quotient
+from morgs_mi.render.region import Region, owned_copy, quotient
 
 __all__ = ["COLUMN", "RADIUS", "STRIP", "Lanes", "Planes", "Runs", "packet_type", "read_packet", "write_packet"]
 
@@ -62,7 +62,7 @@ class Planes:
         self.size = 3 * self.num_columns * height * COLUMN * STRIP
 
     def of(self, picture: Any) -> Any:
-        """Return the planes of a flat picture [H * W * 3] in memory of Dr.Jit's own (see `region.owned`)."""
+        """Return the planes of a flat picture [H * W * 3] in memory of Dr.Jit's own (see `region.owned_copy`)."""
         if self.width % STRIP == 0:
             target = dr.empty(mi.Float, self.size)
             strip, y, places = self._strips(self.num_columns * COLUMN)
@@ -116,7 +116,7 @@ class Planes:
         component = np.tile(np.arange(3), len(x) // 3)
         inside = (x < self.width) & (y < self.height)
         places = np.where(inside, _place(component, y, x, self.height, self.num_columns), 0)
-        return owned(mi.UInt32(places)), owned(mi.UInt32(inside)) != 0
+        return owned_copy(mi.UInt32(places)), owned_copy(mi.UInt32(inside)) != 0
 
     def runs(self, region: Region | None, reach: int) -> Runs:
         """Return the runs that cover a region, or the whole view, and `reach` <= 8 pixels around it."""
@@ -138,10 +138,10 @@ class Planes:
         x = np.tile(strip - 1, 3) * STRIP
         places = (_place(component, 0, x + k * STRIP, self.height, self.num_columns) // STRIP for k in (-1, 0, 1))
         lanes = Lanes(
-            tuple(owned(mi.UInt32(place)) for place in places),  # type: ignore[arg-type]
-            owned(mi.Int32(np.tile(first, 3))),
-            owned(mi.Int32(np.tile(end, 3))),
-            owned(mi.UInt32(np.tile(columns, 3))),
+            tuple(owned_copy(mi.UInt32(place)) for place in places),  # type: ignore[arg-type]
+            owned_copy(mi.Int32(np.tile(first, 3))),
+            owned_copy(mi.Int32(np.tile(end, 3))),
+            owned_copy(mi.UInt32(np.tile(columns, 3))),
         )
         return Runs(lanes, 3 * int(((end - first) * columns).sum()))
 

@@ -24,12 +24,12 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.render.active_view import Window, open_window
+from morgs_mi.render.active_view import ActiveView, make_active_view
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.projection import Splats, project
-from morgs_mi.render.region import owned
+from morgs_mi.render.region import owned_copy
 
-__all__ = ["Part", "changing_part", "standing_still", "whole_part"]
+__all__ = ["ActiveSet", "find_active_set", "full_active_set", "with_zero_motion"]
 
 _LEAST_VIEWS, _LEAST_SHARE, _MOST_SHARE, _FILLED = 1.25, 0.1, 0.5, 0.5
 # Two standard deviations of an opaque Gaussian, of whose extent three and a third reach the alpha cut-off.
@@ -41,7 +41,7 @@ _LEAST_CLUSTER = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class ActiveSet:
     """What a frame works on.
 
     Attributes:
@@ -51,35 +51,35 @@ class Part:
         num_views: V, with those that are left out.
     """
 
-    rows: np.ndarray
+    indices: np.ndarray
     num_gaussians: int
-    windows: Mapping[int, Window]
+    views: Mapping[int, ActiveView]
     num_views: int
 
     @property
-    def shares(self) -> dict[str, float]:
+    def fractions(self) -> dict[str, float]:
         """What it takes of the whole, from 0 to 1: of the Gaussians, of the views and of all their pixels."""
-        pixels = sum(window.share for window in self.windows.values()) / self.num_views
+        pixels = sum(window.pixel_fraction for window in self.views.values()) / self.num_views
         return {
-            "gaussians": len(self.rows) / max(self.num_gaussians, 1),
-            "views": len(self.windows) / self.num_views,
+            "gaussians": len(self.indices) / max(self.num_gaussians, 1),
+            "views": len(self.views) / self.num_views,
             "pixels": pixels,
         }
 
 
-def whole_part(gaussians: Gaussians, cameras: Sequence[Camera], render: RenderConfig) -> Part:
+def full_active_set(gaussians: Gaussians, cameras: Sequence[Camera], render: RenderConfig) -> ActiveSet:
     """Return the part that leaves nothing out."""
-    windows = {view: Window(camera, render) for view, camera in enumerate(cameras)}
-    return Part(np.arange(len(gaussians)), len(gaussians), windows, len(cameras))
+    windows = {view: ActiveView(camera, render) for view, camera in enumerate(cameras)}
+    return ActiveSet(np.arange(len(gaussians)), len(gaussians), windows, len(cameras))
 
 
-def changing_part(
+def find_active_set(
     gaussians: Gaussians,
     cameras: Sequence[Camera],
     changes: Sequence[np.ndarray],
     channels: Sequence[Sequence[str]],
     render: RenderConfig,
-) -> Part:
+) -> ActiveSet:
     """Return the part that may have to do with what has changed (see the module).
 
     Args:
@@ -107,13 +107,13 @@ def changing_part(
     if (more & ~chosen).any():
         chosen |= more
         drawn = [_painted(box, chosen, change.shape) for box, change in zip(boxes, changes, strict=True)]
-    still = standing_still(gaussians.select(~chosen))
+    still = with_zero_motion(gaussians.select(~chosen))
     views = enumerate(zip(cameras, drawn, channels, strict=True))
-    windows = {view: open_window(c, mask, still, names, render) for view, (c, mask, names) in views if mask.any()}
-    return Part(np.flatnonzero(chosen), len(gaussians), windows, len(cameras))
+    windows = {view: make_active_view(c, mask, still, names, render) for view, (c, mask, names) in views if mask.any()}
+    return ActiveSet(np.flatnonzero(chosen), len(gaussians), windows, len(cameras))
 
 
-def standing_still(gaussians: Gaussians) -> Gaussians:
+def with_zero_motion(gaussians: Gaussians) -> Gaussians:
     """Return Gaussians that have not moved since the frame before."""
     nothing = np.zeros((len(gaussians), 3))
     return replace(gaussians, motion=nothing, offset=nothing)
@@ -138,7 +138,7 @@ def _filled(box: tuple[Any, ...], mask: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Return the share of each box that a mask [H, W] fills [N], and whether the view looks at it at all."""
     x0, y0, x1, y1 = box
     pitch, area = dr.opaque(mi.UInt32, mask.shape[1] + 1), (x1 - x0) * (y1 - y0)
-    table = owned(mi.UInt32(cv2.integral(mask.astype(np.uint8)).astype(np.uint32).ravel()))
+    table = owned_copy(mi.UInt32(cv2.integral(mask.astype(np.uint8)).astype(np.uint32).ravel()))
 
     def before(x: Any, y: Any) -> Any:
         return dr.gather(mi.UInt32, table, y * pitch + x)

@@ -18,8 +18,8 @@ __all__ = [
     "MaskRefiner",
     "flow_mask",
     "flow_threshold",
-    "least_motion",
     "mask_refiner",
+    "motion_floor",
     "motion_mask",
     "refine_mask",
     "vote_superpixels",
@@ -40,7 +40,7 @@ SUPERPIXEL_SIDE = 8  # pixels of that width
 SUPERPIXEL_SHARE = 0.75
 
 
-def least_motion(width: int) -> float:
+def motion_floor(width: int) -> float:
     """Return the motion in pixels, in a picture so many pixels wide, below which nothing is said to move."""
     return max(FLOOR * width / REFERENCE_WIDTH, NOISE_FLOOR)
 
@@ -54,7 +54,7 @@ def flow_threshold(motion: np.ndarray, reliable: np.ndarray | None = None) -> fl
     speed = speed[reliable] if reliable is not None and reliable.any() else speed.ravel()
     median = np.median(speed)
     spread = np.median(np.abs(speed - median))
-    return float(max(least_motion(motion.shape[1]), median + 4 * spread))
+    return float(max(motion_floor(motion.shape[1]), median + 4 * spread))
 
 
 def flow_mask(motion: np.ndarray, reliable: np.ndarray | None = None) -> np.ndarray:
@@ -172,7 +172,7 @@ def motion_mask(
     Args:
         image: frame t [H, W, 3], RGB, uint8 or float in [0, 1].
         motion: [H, W, 2] in pixels on frame t's grid.
-        reliable: [H, W] bool, see `consistent`.
+        reliable: [H, W] bool, see `consistency_mask`.
         method: as `mask_refiner` takes it.
 
     Raises:

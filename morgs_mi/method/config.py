@@ -44,7 +44,7 @@ class MotionConfig:
     sam2:ENCODER.onnx,DECODER.onnx for SAM2's two networks (see docs/masks.md)."""
     key_views: int = 4
     """Cameras that get optical flow and masks."""
-    keyframe_interval: int = 5
+    mask_interval: int = 5
     """Every how many frames the masks supervise the confidence."""
     weight_flow: float = 0.01
     """lambda_flow of eq. 13, per px of endpoint error."""
@@ -59,6 +59,6 @@ class MotionConfig:
         # What is wrong with either shall be said before the first frame is fitted.
         flow_source(self.flow_method)
         mask_refiner(self.mask_method)
-        for name in ("key_views", "keyframe_interval"):
+        for name in ("key_views", "mask_interval"):
             if getattr(self, name) < 1:
                 raise ValueError(f"MotionConfig(): `{name}` must be at least 1, got {getattr(self, name)}.")

@@ -10,28 +10,28 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.config import MotionConfig
-from morgs_mi.method.flow_sources.opencv import consistent
+from morgs_mi.method.flow_sources.opencv import consistency_mask
 from morgs_mi.method.flow_sources.registry import FlowSource, FramePair, flow_source
 
-__all__ = ["MotionCue", "choose_key_views", "motion_cue", "motion_cues"]
+__all__ = ["FlowObservation", "choose_key_views", "observe_flow", "observe_key_views"]
 
 
 @dataclass(frozen=True, eq=False)
-class MotionCue:
+class FlowObservation:
     """One key view's evidence at one frame.
 
     Attributes:
         motion: x_t - x_{t-1} [H, W, 2] in px on frame t's grid.
         reliable: [H, W] bool, where the flow there and back agree.
-        onward: x_t - x_{t-1} again, but on frame t - 1's grid [H, W, 2].
-        onward_reliable: [H, W] bool, likewise.
+        forward_flow: x_t - x_{t-1} again, but on frame t - 1's grid [H, W, 2].
+        forward_reliable: [H, W] bool, likewise.
         mask: what moves [H, W] bool (eq. 10), or None where it was not asked for.
     """
 
     motion: np.ndarray
     reliable: np.ndarray
-    onward: np.ndarray
-    onward_reliable: np.ndarray
+    forward_flow: np.ndarray
+    forward_reliable: np.ndarray
     mask: np.ndarray | None = None
 
 
@@ -45,13 +45,13 @@ def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
     return tuple(sorted(chosen))
 
 
-def motion_cue(
+def observe_flow(
     image: np.ndarray,
     previous: np.ndarray,
     method: str = "dis",
     mask_method: str | None = None,
     valid: np.ndarray | None = None,
-) -> MotionCue:
+) -> FlowObservation:
     """Return the cue of two pictures, whichever camera's they are.
 
     Args:
@@ -67,7 +67,9 @@ def motion_cue(
     return _cue(FramePair(np.asarray(image), np.asarray(previous), valid=valid), flow_source(method), mask_method)
 
 
-def motion_cues(pairs: Mapping[int, FramePair], config: MotionConfig, with_masks: bool) -> dict[int, MotionCue]:
+def observe_key_views(
+    pairs: Mapping[int, FramePair], config: MotionConfig, with_masks: bool
+) -> dict[int, FlowObservation]:
     """Return the cue of every key view from its two pictures, by view.
 
     Raises:
@@ -79,15 +81,15 @@ def motion_cues(pairs: Mapping[int, FramePair], config: MotionConfig, with_masks
     return {view: _cue(pair, source, mask_method) for view, pair in pairs.items()}
 
 
-def _cue(pair: FramePair, source: FlowSource, mask_method: str | None) -> MotionCue:
+def _cue(pair: FramePair, source: FlowSource, mask_method: str | None) -> FlowObservation:
     """Return one view's cue (eq. 4, and 9 and 10 for the mask), from optical flow both ways."""
-    flow, onward = source(pair)
-    reliable, onward_reliable = consistent(flow, onward), consistent(onward, flow)
+    flow, forward_flow = source(pair)
+    reliable, forward_reliable = consistency_mask(flow, forward_flow), consistency_mask(forward_flow, flow)
     known = pair.valid
     if pair.box is not None:
         known = np.zeros(reliable.shape, bool)
         known[pair.box] = True if pair.valid is None else pair.valid[pair.box]
     if known is not None:
-        reliable, onward_reliable = reliable & known, onward_reliable & known
+        reliable, forward_reliable = reliable & known, forward_reliable & known
     mask = motion_mask(pair.image, -flow, reliable, mask_method) if mask_method else None
-    return MotionCue(-flow, reliable, onward, onward_reliable, mask)
+    return FlowObservation(-flow, reliable, forward_flow, forward_reliable, mask)

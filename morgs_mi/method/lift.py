@@ -27,9 +27,9 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.method.confidence import least_motion
-from morgs_mi.method.flow import MotionCue
-from morgs_mi.render.active_view import Window
+from morgs_mi.method.confidence import motion_floor
+from morgs_mi.method.flow import FlowObservation
+from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["Lift", "lift_flow"]
 
@@ -76,7 +76,7 @@ class _Seen:
         return np.log1p(np.sum((self.flow - self.projected(d)) ** 2, axis=1) / scale**2)
 
 
-def lift_flow(gaussians: Gaussians, windows: Mapping[int, Window], cues: Mapping[int, MotionCue]) -> Lift:
+def lift_flow(gaussians: Gaussians, windows: Mapping[int, ActiveView], cues: Mapping[int, FlowObservation]) -> Lift:
     """Return the displacements that explain the key views' flow best, and the evidence for them.
 
     Args:
@@ -101,12 +101,12 @@ def lift_flow(gaussians: Gaussians, windows: Mapping[int, Window], cues: Mapping
     return Lift(np.where(logit[:, None] > 0, d, 0).astype(np.float32), logit.astype(np.float32))
 
 
-def _seen(gaussians: Gaussians, means: np.ndarray, window: Window, cue: MotionCue) -> _Seen:
-    trusted = cue.onward_reliable[..., None].astype(np.float32)
-    sums = window.backproject(gaussians, window.cut(np.concatenate([cue.onward * trusted, trusted], axis=2)))
+def _seen(gaussians: Gaussians, means: np.ndarray, window: ActiveView, cue: FlowObservation) -> _Seen:
+    trusted = cue.forward_reliable[..., None].astype(np.float32)
+    sums = window.backproject(gaussians, window.crop(np.concatenate([cue.forward_flow * trusted, trusted], axis=2)))
     flow = sums[:, :2] / np.maximum(sums[:, 2:], 1e-6)
     jacobian = projection_jacobian(window.camera, means)
-    return _Seen(sums[:, 2].astype(float), flow.astype(float), jacobian, least_motion(window.camera.width))
+    return _Seen(sums[:, 2].astype(float), flow.astype(float), jacobian, motion_floor(window.camera.width))
 
 
 def _solved(views: list[_Seen], trust: list[np.ndarray]) -> np.ndarray:

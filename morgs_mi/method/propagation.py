@@ -20,10 +20,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.losses.attribution import error_shares
+from morgs_mi.losses.attribution import attribute_error
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.lift import Lift
-from morgs_mi.render.active_view import Window
+from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["propagate_motion"]
 
@@ -42,7 +42,7 @@ _SURE = 0.3
 def propagate_motion(
     previous: Gaussians,
     lifted: Lift,
-    windows: Mapping[int, Window],
+    windows: Mapping[int, ActiveView],
     targets: Mapping[int, Target],
     rng: np.random.Generator,
 ) -> Lift:
@@ -66,7 +66,7 @@ def propagate_motion(
 
     def error_of(d: np.ndarray) -> np.ndarray:
         moved = replace(previous, means=mi.TensorXf(means + d))
-        sums = np.sum([error_shares(moved, windows[view], targets[view]) for view in windows], axis=0)
+        sums = np.sum([attribute_error(moved, windows[view], targets[view]) for view in windows], axis=0)
         return (sums[:, 0] + _FLOOR) / (sums[:, 1] + 1)
 
     error, near = error_of(d), _nearest(means)

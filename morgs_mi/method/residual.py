@@ -20,7 +20,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.core.gaussians import Gaussians, repeated, sigmoid
+from morgs_mi.core.attributes import sigmoid
+from morgs_mi.core.gaussians import Gaussians, repeat_each
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.lift import Lift
 
@@ -80,7 +81,7 @@ def apply_residual(previous: Gaussians, parameters: Mapping[str, Any], config: M
         if gate is None or (config.two_gates and name in _APPEARANCE):
             return change
         width = change.array.shape[0] // len(previous)
-        return mi.TensorXf(repeated(gate, width) * change.array, tuple(change.shape))
+        return mi.TensorXf(repeat_each(gate, width) * change.array, tuple(change.shape))
 
     motion = gated("motion")
     offset = gated("offset") if "offset" in parameters else dr.zeros(mi.TensorXf, tuple(motion.shape))
@@ -109,6 +110,6 @@ def join_sh(sh_dc: Any, sh_rest: Any) -> Any:
     lane = dr.arange(mi.UInt32, N * K * 3)
     row, column = lane // (3 * K), lane % (3 * K)
     is_dc, mode = column < 3, dr.ReduceMode.NoConflicts
-    joined = dr.gather(mi.Float, sh_dc.array, row * 3 + column, active=is_dc, mode=mode)
-    joined += dr.gather(mi.Float, sh_rest.array, row * (3 * K - 3) + column - 3, active=~is_dc, mode=mode)
-    return mi.TensorXf(joined, (N, K, 3))
+    concatenated = dr.gather(mi.Float, sh_dc.array, row * 3 + column, active=is_dc, mode=mode)
+    concatenated += dr.gather(mi.Float, sh_rest.array, row * (3 * K - 3) + column - 3, active=~is_dc, mode=mode)
+    return mi.TensorXf(concatenated, (N, K, 3))

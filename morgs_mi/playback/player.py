@@ -21,25 +21,25 @@ from morgs_mi.codec.packets import play
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.playback.visualise import as_picture, confidence_picture, depth_picture, motion_picture
+from morgs_mi.playback.visualise import confidence_image, depth_image, motion_image, to_uint8
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
-from morgs_mi.synth.ground_truth import Truth, load_truth
+from morgs_mi.synth.ground_truth import GroundTruth, load_truth
 
 __all__ = [
     "CHANNELS",
     "OFFSET_SCALE",
-    "channel_picture",
+    "channel_image",
     "find_camera",
     "has_confidence",
     "has_offset",
-    "open_recording",
     "open_stream",
+    "open_stream_capture",
     "playback",
     "render",
     "render_config",
     "render_stream",
-    "truth_on",
+    "truth_for_camera",
 ]
 
 CHANNELS = ("color", "motion", "confidence", "offset", "depth", "alpha")
@@ -112,7 +112,7 @@ def has_offset(stream: StreamReader) -> bool:
     return any("offset" in packet.arrays for packet in islice(residuals, 1))
 
 
-def channel_picture(name: str, image: np.ndarray, motion_scale: float | None = None) -> np.ndarray:
+def channel_image(name: str, image: np.ndarray, motion_scale: float | None = None) -> np.ndarray:
     """Return a rendered channel as a picture, uint8 RGB [H, W, 3].
 
     Args:
@@ -123,8 +123,8 @@ def channel_picture(name: str, image: np.ndarray, motion_scale: float | None = N
     """
     if name in ("motion", "offset"):
         scale = motion_scale or 0.03 * image.shape[1]
-        return motion_picture(image, scale if name == "motion" else OFFSET_SCALE * scale)
-    return {"confidence": confidence_picture, "depth": depth_picture}.get(name, as_picture)(image)
+        return motion_image(image, scale if name == "motion" else OFFSET_SCALE * scale)
+    return {"confidence": confidence_image, "depth": depth_image}.get(name, to_uint8)(image)
 
 
 def playback(stream: StreamReader, camera: Camera) -> dict[str, float]:
@@ -150,13 +150,13 @@ def playback(stream: StreamReader, camera: Camera) -> dict[str, float]:
         if not times:
             render(gaussians, camera, ("color",), config)
         begun = time.perf_counter()
-        as_picture(render(gaussians, camera, ("color",), config)["color"])
+        to_uint8(render(gaussians, camera, ("color",), config)["color"])
         times.append((decoded - start, time.perf_counter() - begun))
     decode, show = np.median(times[1:] or times or [(np.nan, np.nan)], axis=0)
     return {"fps": float(1 / (decode + show)), "decode_ms": float(1e3 * decode), "render_ms": float(1e3 * show)}
 
 
-def truth_on(capture: Capture, camera: Camera, frame: int) -> Truth | None:
+def truth_for_camera(capture: Capture, camera: Camera, frame: int) -> GroundTruth | None:
     """Return the ground truth of a frame on the pixel grid of `camera`, or None where the capture has none.
 
     The nearest sample counts, for a mean across an outline would be the motion of nothing. Motion is in pixels of
@@ -169,7 +169,7 @@ def truth_on(capture: Capture, camera: Camera, frame: int) -> Truth | None:
     rows = ((np.arange(camera.height) + 0.5) * H / camera.height).astype(int)[:, None]
     columns = ((np.arange(camera.width) + 0.5) * W / camera.width).astype(int)
     motion = truth.motion[rows, columns] * np.float32([camera.width / W, camera.height / H])
-    return Truth(motion, truth.depth[rows, columns], truth.ids[rows, columns], truth.mask[rows, columns])
+    return GroundTruth(motion, truth.depth[rows, columns], truth.ids[rows, columns], truth.mask[rows, columns])
 
 
 def _carried(gaussians: Gaussians) -> tuple[str, ...]:
@@ -194,7 +194,7 @@ def render_config(stream: StreamReader) -> RenderConfig:
     return RenderConfig(**stream.metadata.get("config", {}).get("render", {}))
 
 
-def open_recording(stream: StreamReader, capture: str | Path | None, frames: Sequence[int]) -> Capture:
+def open_stream_capture(stream: StreamReader, capture: str | Path | None, frames: Sequence[int]) -> Capture:
     """Open what the stream was fitted to, as it was opened then.
 
     Args:

@@ -14,16 +14,16 @@ import numpy as np
 from morgs_mi.core.files import whole
 
 __all__ = [
-    "as_picture",
+    "confidence_image",
     "confidence_legend",
-    "confidence_picture",
     "contact_sheet",
-    "depth_picture",
+    "depth_image",
     "label",
+    "motion_image",
     "motion_legend",
-    "motion_picture",
     "side_by_side",
     "time_slice",
+    "to_uint8",
     "write_png",
 ]
 
@@ -32,7 +32,7 @@ BACKGROUND = 255
 NOTHING = (128, 128, 128)
 
 
-def as_picture(image: np.ndarray) -> np.ndarray:
+def to_uint8(image: np.ndarray) -> np.ndarray:
     """Return a copy in uint8 RGB of a display-referred image: [H, W, 3], [H, W, 1] or [H, W]; floats span [0, 1].
 
     What is not finite becomes black.
@@ -50,7 +50,7 @@ def as_picture(image: np.ndarray) -> np.ndarray:
     return np.broadcast_to(image, (*image.shape[:2], 3)).copy()
 
 
-def motion_picture(motion: np.ndarray, scale_px: float) -> np.ndarray:
+def motion_image(motion: np.ndarray, scale_px: float) -> np.ndarray:
     """Return motion as colour: hue is the direction, saturation the speed, white is no motion.
 
     Right is red and hue turns clockwise on the screen: down yellow-green, left cyan, up violet. A speed of
@@ -73,29 +73,29 @@ def motion_picture(motion: np.ndarray, scale_px: float) -> np.ndarray:
     hue = np.rad2deg(np.arctan2(y, x)) % 360
     saturation = np.minimum(np.hypot(x, y) / scale_px, 1)
     hsv = np.stack([hue, saturation, np.ones_like(hue)], -1).astype(np.float32)
-    picture = as_picture(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB))
+    picture = to_uint8(cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB))
     picture[~known] = NOTHING
     return picture
 
 
 def motion_legend(scale_px: float, size: int = 96) -> np.ndarray:
-    """Return the key [size, size, 3] to `motion_picture`: a disc whose rim is `scale_px`, labelled with it."""
+    """Return the key [size, size, 3] to `motion_image`: a disc whose rim is `scale_px`, labelled with it."""
     axis = np.linspace(-scale_px, scale_px, size, dtype=np.float32)
     motion = np.stack(np.meshgrid(axis, axis), -1)
     motion[np.hypot(*np.moveaxis(motion, -1, 0)) > scale_px] = 0
-    return label(motion_picture(motion, scale_px), f"{scale_px:.3g} px")
+    return label(motion_image(motion, scale_px), f"{scale_px:.3g} px")
 
 
-def confidence_picture(confidence: np.ndarray) -> np.ndarray:
+def confidence_image(confidence: np.ndarray) -> np.ndarray:
     """Return [H, W] or [H, W, 1] in [0, 1] as colour: dark violet is still, bright yellow moves."""
     return _coloured(np.asarray(confidence, np.float64), cv2.COLORMAP_INFERNO)
 
 
 def confidence_legend(size: int = 96) -> np.ndarray:
-    """Return the key [size, size, 3] to `confidence_picture`: a bar from 1 at the top to 0 at the bottom."""
+    """Return the key [size, size, 3] to `confidence_image`: a bar from 1 at the top to 0 at the bottom."""
     ramp = np.repeat(np.linspace(1, 0, size)[:, None], size // 3, axis=1)
     picture = np.full((size, size, 3), BACKGROUND, np.uint8)
-    picture[:, : ramp.shape[1]] = confidence_picture(ramp)
+    picture[:, : ramp.shape[1]] = confidence_image(ramp)
     for text, row in (("1 moves", 0.0), ("0.5", 0.5), ("0 still", 1.0)):
         place = (ramp.shape[1] + 4, round(12 + row * (size - 16)))
         cv2.putText(picture, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.35, (0, 0, 0), 1, cv2.LINE_AA)
@@ -113,10 +113,10 @@ def time_slice(columns: Sequence[np.ndarray], least_width: int = 320) -> np.ndar
     """
     if not columns:
         raise ValueError("time_slice(): there must be at least one column, got none.")
-    return np.repeat(as_picture(np.stack(columns, axis=1)), -(-least_width // len(columns)), axis=1)
+    return np.repeat(to_uint8(np.stack(columns, axis=1)), -(-least_width // len(columns)), axis=1)
 
 
-def depth_picture(depth: np.ndarray, near: float | None = None, far: float | None = None) -> np.ndarray:
+def depth_image(depth: np.ndarray, near: float | None = None, far: float | None = None) -> np.ndarray:
     """Return depth [H, W] or [H, W, 1] as colour, red near and blue far, even in 1 / depth.
 
     Args:
@@ -139,7 +139,7 @@ def depth_picture(depth: np.ndarray, near: float | None = None, far: float | Non
 
 def label(image: np.ndarray, text: str) -> np.ndarray:
     """Return the picture with `text` (ASCII) in its top left corner, white on a dark strip."""
-    picture = as_picture(image)
+    picture = to_uint8(image)
     scale = np.clip(picture.shape[1] / 640, 0.35, 1.0)
     font, thickness = cv2.FONT_HERSHEY_SIMPLEX, 2 if scale > 0.8 else 1
     (width, height), base = cv2.getTextSize(text, font, scale, thickness)
@@ -155,7 +155,7 @@ def side_by_side(images: Sequence[np.ndarray]) -> np.ndarray:
     Raises:
         ValueError: no picture.
     """
-    return _joined([as_picture(image) for image in images], axis=1)
+    return _joined([to_uint8(image) for image in images], axis=1)
 
 
 def contact_sheet(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
@@ -168,7 +168,7 @@ def contact_sheet(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
 
 
 def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
-    """Write a picture (see `as_picture`) as PNG; the file appears whole or not at all.
+    """Write a picture (see `to_uint8`) as PNG; the file appears whole or not at all.
 
     Missing folders are made.
 
@@ -176,7 +176,7 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
         OSError: the file cannot be written; the message names it and the cause.
         ValueError: the image has no pixels or another shape.
     """
-    picture = as_picture(image)
+    picture = to_uint8(image)
     if not picture.size:
         raise ValueError(f"write_png(): the image for {path} has no pixels: {picture.shape}.")
     _, data = cv2.imencode(".png", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
@@ -186,7 +186,7 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
 
 
 def _coloured(values: np.ndarray, colours: int) -> np.ndarray:
-    grey = as_picture(values.reshape(values.shape[:2]))[..., 0]
+    grey = to_uint8(values.reshape(values.shape[:2]))[..., 0]
     return cv2.cvtColor(cv2.applyColorMap(grey, colours), cv2.COLOR_BGR2RGB)
 
 

@@ -17,26 +17,26 @@ from morgs_mi.render.projection import Splats, project
 from morgs_mi.render.rasterize import Image, rasterize
 from morgs_mi.render.region import Region
 
-__all__ = ["Window", "open_window"]
+__all__ = ["ActiveView", "make_active_view"]
 
 
 @dataclass(frozen=True, eq=False)
-class Window:
+class ActiveView:
     """What is looked at when Gaussians are drawn.
 
     Attributes:
         camera: the view.
         config: cut-offs and block shape.
         region: the blocks of pixels that are drawn; None: the whole view.
-        backdrop: what is drawn there besides, and gets no gradients; None: nothing.
+        static_splats: what is drawn there besides, and gets no gradients; None: nothing.
     """
 
     camera: Camera
     config: RenderConfig = field(default_factory=RenderConfig)
     region: Region | None = None
-    backdrop: Splats | None = None
+    static_splats: Splats | None = None
 
-    def draw(
+    def render(
         self, gaussians: ActivatedGaussians, channels: Sequence[str] = ("color",), detach_weights: Sequence[str] = ()
     ) -> Image:
         """Draw Gaussians through this window, as `rasterize` does."""
@@ -46,20 +46,20 @@ class Window:
             channels,
             detach_weights=detach_weights,
             region=self.region,
-            backdrop=self.backdrop,
+            static_splats=self.static_splats,
             config=self.config,
         )
 
     def backproject(self, gaussians: ActivatedGaussians, picture: np.ndarray) -> np.ndarray:
-        """Return what the window's pixels of a picture, as from `cut`, are worth to each Gaussian [N, C]."""
-        return backproject(gaussians, self.camera, picture, self.config, self.region, self.backdrop)
+        """Return what the window's pixels of a picture, as from `crop`, are worth to each Gaussian [N, C]."""
+        return backproject(gaussians, self.camera, picture, self.config, self.region, self.static_splats)
 
-    def cut(self, picture: np.ndarray) -> np.ndarray:
+    def crop(self, picture: np.ndarray) -> np.ndarray:
         """Return what a picture [H, W, ...] of the view shows in this window."""
-        return picture if self.region is None else self.region.cut(picture)
+        return picture if self.region is None else self.region.crop(picture)
 
     @property
-    def share(self) -> float:
+    def pixel_fraction(self) -> float:
         """The drawn pixels' share of the view."""
         if self.region is None:
             return 1.0
@@ -67,9 +67,9 @@ class Window:
         return min(1.0, self.region.num_blocks * width * height / (self.camera.width * self.camera.height))
 
 
-def open_window(
+def make_active_view(
     camera: Camera, mask: np.ndarray, still: ActivatedGaussians, channels: Sequence[str], config: RenderConfig
-) -> Window:
+) -> ActiveView:
     """Return the window onto the blocks around a mask [H, W], with Gaussians that stand still behind it.
 
     They are projected here, once: what is drawn in front of them later costs as if they had never moved.
@@ -83,11 +83,18 @@ def open_window(
     """
     region, blended = Region(mask, config), tuple(name for name in channels if name != "alpha")
     if not int(still.means.shape[0]):
-        return Window(camera, config, region)
+        return ActiveView(camera, config, region)
     with dr.suspend_grad():
         rows = dr.compress(touches(project(still, camera, (), config), region))
         if not dr.width(rows):
-            return Window(camera, config, region)
-        backdrop = project(still, camera, blended, config, rows)
-        dr.eval(backdrop.shape, backdrop.channels, backdrop.depths, backdrop.extent, backdrop.valid, backdrop.finite)
-    return Window(camera, config, region, backdrop)
+            return ActiveView(camera, config, region)
+        static_splats = project(still, camera, blended, config, rows)
+        dr.eval(
+            static_splats.shape,
+            static_splats.channels,
+            static_splats.depths,
+            static_splats.extent,
+            static_splats.valid,
+            static_splats.finite,
+        )
+    return ActiveView(camera, config, region, static_splats)

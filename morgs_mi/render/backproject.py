@@ -14,7 +14,7 @@ from morgs_mi.render.blocks import build_lists
 from morgs_mi.render.compositing import Channel, Layout, blend
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.projection import Splats, project
-from morgs_mi.render.region import Region, whole_view
+from morgs_mi.render.region import Region, full_view
 
 __all__ = ["backproject"]
 
@@ -25,7 +25,7 @@ def backproject(
     picture: np.ndarray,
     config: RenderConfig | None = None,
     region: Region | None = None,
-    backdrop: Splats | None = None,
+    static_splats: Splats | None = None,
 ) -> np.ndarray:
     """Return sum_x w_i(x) picture(x) for every Gaussian i, with the weights w_i = T_i alpha_i of eq. 1.
 
@@ -37,7 +37,7 @@ def backproject(
         picture: [H, W, C], or on the region.
         config: cut-offs.
         region: the pixels that are summed over; None: the whole view.
-        backdrop: splats of this view that stand among the Gaussians and take their share.
+        static_splats: splats of this view that stand among the Gaussians and take their share.
 
     Returns:
         float32 [N, C].
@@ -46,14 +46,14 @@ def backproject(
         ValueError: the picture has another size than the camera or the region.
     """
     config, C = config or RenderConfig(), picture.shape[-1]
-    region = region or whole_view(camera.width, camera.height, config)
+    region = region or full_view(camera.width, camera.height, config)
     if picture.shape != region.shape(C):
         raise ValueError(f"backproject(): `picture` must be {list(region.shape(C))}, got {list(picture.shape)}.")
     with dr.suspend_grad():
         splats = project(gaussians, camera, (), config)
         N = len(splats)
-        if backdrop is not None:
-            splats = splats.followed_by(backdrop, None)
+        if static_splats is not None:
+            splats = splats.concatenated_with(static_splats, None)
         columns = [dr.zeros(mi.Float, len(splats)) for _ in range(C)]
         lists = build_lists(splats, columns, region, config)
     dr.enable_grad(columns)

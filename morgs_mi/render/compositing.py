@@ -117,7 +117,7 @@ def _padded(picture: Any, region: Region, size: int) -> Any:
     if dr.width(picture) != dr.prod(region.shape(size)):
         return dr.opaque(mi.Float, 0, total)
     if not region.whole or region.row == region.width:
-        # In memory of our own (see `region.owned`), by what fuses with whatever computes the gradient.
+        # In memory of our own (see `region.owned_copy`), by what fuses with whatever computes the gradient.
         return picture * dr.opaque(mi.Float, 1)
     lane = dr.arange(mi.UInt32, total)
     row = quotient(lane, region.row * size)

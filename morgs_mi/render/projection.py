@@ -28,7 +28,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians, tensor_rows
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["CHANNEL_SIZES", "Splats", "joined", "project"]
+__all__ = ["CHANNEL_SIZES", "Splats", "concatenated", "project"]
 
 # What a channel blends, and how many numbers that takes; `alpha` is blended with every call.
 CHANNEL_SIZES = {"color": 3, "depth": 1, "motion": 2, "confidence": 1}
@@ -66,23 +66,23 @@ class Splats:
     def __len__(self) -> int:
         return dr.width(self.depths)
 
-    def followed_by(self, other: Splats, order: Any) -> Splats:
+    def concatenated_with(self, other: Splats, order: Any) -> Splats:
         """Return these splats and the others, to be blended in `order` where depths are equal."""
         return Splats(
-            joined(self.shape, other.shape),
-            {name: joined(value, other.channels[name]) for name, value in self.channels.items()},
-            joined(self.depths, other.depths),
-            joined(self.extent, other.extent),
-            joined(self.valid, other.valid),
-            joined(self.finite, other.finite),
+            concatenated(self.shape, other.shape),
+            {name: concatenated(value, other.channels[name]) for name, value in self.channels.items()},
+            concatenated(self.depths, other.depths),
+            concatenated(self.extent, other.extent),
+            concatenated(self.valid, other.valid),
+            concatenated(self.finite, other.finite),
             order,
         )
 
 
-def joined(a: Any, b: Any) -> Any:
+def concatenated(a: Any, b: Any) -> Any:
     """Return two arrays, or tuples of them, end to end; `dr.concat` would compile a kernel for every length."""
     if isinstance(a, tuple):
-        return tuple(joined(v, w) for v, w in zip(a, b, strict=True))
+        return tuple(concatenated(v, w) for v, w in zip(a, b, strict=True))
     n, mode = dr.opaque(mi.UInt32, dr.width(a)), dr.ReduceMode.NoConflicts
     lane = dr.arange(mi.UInt32, dr.width(a) + dr.width(b))
     ours = lane < n

@@ -11,12 +11,12 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.gaussians import ActivatedGaussians, repeated
+from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
 from morgs_mi.render.blocks import build_lists, touches
 from morgs_mi.render.compositing import Channel, Layout, blend
 from morgs_mi.render.config import RenderConfig
-from morgs_mi.render.projection import CHANNEL_SIZES, Splats, joined, project
-from morgs_mi.render.region import Region, owned, whole_view
+from morgs_mi.render.projection import CHANNEL_SIZES, Splats, concatenated, project
+from morgs_mi.render.region import Region, full_view, owned_copy
 
 __all__ = ["Image", "rasterize"]
 
@@ -58,7 +58,7 @@ def rasterize(
     region: Region | None = None,
     active: Any | None = None,
     features: Any | None = None,
-    backdrop: Splats | None = None,
+    static_splats: Splats | None = None,
     config: RenderConfig | None = None,
 ) -> Image:
     """Render Gaussians by depth-ordered alpha blending (eq. 1), differentiably.
@@ -77,7 +77,7 @@ def rasterize(
             touch none of its blocks are only projected.
         active: bool [N], the Gaussians that gradients reach; None: all.
         features: [N, F], whatever else is to be blended like colours, in `Image.features`; F is at most 12.
-        backdrop: splats of this view that are drawn as well and get no gradients; they must have the channels.
+        static_splats: splats of this view that are drawn as well and get no gradients; they must have the channels.
         config: cut-offs and block shape.
 
     Returns:
@@ -98,13 +98,13 @@ def rasterize(
     if features is not None:
         features, sizes["features"] = _checked_features(features, gaussians)
         channels = (*channels, "features")
-    region = region or whole_view(camera.width, camera.height, config)
+    region = region or full_view(camera.width, camera.height, config)
     _check_region(region, camera, config)
     blended = tuple(c for c in channels if c != "alpha")
     if dr.prod(gaussians.means.shape[:1]) == 0:
         return _empty(channels, sizes, background, region)
-    if backdrop is not None:
-        splats = project(gaussians, camera, blended, config, features=features).followed_by(backdrop, None)
+    if static_splats is not None:
+        splats = project(gaussians, camera, blended, config, features=features).concatenated_with(static_splats, None)
     elif region.whole and active is None:
         splats = project(gaussians, camera, blended, config, features=features)
     else:
@@ -122,7 +122,7 @@ def rasterize(
     coverage = images.pop("coverage", None)
     for name in blended:
         if name in _NORMALISED or (name == "color" and background is not None):
-            weight = repeated(dr.detach(coverage) if name in detach_weights else coverage, CHANNEL_SIZES[name])
+            weight = repeat_each(dr.detach(coverage) if name in detach_weights else coverage, CHANNEL_SIZES[name])
             finish = _normalised if name in _NORMALISED else _over(background)
             images[name] = finish(images[name], weight)
     return Image(**{name: _tensor(images[name], region, sizes[name]) for name in channels})
@@ -172,7 +172,7 @@ def _project_part(
     ]
     if len(parts) < 2:
         return parts[0] if parts else None
-    return parts[0].followed_by(parts[1], dr.argsort(joined(*rows)))
+    return parts[0].concatenated_with(parts[1], dr.argsort(concatenated(*rows)))
 
 
 def _layout(
@@ -196,7 +196,7 @@ def _layout(
 def _tensor(values: Any, region: Region, size: int) -> Any:
     """Return a channel's picture; pixels of a region that lie outside the view are 0."""
     if region.weights is not None:
-        values = values * repeated(region.weights, size)
+        values = values * repeat_each(region.weights, size)
     return mi.TensorXf(values, region.shape(size))
 
 
@@ -206,8 +206,8 @@ def _empty(
     """Return the image of no Gaussians."""
     images = {n: dr.zeros(mi.TensorXf, region.shape(sizes[n])) for n in channels}
     if background is not None and "color" in images:
-        backdrop = np.broadcast_to(np.float32(background), region.shape(3))
-        images["color"] = _tensor(mi.Float(backdrop.ravel()), region, 3)
+        static_splats = np.broadcast_to(np.float32(background), region.shape(3))
+        images["color"] = _tensor(mi.Float(static_splats.ravel()), region, 3)
     return Image(**images)
 
 
@@ -254,7 +254,9 @@ def _check(
 def _checked_features(features: Any, gaussians: ActivatedGaussians) -> tuple[Any, int]:
     """Return the features as a tensor [N, F], and F."""
     features = (
-        features if dr.is_tensor_v(features) else mi.TensorXf(owned(mi.Float(np.ravel(features))), np.shape(features))
+        features
+        if dr.is_tensor_v(features)
+        else mi.TensorXf(owned_copy(mi.Float(np.ravel(features))), np.shape(features))
     )
     shape, N = tuple(features.shape), int(gaussians.means.shape[0])
     if len(shape) != 2 or shape[0] != N or not 1 <= shape[1] <= _MOST_FEATURES:

@@ -15,7 +15,7 @@ import numpy as np
 
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["ACROSS", "DOWN", "NO_SLOT", "Region", "owned", "quotient", "whole_view"]
+__all__ = ["ACROSS", "DOWN", "NO_SLOT", "Region", "full_view", "owned_copy", "quotient"]
 
 # Blocks of a tile, across and down: as many as a word has bits.
 ACROSS, DOWN = 4, 8
@@ -37,7 +37,7 @@ class Region:
         height: of the view in pixels.
         block: (width, height) of a block in pixels.
         num_blocks: A.
-        whole: whether pictures are [H, W, C] instead, for a region made by `whole_view`.
+        whole: whether pictures are [H, W, C] instead, for a region made by `full_view`.
 
     Raises:
         ValueError: no pixel is asked for, or `mask` is not a picture of booleans.
@@ -100,11 +100,11 @@ class Region:
             "tile_table": _summed_area(active.any(1).reshape(self.down, self.across)),
         }
         for name, values in arrays.items():
-            setattr(self, name, owned(mi.UInt32(np.asarray(values, np.uint32))))
-        self.corner_x = owned(mi.Float(np.float32(tiles % self.across * (ACROSS * bw))))
-        self.corner_y = owned(mi.Float(np.float32(tiles // self.across * (DOWN * bh))))
+            setattr(self, name, owned_copy(mi.UInt32(np.asarray(values, np.uint32))))
+        self.corner_x = owned_copy(mi.Float(np.float32(tiles % self.across * (ACROSS * bw))))
+        self.corner_y = owned_copy(mi.Float(np.float32(tiles // self.across * (DOWN * bh))))
         inside = None if whole else self.inside()
-        self.weights = None if inside is None or inside.all() else owned(mi.Float(np.float32(inside).ravel()))
+        self.weights = None if inside is None or inside.all() else owned_copy(mi.Float(np.float32(inside).ravel()))
 
     def shape(self, channels: int) -> tuple[int, ...]:
         """Return the shape of a picture on this region."""
@@ -126,7 +126,7 @@ class Region:
         x, y = self.pixels()
         return (x < self.width) & (y < self.height)
 
-    def cut(self, picture: np.ndarray) -> np.ndarray:
+    def crop(self, picture: np.ndarray) -> np.ndarray:
         """Return what a picture [H, W, ...] shows on this region [A, block_height, block_width, ...], 0 outside."""
         x, y = self.pixels()
         inside = (x < self.width) & (y < self.height)
@@ -146,7 +146,7 @@ def _summed_area(grid: np.ndarray) -> np.ndarray:
     return np.pad(grid, ((1, 0), (1, 0))).cumsum(0).cumsum(1).ravel()
 
 
-def owned(values: Any) -> Any:
+def owned_copy(values: Any) -> Any:
     """Return a copy in memory of Dr.Jit's own, evaluated.
 
     It borrows NumPy's memory where it can. Packets cannot be read from there unless it happens to be aligned, and
@@ -162,7 +162,7 @@ def quotient(lane: Any, divisor: int) -> Any:
     return mi.UInt32((mi.Float64(lane) + 0.5) * dr.opaque(mi.Float64, 1 / divisor))
 
 
-def whole_view(width: int, height: int, config: RenderConfig) -> Region:
+def full_view(width: int, height: int, config: RenderConfig) -> Region:
     """Return all blocks of a view, whose pictures are plain images [H, W, C]."""
     return _whole_view(width, height, config.block_shape(dr.backend_v(mi.Float) == dr.JitBackend.CUDA), mi.variant())
 

@@ -17,11 +17,11 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.exr import read_exr, write_exr
 
-__all__ = ["Tracks", "Truth", "carry", "load_tracks", "load_truth", "project", "save_truth", "truth_of"]
+__all__ = ["GroundTruth", "Tracks", "carry", "ground_truth_of", "load_tracks", "load_truth", "project", "save_truth"]
 
 
 @dataclass(frozen=True)
-class Truth:
+class GroundTruth:
     """Ground truth on one camera's frame t.
 
     Attributes:
@@ -71,14 +71,14 @@ def carry(points: np.ndarray, ids: np.ndarray, poses: Sequence[np.ndarray], to: 
     return carried
 
 
-def truth_of(
+def ground_truth_of(
     camera: Camera,
     points: np.ndarray,
     ids: np.ndarray,
     poses: Sequence[np.ndarray],
     before: Sequence[np.ndarray] | None,
     after: Sequence[np.ndarray],
-) -> Truth:
+) -> GroundTruth:
     """Return the truth on a frame whose pixel centres see `points` [H, W, 3] of objects `ids` [H, W].
 
     Args:
@@ -97,10 +97,12 @@ def truth_of(
     motion = np.zeros_like(pixels) if before is None else pixels - project(camera, other)[0]
     # Coordinates are single-precision: what moves less than their rounding stands still.
     mask = np.linalg.norm(other - points, axis=-1) > 1e-6 * np.abs(points).max()
-    return Truth(motion.astype(np.float32), np.where(hit, depth, 0).astype(np.float32), ids.astype(np.int32), mask)
+    return GroundTruth(
+        motion.astype(np.float32), np.where(hit, depth, 0).astype(np.float32), ids.astype(np.int32), mask
+    )
 
 
-def save_truth(folder: str | Path, camera: str, frame: int, truth: Truth) -> None:
+def save_truth(folder: str | Path, camera: str, frame: int, truth: GroundTruth) -> None:
     """Write one camera's frame as ``folder/camera/0000.exr``.
 
     Raises:
@@ -118,7 +120,7 @@ def save_truth(folder: str | Path, camera: str, frame: int, truth: Truth) -> Non
     write_exr(path, channels)
 
 
-def load_truth(folder: str | Path, camera: str, frame: int) -> Truth:
+def load_truth(folder: str | Path, camera: str, frame: int) -> GroundTruth:
     """Read the ground truth of a camera's frame from a capture's ``truth`` folder.
 
     Raises:
@@ -131,7 +133,7 @@ def load_truth(folder: str | Path, camera: str, frame: int) -> Truth:
     missing = {"motion.X", "motion.Y", "depth.Y", "id.Y", "mask.Y"} - set(channels)
     if missing:
         raise ValueError(f"load_truth(): {path} lacks the channels {sorted(missing)}; synthesize the capture again.")
-    return Truth(
+    return GroundTruth(
         np.stack([channels["motion.X"], channels["motion.Y"]], axis=-1),
         channels["depth.Y"],
         channels["id.Y"].astype(np.int32),

@@ -8,7 +8,7 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.synth.scene import Scene
 
-__all__ = ["Stage", "srgb_bytes"]
+__all__ = ["PathTracer", "srgb_bytes"]
 
 
 def srgb_bytes(linear: np.ndarray, noise: np.ndarray | float = 0.0) -> np.ndarray:
@@ -21,7 +21,7 @@ def srgb_bytes(linear: np.ndarray, noise: np.ndarray | float = 0.0) -> np.ndarra
     return np.rint(255 * np.clip(encoded + noise, 0, 1)).astype(np.uint8)
 
 
-class Stage:
+class PathTracer:
     """The scene at one instant.
 
     It is loaded once; moving objects are instances whose transforms alone change, so that all views and

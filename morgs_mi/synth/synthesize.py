@@ -19,8 +19,8 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import whole, write_json
 from morgs_mi.io.video import VideoReader
 from morgs_mi.io.video_writer import write_video
-from morgs_mi.synth.ground_truth import Tracks, carry, project, save_truth, truth_of
-from morgs_mi.synth.path_tracer import Stage
+from morgs_mi.synth.ground_truth import Tracks, carry, ground_truth_of, project, save_truth
+from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import Scene, load_scene
 
 __all__ = ["synthesize"]
@@ -103,7 +103,7 @@ def synthesize(
     _check_folder(Path(out), overwrite)
     with whole(out, "synthesize()") as folder:
         folder.mkdir(parents=True)
-        stage = Stage(scene)
+        stage = PathTracer(scene)
         done = 0
 
         def film(index: int) -> Iterator[np.ndarray]:
@@ -144,16 +144,16 @@ def synthesize(
     return Path(out)
 
 
-def _write_truth(stage: Stage, camera: Camera, times: np.ndarray, fps: float, folder: Path) -> None:
+def _write_truth(stage: PathTracer, camera: Camera, times: np.ndarray, fps: float, folder: Path) -> None:
     for frame, time in enumerate(times):
         stage.move(time)
         points, ids = stage.surface(camera)
         before = stage.poses(times[frame - 1]) if frame else None
-        truth = truth_of(camera, points, ids, stage.poses(time), before, stage.poses(time + 1 / fps))
+        truth = ground_truth_of(camera, points, ids, stage.poses(time), before, stage.poses(time + 1 / fps))
         save_truth(folder, camera.name, frame, truth)
 
 
-def _tracks(stage: Stage, cameras: Sequence[Camera], times: np.ndarray, rng: np.random.Generator) -> Tracks:
+def _tracks(stage: PathTracer, cameras: Sequence[Camera], times: np.ndarray, rng: np.random.Generator) -> Tracks:
     """Follow surface points seen by any camera in the first, middle or last frame; half of them can move."""
     starts = sorted({0, len(times) // 2, len(times) - 1})
     can_move = np.array([thing.pose is not None for thing in stage.scene.objects.values()])
@@ -173,7 +173,7 @@ def _tracks(stage: Stage, cameras: Sequence[Camera], times: np.ndarray, rng: np.
     return Tracks(np.concatenate(points), np.concatenate(owners))
 
 
-def _write_calibration(stage: Stage, cameras: Sequence[Camera], folder: Path, rng: np.random.Generator) -> None:
+def _write_calibration(stage: PathTracer, cameras: Sequence[Camera], folder: Path, rng: np.random.Generator) -> None:
     """Write the cameras as `poses_bounds.npy` and as a COLMAP model with points from the training views."""
     stage.move(0.0)
     points, colors, bounds = [], [], []

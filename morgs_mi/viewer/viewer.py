@@ -20,7 +20,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.geometry import covariances
 from morgs_mi.export.axes import up_direction
 from morgs_mi.export.paths import focus
-from morgs_mi.playback.player import channel_picture, render, render_config
+from morgs_mi.playback.player import channel_image, render, render_config
 from morgs_mi.viewer.clip import Clip
 from morgs_mi.viewer.modes import BACKGROUNDS, MODES, splat_colors
 
@@ -208,7 +208,7 @@ class Viewer:
     def _show_exact(self, gaussians: Any, camera: Camera) -> None:
         mode = self._mode.value
         image = render(gaussians, camera, (mode,), self._config)[mode]
-        self._server.scene.set_background_image(channel_picture(mode, image), format="png")
+        self._server.scene.set_background_image(channel_image(mode, image), format="png")
 
     def _show_trails(self, frame: int) -> None:
         if not self._trails.value:

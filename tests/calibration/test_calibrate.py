@@ -11,7 +11,7 @@ import pytest
 
 from morgs_mi import cli
 from morgs_mi.calibration.calibrate import CalibrateConfig, calibrate
-from morgs_mi.calibration.rig_check import check_rig, find_common
+from morgs_mi.calibration.rig_check import check_rig, match_capture
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
@@ -48,7 +48,7 @@ def test_a_rig_is_found_again(tmp_path: Path, capsys) -> None:
     for camera, expected in zip(capture.cameras, cameras, strict=True):
         np.testing.assert_allclose(camera.viewmat[:3, :3] @ R.T, expected.viewmat[:3, :3], atol=3e-3)
         np.testing.assert_allclose(camera.K[0, 0], expected.K[0, 0], rtol=5e-3)
-    assert check_rig(capture, find_common(capture)).fits
+    assert check_rig(capture, match_capture(capture)).fits
     status = cli.main(["calibrate", str(tmp_path)])
     assert status == 1
     assert "sparse: expected none, got one" in capsys.readouterr().err

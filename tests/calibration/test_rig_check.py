@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import cli
-from morgs_mi.calibration.rig_check import MAX_ERROR, Common, check_rig, find_common, with_points
+from morgs_mi.calibration.rig_check import MAX_ERROR, Common, check_rig, match_capture, triangulate_points
 from morgs_mi.calibration.rig_plot import draw_rig
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.features import detect, match_views, reprojection_errors, triangulate
@@ -38,7 +38,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 @pytest.fixture(scope="module")
 def common(capture: Capture) -> Common:
-    return find_common(capture)
+    return match_capture(capture)
 
 
 def with_cameras(capture: Capture, change: Callable[[int, Camera], Camera]) -> Capture:
@@ -128,7 +128,7 @@ def test_rows_in_alphabetical_order_are_named(tmp_path: Path) -> None:
     for order, fits in ((names, True), (sorted(names), False)):
         write_poses_bounds(tmp_path / "poses_bounds.npy", [cameras[name] for name in order], [[1, 9]] * 4)
         capture = load_capture(tmp_path)
-        check = check_rig(capture, find_common(capture))
+        check = check_rig(capture, match_capture(capture))
         assert check.fits is fits
     assert "the rows seem to be in alphabetical order (cam_0, cam_1, cam_10, cam_2, ...)" in check.advice
 
@@ -218,18 +218,18 @@ def test_points_under_a_small_angle_are_left_out(capture: Capture, common: Commo
 
 
 def test_points_of_a_capture_leave_the_held_out_view_alone(capture: Capture, common: Common) -> None:
-    found = with_points(capture, common)
+    found = triangulate_points(capture, common)
     assert len(found.points) == len(found.point_colors) > 1000
     held_out = replace(capture, test_view=3)
-    fewer = with_points(held_out, common)
+    fewer = triangulate_points(held_out, common)
     blind = Common(
         tuple(detect(np.zeros((48, 64, 3), np.uint8)) if i == 3 else f for i, f in enumerate(common.features)),
         tuple(match for match in common.matches if 3 not in match.views),
     )
-    np.testing.assert_array_equal(fewer.points, with_points(held_out, blind).points)
+    np.testing.assert_array_equal(fewer.points, triangulate_points(held_out, blind).points)
     assert len(fewer.points) < len(found.points)
     wrong = with_cameras(capture, lambda i, c: replace(c, viewmat=FLIP @ c.viewmat))
-    assert len(with_points(wrong, common).points) == 0
+    assert len(triangulate_points(wrong, common).points) == 0
 
 
 def test_a_lens_that_is_undone_fits_and_one_that_is_ignored_does_not(tmp_path: Path) -> None:
@@ -249,7 +249,7 @@ def test_a_lens_that_is_undone_fits_and_one_that_is_ignored_does_not(tmp_path: P
     for lens in (Lens("SIMPLE_RADIAL", (k1,)), Lens()):
         write_colmap(tmp_path / "sparse", cameras, lenses=[lens] * 4)
         capture = load_capture(tmp_path)
-        errors.append(check_rig(capture, find_common(capture)).error)
+        errors.append(check_rig(capture, match_capture(capture)).error)
     assert undistortion(cameras[0], Lens("SIMPLE_RADIAL", (k1,))) is not None
     assert errors[0] < 0.1
     assert errors[1] > 5 * errors[0]

@@ -10,7 +10,7 @@ import pytest
 
 from morgs_mi import cli
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.capture.color_correction import COLOR_METHODS, Tone, delta_e, fit_colors
+from morgs_mi.capture.color_correction import COLOR_METHODS, ColorCorrection, delta_e, fit_colors
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.io.video_writer import write_video
@@ -69,7 +69,10 @@ def test_what_sensors_did_is_undone(views, method: str, left: float) -> None:
     assert min(fit.samples) > 100
     assert all(after < 0.5 * before for before, after in zip(fit.before, fit.after, strict=True))
     for view in (1, 2, 3):
-        before, after = error(seen[view], true[view]), error(Tone.of(fit, view, None)(seen[view]), true[view])
+        before, after = (
+            error(seen[view], true[view]),
+            error(ColorCorrection.of(fit, view, None)(seen[view]), true[view]),
+        )
         assert before > 4
         assert after < left, (view, before, after)
     if method == "linear":
@@ -81,7 +84,7 @@ def test_cameras_that_agree_are_left_as_they_are(views) -> None:
     cameras, true, _ = views
     fit = fit_colors(cameras, true, [None] * 4)
     for view in range(4):
-        assert error(Tone.of(fit, view, None)(true[view]), true[view]) < 0.5
+        assert error(ColorCorrection.of(fit, view, None)(true[view]), true[view]) < 0.5
     assert all(after <= before + 0.1 for before, after in zip(fit.before, fit.after, strict=True))
 
 
@@ -99,7 +102,7 @@ def test_a_camera_with_nothing_in_common_keeps_its_colours(views, caplog) -> Non
 def test_a_change_of_exposure_is_undone_whatever_moves(views) -> None:
     """A third of the picture is covered by something else meanwhile."""
     picture = views[1][0]
-    tone = Tone.of(None, 0, picture)
+    tone = ColorCorrection.of(None, 0, picture)
     assert tone.gain(picture) == 1
     np.testing.assert_array_equal(tone(picture), picture)
     for gain in (0.7, 1.25):
@@ -111,7 +114,7 @@ def test_a_change_of_exposure_is_undone_whatever_moves(views) -> None:
         # A code value of a dim picture is 1.4 of the bright one's.
         assert np.abs(tone(later)[:, 100:].astype(int) - picture[:, 100:])[unclipped].mean() < 2
     black = np.zeros_like(picture)
-    assert Tone.of(None, 0, black).gain(picture) == 1
+    assert ColorCorrection.of(None, 0, black).gain(picture) == 1
 
 
 @pytest.fixture(scope="module")

@@ -99,12 +99,12 @@ def keyframe(payload):
     code = RangeCode(found["code"])
     ids = np.cumsum(code.column(N) + 1) - 1
     state = {"ids": ids, "degree": degree, "confidence": confidence, "next_id": next_id}
-    state["pivots"], state["exponents"], state["values"] = born(code, N, degree, confidence)
+    state["largest_components"], state["exponents"], state["values"] = born(code, N, degree, confidence)
     return state
 
 
 def digest(state):
-    parts = [state["ids"].astype("<u4"), state["pivots"].astype("u1"), state["exponents"].astype("i1")]
+    parts = [state["ids"].astype("<u4"), state["largest_components"].astype("u1"), state["exponents"].astype("i1")]
     parts += [state["values"].astype("<i4"), np.array([state["next_id"], state["degree"]], "<u4")]
     return hashlib.blake2b(b"".join(part.tobytes() for part in parts), digest_size=8).digest()
 
@@ -127,7 +127,11 @@ def residual(state, payload):
             for column in columns:
                 r = code.column(len(changed))
                 values[changed, column] += np.rint(r * F[coarseness % 4] * 2.0 ** (coarseness // 4)).astype(np.int64)
-    new = {**state, **{name: state[name][~dead] for name in ("ids", "pivots", "exponents")}, "values": values[~dead]}
+    new = {
+        **state,
+        **{name: state[name][~dead] for name in ("ids", "largest_components", "exponents")},
+        "values": values[~dead],
+    }
     new.pop("offset", None)
     if "offset" in found:
         new["offset"] = np.zeros((len(new["ids"]) + births, 3))
@@ -140,7 +144,7 @@ def residual(state, payload):
                 new["offset"][i, axis] = int(r) * step
     if births:
         parts = born(code, births, state["degree"], state["confidence"])
-        for name, part in zip(("pivots", "exponents", "values"), parts, strict=True):
+        for name, part in zip(("largest_components", "exponents", "values"), parts, strict=True):
             new[name] = np.concatenate([new[name], part])
         new["ids"] = np.concatenate([new["ids"], state["next_id"] + np.arange(births)])
         new["next_id"] = state["next_id"] + births
@@ -158,7 +162,7 @@ def numbers(state):
             for q, x in zip(state["values"][:, column], e[:, k], strict=True)
         ]
     quats = np.zeros((len(real), 4))
-    for i, pivot in enumerate(state["pivots"]):
+    for i, pivot in enumerate(state["largest_components"]):
         u, v, w = (float(x) for x in real[i, 6:9])
         length = math.sqrt(((1 + u * u) + v * v) + w * w)
         quats[i] = np.insert([u / length, v / length, w / length], int(pivot), 1 / length)

@@ -16,9 +16,17 @@ import pytest
 
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import PAYLOAD, StreamWriter
-from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, keyframe_packet, residual_packet, restated, seek
+from morgs_mi.codec.packets import (
+    CodedFrame,
+    coded_frames,
+    decode,
+    keyframe_packet,
+    reemitted_keyframe,
+    residual_packet,
+    seek,
+)
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.codec.salvage import Gap, salvage, write_salvaged
+from morgs_mi.codec.salvage import DamagedRange, salvage, write_salvaged
 from morgs_mi.core.gaussians import Gaussians
 from tests.codec.test_packets import CAMERAS, cloud, jittered
 
@@ -27,7 +35,7 @@ FRAMES, EVERY = 8, 3
 ROOM = 64 * 2**20
 
 
-class Part(NamedTuple):
+class ActiveSet(NamedTuple):
     """A piece of the file: the preamble (kind -1) or a packet."""
 
     kind: int
@@ -38,7 +46,7 @@ class Part(NamedTuple):
 
 class Clip(NamedTuple):
     data: bytes
-    parts: list[Part]
+    parts: list[ActiveSet]
     states: dict[int, CodedFrame]
 
 
@@ -60,12 +68,12 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
             states.append(decode(before, packet))
             writer.write(packet)
             if frame % EVERY == 0:
-                writer.write(restated(states[-1]))
+                writer.write(reemitted_keyframe(states[-1]))
     data = path.read_bytes()
-    parts, at = [Part(-1, 0, 0, 12)], 12
+    parts, at = [ActiveSet(-1, 0, 0, 12)], 12
     while at < len(data):
         kind, frame, length = struct.unpack_from("<IIQ", data, at)
-        parts.append(Part(kind, frame, at, at + PAYLOAD + length))
+        parts.append(ActiveSet(kind, frame, at, at + PAYLOAD + length))
         at = parts[-1].stop
     return Clip(data, parts, {state.frame: state for state in states})
 
@@ -130,7 +138,7 @@ def check(clip: Clip, data: bytes, path: Path) -> None:
     assert [state.frame for state in states] == playable(clip, intact)
     for state in [*played, *states]:
         assert np.array_equal(state.digest, clip.states[state.frame].digest)
-    gaps = [one for one in found if isinstance(one, Gap)]
+    gaps = [one for one in found if isinstance(one, DamagedRange)]
     for part, whole in zip(clip.parts, intact, strict=True):
         end = min(part.stop, len(data))
         assert whole or part.start >= end or any(g.start <= part.start and end <= g.stop for g in gaps), part
@@ -149,7 +157,7 @@ def check(clip: Clip, data: bytes, path: Path) -> None:
                 assert np.array_equal(state.digest, clip.states[part.frame + 1].digest)
 
 
-def rewritten(path: Path) -> tuple[list[int], list[Gap], list[bytes]]:
+def rewritten(path: Path) -> tuple[list[int], list[DamagedRange], list[bytes]]:
     """Return what `write_salvaged` says, and the digests of the states in the stream that it wrote."""
     new = path.with_name("new")
     frames, gaps = write_salvaged(StreamReader(path), new)
@@ -241,6 +249,6 @@ def test_what_cannot_be_salvaged_is_said_and_nothing_is_written(clip: Clip, tmp_
 
 def test_an_empty_file_and_one_of_something_else_hold_nothing(tmp_path: Path) -> None:
     (tmp_path / "s").write_bytes(b"")
-    assert [gap.problem for gap in salvage(tmp_path / "s") if isinstance(gap, Gap)] == ["the file is empty"]
+    assert [gap.problem for gap in salvage(tmp_path / "s") if isinstance(gap, DamagedRange)] == ["the file is empty"]
     (tmp_path / "s").write_bytes(bytes(10_000))
-    assert list(salvage(tmp_path / "s")) == [Gap(0, 10_000, "the bytes are damaged or cut off")]
+    assert list(salvage(tmp_path / "s")) == [DamagedRange(0, 10_000, "the bytes are damaged or cut off")]

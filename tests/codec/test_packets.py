@@ -25,8 +25,8 @@ from morgs_mi.codec.packets import (
     coded_frames,
     decode,
     keyframe_packet,
+    reemitted_keyframe,
     residual_packet,
-    restated,
     seek,
 )
 from morgs_mi.codec.reader import StreamReader
@@ -83,7 +83,7 @@ def write(path: Path, packets: list[Packet], states: list[CodedFrame], every: in
         for packet, state in zip(packets, states, strict=True):
             writer.write(packet)
             if state.frame and state.frame % every == 0:
-                writer.write(restated(state))
+                writer.write(reemitted_keyframe(state))
 
 
 def assert_same(got: CodedFrame, expected: CodedFrame) -> None:
@@ -230,7 +230,7 @@ def test_numbers_follow_a_gaussian_from_birth_to_death() -> None:
     assert (state.ids.tolist(), state.next_id) == ([2, 5, 7, 8], 9)
     np.testing.assert_allclose(state.gaussians.numpy()["means"][2:, 0], [8, 9], atol=0.01)
     assert not state.gaussians.numpy()["motion"][2:].any(), "who was born comes from nowhere"
-    assert decode(None, restated(state)).ids.tolist() == [2, 5, 7, 8]
+    assert decode(None, reemitted_keyframe(state)).ids.tolist() == [2, 5, 7, 8]
 
 
 def one(x: float) -> Gaussians:
@@ -281,7 +281,7 @@ def test_the_extremes_are_coded_as_exactly_as_float32_is() -> None:
     for config in (CodecConfig(), CodecConfig(birth_precision=1), CodecConfig(target_size=1)):
         second = decode(first, residual_packet(first, gone, cameras=CAMERAS, config=config))
         assert np.asarray(second.gaussians.means).min() > 100
-        assert np.array_equal(decode(None, restated(second)).digest, second.digest)
+        assert np.array_equal(decode(None, reemitted_keyframe(second)).digest, second.digest)
 
 
 def test_seeking_equals_playing_on_an_index_or_without(tmp_path: Path) -> None:

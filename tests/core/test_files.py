@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from morgs_mi.core.files import new_folder, whole, write_json
+from morgs_mi.core.files import atomic_folder, whole, write_json
 
 
 def tree(path: Path) -> dict[str, str | None]:
@@ -119,7 +119,7 @@ def test_what_a_killed_run_left_is_no_hindrance(tmp_path: Path) -> None:
     theirs = {f".partial-{os.getppid()}-x": "", f".partial-{os.getpid()}-y-x": ""}
     for name in theirs:
         (tmp_path / name).touch()
-    with new_folder(tmp_path / "x", "test()") as partial:
+    with atomic_folder(tmp_path / "x", "test()") as partial:
         (partial / "b").touch()
     assert tree(tmp_path) == theirs | {"x": None, "x/b": ""}
 
@@ -135,10 +135,10 @@ def test_a_new_folder_replaces_nothing_not_even_what_came_meanwhile(tmp_path: Pa
     write(tmp_path / "x", "folder", "old")
     with (
         pytest.raises(FileExistsError, match="x: expected a new folder, got one that exists; remove it first"),
-        new_folder(tmp_path / "x", "test()"),
+        atomic_folder(tmp_path / "x", "test()"),
     ):
         pass
-    with pytest.raises(OSError, match=r"y, .*not empty"), new_folder(tmp_path / "y", "test()"):
+    with pytest.raises(OSError, match=r"y, .*not empty"), atomic_folder(tmp_path / "y", "test()"):
         write(tmp_path / "y", "folder", "theirs")
     assert tree(tmp_path) == {"x": None, "x/a": "old", "y": None, "y/a": "theirs"}
 
@@ -147,7 +147,7 @@ def test_a_file_in_a_folder_fails_with_one_sentence(tmp_path: Path) -> None:
     with (
         file_size_limit(10),
         pytest.raises(OSError, match=r"^test\(\): .*/new/x, [^(]*: File too large; [^:]*$"),
-        new_folder(tmp_path / "new" / "x", "test()") as folder,
+        atomic_folder(tmp_path / "new" / "x", "test()") as folder,
     ):
         write_json(folder / "a.json", {"a": "b" * 1000})
     assert tree(tmp_path) == {"new": None}

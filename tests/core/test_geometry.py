@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.geometry import colors_towards, covariances, rotated, sh_basis
+from morgs_mi.core.geometry import colors_seen_from, covariances, rotated, sh_basis
 from morgs_mi.render.rasterize import rasterize
 from tests import reference
 
@@ -46,7 +46,7 @@ def test_harmonics_and_colours_are_those_of_the_twin(degree):
     expected = np.stack([np.stack(reference.sh_basis(d, degree)) for d in directions])
     np.testing.assert_allclose(sh_basis(directions, degree), expected, atol=2e-6)  # float32 polynomials
     colors = np.maximum(0.5 + np.einsum("nk,nkc->nc", expected, raw["sh_coeffs"]), 0)
-    np.testing.assert_allclose(colors_towards(gaussians, eye), colors, atol=1e-5)
+    np.testing.assert_allclose(colors_seen_from(gaussians, eye), colors, atol=1e-5)
 
 
 @pytest.mark.parametrize("degree", range(4))

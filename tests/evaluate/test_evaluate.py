@@ -11,9 +11,9 @@ import pytest
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet, restated
+from morgs_mi.codec.packets import decode, keyframe_packet, reemitted_keyframe, residual_packet
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.evaluate.evaluate import PICTURE_SCORES, evaluate_stream
+from morgs_mi.evaluate.evaluate import IMAGE_SCORES, evaluate_stream
 from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.render.rasterize import rasterize
@@ -59,7 +59,7 @@ def test_a_wrong_motion_is_an_error_where_things_move(fitted_clip: Path, tmp_pat
     """A stream of keyframes alone carries no motion: none is judged. One that stands still errs by the truth."""
     state = decode(None, keyframe_packet(moved(1), 0, CAMERAS, EXACT))
     with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
-        writer.write(restated(state))
+        writer.write(reemitted_keyframe(state))
         writer.write(residual_packet(state, state.gaussians))
         writer.write(keyframe_packet(moved(1), 2, CAMERAS, EXACT))
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
@@ -73,7 +73,7 @@ def test_only_those_who_live_in_both_frames_are_judged_by_their_motion(fitted_cl
     state = decode(None, keyframe_packet(moved(0), 0, CAMERAS, EXACT))
     after = moved(1).select([1, 2, 3, 4, 0])
     with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
-        writer.write(restated(state))
+        writer.write(reemitted_keyframe(state))
         writer.write(residual_packet(state, after, np.array([1, 2, 3, 4, -1]), CAMERAS, EXACT))
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")["motion_3d"]
     assert 0 < result["num_gaussians"] <= 4
@@ -152,7 +152,7 @@ def test_drift_is_the_slope_of_psnr(fitted_clip: Path, tmp_path: Path) -> None:
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
     first, _, last = (row["psnr"] for row in result["frames"])
     assert result["psnr_slope"] == pytest.approx((last - first) / 2)
-    scores = {name + region for name in PICTURE_SCORES for region in ("", "_moving", "_still")}
+    scores = {name + region for name in IMAGE_SCORES for region in ("", "_moving", "_still")}
     assert scores <= result["frames"][0].keys()
 
 

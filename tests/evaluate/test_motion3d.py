@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.evaluate.motion3d import compare_motion, judge_motion, rigid_motions, surface_ids
-from morgs_mi.synth.ground_truth import Truth
+from morgs_mi.evaluate.motion3d import compare_motion, evaluate_motion, rigid_motions, surface_ids
+from morgs_mi.synth.ground_truth import GroundTruth
 
 rng = np.random.default_rng(0)
 WIDTH, HEIGHT = 40, 30
@@ -16,10 +16,12 @@ FRONT = Camera.look_at((0, 0, -4), (0, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT)
 TURN, SHIFT = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0.05, 0, -0.02])
 
 
-def plane(depth: float, left: int, right: int) -> Truth:
+def plane(depth: float, left: int, right: int) -> GroundTruth:
     """What a camera sees of a wall: object `left` in its left half, `right` in its right half."""
     ids = np.where(np.arange(WIDTH) < WIDTH // 2, left, right) + np.zeros((HEIGHT, 1), int)
-    return Truth(np.zeros((HEIGHT, WIDTH, 2)), np.full((HEIGHT, WIDTH), depth), ids, np.zeros((HEIGHT, WIDTH), bool))
+    return GroundTruth(
+        np.zeros((HEIGHT, WIDTH, 2)), np.full((HEIGHT, WIDTH), depth), ids, np.zeros((HEIGHT, WIDTH), bool)
+    )
 
 
 def test_points_on_a_visible_surface_are_its_objects():
@@ -88,7 +90,7 @@ def test_the_judged_are_opaque_on_a_moving_object_and_not_on_its_axis():
     opacities = np.array([0.9, 0.9, 0.05, 0.9, 0.9])
     views = [(FRONT, plane(4, 3, 5))]
     # Judged is the first alone: the axis, too thin, the half that stands still, off the surface.
-    score = judge_motion(means, 1.5 * true, opacities, (tracked, after, ids), views)
+    score = evaluate_motion(means, 1.5 * true, opacities, (tracked, after, ids), views)
     assert score["num_gaussians"] == 1
     assert score["true_length"] == pytest.approx(2 * 0.4 * np.sin(0.1))
     assert (score["relative_error"], score["length_ratio"]) == pytest.approx((0.5, 1.5))

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from morgs_mi.evaluate.evaluate import evaluate_stream
-from morgs_mi.evaluate.tables import figure, judgement_sentences, judgement_tables
+from morgs_mi.evaluate.tables import evaluation_summary, evaluation_tables, figure
 from tests.moving_splats import write_stream
 
 
@@ -21,7 +21,7 @@ def result(fitted_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> dict:
 
 def test_tables_fit_eighty_columns(result: dict) -> None:
     console = Console(width=200, record=True)
-    for table in judgement_tables(result):
+    for table in evaluation_tables(result):
         console.print(table)
     lines = [line.rstrip() for line in console.export_text().splitlines()]
     assert max(map(len, lines)) <= 80
@@ -35,7 +35,7 @@ def test_tables_fit_eighty_columns(result: dict) -> None:
 
 
 def test_sentences_hold_what_no_table_does(result: dict) -> None:
-    text = " ".join(judgement_sentences(result))
+    text = " ".join(evaluation_summary(result))
     for value, digits in ((result["psnr_slope"], 4), (result["playback"]["fps"], 0), (result["motion_3d"]["angle"], 1)):
         assert figure(value, digits) in text
 

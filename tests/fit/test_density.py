@@ -11,11 +11,11 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.fit.config import DensityConfig
-from morgs_mi.fit.density import Plan, apply_plan, plan_additions, plan_growth, regrow
+from morgs_mi.fit.density import DensityPlan, apply_plan, plan_additions, plan_growth, resize_optimizer
 from morgs_mi.fit.optimise import adam, values_of
-from morgs_mi.losses.attribution import NOISE, Need, find_need
+from morgs_mi.losses.attribution import NOISE_TOLERANCE, DensificationScores, densification_scores
 from morgs_mi.losses.ssim import Target
-from morgs_mi.render.active_view import Window
+from morgs_mi.render.active_view import ActiveView
 
 CONFIG = DensityConfig(max_gaussians=100, split_scale=0.1, min_opacity=0.005, births=1.0)
 
@@ -33,7 +33,9 @@ def some(n=6, opacity=0.6, scale=0.05):
 
 
 def need(error, weight=None):
-    return Need(np.asarray(error, float), np.ones(len(error)) if weight is None else np.asarray(weight, float))
+    return DensificationScores(
+        np.asarray(error, float), np.ones(len(error)) if weight is None else np.asarray(weight, float)
+    )
 
 
 def growth(gaussians, error):
@@ -128,7 +130,7 @@ def test_optimiser_remembers_survivors_and_knows_nothing_of_births():
     """After a plan that only adds and removes, survivors step as if nothing had happened."""
     rng = np.random.default_rng(2)
     start, slope = rng.normal(size=(2, 6, 3)).astype(np.float32)
-    found = Plan(np.array([0, 2, 5, 2]), np.array([0, 2, 5, -1]))
+    found = DensityPlan(np.array([0, 2, 5, 2]), np.array([0, 2, 5, -1]))
 
     def run(rebuild):
         optimizer = adam({"x": mi.TensorXf(start)})
@@ -136,7 +138,7 @@ def test_optimiser_remembers_survivors_and_knows_nothing_of_births():
         gradients = slope
         for step in range(8):
             if rebuild and step == 4:
-                regrow(optimizer, found)
+                resize_optimizer(optimizer, found)
                 gradients = slope[found.parent]
             dr.backward(dr.sum(dr.square(optimizer["x"]) * mi.TensorXf(gradients), axis=None))
             optimizer.step()
@@ -152,7 +154,7 @@ def test_edits_reach_the_parameters():
     before = some()
     found = growth(before, np.ones(6))
     optimizer = adam({"means": before.means, "log_scales": before.log_scales})
-    regrow(optimizer, found, found.edits)
+    resize_optimizer(optimizer, found, found.edits)
     after = apply_plan(before, found)
     for name, value in values_of(optimizer).items():
         assert np.array_equal(np.asarray(value), np.asarray(getattr(after, name))), name
@@ -172,16 +174,21 @@ def test_need_points_at_the_gaussian_that_is_wrong():
     sh = np.full((6, 1, 3), 0.5, np.float32)
     sh[4] = -1.0
     wrong = dataclasses.replace(truth, sh_coeffs=sh)
-    found = find_need(wrong, [Window(camera)], [Target(image)])
+    found = densification_scores(wrong, [ActiveView(camera)], [Target(image)])
     assert found.error.argmax() == 4
     assert found.error[[0, 1, 2]].max() < 0.01 * found.error[4]
     # w sums to the alpha of the whole picture
     assert found.weight.sum() == pytest.approx(np.asarray(rasterize(wrong, camera, ("alpha",)).alpha).sum(), rel=1e-4)
     noisy = [Target(np.float32(image + rng.normal(0, 0.02, image.shape))) for rng in [np.random.default_rng(3)]]
-    assert find_need(truth, [Window(camera)], noisy, NOISE).error.max() < DensityConfig().min_error
+    assert (
+        densification_scores(truth, [ActiveView(camera)], noisy, NOISE_TOLERANCE).error.max()
+        < DensityConfig().min_error
+    )
     hidden = np.ones((48, 64), bool)
     hidden[:, 32:] = False
-    assert find_need(wrong, [Window(camera)], [Target(image, hidden)]).error.max() < 0.01 * found.error[4]
+    assert (
+        densification_scores(wrong, [ActiveView(camera)], [Target(image, hidden)]).error.max() < 0.01 * found.error[4]
+    )
 
 
 @pytest.mark.parametrize(

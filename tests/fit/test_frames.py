@@ -12,9 +12,9 @@ from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.fit.config import DensityConfig, FitConfig
 from morgs_mi.fit.first_frame import density_rounds, fit_first_frame
 from morgs_mi.fit.initialise import from_points
-from morgs_mi.fit.later_frame import fit_next_frame
+from morgs_mi.fit.later_frame import fit_later_frame
 from morgs_mi.losses.ssim import Target
-from morgs_mi.method.active_set import whole_part
+from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.config import MotionConfig
 
 RENDER, EXTENT = RenderConfig(), 3.0
@@ -85,9 +85,9 @@ def test_a_later_frame_tells_who_is_new(truth, motion):
     results = {}
     for births in (0.0, 0.3):
         density = DensityConfig(later_frames=True, births=births, min_error=0)
-        fitted = fit_next_frame(
+        fitted = fit_later_frame(
             before,
-            whole_part(before, views(), RENDER),
+            full_active_set(before, views(), RENDER),
             {view: Target(image) for view, image in enumerate(images)},
             {},
             EXTENT,
@@ -112,9 +112,9 @@ def test_a_later_frame_tells_who_is_new(truth, motion):
 
 
 def test_without_density_control_everybody_stays(truth):
-    fitted = fit_next_frame(
+    fitted = fit_later_frame(
         truth,
-        whole_part(truth, views(), RENDER),
+        full_active_set(truth, views(), RENDER),
         {view: Target(image) for view, image in enumerate(pictures(truth))},
         {},
         EXTENT,
@@ -130,6 +130,6 @@ def test_nobody_is_born_when_no_step_is_left_to_fit_them(truth):
     config = FitConfig(sh_degree=0, epochs=1, density=DensityConfig(min_error=0))
     targets = {view: Target(image) for view, image in enumerate(pictures(truth))}
     before = truth.select(np.arange(200))
-    part = whole_part(before, views(), RENDER)
-    fitted = fit_next_frame(before, part, targets, {}, EXTENT, config, PLAIN, np.random.default_rng(0))
+    part = full_active_set(before, views(), RENDER)
+    fitted = fit_later_frame(before, part, targets, {}, EXTENT, config, PLAIN, np.random.default_rng(0))
     assert np.array_equal(fitted.source, np.arange(200))

@@ -139,7 +139,7 @@ def test_recon_loss_on_a_region_teaches_what_the_whole_view_does(width, masked):
     drawn[0, 0] = drawn[-1, -1] = drawn[70, 5] = True
     region = Region(drawn)
     truth, before = (np.float32(rng.uniform(size=(height, width, 3))) for _ in range(2))
-    changed = region.cut(before) + np.float32(rng.normal(size=region.shape(3))) * region.inside()[..., None] * 0.1
+    changed = region.crop(before) + np.float32(rng.normal(size=region.shape(3))) * region.inside()[..., None] * 0.1
     after = region.paste(changed, before)
     target = Target(truth, rng.uniform(size=drawn.shape) < 0.8 if masked else None)
     target.remember(mi.TensorXf(before))
@@ -154,8 +154,8 @@ def test_recon_loss_on_a_region_teaches_what_the_whole_view_does(width, masked):
     found, found_grad = evaluate(changed, region)
     expected, expected_grad = evaluate(after, None)
     scale = np.abs(expected_grad).max()
-    assert np.abs(found_grad - region.cut(expected_grad)).max() < tol.SUM_ORDER_REL * scale
-    (old, _), (old_part, _) = evaluate(before, None), evaluate(region.cut(before), region)
+    assert np.abs(found_grad - region.crop(expected_grad)).max() < tol.SUM_ORDER_REL * scale
+    (old, _), (old_part, _) = evaluate(before, None), evaluate(region.crop(before), region)
     assert found - old_part == pytest.approx(expected - old, abs=tol.LOSS_REL * expected)
     again, again_grad = evaluate(changed, region)  # the surroundings have not suffered
     assert (again, np.abs(again_grad - found_grad).max()) == (found, 0)
@@ -171,8 +171,8 @@ def test_difference_is_that_of_every_pixel(width):
     drawn = np.zeros(mask.shape, bool)
     drawn[-1, -1] = drawn[3, 5] = True
     region = Region(drawn)
-    found = target.difference(mi.TensorXf(region.cut(image)), region)
-    assert np.allclose(found, region.cut(expected), atol=1e-6)
+    found = target.difference(mi.TensorXf(region.crop(image)), region)
+    assert np.allclose(found, region.crop(expected), atol=1e-6)
 
 
 def test_a_region_stands_in_its_target_unless_told_otherwise():
@@ -182,7 +182,7 @@ def test_a_region_stands_in_its_target_unless_told_otherwise():
     mask[3, 4] = True
     region, told, untold = Region(mask), Target(truth), Target(truth)
     told.remember(mi.TensorXf(truth))
-    image = mi.TensorXf(region.cut(truth) + 0.1)
+    image = mi.TensorXf(region.crop(truth) + 0.1)
     assert item(recon_loss(image, untold, region=region)) == item(recon_loss(image, told, region=region)) > 0
 
 
@@ -194,7 +194,7 @@ def test_a_picture_of_another_size_is_refused(pictures):
     with pytest.raises(ValueError, match=r"`image` must be \(1, 4, 8, 3\) like its target"):
         recon_loss(mi.TensorXf(image), Target(target), region=region)
     with pytest.raises(ValueError, match="`region` must be of a 23x19 view like its target, got 40x32"):
-        recon_loss(mi.TensorXf(region.cut(image)), Target(pictures[1]), region=region)
+        recon_loss(mi.TensorXf(region.crop(image)), Target(pictures[1]), region=region)
 
 
 def test_recon_kernels_are_compiled_once_for_all_sizes():

@@ -9,9 +9,9 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.fit.config import DensityConfig, FitConfig
-from morgs_mi.fit.later_frame import fit_next_frame
+from morgs_mi.fit.later_frame import fit_later_frame
 from morgs_mi.losses.ssim import Target
-from morgs_mi.method.active_set import changing_part, whole_part
+from morgs_mi.method.active_set import find_active_set, full_active_set
 from morgs_mi.method.config import MotionConfig
 
 RENDER, EXTENT, V = RenderConfig(), 3.0, 5
@@ -59,21 +59,21 @@ def changes(before, after) -> list[np.ndarray]:
 
 
 def test_who_moves_takes_part_and_who_is_hidden_now_and_then_does_not(before, after):
-    part = changing_part(before, cameras(), changes(before, after), CHANNELS, RENDER)
-    chosen = np.isin(np.arange(len(before)), part.rows)
+    part = find_active_set(before, cameras(), changes(before, after), CHANNELS, RENDER)
+    chosen = np.isin(np.arange(len(before)), part.indices)
     assert chosen[HIDDEN:].mean() > 0.9
     assert chosen[:HIDDEN].mean() < 0.1
-    assert len(part.windows) == V
-    assert part.shares["pixels"] < 0.4
-    assert part.shares["gaussians"] == chosen.mean()
+    assert len(part.views) == V
+    assert part.fractions["pixels"] < 0.4
+    assert part.fractions["gaussians"] == chosen.mean()
 
 
 def test_nothing_has_changed(before):
     nothing = [np.zeros((96, 128), bool)] * V
-    part = changing_part(before, cameras(), nothing, CHANNELS, RENDER)
-    assert not part.windows
-    assert part.shares == {"gaussians": 0, "views": 0, "pixels": 0}
-    fitted = fit_next_frame(before, part, {}, {}, EXTENT, FitConfig(sh_degree=0), PLAIN, np.random.default_rng(0))
+    part = find_active_set(before, cameras(), nothing, CHANNELS, RENDER)
+    assert not part.views
+    assert part.fractions == {"gaussians": 0, "views": 0, "pixels": 0}
+    fitted = fit_later_frame(before, part, {}, {}, EXTENT, FitConfig(sh_degree=0), PLAIN, np.random.default_rng(0))
     assert fitted.epochs == 0
     assert np.array_equal(fitted.gaussians.means, before.means)
     assert not np.asarray(fitted.gaussians.motion).any()
@@ -82,10 +82,10 @@ def test_nothing_has_changed(before):
 def test_what_appears_before_a_still_wall_wakes_it(before):
     """The ball is new: no Gaussian is there, and every view sees it before another part of the wall."""
     wall = before.select(np.arange(HIDDEN))
-    part = changing_part(wall, cameras(), changes(wall, before), CHANNELS, RENDER)
+    part = find_active_set(wall, cameras(), changes(wall, before), CHANNELS, RENDER)
     covered = []
     for view in range(V):
-        region = part.windows[view].region
+        region = part.views[view].region
         covered.append(region.paste(np.ones(region.shape(1)[:3]), np.zeros((96, 128))))
     for change, drawn in zip(changes(wall, before), covered, strict=True):
         assert drawn[change].mean() > 0.9
@@ -96,11 +96,11 @@ def test_a_part_is_fitted_as_the_whole_is(before, after, grows):
     """Error of the moved picture, and who is there: what stands still is as it was, to the bit."""
     density = DensityConfig(later_frames=grows, births=0.05, min_error=0)
     config, truth = FitConfig(sh_degree=0, epochs=12, density=density), pictures(after)
-    part = changing_part(before, cameras(), changes(before, after), CHANNELS, RENDER)
+    part = find_active_set(before, cameras(), changes(before, after), CHANNELS, RENDER)
     errors = {}
-    for name, some in (("whole", whole_part(before, cameras(), RENDER)), ("part", part)):
+    for name, some in (("whole", full_active_set(before, cameras(), RENDER)), ("part", part)):
         targets = {view: Target(image) for view, image in enumerate(truth)}
-        fitted = fit_next_frame(before, some, targets, {}, EXTENT, config, PLAIN, np.random.default_rng(0))
+        fitted = fit_later_frame(before, some, targets, {}, EXTENT, config, PLAIN, np.random.default_rng(0))
         errors[name] = np.sqrt(np.mean([(a - b) ** 2 for a, b in zip(pictures(fitted.gaussians), truth, strict=True)]))
     start = np.sqrt(np.mean([(a - b) ** 2 for a, b in zip(pictures(before), truth, strict=True)]))
     assert errors["whole"] < 0.4 * start
@@ -108,7 +108,7 @@ def test_a_part_is_fitted_as_the_whole_is(before, after, grows):
     assert errors["part"] < 1.06 * errors["whole"]
     assert np.array_equal(fitted.source[fitted.source >= 0], np.unique(fitted.source[fitted.source >= 0]))
     assert (fitted.source == -1).any() == grows
-    still = np.setdiff1d(np.arange(len(before)), part.rows)
+    still = np.setdiff1d(np.arange(len(before)), part.indices)
     where = np.searchsorted(fitted.source[fitted.source >= 0], still)
     assert not np.asarray(fitted.gaussians.motion)[where].any()
     assert not np.asarray(fitted.gaussians.offset)[where].any()
@@ -119,9 +119,9 @@ def test_a_part_is_fitted_as_the_whole_is(before, after, grows):
 
 def test_a_frame_that_has_settled_ends_early(before):
     targets = {view: Target(image) for view, image in enumerate(pictures(before))}
-    config = FitConfig(sh_degree=0, epochs=12, density=DensityConfig(later_frames=False), settled=0.0)
-    whole = whole_part(before, cameras(), RENDER)
-    fitted = fit_next_frame(before, whole, targets, {}, EXTENT, config, PLAIN, np.random.default_rng(0))
+    config = FitConfig(sh_degree=0, epochs=12, density=DensityConfig(later_frames=False), early_stopping_tolerance=0.0)
+    whole = full_active_set(before, cameras(), RENDER)
+    fitted = fit_later_frame(before, whole, targets, {}, EXTENT, config, PLAIN, np.random.default_rng(0))
     assert fitted.epochs == 12
     config = replace(config, density=DensityConfig(births=0.0))
-    assert fit_next_frame(before, whole, targets, {}, EXTENT, config, PLAIN, np.random.default_rng(0)).epochs < 12
+    assert fit_later_frame(before, whole, targets, {}, EXTENT, config, PLAIN, np.random.default_rng(0)).epochs < 12

@@ -8,10 +8,10 @@ import pytest
 
 from morgs_mi.method.change import around, changed, renewed
 from morgs_mi.method.config import MotionConfig
-from morgs_mi.method.flow import motion_cues
+from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.registry import FramePair
 
-H, W, NOISE = 120, 160, 3.0
+H, W, NOISE_TOLERANCE = 120, 160, 3.0
 
 
 def picture(rng, level=0.0, disc=None):
@@ -20,7 +20,7 @@ def picture(rng, level=0.0, disc=None):
     image = 120 + 60 * np.sin(x / 7)[..., None] * np.cos(y / 9)[..., None] * np.ones(3) + level
     if disc is not None:
         image[(x - disc[0]) ** 2 + (y - disc[1]) ** 2 < 15**2] += 40
-    return np.clip(image + rng.normal(0, NOISE, image.shape), 0, 255).astype(np.uint8)
+    return np.clip(image + rng.normal(0, NOISE_TOLERANCE, image.shape), 0, 255).astype(np.uint8)
 
 
 def test_noise_is_no_change():
@@ -88,7 +88,7 @@ def test_flow_around_a_change_is_that_of_the_whole_picture(with_masks):
     patch = cv2.resize(rng.integers(0, 255, (8, 8, 3), np.uint8), (32, 32), interpolation=cv2.INTER_CUBIC)
     before[34:66, 54:86], after[34:66, 58:90] = patch, patch
     box = around(changed(before, after))
-    cues = [motion_cues({0: FramePair(after, before, box=b)}, MotionConfig(), with_masks)[0] for b in (None, box)]
+    cues = [observe_key_views({0: FramePair(after, before, box=b)}, MotionConfig(), with_masks)[0] for b in (None, box)]
     whole, part = (cue.motion[40:60, 64:84] for cue in cues)
     assert np.median(whole, axis=(0, 1)) == pytest.approx((4, 0), abs=0.2)
     assert np.median(np.linalg.norm(whole - part, axis=-1)) < 0.2

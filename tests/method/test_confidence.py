@@ -18,7 +18,7 @@ from morgs_mi.method.confidence import (
     vote_superpixels,
 )
 from morgs_mi.method.config import MotionConfig
-from morgs_mi.method.flow import motion_cue, motion_cues
+from morgs_mi.method.flow import observe_flow, observe_key_views
 from morgs_mi.method.flow_sources.registry import FramePair
 from tests.method.moving_disc import moving_disc
 
@@ -33,14 +33,14 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
 @pytest.mark.parametrize("method", MASK_METHODS)
 def test_static_pair_gives_an_empty_mask_under_camera_noise(method, size):
     previous, image, _ = moving_disc(*size, shift=(0, 0), noise=CAMERA_NOISE)
-    assert not motion_cue(image, previous, mask_method=method).mask.any()
+    assert not observe_flow(image, previous, mask_method=method).mask.any()
 
 
 @pytest.mark.parametrize("shift", [(6, -4), (1, 0)])
 @pytest.mark.parametrize("method", MASK_METHODS)
 def test_moving_disc_is_found(method, shift):
     previous, image, disc = moving_disc(240, 320, shift, CAMERA_NOISE)
-    mask = motion_cue(image, previous, mask_method=method).mask
+    mask = observe_flow(image, previous, mask_method=method).mask
     # DIS spreads motion by up to half a patch, 4 px: the bound is a disc of 48 px radius grown by that much.
     assert overlap(mask, disc) > (48 / 52) ** 2 - 0.1
     assert mask[disc].mean() > 0.95
@@ -55,13 +55,13 @@ def test_refinement_recovers_an_object_from_a_part_of_it():
 
 def test_union_never_loses_flow():
     previous, image, _ = moving_disc(120, 160, (3, 2))
-    cue = motion_cue(image, previous, mask_method="grabcut")
+    cue = observe_flow(image, previous, mask_method="grabcut")
     assert not (flow_mask(cue.motion, cue.reliable) & ~cue.mask).any()
 
 
 def test_without_refinement_the_mask_is_the_flows():
     previous, image, _ = moving_disc(120, 160, (3, 2))
-    cue = motion_cue(image, previous, mask_method="none")
+    cue = observe_flow(image, previous, mask_method="none")
     np.testing.assert_array_equal(cue.mask, flow_mask(cue.motion, cue.reliable))
 
 
@@ -84,10 +84,10 @@ def test_masks_are_those_of_the_method_that_the_settings_name():
     previous, image, _ = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
     pair = {7: FramePair(image, previous)}
     for method in MASK_METHODS:
-        cue = motion_cues(pair, MotionConfig(mask_method=method), with_masks=True)[7]
+        cue = observe_key_views(pair, MotionConfig(mask_method=method), with_masks=True)[7]
         moves = flow_mask(cue.motion, cue.reliable)
         np.testing.assert_array_equal(cue.mask, mask_refiner(method)(image, moves))
-    assert motion_cues(pair, MotionConfig(), with_masks=False)[7].mask is None
+    assert observe_key_views(pair, MotionConfig(), with_masks=False)[7].mask is None
 
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 5), (40, 30), (700, 20)])

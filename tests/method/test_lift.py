@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians
-from morgs_mi.method.flow import MotionCue, choose_key_views
+from morgs_mi.method.flow import FlowObservation, choose_key_views
 from morgs_mi.method.lift import lift_flow, projection_jacobian
-from morgs_mi.render.active_view import Window
+from morgs_mi.render.active_view import ActiveView
 from morgs_mi.synth.ground_truth import project
 
 SHIFT = np.array([0.03, -0.02, 0.015])
@@ -36,11 +36,11 @@ def uniform_cue(camera, shift):
     before, after = (project(camera, np.atleast_2d(p))[0][0] for p in (np.zeros(3), shift))
     flow = np.broadcast_to(np.float32(after - before), (camera.height, camera.width, 2)).copy()
     everywhere = np.ones((camera.height, camera.width), bool)
-    return MotionCue(flow, everywhere, flow, everywhere)
+    return FlowObservation(flow, everywhere, flow, everywhere)
 
 
 def lifted_from(gaussians, cues):
-    return lift_flow(gaussians, {view: Window(camera) for view, camera in enumerate(rig())}, cues)
+    return lift_flow(gaussians, {view: ActiveView(camera) for view, camera in enumerate(rig())}, cues)
 
 
 def test_uniform_motion_is_recovered_in_3d():
@@ -55,8 +55,8 @@ def test_uniform_motion_is_recovered_in_3d():
 
 def test_no_evidence_means_no_motion():
     cue = uniform_cue(rig()[0], SHIFT)
-    nowhere = np.zeros_like(cue.onward_reliable)
-    for cues in ({}, {0: MotionCue(cue.motion, nowhere, cue.onward, nowhere)}):
+    nowhere = np.zeros_like(cue.forward_reliable)
+    for cues in ({}, {0: FlowObservation(cue.motion, nowhere, cue.forward_flow, nowhere)}):
         lifted = lifted_from(cloud(), cues)
         assert np.abs(lifted.displacement).max() == 0
         assert (lifted.logit_confidence < -1).all()
@@ -68,7 +68,7 @@ def test_noise_of_the_flow_is_no_motion():
     for view, camera in enumerate(rig()):
         flow = cv2.resize(rng.normal(0, 0.1, (6, 8, 2)), (camera.width, camera.height)).astype(np.float32)
         everywhere = np.ones((camera.height, camera.width), bool)
-        cues[view] = MotionCue(flow, everywhere, flow, everywhere)
+        cues[view] = FlowObservation(flow, everywhere, flow, everywhere)
     lifted = lifted_from(cloud(), cues)
     assert (lifted.logit_confidence < 0).all()
     assert np.abs(lifted.displacement).max() == 0
@@ -79,8 +79,8 @@ def test_one_view_that_errs_does_not_convince_the_others():
     cameras = rig()
     for truth in (np.zeros(3), SHIFT):
         cues = {view: uniform_cue(camera, truth) for view, camera in enumerate(cameras)}
-        wrong = np.full_like(cues[2].onward, 6.0)
-        cues[2] = replace(cues[2], onward=wrong)
+        wrong = np.full_like(cues[2].forward_flow, 6.0)
+        cues[2] = replace(cues[2], forward_flow=wrong)
         lifted = lifted_from(cloud(), cues)
         error = np.linalg.norm(np.median(lifted.displacement, axis=0) - truth)
         # Without the rounds of reweighting it is 0.6 to 0.7 of the motion.

@@ -12,7 +12,7 @@ from morgs_mi import Camera, Gaussians
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.lift import Lift
 from morgs_mi.method.propagation import propagate_motion
-from morgs_mi.render.active_view import Window
+from morgs_mi.render.active_view import ActiveView
 
 SHIFT = np.float32([0.25, -0.1, 0.0])
 
@@ -32,8 +32,8 @@ def scene():
     before = Gaussians.from_activated(means, scales, quats, np.full(460, 0.9), colors)
     moves = np.arange(460) < 60
     after = replace(before, means=mi.TensorXf(np.asarray(before.means) + SHIFT * moves[:, None]))
-    windows = {view: Window(camera) for view, camera in enumerate(cameras())}
-    targets = {view: Target(np.asarray(window.draw(after).color)) for view, window in windows.items()}
+    windows = {view: ActiveView(camera) for view, camera in enumerate(cameras())}
+    targets = {view: Target(np.asarray(window.render(after).color)) for view, window in windows.items()}
     return before, moves, windows, targets
 
 
@@ -69,7 +69,7 @@ def test_what_moved_goes_on_where_flow_says_nothing(scene):
 def test_what_stopped_does_not_go_on(scene):
     """The pictures are those of `before`: whoever moved, stands."""
     before, moves, windows, _ = scene
-    targets = {view: Target(np.asarray(window.draw(before).color)) for view, window in windows.items()}
+    targets = {view: Target(np.asarray(window.render(before).color)) for view, window in windows.items()}
     gone_on = start((before, moves, windows, targets), still(460), SHIFT * moves[:, None])
     assert not gone_on.displacement[moves].any()
 

@@ -91,7 +91,7 @@ def test_gradient_of_the_gate_agrees_with_the_product_rule():
 def test_joining_split_sh_is_the_identity_with_gradient(degree):
     sh = to_gaussians(make_scene(degree)).sh_coeffs
     dr.enable_grad(sh)
-    joined = join_sh(*split_sh(sh))
-    assert np.array_equal(np.asarray(joined), np.asarray(sh))
-    dr.backward(dr.sum(dr.square(joined), axis=None))
+    concatenated = join_sh(*split_sh(sh))
+    assert np.array_equal(np.asarray(concatenated), np.asarray(sh))
+    dr.backward(dr.sum(dr.square(concatenated), axis=None))
     assert np.asarray(dr.grad(sh)) == pytest.approx(2 * np.asarray(sh), rel=1e-6)

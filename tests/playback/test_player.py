@@ -11,26 +11,26 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.playback.player import (
-    channel_picture,
+    channel_image,
     find_camera,
     has_confidence,
     has_offset,
     open_stream,
     playback,
     render_stream,
-    truth_on,
+    truth_for_camera,
 )
 from tests.moving_splats import CAMERAS, FRAMES, HEIGHT, WIDTH, moved, write_stream
 
 
 def test_truth_on_a_coarser_grid(fitted_clip: Path) -> None:
     small = load_capture(fitted_clip / "capture", downscale=2)
-    full, half = (truth_on(small, c, 1) for c in (CAMERAS[0], small.cameras[0]))
+    full, half = (truth_for_camera(small, c, 1) for c in (CAMERAS[0], small.cameras[0]))
     assert full is not None
     assert half is not None
     np.testing.assert_array_equal(half.mask, full.mask[1::2, 1::2])
     np.testing.assert_allclose(half.motion, full.motion[1::2, 1::2] / 2)
-    assert truth_on(small, CAMERAS[0], FRAMES) is None
+    assert truth_for_camera(small, CAMERAS[0], FRAMES) is None
 
 
 def test_every_carried_channel_is_rendered(fitted_clip: Path, tmp_path: Path) -> None:
@@ -39,7 +39,7 @@ def test_every_carried_channel_is_rendered(fitted_clip: Path, tmp_path: Path) ->
     assert [index for index, _ in frames] == list(range(FRAMES))
     shapes = {name: image.shape for name, image in frames[0][1].items()}
     assert shapes == {n: (HEIGHT, WIDTH, k) for n, k in (("color", 3), ("motion", 2), ("depth", 1), ("confidence", 1))}
-    assert all(channel_picture(n, i).shape == (HEIGHT, WIDTH, 3) for n, i in frames[0][1].items())
+    assert all(channel_image(n, i).shape == (HEIGHT, WIDTH, 3) for n, i in frames[0][1].items())
     write_stream(tmp_path / "s.morgs", {}, logit=None)
     assert "confidence" not in next(render_stream(open_stream(tmp_path / "s.morgs"), CAMERAS[0]))[1]
 
@@ -75,8 +75,8 @@ def test_offsets_are_drawn_as_the_share_of_motion_that_they_are(fitted_clip: Pat
         np.testing.assert_allclose(images["offset"], 0.25 * images["motion"], atol=1e-4)
     for _, images in render_stream(open_stream(fitted_clip), CAMERAS[0], ("offset",)):
         assert not images["offset"].any()
-    tenth = channel_picture("offset", 0.1 * images["offset"] + 0.05)
-    np.testing.assert_array_equal(tenth, channel_picture("motion", images["offset"] + 0.5))
+    tenth = channel_image("offset", 0.1 * images["offset"] + 0.05)
+    np.testing.assert_array_equal(tenth, channel_image("motion", images["offset"] + 0.5))
 
 
 def test_playback_is_the_time_of_a_frame(fitted_clip: Path, tmp_path: Path) -> None:

@@ -11,35 +11,35 @@ from morgs_mi.playback import visualise as pictures
 
 def test_motion_colours_follow_the_docstring():
     motion = np.array([[[0, 0], [5, 0], [-5, 0], [50, 0], [np.nan, 0]]])
-    colours = pictures.motion_picture(motion, 5.0)[0].tolist()
+    colours = pictures.motion_image(motion, 5.0)[0].tolist()
     assert colours == [[255, 255, 255], [255, 0, 0], [0, 255, 255], [255, 0, 0], [128, 128, 128]]
-    down, up = pictures.motion_picture(np.array([[[0, 5], [0, -5]]]), 5.0)[0]
+    down, up = pictures.motion_image(np.array([[[0, 5], [0, -5]]]), 5.0)[0]
     assert down.argmax() == 1
     assert up.argmax() == 2
 
 
 def test_motion_paler_when_slower():
     speeds = np.linspace(0, 10, 11)
-    green = pictures.motion_picture(np.stack([speeds, 0 * speeds], -1)[None], 10)[0, :, 1].astype(int)
+    green = pictures.motion_image(np.stack([speeds, 0 * speeds], -1)[None], 10)[0, :, 1].astype(int)
     assert (np.diff(green) < 0).all()
 
 
 def test_legend_agrees_with_the_picture():
     legend = pictures.motion_legend(8.0, size=101)
-    expected = pictures.motion_picture(np.array([[[0.0, 6.4]]]), 8.0)[0, 0]
+    expected = pictures.motion_image(np.array([[[0.0, 6.4]]]), 8.0)[0, 0]
     np.testing.assert_allclose(legend[90, 50].astype(int), expected, atol=2)
     assert (legend[-1, -1] == 255).all()
 
 
 def test_confidence_brightens():
-    ramp = pictures.confidence_picture(np.linspace(0, 1, 8)[None, :, None])
+    ramp = pictures.confidence_image(np.linspace(0, 1, 8)[None, :, None])
     assert (np.diff(ramp.sum(-1, dtype=int)[0]) > 0).all()
 
 
 def test_confidence_legend_agrees_with_the_picture():
     legend = pictures.confidence_legend(size=90)
     for row, value in ((0, 1.0), (89, 0.0)):
-        assert (legend[row, :30] == pictures.confidence_picture(np.array([[value]]))[0, 0]).all()
+        assert (legend[row, :30] == pictures.confidence_image(np.array([[value]]))[0, 0]).all()
     assert (legend[:, 89] == 255).all()
 
 
@@ -55,12 +55,12 @@ def test_time_runs_to_the_right_of_a_slice():
 
 def test_depth_is_red_near_blue_far_and_grey_nowhere():
     depth = np.array([[1.0, 2.0, 10.0, 0.0, np.inf, np.nan]])
-    red, _, blue, *nothing = pictures.depth_picture(depth, near=1.0, far=10.0)[0].astype(int)
+    red, _, blue, *nothing = pictures.depth_image(depth, near=1.0, far=10.0)[0].astype(int)
     assert red[0] > red[2]
     assert blue[2] > blue[0]
     assert (np.array(nothing) == 128).all()
-    assert (pictures.depth_picture(np.zeros((2, 2))) == 128).all()
-    assert np.unique(pictures.depth_picture(np.ones((2, 2, 1)))[..., 0]).size == 1
+    assert (pictures.depth_image(np.zeros((2, 2))) == 128).all()
+    assert np.unique(pictures.depth_image(np.ones((2, 2, 1)))[..., 0]).size == 1
 
 
 def test_sheet_size():
@@ -76,7 +76,7 @@ def test_label_fits_any_size():
         image = np.full((*size, 3), 0.5)
         labelled = pictures.label(image, "frame 12")
         assert labelled.shape == (*size, 3)
-        assert (labelled != pictures.as_picture(image)).any()
+        assert (labelled != pictures.to_uint8(image)).any()
 
 
 def test_png_round_trip(tmp_path):
@@ -100,9 +100,9 @@ def test_failed_png_leaves_nothing_behind(tmp_path):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: pictures.as_picture(np.zeros((2, 2, 4))), r"got \(2, 2, 4\)"),
-        (lambda: pictures.motion_picture(np.zeros((2, 2)), 1), r"\[H, W, 2\]"),
-        (lambda: pictures.motion_picture(np.zeros((2, 2, 2)), 0), "positive, got 0"),
+        (lambda: pictures.to_uint8(np.zeros((2, 2, 4))), r"got \(2, 2, 4\)"),
+        (lambda: pictures.motion_image(np.zeros((2, 2)), 1), r"\[H, W, 2\]"),
+        (lambda: pictures.motion_image(np.zeros((2, 2, 2)), 0), "positive, got 0"),
         (lambda: pictures.side_by_side([]), "at least one"),
         (lambda: pictures.time_slice([]), "at least one column"),
         (lambda: pictures.write_png("x.png", np.zeros((0, 2))), "no pixels"),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
-from morgs_mi.render.active_view import Window, open_window
+from morgs_mi.render.active_view import ActiveView, make_active_view
 from morgs_mi.render.backproject import backproject
 from tests import tolerances as tol
 
@@ -42,21 +42,21 @@ def mask(camera: Camera) -> np.ndarray:
     return (x - 30) ** 2 + (y - 20) ** 2 < 20**2
 
 
-def opened(camera, everyone, mask) -> tuple[Window, Gaussians]:
+def opened(camera, everyone, mask) -> tuple[ActiveView, Gaussians]:
     moving = np.isin(np.arange(N), MOVING)
-    return open_window(camera, mask, everyone.select(~moving), CHANNELS, RenderConfig()), everyone.select(moving)
+    return make_active_view(camera, mask, everyone.select(~moving), CHANNELS, RenderConfig()), everyone.select(moving)
 
 
 def test_a_window_shows_and_teaches_what_the_whole_view_does(camera, everyone, mask):
     window, moving = opened(camera, everyone, mask)
-    assert 0.1 < window.share < 0.4
+    assert 0.1 < window.pixel_fraction < 0.4
     dr.enable_grad(moving.means, moving.sh_coeffs, everyone.means, everyone.sh_coeffs)
-    part, whole = window.draw(moving, CHANNELS), rasterize(everyone, camera, CHANNELS)
+    part, whole = window.render(moving, CHANNELS), rasterize(everyone, camera, CHANNELS)
     for name in CHANNELS:
-        assert np.array_equal(getattr(part, name), window.cut(np.asarray(getattr(whole, name)))), name
+        assert np.array_equal(getattr(part, name), window.crop(np.asarray(getattr(whole, name)))), name
     weight = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3))
     shown = window.region.paste(np.ones(window.region.shape(1)[:3]), np.zeros(mask.shape))
-    dr.backward(dr.sum(part.color * mi.TensorXf(np.float32(window.cut(weight))), axis=None))
+    dr.backward(dr.sum(part.color * mi.TensorXf(np.float32(window.crop(weight))), axis=None))
     dr.backward(dr.sum(whole.color * mi.TensorXf(np.float32(weight * shown[..., None])), axis=None))
     for name in ("means", "sh_coeffs"):
         found, expected = np.asarray(dr.grad(getattr(moving, name))), np.asarray(dr.grad(getattr(everyone, name)))
@@ -69,13 +69,13 @@ def test_who_stands_still_takes_their_share_of_the_pixels(camera, everyone, mask
     drawn = window.region.paste(np.ones(window.region.shape(1)[:3]), np.zeros(mask.shape))
     picture = np.float32(np.random.default_rng(1).uniform(size=(camera.height, camera.width, 2)))
     expected = backproject(everyone, camera, picture * np.float32(drawn)[..., None])[MOVING]
-    found = window.backproject(moving, window.cut(picture))
+    found = window.backproject(moving, window.crop(picture))
     assert expected.max() > 10
     assert np.abs(found - expected).max() < tol.SUM_ORDER_REL * expected.max()
 
 
 def test_nobody_stands_still(camera, everyone, mask):
     nobody = everyone.select(np.zeros(0, int))
-    window = open_window(camera, mask, nobody, CHANNELS, RenderConfig())
+    window = make_active_view(camera, mask, nobody, CHANNELS, RenderConfig())
     whole = rasterize(everyone, camera, ("color",)).color
-    assert np.array_equal(window.draw(everyone).color, window.cut(np.asarray(whole)))
+    assert np.array_equal(window.render(everyone).color, window.crop(np.asarray(whole)))

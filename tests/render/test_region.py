@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
-from morgs_mi.render.region import Region, owned
+from morgs_mi.render.region import Region, owned_copy
 from tests import tolerances as tol
 
 CHANNELS = ("color", "alpha", "depth", "motion", "confidence")
@@ -52,7 +52,7 @@ def run(raw, camera, region=None, active=None, weight=None, config=None):
     image = rasterize(gaussians, camera, CHANNELS, BACKGROUND, region=region, active=active, config=config)
     images = {name: getattr(image, name) for name in CHANNELS}
     if weight is not None:
-        laid_out = {name: region.cut(w) if region else w for name, w in weight.items()}
+        laid_out = {name: region.crop(w) if region else w for name, w in weight.items()}
         dr.backward(sum(dr.sum(images[n] * mi.TensorXf(np.float32(laid_out[n])), axis=None) for n in CHANNELS))
     grads = {name: np.asarray(dr.grad(getattr(gaussians, name)), np.float64) for name in RAW}
     return {name: np.asarray(value) for name, value in images.items()}, grads
@@ -82,7 +82,7 @@ def test_a_region_shows_and_teaches_what_the_whole_view_does(raw, camera, mask, 
     images, grads = run(raw, camera, region, None, weight, config)
     full_images, full_grads = run(raw, camera, None, None, weight, config)
     for name in CHANNELS:
-        assert np.array_equal(images[name], region.cut(full_images[name])), name
+        assert np.array_equal(images[name], region.crop(full_images[name])), name
         assert (images[name][~region.inside()] == 0).all(), name
     assert_same_gradients(grads, full_grads)
 
@@ -113,7 +113,7 @@ def test_features_on_a_region_of_the_active(raw, camera, mask):
 
     expected, full = run_features()
     found, grad = run_features(region=region, active=active)
-    assert np.array_equal(found, region.cut(expected))
+    assert np.array_equal(found, region.crop(expected))
     assert np.abs(full[active]).max() > 0
     assert np.abs(grad[active] - full[active]).max() < tol.SUM_ORDER_REL * np.abs(full).max()
     assert (grad[~active] == 0).all()
@@ -154,7 +154,7 @@ def test_a_region_in_forward_mode(raw, camera, mask):
         dr.forward_to(outputs)
         tangents.append([np.asarray(dr.grad(output)) for output in outputs])
     for name, found, expected in zip(CHANNELS, *tangents, strict=True):
-        assert np.abs(found - region.cut(expected)).max() < tol.SUM_ORDER_REL * np.abs(expected).max(), name
+        assert np.abs(found - region.crop(expected)).max() < tol.SUM_ORDER_REL * np.abs(expected).max(), name
 
 
 def test_a_region_where_nothing_is(raw, camera, mask):
@@ -169,7 +169,7 @@ def test_a_region_where_nothing_is(raw, camera, mask):
 def test_cut_and_paste_are_inverse(camera, mask):
     region, rng = Region(mask), np.random.default_rng(0)
     picture, other = (rng.normal(size=(*mask.shape, 3)) for _ in range(2))
-    pasted = region.paste(region.cut(picture), other)
+    pasted = region.paste(region.crop(picture), other)
     assert (pasted[mask] == picture[mask]).all()
     drawn = region.paste(np.ones(region.shape(1)[:3], bool), np.zeros(mask.shape, bool))
     assert (pasted[~drawn] == other[~drawn]).all()
@@ -229,6 +229,6 @@ def test_gradients_from_memory_of_any_alignment(raw, offset):
 
 def test_owned_memory_is_aligned():
     borrowed = mi.Float(np.arange(1001, dtype=np.float32)[1:])
-    copy = np.asarray(owned(borrowed))
+    copy = np.asarray(owned_copy(borrowed))
     assert np.array_equal(copy, np.arange(1, 1001))
     assert copy.__array_interface__["data"][0] % 64 == 0

@@ -6,15 +6,15 @@ from pathlib import Path
 
 import pytest
 
-from morgs_mi.synth.path_tracer import Stage
+from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import load_scene
 from morgs_mi.synth.synthesize import synthesize
 
 
 @pytest.fixture(scope="session")
-def stage() -> Stage:
+def stage() -> PathTracer:
     """The balls, at whatever time the last test left them."""
-    return Stage(load_scene("spheres"))
+    return PathTracer(load_scene("spheres"))
 
 
 @pytest.fixture(scope="session")

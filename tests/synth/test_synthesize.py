@@ -14,8 +14,8 @@ import pytest
 from morgs_mi.capture.layouts.colmap import read_colmap
 from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds
 from morgs_mi.io.video import open_frames
-from morgs_mi.synth.ground_truth import carry, load_tracks, load_truth, project, truth_of
-from morgs_mi.synth.path_tracer import Stage
+from morgs_mi.synth.ground_truth import carry, ground_truth_of, load_tracks, load_truth, project
+from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import Light, Object, Scene, load_scene, translate
 from morgs_mi.synth.synthesize import synthesize
 
@@ -26,13 +26,13 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / np.mean((a.astype(float) - b) ** 2)))
 
 
-def look(stage: Stage, camera, frame: int):
+def look(stage: PathTracer, camera, frame: int):
     """Return the picture and the truth of a frame."""
     time = frame / FPS
     stage.move(time)
     points, ids = stage.surface(camera)
     poses = [stage.poses(time + step / FPS) for step in (0, -1, 1)]
-    return stage.picture(camera, 16, frame), truth_of(camera, points, ids, *poses)
+    return stage.picture(camera, 16, frame), ground_truth_of(camera, points, ids, *poses)
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def test_layout_is_n3dvs_with_a_colmap_model(clip):
 
 def test_lossless_frames_are_what_was_rendered(clip):
     scene = load_scene("arm")
-    stage = Stage(scene)
+    stage = PathTracer(scene)
     stage.move(1 / FPS)
     noise = int(np.random.SeedSequence([0, 1, 1]).generate_state(1)[0])
     picture = stage.picture(scene.rig.cameras(3, 64, 48)[1], 4, noise)
@@ -148,16 +148,16 @@ def test_depth_and_points_agree_with_rays_of_the_mitsuba_sensor(stage):
     pixels, depth = project(camera, points)
     np.testing.assert_allclose(pixels, np.stack([x, y], axis=-1).reshape(48, 64, 2), atol=1e-3)
     poses = stage.poses(0)
-    np.testing.assert_allclose(truth_of(camera, points, ids, poses, None, poses).depth, depth, rtol=1e-6)
+    np.testing.assert_allclose(ground_truth_of(camera, points, ids, poses, None, poses).depth, depth, rtol=1e-6)
 
 
 def test_pixels_that_see_nothing_are_marked():
     square = {"type": "rectangle"}
     scene = Scene("square", {"square": Object({"square": square}, lambda t: translate(t, 0.8, 0))}, {})
-    stage = Stage(scene)
+    stage = PathTracer(scene)
     camera = scene.rig.cameras(2, 64, 48)[0]
     points, ids = stage.surface(camera)
-    truth = truth_of(camera, points, ids, stage.poses(0), None, stage.poses(1))
+    truth = ground_truth_of(camera, points, ids, stage.poses(0), None, stage.poses(1))
     assert set(np.unique(truth.ids)) == {-1, 0}
     nothing = truth.ids < 0
     assert (truth.depth[nothing] == 0).all()
@@ -169,7 +169,7 @@ def test_pixels_that_see_nothing_are_marked():
 def test_pictures_are_srgb_encoded(radiance):
     light = Light({"type": "constant", "radiance": {"type": "rgb", "value": radiance}})
     scene = Scene("sky", {}, {"sky": light})
-    picture = Stage(scene).picture(scene.rig.cameras(2, 8, 8)[0], 1, 0)
+    picture = PathTracer(scene).picture(scene.rig.cameras(2, 8, 8)[0], 1, 0)
     linear = min(radiance, 1.0)
     encoded = 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
     np.testing.assert_array_equal(picture, np.uint8(round(255 * encoded)))
@@ -221,7 +221,7 @@ def test_balls_roll_without_slipping(name, radius):
 
 
 def test_thin_parts_move_farther_than_they_are_wide():
-    stage = Stage(load_scene("thin"))
+    stage = PathTracer(load_scene("thin"))
     camera = stage.scene.rig.cameras(3, 320, 240)[0]
     _, truth = look(stage, camera, 5)
     speed = np.linalg.norm(truth.motion, axis=-1)
@@ -233,7 +233,7 @@ def test_thin_parts_move_farther_than_they_are_wide():
 
 
 def test_where_light_flickers_pictures_change_and_surfaces_do_not():
-    stage = Stage(load_scene("flicker"))
+    stage = PathTracer(load_scene("flicker"))
     camera = stage.scene.rig.cameras(3, 160, 120)[0]
     pictures, truths = zip(*(look(stage, camera, frame) for frame in range(6)), strict=True)
     still = ~np.any([truth.mask for truth in truths], axis=0)

@@ -10,8 +10,8 @@ import pytest
 from morgs_mi import cli
 from morgs_mi.codec.packets import CodedFrame
 from morgs_mi.core.camera import Camera
-from morgs_mi.playback.player import channel_picture, open_stream, render
-from morgs_mi.playback.visualise import confidence_picture, motion_picture
+from morgs_mi.playback.player import channel_image, open_stream, render
+from morgs_mi.playback.visualise import confidence_image, motion_image
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.viewer.clip import Clip
@@ -90,12 +90,12 @@ def test_one_splat_has_the_colour_that_the_renderer_gives_it(states):
         alpha = np.array(drawn.alpha)[24, 32]
         color = np.clip(np.array(drawn.color)[24, 32] / alpha, 0, 1)
         np.testing.assert_allclose(splat_colors(one, facing, "color")[0] / 255, color, atol=0.01)
-        motion = motion_picture(np.array(drawn.motion)[24:25, 32:33], FULL_SPEED["motion"] * 65)[0, 0].astype(int)
+        motion = motion_image(np.array(drawn.motion)[24:25, 32:33], FULL_SPEED["motion"] * 65)[0, 0].astype(int)
         np.testing.assert_allclose(splat_colors(one, facing, "motion")[0], motion, atol=2)
-        learned = channel_picture("offset", render(one, facing, ("offset",), RenderConfig())["offset"])[24, 32]
+        learned = channel_image("offset", render(one, facing, ("offset",), RenderConfig())["offset"])[24, 32]
         np.testing.assert_allclose(splat_colors(one, facing, "offset")[0].astype(int), learned, atol=2)
         assert learned.astype(int).min() < 200, "the first half of the splats moves"
-        confidence = confidence_picture(np.array(drawn.confidence)[24:25, 32:33] / alpha)[0, 0].astype(int)
+        confidence = confidence_image(np.array(drawn.confidence)[24:25, 32:33] / alpha)[0, 0].astype(int)
         np.testing.assert_allclose(splat_colors(one, facing, "confidence")[0], confidence, atol=3)
 
 

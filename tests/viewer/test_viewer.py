@@ -17,7 +17,7 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.export.axes import up_direction
-from morgs_mi.playback.player import channel_picture, open_stream, render, render_config
+from morgs_mi.playback.player import channel_image, open_stream, render, render_config
 from tests.export.streams import write_stream
 
 pytest.importorskip("viser", reason="comes with the extra `viewer`")
@@ -97,7 +97,7 @@ def drawn(stream: StreamReader, state: CodedFrame, mode: str) -> np.ndarray:
     first = stream.cameras[0]
     ahead = first.position + first.viewmat[2, :3]
     camera = Camera.look_at(first.position, ahead, up_direction(stream.cameras), 45, WIDTH, HEIGHT)
-    return channel_picture(mode, render(state.gaussians, camera, (mode,), render_config(stream))[mode])
+    return channel_image(mode, render(state.gaussians, camera, (mode,), render_config(stream))[mode])
 
 
 def choose(page, mode: str) -> None:

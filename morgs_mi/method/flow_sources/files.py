@@ -63,8 +63,8 @@ class FlowFolder:
             FileNotFoundError: a file or its folder is missing.
             ValueError: two files claim one frame, a flow has another size, or as `read_flow`.
         """
-        back, onward = self._read(camera, "backward", frame, size), self._read(camera, "forward", frame - 1, size)
-        return back, onward
+        back, forward_flow = self._read(camera, "backward", frame, size), self._read(camera, "forward", frame - 1, size)
+        return back, forward_flow
 
     def _read(self, camera: str, direction: str, frame: int, size: tuple[int, int]) -> np.ndarray:
         path = self._find(self.folder / camera / direction, frame)

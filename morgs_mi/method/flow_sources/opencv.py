@@ -12,7 +12,7 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-__all__ = ["FLOW_METHODS", "check_pictures", "consistent", "optical_flow"]
+__all__ = ["FLOW_METHODS", "check_pictures", "consistency_mask", "optical_flow"]
 
 # DIS needs patches of 8 pixels on its coarsest level; below this no method has anything to match.
 MIN_SIDE = 16
@@ -114,7 +114,7 @@ def check_pictures(place: str, image: np.ndarray, previous: np.ndarray) -> None:
         )
 
 
-def consistent(flow: np.ndarray, back: np.ndarray) -> np.ndarray:
+def consistency_mask(flow: np.ndarray, back: np.ndarray) -> np.ndarray:
     """Return where a flow can be trusted [H, W], bool: where the way back returns to where it began.
 
     |F + B|^2 < 0.01 (|F|^2 + |B|^2) + 0.5 px^2, with B read where F leads (Sundaram, Brox and Keutzer, ECCV

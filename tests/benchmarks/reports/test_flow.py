@@ -13,7 +13,7 @@ from benchmarks.reports import __main__ as cli
 from benchmarks.reports.flow import FlowReportConfig, markdown_table, report_flow
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.evaluate.metrics import endpoint_error
-from morgs_mi.method.flow import motion_cue
+from morgs_mi.method.flow import observe_flow
 from morgs_mi.method.flow_sources.files import write_flow
 from morgs_mi.method.flow_sources.opencv import FLOW_METHODS
 from morgs_mi.synth.ground_truth import load_truth
@@ -56,7 +56,7 @@ def test_errors_are_those_of_the_cue(clip):
     frames, errors = list(capture.frames()), []
     for view, camera in enumerate(capture.cameras):
         truth = load_truth(clip / "truth", camera.name, 1)
-        cue = motion_cue(frames[1].images[view], frames[0].images[view])
+        cue = observe_flow(frames[1].images[view], frames[0].images[view])
         moving = truth.mask
         errors.append(
             {

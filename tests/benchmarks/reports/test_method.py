@@ -211,7 +211,7 @@ def test_a_cell_changes_what_it_says_and_no_more():
     config = Cell("paper", 3, 2, 4.0, 7).config(base)
     assert (config.fit.epochs, config.motion.key_views, config.seed) == (3, 2, 7)
     assert config.fit.rates.means == 4 * base.fit.rates.means
-    assert config.fit.first_rates == base.fit.first_rates
+    assert config.fit.first_frame_rates == base.fit.first_frame_rates
     assert not config.motion.lift_flow
     assert Cell("default", base.fit.epochs, base.motion.key_views, 1.0, base.seed).config(base) == base
 

@@ -8,7 +8,7 @@ import pytest
 
 from morgs_mi.io.exr import write_exr
 from morgs_mi.method.config import MotionConfig
-from morgs_mi.method.flow import motion_cues
+from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.files import FlowFolder, read_flow, write_flow
 from morgs_mi.method.flow_sources.registry import FramePair, flow_source
 
@@ -58,23 +58,23 @@ def test_a_frame_gets_its_own_flow_in_both_directions(folder):
     for frame in (1, 2):
         pictures = np.zeros((2, 6, 9, 3), np.uint8)
         pair = FramePair(*pictures, camera="cam00", frame=frame)
-        back, onward = flow_source(f"files:{folder}")(pair)
+        back, forward_flow = flow_source(f"files:{folder}")(pair)
         np.testing.assert_array_equal(back, random_flow(seed=frame))
-        np.testing.assert_array_equal(onward, random_flow(seed=frame - 1 + 10))
+        np.testing.assert_array_equal(forward_flow, random_flow(seed=frame - 1 + 10))
 
 
 def test_cues_from_files_move_the_other_way_and_are_checked(tmp_path):
-    onward = np.full((40, 60, 2), (3, 1), np.float32)
-    back = -onward
+    forward_flow = np.full((40, 60, 2), (3, 1), np.float32)
+    back = -forward_flow
     back[:, :10] = (5, 5)  # leads nowhere that leads back
-    for direction, frame, flow in (("backward", 7, back), ("forward", 6, onward)):
+    for direction, frame, flow in (("backward", 7, back), ("forward", 6, forward_flow)):
         (tmp_path / "cam01" / direction).mkdir(parents=True)
         write_flow(tmp_path / "cam01" / direction / f"{frame}.exr", flow)
     pictures = np.zeros((2, 40, 60, 3), np.uint8)
     pair = FramePair(*pictures, camera="cam01", frame=7)
-    cue = motion_cues({5: pair}, MotionConfig(flow_method=f"files:{tmp_path}"), with_masks=False)[5]
-    np.testing.assert_array_equal(cue.motion[:, 10:], onward[:, 10:])
-    np.testing.assert_array_equal(cue.onward, onward)
+    cue = observe_key_views({5: pair}, MotionConfig(flow_method=f"files:{tmp_path}"), with_masks=False)[5]
+    np.testing.assert_array_equal(cue.motion[:, 10:], forward_flow[:, 10:])
+    np.testing.assert_array_equal(cue.forward_flow, forward_flow)
     assert cue.reliable[3:, 12:].all()
     assert not cue.reliable[:, :10].any()
 

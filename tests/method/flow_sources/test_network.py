@@ -36,10 +36,10 @@ def test_the_flow_is_the_networks_own_at_any_size(network, size):
 @pytest.mark.parametrize(("kind", "low", "high"), [("onnx", 0, 255), ("onnx-unit", 0, 1), ("onnx-signed", -1, 1)])
 def test_both_directions_in_the_range_that_the_name_says(network, kind, low, high):
     image, previous = pictures(24, 40)
-    back, onward = flow_source(f"{kind}:{network}")(FramePair(image, previous))
+    back, forward_flow = flow_source(f"{kind}:{network}")(FramePair(image, previous))
     a, b = (low + (high - low) / 255 * picture.astype(float) for picture in (image, previous))
     np.testing.assert_allclose(back, known_flow(a, b), atol=TOLERANCE)
-    np.testing.assert_allclose(onward, known_flow(b, a), atol=TOLERANCE)
+    np.testing.assert_allclose(forward_flow, known_flow(b, a), atol=TOLERANCE)
     floats = flow_source(f"{kind}:{network}")(FramePair(image / 255, previous / 255))
     np.testing.assert_allclose(floats[0], back, atol=TOLERANCE)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.method.flow import motion_cue
+from morgs_mi.method.flow import observe_flow
 from morgs_mi.method.flow_sources.opencv import FLOW_METHODS, optical_flow
 from tests.method.moving_disc import moving_disc, texture
 
@@ -24,7 +24,7 @@ def test_translation_is_recovered_with_its_sign(method, shift):
 
 def test_motion_is_the_shift_on_frame_ts_grid():
     previous, image, disc = moving_disc(240, 320, shift=(6, -4))
-    cue = motion_cue(image, previous)
+    cue = observe_flow(image, previous)
     motion, reliable = cue.motion, cue.reliable
     # 0.25 px: DIS smooths over 8x8 patches.
     assert np.abs(motion[disc & reliable] - (6, -4)).mean() < 0.25
@@ -34,7 +34,7 @@ def test_motion_is_the_shift_on_frame_ts_grid():
 
 def test_what_was_hidden_is_not_reliable():
     previous, image, disc = moving_disc(240, 320, shift=(10, 0))
-    reliable = motion_cue(image, previous).reliable
+    reliable = observe_flow(image, previous).reliable
     uncovered = np.roll(disc, (0, -10), (0, 1)) & ~disc
     assert reliable[uncovered].mean() < 0.5 < 0.95 < reliable.mean()
 

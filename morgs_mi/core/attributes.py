@@ -1,0 +1,141 @@
+"""The table of per-Gaussian attributes, from which all that depends on an attribute derives.
+
+`Gaussians` (shapes, activations), learning rates, the residual (gates), the first frame, the stream (groups of
+integers) and the renderer (channels) read it. A new attribute is a row here and a field of `Gaussians` of that name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import drjit as dr
+
+__all__ = ["ATTRIBUTES", "BY_ACTIVATED_NAME", "BY_NAME", "Activation", "Attribute", "sigmoid"]
+
+
+def sigmoid(x: Any) -> Any:
+    """Return 1 / (1 + exp(-x)); finite with a finite gradient for every finite x."""
+    return 0.5 + 0.5 * dr.tanh(0.5 * x)
+
+
+@dataclass(frozen=True)
+class Activation:
+    """Function from an optimised value to the value that is rendered.
+
+    Attributes:
+        function: of a Dr.Jit array or tensor.
+        largest_slope: bound of its derivative, which converts a tolerated error of the activated value into one of the
+            optimised value; None where there is no bound.
+    """
+
+    function: Callable[[Any], Any]
+    largest_slope: float | None
+
+
+IDENTITY = Activation(lambda x: x, 1.0)
+EXP = Activation(dr.exp, None)
+SIGMOID = Activation(sigmoid, 0.25)
+
+
+@dataclass(frozen=True)
+class Attribute:
+    """One row of the table.
+
+    Attributes:
+        name: of the optimised tensor in `Gaussians`; the two rows of the spherical harmonics share `sh_coeffs`.
+        shape: of one Gaussian's value; -1 where it depends on the degree of the spherical harmonics.
+        activated_name: of the rendered value.
+        activation: between the two.
+        required: whether every `Gaussians` has it.
+        rate: field of `LearningRates`, or a learning rate; None where it is not optimised.
+        rate_in_extents: whether that rate counts in scene extents.
+        gate: which gate its residual passes with two gates: the confidence for ``motion``, none for ``appearance``;
+            None where it has no residual (eq. 12).
+        first_frame: whether the first frame fits it.
+        error: field of `CodecConfig`, or number: error of the activated value that the stream tolerates; None where the
+            stream does not store it.
+        channel: of the renderer that blends it like a colour; None where there is none, or where the channel is not
+            plain blending (`color`, `motion`).
+    """
+
+    name: str
+    shape: tuple[int, ...]
+    activated_name: str
+    activation: Activation = IDENTITY
+    required: bool = False
+    rate: str | float | None = None
+    rate_in_extents: bool = False
+    gate: Literal["motion", "appearance"] | None = None
+    first_frame: bool = False
+    error: str | float | None = None
+    channel: str | None = None
+
+    @property
+    def width(self) -> int:
+        """The numbers of one Gaussian's value; -1 where that depends on the degree of the spherical harmonics."""
+        width = 1
+        for size in self.shape:
+            width = -1 if size < 0 or width < 0 else width * size
+        return width
+
+
+# The order is that of the stream's columns.
+ATTRIBUTES: tuple[Attribute, ...] = (
+    # The residual of the means is motion + offset, below.
+    Attribute(
+        "means", (3,), "means", required=True, rate="means", rate_in_extents=True, first_frame=True, error="error_px"
+    ),
+    Attribute(
+        "log_scales",
+        (3,),
+        "scales",
+        EXP,
+        required=True,
+        rate="scales",
+        gate="appearance",
+        first_frame=True,
+        error="error_px",
+    ),
+    Attribute("quats", (4,), "quats", required=True, rate="quats", gate="motion", first_frame=True, error="error_px"),
+    Attribute(
+        "logit_opacities",
+        (),
+        "opacities",
+        SIGMOID,
+        required=True,
+        rate="opacities",
+        gate="appearance",
+        first_frame=True,
+        error="error_opacity",
+    ),
+    Attribute(
+        "sh_dc",
+        (1, 3),
+        "sh_coeffs",
+        required=True,
+        rate="sh_dc",
+        gate="appearance",
+        first_frame=True,
+        error="error_color",
+    ),
+    Attribute(
+        "sh_rest",
+        (-1, 3),
+        "sh_coeffs",
+        required=True,
+        rate="sh_rest",
+        gate="appearance",
+        first_frame=True,
+        error="error_color",
+    ),
+    Attribute(
+        "logit_confidence", (), "confidence", SIGMOID, rate="confidence", error="error_confidence", channel="confidence"
+    ),
+    Attribute("motion", (3,), "motion", rate="means", rate_in_extents=True, gate="motion"),
+    Attribute("offset", (3,), "offset", rate="means", rate_in_extents=True, gate="motion"),
+)
+
+BY_NAME = {attribute.name: attribute for attribute in ATTRIBUTES}
+BY_ACTIVATED_NAME = {a.activated_name: a for a in ATTRIBUTES if a.activated_name != "sh_coeffs"}

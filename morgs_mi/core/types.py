@@ -1,0 +1,24 @@
+"""Names for Dr.Jit's types.
+
+Which class stands behind a name depends on the Mitsuba variant that is set while the program runs, so there is nothing
+to check statically: the names state what an argument or a result is.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+__all__ = ["Bool", "Float", "Int32", "Jit", "Tensor", "UInt32"]
+
+Float: TypeAlias = Any
+"""`mi.Float`, a differentiable float32 array [N]."""
+Int32: TypeAlias = Any
+"""`mi.Int32` [N]."""
+UInt32: TypeAlias = Any
+"""`mi.UInt32` [N]."""
+Bool: TypeAlias = Any
+"""`mi.Bool` [N]."""
+Tensor: TypeAlias = Any
+"""`mi.TensorXf`, a differentiable float32 tensor."""
+Jit: TypeAlias = Any
+"""Any Dr.Jit array, or nested vectors, tuples and lists of them."""
