@@ -169,7 +169,7 @@ def _fingerprint(arrays: Iterable[np.ndarray | None]) -> str:
     """Return a digest of a recording's first pictures and its points, which tells it from another in its place."""
     digest = blake2b(digest_size=8)
     for array in arrays:
-        digest.update(b"" if array is None else np.ascontiguousarray(array))
+        digest.update(b"" if array is None else np.ascontiguousarray(array).data)
     return digest.hexdigest()
 
 
@@ -185,7 +185,7 @@ def _reports(path: Path, count: int) -> list[FrameReport]:
     """Return the reports of the first `count` frames."""
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))["frames"][:count]
-        reports = [FrameReport(**{**row, "left_out": tuple(row["left_out"])}) for row in rows]
+        reports = [FrameReport(**{**row, "missing_views": tuple(row["missing_views"])}) for row in rows]
     except (OSError, KeyError, TypeError, ValueError) as error:
         found = f"a broken one ({error})" if path.exists() else "none"
         raise ValueError(f"{path}: expected the report of what was fitted, got {found}; start again.") from None
