@@ -10,7 +10,7 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.config import MotionConfig
-from morgs_mi.method.flow_sources.opencv import consistency_mask
+from morgs_mi.method.flow_sources.consistency import consistency_mask
 from morgs_mi.method.flow_sources.registry import FlowSource, FramePair, flow_source
 
 __all__ = ["FlowObservation", "choose_key_views", "observe_flow", "observe_key_views"]
