@@ -249,7 +249,8 @@ def _observe(
         box = None if changes is None else box_around(changes[v], motion.change)
         if changes is None or box is not None:
             pairs[v] = FramePair(images[v], state.images[v], setup.cameras[v].name, state.frame, setup.masks[v], box)
-    flows = observe_key_views(pairs, motion.flow_method, motion.mask_method if with_masks else None)
+    masks = motion.mask_method if with_masks else None
+    flows = observe_key_views(pairs, motion.flow_method, masks, motion.flow, motion.masks)
     return flows, {v: KeyView(pairs[v], flow) for v, flow in flows.items()}
 
 
@@ -273,8 +274,8 @@ def _first_confidence(
     assert previous is not None
     if state.frame != 1 or not flows or not config.motion.learn_confidence:
         return previous
-    method = config.motion.mask_method
-    masks = {v: motion_mask(state.images[v], f.forward_flow, f.forward_reliable, method) for v, f in flows.items()}
+    how = config.motion.mask_method, config.motion.masks
+    masks = {v: motion_mask(state.images[v], f.forward_flow, f.forward_reliable, *how) for v, f in flows.items()}
     return fit_confidence(previous, dict(enumerate(setup.cameras)), masks, config.fit, config.render, rng)[0]
 
 

@@ -6,7 +6,9 @@ from dataclasses import dataclass, field
 
 from morgs_mi.method.active_set import ActiveSetConfig
 from morgs_mi.method.change import ChangeConfig
+from morgs_mi.method.flow_sources.config import FlowConfig
 from morgs_mi.method.lift import LiftConfig
+from morgs_mi.method.mask_refiners.config import MaskConfig
 from morgs_mi.method.propagation import PropagationConfig
 
 __all__ = ["MotionConfig"]
@@ -50,6 +52,10 @@ class MotionConfig:
     """Gate below which a lifted motion is no longer scaled up to pass the gate at full length."""
     confidence_decay: float = 0.3
     """Logit that a confidence loses per frame without evidence of motion: where something moved, more is to correct."""
+    flow: FlowConfig = field(default_factory=FlowConfig)
+    """Optical flow and its forward-backward check."""
+    masks: MaskConfig = field(default_factory=MaskConfig)
+    """Motion masks."""
     lift: LiftConfig = field(default_factory=LiftConfig)
     """Lifted flow."""
     propagation: PropagationConfig = field(default_factory=PropagationConfig)

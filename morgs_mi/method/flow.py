@@ -9,8 +9,10 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.method.confidence import motion_mask
-from morgs_mi.method.flow_sources.opencv import consistency_mask
-from morgs_mi.method.flow_sources.registry import FlowSource, FramePair, flow_source
+from morgs_mi.method.flow_sources.config import FlowConfig
+from morgs_mi.method.flow_sources.consistency import consistency_mask
+from morgs_mi.method.flow_sources.registry import FramePair, flow_source
+from morgs_mi.method.mask_refiners.config import MaskConfig
 
 __all__ = ["FlowObservation", "choose_key_views", "observe_flow", "observe_key_views"]
 
@@ -66,11 +68,16 @@ def observe_flow(
     Raises:
         ValueError: as `flow_source`, `optical_flow` and `mask_refiner`.
     """
-    return _observe(FramePair(np.asarray(image), np.asarray(previous), valid=valid), flow_source(method), mask_method)
+    pair = FramePair(np.asarray(image), np.asarray(previous), valid=valid)
+    return observe_key_views({0: pair}, method, mask_method)[0]
 
 
 def observe_key_views(
-    pairs: Mapping[int, FramePair], method: str = "dis", mask_method: str | None = None
+    pairs: Mapping[int, FramePair],
+    method: str = "dis",
+    mask_method: str | None = None,
+    flow: FlowConfig | None = None,
+    masks: MaskConfig | None = None,
 ) -> dict[int, FlowObservation]:
     """Return the flow observation of each pair of images, by view index.
 
@@ -78,24 +85,32 @@ def observe_key_views(
         pairs: images of the key views at two frames, by view index.
         method: source of the flow, see `flow_source`.
         mask_method: refinement of the masks, see `mask_refiner`; None: no masks.
+        flow: settings of the flow and of its check.
+        masks: settings of the masks.
 
     Raises:
         OSError: flow is read from files and one is missing.
         ValueError: as `flow_source` and `mask_refiner`.
     """
-    source = flow_source(method)
-    return {view: _observe(pair, source, mask_method) for view, pair in pairs.items()}
+    source = flow_source(method, flow)
+    observations = {}
+    for view, pair in pairs.items():
+        backward, forward = source(pair)  # eq. 4
+        reliable, forward_reliable = _reliable(pair, backward, forward, flow)
+        mask = motion_mask(pair.image, -backward, reliable, mask_method, masks) if mask_method else None  # eqs. 9, 10
+        observations[view] = FlowObservation(-backward, reliable, forward, forward_reliable, mask)
+    return observations
 
 
-def _observe(pair: FramePair, source: FlowSource, mask_method: str | None) -> FlowObservation:
-    """Return one view's observation: flow in both directions (eq. 4), and its mask (eqs. 9 and 10)."""
-    backward, forward = source(pair)
-    reliable, forward_reliable = consistency_mask(backward, forward), consistency_mask(forward, backward)
+def _reliable(
+    pair: FramePair, backward: np.ndarray, forward: np.ndarray, config: FlowConfig | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the backward flow and where the forward flow is reliable, bool [H, W] each."""
+    reliable, forward_reliable = (
+        consistency_mask(*flows, config) for flows in ((backward, forward), (forward, backward))
+    )
     known = pair.valid
     if pair.box is not None:
         known = np.zeros(reliable.shape, bool)
         known[pair.box] = True if pair.valid is None else pair.valid[pair.box]
-    if known is not None:
-        reliable, forward_reliable = reliable & known, forward_reliable & known
-    mask = motion_mask(pair.image, -backward, reliable, mask_method) if mask_method else None
-    return FlowObservation(-backward, reliable, forward, forward_reliable, mask)
+    return (reliable, forward_reliable) if known is None else (reliable & known, forward_reliable & known)

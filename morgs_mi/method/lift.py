@@ -33,6 +33,7 @@ import numpy as np
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.confidence import motion_floor
 from morgs_mi.method.flow import FlowObservation
+from morgs_mi.method.mask_refiners.config import MaskConfig
 from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["Lift", "LiftConfig", "lift_flow"]
@@ -99,6 +100,7 @@ def lift_flow(
     views: Mapping[int, ActiveView],
     observations: Mapping[int, FlowObservation],
     config: LiftConfig | None = None,
+    masks: MaskConfig | None = None,
 ) -> Lift:
     """Return the displacements that explain the flow of the key views best, and the confidence that follows from it.
 
@@ -107,11 +109,12 @@ def lift_flow(
         views: active views, by view index.
         observations: flow of the key views, by view index; those without an active view are not used.
         config: settings.
+        masks: settings of the motion masks, whose floor is the noise of the flow.
     """
     config = config or LiftConfig()
     means = gaussians.numpy()["means"].astype(np.float64)
     seen = [
-        _lift_view(gaussians, means, views[v], observations[v], config)
+        _lift_view(gaussians, means, views[v], observations[v], motion_floor(views[v].camera.width, masks), config)
         for v in sorted(observations.keys() & views.keys())
     ]
     top = config.max_logit
@@ -132,14 +135,18 @@ def lift_flow(
 
 
 def _lift_view(
-    gaussians: Gaussians, means: np.ndarray, view: ActiveView, observation: FlowObservation, config: LiftConfig
+    gaussians: Gaussians,
+    means: np.ndarray,
+    view: ActiveView,
+    observation: FlowObservation,
+    floor: float,
+    config: LiftConfig,
 ) -> _LiftView:
     reliable = observation.forward_reliable[..., None].astype(np.float32)
     image = np.concatenate([observation.forward_flow * reliable, reliable], axis=2)
     sums = view.backproject(gaussians, view.crop(image))
     flow = sums[:, :2] / np.maximum(sums[:, 2:], 1e-6)
     jacobian = view.camera.projection_jacobian(means)
-    floor = motion_floor(view.camera.width)
     return _LiftView(sums[:, 2].astype(float), flow.astype(float), jacobian, floor, config)
 
 

@@ -38,7 +38,7 @@ def initial_motion(
     if not (config.learn_motion and config.lift_flow and active.views and len(active.indices)):
         return None
     gaussians = active.select(previous)
-    lifted = lift_flow(gaussians, active.views, flows, config.lift)
+    lifted = lift_flow(gaussians, active.views, flows, config.lift, config.masks)
     if not config.propagate_motion:
         return lifted
     views = {v: active.views[v] for v in sorted(flows.keys() & active.views.keys())}
