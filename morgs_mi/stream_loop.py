@@ -148,7 +148,9 @@ def step(
     """
     _check_images(setup.cameras, images, state.frame)
     seen = {view: image.copy() for view, image in enumerate(images) if image is not None}
-    return (_first_step if state.coded is None else _later_step)(setup, state, seen, on_step)
+    if state.coded is None:
+        return _first_step(setup, state, seen, on_step)
+    return _later_step(setup, state, seen, on_step)
 
 
 def _later_step(
@@ -161,7 +163,7 @@ def _later_step(
     changes = _changes(setup, state.references, images)
     flows, key_views = _observe(setup, state, images, changes)  # flow (4), masks (9, 10)
     previous = _first_confidence(setup, state, flows, rng)  # frame 0's confidence (11)
-    observations = observe(key_views, motion)
+    observations = observe(key_views, motion, config.fit.objective)
     active = _active_set(setup, previous, images, changes, observations)
     targets = {view: Target(images[view], setup.masks[view]) for view in active.views}
     initial = initial_motion(previous, active, flows, targets, motion, rng)  # motion (5)

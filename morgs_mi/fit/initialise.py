@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import KDTree
 
+from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
@@ -60,7 +61,7 @@ def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int) -> Gauss
         np.tile([1.0, 0, 0, 0], (n, 1)),
         np.full(n, _INITIAL_OPACITY),
         sh,
-        logit_confidence=np.zeros(n),
+        **{a.name: np.full((n, *a.shape), a.initial) for a in ATTRIBUTES if a.initial is not None},
     )
 
 

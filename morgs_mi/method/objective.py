@@ -147,22 +147,32 @@ TERMS: tuple[Term, ...] = (
 )
 
 
-def _observe_motion(view: KeyView, motion: MotionConfig) -> dict[str, np.ndarray]:
+def _observe_motion(view: KeyView, motion: MotionConfig, config: ObjectiveConfig) -> dict[str, np.ndarray]:
     """Return the motion by optical flow [H, W, 2] in px, and where it is reliable [H, W]."""
     return {"motion": view.flow.motion, "reliable": view.flow.reliable} if motion.learn_motion else {}
 
 
-def _observe_mask(view: KeyView, motion: MotionConfig) -> dict[str, np.ndarray]:
+def _observe_mask(view: KeyView, motion: MotionConfig, config: ObjectiveConfig) -> dict[str, np.ndarray]:
     """Return the motion mask [H, W], in frames that have one."""
     return {"mask": view.flow.mask} if motion.learn_confidence and view.flow.mask is not None else {}
 
 
-OBSERVERS: tuple[Callable[[KeyView, MotionConfig], Mapping[str, np.ndarray]], ...] = (_observe_motion, _observe_mask)
+Observer = Callable[[KeyView, MotionConfig, ObjectiveConfig], Mapping[str, np.ndarray]]
+OBSERVERS: tuple[Observer, ...] = (
+    _observe_motion,
+    _observe_mask,
+)
 
 
-def observe(views: Mapping[int, KeyView], motion: MotionConfig) -> dict[int, dict[str, np.ndarray]]:
+def observe(
+    views: Mapping[int, KeyView], motion: MotionConfig, config: ObjectiveConfig
+) -> dict[int, dict[str, np.ndarray]]:
     """Return the observations of the key views, arrays [H, W, ...] by name, by view index."""
-    return {v: {k: a for observer in OBSERVERS for k, a in observer(view, motion).items()} for v, view in views.items()}
+    observations: dict[int, dict[str, np.ndarray]] = {}
+    for index, view in views.items():
+        found = (observer(view, motion, config) for observer in OBSERVERS)
+        observations[index] = {name: array for arrays in found for name, array in arrays.items()}
+    return observations
 
 
 def active_terms(observations: Observations, parameters: Mapping[str, Tensor], config: ObjectiveConfig) -> list[Term]:
