@@ -36,11 +36,11 @@ class CalibrateConfig:
     ] = "SIMPLE_RADIAL"
     """COLMAP camera model; one with more parameters needs more views, or shared intrinsics."""
     shared_intrinsics: bool = False
-    """One set of intrinsics for all cameras, if they have the same make and zoom; few views determine it better."""
+    """Whether all cameras share one set of intrinsics, which needs fewer views; for cameras of equal make and zoom."""
     frame: int = 0
     """Frame to calibrate on."""
     partial: bool = False
-    """Acceptance of a model that lacks some of the cameras."""
+    """Whether to accept a model that lacks some of the cameras."""
     seed: int = 0
     """Seed of COLMAP's random samples."""
 

@@ -31,19 +31,19 @@ class ReadConfig:
     """Handling of clips that do not match; by default they are refused."""
 
     trim: bool = False
-    """Restriction to the instants that all clips cover, at the lowest of their frame rates."""
+    """Whether to use only the instants that all clips cover, at the lowest of their frame rates."""
     offset: dict[str, int] = field(default_factory=dict)
     """Frame of each listed camera's clip that is simultaneous with frame 0 of the others; negative for a clip that
     started later. Instants that not all clips cover are left out, as with trim."""
     gaps: bool = False
-    """Tolerance of missing images: a camera is left out of the frames that it lacks."""
+    """Whether images may be missing; a camera is left out of the frames that it lacks."""
     color: Literal["none", "linear", "root-polynomial", "vandermonde"] = "none"
     """Method that matches each camera's colours to those of a reference camera, fitted to points that both see."""
     color_reference: str = ""
     """Name of the reference camera; by default the one that shares most points with the others."""
     exposure: bool = False
-    """Removal of exposure changes over time: one gain per view and frame restores the brightness that static surfaces
-    have in the first frame."""
+    """Whether to remove exposure changes over time: one gain per view and frame restores the brightness that static
+    surfaces have in the first frame."""
 
     @property
     def aligns_clips(self) -> bool:
