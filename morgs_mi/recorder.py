@@ -73,7 +73,7 @@ def stream_capture(
     )
     if interrupted is None:
         out.mkdir(parents=True, exist_ok=True)
-        write_json(out / "capture.json", capture.record())
+        write_json(out / "capture.json", capture.metadata())
         writer, reports = StreamWriter(out / "stream.morgs", capture.cameras, capture.fps, metadata), []
         frames = chain((first,), frames)
     else:

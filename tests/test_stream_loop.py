@@ -238,7 +238,7 @@ def test_stream_capture__writes_a_file(clip, tmp_path):
         def partial_frames(self, start=0, stop=None):
             yield from (PartialFrame(i, tuple(images)) for i, images in enumerate(clip[:2]))
 
-        def record(self):
+        def metadata(self):
             return {"layout": "in memory"}
 
     points = scene(0)[0].numpy()
