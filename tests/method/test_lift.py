@@ -12,7 +12,6 @@ from morgs_mi import Camera, Gaussians
 from morgs_mi.method.flow import FlowObservation, choose_key_views
 from morgs_mi.method.lift import lift_flow, projection_jacobian
 from morgs_mi.render.active_view import ActiveView
-from morgs_mi.synth.ground_truth import project
 
 SHIFT = np.array([0.03, -0.02, 0.015])
 
@@ -33,7 +32,7 @@ def cloud(n=200, seed=0):
 
 def uniform_cue(camera, shift):
     """The flow of a plane at the scene's depth that moves by `shift`."""
-    before, after = (project(camera, np.atleast_2d(p))[0][0] for p in (np.zeros(3), shift))
+    before, after = (camera.project(np.atleast_2d(p))[0][0] for p in (np.zeros(3), shift))
     flow = np.broadcast_to(np.float32(after - before), (camera.height, camera.width, 2)).copy()
     everywhere = np.ones((camera.height, camera.width), bool)
     return FlowObservation(flow, everywhere, flow, everywhere)
@@ -94,7 +93,7 @@ def test_jacobian_agrees_with_central_differences():
     J = projection_jacobian(camera, points)
     for k in range(3):
         step = h * np.eye(3)[k]
-        difference = (project(camera, points + step)[0] - project(camera, points - step)[0]) / (2 * h)
+        difference = (camera.project(points + step)[0] - camera.project(points - step)[0]) / (2 * h)
         assert J[:, :, k] == pytest.approx(difference, rel=1e-6, abs=1e-6)
 
 
