@@ -26,7 +26,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable"
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
 pytestmark = pytest.mark.skipif(
     CHROMIUM is None,
-    reason="needs a system Chromium; install it with tools/setup_browser.sh or apt-get install chromium",
+    reason="no Chromium found; install it with tools/setup_browser.sh (apt-get install chromium)",
 )
 
 WIDTH, HEIGHT = 480, 360
