@@ -20,8 +20,8 @@ from morgs_mi.export.axes import up_direction
 from morgs_mi.playback.player import channel_image, open_stream, render, render_config
 from tests.export.streams import write_stream
 
-pytest.importorskip("viser", reason="comes with the extra `viewer`")
-playwright = pytest.importorskip("playwright.sync_api", reason="comes with the extra `viewer-test`")
+pytest.importorskip("viser", reason="install it with pip install 'morgs-mi[viewer]'")
+playwright = pytest.importorskip("playwright.sync_api", reason="install it with pip install 'morgs-mi[viewer-test]'")
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
 pytestmark = pytest.mark.skipif(
@@ -97,7 +97,7 @@ def wait_for(page, expected: np.ndarray, least: float) -> None:
 
 
 def rendered(stream: StreamReader, state: CodedFrame, mode: str) -> np.ndarray:
-    """Return the renderer's image from the page's initial view: the first camera, upright with respect to the mean up."""
+    """Return the renderer's image from the page's initial view: the first camera, upright to the mean up."""
     first = stream.cameras[0]
     ahead = first.position + first.viewmat[2, :3]
     camera = Camera.look_at(first.position, ahead, up_direction(stream.cameras), 45, WIDTH, HEIGHT)
@@ -131,9 +131,7 @@ def test_viewer__shows_the_images_of_the_renderer(page, tmp_path):
     page.get_by_label("Exact image").check()
     for mode in ("motion", "confidence", "offset", "depth", "color"):
         select_mode(page, mode)
-        wait_for(
-            page, rendered(stream, states[1], mode), 50
-        )  # the page rounds the camera, so some pixels differ by one
+        wait_for(page, rendered(stream, states[1], mode), 50)  # the page rounds the camera: some pixels differ by 1
     page.get_by_label("Exact image").uncheck()
     select_mode(page, "confidence")
     wait_for(page, rendered(stream, states[1], "confidence"), 17)  # as above
