@@ -195,8 +195,8 @@ def render(
     rendered = [name for name in channels if name != "offset"]
     images: dict[str, Any] = {}
     if rendered:
-        image = rasterize(gaussians, camera, rendered, config=config)
-        images = {name: getattr(image, name) for name in rendered}
+        image = vars(rasterize(gaussians, camera, rendered, config=config))
+        images = image | image.get("others", {})  # the channels of attributes without a field of their own
     if "offset" in channels:
         offset = np.zeros((len(gaussians), 3)) if gaussians.offset is None else gaussians.offset
         images["offset"] = rasterize(replace(gaussians, motion=offset), camera, ("motion",), config=config).motion

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -87,6 +87,9 @@ def test_modes__include_a_new_row_of_the_attribute_table(states, monkeypatch):
     assert "wetness" in player.CHANNELS
     assert player.available_channels(wet) == (*player.available_channels(dry), "wetness")
     assert set(modes.available_modes(wet)) - set(modes.available_modes(dry)) == {"wetness"}
+    image = SimpleNamespace(color=np.zeros((2, 3, 3)), others={"wetness": np.ones((2, 3, 1))})
+    monkeypatch.setattr(player, "rasterize", lambda *_, **__: image)
+    assert player.render(wet, rig()[0], ("color", "wetness"), RenderConfig())["wetness"].all()
     grey = np.rint(255 * wet.wetness)
     assert np.abs(modes.splat_colors(wet, rig()[0], "wetness") - grey[:, None]).max() <= 1
     with pytest.raises(ValueError, match="got 'wetness'"):
