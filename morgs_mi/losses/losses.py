@@ -25,7 +25,7 @@ def recon_loss(image: Any, target: Target, dssim_weight: float = 0.2, region: Re
         image: [H, W, 3], or a picture on the region.
         target: what it should show.
         dssim_weight: lambda.
-        region: only its pixels have changed since the target was told to `remember` a picture; one that was not told
+        region: only its pixels have changed since `Target.set_surroundings` was called; a target without surroundings
             takes itself as what surrounds the region. The derivative is then the whole view's; the value leaves out
             what cannot have changed: pixels outside, windows that see none inside.
 
