@@ -11,7 +11,7 @@ import numpy as np
 from morgs_mi.capture.color_correction import ColorCorrection
 from morgs_mi.capture.lens import Lens, Undistortion
 from morgs_mi.core.camera import Camera
-from morgs_mi.io.video import FrameReader, Picture
+from morgs_mi.io.video import FrameReader, ImageOrError
 
 __all__ = ["CameraSource", "at_clip_size"]
 
@@ -34,7 +34,7 @@ class CameraSource:
     picks: np.ndarray
     tone: ColorCorrection | None = None
 
-    def pictures(self, camera: Camera, start: int, stop: int) -> Iterator[Picture]:
+    def pictures(self, camera: Camera, start: int, stop: int) -> Iterator[ImageOrError]:
         """Yield what `camera` would have seen at the instants start..stop-1, an error in place of what is missing."""
         for picture in self.reader.pick(self.picks[start:stop].tolist()):
             yield self.seen(picture, camera) if isinstance(picture, np.ndarray) else picture
