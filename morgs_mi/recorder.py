@@ -139,7 +139,7 @@ def _begun(out: Path, capture: Capture, metadata: Mapping[str, Any]) -> _Begun |
             f"{path}: expected to resume what was begun with {name} = {shortened(before)}, got {shortened(now)}; give "
             "the same capture and settings, or start again without --resume."
         )
-    index, end = stream.whole()
+    index, end = stream.check()
     if not index:
         return None
     coded = seek(stream, index[-1][1])
