@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import blake2b
+from math import prod
 
 import numpy as np
 
@@ -26,14 +27,15 @@ from morgs_mi.codec.quantisation import (
     Grid,
     bounded,
     columns_of,
-    finite_attributes,
+    finite_fields,
     new_grid,
     num_exponents,
     optional_mask,
     optional_names,
     real_values,
+    split_groups,
     step_sizes,
-    stored_attributes,
+    stored_fields,
 )
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.codec.residuals import columns_of_change, take_change
@@ -112,7 +114,7 @@ def keyframe_packet(
     Raises:
         ValueError: an attribute is not finite.
     """
-    grid = new_grid(finite_attributes(gaussians), cameras, config or CodecConfig())
+    grid = new_grid(split_groups(finite_fields(gaussians)), cameras, config or CodecConfig())
     return reemitted_keyframe(CodedFrame(frame, grid, np.arange(len(grid), dtype=np.uint32), len(grid), gaussians))
 
 
@@ -151,9 +153,9 @@ def residual_packet(
     _check_attributes(previous, gaussians.sh_degree, optional_mask(gaussians.items()))
     source = _checked(np.arange(len(grid)) if source is None else source, len(grid), len(gaussians))
     survivors, births = source[source >= 0], int((source < 0).sum())
-    raw, count = finite_attributes(gaussians), len(survivors)
-    touched = _touched(raw, stored_attributes(previous.gaussians), survivors)
-    rows = survivors[touched]
+    stored, count = finite_fields(gaussians), len(survivors)
+    touched = _touched(stored, stored_fields(previous.gaussians), survivors)
+    raw, rows = split_groups(stored), survivors[touched]
     change = real_values({name: value[touched] for name, value in raw.items()}, grid.select(rows))
     change -= grid.values[rows].T
     born = new_grid({name: value[count:] for name, value in raw.items()}, cameras, config) if births else None
@@ -334,7 +336,8 @@ def _touched(now: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray], su
     """Return the indices of the survivors with any attribute that differs: the others are skipped."""
     differs = np.zeros(len(survivors), bool)
     for name, value in now.items():
-        differs |= np.any(value[: len(survivors)] != before[name][survivors], axis=tuple(range(1, value.ndim)))
+        different = value[: len(survivors)] != before[name][survivors]
+        differs |= different.reshape(len(survivors), prod(value.shape[1:])).any(1)
     return np.flatnonzero(differs)
 
 

@@ -40,14 +40,15 @@ __all__ = [
     "Grid",
     "bounded",
     "columns_of",
-    "finite_attributes",
+    "finite_fields",
     "new_grid",
     "num_exponents",
     "optional_mask",
     "optional_names",
     "real_values",
+    "split_groups",
     "step_sizes",
-    "stored_attributes",
+    "stored_fields",
 ]
 
 _STORED: dict[str, Attribute] = {row.name: row for row in ATTRIBUTES if row.error is not None}
@@ -201,32 +202,38 @@ def bounded(values: np.ndarray, limit: int, what: str) -> np.ndarray:
     return values
 
 
-def stored_attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """Return the raw attributes [N, ...] that a stream stores, by group."""
-    raw = gaussians.numpy()
-    sh = raw.pop("sh_coeffs")
-    raw |= {"sh_dc": sh[:, :1], "sh_rest": sh[:, 1:]}
-    return {name: raw[name] for name in GROUPS if name in raw}
+def stored_fields(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """Return the fields [N, ...] of Gaussians that a stream stores, by name."""
+    return {name: value for name, value in gaussians.numpy().items() if name == "sh_coeffs" or name in GROUPS}
 
 
-def finite_attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """Return the `stored_attributes`.
+def split_groups(stored: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return `stored_fields` by group: the spherical harmonics in two parts."""
+    sh = stored["sh_coeffs"]
+    return {name: value for name, value in stored.items() if name in GROUPS} | {
+        "sh_dc": sh[:, :1],
+        "sh_rest": sh[:, 1:],
+    }
+
+
+def finite_fields(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """Return the `stored_fields`.
 
     Raises:
         ValueError: one is not finite.
     """
-    raw = stored_attributes(gaussians)
-    for name, value in raw.items():
+    stored = stored_fields(gaussians)
+    for name, value in stored.items():
         if not np.isfinite(value).all():
             row = np.argwhere(~np.isfinite(value))[0][0]
             raise ValueError(
                 f"the stream: `{name}` must be finite, that of Gaussian {row} is not; lower the learning rates."
             )
-    return raw
+    return stored
 
 
 def new_grid(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> Grid:
-    """Return new Gaussians, given by their `stored_attributes`, rounded to steps that are chosen here."""
+    """Return new Gaussians, given by their raw attributes by group, rounded to steps that are chosen here."""
     raw = {name: np.asarray(value, np.float64) for name, value in raw.items()}
     largest_components = np.abs(raw["quats"]).argmax(1).astype(np.uint8)
     degree = round((1 + raw["sh_rest"].shape[1]) ** 0.5) - 1
@@ -237,7 +244,7 @@ def new_grid(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: C
 
 
 def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
-    """Return unrounded `Grid.values` of other `stored_attributes`, float64 [C, N], with the steps of `grid`."""
+    """Return unrounded `Grid.values` of other raw attributes by group, float64 [C, N], with the steps of `grid`."""
     largest_components, rows = grid.largest_components, np.arange(len(grid.largest_components))
     quats = np.asarray(raw["quats"], np.float64)
     others = np.stack([quats[rows, k + (k >= largest_components)] for k in range(3)], axis=1)
