@@ -21,7 +21,7 @@ from benchmarks.reports.method import MethodReportConfig
 from benchmarks.reports.renderer import RendererReportConfig
 from morgs_mi.cli import Common, run
 from morgs_mi.cli.console import OUT, progress, say
-from morgs_mi.core.files import finite, write_json
+from morgs_mi.core.files import json_finite, write_json
 from morgs_mi.evaluate.tables import figure
 
 __all__ = ["CodecReport", "FlowReport", "MethodReport", "RendererReport"]
@@ -180,7 +180,7 @@ def _show_renderer(result: Mapping[str, Any]) -> None:
 def _in_tables(result: Mapping[str, Any], file: Path | None) -> bool:
     """Write all figures to `file`, or print them where it is -; return whether tables are still to be printed."""
     if file == Path("-"):
-        say(json.dumps(finite(result), indent=2))
+        say(json.dumps(json_finite(result), indent=2))
         return False
     if file is not None:
         write_json(file, result)

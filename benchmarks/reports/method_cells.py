@@ -23,7 +23,7 @@ import morgs_mi
 from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import coded_frames
-from morgs_mi.core.files import whole, write_json
+from morgs_mi.core.files import atomic_path, write_json
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.playback.player import open_stream
 from morgs_mi.presets import apply_preset
@@ -209,7 +209,7 @@ def _first_frame(clip: Clip, base: StreamConfig, version: str, out: Path) -> Pat
     if not path.is_file():
         path.parent.mkdir(parents=True, exist_ok=True)
         packet, _ = clip.loop(base).push(clip.images[0])
-        with whole(path, "report_method()") as partial, clip.writer(partial, base) as writer:
+        with atomic_path(path, "report_method()") as partial, clip.writer(partial, base) as writer:
             writer.write(packet)
     return path
 

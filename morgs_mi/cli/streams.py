@@ -119,7 +119,7 @@ class Eval:
     """LPIPS network as ONNX with inputs in0 and in1, RGB [1, 3, H, W] from -1 to 1; none comes with the package."""
 
     def run(self) -> None:
-        from morgs_mi.core.files import finite, write_json
+        from morgs_mi.core.files import json_finite, write_json
         from morgs_mi.evaluate.environment import machine, versions
         from morgs_mi.evaluate.evaluate import evaluate_stream
         from morgs_mi.evaluate.figures import draw_stream
@@ -132,7 +132,7 @@ class Eval:
                 draw_stream(self.out, self.pictures, self.capture, partial(report, "Drawing frames"))
         result |= {"machine": machine(), "versions": versions()}
         if self.json == Path("-"):
-            say(json.dumps(finite(result), indent=2))
+            say(json.dumps(json_finite(result), indent=2))
             return
         _show(result)
         if self.json is not None:
