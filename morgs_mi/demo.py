@@ -16,6 +16,7 @@ from morgs_mi.core.files import write_json
 from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.figures import motion_scale
+from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.export.frames import PLAYABLE, even
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.io.video_writer import write_video
@@ -78,7 +79,7 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Progre
         progress: called with (stage, done, total).
 
     Returns:
-        What ``report.json`` holds: `evaluate_stream` of both fits as ``full`` and ``plain``, ``comparison`` with
+        What ``report.json`` holds: `Evaluation.as_dict` of both fits as ``full`` and ``plain``, ``comparison`` with
         their means over the same frames after the first, seconds per stage, machine, versions and seed.
 
     Raises:
@@ -107,7 +108,7 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Progre
     stage("Fitting", fit("stream", config.stream, None))
     stage("Fitting without ML, MO, MC", fit("stream_plain", plain, min(config.plain_frames, config.clip.num_frames)))
     results = {
-        name: stage(f"Judging {folder}", lambda tell, folder=folder: evaluate_stream(out / folder, progress=tell))
+        name: stage(f"Evaluating {folder}", lambda tell, folder=folder: evaluate_stream(out / folder, progress=tell))
         for name, folder in (("full", "stream"), ("plain", "stream_plain"))
     }
     stage("Drawing", lambda tell: _draw(out, load_capture(out / "capture"), tell))
@@ -118,7 +119,7 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Progre
         "seconds": {**seconds, "total": sum(seconds.values())},
         "machine": machine(),
         "versions": versions(),
-        **results,
+        **{name: result.as_dict() for name, result in results.items()},
     }
     write_json(out / "report.json", report)
     return report
@@ -138,12 +139,14 @@ def _clip(folder: Path, config: DemoConfig, tell: Callable[[float, float], None]
     synthesize(config.scene, folder, **settings, overwrite=True, progress=tell)
 
 
-def _compared(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def _compared(results: Mapping[str, Evaluation]) -> dict[str, Any]:
     """Return both fits' means over the frames that both have, the first one left out, for nothing moves in it."""
-    count = min(result["num_frames"] for result in results.values())
-    rows = {name: result["frames"][1:count] for name, result in results.items()}
-    return {"frames": [row["frame"] for row in rows["full"]]} | {
-        name: {score: float(np.mean([row[score] for row in own])) if own else None for score in _COMPARED}
+    count = min(result.num_frames for result in results.values())
+    rows = {name: result.frames[1:count] for name, result in results.items()}
+    return {"frames": [row.frame for row in rows["full"]]} | {
+        name: {
+            score: float(np.mean([getattr(row.scores, score) for row in own])) if own else None for score in _COMPARED
+        }
         for name, own in rows.items()
     }
 
