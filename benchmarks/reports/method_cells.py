@@ -123,6 +123,14 @@ def method_version(package: Path = Path(morgs_mi.__file__).parent) -> str:
 
     Layout and comments do not count.
     """
+    sources, trees = hashlib.sha256(), _sources(package)
+    for file in sorted(trees):
+        sources.update(ast.dump(trees[file]).encode())
+    return sources.hexdigest()[:16]
+
+
+def _sources(package: Path) -> dict[Path, ast.Module]:
+    """Return the syntax trees on which the version of the method depends, by file."""
     trees: dict[Path, ast.Module] = {}
     waiting = [package / "stream_loop.py"]
     while waiting:
@@ -132,10 +140,7 @@ def method_version(package: Path = Path(morgs_mi.__file__).parent) -> str:
             waiting += _imported(trees[file], package)
     for file in (package / "evaluate" / name for name in _EVALUATION):
         trees[file] = ast.parse(file.read_text(encoding="utf-8"))
-    sources = hashlib.sha256()
-    for file in sorted(trees):
-        sources.update(ast.dump(trees[file]).encode())
-    return sources.hexdigest()[:16]
+    return trees
 
 
 def _imported(tree: ast.Module, package: Path) -> list[Path]:

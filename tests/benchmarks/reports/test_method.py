@@ -12,10 +12,10 @@ import pytest
 
 import morgs_mi
 from benchmarks.reports import __main__ as cli
-from benchmarks.reports import method_cells
+from benchmarks.reports import method, method_cells
 from benchmarks.reports.method import MethodReportConfig, aggregate, cells_of, report_method
 from benchmarks.reports.method_cells import Cell, Clip, method_version, scores_of
-from benchmarks.reports.method_results import FlowError, MethodClip, MethodResult, SettingRow
+from benchmarks.reports.method_results import FlowError, MethodClip, MethodResult, ScratchRow, SettingRow
 from benchmarks.reports.method_tables import (
     ablation_table,
     best_rows,
@@ -53,10 +53,21 @@ def clip(tmp_path_factory):
     return synthesize("spheres", folder, num_cameras=4, num_frames=3, width=48, height=36, spp=1)
 
 
-@pytest.fixture(scope="module")
-def interrupted(clip, tmp_path_factory):
+def made_up_scores(clip, config, first):
+    """Scores in place of those of a fit; more epochs and key views are better."""
+    score = 20.0 + config.fit.epochs + 0.1 * config.motion.key_views + 100 * config.fit.rates.means
+    names = ("psnr", "psnr_moving", "psnr_still", "ssim", "motion_error_moving", "motion_error_still")
+    names += ("true_motion_moving", "num_bytes", *(f"motion_3d_{name}" for name in method_cells._MOTION_3D))
+    frames = {name: [score - 1, score + 1] for name in method_cells._BY_FRAME}
+    rest = {"confidence_iou": None, "mtv": 0.5, "mtv_input": 0.6, "psnr_slope": 2.0, "seconds": 0.1}
+    return dict.fromkeys(names, score) | rest | {"by_frame": frames}
+
+
+@pytest.fixture(scope="module", params=["made up", pytest.param("fitted", marks=pytest.mark.slow)])
+def interrupted(request, clip, tmp_path_factory):
     """A report that was interrupted in its third cell and run again: result, folder, files of the first run, fits."""
-    out, fits, fit = tmp_path_factory.mktemp("report"), [], method_cells._fit
+    made_up = request.param == "made up"
+    out, fits, fit = tmp_path_factory.mktemp("report"), [], made_up_scores if made_up else method_cells._fit
 
     def counted(clip, config, first):
         fits.append(config)
@@ -66,6 +77,8 @@ def interrupted(clip, tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(method_cells, "_fit", counted)
+        if made_up:
+            patch.setattr(method, "_SCRATCH", 1)
         with pytest.raises(KeyboardInterrupt):
             report_method([clip], out, TINY)
         stored = {path: path.stat().st_mtime_ns for path in (out / "spheres").iterdir()}
@@ -135,7 +148,6 @@ def test_report_method__scores_are_those_of_the_held_out_view(interrupted):
         assert all(spread != spread for spread in row.std.values())  # NaN for a single run
     assert 0 < found.flow.error < 2
     (scratch,) = found.scratch
-    assert scratch.steps == 20 * 8 * 3
     assert 5 < scratch.psnr < 40
 
 
@@ -170,6 +182,17 @@ def test_gains_and_comparison__are_those_of_the_best_rates():
         assert "flow's own | - |" in comparison_table([replace(clip, flow=flow)])
 
 
+def test_scores_of__is_that_of_the_held_out_view_of_a_fit(clip, tmp_path):
+    """One genuine fit; the fixture `interrupted` makes up its scores unless slow tests run."""
+    recording, cell = Clip.read(load_capture(clip)), Cell("default", 1, 1, 1.0, 0)
+    scores = scores_of(recording, cell, TINY.base, "test", tmp_path)
+    assert scores["psnr"] == pytest.approx(sum(scores["by_frame"]["psnr"]) / 2)
+    assert 5 < scores["psnr"] < 40
+    assert scores["seconds"] > 0
+    assert 0 < scores["motion_error_moving"] < 5 * scores["true_motion_moving"]
+    assert scores.keys() == made_up_scores(recording, cell.config(TINY.base), None).keys()
+
+
 def test_scores_of__fits_another_version_or_setting_again(clip, tmp_path, monkeypatch):
     fits = []
     monkeypatch.setattr(method_cells, "_first_frame", lambda *_: None)
@@ -191,24 +214,46 @@ def test_scores_of__fits_another_version_or_setting_again(clip, tmp_path, monkey
         scores_of(*calls[2], tmp_path)
 
 
+def write_package(folder: Path, **changed: str) -> Path:
+    """Write a package of a few modules, of which `changed` have another text."""
+    texts = {
+        "stream_loop": "from morgs_mi.method import lift\nfrom morgs_mi.render.loops import blend\n",
+        "method/lift": "from morgs_mi.method.weights import weight\n",
+        "method/weights": "weight = 1\n",
+        "method/__init__": "",
+        "render/loops": "blend = 1\n",
+        "viewer/__init__": "import morgs_mi\n",
+        **{f"evaluate/{Path(name).stem}": "" for name in (*method_cells._EVALUATION, "environment.py")},
+    } | changed
+    for name, text in texts.items():
+        path = folder / "morgs_mi" / f"{name}.py"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return folder / "morgs_mi"
+
+
 def test_method_version__ignores_comments_and_depends_on_the_code(tmp_path):
-    package = shutil.copytree(Path(morgs_mi.__file__).parent, tmp_path / "morgs_mi")
-    first = method_version(package)
-    assert first == method_version()
-    for file, text, other in (
-        ("method/lift.py", "# Why.", False),
-        ("viewer/__init__.py", "number = 1", False),
-        ("evaluate/environment.py", "number = 1", False),
-        ("method/lift.py", "number = 1", True),
-        ("evaluate/evaluate.py", "number = 1", True),
-        ("render/loops.py", "number = 1", True),
+    first = method_version(write_package(tmp_path / "first"))
+    assert first == method_version(write_package(tmp_path / "same"))
+    for k, (file, text, other) in enumerate(
+        (
+            ("render/loops", "# Why.\nblend  =  1\n", False),
+            ("viewer/__init__", "number = 1\n", False),
+            ("evaluate/environment", "number = 1\n", False),
+            ("method/lift", "number = 1\n", True),
+            ("method/weights", "weight = 2\n", True),
+            ("evaluate/evaluate", "number = 1\n", True),
+            ("render/loops", "blend = 2\n", True),
+        )
     ):
-        path = package / file
-        path.parent.mkdir(exist_ok=True)
-        before = path.read_text() if path.exists() else ""
-        path.write_text(f"{before}\n{text}\n")
-        assert (method_version(package) != first) == other, (file, text)
-        path.write_text(before)
+        assert (method_version(write_package(tmp_path / str(k), **{file: text})) != first) == other, (file, text)
+
+
+def test_method_version__depends_on_the_loop_and_the_evaluation():
+    package = Path(morgs_mi.__file__).parent
+    files = {path.relative_to(package).as_posix() for path in method_cells._sources(package)}
+    assert {"stream_loop.py", "method/lift.py", "render/loops.py", "evaluate/evaluate.py"} <= files
+    assert not files & {"viewer/__init__.py", "evaluate/environment.py"}
 
 
 def test_cell__config_changes_its_own_settings_only():
@@ -278,8 +323,13 @@ def test_report_method__runs_later_seeds_at_the_best_rate_only(clip, tmp_path, m
         psnr = 30.0 + {1: 1, 2: 3, 4: 2}[cell.rates] * (1 if cell.epochs == 2 else -1)
         return {"psnr": psnr + 10 * cell.seed, "by_frame": {}}
 
+    def from_scratch(clip, frame, base, steps, version, out):
+        assert (frame, steps) == (2, 20 * 8 * 3)
+        return ScratchRow(frame, steps, 30.0, 25.0, 31.0, 0.9, 1.0)
+
     monkeypatch.setattr("benchmarks.reports.method.scores_of", scores)
-    config = replace(TINY, rates=(1, 2, 4), tuned=("baseline",), seeds=3, key_views=(), scratch=0)
+    monkeypatch.setattr("benchmarks.reports.method.scratch_scores", from_scratch)
+    config = replace(TINY, rates=(1, 2, 4), tuned=("baseline",), seeds=3, key_views=())
     (found,) = report_method([clip], tmp_path, config).clips
     assert [cell.seed for cell in ran] == 8 * [0] + 4 * [1] + 4 * [2]
     assert {(c.preset, c.epochs, c.rates) for c in ran if c.seed == 1} == {
