@@ -107,7 +107,10 @@ class Clip:
         self.capture: Capture = load_capture(path, max_frames=options.frames + 1)
         self.views = self.capture.train_views
         self.cameras = [self.capture.cameras[v] for v in self.views]
-        self.held_out = self.capture.cameras[self.capture.test_view]
+        if self.capture.test_view is None or self.capture.truth is None:
+            raise ValueError(f"{path}: expected a capture with a held-out view and ground truth; make one with synth.")
+        self.test_view, self.truth = self.capture.test_view, self.capture.truth
+        self.held_out = self.capture.cameras[self.test_view]
         self.frames = list(self.capture.frames())
         self.fit = FitConfig(first_frame_steps=options.first_frame_steps, num_gaussians=options.num_gaussians)
         loop = self._loop(MotionConfig())
@@ -124,8 +127,7 @@ class Clip:
         return StreamLoop(self.cameras, self.capture.points, self.capture.point_colors, config, masks)
 
     def _truth(self, camera: Camera, t: int) -> np.ndarray:
-        assert self.capture.truth is not None
-        return load_truth(self.capture.truth, camera.name, t).mask
+        return load_truth(self.truth, camera.name, t).mask
 
     def masks(self) -> dict[str, dict[str, float]]:
         """Return the overlap of the key views' masks by method."""
@@ -157,7 +159,7 @@ class Clip:
             for camera in (self.cameras[k] for k in loop.setup.key_views):
                 key_views.append(overlap(confidence_mask(now, camera), self._truth(camera, t)))
             color, moving = np.asarray(rasterize(now, self.held_out).color), self._truth(self.held_out, t)
-            recorded = self.frames[t].images[self.capture.test_view]
+            recorded = self.frames[t].images[self.test_view]
             quality = psnr(np.clip(color, 0, 1), recorded, moving)
             held_out.append({**overlap(confidence_mask(now, self.held_out), moving), "psnr_moving": quality})
         return {"key_views": means(key_views), "held_out": means(held_out)}

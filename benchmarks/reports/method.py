@@ -36,7 +36,7 @@ class MethodReportConfig:
     """Settings of the report on the method."""
 
     presets: tuple[str, ...] = ("baseline", "ml", "ml-mo", "ml-mo-mc", "paper", DEFAULT)
-    """Presets of morgs-mi fit; default stands for no preset."""
+    """Presets of morgs-mi fit; default means none."""
     epochs: tuple[int, ...] = (1, 2, 3, 5, 8, 12)
     """Passes over the views for every later frame."""
     key_views: tuple[int, ...] = (2, 4, 8, 12)

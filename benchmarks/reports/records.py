@@ -35,7 +35,7 @@ def from_json(kind: type[T], value: Any) -> T:
 
 
 def _parse(kind: Any, value: Any) -> Any:
-    if is_dataclass(kind):
+    if isinstance(kind, type) and is_dataclass(kind):
         hints = get_type_hints(kind)
         return kind(**{field.name: _parse(hints[field.name], value[_key(field)]) for field in fields(kind)})
     origin, parts = get_origin(kind), get_args(kind)

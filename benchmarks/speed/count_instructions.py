@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -145,14 +145,14 @@ def stage_times(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str,
             dr.sync_thread()
             total = 1e3 * (time.perf_counter() - start)
             history = dr.kernel_history()
-        row, stage = Counter(), "projection and lists"
+        row, stage = defaultdict[str, float](float), "projection and lists"
         for entry in history:
             ir = entry.get("ir") or ""
             ir = ir if isinstance(ir, str) else ir.getvalue()
             found = next((name for name, label in LOOPS.items() if f"; Symbolic loop: {label}\n" in ir), None)
             row[found or stage] += entry["execution_time"]
             stage = {"blend": "loss", "adjoint": "projection's adjoint"}.get(found or "", stage)
-        row["outside kernels"] = total - row.total()
+        row["outside kernels"] = total - sum(row.values())
         row["step"] = total
         if k >= 2:
             rows.append(row)

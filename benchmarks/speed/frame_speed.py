@@ -160,6 +160,7 @@ def measure(size: Size, config: StreamConfig, recorded: list[list[np.ndarray]], 
         profile = cProfile.Profile()
         dr.sync_thread()
         _, report = profile.runcall(loop.push, images[1:])
+        assert loop.gaussians is not None
         found = np.asarray(rasterize(loop.gaussians, cameras[0], ("color",)).color)
         squares = (np.clip(found, 0, 1) - images[0] / 255.0) ** 2
         rows.append(
