@@ -35,10 +35,11 @@ from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.evaluate.metrics import iou, psnr
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.method.active_set import full_active_set
-from morgs_mi.method.confidence import MASK_METHODS, flow_mask
+from morgs_mi.method.confidence import flow_mask
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation, observe_flow
 from morgs_mi.method.lift import lift_flow
+from morgs_mi.method.mask_refiners.registry import MASK_REFINERS, mask_refiner
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.stream_loop import StreamConfig, StreamLoop
 from morgs_mi.synth.ground_truth import load_truth
@@ -75,7 +76,7 @@ def confidence_mask(gaussians: Gaussians, camera: Camera) -> np.ndarray:
 
 def lifted(gaussians: Gaussians, cameras: Sequence[Camera], flow: Mapping[int, FlowObservation]) -> Gaussians:
     """Return the Gaussians moved by the lifted flow of the key views, with a hard confidence."""
-    lift = lift_flow(gaussians, full_active_set(gaussians, cameras, RenderConfig()).views, flow)
+    lift = lift_flow(gaussians, full_active_set(gaussians, dict(enumerate(cameras)), RenderConfig()).views, flow)
     hard = np.where(lift.logit_confidence > 0, 6, -6).astype(np.float32)
     return replace(gaussians, means=np.asarray(gaussians.means) + lift.displacement, logit_confidence=hard)
 
@@ -90,8 +91,8 @@ def processor_ms(image: np.ndarray, previous: np.ndarray) -> dict[str, float]:
     """Return the processor time of each method for one image, summed over threads, ms: medians of 9."""
     flow, costs = observe_flow(image, previous), {}
     moving = flow_mask(flow.motion, flow.reliable)
-    for method, refine in MASK_METHODS.items():
-        times = []
+    for method in MASK_REFINERS.names:
+        refine, times = mask_refiner(method), []
         for _ in range(9):
             start = time.process_time()
             refine(image, moving)
@@ -131,7 +132,7 @@ class Clip:
 
     def masks(self) -> dict[str, dict[str, float]]:
         """Return the overlap of the key views' masks by method."""
-        rows: dict[str, list[dict[str, float]]] = {name: [] for name in (*MASK_METHODS, "lifted")}
+        rows: dict[str, list[dict[str, float]]] = {name: [] for name in (*MASK_REFINERS.names, "lifted")}
         loop = self._loop(MotionConfig())
         loop.resume(self.first, [self._images(0)])
         for t in range(1, len(self.frames)):
@@ -141,8 +142,8 @@ class Clip:
             moved = lifted(loop.gaussians, self.cameras, flow)
             for k, observed in flow.items():
                 truth, moving = self._truth(self.cameras[k], t), flow_mask(observed.motion, observed.reliable)
-                for method, refine in MASK_METHODS.items():
-                    rows[method].append(overlap(refine(images[k], moving), truth))
+                for method in MASK_REFINERS.names:
+                    rows[method].append(overlap(mask_refiner(method)(images[k], moving), truth))
                 rows["lifted"].append(overlap(confidence_mask(moved, self.cameras[k]), truth))
             loop.push(images)
         return {name: means(found) for name, found in rows.items()}

@@ -169,7 +169,7 @@ def scores_of(clip: Clip, cell: Cell, base: StreamConfig, version: str, out: Pat
         out: folder.
 
     Returns:
-        Means over the later frames in the held-out view, or without one in the training views: ``psnr``, ``psnr_moving``,
+        Means over the later frames in the held-out view (or all training views): ``psnr``, ``psnr_moving``,
         ``psnr_still`` in dB, ``ssim``, ``motion_error_moving`` and ``_still`` and ``true_motion_moving`` in px,
         ``confidence_iou``, ``motion_3d_error`` in world units, ``_relative_error`` and ``_length_ratio`` of the true
         length, ``_angle`` in degrees, ``num_bytes``; ``mtv`` and ``mtv_input`` (x100), ``psnr_slope`` in dB per frame,
@@ -198,7 +198,7 @@ def scratch_scores(clip: Clip, frame: int, base: StreamConfig, steps: int, versi
     stored = out / clip.name / f"scratch-f{frame}-{steps}-{_digest(version, clip.digest, asdict(config))}.json"
     if not stored.is_file():
         loop = clip.loop(config)
-        loop.state = StreamState(frame, None, ())
+        loop.state = StreamState(frame)
         with TemporaryDirectory() as folder:
             path = Path(folder) / "stream.morgs"
             with clip.writer(path, config) as writer:

@@ -37,8 +37,8 @@ from morgs_mi.stream_loop import StreamConfig, StreamLoop
 # Stages of a frame: file and function that are timed.
 STAGES = {
     "change": ("stream_loop.py", "_changes"),
-    "flow": ("stream_loop.py", "_cues"),
-    "part": ("stream_loop.py", "_part"),
+    "flow": ("stream_loop.py", "_observe"),
+    "part": ("stream_loop.py", "_active_set"),
     "targets": ("losses/ssim.py", "__init__"),
     "lift": ("method/lift.py", "lift_flow"),
     "propagation": ("method/propagation.py", "propagate_motion"),
@@ -167,7 +167,7 @@ def measure(size: Size, config: StreamConfig, recorded: list[list[np.ndarray]], 
             {
                 "seconds": report.seconds,
                 **{f"{name}_s": value for name, value in stages(profile).items()},
-                **report.effort,
+                **report.active,
                 "bytes": report.num_bytes,
                 "psnr": -10 * np.log10(squares.mean()),
             }
