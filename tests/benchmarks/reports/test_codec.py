@@ -25,15 +25,22 @@ QUICK = CodecReportConfig(
 )
 
 
-def test_report_codec__finds_coarser_streams_smaller_and_lzma_larger(fitted_clip: Path, tmp_path: Path) -> None:
-    stages = []
-    result = report_codec([fitted_clip / "capture"], tmp_path, QUICK, lambda *stage: stages.append(stage))
+@pytest.fixture(scope="module")
+def reported(fitted_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[CodecResult, Path, list]:
+    """Return a result, the folder of its streams, and the reported stages."""
+    folder, stages = tmp_path_factory.mktemp("codec"), []
+    result = report_codec([fitted_clip / "capture"], folder, QUICK, lambda *stage: stages.append(stage))
+    return result, folder, stages
+
+
+def test_report_codec__finds_coarser_streams_smaller_and_lzma_larger(reported) -> None:
+    result, folder, stages = reported
     (found,) = result.clips
     rows = found.rows
     assert [row.quality for row in rows] == [4, 40, 1000]
     assert stages[-1] == ("Fitting capture", 3, 3)
     for row in rows:
-        assert row.file == (tmp_path / "capture" / f"{row.quality:g}" / "stream.morgs").stat().st_size
+        assert row.file == (folder / "capture" / f"{row.quality:g}" / "stream.morgs").stat().st_size
         assert row.later < row.lzma < row.raw
         assert row.loss == pytest.approx(rows[-1].psnr.later - row.psnr.later)
         # The contents of a packet without its flags; the entropy of a few numbers is only approximate.
@@ -46,14 +53,26 @@ def test_report_codec__finds_coarser_streams_smaller_and_lzma_larger(fitted_clip
     assert np.isfinite(rows[0].loss)
     assert rows[-1].moved > 0
     assert sum(rows[-1].bytes_by_group.values()) > 0.3 * rows[-1].later
-    table = markdown_table(found).splitlines()
-    assert len({line.count("|") for line in table}) == 1
-    assert len(table) == 2 + len(rows)
-    before = {path: path.read_bytes() for path in tmp_path.rglob("stream.morgs")}
-    (again,) = report_codec([fitted_clip / "capture"], tmp_path, replace(QUICK, resume=True)).clips
+
+
+def test_report_codec__reuses_complete_streams(reported, fitted_clip: Path) -> None:
+    result, folder, _ = reported
+    before = {path: path.read_bytes() for path in folder.rglob("stream.morgs")}
+    (again,) = report_codec([fitted_clip / "capture"], folder, replace(QUICK, resume=True)).clips
     assert {path: path.read_bytes() for path in before} == before, "nothing was fitted again"
-    assert [row.psnr for row in again.rows] == [row.psnr for row in rows]
+    assert [row.psnr for row in again.rows] == [row.psnr for row in result.clips[0].rows]
+
+
+def test_codec_result__is_read_from_its_json(reported) -> None:
+    result, *_ = reported
     assert CodecResult.from_dict(json.loads(json.dumps(finite(result.as_dict())))).clips == result.clips
+
+
+def test_markdown_table_and_plot_codec__show_every_row(reported, tmp_path: Path) -> None:
+    result, *_ = reported
+    table = markdown_table(result.clips[0]).splitlines()
+    assert len({line.count("|") for line in table}) == 1
+    assert len(table) == 2 + len(result.clips[0].rows)
     plot_codec(result, tmp_path / "codec.png")
     assert (tmp_path / "codec.png").stat().st_size > 10_000
 

@@ -59,7 +59,7 @@ def made_up_scores(clip, config, first):
     names = ("psnr", "psnr_moving", "psnr_still", "ssim", "motion_error_moving", "motion_error_still")
     names += ("true_motion_moving", "num_bytes", *(f"motion_3d_{name}" for name in method_cells._MOTION_3D))
     frames = {name: [score - 1, score + 1] for name in method_cells._BY_FRAME}
-    rest = {"confidence_iou": None, "mtv": 0.5, "mtv_input": 0.6, "psnr_slope": 2.0, "seconds": 0.1}
+    rest = {"confidence_iou": None, "mtv": 0.5, "mtv_input": 0.6, "psnr_slope": 2.0, "seconds": 0.1 * score}
     return dict.fromkeys(names, score) | rest | {"by_frame": frames}
 
 
@@ -106,6 +106,8 @@ def test_method_command__repeats_a_finished_report_without_a_fit(clip, interrupt
     pytest.importorskip("matplotlib")
     result, out, *_ = interrupted
     monkeypatch.setattr(method_cells, "_fit", None)
+    monkeypatch.setattr(Clip, "loop", None)
+    monkeypatch.setattr(method, "_SCRATCH", result.clips[0].scratch[0].steps // (8 * 3))
     shutil.copytree(out, tmp_path / "out")
     args = [
         "--presets",
