@@ -40,7 +40,7 @@ from morgs_mi.playback.player import (
     has_confidence,
     open_stream,
     open_stream_capture,
-    playback,
+    playback_speed,
     render,
     render_config,
     truth_for_camera,
@@ -135,7 +135,7 @@ def evaluate_stream(
         regions="recorded change" if recording.truth is None else "true masks",
         sizes=_sizes(stream.path.stat().st_size, rows),
         variation=VariationScores.mean([variation.result() for variation in variations.values()]),
-        playback=PlaybackTimes(**playback(stream, stream.cameras[views[0]])),
+        playback=PlaybackTimes(**playback_speed(stream, stream.cameras[views[0]])),
         psnr_slope=slope([row.scores.psnr for row in rows]),
         frames=tuple(rows),
     )

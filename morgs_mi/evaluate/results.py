@@ -175,7 +175,7 @@ class Sizes:
 
 @dataclass(frozen=True)
 class PlaybackTimes:
-    """Speed of decoding and rendering a stream on this machine (see `playback`)."""
+    """Speed of decoding and rendering a stream on this machine (see `playback_speed`)."""
 
     fps: float
     """Frames per second."""
