@@ -12,9 +12,11 @@ import pytest
 import morgs_mi
 from benchmarks.speed import frame_speed
 from benchmarks.speed.frame_speed import STAGES, Scene, Size
+from morgs_mi.fit.config import FitConfig
 from morgs_mi.losses.ssim import Target
+from morgs_mi.stream_loop import StreamConfig
 
-SIZE = Size(32, 24, 3, 600, 2)
+SIZE = Size(64, 48, 3, 600, 2)
 
 
 @pytest.mark.parametrize("name", STAGES)
@@ -40,3 +42,15 @@ def test_scene__moves_the_given_number_of_balls():
     moved = np.linalg.norm(after - before, axis=1) > 0
     assert set(scene.owner[moved]) == set(scene.moving)
     assert len(scene.cameras()) == SIZE.views + 1
+
+
+@pytest.mark.slow
+def test_measure__reports_stages_bytes_and_quality():
+    scene, rng = Scene(SIZE, seed=0), np.random.default_rng(0)
+    recorded = [frame_speed.film(scene.at(t), scene.cameras(), rng) for t in range(3)]
+    config = StreamConfig(FitConfig(sh_degree=0, epochs=1, skip_static=False))
+    result = frame_speed.measure(SIZE, config, recorded, scene)
+    stages = {f"{name}_s" for name in STAGES}
+    assert stages | {"seconds", "bytes", "psnr", "gaussians", "views", "pixels", "epochs"} <= result.keys()
+    assert min(result[name] for name in ("seconds", "flow_s", "lift_s", "steps_s", "packet_s", "bytes")) > 0
+    assert 10 < result["psnr"] < 60
