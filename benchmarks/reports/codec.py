@@ -131,7 +131,7 @@ class CodecResult:
 
     @classmethod
     def from_dict(cls, value: Mapping[str, Any]) -> CodecResult:
-        """Return the result of which `value` is the JSON."""
+        """Return the result that is stored as JSON in `value`."""
         return from_json(cls, value)
 
 

@@ -117,7 +117,7 @@ class FlowResult:
 
     @classmethod
     def from_dict(cls, value: Mapping[str, Any]) -> FlowResult:
-        """Return the result of which `value` is the JSON."""
+        """Return the result that is stored as JSON in `value`."""
         return from_json(cls, value)
 
 

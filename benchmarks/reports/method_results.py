@@ -101,5 +101,5 @@ class MethodResult:
 
     @classmethod
     def from_dict(cls, value: Mapping[str, Any]) -> MethodResult:
-        """Return the result of which `value` is the JSON."""
+        """Return the result that is stored as JSON in `value`."""
         return from_json(cls, value)

@@ -159,7 +159,7 @@ class RendererResult:
 
     @classmethod
     def from_dict(cls, value: Mapping[str, Any]) -> RendererResult:
-        """Return the result of which `value` is the JSON."""
+        """Return the result that is stored as JSON in `value`."""
         return from_json(cls, value)
 
 
