@@ -29,7 +29,7 @@ import numpy as np
 
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.entropy import LIMIT
-from morgs_mi.core.attributes import ATTRIBUTES, Attribute
+from morgs_mi.core.attributes import ATTRIBUTES, BY_NAME, SIGMOID, Attribute
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
