@@ -14,12 +14,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import Packet, encode_packet
 from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, residual_packet
+from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.initialise import from_points, resample_points, scene_extent, seed_points
 from morgs_mi.fit.later_frame import fit_later_frame
@@ -27,29 +26,15 @@ from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
 from morgs_mi.method.change import around, changed, renewed
 from morgs_mi.method.confidence import motion_mask
-from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation, choose_key_views, observe_key_views
 from morgs_mi.method.flow_sources.registry import FramePair
-from morgs_mi.render.config import RenderConfig
 
-__all__ = ["MIN_POINTS", "FrameReport", "StreamConfig", "StreamLoop", "StreamState", "step"]
+__all__ = ["MIN_POINTS", "FrameReport", "StreamLoop", "StreamState", "step"]
 
 _LOG = logging.getLogger(__name__)
 
 # Fewer points than this are no scene: random points in the views are the better start.
 MIN_POINTS = 100
-
-
-@dataclass(frozen=True)
-class StreamConfig:
-    """Everything that the loop can be told, room by room."""
-
-    fit: FitConfig = field(default_factory=FitConfig)
-    motion: MotionConfig = field(default_factory=MotionConfig)
-    render: RenderConfig = field(default_factory=RenderConfig)
-    codec: CodecConfig = field(default_factory=CodecConfig)
-    seed: int = 0
-    """Of every random choice: order of the views, points that are added."""
 
 
 @dataclass(frozen=True)

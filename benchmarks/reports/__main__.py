@@ -20,7 +20,7 @@ from benchmarks.reports.flow import FlowReportConfig
 from benchmarks.reports.method import MethodReportConfig
 from benchmarks.reports.renderer import RendererReportConfig
 from morgs_mi.cli import Common, run
-from morgs_mi.cli.console import OUT, progress, say
+from morgs_mi.cli.console import OUT, print_result, progress
 from morgs_mi.core.files import finite, write_json
 from morgs_mi.evaluate.tables import figure
 
@@ -68,7 +68,7 @@ class FlowReport:
         if _in_tables(result, self.json):
             for clip in result["clips"]:
                 title = f"{clip['name']}: {clip['pairs']} pairs of {clip['width']}x{clip['height']} pixels"
-                say(f"{title}, motion of {figure(clip['motion'], 1)} px\n\n{markdown_table(clip)}")
+                print_result(f"{title}, motion of {figure(clip['motion'], 1)} px\n\n{markdown_table(clip)}")
         if self.plot is not None:
             plot_flow(result, self.plot)
 
@@ -94,7 +94,7 @@ class CodecReport:
             result = report_codec(self.captures, self.out, self.config, report)
         if _in_tables(result, self.json):
             for clip in result["clips"]:
-                say(f"{clip['name']}\n\n{markdown_table(clip)}")
+                print_result(f"{clip['name']}\n\n{markdown_table(clip)}")
         if self.plot is not None:
             plot_codec(result, self.plot)
 
@@ -124,7 +124,7 @@ class MethodReport:
 
         with progress() as report:
             result = report_method(self.captures, self.out, self.config, report, keep)
-        say(f"{method_page(result)}\nAll figures: {self.out / 'method.json'}")
+        print_result(f"{method_page(result)}\nAll figures: {self.out / 'method.json'}")
 
 
 Subject = (
@@ -180,11 +180,11 @@ def _show_renderer(result: Mapping[str, Any]) -> None:
 def _in_tables(result: Mapping[str, Any], file: Path | None) -> bool:
     """Write all figures to `file`, or print them where it is -; return whether tables are still to be printed."""
     if file == Path("-"):
-        say(json.dumps(finite(result), indent=2))
+        print_result(json.dumps(finite(result), indent=2))
         return False
     if file is not None:
         write_json(file, result)
-        say(f"All figures: {file}")
+        print_result(f"All figures: {file}")
     return True
 
 

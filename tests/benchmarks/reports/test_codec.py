@@ -11,9 +11,9 @@ import pytest
 
 from benchmarks.reports.codec import CodecReportConfig, markdown_table, plot_codec, report_codec
 from benchmarks.reports.plots import markdown
+from morgs_mi.config import StreamConfig
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.method.config import MotionConfig
-from morgs_mi.stream_loop import StreamConfig
 
 ROOT = Path(__file__).parents[3]
 QUICK = CodecReportConfig(

@@ -25,8 +25,8 @@ from benchmarks.reports.method_tables import (
     method_page,
 )
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.config import StreamConfig
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.stream_loop import StreamConfig
 from morgs_mi.synth.synthesize import synthesize
 
 ROOT = Path(__file__).parents[3]
