@@ -35,7 +35,7 @@ class FlowReportConfig:
     """What is measured."""
 
     methods: tuple[str, ...] = tuple(FLOW_METHODS)
-    """Sources of flow, as --motion.flow-method takes them."""
+    """Sources of flow, as `morgs-mi fit --flow` takes them."""
     views: int = 4
     """Cameras, spread over the rig as key views are."""
     frames: int | None = None

@@ -30,7 +30,7 @@ __all__ = ["Viewer", "ViewerConfig"]
 # splats down to 1/1000 of that distance, and the page's near and far planes fit.
 _DISTANCE = 10.0
 _HALF_MAX = 6e4
-_NO_OFFSET = ". It holds no offset: fit with --codec.offset, and each frame but the first holds one."
+_NO_OFFSET = ". It holds no offset: fit with codec.offset = true (--config), and each frame but the first holds one."
 _TICK, _LOOK_AGAIN, _REST = 0.01, 1.0, 0.2  # seconds
 
 

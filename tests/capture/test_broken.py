@@ -144,11 +144,11 @@ POSES_BOUNDS = {
     "truncated clip": (truncated("cam11.mkv"), r"cam11.mkv: frame \d of 4 cannot be read: the file is truncated"),
     "shorter clip": (shorter("cam11.mkv", 2), "the same number of frames, got cam00.mkv 4, cam02.mkv 4, cam11.mkv 3"),
     "faster clip": (faster("cam11.mkv", 2), "frame rate, got cam00.mkv 25, cam02.mkv 25, cam11.mkv 50; .* --trim"),
-    "unknown offset": (told("--offset", "cam01", "2"), "`offset` must name cameras of cam00, cam02, cam11, got cam01"),
+    "unknown offset": (told("--offset", "cam01", "2"), "--offset must name cameras of cam00, cam02, cam11, got cam01"),
     "far offset": (told("--offset", "cam02", "9"), "no instant in common, cam00 0.00 to 0.16 s, cam02 -0.36 to -0.20"),
     "unknown reference": (
         told("--color", "linear", "--color-reference", "cam01"),
-        "`color_reference` must be one of cam00, cam02, cam11, got 'cam01'",
+        "--color-reference must be one of cam00, cam02, cam11, got 'cam01'",
     ),
     "gaps and no clip": (lambda path: (empty("cam00.mkv")(path), told("--gaps")(path)), "got an empty file"),
     "empty clip": (empty("cam00.mkv"), "cam00.mkv: expected a video, got an empty file"),

@@ -114,7 +114,7 @@ def test_the_page_shows_what_the_renderer_shows(page, tmp_path):
     wait_for(page, drawn(stream, states[0], "color"), 40)
 
     choose(page, "offset")
-    page.get_by_text("It holds no offset: fit with --codec.offset").wait_for()
+    page.get_by_text("It holds no offset: fit with codec.offset = true").wait_for()
     frame = page.locator("input[inputmode=decimal]").first
     frame.fill("1")
     frame.press("Enter")
