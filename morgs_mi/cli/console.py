@@ -40,7 +40,7 @@ def with_option_names(sentence: str, names: Mapping[str, str], place: str = "") 
     """
     function = re.match(r"[\w.]+\(\): ", sentence)
     start = function[0] if function else f"{place}: "
-    if (not place and not function) or not sentence.startswith(start):
+    if not (function or place) or not sentence.startswith(start):
         return sentence
     text = sentence[len(start) :]
     named = re.sub(r"`([\w.]+)`", lambda m: names.get(m[1], m[0]), text)

@@ -36,7 +36,7 @@ class Fit:
     reading: GivenReading = field(default_factory=Reading)
     settings: GivenSettings = field(default_factory=Settings)
     resume: Flag = False
-    """Continue the stream in OUT, with the same capture and settings."""
+    """Continue the stream in OUT, with the same capture and settings; with --reproducible to the same bytes."""
     print_config: Flag = False
     """Print all settings as TOML and exit."""
 

@@ -50,7 +50,7 @@ class Reading:
     offset: Annotated[dict[str, int], arg(metavar="CAMERA INT ...", help_behavior_hint="")] = field(
         default_factory=dict
     )
-    """Frame of a camera's clip that shows frame 0 of the others; may be negative."""
+    """Frame of a camera's clip that shows frame 0 of the others; negative if it began later."""
     gaps: Flag = False
     """Continue where images are missing, without their cameras."""
     color: Annotated[Literal["none", "linear", "root-polynomial", "vandermonde"], arg(metavar="NAME")] = "none"
