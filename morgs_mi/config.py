@@ -273,7 +273,8 @@ def _table(config: Any, key: str) -> Iterator[str]:
 
 def _comment(text: str) -> list[str]:
     """Return a docstring as lines of comment."""
-    return [f"# {line}" for line in textwrap.wrap(" ".join(text.split()), _COMMENT_WIDTH, break_long_words=False)]
+    lines = textwrap.wrap(" ".join(text.split()), _COMMENT_WIDTH, break_long_words=False, break_on_hyphens=False)
+    return [f"# {line}" for line in lines]
 
 
 def _toml(value: Any) -> str:

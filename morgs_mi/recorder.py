@@ -1,8 +1,8 @@
-"""From a recording to a stream file: the loop run over a capture, one whole packet after the other.
+"""Fitting a whole capture into a stream file, packet by packet.
 
-A fit may be killed at any instruction. What stands in the file then is its whole packets and perhaps a piece of the
-next. The report gets a frame's row before the stream gets its packet, so that no packet is without one; nothing else
-needs to be kept, for all that crosses frames follows from the stream and the recording (`StreamState`).
+A fit may be killed at any instruction. The file then holds complete packets and perhaps a part of the next one. A
+frame's row is written to the report before its packet is written to the stream, so that every packet has a row. Nothing
+else is stored, because the state of the loop follows from the stream and the recording (see `StreamState`).
 """
 
 from __future__ import annotations
@@ -41,29 +41,29 @@ def stream_capture(
 ) -> list[FrameReport]:
     """Fit a whole capture and write OUT/stream.morgs packet by packet, and OUT/report.json with every frame.
 
-    OUT/capture.json says how the capture was read. One that comes with too few points gets them by triangulation.
+    OUT/capture.json describes how the capture was read. Points are triangulated where a capture has too few.
 
     Args:
-        capture: cameras and frames; its test view is not trained on, but stands in the stream's header.
+        capture: cameras and frames; the test view is not trained on, but is part of the stream's header.
         out: folder, made if missing.
         config: settings.
         on_step: called with (frame, steps done, steps of that frame).
-        resume: go on behind the last whole packet of the stream in `out`, if there is one. With
-            `RenderConfig(reproducible=True)` the stream becomes the same, byte by byte, as without an interruption.
+        resume: continue after the last complete packet of the stream in `out`, if there is one. With
+            `RenderConfig(reproducible=True)` the stream has the same bytes as without an interruption.
 
     Returns:
-        The reports of all frames, those from before an interruption included.
+        The reports of all frames, including those before an interruption.
 
     Raises:
-        OSError: the disk is full or not writable; what stands in the stream up to then is whole.
-        ValueError: as `StreamLoop`; or what is to be resumed is damaged, or another capture's or other settings'.
+        OSError: the disk is full or not writable; the stream is complete up to the last frame. ValueError: as
+        `StreamLoop`; or the stream to resume is damaged, or belongs to another capture or other settings.
     """
     config, out, train = config or StreamConfig(), Path(out), capture.train_views
     frames = capture.partial_frames()
     first = next(frames)
     metadata = _metadata(capture, first, config)
-    begun = _begun(out, capture, metadata) if resume else None
-    if begun is None and len(capture.points) < MIN_POINTS:
+    interrupted = _interrupted(out, capture, metadata) if resume else None
+    if interrupted is None and len(capture.points) < MIN_POINTS:
         capture = triangulate_points(capture, match_capture(capture))
     loop = StreamLoop(
         [capture.cameras[v] for v in train],
@@ -72,22 +72,23 @@ def stream_capture(
         config,
         [capture.masks[v] for v in train],
     )
-    if begun is None:
+    if interrupted is None:
         out.mkdir(parents=True, exist_ok=True)
-        write_json(out / "capture.json", capture.record())
+        write_json(out / "capture.json", capture.metadata())
         writer, reports = StreamWriter(out / "stream.morgs", capture.cameras, capture.fps, metadata), []
         frames = chain((first,), frames)
     else:
-        # What has changed is told from all pictures up to now.
-        start, now = 0 if config.fit.skip_static else begun.coded.frame, begun.coded.frame
+        # Changes are detected against references that depend on all images so far.
+        start, now = 0 if config.fit.skip_static else interrupted.coded.frame, interrupted.coded.frame
         frames = capture.partial_frames(start)
         past = islice(frames, now + 1 - start)
-        loop.resume(begun.coded, ([frame.images[v] for v in train] for frame in past))
-        writer, reports = StreamWriter.continued(out / "stream.morgs", begun.index, begun.end), begun.reports
+        loop.resume(interrupted.coded, ([frame.images[v] for v in train] for frame in past))
+        writer = StreamWriter.continued(out / "stream.morgs", interrupted.index, interrupted.end)
+        reports = interrupted.reports
     interval = config.codec.keyframe_interval
     with writer:
-        if begun is not None and begun.index[-1][0] == PacketKind.RESIDUAL:
-            _reemit_keyframe(writer, begun.coded, interval)
+        if interrupted is not None and interrupted.index[-1][0] == PacketKind.RESIDUAL:
+            _reemit_keyframe(writer, interrupted.coded, interval)
         for frame in frames:
             tick = None if on_step is None else _frame_ticker(on_step, frame.index)
             packet, report = loop.push([frame.images[v] for v in train], tick)
@@ -100,14 +101,14 @@ def stream_capture(
 
 
 @dataclass(frozen=True, eq=False)
-class _Begun:
-    """A stream that was interrupted.
+class _Interrupted:
+    """An interrupted stream.
 
     Attributes:
-        index: (kind, frame, offset) of its whole packets.
-        end: where the last one ends.
-        coded: what they lead to.
-        reports: of their frames.
+        index: (kind, frame, offset) of its complete packets.
+        end: offset of the end of the last one.
+        coded: state after it.
+        reports: of the frames.
     """
 
     index: list[tuple[int, int, int]]
@@ -116,8 +117,8 @@ class _Begun:
     reports: list[FrameReport]
 
 
-def _begun(out: Path, capture: Capture, metadata: Mapping[str, Any]) -> _Begun | None:
-    """Return the stream in `out` up to its last whole packet, None if there is none yet.
+def _interrupted(out: Path, capture: Capture, metadata: Mapping[str, Any]) -> _Interrupted | None:
+    """Return the stream in `out` up to its last complete packet, None if there is none yet.
 
     Raises:
         ValueError: it is damaged, or does not belong to the capture or the settings.
@@ -137,18 +138,18 @@ def _begun(out: Path, capture: Capture, metadata: Mapping[str, Any]) -> _Begun |
     if difference := _difference(old, new):
         name, before, now = difference
         raise ValueError(
-            f"{path}: expected to resume what was begun with {name} = {shortened(before)}, got {shortened(now)}; give "
-            "the same capture and settings, or start again without --resume."
+            f"{path}: expected to resume a fit with {name} = {shortened(before)}, got {shortened(now)}; give the same "
+            "capture and settings, or start again without --resume."
         )
     index, end = stream.whole()
     if not index:
         return None
     coded = seek(stream, index[-1][1])
-    return _Begun(index, end, coded, _reports(out / "report.json", coded.frame + 1))
+    return _Interrupted(index, end, coded, _reports(out / "report.json", coded.frame + 1))
 
 
 def _metadata(capture: Capture, first: PartialFrame, config: StreamConfig) -> dict[str, Any]:
-    """Return what the stream's header says about the fit; one that is resumed must say the same."""
+    """Return the entries of the stream's header about the fit; they must agree for a fit to be resumed."""
     train = capture.train_views
     key_views = choose_key_views([capture.cameras[v] for v in train], config.motion.key_views)
     return {
@@ -167,15 +168,15 @@ def _metadata(capture: Capture, first: PartialFrame, config: StreamConfig) -> di
 
 
 def _fingerprint(arrays: Iterable[np.ndarray | None]) -> str:
-    """Return a digest of a recording's first pictures and its points, which tells it from another in its place."""
+    """Return a digest of a recording's first images and its points, to recognise another recording in its place."""
     digest = blake2b(digest_size=8)
     for array in arrays:
-        digest.update(b"" if array is None else np.ascontiguousarray(array))
+        digest.update(b"" if array is None else np.ascontiguousarray(array).data)
     return digest.hexdigest()
 
 
 def _difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any] | None:
-    """Return (name, old, new) of the first entry in which two pieces of JSON differ, None if they are the same."""
+    """Return (name, old, new) of the first entry in which two JSON values differ, None if they are equal."""
     if isinstance(old, dict) and isinstance(new, dict):
         pairs = (_difference(old.get(key), new.get(key), f"{name}.{key}".lstrip(".")) for key in {**old, **new})
         return next(filter(None, pairs), None)
@@ -184,19 +185,20 @@ def _difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any] | No
 
 def _reports(path: Path, count: int) -> list[FrameReport]:
     """Return the reports of the first `count` frames."""
+    remedy = "start again without --resume"
     try:
         rows = json.loads(path.read_text(encoding="utf-8"))["frames"][:count]
-        reports = [FrameReport(**{**row, "left_out": tuple(row["left_out"])}) for row in rows]
+        reports = [FrameReport(**{**row, "missing_views": tuple(row["missing_views"])}) for row in rows]
     except (OSError, KeyError, TypeError, ValueError) as error:
         found = f"a broken one ({error})" if path.exists() else "none"
-        raise ValueError(f"{path}: expected the report of what was fitted, got {found}; start again.") from None
+        raise ValueError(f"{path}: expected the report of the fit, got {found}; {remedy}.") from None
     if [report.frame for report in reports] != list(range(count)):
-        raise ValueError(f"{path}: expected the rows of {count} frames, got {len(reports)}; start again.")
+        raise ValueError(f"{path}: expected the rows of {count} frames, got {len(reports)}; {remedy}.")
     return reports
 
 
 def _reemit_keyframe(writer: StreamWriter, coded: CodedFrame | None, interval: int) -> None:
-    """Write the whole state once more where it is time for that."""
+    """Write the state as a keyframe where one is due."""
     if coded is not None and interval and coded.frame and coded.frame % interval == 0:
         writer.write(reemitted_keyframe(coded))
 

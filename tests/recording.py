@@ -50,7 +50,7 @@ class Recording(Capture):
             images[:, 8:16, 2 * t % 24 : 2 * t % 24 + 8] = (255, 200, 40)
             yield PartialFrame(t, tuple(images))
 
-    def record(self):
+    def metadata(self):
         return {"layout": "noise"}
 
 

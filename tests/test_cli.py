@@ -149,7 +149,7 @@ def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
     monkeypatch.setattr("morgs_mi.io.video._count_packets", lambda path: FRAMES)
     assert run(capsys, "fit", capture, tmp_path / "out", *QUICK)[0] == 0
     frames = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
-    assert [frame["left_out"] for frame in frames] == [[], ["cam1"], ["cam1"]]
+    assert [frame["missing_views"] for frame in frames] == [[], ["cam1"], ["cam1"]]
     assert "cam1.mkv: frame 1 of 3 cannot be decoded" in frames[2]["status"]
     assert run(capsys, "eval", tmp_path / "out", "--json", tmp_path / "eval.json")[0] == 0
     frames = json.loads((tmp_path / "eval.json").read_text())["frames"]
@@ -295,13 +295,15 @@ def printed_config(capsys, *args: object) -> StreamConfig:
         (("--config", "FILE", "--quality", "0.5"), "codec.quality", 0.5),
         (("--config", "FILE", "--quality", "0.5"), "render.block_width", 4),
         (("--config", "FILE"), "render.reproducible", True),
+        (("--config", "FILE", "--flow", "dis"), "motion.flow_method", "dis"),
         (("--config", "FILE", "--target-size", "0"), "codec.target_size", 0),
     ],
 )
 def test_fit__overrides_defaults_by_preset_by_file_by_options(tmp_path: Path, capsys, args, key, expected) -> None:
     file = tmp_path / "a.toml"
     file.write_text(
-        "[fit]\nepochs = 3\n[codec]\nquality = 2.5\ntarget_size = 9\n[render]\nreproducible = true\nblock_width = 4\n"
+        "[fit]\nepochs = 3\n[motion]\nflow_method = 'files:nowhere'\n[codec]\nquality = 2.5\ntarget_size = 9\n"
+        "[render]\nreproducible = true\nblock_width = 4\n"
     )
     config = printed_config(capsys, *(file if arg == "FILE" else arg for arg in args))
     assert reduce(getattr, key.split("."), config) == expected

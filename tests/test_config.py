@@ -130,7 +130,7 @@ def test_rates_at__decays_the_rate_of_the_means_and_raises_the_others_for_fewer_
         *(apply_preset(StreamConfig(), name) for name in PRESETS),
         StreamConfig(
             fit=FitConfig(density=DensityConfig(rounds=0, births=1 / 3), rates=LearningRates(means=1e-300)),
-            motion=MotionConfig(mask_method="none", weight_flow=1e22),
+            motion=MotionConfig(mask_method="none", confidence_decay=1e22),
             render=RenderConfig(block_width=4, block_height=None, reproducible=True),
             codec=CodecConfig(quality=0.1 + 0.2),
             seed=-1,

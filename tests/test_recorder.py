@@ -1,4 +1,4 @@
-"""Recording: a fit that is killed and resumed leaves the very files of one that was not."""
+"""Recording: a fit that is killed and resumed leaves the same files as one that was not."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SECONDS = 0.8
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a fit leaves that nobody has interrupted."""
+    """The output of a fit without interruption."""
     out = tmp_path_factory.mktemp("whole")
     stream_capture(recording(), out, CONFIG)
     return out
@@ -41,7 +41,7 @@ def stream_of(out: Path) -> bytes:
 
 
 def report_of(out: Path) -> dict:
-    """Return the report without what no two runs have in common."""
+    """Return the report without what differs between any two runs."""
     report = json.loads((out / "report.json").read_text())
     return report | {"frames": [{k: v for k, v in row.items() if k != "seconds"} for row in report["frames"]]}
 
@@ -81,18 +81,18 @@ def kill_and_resume(whole: Path, folder: Path, kills: int) -> None:
         assert_same(out, whole)
 
 
-def test_a_fit_that_is_killed_and_resumed_is_the_same(whole: Path, tmp_path: Path) -> None:
+def test_stream_capture__killed_and_resumed_is_the_same(whole: Path, tmp_path: Path) -> None:
     kill_and_resume(whole, tmp_path, 3)
 
 
 @pytest.mark.slow
-def test_a_fit_that_is_killed_60_times_is_the_same(whole: Path, tmp_path: Path) -> None:
+def test_stream_capture__killed_60_times_is_the_same(whole: Path, tmp_path: Path) -> None:
     kill_and_resume(whole, tmp_path, 60)
 
 
 @pytest.mark.slow
-def test_300_frames_of_the_loop_play_as_they_were_fitted(tmp_path: Path) -> None:
-    """What the loop had after each frame, with births and deaths, is what a reader gets, from any frame on."""
+def test_stream_capture__300_frames_play_as_they_were_fitted(tmp_path: Path) -> None:
+    """A reader gets the state of the loop after each frame, with births and deaths, from any frame on."""
     capture = recording(num_frames=300)
     loop = StreamLoop(capture.cameras, capture.points, capture.point_colors, CONFIG)
     states: list[CodedFrame] = []
@@ -121,7 +121,7 @@ def cuts(whole: Path) -> list[int]:
     return [0, ends[0] - 1, ends[0], ends[3] - 1, ends[3], ends[4], index_at, size - 1, size]
 
 
-def test_wherever_the_stream_was_cut_off_it_is_resumed_to_the_same(whole: Path, tmp_path: Path) -> None:
+def test_stream_capture__resumed_from_any_cut_is_the_same(whole: Path, tmp_path: Path) -> None:
     report = json.loads((whole / "report.json").read_text())
     for k, at in enumerate(cuts(whole)):
         out = interrupted(whole, tmp_path / f"{at}", at)
@@ -136,8 +136,8 @@ def test_wherever_the_stream_was_cut_off_it_is_resumed_to_the_same(whole: Path, 
         assert_same(out, whole)
 
 
-def test_a_fit_that_was_interrupted_by_hand_is_resumed_to_the_same(whole: Path, tmp_path: Path) -> None:
-    """It has closed its stream, with an index that must not stay in the middle."""
+def test_stream_capture__resumed_after_an_interrupt_is_the_same(whole: Path, tmp_path: Path) -> None:
+    """The stream was closed, with an index that must not stay in the middle."""
 
     def stop(frame: int, step: int, steps: int) -> None:
         if frame == 3 and step == 2:
@@ -174,14 +174,16 @@ def brighter(capture: Recording) -> Recording:
 @pytest.mark.parametrize(
     ("capture", "config", "message"),
     [
-        (recording(), replace(CONFIG, seed=1), r"begun with metadata\.config\.seed = 0, got 1"),
+        (recording(), replace(CONFIG, seed=1), r"resume a fit with metadata\.config\.seed = 0, got 1"),
         (recording(), replace(CONFIG, codec=CodecConfig(quality=2)), r"metadata\.config\.codec\.quality = 1\.0, got 2"),
-        (brighter(recording()), CONFIG, r"begun with metadata\.fingerprint = "),
-        (recording(fps=50.0), CONFIG, r"begun with fps = 25\.0, got 50\.0"),
-        (recording(cameras=recording().cameras[::-1]), CONFIG, "begun with cameras = "),
+        (brighter(recording()), CONFIG, r"resume a fit with metadata\.fingerprint = "),
+        (recording(fps=50.0), CONFIG, r"resume a fit with fps = 25\.0, got 50\.0"),
+        (recording(cameras=recording().cameras[::-1]), CONFIG, "resume a fit with cameras = "),
     ],
 )
-def test_another_fit_is_not_resumed(whole: Path, tmp_path: Path, capture, config, message: str) -> None:
+def test_stream_capture__does_not_resume_another_fit(
+    whole: Path, tmp_path: Path, capture, config, message: str
+) -> None:
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)) // 2)
     before = stream_of(out)
     with pytest.raises(ValueError, match=message):
@@ -189,15 +191,13 @@ def test_another_fit_is_not_resumed(whole: Path, tmp_path: Path, capture, config
     assert stream_of(out) == before
 
 
-def test_what_is_damaged_is_not_resumed(whole: Path, tmp_path: Path) -> None:
+def test_stream_capture__does_not_resume_a_damaged_fit(whole: Path, tmp_path: Path) -> None:
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)))
     (out / "report.json").write_text("{")
-    with pytest.raises(ValueError, match=r"report\.json: expected the report of what was fitted, got a broken one"):
+    with pytest.raises(ValueError, match=r"report\.json: expected the report of the fit, got a broken one"):
         stream_capture(recording(), out, CONFIG, resume=True)
     (out / "report.json").unlink()
-    with pytest.raises(
-        ValueError, match=r"report\.json: expected the report of what was fitted, got none; start again"
-    ):
+    with pytest.raises(ValueError, match=r"report\.json: expected the report of the fit, got none; start again"):
         stream_capture(recording(), out, CONFIG, resume=True)
     (out / "report.json").write_text('{"frames": []}')
     with pytest.raises(ValueError, match=r"report\.json: expected the rows of 6 frames, got 0"):

@@ -1,4 +1,4 @@
-"""The loop: causal, repeatable, never drifting, silent where nothing moves."""
+"""The loop: causal, pure, repeatable, without drift, and cheap where nothing moves."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from morgs_mi.codec.container import PacketKind, encode_packet
 from morgs_mi.codec.packets import coded_frames, decode, play
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
+from morgs_mi.core.color_space import SH_C0
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
 from morgs_mi.fit.config import DensityConfig, FitConfig, LearningRates
 from morgs_mi.method.config import MotionConfig
@@ -22,7 +23,7 @@ from morgs_mi.recorder import stream_capture
 from morgs_mi.stream_loop import StreamLoop
 
 SHIFT = np.array([0.06, 0.02, 0.0])  # about 3 px a frame
-QUICK = StreamConfig(  # from all points, for they are those that made the pictures
+QUICK = StreamConfig(  # from all points, as the images were made of them
     fit=FitConfig(
         sh_degree=0,
         num_gaussians=600,
@@ -36,7 +37,7 @@ QUICK = StreamConfig(  # from all points, for they are those that made the pictu
 
 
 def scene(frame: int) -> tuple[Gaussians, np.ndarray]:
-    """A textured ball that moves by SHIFT in front of a textured wall that stands; and who moves.
+    """A textured ball that moves by SHIFT in front of a static textured wall; and the mask of the moving Gaussians.
 
     The wall is thick, so that its Gaussians lie in the same order in every view.
     """
@@ -67,10 +68,13 @@ def clip():
     ]
 
 
-def new_loop(config=QUICK):
+def points_and_colors():
     points = scene(0)[0].numpy()
-    colors = np.clip(points["sh_coeffs"][:, 0] * 0.28209479177387814 + 0.5, 0, 1)
-    return StreamLoop(cameras()[:4], points["means"], colors, config)
+    return points["means"], np.clip(points["sh_coeffs"][:, 0] * SH_C0 + 0.5, 0, 1)
+
+
+def new_loop(config=QUICK):
+    return StreamLoop(cameras()[:4], *points_and_colors(), config)
 
 
 def run(clip, config=QUICK, frames=3):
@@ -91,15 +95,15 @@ def held_out(loop_or_gaussians, channels=("color", "motion", "confidence")):
     return rasterize(loop_or_gaussians, cameras()[4], channels)
 
 
-def test_first_frame_is_reconstructed_in_the_held_out_view(clip):
+def test_push__reconstructs_the_first_frame_in_the_held_out_view(clip):
     loop, _, reports = run(clip, frames=1)
     image = np.clip(np.asarray(held_out(loop.gaussians, ("color",)).color), 0, 1)
-    # 150 steps on the points that made the picture; the wall alone, without the ball, gives 17 dB.
+    # 150 steps on the points that made the image; the wall alone, without the ball, gives 17 dB.
     assert psnr(image, clip[0][4] / 255) > 26
     assert reports[0].status == "ok"
 
 
-def test_motion_follows_the_truth_and_stays_out_of_the_wall(full):
+def test_push__motion_follows_the_truth_and_not_the_static_wall(full):
     """The modules' claim: per-Gaussian motion is the scene's, not the residual's."""
     loop, _, reports = full
     maps = held_out(loop.gaussians)
@@ -114,7 +118,7 @@ def test_motion_follows_the_truth_and_stays_out_of_the_wall(full):
     assert {"recon", "flow", "offset"} <= reports[2].losses.keys()
 
 
-def test_confidence_lights_up_what_moves(full):
+def test_push__confidence_is_high_where_things_move(full):
     loop = full[0]
     found = np.asarray(held_out(loop.gaussians).confidence)[..., 0]
     _, moves = scene(2)
@@ -123,7 +127,7 @@ def test_confidence_lights_up_what_moves(full):
     assert found[truth > 0.9].mean() > found[truth < 0.1].mean() + 0.4
 
 
-def test_decoder_has_the_encoders_state_to_the_bit(full):
+def test_push__decoder_has_the_encoders_state_to_the_bit(full):
     loop, packets, _ = full
     *_, (frame, decoded) = play(packets)
     assert frame == 2
@@ -132,7 +136,7 @@ def test_decoder_has_the_encoders_state_to_the_bit(full):
         assert np.array_equal(value, state[name]), name
 
 
-def test_packets_are_a_keyframe_and_then_residuals(full):
+def test_push__returns_a_keyframe_and_then_residuals(full):
     _, packets, reports = full
     assert [p.kind for p in packets] == [PacketKind.KEYFRAME, PacketKind.RESIDUAL, PacketKind.RESIDUAL]
     assert [r.frame for r in reports] == [p.frame for p in packets] == [0, 1, 2]
@@ -140,8 +144,8 @@ def test_packets_are_a_keyframe_and_then_residuals(full):
         decode(None, packets[1])
 
 
-def test_same_seed_gives_the_same_bytes_and_nothing_looks_ahead(clip):
-    """Whatever follows, the packets so far are the same, to the byte where sums are made in a fixed order."""
+def test_push__same_seed_gives_the_same_bytes_and_no_frame_looks_ahead(clip):
+    """The packets so far do not depend on later frames, to the byte where sums have a fixed order."""
     density = DensityConfig(rounds=2, births=0.05, min_error=0)
     fit = dataclasses.replace(QUICK.fit, density=density)
     config = dataclasses.replace(QUICK, fit=fit, render=RenderConfig(reproducible=True))
@@ -151,8 +155,8 @@ def test_same_seed_gives_the_same_bytes_and_nothing_looks_ahead(clip):
     assert runs[0][2] != runs[1][2]
 
 
-def test_births_and_deaths_travel_with_the_stream(clip):
-    """At the bound as many die as are born, their numbers are never given twice, and the decoder has them all."""
+def test_push__stream_carries_births_and_deaths(clip):
+    """At the limit as many are pruned as added, ids are never reused, and the decoder has them all."""
     density = DensityConfig(rounds=0, births=0.05, max_gaussians=610, min_error=0)
     loop, packets, reports = run(clip, dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, density=density)))
     assert [r.num_gaussians for r in reports] == [600, 610, 610]
@@ -165,7 +169,7 @@ def test_births_and_deaths_travel_with_the_stream(clip):
         assert np.array_equal(value, loop.gaussians.numpy()[name]), name
 
 
-def test_modules_can_be_switched_off(clip):
+def test_push__modules_can_be_switched_off(clip):
     off = dataclasses.replace(
         QUICK, motion=MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
     )
@@ -176,27 +180,27 @@ def test_modules_can_be_switched_off(clip):
     assert reports[1].losses.keys() == {"recon", "flow", "mask"}
 
 
-def test_too_few_points_are_replaced_and_reported(clip):
-    """Half of the Gaussians are seeded, the others are born where they are missed."""
+def test_push__replaces_too_few_points_and_reports_it(clip):
+    """Half of the Gaussians are seeded, the others are added by density control."""
     config = dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, density=DensityConfig()))
     loop = StreamLoop(cameras()[:4], np.zeros((0, 3)), np.zeros((0, 3)), config)
     _, report = loop.push(clip[0][:4])
     assert "0 points, too few: seeded 300" in report.status
-    assert 590 < len(loop.gaussians) <= 600  # those that fade in the last round are not made up for
+    assert 590 < len(loop.gaussians) <= 600  # those pruned in the last round are not replaced
 
 
 def without(images, *views):
     return [None if view in views else image for view, image in enumerate(images[:4])]
 
 
-def test_a_view_that_drops_out_is_left_out_of_its_frame_and_of_the_next_flow(clip, monkeypatch):
-    """Flow on two key views, of those that have both pictures: never of the view that is away, nor when it is back."""
-    flowed = []
-    cues = stream_loop.observe_key_views
+def test_push__without_an_image_of_one_view(clip, monkeypatch):
+    """Flow on two key views out of those that have both images: not of the missing view, nor when it is back."""
+    flow_views = []
+    observe = stream_loop.observe_key_views
     monkeypatch.setattr(
         stream_loop,
         "observe_key_views",
-        lambda pairs, *more: flowed.append({p.camera for p in pairs.values()}) or cues(pairs, *more),
+        lambda pairs, *more: flow_views.append({p.camera for p in pairs.values()}) or observe(pairs, *more),
     )
     loop = new_loop()
     usual = {cameras()[view].name for view in loop.setup.key_views}
@@ -207,35 +211,35 @@ def test_a_view_that_drops_out_is_left_out_of_its_frame_and_of_the_next_flow(cli
         reports.append(loop.push(images)[1])
         shown = np.clip(np.asarray(held_out(loop.gaussians, ("color",)).color), 0, 1)
         scores.append([psnr(shown, clip[t][4] / 255) for t in range(4)])
-    assert [report.left_out for report in reports] == [(), (f"cam{gone:02d}",), (), ()]
-    assert [len(views) for views in flowed] == [2, 2, 2]
-    assert all(f"cam{gone:02d}" not in views for views in flowed[:2])
-    assert flowed[2] == usual
-    # Every frame follows what moves, from three views of four too: it shows its own instant better than the last did.
+    assert [report.missing_views for report in reports] == [(), (f"cam{gone:02d}",), (), ()]
+    assert [len(views) for views in flow_views] == [2, 2, 2]
+    assert all(f"cam{gone:02d}" not in views for views in flow_views[:2])
+    assert flow_views[2] == usual
+    # Every frame follows the motion, from three of four views too: it shows its own instant better than the last did.
     assert all(scores[t][t] > scores[t - 1][t] + 1 for t in (1, 2, 3)), scores
 
 
-def test_a_frame_that_nobody_saw_stands_still(clip):
+def test_push__without_any_image_nothing_moves(clip):
     loop = new_loop()
     first, _ = loop.push(without(clip[0], 1))
     before = loop.gaussians.numpy()
     packet, report = loop.push([None] * 4)
-    assert report.status == "no view has a picture"
-    assert report.left_out == ("cam00", "cam01", "cam02", "cam03")
+    assert report.status == "no view has an image"
+    assert report.missing_views == ("cam00", "cam01", "cam02", "cam03")
     assert report.num_bytes < 200 < len(encode_packet(first))  # the packet's frame, and nothing in it
     for name, value in loop.gaussians.numpy().items():
         assert name == "motion" or np.array_equal(value, before[name]), name
     packet, report = loop.push(clip[1][:4])
-    assert (packet.frame, report.status, report.left_out) == (2, "ok", ())
+    assert (packet.frame, report.status, report.missing_views) == (2, "ok", ())
     assert "flow" not in report.losses
 
 
-def test_a_capture_becomes_a_file(clip, tmp_path):
+def test_stream_capture__writes_a_file(clip, tmp_path):
     class Recorded(Capture):
         def partial_frames(self, start=0, stop=None):
             yield from (PartialFrame(i, tuple(images)) for i, images in enumerate(clip[:2]))
 
-        def record(self):
+        def metadata(self):
             return {"layout": "in memory"}
 
     points = scene(0)[0].numpy()
@@ -269,8 +273,8 @@ def test_a_capture_becomes_a_file(clip, tmp_path):
     ("call", "message"),
     [
         (lambda clip: StreamLoop([], np.zeros((0, 3)), np.zeros((0, 3))), "at least one view"),
-        (lambda clip: new_loop().push(clip[0][:3]), "one picture for each of 4 views, or None, got 3"),
-        (lambda clip: new_loop().push([None] * 4), "frame 0 must have a picture of at least one view, got none"),
+        (lambda clip: new_loop().push(clip[0][:3]), "one image or None for each of 4 views, got 3"),
+        (lambda clip: new_loop().push([None] * 4), "frame 0 must have an image of at least one view, got none"),
         (lambda clip: new_loop().push([i[:50] for i in clip[0][:4]]), r"view 'cam00' must be uint8 \[72, 96, 3\]"),
         (lambda clip: new_loop().push([i / 255 for i in clip[0][:4]]), "got float64"),
         (lambda clip: StreamLoop(cameras(), np.full((200, 3), np.nan), np.zeros((200, 3))), "point 0 is not"),
@@ -281,16 +285,16 @@ def test_a_capture_becomes_a_file(clip, tmp_path):
         (lambda clip: FitConfig(epochs=0), "`epochs` must be at least 1, got 0"),
         (lambda clip: LearningRates(means=np.nan), "`means` must be finite and not negative, got nan"),
         (lambda clip: FitConfig(sh_degree=4), "`sh_degree` must be 0 to 3, got 4"),
-        (lambda clip: MotionConfig(flow_method="raft"), "`flow_method` must be one of dis, dis-fine"),
+        (lambda clip: MotionConfig(key_views=0), "`key_views` must be at least 1, got 0"),
     ],
 )
-def test_bad_input_gets_a_sentence(clip, call, message):
+def test_bad_input__gets_a_sentence(clip, call, message):
     with pytest.raises(ValueError, match=message):
         call(clip)
 
 
-def test_a_clip_that_stands_still_costs_next_to_nothing(clip):
-    """Camera noise of 2 grey levels is no change: nothing is worked on, and the packets say so in a few bytes."""
+def test_push__a_static_clip_costs_next_to_nothing(clip):
+    """Camera noise of 2 grey levels is no change: nothing is active, and the packets have a few bytes."""
     rng = np.random.default_rng(0)
 
     def recorded(frame):
@@ -301,17 +305,16 @@ def test_a_clip_that_stands_still_costs_next_to_nothing(clip):
     still = [loop.push(recorded(0))[1] for _ in range(3)]
     _, moving = loop.push(recorded(1))
     for report in still:
-        assert set(report.effort.values()) == {0}
+        assert set(report.active.values()) == {0}
         assert report.losses == {}
         assert report.num_bytes < 200  # heads of a packet and of its groups
-        assert report.seconds < 0.2 * moving.seconds  # a twentieth on pictures of a usual size
-    # It wakes when something moves.
-    assert 0.1 < moving.effort["gaussians"] < 0.9
-    assert moving.effort["views"] == 1
+        assert report.seconds < 0.2 * moving.seconds  # a twentieth on images of a usual size
+    assert 0.1 < moving.active["gaussians"] < 0.9
+    assert moving.active["views"] == 1
 
 
-def test_what_is_left_out_was_not_needed(clip):
-    """With and without: the held-out picture is as good, and what stands still is told in fewer bytes."""
+def test_push__skipping_static_views_costs_no_quality(clip):
+    """With and without: the held-out image is as good, in fewer bytes."""
     some = dataclasses.replace(QUICK, render=RenderConfig(reproducible=True))
     everything = dataclasses.replace(some, fit=dataclasses.replace(QUICK.fit, skip_static=False))
     quality, sizes = [], []
@@ -321,6 +324,27 @@ def test_what_is_left_out_was_not_needed(clip):
         found = np.asarray(rasterize(loop.gaussians, cameras()[4], ("color",)).color)
         quality.append(psnr(np.clip(found, 0, 1), clip[2][4] / 255))
         sizes.append(sum(report.num_bytes for report in reports[1:]))
-        assert (reports[-1].effort["pixels"] < 1) == config.fit.skip_static
+        assert (reports[-1].active["pixels"] < 1) == config.fit.skip_static
     assert quality[0] > quality[1] - 0.5  # of five small views with a first frame that is far from done
     assert sizes[0] < 0.9 * sizes[1]
+
+
+def test_step__is_pure_and_complete(clip):
+    """With default settings, called twice in a row and again from the same state; the caller's images may be reused."""
+    setup = stream_loop.prepare(cameras()[:4], *points_and_colors(), StreamConfig(fit=QUICK.fit))
+    start = stream_loop.StreamState()
+    buffers = [image.copy() for image in clip[0][:4]]
+    first, keyframe, _ = stream_loop.step(setup, start, buffers)
+    for buffer, image in zip(buffers, clip[1][:4], strict=True):
+        buffer[:] = image
+    second, residual, report = stream_loop.step(setup, first, buffers)
+    third, _, _ = stream_loop.step(setup, second, clip[2][:4])
+    assert (start.frame, first.frame, second.frame, third.frame) == (0, 1, 2, 3)
+    assert report.active["gaussians"] > 0.1, "a refilled buffer must not pass for a static clip"
+    assert (keyframe.frame, residual.frame) == (0, 1)
+    decoded = decode(decode(None, keyframe), residual).gaussians.numpy()
+    for name, value in second.gaussians.numpy().items():
+        assert np.array_equal(value, decoded[name]), name
+    again, _, _ = stream_loop.step(setup, first, clip[1][:4])
+    assert again.frame == 2
+    assert first.frame == 1

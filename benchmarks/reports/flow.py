@@ -21,7 +21,8 @@ from benchmarks.reports.plots import blank_figure, markdown, save_figure
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.method.flow import choose_key_views
-from morgs_mi.method.flow_sources.opencv import FLOW_METHODS, consistency_mask
+from morgs_mi.method.flow_sources.consistency import consistency_mask
+from morgs_mi.method.flow_sources.opencv import FLOW_METHODS
 from morgs_mi.method.flow_sources.registry import FramePair, flow_source
 from morgs_mi.synth.ground_truth import GroundTruth, load_truth
 

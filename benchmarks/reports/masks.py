@@ -36,10 +36,11 @@ from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.evaluate.metrics import iou, psnr
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.method.active_set import full_active_set
-from morgs_mi.method.confidence import MASK_METHODS, flow_mask
+from morgs_mi.method.confidence import flow_mask
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation, observe_flow
 from morgs_mi.method.lift import lift_flow
+from morgs_mi.method.mask_refiners.registry import MASK_REFINERS, mask_refiner
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.stream_loop import StreamLoop
 from morgs_mi.synth.ground_truth import load_truth
@@ -91,8 +92,8 @@ def processor_ms(image: np.ndarray, previous: np.ndarray) -> dict[str, float]:
     """Return the processor time of each method on one picture, all threads together, ms: medians of 9."""
     cue, costs = observe_flow(image, previous), {}
     moves = flow_mask(cue.motion, cue.reliable)
-    for method, refine in MASK_METHODS.items():
-        times = []
+    for method in MASK_REFINERS.names:
+        refine, times = mask_refiner(method), []
         for _ in range(9):
             start = time.process_time()
             refine(image, moves)
@@ -130,7 +131,7 @@ class Clip:
 
     def masks(self) -> dict[str, dict[str, float]]:
         """Return the figures of each way to a mask of the key views."""
-        rows: dict[str, list[dict[str, float]]] = {name: [] for name in (*MASK_METHODS, "lifted")}
+        rows: dict[str, list[dict[str, float]]] = {name: [] for name in (*MASK_REFINERS.names, "lifted")}
         loop = self._loop(MotionConfig())
         loop.resume(self.first, [self._images(0)])
         for t in range(1, len(self.frames)):
@@ -140,8 +141,8 @@ class Clip:
             lifted = carried(loop.gaussians, self.cameras, cues)
             for k, cue in cues.items():
                 truth, moves = self._truth(self.cameras[k], t), flow_mask(cue.motion, cue.reliable)
-                for method, refine in MASK_METHODS.items():
-                    rows[method].append(overlap(refine(images[k], moves), truth))
+                for method in MASK_REFINERS.names:
+                    rows[method].append(overlap(mask_refiner(method)(images[k], moves), truth))
                 rows["lifted"].append(overlap(confidence_mask(lifted, self.cameras[k]), truth))
             loop.push(images)
         return {name: means(found) for name, found in rows.items()}

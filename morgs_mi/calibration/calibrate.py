@@ -1,12 +1,12 @@
-"""From clips alone to a COLMAP model: features, matches and mapping of one frame by pycolmap.
+"""Calibration from clips alone: features, matches and mapping of one frame by pycolmap, stored as a COLMAP model.
 
-The model's world has no scale and no up: COLMAP can know neither.
+The scale and the up direction of the model's world are arbitrary: images do not determine them.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,40 +19,40 @@ from morgs_mi.capture.layouts.clips import clips_by_camera
 from morgs_mi.core.files import whole
 from morgs_mi.io.video import open_frames
 
-__all__ = ["CalibrateConfig", "Calibrated", "calibrate"]
+__all__ = ["CalibrateConfig", "CalibrationResult", "calibrate"]
 
-# Fewer features, or fewer matches that agree in a pair, leave COLMAP nothing to hold on to.
+# With fewer features in a view COLMAP cannot register it.
 _MIN_FEATURES = 100
 _TRIES = 3
-_MORE_TEXTURE = "light the scene evenly, put something with texture into it, or record a frame with it before the take"
+_MORE_TEXTURE = "light the scene evenly, add textured objects, or record a frame with such objects before the take"
 
 
 @dataclass(frozen=True)
 class CalibrateConfig:
-    """How the cameras are found."""
+    """Settings of the calibration."""
 
     camera_model: Literal[
         "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV"
     ] = "SIMPLE_RADIAL"
-    """COLMAP's; one with more parameters needs more views, or shared intrinsics."""
+    """COLMAP camera model; one with more parameters needs more views, or shared intrinsics."""
     shared_intrinsics: bool = False
-    """All cameras are of one make and zoom: one set of intrinsics, which few views determine better."""
+    """Whether all cameras share one set of intrinsics, which needs fewer views; for cameras of equal make and zoom."""
     frame: int = 0
-    """The instant to calibrate on."""
+    """Frame to calibrate on."""
     partial: bool = False
-    """Keep a model of only a part of the cameras."""
+    """Whether to accept a model that lacks some of the cameras."""
     seed: int = 0
-    """Of COLMAP's random samples."""
+    """Seed of COLMAP's random samples."""
 
 
 @dataclass(frozen=True)
-class Calibrated:
-    """What `calibrate` has found.
+class CalibrationResult:
+    """Result of `calibrate`.
 
     Attributes:
         model: folder of the COLMAP model.
         cameras: names of the calibrated cameras.
-        left_out: names of the others.
+        left_out: names of the cameras that could not be calibrated.
         points: number of points.
         error: mean reprojection error of the points, px.
     """
@@ -69,47 +69,49 @@ def calibrate(
     config: CalibrateConfig | None = None,
     overwrite: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
-) -> Calibrated:
+) -> CalibrationResult:
     """Calibrate a folder of clips, one per camera, and write ``sparse/0`` there; nothing is written on failure.
 
     Args:
         path: the folder: videos, or a folder of images per camera.
-        config: how.
-        overwrite: replace a model that is there.
-        progress: is called with (stage, done, total).
+        config: settings.
+        overwrite: whether to replace an existing model.
+        progress: called with (stage, done, total).
 
     Raises:
         FileNotFoundError: there is no such folder.
         FileExistsError: there is a `sparse` folder and `overwrite` is not given.
-        ValueError: fewer than two clips, clips that cannot be read, or views that do not determine the cameras, in a
-            sentence that says which and what to try.
+        ValueError: fewer than two clips, clips that cannot be read, or views that do not determine the cameras; the
+            message names them and suggests a remedy.
         OSError: the model cannot be written.
     """
     path, config = Path(path), config or CalibrateConfig()
-    tell = progress or (lambda stage, done, total: None)
+    report = progress or (lambda stage, done, total: None)
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: expected a folder of clips, found none; check the path.")
     if (path / "sparse").exists() and not overwrite:
-        raise FileExistsError(f"{path / 'sparse'}: expected none, got one; remove it, or overwrite it (--overwrite).")
-    tell("Reading frames", 0, 1)
+        raise FileExistsError(
+            f"{path / 'sparse'}: expected no model, got one; remove it, or overwrite it (--overwrite)."
+        )
+    report("Reading frames", 0, 1)
     images = _frames(path, config)
-    tell("Reading frames", 1, 1)
+    report("Reading frames", 1, 1)
     with tempfile.TemporaryDirectory() as scratch, _quiet():
-        model = _map(path, images, Path(scratch), config, tell)
-        found = {Path(model.image(i).name).stem for i in model.reg_image_ids()}
-        names = tuple(name for name in images if name in found)
-        left_out = tuple(name for name in images if name not in found)
+        model = _map(path, images, Path(scratch), config, report)
+        registered = {Path(model.image(i).name).stem for i in model.reg_image_ids()}
+        names = tuple(name for name in images if name in registered)
+        left_out = tuple(name for name in images if name not in registered)
         if left_out and not config.partial:
             raise ValueError(
-                f"{path}: {len(names)} of {len(images)} cameras were found, {', '.join(left_out)} could not be tied to "
-                f"them: move them so that neighbours see the same things, {_MORE_TEXTURE}, calibrate on another frame "
-                "(--frame), or keep what was found (--partial)."
+                f"{path}: expected to register all {len(images)} cameras, got {len(names)}, without "
+                f"{', '.join(left_out)}: move these so that neighbours see the same objects, {_MORE_TEXTURE}, "
+                "calibrate on another frame (--frame), or accept the partial model (--partial)."
             )
         with whole(path / "sparse", "calibrate()") as folder:
             (folder / "0").mkdir(parents=True)
             model.write_text(str(folder / "0"))
     error = float(model.compute_mean_reprojection_error())
-    return Calibrated(path / "sparse" / "0", names, left_out, model.num_points3D(), error)
+    return CalibrationResult(path / "sparse" / "0", names, left_out, model.num_points3D(), error)
 
 
 def _frames(path: Path, config: CalibrateConfig) -> dict[str, np.ndarray]:
@@ -137,7 +139,7 @@ def _map(
     images: dict[str, np.ndarray],
     scratch: Path,
     config: CalibrateConfig,
-    tell: Callable[[str, int, int], None],
+    report: Callable[[str, int, int], None],
 ) -> Any:
     """Return pycolmap's reconstruction with the most cameras."""
     import pycolmap
@@ -148,30 +150,30 @@ def _map(
         data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
         (folder / f"{name}.png").write_bytes(data)
     pycolmap.set_random_seed(config.seed)
-    tell("Finding features", 0, 1)
+    report("Finding features", 0, 1)
     mode = pycolmap.CameraMode.SINGLE if config.shared_intrinsics else pycolmap.CameraMode.PER_IMAGE
     reader = pycolmap.ImageReaderOptions(camera_model=config.camera_model)
     pycolmap.extract_features(database, folder, camera_mode=mode, reader_options=reader, device=pycolmap.Device.cpu)
-    tell("Finding features", 1, 1)
+    report("Finding features", 1, 1)
     _check_features(path, database)
-    tell("Matching views", 0, 1)
+    report("Matching views", 0, 1)
     pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
-    tell("Matching views", 1, 1)
+    report("Matching views", 1, 1)
     _check_pairs(path, database)
-    tell("Mapping", 0, 1)
+    report("Mapping", 0, 1)
     models: list[Any] = []
-    # Which views it begins with, and who is tied in, is partly chance: another draw may find who was missed.
+    # The initial pair and the registered views are partly random: another seed may register the missing views.
     for attempt in range(_TRIES):
         options = pycolmap.IncrementalPipelineOptions(min_model_size=2, random_seed=config.seed + attempt)
         models += pycolmap.incremental_mapping(database, folder, scratch, options).values()
         if any(model.num_reg_images() == len(images) for model in models):
             break
-    tell("Mapping", 1, 1)
+    report("Mapping", 1, 1)
     if not models:
         raise ValueError(
-            f"{path}: the views match, but no two of them give COLMAP a start: their baselines may be too short or too "
-            f"wide, or all that they share lies in one plane; try shared intrinsics (--shared-intrinsics), another "
-            f"frame (--frame), or {_MORE_TEXTURE}."
+            f"{path}: the views match, but COLMAP found no pair to initialise from: their baselines may be too short "
+            f"or too wide, or all shared points may lie in one plane; try shared intrinsics (--shared-intrinsics), "
+            f"another frame (--frame), or {_MORE_TEXTURE}."
         )
     return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
 
@@ -183,26 +185,19 @@ def _check_features(path: Path, database: Path) -> None:
         table = ", ".join(f"{count} in {name}" for name, count in poor.items())
         raise ValueError(
             f"{path}: expected at least {_MIN_FEATURES} features in every view, got {table}: too dark, blurred or "
-            f"bare; {_MORE_TEXTURE}, or calibrate on another frame (--frame)."
+            f"uniform; {_MORE_TEXTURE}, or calibrate on another frame (--frame)."
         )
 
 
 def _check_pairs(path: Path, database: Path) -> None:
     with _opened(database) as db:
-        names = {i.image_id: Path(i.name).stem for i in db.read_all_images()}
-        pairs, geometries = db.read_two_view_geometries()
-    tied = {i for pair, g in zip(pairs, geometries, strict=True) if len(g.inlier_matches) for i in _ids(pair)}
-    if not tied:
+        count = len(db.read_all_images())
+        _, geometries = db.read_two_view_geometries()
+    if not any(len(geometry.inlier_matches) for geometry in geometries):
         raise ValueError(
-            f"{path}: no two of the {len(names)} views match: they may look at different things, from too far apart "
-            f"(more than about 30 degrees), or not be of one instant; move the cameras closer, or {_MORE_TEXTURE}."
+            f"{path}: no two of the {count} views match: they may show different objects, be too far apart (more than "
+            f"about 30 degrees), or not be simultaneous; move the cameras closer, or {_MORE_TEXTURE}."
         )
-
-
-def _ids(pair: Any) -> Sequence[int]:
-    import pycolmap
-
-    return pair if isinstance(pair, tuple) else pycolmap.pair_id_to_image_pair(pair)
 
 
 @contextmanager
@@ -218,7 +213,7 @@ def _opened(database: Path) -> Iterator[Any]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep COLMAP from logging to standard error: what matters is said in our own sentences."""
+    """Silence COLMAP's log on standard error; failures are reported by our own messages."""
     import pycolmap
 
     before = pycolmap.logging.minloglevel

@@ -1,4 +1,4 @@
-"""A picture of the rig: cameras and points seen from above and from the side."""
+"""Plot of the rig: cameras and points seen from above and from the side."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Projection = Callable[[np.ndarray], np.ndarray]
 
 
 def write_rig(path: Path, capture: Capture) -> None:
-    """Write the picture of a capture's rig as .png or .jpg; the file appears whole or not at all.
+    """Write the plot of a capture's rig as .png or .jpg; the file appears whole or not at all.
 
     Raises:
         ValueError: the name has another suffix.
@@ -30,7 +30,7 @@ def write_rig(path: Path, capture: Capture) -> None:
     """
     suffix = path.suffix.lower()
     if suffix not in (".png", ".jpg", ".jpeg"):
-        raise ValueError(f"{path}: a picture of the rig must be called .png or .jpg, got {suffix!r}.")
+        raise ValueError(f"{path}: the suffix of a plot must be .png or .jpg, got {suffix!r}; rename it.")
     image = draw_rig(capture.cameras, capture.points, capture.point_colors, capture.test_view)
     data = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
     with whole(path, "write_rig()") as partial:
@@ -41,14 +41,14 @@ def write_rig(path: Path, capture: Capture) -> None:
 def draw_rig(
     cameras: Sequence[Camera], points: np.ndarray, point_colors: np.ndarray, test_view: int | None = None
 ) -> np.ndarray:
-    """Draw the cameras' frusta and names, the points, the world's axes and a scale: RGB uint8 [H, W, 3].
+    """Return a plot of the cameras' frusta and names, the points, the world axes and a scale: RGB uint8 [H, W, 3].
 
-    Up is the mean of the cameras' own up, forward the mean of where they look; the left half is seen from above with
-    forward to the top, the right half from the right with forward to the right.
+    Up is the mean of the cameras' up directions, forward the mean of their viewing directions. The left half is seen
+    from above with forward to the top, the right half from the right with forward to the right.
 
     Args:
         cameras: the rig.
-        points: [P, 3] world units; far ones are cut off.
+        points: [P, 3] world units; distant ones are cut off.
         point_colors: [P, 3] in [0, 1].
         test_view: index of the held-out camera, drawn in red.
     """
@@ -81,7 +81,7 @@ def _directions(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the rig's right, forward and up [3, 3], orthonormal."""
     axes = np.array([np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in cameras])
     up = -axes[:, 1].mean(0)
-    # Cameras all around a scene have no common forward: then the first one's counts.
+    # Cameras all around a scene have no common forward direction: use that of the first one.
     forward = axes[:, 2].mean(0)
     up = up if np.linalg.norm(up) > 1e-3 else -axes[0, 1]
     up = up / np.linalg.norm(up)
@@ -97,14 +97,12 @@ def _directions(cameras: Sequence[Camera]) -> np.ndarray:
 def _frustum(camera: Camera, depth: float) -> np.ndarray:
     """Return the camera's centre and the four corners of its image at `depth` [5, 3], world units."""
     w, h = camera.width, camera.height
-    pixels = np.array([[0, 0, 1], [w, 0, 1], [w, h, 1], [0, h, 1.0]])
-    local = np.vstack([np.zeros(3), depth * pixels @ np.linalg.inv(camera.K).T])
-    V = np.asarray(camera.viewmat, np.float64)
-    return (local - V[:3, 3]) @ V[:3, :3]
+    corners = np.array([[0, 0], [w, 0], [w, h], [0, h]])
+    return np.vstack([camera.position, camera.unproject(corners, np.full(4, depth))])
 
 
 def _projection(box: np.ndarray, plane: np.ndarray) -> tuple[Projection, float]:
-    """Return what maps points [n, 3] to pixels [n, 2] of a panel that shows all of `box`, and its px per unit."""
+    """Return the function from points [n, 3] to pixels [n, 2] of a panel that contains `box`, and its px per unit."""
     flat = box @ plane.T
     low, high = flat.min(0), flat.max(0)
     scale = (_PANEL - 2 * _MARGIN) / max((high - low).max(), 1e-12)
@@ -133,7 +131,7 @@ def _draw_cameras(
 
 
 def _draw_axes(panel: np.ndarray, plane: np.ndarray) -> None:
-    """Draw the directions of the world's axes, 40 px long, in the lower left corner."""
+    """Draw the directions of the world axes, 40 px long, in the lower left corner."""
     start = np.array([_MARGIN, panel.shape[0] - _MARGIN])
     for (name, color), axis in zip(_AXES, plane.T, strict=True):
         end = start + np.rint(40 * axis * (1, -1)).astype(int)

@@ -1,8 +1,8 @@
-"""From what a camera has recorded to what a pinhole camera on the common clock would have."""
+"""The clip of one camera, converted to the frames of a pinhole camera on the common timeline."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Generator
 from dataclasses import dataclass
 
 import cv2
@@ -18,45 +18,45 @@ __all__ = ["CameraSource", "at_clip_size"]
 
 @dataclass(frozen=True)
 class CameraSource:
-    """One camera's clip, and what is done to its pictures.
+    """One camera's clip and the processing of its images.
 
     Attributes:
-        reader: of the clip.
-        lens: that it was recorded through.
-        undo: what undoes the lens; None for nothing.
-        picks: the clip's frames that show the instants 0, 1, ... of the recording, int [T].
-        tone: what corrects the colours; None for nothing.
+        reader: reader of the clip.
+        lens: the lens that the clip was recorded through.
+        undistortion: the pixel maps that remove the lens distortion, or None.
+        frame_indices: the clip's frames that show the instants 0, 1, ... of the recording, int [T].
+        color_correction: the colour correction, or None.
     """
 
     reader: FrameReader
     lens: Lens
-    undo: Undistortion | None
-    picks: np.ndarray
-    tone: ColorCorrection | None = None
+    undistortion: Undistortion | None
+    frame_indices: np.ndarray
+    color_correction: ColorCorrection | None = None
 
-    def pictures(self, camera: Camera, start: int, stop: int) -> Iterator[Picture]:
-        """Yield what `camera` would have seen at the instants start..stop-1, an error in place of what is missing."""
-        for picture in self.reader.pick(self.picks[start:stop].tolist()):
-            yield self.seen(picture, camera) if isinstance(picture, np.ndarray) else picture
+    def images(self, camera: Camera, start: int, stop: int) -> Generator[Picture, None, None]:
+        """Yield the processed images of the instants start..stop-1, with an error in place of a missing image."""
+        for image in self.reader.pick(self.frame_indices[start:stop].tolist()):
+            yield self.process(image, camera) if isinstance(image, np.ndarray) else image
 
-    def seen(self, image: np.ndarray, camera: Camera) -> np.ndarray:
-        """Return a recorded picture as `camera` would have taken it."""
-        image = _shrunk(self.undo(image) if self.undo else image, camera)
-        return self.tone(image) if self.tone else image
+    def process(self, image: np.ndarray, camera: Camera) -> np.ndarray:
+        """Return a recorded image undistorted, downscaled to the size of `camera` and colour-corrected."""
+        image = _downscaled(self.undistortion(image) if self.undistortion else image, camera)
+        return self.color_correction(image) if self.color_correction else image
 
     def mask(self, camera: Camera) -> np.ndarray | None:
-        """Return where `camera` sees what was recorded [H, W] bool, None for everywhere."""
-        if self.undo is None or self.undo.mask.all():
+        """Return the mask of the valid pixels of `camera` [H, W] bool, or None if all are valid."""
+        if self.undistortion is None or self.undistortion.mask.all():
             return None
-        # A shrunk pixel is valid if all that it averages is.
-        return _shrunk(self.undo.mask.astype(np.float32), camera) > 1 - 1e-4
+        # A downscaled pixel is valid if all pixels that it averages are.
+        return _downscaled(self.undistortion.mask.astype(np.float32), camera) > 1 - 1e-4
 
 
 def at_clip_size(camera: Camera, reader: FrameReader) -> Camera:
-    """Return the camera at the size of its clip, which may be the calibrated one made smaller or larger.
+    """Return the camera at the size of its clip, which may be a scaled version of the calibrated size.
 
     Raises:
-        ValueError: it is neither.
+        ValueError: the clip has another aspect ratio.
     """
     if (reader.width, reader.height) == (camera.width, camera.height):
         return camera
@@ -64,13 +64,13 @@ def at_clip_size(camera: Camera, reader: FrameReader) -> Camera:
     # Both sides were rounded to whole pixels.
     if abs(camera.width * y - reader.width) > 1 or abs(camera.height * x - reader.height) > 1:
         raise ValueError(
-            f"{reader.path}: expected {camera.width}x{camera.height} as the calibration of {camera.name} says, or "
-            f"that scaled, got {reader.width}x{reader.height}; calibrate at the recorded size."
+            f"{reader.path}: expected {camera.width}x{camera.height}, the calibrated size of {camera.name}, or a "
+            f"scaled version of it, got {reader.width}x{reader.height}; calibrate at the recorded size."
         )
     return camera.resized(reader.width, reader.height)
 
 
-def _shrunk(image: np.ndarray, camera: Camera) -> np.ndarray:
+def _downscaled(image: np.ndarray, camera: Camera) -> np.ndarray:
     if image.shape[:2] == (camera.height, camera.width):
         return image
     return cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA)

@@ -1,8 +1,9 @@
-"""Colours that agree between cameras and over time.
+"""Colour correction between cameras and over time.
 
-Corrections are made in linear light, where another gain, white balance or sensor is a matrix on (R, G, B). They are
-fitted to the colours of points that views have in common: features that match, and on which the poses agree. The
-reference camera keeps its colours; the others follow from those already corrected that they have most in common with.
+Corrections are applied in linear light, where a different gain, white balance or sensor is a matrix on (R, G, B).
+They are fitted to the colours of points that views share: features that match and on which the poses agree. The
+reference camera is not changed. Then, one by one, the camera that shares most points with those already corrected is
+fitted to them.
 """
 
 from __future__ import annotations
@@ -17,12 +18,13 @@ import numpy as np
 
 from morgs_mi.capture.features import Features, Match, detect, match_views, reprojection_errors
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
 
 __all__ = ["COLOR_METHODS", "ColorCorrection", "ColorFit", "fit_colors"]
 
 _LOG = logging.getLogger(__name__)
 
-# By name: colour-science's method and its settings.
+# Per method the name and the settings of colour-science's method.
 COLOR_METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "linear": ("Cheung 2004", {"terms": 3}),
     "root-polynomial": ("Finlayson 2015", {"degree": 2, "root_polynomial_expansion": True}),
@@ -30,33 +32,31 @@ COLOR_METHODS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 # A matrix has nine numbers; features are noisy.
 _MIN_SAMPLES, _MAX_ERROR = 30, 2.0
-# What is nearly black or white says nothing about a gain, of 0..255.
+# Well-exposed pixel values, of 0..255; those nearly black or white do not determine a gain.
 _DARK, _BRIGHT = 12, 243
-_BLUR = 0.008  # of the width
-_THUMB = 96  # pixels across that are enough for a median
+_BLUR = 0.008  # standard deviation of the blur around a feature, as a fraction of the width
+_THUMB = 96  # width of the thumbnail, px; enough for a median
 
 
-def _decoded(codes: np.ndarray) -> np.ndarray:
-    """Return the light, 0 to 1, of sRGB's codes, 0 to 255 and between (IEC 61966-2-1)."""
-    signal = codes / np.float32(255)
-    return np.where(signal <= 0.04045, signal / 12.92, ((signal + 0.055) / 1.055) ** 2.4).astype(np.float32)
+def _decoded(values: np.ndarray) -> np.ndarray:
+    """Return the linear light in [0, 1] of sRGB values in [0, 255], which need not be whole, in float32."""
+    return srgb_to_linear(values / np.float32(255)).astype(np.float32)
 
 
+# Tables: the light of each byte, and the byte of 65536 levels of light.
 _LINEAR = _decoded(np.arange(256, dtype=np.float32))
-_LIGHT = np.arange(65536) / 65535
-_ENCODED = np.where(_LIGHT <= 0.0031308, 12.92 * _LIGHT, 1.055 * _LIGHT ** (1 / 2.4) - 0.055)
-_ENCODED = np.rint(255 * _ENCODED).astype(np.uint8)
+_ENCODED = np.rint(255 * linear_to_srgb(np.arange(65536) / 65535)).astype(np.uint8)
 
 
 @dataclass(frozen=True)
 class ColorFit:
-    """What brings the cameras' colours together.
+    """Colour correction of all cameras towards a reference camera.
 
     Attributes:
         method: one of `COLOR_METHODS`.
-        reference: index of the camera that keeps its colours.
-        matrices: per camera; None for the reference, and for a camera that has too little in common with the others.
-        samples: per camera, points that it has in common with others.
+        reference: index of the reference camera, which is not changed.
+        matrices: per camera; None for the reference, and for a camera that shares too few points with the others.
+        samples: per camera, number of points shared with others.
         before: per camera, mean dE2000 of these against the other views' colours; NaN without any.
         after: the same after the correction.
     """
@@ -71,12 +71,12 @@ class ColorFit:
 
 @dataclass(frozen=True)
 class ColorCorrection:
-    """What one camera's pictures need to agree with the other cameras' and with its own first.
+    """Colour correction of one camera's images, towards the other cameras and towards its own first image.
 
     Attributes:
         method: one of `COLOR_METHODS`.
-        matrix: of the correction; None for none.
-        first: a small version of the first picture, where gains are to be undone; None: they stay.
+        matrix: matrix of the correction, or None.
+        first: thumbnail of the first image, to which changes of exposure are relative; None if they are not corrected.
     """
 
     method: str = "linear"
@@ -85,14 +85,14 @@ class ColorCorrection:
 
     @classmethod
     def of(cls, fit: ColorFit | None, view: int, first: np.ndarray | None) -> ColorCorrection:
-        """Return the tone of a view, relative to its `first` picture if that is given."""
+        """Return the correction of a view; exposure changes are corrected if its `first` image is given."""
         matrix = None if fit is None else fit.matrices[view]
         return cls(fit.method if fit else "linear", matrix, None if first is None else _thumb(first))
 
     def gain(self, image: np.ndarray) -> float:
-        """Return the factor in light between the first picture and this one: the median of what is well exposed.
+        """Return the factor in linear light from the first image to this one: the median of well-exposed pixels.
 
-        Cameras do not move here, so most pixels show what they showed then.
+        The cameras are fixed, so most pixels show the same surface in both.
         """
         if self.first is None:
             return 1.0
@@ -102,7 +102,7 @@ class ColorCorrection:
         return float(np.median(_decoded(now[good]) / _decoded(self.first[good]))) if good.sum() >= _MIN_SAMPLES else 1.0
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Return the picture uint8 [H, W, 3] as it should have been."""
+        """Return the corrected image, uint8 [H, W, 3]."""
         gain = self.gain(image)
         if self.matrix is None:
             return image if gain == 1 else cv2.LUT(image, _encode(_LINEAR / gain))
@@ -116,42 +116,42 @@ def fit_colors(
     method: str = "linear",
     reference: int | None = None,
 ) -> ColorFit:
-    """Fit what makes all views show points in the colours that the reference view shows.
+    """Fit the correction that maps each view's colours of shared points to those in the reference view.
 
     Args:
         cameras: C views.
-        images: a picture of one instant per view, uint8 [H, W, 3], or None: that view keeps its colours.
-        masks: per view where pixels are valid, or None.
+        images: per view an image of one instant, uint8 [H, W, 3], or None: the view is not corrected.
+        masks: per view the mask of valid pixels [H, W], or None.
         method: one of `COLOR_METHODS`.
-        reference: index of the view that keeps its colours; by default the one with the most in common.
+        reference: index of the reference view; by default the one that shares most points with the others.
     """
     features = [detect(image, mask) for image, mask in zip(images, masks, strict=True)]
-    seen = [np.zeros((0, 3)) if i is None else _colors_at(i, f.points) for i, f in zip(images, features, strict=True)]
-    pairs = [_agreeing(match, features, cameras, seen) for match in match_views(features, cameras)]
+    colors = [np.zeros((0, 3)) if i is None else _colors_at(i, f.points) for i, f in zip(images, features, strict=True)]
+    pairs = [_reliable(match, features, cameras, colors) for match in match_views(features, cameras)]
     counts = np.zeros((len(cameras),) * 2, int)
     for match in pairs:
         counts[match.views] = counts[match.views[::-1]] = len(match.features)
     start = int(counts.sum(1).argmax()) if reference is None else reference
-    corrected: dict[int, np.ndarray] = {start: seen[start]}
+    corrected: dict[int, np.ndarray] = {start: colors[start]}
     matrices: list[np.ndarray | None] = [None] * len(cameras)
     while len(corrected) < len(cameras):
         known = counts[:, list(corrected)].sum(1)
         known[list(corrected)] = -1
         view = int(known.argmax())
         if known[view] >= _MIN_SAMPLES:
-            matrices[view] = matrix = _fit(*_against(view, pairs, seen, corrected), method)
-            corrected[view] = _corrected(seen[view], matrix, method)
+            matrices[view] = matrix = _fit(*_shared_colors(view, pairs, colors, corrected), method)
+            corrected[view] = _corrected(colors[view], matrix, method)
         else:
             _LOG.warning("%s keeps its colours: too few points in common with the others.", cameras[view].name)
-            corrected[view] = seen[view]
-            counts[view] = counts[:, view] = 0  # nobody is corrected towards it
+            corrected[view] = colors[view]
+            counts[view] = counts[:, view] = 0  # no other view is corrected towards it
     after = [corrected[view] for view in range(len(cameras))]
     return ColorFit(
         method,
         start,
         tuple(matrices),
         tuple(sum(len(pair.features) for pair in pairs if view in pair.views) for view in range(len(cameras))),
-        _differences(pairs, seen),
+        _differences(pairs, colors),
         _differences(pairs, after),
     )
 
@@ -160,37 +160,39 @@ def _colors_at(image: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the linear colours [K, 3] around points [K, 2].
 
     Features are edges, which two views sample differently: the wider the mean, the smaller that error (dE2000 of 3.2
-    between equal cameras with 1 px, 2.1 with 2.6 px at a width of 320), until it takes in what lies behind.
+    between equal cameras with 1 px, 2.1 with 2.6 px at a width of 320), until the mean includes the background.
     """
     light = cv2.GaussianBlur(_LINEAR[image], (0, 0), max(1.0, _BLUR * image.shape[1]))
     columns, rows = np.clip(points.astype(int), 0, (image.shape[1] - 1, image.shape[0] - 1)).T
     return light[rows, columns].astype(np.float64)
 
 
-def _agreeing(match: Match, features: Sequence[Features], cameras: Sequence[Camera], seen: Sequence) -> Match:
-    """Keep the features on which the poses agree, and that are well exposed in both views."""
+def _reliable(
+    match: Match, features: Sequence[Features], cameras: Sequence[Camera], colors: Sequence[np.ndarray]
+) -> Match:
+    """Return the features of a match on which the poses agree and that are well exposed in both views."""
     good = reprojection_errors(match, features, cameras) <= _MAX_ERROR
     for k, view in enumerate(match.views):
-        colors = seen[view][match.features[:, k]]
-        good &= ((colors > _LINEAR[_DARK]) & (colors < _LINEAR[_BRIGHT])).all(1)
+        matched = colors[view][match.features[:, k]]
+        good &= ((matched > _LINEAR[_DARK]) & (matched < _LINEAR[_BRIGHT])).all(1)
     return Match(match.views, match.features[good])
 
 
-def _against(
-    view: int, pairs: Sequence[Match], seen: Sequence[np.ndarray], corrected: dict[int, np.ndarray]
+def _shared_colors(
+    view: int, pairs: Sequence[Match], colors: Sequence[np.ndarray], corrected: dict[int, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a view's colours [M, 3] and those of the same points in the views that are corrected already."""
+    """Return a view's colours [M, 3] and those of the same points in the views already corrected."""
     mine, theirs = [], []
     for pair in pairs:
         if view in pair.views and (other := sum(pair.views) - view) in corrected:
             k = pair.views.index(view)
-            mine.append(seen[view][pair.features[:, k]])
+            mine.append(colors[view][pair.features[:, k]])
             theirs.append(corrected[other][pair.features[:, 1 - k]])
     return np.concatenate(mine), np.concatenate(theirs)
 
 
 def _fit(mine: np.ndarray, theirs: np.ndarray, method: str) -> np.ndarray:
-    """Fit a correction, and once more without what it explains worst: highlights, wrong matches."""
+    """Return a correction that is fitted twice, the second time without outliers: highlights and wrong matches."""
     from colour.characterisation import matrix_colour_correction
 
     name, settings = COLOR_METHODS[method]
@@ -201,10 +203,10 @@ def _fit(mine: np.ndarray, theirs: np.ndarray, method: str) -> np.ndarray:
 
 
 def _corrected(light: np.ndarray, matrix: np.ndarray, method: str) -> np.ndarray:
-    """Apply a correction to linear colours [..., 3]."""
+    """Return corrected linear colours [..., 3]."""
     from colour.characterisation import apply_matrix_colour_correction
 
-    if method == "linear":  # a polynomial of these terms only
+    if method == "linear":  # its only terms are R, G and B
         return light @ matrix.T.astype(light.dtype)
     name, settings = COLOR_METHODS[method]
     return apply_matrix_colour_correction(np.maximum(light, 0), matrix, name, **settings)
@@ -219,7 +221,7 @@ def delta_e(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _differences(pairs: Sequence[Match], colors: Sequence[np.ndarray]) -> tuple[float, ...]:
-    """Return per view the mean dE2000 of its points against the other views' colours of them."""
+    """Return per view the mean dE2000 of its points against their colours in the other views."""
     found: list[list[np.ndarray]] = [[] for _ in colors]
     for pair in pairs:
         a, b = (colors[view][pair.features[:, k]] for k, view in enumerate(pair.views))
@@ -230,7 +232,7 @@ def _differences(pairs: Sequence[Match], colors: Sequence[np.ndarray]) -> tuple[
 
 
 def _thumb(image: np.ndarray) -> np.ndarray:
-    """Return the picture some pixels small, as float32: rounded codes would round the gain to 2 %."""
+    """Return a thumbnail in float32; rounded to bytes it would limit the gain's precision to 2 %."""
     height, width = image.shape[:2]
     across = min(_THUMB, width)
     return cv2.resize(

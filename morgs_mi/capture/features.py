@@ -1,13 +1,13 @@
-"""Points that several views of one instant have in common: features, matches, triangulation.
+"""Points seen in several views of one instant: features, matches and triangulation.
 
-Notation: a feature x [2] lies in pixels with centres at +0.5, as in `Camera`; a match is a row (view, feature, view,
-feature). Matches are found without looking at the poses, so the poses can be checked against them.
+Notation: a feature x [2] is a pixel position with pixel centres at +0.5, as in `Camera`; a match is a pair of features
+in two views. Matching does not use the poses, so the poses can be checked against the matches.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -16,22 +16,22 @@ from morgs_mi.core.camera import Camera
 
 __all__ = ["Features", "Match", "detect", "match_views", "reprojection_errors", "triangulate"]
 
-# Larger images have no more corners that are seen from elsewhere, and SIFT takes its time.
+# Larger images do not add corners that other views see too, and SIFT is slow.
 _DETECTION_PIXELS = 1.3e6
 _MAX_FEATURES = 2500
-# Lowe's ratio; beyond this many cameras each is matched with its nearest only.
+# Lowe's ratio; with more cameras than this, each is matched with its nearest neighbours only.
 _RATIO, _ALL_PAIRS, _NEIGHBOURS = 0.8, 24, 8
 _MIN_MATCHES = 16
 
 
 @dataclass(frozen=True)
 class Features:
-    """What stands out in one image.
+    """SIFT features of one image.
 
     Attributes:
         points: [K, 2] float64, pixels.
         descriptors: [K, 128] float32 of length 1.
-        colors: [K, 3] float32 in [0, 1], of the pixel.
+        colors: [K, 3] float32 in [0, 1], colour of the pixel.
     """
 
     points: np.ndarray
@@ -41,11 +41,11 @@ class Features:
 
 @dataclass(frozen=True)
 class Match:
-    """What two views have in common.
+    """Matched features of two views.
 
     Attributes:
-        views: indices of the two.
-        features: [M, 2] int, the feature in either.
+        views: indices of the two views.
+        features: [M, 2] int, index of the feature in each view.
     """
 
     views: tuple[int, int]
@@ -53,31 +53,31 @@ class Match:
 
 
 def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features:
-    """Find SIFT features in an image uint8 [H, W, 3], only where the `mask` [H, W] is true; none where it is None."""
-    nothing = Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3), np.float32))
+    """Return the SIFT features of an image uint8 [H, W, 3] where `mask` [H, W] is true; none if the image is None."""
+    none = Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3), np.float32))
     if image is None:
-        return nothing
+        return none
     height, width = image.shape[:2]
     scale = min(1.0, np.sqrt(_DETECTION_PIXELS / (width * height)))
     size = (round(width * scale), round(height * scale))
     grey = cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2GRAY)
     where = None if mask is None else cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST)
-    # Without the precise upscaling OpenCV's features are off by a quarter of a pixel.
-    sift = cv2.SIFT_create(nfeatures=_MAX_FEATURES, enable_precise_upscale=True)
+    # Without precise upscaling OpenCV's features are off by a quarter of a pixel.
+    sift = cv2.SIFT.create(nfeatures=_MAX_FEATURES, enable_precise_upscale=True)
     found, descriptors = sift.detectAndCompute(grey, where)
     if descriptors is None:
-        return nothing
+        return none
     points = (np.array([k.pt for k in found]) + 0.5) * (width / size[0], height / size[1])
-    # Square roots of what sums to 1: distances between them tell matches apart better (Arandjelovic 2012).
+    # RootSIFT: square roots of the normalised descriptors are easier to tell apart (Arandjelovic 2012).
     descriptors = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
     columns, rows = np.clip(points.astype(int), 0, (width - 1, height - 1)).T
     return Features(points, descriptors, image[rows, columns].astype(np.float32) / 255)
 
 
 def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list[Match]:
-    """Match features between all views, or between near ones where there are many cameras.
+    """Return the matches between all pairs of views, or between near views if there are many cameras.
 
-    Only matches that agree with one epipolar geometry, whichever it is, are kept.
+    Only matches that are consistent with a common epipolar geometry are kept, whatever that geometry is.
     """
     matches = (Match((i, j), _matches(features[i], features[j])) for i, j in _pairs(cameras))
     return [match for match in matches if len(match.features)]
@@ -95,7 +95,7 @@ def _pairs(cameras: Sequence[Camera]) -> Iterator[tuple[int, int]]:
 
 
 def _matches(a: Features, b: Features) -> np.ndarray:
-    """Return the pairs [M, 2] that are mutually nearest and clearly so."""
+    """Return the pairs [M, 2] that are mutual nearest neighbours and pass Lowe's ratio test."""
     none = np.zeros((0, 2), int)
     if min(len(a.points), len(b.points)) < 2:
         return none
@@ -114,9 +114,10 @@ def _matches(a: Features, b: Features) -> np.ndarray:
 
 
 def reprojection_errors(match: Match, features: Sequence[Features], cameras: Sequence[Camera]) -> np.ndarray:
-    """Return how far each match [M] is from the projections of its own point in the two views, px.
+    """Return the reprojection error of each match [M], px.
 
-    It is the mean of both views' distances, and infinite for a point behind a camera.
+    A match is triangulated from its two features. Its error is the mean distance of the point's projections from
+    them, and infinite for a point behind a camera.
     """
     count = len(match.features)
     tracks = np.tile(np.arange(count), 2)
@@ -134,14 +135,14 @@ def triangulate(
     max_error: float = 2.0,
     min_angle: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the points [P, 3] float32, world units, on which the views agree, and their colours [P, 3] in [0, 1].
+    """Return the triangulated points [P, 3] float32, world units, and their colours [P, 3] in [0, 1].
 
     Args:
         matches: from `match_views`.
         features: per view.
         cameras: per view.
-        max_error: farthest that a point may project from any of its features, px.
-        min_angle: least angle between two rays to a point, degrees.
+        max_error: largest distance of a point's projection from any of its features, px.
+        min_angle: smallest accepted angle between the rays to a point, degrees.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -161,7 +162,7 @@ def triangulate(
     views = np.repeat(np.arange(len(features)), np.diff(starts))
     pixels = np.concatenate([f.points for f in features])
     colors = np.concatenate([f.colors for f in features])
-    # A track is whole if it has at least two features, all in different views.
+    # A track is valid if it has at least two features, all in different views.
     sizes = np.bincount(track)
     distinct = np.bincount(np.unique(np.stack([track, views]), axis=1)[0])
     used = np.flatnonzero(((sizes >= 2) & (distinct == sizes))[track])
@@ -181,17 +182,20 @@ def triangulate(
 def _intersect(
     track: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera], count: int
 ) -> np.ndarray:
-    """Return the points [count, 3] nearest, in the algebraic sense, to the rays of their observations.
+    """Return the points [count, 3] with the least algebraic distance to the rays of their observations.
 
-    Observation k says that point `track[k]` is seen in `views[k]` at `pixels[k]`.
+    Observation k is the pixel position `pixels[k]` of point `track[k]` in view `views[k]`.
     """
-    K = np.array([camera.K for camera in cameras])[views]
     V = np.array([np.asarray(camera.viewmat, np.float64)[:3] for camera in cameras])
-    # In units of the rig around its middle, for the sake of the conditioning.
+    # Relative to the centre and the size of the rig, which makes the system well conditioned.
     positions = np.array([camera.position for camera in cameras])
     middle, scale = positions.mean(0), np.linalg.norm(positions - positions.mean(0), axis=1).max() or 1.0
     V = np.concatenate([V[:, :, :3], ((V[:, :, :3] @ middle + V[:, :, 3]) / scale)[..., None]], axis=2)[views]
-    x = (pixels - K[:, :2, 2]) / K[:, [0, 1], [0, 1]]
+    # Image coordinates at depth 1, in each camera's own frame.
+    x = np.empty_like(pixels)
+    for view in np.unique(views):
+        of_view, local = views == view, replace(cameras[view], viewmat=np.eye(4))
+        x[of_view] = local.unproject(pixels[of_view], np.ones(np.count_nonzero(of_view)))[:, :2]
     rows = x[:, :, None] * V[:, 2:3] - V[:, :2]
     system = np.zeros((count, 4, 4))
     np.add.at(system, track, np.einsum("kri,krj->kij", rows, rows))
@@ -201,18 +205,18 @@ def _intersect(
 
 
 def _distances(points: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return how far each point [n, 3] projects from its pixel, infinite behind the camera."""
-    K = np.array([camera.K for camera in cameras])[views]
-    V = np.array([np.asarray(camera.viewmat, np.float64) for camera in cameras])[views]
+    """Return the distance of each point's projection [n] from its pixel, px, infinite behind the camera."""
+    projected, depths = np.empty_like(pixels), np.empty(len(points))
     with np.errstate(divide="ignore", invalid="ignore"):
-        local = np.einsum("nij,nj->ni", V[:, :3, :3], points) + V[:, :3, 3]
-        projected = np.einsum("nij,nj->ni", K, local)
-        error = np.linalg.norm(projected[:, :2] / projected[:, 2:] - pixels, axis=1)
-    return np.where((local[:, 2] > 0) & np.isfinite(error), error, np.inf)
+        for view in np.unique(views):
+            of_view = views == view
+            projected[of_view], depths[of_view] = cameras[view].project(points[of_view])
+        error = np.linalg.norm(projected - pixels, axis=1)
+    return np.where((depths > 0) & np.isfinite(error), error, np.inf)
 
 
 def _widest_angles(points: np.ndarray, track: np.ndarray, views: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return twice the widest angle [P] between a point's rays and their mean, degrees: the spread of its views."""
+    """Return twice the largest angle [P] between a point's rays and their mean, degrees: the spread of its views."""
     positions = np.array([camera.position for camera in cameras])[views]
     with np.errstate(invalid="ignore"):
         rays = points[track] - positions

@@ -1,4 +1,4 @@
-"""Lens distortion of COLMAP's camera models, undone once per camera by OpenCV's maps.
+"""Undistortion of COLMAP's camera models by OpenCV's pixel maps, computed once per camera.
 
 Notation: a model's parameters are its focal length(s), principal point and distortion coefficients, in
 COLMAP's order. OpenCV puts pixel centres at integers, COLMAP and `Camera` at +0.5.
@@ -7,7 +7,7 @@ COLMAP's order. OpenCV puts pixel centres at integers, COLMAP and `Camera` at +0
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -30,11 +30,11 @@ MODELS = {
 
 @dataclass(frozen=True)
 class Lens:
-    """What bends the rays of a COLMAP camera.
+    """Lens distortion of a COLMAP camera.
 
     Attributes:
         model: COLMAP's name of the model, e.g. ``OPENCV``.
-        distortion: its coefficients in COLMAP's order; empty for a pinhole.
+        distortion: distortion coefficients in COLMAP's order; empty for a pinhole.
     """
 
     model: str = "PINHOLE"
@@ -42,16 +42,16 @@ class Lens:
 
     @property
     def opencv_coefficients(self) -> np.ndarray:
-        """The coefficients as OpenCV takes them: [4] for a fisheye, else [8] (k1 k2 p1 p2 k3 .. k6)."""
+        """The coefficients in OpenCV's order: [4] for a fisheye, otherwise [8] (k1 k2 p1 p2 k3 .. k6)."""
         count = 4 if self.model == "OPENCV_FISHEYE" else 8
         return np.pad(np.array(self.distortion, dtype=np.float64), (0, count - len(self.distortion)))
 
 
 def lens_and_intrinsics(model: str, params: Sequence[float]) -> tuple[Lens, np.ndarray]:
-    """Split a COLMAP camera's parameters into its lens and K [3, 3].
+    """Split a COLMAP camera's parameters into the lens and K [3, 3].
 
     Raises:
-        ValueError: the model is not supported, or the number of parameters is not the model's.
+        ValueError: the model is not supported, or the number of parameters does not match the model.
     """
     if model not in MODELS:
         raise ValueError(
@@ -71,24 +71,24 @@ def lens_and_intrinsics(model: str, params: Sequence[float]) -> tuple[Lens, np.n
 
 @dataclass(frozen=True)
 class Undistortion:
-    """The pixel maps that undo one lens, and what they reach.
+    """Pixel maps that remove the distortion of one lens.
 
     Attributes:
         maps: OpenCV's fixed-point maps for `cv2.remap`.
-        mask: [H, W] bool, true where the undistorted pixel lies inside the recorded image, and the lens model holds.
+        mask: [H, W] bool, true where the undistorted pixel lies inside the recorded image and the lens model is valid.
     """
 
     maps: tuple[np.ndarray, np.ndarray]
     mask: np.ndarray
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
-        """Return the image [H, W, 3] as the pinhole camera with the same K would have seen it."""
-        # Cubic, for linear filtering blurs by the sub-pixel shifts that most of these lenses cause.
+        """Return the image [H, W, 3] of the pinhole camera with the same K."""
+        # Cubic, because linear filtering would blur: most of these lenses shift pixels by fractions of a pixel.
         return cv2.remap(image, *self.maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
 def undistortion(camera: Camera, lens: Lens) -> Undistortion | None:
-    """Return what undoes `lens`, or None where there is nothing to undo.
+    """Return the undistortion of `lens`, or None for a lens without distortion.
 
     The undistorted view has the same K and size as the recorded one, so corners of a barrel-shaped
     image are lost and those of a pincushion-shaped one are empty (see `Undistortion.mask`).
@@ -102,24 +102,28 @@ def undistortion(camera: Camera, lens: Lens) -> Undistortion | None:
     build = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
     x, y = build(K, lens.opencv_coefficients, np.eye(3), K, size, cv2.CV_32FC1)
     mask = (x >= -0.5) & (x <= camera.width - 0.5) & (y >= -0.5) & (y <= camera.height - 0.5)
-    mask &= ~_folded(x, y, K)
-    # Fixed point halves the memory of a rig's maps; its 1/32 px is far below any calibration's error.
+    mask &= ~_folded(x, y, camera)
+    # Fixed point halves the memory of a rig's maps; its 1/32 px is far below the error of any calibration.
     return Undistortion(cv2.convertMaps(x, y, cv2.CV_16SC2), mask)
 
 
-def _folded(x: np.ndarray, y: np.ndarray, K: np.ndarray) -> np.ndarray:
-    """Return where a lens model is beyond the angle up to which it holds [H, W].
+def _folded(x: np.ndarray, y: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the mask of pixels beyond the angle up to which the lens model is valid [H, W].
 
-    A polynomial that was fitted to the recorded rays turns back farther out, and would show the image's inside there
-    once more, mirrored.
+    A polynomial that was fitted to the recorded rays decreases again farther out, where it would repeat the inner
+    part of the image, mirrored.
     """
-    # Every few pixels is enough, and quick.
+    # Sampling every few pixels is accurate enough, and fast.
     step = max(1, min(x.shape) // 256)
     coarse = x[::step, ::step], y[::step, ::step]
     if min(coarse[0].shape) < 2:
         return np.zeros(x.shape, bool)
     (x_down, x_right), (y_down, y_right) = (np.gradient(values) for values in coarse)
-    rows, columns = np.ogrid[: x.shape[0], : x.shape[1]]
-    radius = np.hypot((columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1])
-    turned = x_right * y_down - x_down * y_right <= 0
-    return radius >= np.min(radius[::step, ::step][turned], initial=np.inf)
+    # Image coordinates at depth 1: x depends on the column only, y on the row only.
+    local = replace(camera, viewmat=np.eye(4))
+    columns, rows = np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5
+    across = local.unproject(np.stack([columns, columns], axis=1), np.ones_like(columns))[:, 0]
+    down = local.unproject(np.stack([rows, rows], axis=1), np.ones_like(rows))[:, 1]
+    radius = np.hypot(across, down[:, None])
+    folded = x_right * y_down - x_down * y_right <= 0
+    return radius >= np.min(radius[::step, ::step][folded], initial=np.inf)

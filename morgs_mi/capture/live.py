@@ -1,11 +1,12 @@
-"""Pictures of a calibrated rig as they come, instead of recorded clips.
+"""Live images of a calibrated rig, in place of recorded clips.
 
-A source is whatever gives one camera's pictures, of the size that its clip was recorded at:
+A source yields the images of one camera, at the size of its recorded clip:
 
 - an int: a camera of this machine, by OpenCV's index;
-- a path or URL: whatever FFmpeg can open, e.g. a named pipe, ``/dev/video0`` or ``rtsp://...``;
-- a binary file, e.g. the end of a pipe: raw RGB pictures, 8 bits each (``ffmpeg ... -f rawvideo -pix_fmt rgb24 -``);
-- an iterable of arrays uint8 [H, W, 3], RGB, with None for an instant that it has missed.
+- a path or URL: anything that FFmpeg opens, e.g. a named pipe, ``/dev/video0`` or ``rtsp://...``;
+- a binary file, e.g. the end of a pipe: raw RGB images, 8 bits per channel
+  (``ffmpeg ... -f rawvideo -pix_fmt rgb24 -``);
+- an iterable of arrays uint8 [H, W, 3], RGB, with None for a missed instant.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import count
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, cast
 
 import cv2
 import numpy as np
@@ -27,71 +28,73 @@ Source = int | str | Path | BinaryIO | Iterable[np.ndarray | None]
 
 
 def live_frames(rig: Capture, sources: Sequence[Source], newest: bool = False) -> Iterator[PartialFrame]:
-    """Yield the frames of live sources as `rig` would see them: lenses undone, downscaled, colours corrected.
+    """Yield the frames of live sources, undistorted, downscaled and colour-corrected like those of `rig`.
 
-    One picture is taken of each source in turn, in a background thread; that they belong to one instant is up to the
-    cameras. A source that fails or ends is left out; it is over when none gives a picture any more.
+    A background thread reads one image of each source in turn; the cameras must be synchronised. A source that fails
+    or ends is left out. The frames end when no source yields an image any more.
 
     Args:
         rig: a capture of the same cameras.
         sources: one per camera of the rig.
-        newest: frames that come while the last one is still in use are dropped but for the newest.
+        newest: whether to drop all but the newest of the frames that arrive while one is being processed.
 
     Raises:
         OSError: a source cannot be opened.
-        ValueError: there is not one source per camera, or a picture has another size than the rig's.
+        ValueError: the number of sources differs from that of the cameras, or an image from the size of the rig's.
     """
     if len(sources) != len(rig.cameras):
         raise ValueError(
             f"live_frames(): `sources` must be one for each of {len(rig.cameras)} cameras ({', '.join(rig.names)}), "
             f"got {len(sources)}."
         )
-    streams = [_pictures(source, *size) for source, size in zip(sources, rig.recorded_sizes, strict=True)]
+    streams = [_images(source, *size) for source, size in zip(sources, rig.recorded_sizes, strict=True)]
     return prefetched(_frames(rig, streams), newest=newest)
 
 
 def _frames(rig: Capture, streams: Sequence[Iterator[np.ndarray | None]]) -> Iterator[PartialFrame]:
     try:
         for index in count():
-            pictures = [next(stream, None) for stream in streams]
-            if all(picture is None for picture in pictures):
+            images = [next(stream, None) for stream in streams]
+            if all(image is None for image in images):
                 return
-            problems = [f"{n}: no picture" for n, p in zip(rig.names, pictures, strict=True) if p is None]
-            for view, picture in enumerate(pictures):
-                _check_size(rig, view, picture)
-            images = [None if p is None else rig.seen(view, p) for view, p in enumerate(pictures)]
-            yield PartialFrame(index, tuple(images), tuple(problems))
+            problems = [f"{n}: no image" for n, image in zip(rig.names, images, strict=True) if image is None]
+            for view, image in enumerate(images):
+                _check_size(rig, view, image)
+            processed = [None if image is None else rig.process(view, image) for view, image in enumerate(images)]
+            yield PartialFrame(index, tuple(processed), tuple(problems))
     finally:
         for stream in streams:
             if (close := getattr(stream, "close", None)) is not None:
                 close()
 
 
-def _check_size(rig: Capture, view: int, picture: np.ndarray | None) -> None:
+def _check_size(rig: Capture, view: int, image: np.ndarray | None) -> None:
     width, height = rig.recorded_sizes[view]
-    if picture is not None and (picture.shape != (height, width, 3) or picture.dtype != np.uint8):
+    if image is not None and (image.shape != (height, width, 3) or image.dtype != np.uint8):
         raise ValueError(
-            f"live_frames(): the pictures of {rig.names[view]} must be uint8 [{height}, {width}, 3] as in its clip, "
-            f"got {picture.dtype} {list(picture.shape)}; calibrate at the live size."
+            f"live_frames(): the images of {rig.names[view]} must be uint8 [{height}, {width}, 3] as in its clip, "
+            f"got {image.dtype} {list(image.shape)}; calibrate at the live size."
         )
 
 
-def _pictures(source: Source, width: int, height: int) -> Iterator[np.ndarray | None]:
+def _images(source: Source, width: int, height: int) -> Iterator[np.ndarray | None]:
     if isinstance(source, int | str | Path):
         stream = cv2.VideoCapture(source) if isinstance(source, int) else cv2.VideoCapture(str(source), cv2.CAP_FFMPEG)
         if not stream.isOpened():
             raise OSError(
-                f"live_frames(): the source {source} cannot be opened; check that it is there and not in use."
+                f"live_frames(): the source {source} cannot be opened; check that it exists and is not in use."
             )
         return _captured(stream)
-    return iter(source) if not hasattr(source, "read") else _raw(source, width, height)
+    if hasattr(source, "read"):
+        return _raw(cast(BinaryIO, source), width, height)
+    return iter(cast(Iterable[np.ndarray | None], source))
 
 
 def _captured(stream: cv2.VideoCapture) -> Iterator[np.ndarray | None]:
     try:
         while True:
-            ok, picture = stream.read()
-            yield cv2.cvtColor(picture, cv2.COLOR_BGR2RGB) if ok else None
+            ok, image = stream.read()
+            yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if ok else None
     finally:
         stream.release()
 
@@ -103,7 +106,7 @@ def _raw(pipe: BinaryIO, width: int, height: int) -> Iterator[np.ndarray]:
 
 
 def _exactly(pipe: BinaryIO, size: int) -> bytes:
-    """Read `size` bytes, less only at the end: pipes give what they have."""
+    """Return `size` bytes, fewer only at the end of the file: one read of a pipe may return fewer."""
     data = bytearray()
     while len(data) < size and (chunk := pipe.read(size - len(data))):
         data += chunk

@@ -1,8 +1,8 @@
-"""How the clips of a capture are put together: on one clock, of one colour, with or without gaps.
+"""Alignment of a capture's clips in time, and the settings that control how they are read.
 
-An instant t = 0, 1, ... is a frame of the recording; a clip's frame k shows it if
+An instant t = 0, 1, ... is a frame of the recording. It is shown by frame k of a clip if
 
-    k = o + r t,    with o the clip's offset and r its frame rate over the lowest.
+    k = o + r t,    with o the clip's offset and r its frame rate divided by the lowest frame rate.
 """
 
 from __future__ import annotations
@@ -22,48 +22,48 @@ __all__ = ["ReadConfig", "Timeline", "read_settings", "timeline"]
 
 _LOG = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0
-# 29.97 and 30 are one camera written by two programs.
+# 29.97 and 30 fps count as the same rate: programs write either for the same camera.
 _SAME_RATE = 1.01
 
 
 @dataclass(frozen=True)
 class ReadConfig:
-    """What to do with clips that do not fit each other; by default they are refused."""
+    """Handling of clips that do not match; by default they are refused."""
 
     trim: bool = False
-    """Take the instants that all clips hold, at the lowest of their frame rates."""
+    """Whether to use only the instants that all clips cover, at the lowest of their frame rates."""
     offset: dict[str, int] = field(default_factory=dict)
-    """By camera: which frame of its clip shows the instant that frame 0 of the others shows. Negative for a clip that
-    began later. What not all clips hold is left out, as with trim."""
+    """Frame of each listed camera's clip that is simultaneous with frame 0 of the others; negative for a clip that
+    started later. Instants that not all clips cover are left out, as with trim."""
     gaps: bool = False
-    """Go on where pictures are missing: a camera is left out of the frames that it lacks."""
+    """Whether images may be missing; a camera is left out of the frames that it lacks."""
     color: Literal["none", "linear", "root-polynomial", "vandermonde"] = "none"
-    """Correct each camera's colours towards a reference camera's on the points that they have in common."""
+    """Method that matches each camera's colours to those of a reference camera, fitted to points that both see."""
     color_reference: str = ""
-    """That camera's name; by default the one that has most in common with the others."""
+    """Name of the reference camera; by default the one that shares most points with the others."""
     exposure: bool = False
-    """Undo changes of a camera's exposure over time: one gain per view and frame brings what stands still back to its
-    brightness in the first frame."""
+    """Whether to remove exposure changes over time: one gain per view and frame restores the brightness that static
+    surfaces have in the first frame."""
 
     @property
-    def one_clock(self) -> bool:
-        """Whether it is told how clips of other lengths and rates fit together."""
+    def aligns_clips(self) -> bool:
+        """Whether clips of different lengths and frame rates are aligned."""
         return self.trim or bool(self.offset)
 
 
 @dataclass(frozen=True)
 class Timeline:
-    """Which frame of each clip shows which instant.
+    """Frames of each clip that show the instants of the recording.
 
     Attributes:
-        picks: per camera the clip's frames, int [T], rising.
+        frame_indices: per camera the clip's frames in increasing order, int [T].
         fps: instants per second.
-        plain: whether every clip is shown from its first frame on, one after the other.
+        unchanged: whether instant t is frame t of every clip.
     """
 
-    picks: tuple[np.ndarray, ...]
+    frame_indices: tuple[np.ndarray, ...]
     fps: float
-    plain: bool
+    unchanged: bool
 
 
 def timeline(
@@ -74,30 +74,30 @@ def timeline(
     max_frames: int | None,
     fps: float | None,
 ) -> Timeline:
-    """Put the clips of the capture `path` on one clock.
+    """Return the common timeline of the clips of the capture `path`.
 
     Args:
-        path: for messages.
-        names: the cameras'.
-        readers: their clips.
-        config: what to do where these differ.
-        max_frames: at most this many instants.
-        fps: true frame rate of all clips; None: what they say.
+        path: the capture folder, for messages.
+        names: names of the cameras.
+        readers: one clip per camera.
+        config: how clips that do not match are read.
+        max_frames: number of instants at most.
+        fps: true frame rate of all clips, or None for the rates in their headers.
 
     Raises:
-        ValueError: lengths or rates differ and nothing is said about it, a clip is cut off, the clips have no instant
-            in common, or `config` names an unknown camera.
+        ValueError: lengths or rates differ and `config` does not resolve it, a clip is cut off, the clips have no
+            instant in common, or `config` names an unknown camera.
     """
     if unknown := [name for name in config.offset if name not in names]:
         raise ValueError(f"{path}: `offset` must name cameras of {', '.join(names)}, got {', '.join(unknown)}.")
-    if not config.one_clock:
+    if not config.aligns_clips:
         count, rate = _num_frames(path, readers, max_frames, config.gaps), _fps(path, readers, fps)
         return Timeline((np.arange(count),) * len(readers), rate, True)
-    own = [fps or reader.fps for reader in readers]
-    lowest = min((rate for rate in own if rate), default=_DEFAULT_FPS)
-    rates = np.array([1.0 if not rate or rate < _SAME_RATE * lowest else rate / lowest for rate in own])
+    clip_fps = [fps or reader.fps for reader in readers]
+    lowest = min((rate for rate in clip_fps if rate), default=_DEFAULT_FPS)
+    rates = np.array([1.0 if not rate or rate < _SAME_RATE * lowest else rate / lowest for rate in clip_fps])
     offsets = np.array([config.offset.get(name, 0) for name in names], float)
-    lengths = np.array([reader.num_frames if config.gaps else _held(reader, config) for reader in readers])
+    lengths = np.array([reader.num_frames if config.gaps else _usable_frames(reader, config) for reader in readers])
     first, last = np.ceil(np.max(-offsets / rates)), np.floor(np.min((lengths - 1 - offsets) / rates))
     instants = np.arange(first, last + 1)[:max_frames]
     if not len(instants):
@@ -105,25 +105,25 @@ def timeline(
         table = ", ".join(f"{name} {start:.2f} to {stop:.2f} s" for name, start, stop in spans)
         raise ValueError(f"{path}: the clips have no instant in common, {table}; check `offset`.")
     exact = offsets[:, None] + rates[:, None] * instants
-    picks = np.rint(exact).astype(int)
-    apart = float(np.max(np.abs(picks - exact) / (rates[:, None] * lowest)))
+    indices = np.rint(exact).astype(int)
+    apart = float(np.max(np.abs(indices - exact) / (rates[:, None] * lowest)))
     if apart > 1e-3:
-        _LOG.warning("%s: of clips with other frame rates pictures up to %.1f ms apart are taken.", path, 1e3 * apart)
-    return Timeline(tuple(picks), lowest, bool((offsets + rates * first == 0).all() and (rates == 1).all()))
+        _LOG.warning("%s: the frame rates differ; images of one instant are up to %.1f ms apart.", path, 1e3 * apart)
+    return Timeline(tuple(indices), lowest, bool((offsets + rates * first == 0).all() and (rates == 1).all()))
 
 
-def _held(reader: FrameReader, config: ReadConfig) -> int:
-    """Return how many frames a clip holds; what was cut off can be trimmed away, not shifted into."""
-    return reader.num_held if config.trim else _whole(reader, reader.num_frames)
+def _usable_frames(reader: FrameReader, config: ReadConfig) -> int:
+    """Return the number of frames that can be read; a truncated clip can be trimmed but not shifted."""
+    return reader.num_held if config.trim else _check_complete(reader, reader.num_frames)
 
 
-def _whole(reader: FrameReader, wanted: int) -> int:
-    """Return the number of frames of a clip that holds those `wanted`."""
-    if wanted > reader.num_held:
+def _check_complete(reader: FrameReader, required: int) -> int:
+    """Return the clip's number of frames after checking that the first `required` ones can be read."""
+    if required > reader.num_held:
         raise ValueError(
             f"{reader.path}: frame {reader.num_held} of {reader.num_frames} cannot be read: the file is truncated or "
-            f"broken; copy it again, use the first {reader.num_held} frames (max_frames), or go on without its camera "
-            "from there (--gaps)."
+            f"broken; copy it again, use the first {reader.num_held} frames (max_frames), or leave its camera out of "
+            "the later ones (--gaps)."
         )
     return reader.num_frames
 
@@ -133,7 +133,7 @@ def _num_frames(path: Path, readers: Sequence[FrameReader], max_frames: int | No
     if gaps:
         return min(max(lengths), max_frames or max(lengths))
     for reader in readers:
-        _whole(reader, min(reader.num_frames, max_frames or reader.num_frames))
+        _check_complete(reader, min(reader.num_frames, max_frames or reader.num_frames))
     shortest = min(lengths)
     if max_frames is not None and max_frames <= shortest:
         return max_frames
@@ -141,7 +141,7 @@ def _num_frames(path: Path, readers: Sequence[FrameReader], max_frames: int | No
         table = ", ".join(f"{r.path.name} {n}" for r, n in zip(readers, lengths, strict=True))
         raise ValueError(
             f"{path}: all cameras must have the same number of frames, got {table}; use the first frames with "
-            f"max_frames={shortest} (--frames), what all have with --trim, or say which frames belong together with "
+            f"max_frames={shortest} (--frames), the instants that all clips cover with --trim, or align the clips with "
             "--offset."
         )
     return shortest
@@ -154,17 +154,17 @@ def _fps(path: Path, readers: Sequence[FrameReader], given: float | None) -> flo
     if rates and max(rates) > _SAME_RATE * min(rates):
         table = ", ".join(f"{r.path.name} {r.fps:g}" for r in readers if r.fps)
         raise ValueError(
-            f"{path}: all cameras must have the same frame rate, got {table}; take the lowest with --trim, or give the "
+            f"{path}: all cameras must have the same frame rate, got {table}; use the lowest with --trim, or set the "
             "true one as `fps` in capture.json."
         )
     return rates[0] if rates else _DEFAULT_FPS
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """Read a capture's own `capture.json`, which may give ``fps`` and ``test_view``; empty where there is none.
+    """Return the settings ``fps`` and ``test_view`` in a capture's `capture.json`, or {} without such a file.
 
     Raises:
-        ValueError: it is no JSON object, or what it gives is no frame rate and no index.
+        ValueError: the file is not a JSON object, or `fps` or `test_view` is not valid.
     """
     if not path.exists():
         return {}

@@ -129,16 +129,17 @@ class Settings:
             FileNotFoundError: one of them names a missing file or folder.
             ValueError: one of them is unknown, or its network does not fit.
         """
-        from morgs_mi.method.confidence import mask_refiner
         from morgs_mi.method.flow_sources.registry import flow_source
+        from morgs_mi.method.mask_refiners.registry import mask_refiner
 
-        checks: tuple[tuple[str, Callable[[str], Any]], ...] = (
-            ("flow_method", flow_source),
-            ("mask_method", mask_refiner),
-        )
-        for name, check in checks:
+        motion = config.motion
+        checks: dict[str, Callable[[], Any]] = {
+            "flow_method": lambda: flow_source(motion.flow_method, motion.flow),
+            "mask_method": lambda: mask_refiner(motion.mask_method, motion.masks),
+        }
+        for name, check in checks.items():
             try:
-                check(getattr(config.motion, name))
+                check()
             except ValueError as error:
                 if self.config is None or f"motion.{name}" in self.given():
                     raise

@@ -58,6 +58,8 @@ class Attribute:
             stream does not store it.
         channel: of the renderer that blends it like a colour; None where there is none, or where the channel is not
             plain blending (`color`, `motion`).
+        initial: value of the optimised tensor before the first frame; None where `fit.initialise` computes it, or where
+            the attribute is absent then.
     """
 
     name: str
@@ -71,6 +73,7 @@ class Attribute:
     first_frame: bool = False
     error: str | float | None = None
     channel: str | None = None
+    initial: float | None = None
 
     @property
     def width(self) -> int:
@@ -131,7 +134,14 @@ ATTRIBUTES: tuple[Attribute, ...] = (
         error="error_color",
     ),
     Attribute(
-        "logit_confidence", (), "confidence", SIGMOID, rate="confidence", error="error_confidence", channel="confidence"
+        "logit_confidence",
+        (),
+        "confidence",
+        SIGMOID,
+        rate="confidence",
+        error="error_confidence",
+        channel="confidence",
+        initial=0.0,
     ),
     Attribute("motion", (3,), "motion", rate="means", rate_in_extents=True, gate="motion"),
     Attribute("offset", (3,), "offset", rate="means", rate_in_extents=True, gate="motion"),

@@ -1,11 +1,13 @@
-"""The `Gaussians` value: what a scene is made of.
+"""The `Gaussians` value.
 
-A bare name (`scales`, `opacities`, `confidence`) is activated, what the optimiser holds says so in its name
-(`log_scales`, `logit_opacities`, `logit_confidence`). N is the number of Gaussians, K = (degree + 1)^2.
+A bare name (`scales`, `opacities`, `confidence`) is activated; what the optimiser holds has the inverse of its
+activation in its name (`log_scales`, `logit_opacities`, `logit_confidence`). N is the number of Gaussians, K = (degree
++ 1)^2 the number of spherical harmonics (SH).
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
 
@@ -15,11 +17,11 @@ import numpy as np
 
 from morgs_mi.core.attributes import ATTRIBUTES, BY_ACTIVATED_NAME, sigmoid
 
-__all__ = ["ActivatedGaussians", "Gaussians", "repeat_each", "tensor_rows"]
+__all__ = ["ActivatedGaussians", "Gaussians", "join_sh", "repeat_each", "split_sh", "tensor_rows"]
 
 
 class ActivatedGaussians(Protocol):
-    """What the renderer reads: activated attributes as Dr.Jit tensors."""
+    """Activated attributes as Dr.Jit tensors, which the renderer reads."""
 
     @property
     def means(self) -> Any:
@@ -77,12 +79,12 @@ def tensor_rows(tensor: Any, index: Any) -> list[Any]:
 def repeat_each(x: Any, count: int) -> Any:
     """Return every element of a float [N] `count` times in a row, [N * count].
 
-    Dr.Jit's own `repeat` gathers, so its adjoint adds atomically, in an order of its own; this one sums blocks.
+    The adjoint of Dr.Jit's own `repeat` adds atomically, in no fixed order; this one sums blocks.
     """
-    return dr.custom(_Repeated, x, count) if count > 1 else x
+    return dr.custom(_RepeatEach, x, count) if count > 1 else x
 
 
-class _Repeated(dr.CustomOp):
+class _RepeatEach(dr.CustomOp):
     def eval(self, x: Any, count: int) -> Any:
         self.count = count
         return dr.repeat(x, count)
@@ -94,18 +96,18 @@ class _Repeated(dr.CustomOp):
         self.set_grad_out(dr.repeat(self.grad_in("x"), self.count))
 
     def name(self) -> str:
-        return "morgs_mi.repeated"
+        return "morgs_mi.repeat_each"
 
 
 def _aligned_tensor(value: Any) -> Any:
-    """Return a NumPy array as a float tensor in memory of Dr.Jit's own.
+    """Return a NumPy array as a float tensor in memory that Dr.Jit owns.
 
-    Dr.Jit borrows NumPy's memory where it can. Packets of floats cannot be read from it unless it happens to
-    be aligned, and kernels would be compiled for both cases; multiplying by an opaque one makes a copy.
+    Dr.Jit borrows NumPy's memory where it can. Packets of floats can be read from it only if it happens to be aligned,
+    and kernels would be compiled for both cases. Multiplying by an opaque 1 makes a copy.
     """
     tensor = mi.TensorXf(np.ascontiguousarray(value, dtype=np.float32))
     if tensor.array.shape[0]:
-        tensor = tensor * dr.opaque(mi.Float, 1)
+        tensor = tensor * dr.opaque(mi.Float, 1)  # pyright: ignore[reportOperatorIssue]
         dr.eval(tensor)
     return tensor
 
@@ -124,10 +126,14 @@ class Gaussians:
         sh_coeffs: [N, K, 3] with K = (degree + 1)^2; colour = max(0.5 + SH(mean - camera), 0) as in 3DGS.
         motion: displacement since the last frame [N, 3] in world units, or None.
         logit_confidence: motion confidence [N] before the sigmoid, or None.
-        offset: the learned part of that displacement [N, 3] beside the one that flow guides (eq. 8), or None.
+        offset: the learned part of that displacement [N, 3], beside the part that is guided by flow (eq. 8), or None.
+
+    Example:
+        >>> gaussians = morgs_mi.Gaussians.from_activated(means, scales, quats, opacities, sh_coeffs)
+        >>> image = morgs_mi.rasterize(gaussians, camera).color
 
     Raises:
-        ValueError: a shape that does not agree with `means`, or K that is no square of 1 to 4.
+        ValueError: a shape that does not agree with `means`, or a K that is not 1, 4, 9 or 16.
     """
 
     means: Any
@@ -169,9 +175,9 @@ class Gaussians:
     def from_activated(
         cls, means: Any, scales: Any, quats: Any, opacities: Any, sh_coeffs: Any, **more: Any
     ) -> Gaussians:
-        """Build from activated NumPy arrays: `scales` [N, 3] > 0 and `opacities` [N] in [0, 1].
+        """Return Gaussians with activated NumPy arrays: `scales` [N, 3] > 0 and `opacities` [N] in [0, 1].
 
-        Opacities are kept 1e-6 away from 0 and 1, where the logit is infinite.
+        Opacities are clipped to [1e-6, 1 - 1e-6], as the logit is infinite at 0 and 1.
         """
         opacities = np.clip(np.asarray(opacities, np.float64), 1e-6, 1 - 1e-6)
         log_scales = np.log(np.maximum(np.asarray(scales, np.float64), 1e-30))
@@ -208,8 +214,24 @@ class Gaussians:
         """Degree of the spherical harmonics, 0 to 3."""
         return round(int(self.sh_coeffs.shape[1]) ** 0.5) - 1
 
+    def parameters(self) -> dict[str, Any]:
+        """Return the raw attributes that are present, by the names of the attribute table (SH in two parts)."""
+        sh_dc, sh_rest = split_sh(self.sh_coeffs)
+        values = {**self.items(), "sh_dc": sh_dc, "sh_rest": sh_rest}
+        return {a.name: values[a.name] for a in ATTRIBUTES if values.get(a.name) is not None}
+
+    def with_parameters(self, parameters: Mapping[str, Any]) -> Gaussians:
+        """Return these Gaussians with some of their `parameters` replaced.
+
+        Where `sh_dc` is given, `sh_rest` is taken from `parameters` too; without it the degree becomes 0.
+        """
+        values = dict(parameters)
+        if "sh_dc" in values:
+            values["sh_coeffs"] = join_sh(values.pop("sh_dc"), values.pop("sh_rest", None))
+        return replace(self, **values)
+
     def items(self) -> dict[str, Any]:
-        """Return the raw attributes that are present, by name."""
+        """Return the raw attributes that are present, by the names of the fields."""
         return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
 
     def numpy(self) -> dict[str, np.ndarray]:
@@ -217,7 +239,7 @@ class Gaussians:
         return {name: np.asarray(dr.detach(value)) for name, value in self.items().items()}
 
     def detached(self) -> Gaussians:
-        """Return the same values cut off from the gradient graph."""
+        """Return the same values, detached from the gradient graph."""
         return replace(self, **{name: dr.detach(value) for name, value in self.items().items()})
 
     def rows(self, name: str, index: Any) -> list[Any]:
@@ -233,11 +255,35 @@ class Gaussians:
 
     @staticmethod
     def concatenate(parts: list[Gaussians]) -> Gaussians:
-        """Return all Gaussians of `parts` in order; every part must carry the same attributes."""
+        """Return the Gaussians of all `parts` in order.
+
+        Raises:
+            ValueError: the parts have different attributes.
+        """
         columns = [part.numpy() for part in parts]
         if any(column.keys() != columns[0].keys() for column in columns):
             raise ValueError(
-                "Gaussians.concatenate(): all parts must carry the same attributes, got "
+                "Gaussians.concatenate(): all parts must have the same attributes, got "
                 f"{[sorted(column) for column in columns]}; drop or add `motion`, `offset` and `logit_confidence`."
             )
         return Gaussians(**{k: np.concatenate([column[k] for column in columns]) for k in columns[0]})
+
+
+def split_sh(sh_coeffs: Any) -> tuple[Any, Any]:
+    """Return the constant coefficient [N, 1, 3] and the others [N, K - 1, 3], or None where there are none."""
+    K = int(sh_coeffs.shape[1])
+    return (sh_coeffs, None) if K == 1 else (sh_coeffs[:, :1], sh_coeffs[:, 1:])
+
+
+def join_sh(sh_dc: Any, sh_rest: Any) -> Any:
+    """Return the coefficients [N, K, 3] of the two results of `split_sh`."""
+    if sh_rest is None:
+        return sh_dc
+    N, K = int(sh_dc.shape[0]), int(sh_rest.shape[1]) + 1
+    # One gather per part: every element is read once, so that the adjoint needs no atomics.
+    lane = dr.arange(mi.UInt32, N * K * 3)
+    row, column = lane // (3 * K), lane % (3 * K)
+    is_dc, mode = column < 3, dr.ReduceMode.NoConflicts
+    concatenated = dr.gather(mi.Float, sh_dc.array, row * 3 + column, active=is_dc, mode=mode)
+    concatenated += dr.gather(mi.Float, sh_rest.array, row * (3 * K - 3) + column - 3, active=~is_dc, mode=mode)
+    return mi.TensorXf(concatenated, (N, K, 3))

@@ -1,4 +1,4 @@
-"""What Gaussians look like to other programs, in NumPy: covariances, colours towards a place, another frame of axes.
+"""Gaussians in NumPy, as other programs need them: covariances, colours seen from a point, rotated axes.
 
 N Gaussians, K = (degree + 1)^2 SH coefficients; R [3, 3] is a rotation that takes column vectors, x' = R x.
 """
@@ -18,7 +18,7 @@ __all__ = ["colors_seen_from", "covariances", "rotated", "sh_basis", "unit_quats
 
 
 def unit_quats(gaussians: Gaussians) -> np.ndarray:
-    """Return the rotations as unit quaternions wxyz, float64 [N, 4]; one of length 0 does not rotate."""
+    """Return the rotations as unit quaternions wxyz, float64 [N, 4]; a quaternion of length 0 becomes the identity."""
     quats = np.asarray(gaussians.numpy()["quats"], np.float64)
     lengths = np.linalg.norm(quats, axis=1, keepdims=True)
     return np.where(lengths > 0, quats / np.maximum(lengths, 1e-300), (1.0, 0, 0, 0))
@@ -33,9 +33,8 @@ def covariances(gaussians: Gaussians) -> np.ndarray:
 
 def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
     """Return the spherical harmonics of unit directions [M, 3] with 3DGS's signs, [M, K]."""
-    return np.stack(
-        [np.broadcast_to(b, len(directions)) for b in dr.sh_eval(mi.Vector3f(directions.T), degree)], axis=1
-    )
+    basis = [np.asarray(values) for values in dr.sh_eval(mi.Vector3f(directions.T), degree)]
+    return np.stack([np.broadcast_to(values, len(directions)) for values in basis], axis=1)
 
 
 def colors_seen_from(gaussians: Gaussians, eye: np.ndarray) -> np.ndarray:
@@ -48,10 +47,10 @@ def colors_seen_from(gaussians: Gaussians, eye: np.ndarray) -> np.ndarray:
 
 
 def rotated(gaussians: Gaussians, R: np.ndarray) -> Gaussians:
-    """Return the same Gaussians in axes turned by R [3, 3]: centres, rotations, colours, motion and offset.
+    """Return the Gaussians rotated by R [3, 3]: means, rotations, spherical harmonics, motion and offset.
 
-    A colour that was seen along d is now seen along R d. The harmonics of one degree stay among themselves under a
-    rotation, so their new coefficients are found exactly, from as many directions as make the basis invertible.
+    A colour that was seen along d is then seen along R d. A rotation maps the harmonics of one degree to themselves, so
+    that the new coefficients follow exactly from enough directions to make the basis invertible.
     """
     R = np.asarray(R, np.float64)
     turn = Rotation.from_matrix(R)

@@ -1,9 +1,12 @@
-"""How Gaussians are fitted to pictures."""
+"""Settings of the optimisation."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from math import inf
+
+from morgs_mi.core.attributes import ATTRIBUTES
+from morgs_mi.method.objective import ObjectiveConfig
 
 __all__ = ["DensityConfig", "FitConfig", "LearningRates"]
 
@@ -17,62 +20,68 @@ class LearningRates:
     """
 
     means: float = 5e-4
-    """Of centres, motion and offset, times the scene's extent."""
+    """Learning rate of the means, motion and offset, in scene extents."""
     scales: float = 1e-2
-    """Of log_scales."""
+    """Learning rate of the logarithms of the scales."""
     quats: float = 1e-2
-    """Of quats."""
+    """Learning rate of the rotations."""
     opacities: float = 0.05
-    """Of logit_opacities."""
+    """Learning rate of the logits of the opacities."""
     sh_dc: float = 1e-2
-    """Of the constant SH coefficient."""
+    """Learning rate of the constant SH coefficient."""
     sh_rest: float = 5e-4
-    """Of the other SH coefficients, a twentieth, as in 3DGS."""
+    """Learning rate of the other SH coefficients: a twentieth of the constant one's, as in 3DGS."""
     confidence: float = 0.05
-    """Of logit_confidence."""
+    """Learning rate of the logits of the confidence."""
 
     def __post_init__(self) -> None:
         for name, rate in asdict(self).items():
             if not 0 <= rate < inf:
-                raise ValueError(f"Rates(): `{name}` must be finite and not negative, got {rate}.")
+                raise ValueError(f"LearningRates(): `{name}` must be finite and not negative, got {rate}.")
 
     def by_parameter(self, extent: float) -> dict[str, float]:
-        """Return the rate of every parameter by its name; `extent` in world units."""
-        means = self.means * extent
-        return {
-            "means": means,
-            "motion": means,
-            "offset": means,
-            "log_scales": self.scales,
-            "quats": self.quats,
-            "logit_opacities": self.opacities,
-            "sh_dc": self.sh_dc,
-            "sh_rest": self.sh_rest,
-            "logit_confidence": self.confidence,
-        }
+        """Return the learning rate of every parameter of the attribute table by its name; `extent` in world units."""
+        rates = {}
+        for attribute in ATTRIBUTES:
+            if attribute.rate is not None:
+                rate = getattr(self, attribute.rate) if isinstance(attribute.rate, str) else attribute.rate
+                rates[attribute.name] = rate * extent if attribute.rate_in_extents else rate
+        return rates
 
 
 @dataclass(frozen=True)
 class DensityConfig:
-    """How the number of Gaussians follows the pictures (see `density`); thresholds are those of the literature."""
+    """Settings of density control (see `density`); thresholds are those of the literature."""
 
     rounds: int = 6
-    """Steps of density control in the first frame, from a tenth to a half of its steps; 0: none. With them, the first
-    frame starts from half of its Gaussians and grows to all."""
+    """Rounds of density control in the first frame; 0: none. With them, the first frame starts from half of its
+    Gaussians and grows to all."""
+    first_round: float = 0.1
+    """First of these rounds, as a fraction of the first frame's steps."""
+    last_round: float = 0.5
+    """Last of them, likewise: the rest of the steps fits what was added."""
     later_frames: bool = True
-    """One step of density control in every later frame, after five eighths of its epochs."""
+    """One round of density control in every later frame."""
+    later_round: float = 0.625
+    """That round, as a fraction of the frame's epochs: the residual has shown by then what is missing, and enough steps
+    are left to fit what is added."""
     births: float = 0.02
-    """Most births of a later frame, as a share of the Gaussians."""
+    """Largest number of births in a later frame, as a fraction of the Gaussians."""
     max_gaussians: int = 30_000
-    """Beyond this many, nobody is born in a later frame unless another dies."""
+    """Number of Gaussians beyond which a later frame adds none unless others are pruned."""
     birth_opacity: float = 0.1
-    """What is added in a later frame starts as faint as this."""
+    """Opacity of a Gaussian that is added in a later frame."""
     split_scale: float = 0.01
-    """In the first frame, who is wider than this share of the scene's extent is split, others are cloned."""
+    """Scale, in scene extents, above which the first frame splits a Gaussian instead of cloning it."""
+    shrink: float = 1.6
+    """Factor by which a split Gaussian, and one that is added in a later frame, is smaller than its parent."""
     min_error: float = 0.1
-    """In a later frame, who answers for less error beyond noise, in pixels of full contrast, is nobody's parent."""
+    """Attributed error, in pixels of full contrast, below which a later frame does not densify a Gaussian."""
+    noise_tolerance: float = 3.0
+    """Error that counts as noise in a later frame, in medians of the image's error: normal noise, independent in three
+    colours, exceeds 3 at 3 of 10,000 pixels."""
     min_opacity: float = 0.005
-    """Who is fainter dies."""
+    """Opacity below which a Gaussian is pruned."""
 
     def __post_init__(self) -> None:
         for name, low in (("rounds", 0), ("births", 0), ("max_gaussians", 1), ("split_scale", 0), ("min_error", 0)):
@@ -81,6 +90,9 @@ class DensityConfig:
         for name in ("birth_opacity", "min_opacity"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"DensityConfig(): `{name}` must lie between 0 and 1, got {getattr(self, name)}.")
+        for name in ("first_round", "last_round", "later_round"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"DensityConfig(): `{name}` must be 0 to 1, got {getattr(self, name)}.")
 
 
 @dataclass(frozen=True)
@@ -88,52 +100,66 @@ class FitConfig:
     """Settings of the optimisation."""
 
     sh_degree: int = 1
-    """Degree of the spherical harmonics, 0 to 3; 0 is enough where nothing shines."""
+    """Degree of the spherical harmonics, 0 to 3; 0 is enough where no surface is glossy."""
     num_gaussians: int = 20_000
-    """Gaussians of the first frame; see `first_count` for those that it starts from."""
+    """Number of Gaussians of the first frame; see `first_count` for the number that it starts from."""
     first_frame_steps: int = 1500
-    """Steps (one view each) for the first frame."""
+    """Steps of the first frame, one view each."""
+    sh_band_fraction: float = 1 / 30
+    """Fraction of the first frame's steps after which another SH band is added, as in 3DGS."""
     confidence_steps: int = 40
     """Steps that learn the confidence of the first frame from the masks of its key views."""
+    confidence_rate_scale: float = 4.0
+    """Factor on the confidence's learning rate in these steps, in which nothing else changes."""
     epochs: int = 8
     """Passes over all training views for every later frame; the paper's small variant takes 5."""
     skip_static: bool = True
-    """Leave out of a later frame which Gaussians, blocks of pixels and views cannot have changed; see `part`."""
-    early_stopping_tolerance: float = 0.0
-    """A later frame ends once a pass over its views lessens L_recon by less than this share of it; 0: when it grows."""
-    dssim_weight: float = 0.2
-    """lambda of eq. 2."""
+    """Skip the Gaussians, blocks of pixels and views that cannot have changed (see `active_set`)."""
+    early_stopping_tolerance: float = 1e-6
+    """Relative decrease of L_recon over an epoch below which a later frame ends early; 0: never."""
+    objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
+    """Weights of the losses."""
     density: DensityConfig = field(default_factory=DensityConfig)
-    """Births and deaths."""
+    """Density control."""
     rates: LearningRates = field(default_factory=LearningRates)
-    """Learning rates of every later frame; `rates_at` makes them those of an epoch."""
+    """Learning rates of every later frame, which `rates_at` adapts to the epoch."""
     decay_means_rate: bool = True
-    """Let the rates of places fall within a later frame, from its third epoch on."""
+    """Let the learning rate of the means decay within a later frame."""
+    means_rate_epochs: int = 2
+    """Epochs before that decay begins."""
+    rates_epochs: int = 8
+    """Number of epochs that `rates` were chosen for: other parameters get larger rates in fewer epochs."""
     first_frame_rates: LearningRates = field(
         default_factory=lambda: LearningRates(means=2e-3, scales=0.02, quats=0.02, opacities=0.2)
     )
-    """Learning rates at the start of the first frame; they fall to a tenth of that to its end."""
+    """Learning rates at the start of the first frame."""
+    final_rate: float = 0.1
+    """Learning rates at the end of the first frame, as a fraction of those at its start."""
 
     def __post_init__(self) -> None:
-        for name, low in (("first_frame_steps", 1), ("epochs", 1), ("num_gaussians", 1), ("confidence_steps", 0)):
-            if getattr(self, name) < low:
+        lowest = {"first_frame_steps": 1, "epochs": 1, "num_gaussians": 1, "confidence_steps": 0}
+        lowest |= {"means_rate_epochs": 1, "rates_epochs": 1, "early_stopping_tolerance": 0}
+        for name, low in lowest.items():
+            if not getattr(self, name) >= low:
                 raise ValueError(f"FitConfig(): `{name}` must be at least {low}, got {getattr(self, name)}.")
         if self.sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"FitConfig(): `sh_degree` must be 0 to 3, got {self.sh_degree}.")
+        if not 0 < self.final_rate <= 1:
+            raise ValueError(f"FitConfig(): `final_rate` must be above 0 and at most 1, got {self.final_rate}.")
 
     def rates_at(self, epoch: int) -> LearningRates:
-        """Return the learning rates of a later frame's epoch, counted from 0.
+        """Return the learning rates of an epoch of a later frame, counted from 0.
 
-        Those of places are those of `rates` in the first two epochs, and then fall like 1 / (epoch + 1), for who is
-        nearly in its place must not leave it again; without `decay_means_rate` they stay. All others are larger by
-        (8 / epochs)^1/2 throughout: fewer steps have to go as far.
+        That of the means is constant in the first `means_rate_epochs` and then falls like 1 / (epoch + 1), so that a
+        mean that has nearly arrived does not leave again. All others are larger by (rates_epochs / epochs)^1/2: fewer
+        steps have to go as far.
         """
-        places, others = min(1.0, 2 / (epoch + 1)) if self.decay_means_rate else 1.0, (8 / self.epochs) ** 0.5
-        return LearningRates(
-            **{n: (places if n == "means" else others) * rate for n, rate in asdict(self.rates).items()}
-        )
+        means = min(1.0, self.means_rate_epochs / (epoch + 1)) if self.decay_means_rate else 1.0
+        others = (self.rates_epochs / self.epochs) ** 0.5
+        scaled = {n: (means if n == "means" else others) * rate for n, rate in asdict(self.rates).items()}
+        return LearningRates(**scaled)
 
     @property
     def first_count(self) -> int:
-        """How many Gaussians to start from: fewer points are filled up between neighbours, more are thinned out."""
+        """Number of Gaussians that the first frame starts from."""
         return -(-self.num_gaussians // 2) if self.density.rounds else self.num_gaussians

@@ -1,18 +1,15 @@
-"""Density control: who is cloned, split, added or pruned, and what the optimiser remembers of them.
+"""Density control: cloning, splitting, adding and pruning Gaussians, and resizing the optimiser's state.
 
-N Gaussians become M. `parent` [M] says which of the N each one is or was made from; `source` [M] is the same for
-survivors, who come first in ascending order, and -1 for births, who come after them. Survivors keep their centres,
-so that their tracks do not jump; what is born is drawn from its parent's own density.
+N Gaussians become M. `parent` [M] is the index among the N of the Gaussian that each one is or was made from; `source`
+[M] is the same for survivors, which come first in ascending order, and -1 for births, which come last. Survivors keep
+their means, so that their tracks do not jump; births are drawn from the density of their parents.
 
-In the first frame, `plan_growth` (Kerbl et al. 2023): a wide parent is split, both shrink by 1.6; a narrow one is
-cloned, both get opacity 1 - sqrt(1 - o), so that together they cover what one did (Bulo et al. 2024).
-In a later frame, `plan_additions` (Sun et al. 2024): parents stay as they are, so that nothing is spoilt that the
-few steps left could not mend; what is born is faint and small, and earns its opacity or dies.
+In the first frame, `plan_growth` (Kerbl et al. 2023): a large parent is split, and both shrink by 1.6; a small one is
+cloned, and both get the opacity 1 - sqrt(1 - o), so that together they cover what one did (Bulo et al. 2024). In a
+later frame, `plan_additions` (Sun et al. 2024): parents stay unchanged, because the few remaining steps could not
+repair them; births are small and faint, and gain opacity or are pruned.
 
-Who is in need is told by the pictures: E_i = sum_x w_i(x) e(x), the error that a Gaussian answers for with its blend
-weights w_i (Bulo et al. 2024), of that view where it is largest, and W_i = sum_x w_i(x), the pixels that it covers.
-While a picture is not yet fitted, e = |I - I*|; in a later frame what exceeds thrice its median over the picture, so
-that noise asks for nobody.
+Parents are the Gaussians with the largest densification scores (see `losses.attribution`).
 """
 
 from __future__ import annotations
@@ -29,27 +26,20 @@ from morgs_mi.fit.config import DensityConfig
 from morgs_mi.fit.optimise import replace_parameter
 from morgs_mi.losses.attribution import DensificationScores
 
-__all__ = [
-    "DensityPlan",
-    "apply_plan",
-    "plan_additions",
-    "plan_growth",
-    "resize_optimizer",
-]
+__all__ = ["DensityPlan", "apply_plan", "plan_additions", "plan_growth", "resize_optimizer"]
 
-_SHRINK = float(np.log(1.6))
-# float32 knows no opacity closer to 1.
-_MOST_OPAQUE = 1 - 1e-6
+# float32 has no opacity closer to 1.
+_MAX_OPACITY = 1 - 1e-6
 
 
 @dataclass(frozen=True)
 class DensityPlan:
-    """Who is there after a step of density control; see the module for the order.
+    """One round of density control; see the module for the order of the M Gaussians.
 
     Attributes:
-        parent: int [M], index into the N before.
+        parent: int [M], index among the N Gaussians before.
         source: int [M], the same for survivors, -1 for births.
-        edits: what is added to raw attributes, by name, [M, ...]; attributes that stay are left out.
+        edits: what is added to raw attributes, by name, [M, ...]; other attributes stay unchanged.
     """
 
     parent: np.ndarray
@@ -58,103 +48,109 @@ class DensityPlan:
 
     @property
     def num_births(self) -> int:
-        """How many were born."""
+        """Number of births."""
         return int((self.source < 0).sum())
 
     @property
     def num_survivors(self) -> int:
-        """How many live on."""
+        """Number of survivors."""
         return len(self.source) - self.num_births
 
 
 def plan_growth(
     gaussians: Gaussians,
-    need: DensificationScores,
+    scores: DensificationScores,
     births: int,
     limit: int,
     extent: float,
     config: DensityConfig,
     rng: np.random.Generator,
 ) -> DensityPlan:
-    """Decide who dies and who is cloned or split in the first frame.
+    """Return the plan of a round in the first frame: which Gaussians are pruned, cloned and split.
 
     Args:
-        gaussians: N of them.
-        need: of the same.
-        births: at most so many.
-        limit: how many there may be.
+        gaussians: N Gaussians.
+        scores: their densification scores.
+        births: largest number of births.
+        limit: largest number of Gaussians afterwards.
         extent: of the scene, world units.
         config: thresholds.
-        rng: draws where the births lie.
+        rng: draws the means of the births.
     """
-    survivors, chosen = _choose(gaussians, need, births, limit, 0, config)
-    parent, opacity = np.concatenate([survivors, chosen]), np.asarray(gaussians.opacities)
-    touched, scales = np.isin(parent, chosen), np.asarray(gaussians.scales).max(axis=1)[parent]
-    wide = touched & (scales > config.split_scale * extent)
-    half = 1 - np.sqrt(1 - np.minimum(opacity[parent], _MOST_OPAQUE))
-    fainter = np.where(touched & ~wide, _logit(half) - np.asarray(gaussians.logit_opacities)[parent], 0)
-    return _plan(gaussians, survivors, chosen, np.where(wide, -_SHRINK, 0), fainter, rng)
+    survivors, parents = _select(gaussians, scores, births, limit, 0, config)
+    parent, opacity = np.concatenate([survivors, parents]), np.asarray(gaussians.opacities)
+    touched, scales = np.isin(parent, parents), np.asarray(gaussians.scales).max(axis=1)[parent]
+    split = touched & (scales > config.split_scale * extent)
+    half = 1 - np.sqrt(1 - np.minimum(opacity[parent], _MAX_OPACITY))
+    logits = np.where(touched & ~split, _logit(half) - np.asarray(gaussians.logit_opacities)[parent], 0)
+    return _plan(gaussians, survivors, parents, np.where(split, _log_shrink(config), 0), logits, rng)
 
 
 def plan_additions(
     gaussians: Gaussians,
-    need: DensificationScores,
+    scores: DensificationScores,
     config: DensityConfig,
     rng: np.random.Generator,
-    num_others: int = 0,
+    num_static: int = 0,
 ) -> DensityPlan:
-    """Decide who dies and beside whom a faint Gaussian is added in a later frame.
+    """Return the plan of a round in a later frame: which Gaussians are pruned, and where small faint ones are added.
 
     Args:
-        gaussians: N of them.
-        need: of the same.
+        gaussians: N active Gaussians.
+        scores: their densification scores.
         config: thresholds.
-        rng: draws where the births lie.
-        num_others: how many there are besides, who are not to be touched.
+        rng: draws the means of the births.
+        num_static: number of Gaussians besides, which stay unchanged.
     """
-    births, limit = round(config.births * (len(gaussians) + num_others)), max(config.max_gaussians - num_others, 0)
-    survivors, chosen = _choose(gaussians, need, births, limit, config.min_error, config)
-    born = np.arange(len(survivors) + len(chosen)) >= len(survivors)
-    logits = np.asarray(gaussians.logit_opacities)[np.concatenate([survivors, chosen])]
+    births, limit = round(config.births * (len(gaussians) + num_static)), max(config.max_gaussians - num_static, 0)
+    survivors, parents = _select(gaussians, scores, births, limit, config.min_error, config)
+    born = np.arange(len(survivors) + len(parents)) >= len(survivors)
+    logits = np.asarray(gaussians.logit_opacities)[np.concatenate([survivors, parents])]
     fainter = np.where(born, _logit(config.birth_opacity) - logits, 0)
-    return _plan(gaussians, survivors, chosen, np.where(born, -_SHRINK, 0), fainter, rng)
+    return _plan(gaussians, survivors, parents, np.where(born, _log_shrink(config), 0), fainter, rng)
 
 
-def _choose(
-    gaussians: Gaussians, need: DensificationScores, births: int, limit: int, least_error: float, config: DensityConfig
+def _log_shrink(config: DensityConfig) -> float:
+    return -float(np.log(config.shrink))
+
+
+def _select(
+    gaussians: Gaussians, scores: DensificationScores, births: int, limit: int, min_error: float, config: DensityConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return who lives on, and who of them becomes a parent: those with the largest error.
+    """Return the indices of the survivors, and those of the parents among them: the ones with the largest error.
 
-    Who is fainter than `min_opacity` dies, and so does who covers least where births would exceed `limit`.
+    Gaussians fainter than `min_opacity` are pruned, and so are those that cover least where births would exceed
+    `limit`.
     """
-    alive = np.asarray(gaussians.opacities) >= config.min_opacity
-    survivors = np.flatnonzero(alive) if alive.any() else np.arange(len(alive))  # no scene could come back from none
-    needy = survivors[need.error[survivors] > least_error]
-    chosen = needy[np.argsort(-need.error[needy], kind="stable")][:births]
-    excess = min(max(len(survivors) + len(chosen) - limit, 0), len(chosen))
-    expendable = np.setdiff1d(survivors, chosen)
-    least = expendable[np.argsort(need.weight[expendable], kind="stable")][:excess]
-    return np.setdiff1d(survivors, least), np.sort(chosen[: len(chosen) - (excess - len(least))])
+    visible = np.asarray(gaussians.opacities) >= config.min_opacity
+    # A scene cannot come back from no Gaussians at all.
+    survivors = np.flatnonzero(visible) if visible.any() else np.arange(len(visible))
+    candidates = survivors[scores.error[survivors] > min_error]
+    parents = candidates[np.argsort(-scores.error[candidates], kind="stable")][:births]
+    excess = min(max(len(survivors) + len(parents) - limit, 0), len(parents))
+    others = np.setdiff1d(survivors, parents)
+    pruned = others[np.argsort(scores.weight[others], kind="stable")][:excess]
+    return np.setdiff1d(survivors, pruned), np.sort(parents[: len(parents) - (excess - len(pruned))])
 
 
 def _plan(
     gaussians: Gaussians,
     survivors: np.ndarray,
-    chosen: np.ndarray,
+    parents: np.ndarray,
     log_scale: np.ndarray,
     logit_opacity: np.ndarray,
     rng: np.random.Generator,
 ) -> DensityPlan:
-    """Return the plan that adds `log_scale` and `logit_opacity` [M] and draws the places of the births."""
-    parent, source = np.concatenate([survivors, chosen]), np.concatenate([survivors, np.full(len(chosen), -1)])
+    """Return the plan that adds `log_scale` and `logit_opacity` [M] and draws the means of the births."""
+    parent, source = np.concatenate([survivors, parents]), np.concatenate([survivors, np.full(len(parents), -1)])
     shift = np.zeros((len(parent), 3))
-    shift[len(survivors) :] = _draw(np.asarray(gaussians.quats)[chosen], np.asarray(gaussians.scales)[chosen], rng)
+    shift[len(survivors) :] = _draw(np.asarray(gaussians.quats)[parents], np.asarray(gaussians.scales)[parents], rng)
     edits = {"means": shift, "log_scales": np.repeat(log_scale[:, None], 3, axis=1), "logit_opacities": logit_opacity}
     return DensityPlan(parent, source, {name: edit.astype(np.float32) for name, edit in edits.items()})
 
 
 def _draw(quats: np.ndarray, scales: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return one displacement [M, 3] from each Gaussian's own density."""
+    """Return one displacement [M, 3] from the density of each Gaussian."""
     w, v = quats[:, :1], quats[:, 1:]
     n = rng.standard_normal(scales.shape) * scales
     # Rodrigues: the rotation of n by a quaternion of any length
@@ -169,17 +165,17 @@ def _logit(x: np.ndarray | float) -> np.ndarray:
 
 def apply_plan(gaussians: Gaussians, plan: DensityPlan) -> Gaussians:
     """Return the M Gaussians of a plan."""
-    chosen = gaussians.select(plan.parent)
-    columns = chosen.numpy()
-    return replace(chosen, **{name: columns[name] + edit for name, edit in plan.edits.items()})
+    selected = gaussians.select(plan.parent)
+    columns = selected.numpy()
+    return replace(selected, **{name: columns[name] + edit for name, edit in plan.edits.items()})
 
 
 def resize_optimizer(optimizer: Adam, plan: DensityPlan, edits: Mapping[str, np.ndarray] | None = None) -> None:
-    """Give an optimiser's parameters [N, ...] the rows of a plan [M, ...]; moments go along, those of births are 0.
+    """Give an optimiser's parameters [N, ...] the rows of a plan [M, ...], with their moments; those of births are 0.
 
     Args:
         optimizer: holds tensors of N rows; its learning rates and its count of steps stay.
-        plan: who is there.
+        plan: one round of density control.
         edits: what is added to the parameters, by name.
     """
     born = plan.source < 0

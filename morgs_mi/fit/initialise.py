@@ -1,25 +1,26 @@
-"""The first Gaussians: from SfM points, or from random points where there are none."""
+"""The initial Gaussians: on SfM points, or on random points inside the views."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
+from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 
 __all__ = ["focus_point", "from_points", "resample_points", "scene_extent", "seed_points"]
 
-_SH_C0 = 0.28209479177387814
 _INITIAL_OPACITY = 0.3
 
 
 def scene_extent(cameras: Sequence[Camera]) -> float:
-    """Return 1.1 times the radius of the cameras around their mean, world units (3DGS's scale of the scene).
+    """Return the scene extent in world units: 1.1 times the radius of the cameras around their mean, as in 3DGS.
 
-    A single camera has no such radius: it counts as 1.
+    It is 1 for a single camera.
     """
     positions = np.array([camera.position for camera in cameras])
     radius = np.linalg.norm(positions - positions.mean(0), axis=1).max()
@@ -27,7 +28,7 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
 
 
 def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int) -> Gaussians:
-    """Place a round Gaussian on every point, as wide as its three nearest neighbours are far (as in 3DGS).
+    """Return a round Gaussian on every point, as large as the distance to its three nearest neighbours (as in 3DGS).
 
     Args:
         points: [P, 3], world units.
@@ -35,7 +36,7 @@ def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int) -> Gauss
         sh_degree: 0 to 3; all but the constant coefficient start at 0.
 
     Raises:
-        ValueError: no points, points that are not finite, or colours that do not fit.
+        ValueError: no points, points that are not finite, or colours of another shape.
     """
     points, colors = np.asarray(points, np.float64), np.asarray(colors, np.float64)
     if points.ndim != 2 or points.shape[1:] != (3,) or not len(points) or points.shape != colors.shape:
@@ -48,33 +49,33 @@ def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int) -> Gauss
         raise ValueError(f"from_points(): `points` must be finite, got {points[tuple(index)]} at {index}.")
     n = len(points)
     neighbours = min(4, n)
-    distance = cKDTree(points).query(points, k=neighbours)[0].reshape(n, neighbours)[:, 1:]
+    distance = KDTree(points).query(points, k=neighbours)[0].reshape(n, neighbours)[:, 1:]
     spacing = np.sqrt(np.mean(distance**2, axis=1)) if neighbours > 1 else np.ones(n)
-    # Coincident points would get no size at all, stray ones would cover the view.
+    # Coincident points would have no size, and outliers would cover the view.
     spacing = np.clip(spacing, 0.1 * np.median(spacing) + 1e-9, 10 * np.median(spacing) + 1e-9)
     sh = np.zeros((n, (sh_degree + 1) ** 2, 3))
-    sh[:, 0] = (colors - 0.5) / _SH_C0
+    sh[:, 0] = (colors - 0.5) / SH_C0
     return Gaussians.from_activated(
         points,
         np.repeat(spacing[:, None], 3, axis=1),
         np.tile([1.0, 0, 0, 0], (n, 1)),
         np.full(n, _INITIAL_OPACITY),
         sh,
-        logit_confidence=np.zeros(n),
+        **{a.name: np.full((n, *a.shape), a.initial) for a in ATTRIBUTES if a.initial is not None},
     )
 
 
 def resample_points(
     points: np.ndarray, colors: np.ndarray, count: int, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return `count` points [count, 3] and colours: thinned at random, or filled up between near neighbours."""
+    """Return `count` points [count, 3] and colours: a random subset, or with points added between near neighbours."""
     if len(points) >= count:
         chosen = np.sort(rng.choice(len(points), count, replace=False))
         return points[chosen], colors[chosen]
     if len(points) < 2:
         return points, colors
     parent = rng.integers(0, len(points), count - len(points))
-    neighbours = cKDTree(points).query(points[parent], k=min(4, len(points)))[1]
+    neighbours = np.asarray(KDTree(points).query(points[parent], k=min(4, len(points)))[1])
     partner = neighbours[np.arange(len(parent)), rng.integers(1, neighbours.shape[1], len(parent))]
     blend = rng.uniform(0.2, 0.8, (len(parent), 1))
     added = [(1 - blend) * values[parent] + blend * values[partner] for values in (points, colors)]
@@ -82,7 +83,7 @@ def resample_points(
 
 
 def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the point [3] nearest to all optical axes, least squares."""
+    """Return the point [3] that is nearest to all optical axes in the least-squares sense."""
     system, right = 1e-9 * np.eye(3), np.zeros(3)
     for camera in cameras:
         axis = np.asarray(camera.viewmat, float)[2, :3]
@@ -96,25 +97,22 @@ def seed_points(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return random points [count, 3] inside the views, and their colours [count, 3] in [0, 1].
 
-    Each view gets its share: a random pixel, at a random depth from a third to thrice the distance of the
-    point that all cameras look at, evenly in 1 / depth, with that pixel's colour.
+    Each view gets the same number of points: random pixels at random depths, uniform in 1 / depth between a third and
+    three times the distance of the `focus_point`, in the colours of these pixels.
 
     Args:
         cameras: C views.
         images: per view uint8 [H, W, 3], RGB.
-        count: how many points.
-        rng: source of randomness.
+        count: number of points.
+        rng: draws pixels and depths.
     """
     focus = focus_point(cameras)
     points, colors = [], []
     for view, (camera, image) in enumerate(zip(cameras, images, strict=True)):
         n = count // len(cameras) + (view < count % len(cameras))
-        distance = max((np.asarray(camera.viewmat, float) @ np.append(focus, 1))[2], 10 * camera.near)
+        distance = max(camera.project(focus)[1], 10 * camera.near)
         depth = distance / rng.uniform(1 / 3, 3, n)
         x, y = rng.uniform(0, camera.width, n), rng.uniform(0, camera.height, n)
-        K = camera.K
-        local = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones(n)], axis=1) * depth[:, None]
-        viewmat = np.asarray(camera.viewmat, float)
-        points.append((local - viewmat[:3, 3]) @ viewmat[:3, :3])
+        points.append(camera.unproject(np.stack([x, y], axis=1), depth))
         colors.append(image[y.astype(int), x.astype(int)] / 255.0)
     return np.concatenate(points), np.concatenate(colors)

@@ -1,4 +1,4 @@
-"""The one optimisation loop: Adam on a dict of parameters, a dict of losses, a dict of weights."""
+"""The optimisation loop: Adam on a dict of parameters, with a dict of losses and a dict of weights."""
 
 from __future__ import annotations
 
@@ -10,44 +10,47 @@ import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
+from morgs_mi.core.types import Tensor
+
 __all__ = ["Losses", "adam", "optimise", "replace_parameter", "values_of", "view_order"]
 
-Losses = dict[str, Any]
+Losses = dict[str, Tensor]
 
 
-def adam(parameters: Mapping[str, Any]) -> Adam:
-    """Return Adam with these tensors, by name, at their start."""
-    # Gradients of means over a million pixels are tiny: Adam's usual epsilon of 1e-8 would drown them.
+def adam(parameters: Mapping[str, Tensor]) -> Adam:
+    """Return Adam with these tensors, by name, at their start values."""
+    # Gradients of means over a million pixels are tiny: Adam's usual epsilon of 1e-8 would dominate them.
     return Adam(lr=1.0, params=dict(parameters), epsilon=1e-15)
 
 
-def values_of(optimizer: Adam) -> dict[str, Any]:
-    """Return the parameters as they are, detached."""
+def values_of(optimizer: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the current parameters, detached."""
     return {name: dr.detach(optimizer[name]) for name in optimizer}
 
 
 def replace_parameter(optimizer: Adam, name: str, value: np.ndarray, carry: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Give a parameter another value and shape; unlike on assignment, Adam's two moments go along.
+    """Give a parameter another value and shape, and Adam's two moments with it, which an assignment would reset.
 
     Args:
         optimizer: its learning rates and its count of steps stay.
         name: of the parameter.
         value: the new one.
-        carry: makes a moment of the new shape out of one of the old.
+        carry: maps a moment of the old shape to one of the new shape.
     """
     _, promoted, rate, (steps, first, second, largest) = optimizer.state[name]
     shape = tuple(optimizer[name].shape)
     moments = [mi.Float(np.float32(carry(np.asarray(m).reshape(shape))).ravel()) for m in (first, second)]
     dr.make_opaque(moments)
     optimizer[name] = mi.TensorXf(np.ascontiguousarray(value, np.float32))
-    optimizer.state[name] = (optimizer.state[name][0], promoted, rate, (steps, *moments, largest))
+    state: Any = (optimizer.state[name][0], promoted, rate, (steps, *moments, largest))
+    optimizer.state[name] = state
 
 
 def optimise(
     optimizer: Adam,
     rates: Mapping[str, float],
     views: Iterable[int],
-    losses_of: Callable[[Mapping[str, Any], int], Losses],
+    losses_at: Callable[[Mapping[str, Tensor], int], Losses],
     weights: Mapping[str, float],
     decay: Callable[[int], float] | None = None,
     on_step: Callable[[int], None] | None = None,
@@ -60,15 +63,15 @@ def optimise(
         optimizer: as from `adam`.
         rates: learning rate of each parameter.
         views: the view of every step.
-        losses_of: (parameters, view) -> losses by name; a view may leave some out.
+        losses_at: (parameters, view) -> losses by name; a view may lack some of them.
         weights: of the losses by name; 1 where not named.
         decay: step -> factor on all rates; None: 1.
         on_step: called with the number of steps done.
-        first_step: what the count of steps goes on from.
-        last: number of steps.
+        first_step: number of steps before these.
+        last: number of steps over which the returned losses are averaged.
 
     Returns:
-        Each loss's mean over so many last steps that had it.
+        The mean of each loss over the last steps that had it, by name.
 
     Raises:
         FloatingPointError: the losses of the last steps are not finite.
@@ -76,13 +79,14 @@ def optimise(
     scale = {name: float(rates[name]) for name in optimizer}
     # As Python numbers: Dr.Jit 1.5 multiplies a rate that is an array in place, once per step.
     optimizer.set_learning_rate(scale)
-    history: dict[str, list[Any]] = {}
+    history: dict[str, list[Tensor]] = {}
     for step, view in enumerate(views, first_step):
         if decay is not None:
             factor = decay(step)
             optimizer.set_learning_rate({name: factor * rate for name, rate in scale.items()})
-        losses = losses_of(optimizer, view)
-        dr.backward(sum(weights.get(name, 1.0) * loss for name, loss in losses.items()))
+        losses = losses_at(optimizer, view)
+        total: Tensor = sum(weights.get(name, 1.0) * loss for name, loss in losses.items())
+        dr.backward(total)
         optimizer.step()
         for name, loss in losses.items():
             history.setdefault(name, []).append(dr.detach(loss))
@@ -99,6 +103,6 @@ def optimise(
 
 
 def view_order(num_views: int, steps: int, rng: np.random.Generator) -> list[int]:
-    """Return `steps` views, each drawn once before any is drawn again."""
+    """Return the views of `steps` steps in random order: each is drawn once before any is drawn again."""
     epochs = -(-steps // num_views)
     return np.concatenate([rng.permutation(num_views) for _ in range(epochs)])[:steps].tolist()

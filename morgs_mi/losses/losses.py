@@ -5,29 +5,28 @@ Every loss is a mean, over pixels or Gaussians, so that its weight does not depe
 
 from __future__ import annotations
 
-from typing import Any
-
 import drjit as dr
 import mitsuba as mi
 
+from morgs_mi.core.types import Float, Tensor
 from morgs_mi.losses.ssim import OnRegion, Target, WholeView
 from morgs_mi.render.region import Region
 
 __all__ = ["flow_loss", "mask_loss", "offset_loss", "recon_loss"]
 
 
-def recon_loss(image: Any, target: Target, dssim_weight: float = 0.2, region: Region | None = None) -> Any:
+def recon_loss(image: Tensor, target: Target, dssim_weight: float = 0.2, region: Region | None = None) -> Tensor:
     """Return (1 - lambda) mean |I - I*| + lambda (1 - SSIM) (eq. 2), differentiable in `image`.
 
-    Value and derivative are computed together, so that backward costs one multiplication.
+    Value and derivative are computed together, so that the backward pass costs one multiplication.
 
     Args:
-        image: [H, W, 3], or a picture on the region.
-        target: what it should show.
+        image: rendered image [H, W, 3], or an image on the region.
+        target: image to match.
         dssim_weight: lambda.
-        region: only its pixels have changed since the target was told to `remember` a picture; one that was not told
-            takes itself as what surrounds the region. The derivative is then the whole view's; the value leaves out
-            what cannot have changed: pixels outside, windows that see none inside.
+        region: the pixels that have changed since the target was given an image to `remember`; the first image stands
+            for a missing one. The derivative is that of the whole view; the value leaves out what cannot have changed:
+            pixels outside, and SSIM windows that contain none inside.
 
     Raises:
         ValueError: image and target differ in size.
@@ -45,36 +44,41 @@ def recon_loss(image: Any, target: Target, dssim_weight: float = 0.2, region: Re
     return dr.custom(OnRegion, image.array, target, dssim_weight, region)
 
 
-def flow_loss(motion: Any, cue: Any, reliable: Any, num_pixels: int | None = None) -> Any:
-    """Return the mean endpoint error in px between the rendered motion map and the flow's motion (eq. 7).
+def flow_loss(motion: Tensor, target: Tensor, reliable: Tensor, num_pixels: int | None = None) -> Tensor:
+    """Return the mean endpoint error in px between the rendered motion map and the observed motion (eq. 7).
 
     Args:
-        motion: rendered [H, W, 2], px, x_t - x_{t-1}; or on a region.
-        cue: from optical flow on the same grid and of the same shape, px, of the same sign.
-        reliable: [H, W] of 0 and 1, or on the region; the mean is over all pixels, so that little evidence weighs
+        motion: rendered motion map [H, W, 2], px, x_t - x_{t-1}; or on a region.
+        target: motion by optical flow on the same grid, of the same shape and sign, px.
+        reliable: [H, W] of 0 and 1, or on the region. The mean is over all pixels, so that few reliable pixels weigh
             little.
-        num_pixels: of the view; None: those given.
+        num_pixels: of the whole view; None: those given.
     """
-    n = dr.width(motion) // 2
-    lane = dr.arange(mi.UInt32, n) * 2
+    lane = dr.arange(mi.UInt32, dr.width(motion) // 2) * 2
     x, y = (
         dr.gather(mi.Float, motion.array, lane + k, mode=dr.ReduceMode.NoConflicts)
-        - dr.gather(mi.Float, cue.array, lane + k)
+        - dr.gather(mi.Float, target.array, lane + k)
         for k in range(2)
     )
     # A hundredth of a pixel keeps the derivative finite where both agree.
     return _mean(dr.sqrt(x * x + y * y + 1e-4) * reliable.array, num_pixels)
 
 
-def mask_loss(confidence: Any, mask: Any, num_pixels: int | None = None) -> Any:
+def mask_loss(confidence: Tensor, mask: Tensor, num_pixels: int | None = None) -> Tensor:
     """Return mean |M~ - M| of the rendered confidence [H, W, 1] and the motion mask [H, W] (eq. 11), as `flow_loss`."""
     return _mean(dr.abs(confidence.array - mask.array), num_pixels)
 
 
-def offset_loss(offset: Any, extent: float, num_gaussians: int | None = None) -> Any:
-    """Return the mean L1 norm of the offsets [N, 3] over the scene's extent (L_off); N may be more than are given."""
+def offset_loss(offset: Tensor, extent: float, num_gaussians: int | None = None) -> Tensor:
+    """Return the mean L1 norm of the offsets [N, 3] in scene extents (L_off).
+
+    Args:
+        offset: offsets of the active Gaussians, world units.
+        extent: of the scene, world units.
+        num_gaussians: of the whole scene; None: those given.
+    """
     return dr.sum(dr.abs(offset.array)) * dr.opaque(mi.Float, 1 / ((num_gaussians or int(offset.shape[0])) * extent))
 
 
-def _mean(values: Any, count: int | None) -> Any:
+def _mean(values: Float, count: int | None) -> Tensor:
     return dr.sum(values) * dr.opaque(mi.Float, 1 / (count or dr.width(values)))

@@ -1,81 +1,101 @@
-"""What changes from one picture of a fixed camera to another by more than noise, and who may be the cause.
+"""Detection of the pixels of a fixed camera that changed by more than noise.
 
-Changes of brightness are averaged over 5x5 pixels, in which noise averages out and what is seen does not. How much
-noise is left is told from the median absolute deviation over the picture, which holds while most of it stands still;
-where it does not, a grey level is the bound, more than what is left of six in every pixel.
+Changes of brightness are averaged over a window, which averages out noise and keeps what is visible. The remaining
+noise is estimated from the median absolute deviation over the image, which holds while most of the image is static;
+otherwise a grey level bounds it, which is more than what remains of a noise of six grey levels per pixel.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 
-__all__ = ["around", "change_map", "changed", "noise_of", "renewed"]
+__all__ = ["ChangeConfig", "box_around", "change_map", "change_mask", "change_noise", "update_reference"]
 
-_WINDOW = 5
-# Of 1.4 million pixels, normal noise takes less than one beyond five standard deviations.
-_SIGMAS = 5
 _GREY_LEVEL = 1 / 255
-# px, around a box: what moves comes from there, and flow needs something to match.
-_LEAST_MARGIN = 24
 
 
-def change_map(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return the change of brightness, averaged over 5x5 pixels, [H, W], from two pictures [H, W, 3].
+@dataclass(frozen=True)
+class ChangeConfig:
+    """Settings of the change detection."""
 
-    They are uint8, or floats in [0, 1].
+    window: int = 5
+    """Side of the window over which changes are averaged, in px."""
+    sigmas: float = 5.0
+    """Threshold in standard deviations of the noise: normal noise exceeds 5 at less than one of 1.4 million pixels."""
+    min_change: float = _GREY_LEVEL
+    """Least threshold and bound of the estimated noise, of 1: a grey level."""
+    min_margin: int = 24
+    """Least margin of the box around a change, in px: flow needs something to match."""
+
+
+def change_map(before: np.ndarray, after: np.ndarray, config: ChangeConfig | None = None) -> np.ndarray:
+    """Return the change of brightness, averaged over the window, [H, W], of 1.
+
+    Args:
+        before: an earlier image of the same camera [H, W, 3], uint8 or float in [0, 1].
+        after: a later one, likewise.
+        config: settings.
     """
+    config = config or ChangeConfig()
     if before.dtype == np.uint8 and after.dtype == np.uint8:
         change = cv2.subtract(after, before, dtype=cv2.CV_16S).astype(np.float32)
         change = cv2.transform(change, np.full((1, 3), 1 / (3 * 255), np.float32))
     else:
         change = (after - before).mean(-1)
-    # Zeros around: at the border a mirror would double what noise there is.
-    return cv2.blur(change, (_WINDOW, _WINDOW), borderType=cv2.BORDER_CONSTANT)
+    # Zero padding: reflection would double the noise at the border.
+    return cv2.blur(change, (config.window, config.window), borderType=cv2.BORDER_CONSTANT)
 
 
-def noise_of(change: np.ndarray) -> float:
-    """Return the standard deviation of the noise in a map of changes, at most a grey level."""
+def change_noise(change: np.ndarray, config: ChangeConfig | None = None) -> float:
+    """Return the standard deviation of the noise in a `change_map`, at most `min_change`."""
     sample = change.ravel()[:: max(1, change.size // 100_000)]
-    return min(1.4826 * float(np.median(np.abs(sample - np.median(sample)))), _GREY_LEVEL)
+    return min(1.4826 * float(np.median(np.abs(sample - np.median(sample)))), (config or ChangeConfig()).min_change)
 
 
-def changed(before: np.ndarray, after: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
-    """Return where a picture has changed by more than its noise and one grey level, bool [H, W].
+def change_mask(
+    before: np.ndarray, after: np.ndarray, valid: np.ndarray | None = None, config: ChangeConfig | None = None
+) -> np.ndarray:
+    """Return the mask of changed pixels [H, W], bool.
 
     Args:
-        before: an earlier picture of the same camera [H, W, 3], uint8.
-        after: this one.
-        valid: [H, W] bool, what counts; None: everything.
+        before: an earlier image of the same camera [H, W, 3], uint8 or float in [0, 1].
+        after: a later one, likewise.
+        valid: [H, W] bool, pixels that count; None: all.
+        config: settings.
     """
-    change = change_map(before, after)
-    found = np.abs(change) > max(_SIGMAS * noise_of(change), _GREY_LEVEL)
-    return found if valid is None else found & valid
+    config = config or ChangeConfig()
+    change = change_map(before, after, config)
+    mask = np.abs(change) > max(config.sigmas * change_noise(change, config), config.min_change)
+    return mask if valid is None else mask & valid
 
 
-def renewed(
-    reference: np.ndarray | None, image: np.ndarray | None, valid: np.ndarray | None = None
-) -> np.ndarray | None:
-    """Return what the next picture is to be compared with: the reference, renewed where the picture has changed.
+def update_reference(reference: np.ndarray, image: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """Return the image that the next frame is compared with: the reference, replaced where the image changed.
 
-    What changes slowly is thus found once it has changed enough. None stands for no picture.
+    So a slow change is detected once it has added up.
+
+    Args:
+        reference: [H, W, 3].
+        image: of the same camera [H, W, 3].
+        change: the `change_mask` of both [H, W].
     """
-    if reference is None or image is None:
-        return reference if image is None else image
-    return np.where(changed(reference, image, valid)[..., None], image, reference)
+    return np.where(change[..., None], image, reference)
 
 
-def around(change: np.ndarray) -> tuple[slice, slice] | None:
-    """Return the rows and columns of the smallest box around what has changed, with half its size on all sides.
+def box_around(mask: np.ndarray, config: ChangeConfig | None = None) -> tuple[slice, slice] | None:
+    """Return rows and columns of the smallest box around a mask [H, W], enlarged by half its size on all sides.
 
-    What surrounds a motion tells it from the noise. None where nothing has changed.
+    The static surroundings of a motion are needed to separate it from noise. None where the mask is empty.
     """
-    if not change.any():
+    if not mask.any():
         return None
     spans = []
     for axis in (0, 1):
-        (places,) = np.nonzero(change.any(axis=1 - axis))
+        (places,) = np.nonzero(mask.any(axis=1 - axis))
         low, high = int(places[0]), int(places[-1]) + 1
-        margin = max(_LEAST_MARGIN, (high - low) // 2)
-        spans.append(slice(max(low - margin, 0), min(high + margin, change.shape[axis])))
+        margin = max((config or ChangeConfig()).min_margin, (high - low) // 2)
+        spans.append(slice(max(low - margin, 0), min(high + margin, mask.shape[axis])))
     return spans[0], spans[1]

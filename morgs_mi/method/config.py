@@ -1,11 +1,15 @@
-"""Which motion reasoning is done, and how much it weighs."""
+"""Settings of the motion modules."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from morgs_mi.method.confidence import mask_refiner
-from morgs_mi.method.flow_sources.registry import flow_source
+from morgs_mi.method.active_set import ActiveSetConfig
+from morgs_mi.method.change import ChangeConfig
+from morgs_mi.method.flow_sources.config import FlowConfig
+from morgs_mi.method.lift import LiftConfig
+from morgs_mi.method.mask_refiners.config import MaskConfig
+from morgs_mi.method.propagation import PropagationConfig
 
 __all__ = ["MotionConfig"]
 
@@ -14,11 +18,10 @@ __all__ = ["MotionConfig"]
 class MotionConfig:
     """Settings of the motion modules; the first three are the rows of the paper's ablation.
 
-    With all three off, what is left is the residual-only baseline (eq. 3).
+    With all three off, the residual-only baseline remains (eq. 3).
 
     Raises:
-        FileNotFoundError: `flow_method` or `mask_method` names a file or folder that does not exist.
-        ValueError: `flow_method` names no source of flow, `mask_method` no refinement, or a number is out of range.
+        ValueError: a number is out of range.
     """
 
     learn_motion: bool = True
@@ -26,39 +29,43 @@ class MotionConfig:
     learn_offset: bool = True
     """MO: a learned offset corrects the flow-guided motion (eq. 8)."""
     learn_confidence: bool = True
-    """MC: a learned confidence gates all residuals (eq. 12)."""
+    """MC: a learned confidence gates the residuals (eq. 12)."""
     two_gates: bool = True
-    """The confidence gates places and rotations alone, the rest changes wherever it has to; False: one gate for all."""
+    """Gate means and rotations only, so that appearance changes freely; False: one gate for all, as in the paper."""
     lift_flow: bool = True
-    """Start each Gaussian's motion from the key views' flow in closed form; False: from zero, as in the paper."""
+    """Start each Gaussian's motion from lifted flow; False: from zero, as in the paper."""
     propagate_motion: bool = True
-    """Offer each Gaussian its own motion of the frame before and its neighbours', too, where motion starts from lifted
-    flow; False: that alone."""
+    """Also try the motion of the previous frame and of neighbours as starts; needs `lift_flow`."""
     lift_confidence: bool = True
-    """Raise each Gaussian's confidence to that evidence; False: start from the frame before, as in the paper."""
+    """Raise each Gaussian's confidence to that of lifted flow; False: carry it over, as in the paper."""
     flow_method: str = "dis"
-    """Optical flow: the name of a method (see docs/flow.md), files:FOLDER for flow from files, or onnx:FILE for a
-    network (onnx-unit:FILE or onnx-signed:FILE if it takes values from 0 or -1 to 1 in place of bytes)."""
+    """Source of optical flow: a method of OpenCV (see docs/flow.md), files:FOLDER, or onnx:FILE for a network
+    (onnx-unit:FILE or onnx-signed:FILE if it takes values from 0 or -1 to 1 instead of bytes)."""
     mask_method: str = "grabcut"
-    """How flow masks become objects: none, grabcut, superpixels, superpixels+grabcut, or
-    sam2:ENCODER.onnx,DECODER.onnx for SAM2's two networks (see docs/masks.md)."""
+    """Refinement of flow masks to objects: none, grabcut, superpixels, superpixels+grabcut, or
+    sam2:ENCODER.onnx,DECODER.onnx (see docs/masks.md)."""
     key_views: int = 4
-    """Cameras that get optical flow and masks."""
+    """Number of cameras with optical flow and masks."""
     mask_interval: int = 5
-    """Every how many frames the masks supervise the confidence."""
-    weight_flow: float = 0.01
-    """lambda_flow of eq. 13, per px of endpoint error."""
-    weight_mask: float = 0.5
-    """lambda_mask of eq. 13."""
-    weight_offset: float = 0.01
-    """lambda_off of eq. 13; the offset counts in scene extents."""
-    detach_weights: bool = True
-    """Keep the flow and mask losses from moving opacity and geometry: they are about motion and confidence."""
+    """Frames from one supervision of the confidence by masks to the next."""
+    min_gate: float = 0.1
+    """Gate below which a lifted motion is no longer scaled up to pass the gate at full length."""
+    confidence_decay: float = 0.3
+    """Logit that a confidence loses per frame without evidence of motion: where something moved, more is to correct."""
+    flow: FlowConfig = field(default_factory=FlowConfig)
+    """Optical flow and its forward-backward check."""
+    masks: MaskConfig = field(default_factory=MaskConfig)
+    """Motion masks."""
+    lift: LiftConfig = field(default_factory=LiftConfig)
+    """Lifted flow."""
+    propagation: PropagationConfig = field(default_factory=PropagationConfig)
+    """Motion proposals."""
+    active_set: ActiveSetConfig = field(default_factory=ActiveSetConfig)
+    """Selection of the Gaussians that a frame may change."""
+    change: ChangeConfig = field(default_factory=ChangeConfig)
+    """Detection of changed pixels."""
 
     def __post_init__(self) -> None:
-        # What is wrong with either shall be said before the first frame is fitted.
-        flow_source(self.flow_method)
-        mask_refiner(self.mask_method)
         for name in ("key_views", "mask_interval"):
             if getattr(self, name) < 1:
                 raise ValueError(f"MotionConfig(): `{name}` must be at least 1, got {getattr(self, name)}.")

@@ -1,4 +1,4 @@
-"""What the key views say about a frame: motion where it can be trusted, and masks at keyframes."""
+"""Optical flow of the key views (eq. 4), checked forward and backward, and the motion masks that follow from it."""
 
 from __future__ import annotations
 
@@ -9,23 +9,24 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.method.confidence import motion_mask
-from morgs_mi.method.config import MotionConfig
-from morgs_mi.method.flow_sources.opencv import consistency_mask
-from morgs_mi.method.flow_sources.registry import FlowSource, FramePair, flow_source
+from morgs_mi.method.flow_sources.config import FlowConfig
+from morgs_mi.method.flow_sources.consistency import consistency_mask
+from morgs_mi.method.flow_sources.registry import FramePair, flow_source
+from morgs_mi.method.mask_refiners.config import MaskConfig
 
 __all__ = ["FlowObservation", "choose_key_views", "observe_flow", "observe_key_views"]
 
 
 @dataclass(frozen=True, eq=False)
 class FlowObservation:
-    """One key view's evidence at one frame.
+    """Optical flow of one key view at one frame.
 
     Attributes:
-        motion: x_t - x_{t-1} [H, W, 2] in px on frame t's grid.
-        reliable: [H, W] bool, where the flow there and back agree.
-        forward_flow: x_t - x_{t-1} again, but on frame t - 1's grid [H, W, 2].
+        motion: x_t - x_{t-1} [H, W, 2] in px on frame t's grid: the negative of the flow to frame t - 1.
+        reliable: [H, W] bool, where forward and backward flow agree.
+        forward_flow: x_t - x_{t-1} [H, W, 2] in px on frame t - 1's grid: the flow to frame t.
         forward_reliable: [H, W] bool, likewise.
-        mask: what moves [H, W] bool (eq. 10), or None where it was not asked for.
+        mask: motion mask [H, W] bool (eq. 10), or None if it was not requested.
     """
 
     motion: np.ndarray
@@ -36,12 +37,15 @@ class FlowObservation:
 
 
 def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
-    """Return `count` views spread over the rig: the most central one, then always the farthest from those chosen."""
+    """Return the indices of `count` views spread over the rig.
+
+    The first is the most central one; each further one is the farthest from those chosen.
+    """
     positions = np.array([camera.position for camera in cameras])
     chosen = [int(np.argmin(np.linalg.norm(positions - positions.mean(0), axis=1)))]
     while len(chosen) < min(count, len(cameras)):
-        gap = np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(1)
-        chosen.append(int(np.argmax(gap)))
+        distance = np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(1)
+        chosen.append(int(np.argmax(distance)))
     return tuple(sorted(chosen))
 
 
@@ -52,44 +56,61 @@ def observe_flow(
     mask_method: str | None = None,
     valid: np.ndarray | None = None,
 ) -> FlowObservation:
-    """Return the cue of two pictures, whichever camera's they are.
+    """Return the flow observation of two images of one camera.
 
     Args:
         image: I_t [H, W, 3], RGB, uint8 or float in [0, 1].
         previous: I_{t-1}, likewise.
-        method: as `flow_source` takes it.
-        mask_method: as `mask_refiner` takes it; None: no mask is wanted.
-        valid: [H, W] bool, False where undistortion left nothing; None: valid everywhere.
+        method: source of the flow, see `flow_source`.
+        mask_method: refinement of the mask, see `mask_refiner`; None: no mask.
+        valid: [H, W] bool, False where undistortion left no data; None: valid everywhere.
 
     Raises:
         ValueError: as `flow_source`, `optical_flow` and `mask_refiner`.
     """
-    return _cue(FramePair(np.asarray(image), np.asarray(previous), valid=valid), flow_source(method), mask_method)
+    pair = FramePair(np.asarray(image), np.asarray(previous), valid=valid)
+    return observe_key_views({0: pair}, method, mask_method)[0]
 
 
 def observe_key_views(
-    pairs: Mapping[int, FramePair], config: MotionConfig, with_masks: bool
+    pairs: Mapping[int, FramePair],
+    method: str = "dis",
+    mask_method: str | None = None,
+    flow: FlowConfig | None = None,
+    masks: MaskConfig | None = None,
 ) -> dict[int, FlowObservation]:
-    """Return the cue of every key view from its two pictures, by view.
+    """Return the flow observation of each pair of images, by view index.
+
+    Args:
+        pairs: images of the key views at two frames, by view index.
+        method: source of the flow, see `flow_source`.
+        mask_method: refinement of the masks, see `mask_refiner`; None: no masks.
+        flow: settings of the flow and of its check.
+        masks: settings of the masks.
 
     Raises:
-        OSError: flow that is read from files is missing.
-        ValueError: as `flow_source`, `mask_refiner` and what they name.
+        OSError: flow is read from files and one is missing.
+        ValueError: as `flow_source` and `mask_refiner`.
     """
-    source = flow_source(config.flow_method)
-    mask_method = config.mask_method if with_masks else None
-    return {view: _cue(pair, source, mask_method) for view, pair in pairs.items()}
+    source = flow_source(method, flow)
+    observations = {}
+    for view, pair in pairs.items():
+        backward, forward = source(pair)  # eq. 4
+        reliable, forward_reliable = _reliable(pair, backward, forward, flow)
+        mask = motion_mask(pair.image, -backward, reliable, mask_method, masks) if mask_method else None  # eqs. 9, 10
+        observations[view] = FlowObservation(-backward, reliable, forward, forward_reliable, mask)
+    return observations
 
 
-def _cue(pair: FramePair, source: FlowSource, mask_method: str | None) -> FlowObservation:
-    """Return one view's cue (eq. 4, and 9 and 10 for the mask), from optical flow both ways."""
-    flow, forward_flow = source(pair)
-    reliable, forward_reliable = consistency_mask(flow, forward_flow), consistency_mask(forward_flow, flow)
+def _reliable(
+    pair: FramePair, backward: np.ndarray, forward: np.ndarray, config: FlowConfig | None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return where the backward flow and where the forward flow is reliable, bool [H, W] each."""
+    reliable, forward_reliable = (
+        consistency_mask(*flows, config) for flows in ((backward, forward), (forward, backward))
+    )
     known = pair.valid
     if pair.box is not None:
         known = np.zeros(reliable.shape, bool)
         known[pair.box] = True if pair.valid is None else pair.valid[pair.box]
-    if known is not None:
-        reliable, forward_reliable = reliable & known, forward_reliable & known
-    mask = motion_mask(pair.image, -flow, reliable, mask_method) if mask_method else None
-    return FlowObservation(-flow, reliable, forward_flow, forward_reliable, mask)
+    return (reliable, forward_reliable) if known is None else (reliable & known, forward_reliable & known)

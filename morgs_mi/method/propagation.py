@@ -1,23 +1,24 @@
-"""Where each Gaussian's motion starts: from the flow's, from its own of the frame before, or from a neighbour's.
+"""Motion proposals from the previous frame and from neighbours, where lifted flow fails.
 
-Flow fails where parts are thin and fast, or alike; but what moves mostly goes on as before, and as what lies beside
-it. So each Gaussian is offered further displacements, as PatchMatch offers them to pixels (Barnes et al. 2009): first
-the one it had, then, twice, that of one of its nearest neighbours that move. All try theirs at once, and are drawn so
-on the key views; what each answers for there, E_iv of W_iv pixels (see `density`), makes its error
+Flow fails where parts are thin and fast, or look alike; but motion mostly continues, and is shared with the
+surroundings. So each Gaussian gets further proposals, as PatchMatch gives them to pixels (Barnes et al. 2009): first
+its own motion of the previous frame, then, in each of some rounds, that of a random one of its nearest moving
+neighbours. All Gaussians try their proposals at once and are rendered in the key views. With the attributed error E_iv
+and the coverage W_iv there (see `losses.attribution`), the error of a Gaussian is
 
     (0.01 px + sum_v E_iv) / (1 px + sum_v W_iv) .
 
-Who answers for clearly less error than before keeps the offer.
+A Gaussian whose error falls clearly accepts its proposal.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.losses.attribution import attribute_error
@@ -25,72 +26,84 @@ from morgs_mi.losses.ssim import Target
 from morgs_mi.method.lift import Lift
 from morgs_mi.render.active_view import ActiveView
 
-__all__ = ["propagate_motion"]
+__all__ = ["PropagationConfig", "propagate_motion"]
 
-_ROUNDS = 2
-_NEIGHBOURS = 8
-# How much of the error must not be left; others move at the same time, so a little less is chance.
-_BETTER = 0.9
-# The same for who would stand still else.
-_WAKE = 0.8
-# px of full contrast: who is hardly seen does not change its mind.
-_FLOOR = 0.01
-# A confidence of 0.57 for who moves: chance lets some keep an offer that is wrong.
-_SURE = 0.3
+
+@dataclass(frozen=True)
+class PropagationConfig:
+    """Settings of the motion proposals."""
+
+    rounds: int = 2
+    """Rounds of proposals from neighbours, after the one from the previous frame."""
+    neighbours: int = 8
+    """Nearest Gaussians that a proposal is drawn from."""
+    max_error_ratio: float = 0.9
+    """Ratio of the new error to the old one up to which a moving Gaussian accepts a proposal. Others move at the same
+    time, so that a smaller gain is chance."""
+    max_error_ratio_static: float = 0.8
+    """The same for a Gaussian that does not move without the proposal."""
+    floor_px: float = 0.01
+    """Error, in pixels of full contrast, that is added to that of every Gaussian: one that is hardly visible does not
+    change its motion."""
+    min_logit: float = 0.3
+    """Logit of the confidence of a Gaussian that accepted a motion: 0.57, as some accept a wrong one by chance."""
 
 
 def propagate_motion(
     previous: Gaussians,
     lifted: Lift,
-    windows: Mapping[int, ActiveView],
+    views: Mapping[int, ActiveView],
     targets: Mapping[int, Target],
     rng: np.random.Generator,
+    config: PropagationConfig | None = None,
 ) -> Lift:
-    """Return a start of the motion that explains the pictures at least as well as the one that the flow gave.
+    """Return a start of the motion that explains the images at least as well as lifted flow does.
 
     Args:
-        previous: N Gaussians of the frame before, detached; `motion` is how they came there.
-        lifted: what the flow says of them.
-        windows: onto the key views, by view.
-        targets: their pictures, by view.
+        previous: N Gaussians of the previous frame, detached; `motion` is their displacement into that frame.
+        lifted: start by lifted flow.
+        views: active views of the key views, by view index.
+        targets: their images, by view index.
         rng: draws the neighbours.
-
-    Returns:
-        The same or another displacement [N, 3], world units; the confidence follows who has taken an offer.
+        config: settings.
     """
-    d, logit = lifted.displacement, lifted.logit_confidence
+    config = config or PropagationConfig()
+    d, logit = lifted.displacement, lifted.logit_confidence  # [N, 3], [N]
     before = np.zeros_like(d) if previous.motion is None else np.asarray(previous.motion)
-    if not windows or not (d.any() or before.any()):
+    if not views or not (d.any() or before.any()):
         return lifted
     means = np.asarray(previous.means)
 
     def error_of(d: np.ndarray) -> np.ndarray:
         moved = replace(previous, means=mi.TensorXf(means + d))
-        sums = np.sum([attribute_error(moved, windows[view], targets[view]) for view in windows], axis=0)
-        return (sums[:, 0] + _FLOOR) / (sums[:, 1] + 1)
+        sums = np.sum([attribute_error(moved, views[view], targets[view]) for view in views], axis=0)
+        return (sums[:, 0] + config.floor_px) / (sums[:, 1] + 1)
 
-    error, near = error_of(d), _nearest(means)
-    for k in range(1 + _ROUNDS):
-        offer = d[_moving_neighbour(near, d, rng)] if k else np.where(before.any(axis=1)[:, None], before, d)
-        other = (offer != d).any(axis=1)
-        if not other.any():
+    error, near = error_of(d), _nearest(means, config.neighbours)
+    for k in range(1 + config.rounds):
+        proposal = (
+            d[_moving_neighbour(near, d, rng)] if k else np.where(np.any(before, axis=1, keepdims=True), before, d)
+        )
+        differs = np.any(proposal != d, axis=1)
+        if not differs.any():
             continue
-        left = error_of(offer)
-        better = other & (left < np.where(d.any(axis=1), _BETTER, _WAKE) * error)
-        d, error = np.where(better[:, None], offer, d), np.where(better, left, error)
-        moves = np.where(d.any(axis=1), np.maximum(logit, _SURE), np.minimum(logit, -_SURE))
-        logit = np.where(better, moves, logit)
+        new_error = error_of(proposal)
+        ratio = np.where(d.any(axis=1), config.max_error_ratio, config.max_error_ratio_static)
+        accepted = differs & (new_error < ratio * error)
+        d, error = np.where(accepted[:, None], proposal, d), np.where(accepted, new_error, error)
+        moves = np.where(d.any(axis=1), np.maximum(logit, config.min_logit), np.minimum(logit, -config.min_logit))
+        logit = np.where(accepted, moves, logit)
     return Lift(d, logit.astype(np.float32))
 
 
-def _nearest(means: np.ndarray) -> np.ndarray:
-    """Return each one's nearest neighbours, [N, 8] or fewer if there are no more."""
-    count = min(_NEIGHBOURS + 1, len(means))
-    _, near = cKDTree(means).query(means, count, workers=-1)
-    return near.reshape(len(means), count)[:, -_NEIGHBOURS:]
+def _nearest(means: np.ndarray, count: int) -> np.ndarray:
+    """Return the indices of the nearest neighbours of each mean, [N, count], or fewer if there are no more."""
+    k = min(count + 1, len(means))
+    _, near = KDTree(means).query(means, k, workers=-1)
+    return np.asarray(near).reshape(len(means), k)[:, -count:]
 
 
 def _moving_neighbour(near: np.ndarray, d: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return one of each one's neighbours [N], by chance; one that moves if there is any."""
-    draw = d.any(axis=1)[near] + rng.random(near.shape, np.float32)
+    """Return the index of a random neighbour of each Gaussian [N]; of a moving one if there is any."""
+    draw = np.any(d, axis=1)[near] + rng.random(near.shape, np.float32)
     return near[np.arange(len(near)), draw.argmax(axis=1)]

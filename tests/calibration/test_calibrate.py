@@ -1,4 +1,4 @@
-"""Clips alone give the rig back, up to the world's scale, and what cannot work is said in a sentence."""
+"""Calibration from clips alone, up to the scale of the world, and the errors for unsuitable clips."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def film(path: Path, cameras: list[Camera], suffix: str = ".mkv") -> Path:
 
 
 def aligned(found: np.ndarray, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return `found` [n, 3] moved, turned and scaled onto `true`, and the rotation."""
+    """Return `found` [n, 3] aligned to `true` by translation, rotation and scale, and the rotation."""
     a, b = found - found.mean(0), true - true.mean(0)
     U, _, Vt = np.linalg.svd(a.T @ b)
     R = (U @ Vt).T
     return np.sqrt((b**2).sum() / (a**2).sum()) * a @ R.T + true.mean(0), R
 
 
-def test_a_rig_is_found_again(tmp_path: Path, capsys) -> None:
+def test_calibrate__recovers_a_rig(tmp_path: Path, capsys) -> None:
     cameras = [camera.resized(240, 180) for camera in textured.rig()]
     film(tmp_path, cameras)
     assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
@@ -43,7 +43,7 @@ def test_a_rig_is_found_again(tmp_path: Path, capsys) -> None:
     assert len(capture.points) > 500
     true = np.array([camera.position for camera in cameras])
     found, R = aligned(np.array([camera.position for camera in capture.cameras]), true)
-    # Features are good to 0.1 px of 208 px focal length; the rig is 2.8 wide and 4 from the scene.
+    # Features are accurate to 0.1 px of 208 px focal length; the rig is 2.8 wide and 4 from the scene.
     np.testing.assert_allclose(found, true, atol=5e-3)
     for camera, expected in zip(capture.cameras, cameras, strict=True):
         np.testing.assert_allclose(camera.viewmat[:3, :3] @ R.T, expected.viewmat[:3, :3], atol=3e-3)
@@ -51,15 +51,15 @@ def test_a_rig_is_found_again(tmp_path: Path, capsys) -> None:
     assert check_rig(capture, match_capture(capture)).fits
     status = cli.main(["calibrate", str(tmp_path)])
     assert status == 1
-    assert "sparse: expected none, got one" in capsys.readouterr().err
+    assert "sparse: expected no model, got one" in capsys.readouterr().err
 
 
-def test_a_camera_that_sees_something_else_is_named(tmp_path: Path) -> None:
+def test_calibrate__names_a_camera_with_another_scene(tmp_path: Path) -> None:
     film(tmp_path, [camera.resized(240, 180) for camera in textured.rig()[1:5]])
     noise = np.random.default_rng(1).integers(0, 255, (90, 120, 3), np.uint8)
     write_video(tmp_path / "other.mkv", [cv2.resize(noise, (240, 180), interpolation=cv2.INTER_CUBIC)] * 2, 30)
     with pytest.raises(
-        ValueError, match=r"4 of 5 cameras were found, other could not be tied to them: .* or keep what"
+        ValueError, match=r"to register all 5 cameras, got 4, without other: .* or accept the partial model"
     ):
         calibrate(tmp_path)
     assert not (tmp_path / "sparse").exists()
@@ -112,7 +112,7 @@ def empty_clip(path: Path) -> None:
         (no_clip, {}, ValueError, "the clips of at least two cameras, found none"),
         (one_clip, {}, ValueError, "the clips of at least two cameras, found b"),
         (empty_clip, {}, ValueError, "c.mkv: expected a video, got an empty file"),
-        (calibrated, {}, FileExistsError, "sparse: expected none, got one"),
+        (calibrated, {}, FileExistsError, "sparse: expected no model, got one"),
         (noise_clips, {"frame": 1}, ValueError, "frame 1 is not in the clips of a, b, c"),
         (noise_clips, {"frame": -1}, ValueError, "frame -1 is not in the clips of a, b, c"),
         (other_size, {"shared_intrinsics": True}, ValueError, "clips of one size, got 160x100, 160x120"),
@@ -120,7 +120,9 @@ def empty_clip(path: Path) -> None:
         (noise_clips, {}, ValueError, "no two of the 3 views match"),
     ],
 )
-def test_what_cannot_work(tmp_path: Path, build, config: dict, error: type[Exception], message: str) -> None:
+def test_calibrate__refuses_clips_that_cannot_be_calibrated(
+    tmp_path: Path, build, config: dict, error: type[Exception], message: str
+) -> None:
     path = tmp_path / "clips"
     build(path)
     before = sorted(tmp_path.rglob("*"))

@@ -1,4 +1,4 @@
-"""The reprojection check, triangulation and the picture of the rig, on textured planes seen from known cameras."""
+"""The reprojection check, triangulation and the plot of the rig, on textured planes seen from known cameras."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 from morgs_mi import cli
-from morgs_mi.calibration.rig_check import MAX_ERROR, Common, check_rig, match_capture, triangulate_points
+from morgs_mi.calibration.rig_check import MAX_ERROR, SharedFeatures, check_rig, match_capture, triangulate_points
 from morgs_mi.calibration.rig_plot import draw_rig
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.features import detect, match_views, reprojection_errors, triangulate
+from morgs_mi.capture.layouts import registry
+from morgs_mi.capture.layouts.calibration import PoseConvention
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds, write_poses_bounds
 from morgs_mi.capture.lens import Lens, undistortion
@@ -27,7 +29,7 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
-    """Six off-centre cameras without points, and their first frame."""
+    """Six cameras with off-centre principal points and one frame, without points."""
     path = tmp_path_factory.mktemp("rig")
     cameras, planes = textured.rig(shift=7), textured.textures()
     write_colmap(path / "sparse", cameras)
@@ -37,7 +39,7 @@ def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 @pytest.fixture(scope="module")
-def common(capture: Capture) -> Common:
+def shared(capture: Capture) -> SharedFeatures:
     return match_capture(capture)
 
 
@@ -45,30 +47,30 @@ def with_cameras(capture: Capture, change: Callable[[int, Camera], Camera]) -> C
     return replace(capture, cameras=tuple(change(i, camera) for i, camera in enumerate(capture.cameras)))
 
 
-def test_true_poses_fit(capture: Capture, common: Common) -> None:
-    check = check_rig(capture, common)
+def test_check_rig__accepts_true_poses(capture: Capture, shared: SharedFeatures) -> None:
+    check = check_rig(capture, shared)
     assert check.fits
-    assert check.advice == "the poses fit the pictures."
+    assert check.advice == "the poses fit the images."
     assert check.pairs == 15
     assert check.matches > 3000
     assert check.camera_matches.sum() == 2 * check.matches
-    # The pictures are exact; SIFT places its features to some hundredths of a pixel.
+    # The images are exact; SIFT locates features to some hundredths of a pixel.
     assert check.error < 0.05
     assert check.camera_errors.max() < 0.1
 
 
-def test_the_error_is_that_of_the_points_projections(capture: Capture, common: Common) -> None:
-    """Against the distance to epipolar lines: no point can be nearer to both features than half of that."""
+def test_reprojection_errors__are_bounded_by_epipolar_distances(capture: Capture, shared: SharedFeatures) -> None:
+    """No point can be nearer to both features than half their distance to the epipolar lines."""
     moved = with_cameras(capture, lambda i, c: turned(c, 4) if i == 2 else c).cameras
-    match = next(m for m in common.matches if m.views == (1, 2))
-    errors = reprojection_errors(match, common.features, moved)
+    match = next(m for m in shared.matches if m.views == (1, 2))
+    errors = reprojection_errors(match, shared.features, moved)
     a, b = (moved[v] for v in match.views)
     relative = b.viewmat @ np.linalg.inv(a.viewmat)
     x, y, z = relative[:3, 3]
     E = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative[:3, :3]
     F = np.linalg.inv(b.K).T @ E @ np.linalg.inv(a.K)
     left, right = (
-        np.column_stack([common.features[v].points[match.features[:, k]], np.ones(len(errors))])
+        np.column_stack([shared.features[v].points[match.features[:, k]], np.ones(len(errors))])
         for k, v in enumerate(match.views)
     )
     lines = left @ F.T
@@ -81,7 +83,7 @@ def test_the_error_is_that_of_the_points_projections(capture: Capture, common: C
 
 
 def turned(camera: Camera, degrees: float) -> Camera:
-    """Turn a camera about its own optical axis."""
+    """Return the camera rotated about its optical axis."""
     c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     return replace(camera, viewmat=np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ camera.viewmat)
 
@@ -95,32 +97,55 @@ POSES = {
 }
 
 
+# Convention that a layout expects; the last two have no layout yet.
+EXPECTED = {
+    "COLMAP": (TO_CAMERA, "OpenCV"),
+    "Nerfstudio": (TO_WORLD, "OpenGL"),
+    "toy OpenCV": (TO_WORLD, "OpenCV"),
+    "toy OpenGL": (TO_CAMERA, "OpenGL"),
+}
+
+
+def interpreted(matrix: np.ndarray, direction: str, axes: str) -> np.ndarray:
+    """Return the view matrix of a pose matrix in a convention, as `read_transforms` does for Nerfstudio."""
+    if direction == TO_WORLD:
+        matrix = np.linalg.inv(matrix)
+    return FLIP @ matrix if axes == "OpenGL" else matrix
+
+
 @pytest.mark.parametrize("kind", list(POSES), ids=" ".join)
-@pytest.mark.parametrize("layout", ["COLMAP", "Nerfstudio"])
-def test_poses_of_another_kind_are_named(capture: Capture, common: Common, layout: str, kind: tuple[str, str]) -> None:
-    """The four kinds of poses, each given where the layout expects one of them."""
-    given = [POSES[kind](camera) for camera in capture.cameras]
-    if layout == "Nerfstudio":  # as `read_transforms` takes them
-        given = [np.linalg.inv(pose @ FLIP) for pose in given]
+@pytest.mark.parametrize("layout", list(EXPECTED))
+def test_check_rig__names_another_pose_convention(
+    capture: Capture,
+    shared: SharedFeatures,
+    layout: str,
+    kind: tuple[str, str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each of the four conventions is read as the one that the layout expects."""
+    expected = EXPECTED[layout]
+    toy = replace(registry.LAYOUTS[0], name=layout, poses=PoseConvention(*expected))
+    if layout.startswith("toy"):
+        monkeypatch.setattr(registry, "LAYOUTS", (*registry.LAYOUTS, toy))
+    given = [interpreted(POSES[kind](camera), *expected) for camera in capture.cameras]
     read = with_cameras(replace(capture, layout=layout), lambda i, c: replace(c, viewmat=given[i]))
-    check = check_rig(read, common)
-    expected = {"COLMAP": (TO_CAMERA, "OpenCV"), "Nerfstudio": (TO_WORLD, "OpenGL")}[layout]
+    check = check_rig(read, shared)
     assert check.fits is (kind == expected)
     if not check.fits:
         assert check.error > MAX_ERROR
-        assert f"do not fit the pictures: the poses seem to be {kind[0]} in {kind[1]}'s" in check.advice
+        assert f"do not fit the images: the poses seem to be {kind[0]} in {kind[1]}'s" in check.advice
         assert f"expected {expected[0]} in {expected[1]}'s" in check.advice
 
 
-def test_a_single_wrong_camera_is_named(capture: Capture, common: Common) -> None:
-    check = check_rig(with_cameras(capture, lambda i, c: turned(c, 5) if i == 3 else c), common)
+def test_check_rig__names_a_single_wrong_camera(capture: Capture, shared: SharedFeatures) -> None:
+    check = check_rig(with_cameras(capture, lambda i, c: turned(c, 5) if i == 3 else c), shared)
     assert check.fits is False
-    assert "the poses of cam3 do not fit the pictures: check the order" in check.advice
+    assert "the poses of cam3 do not fit the images: check the order" in check.advice
     assert int(np.argmax(check.camera_errors)) == 3
 
 
-def test_rows_in_alphabetical_order_are_named(tmp_path: Path) -> None:
-    """Meet Room's names have no leading zeros: cam_10 comes before cam_2 in the alphabet, after it by number."""
+def test_check_rig__names_rows_in_alphabetical_order(tmp_path: Path) -> None:
+    """Meet Room's names have no leading zeros: alphabetically cam_10 precedes cam_2, numerically it follows."""
     names, planes = ("cam_0", "cam_1", "cam_2", "cam_10"), textured.textures()
     cameras = dict(zip(names, textured.rig(4, 240, 180), strict=True))
     for name, camera in cameras.items():
@@ -133,7 +158,9 @@ def test_rows_in_alphabetical_order_are_named(tmp_path: Path) -> None:
     assert "the rows seem to be in alphabetical order (cam_0, cam_1, cam_10, cam_2, ...)" in check.advice
 
 
-def test_columns_of_another_convention_are_named(tmp_path: Path, capture: Capture, common: Common) -> None:
+def test_check_rig__names_columns_of_another_convention(
+    tmp_path: Path, capture: Capture, shared: SharedFeatures
+) -> None:
     cameras = [Camera(textured.rig()[i].K, c.viewmat, c.width, c.height, c.name) for i, c in enumerate(capture.cameras)]
     write_poses_bounds(tmp_path / "p.npy", cameras, [[1, 9]] * 6)
     rows = np.load(tmp_path / "p.npy")
@@ -142,41 +169,41 @@ def test_columns_of_another_convention_are_named(tmp_path: Path, capture: Captur
     matrices[..., 0], matrices[..., 1] = right, -down
     np.save(tmp_path / "p.npy", rows)
     read, _ = read_poses_bounds(tmp_path / "p.npy", capture.names)
-    # The principal points of the pictures, which the format cannot hold.
+    # The principal points of the images, which the format cannot represent.
     read = tuple(replace(c, K=own.K) for c, own in zip(read, capture.cameras, strict=True))
-    check = check_rig(replace(capture, cameras=read, layout="poses_bounds"), common)
+    check = check_rig(replace(capture, cameras=read, layout="poses_bounds"), shared)
     assert check.fits is False
     assert "the columns seem to be the camera's right, up and backward axes" in check.advice
 
 
-def test_too_few_matches_are_no_verdict(capture: Capture) -> None:
+def test_check_rig__is_undecided_without_matches(capture: Capture) -> None:
     blank = detect(np.full((48, 64, 3), 128, np.uint8))
     assert blank.points.shape == (0, 2)
-    check = check_rig(capture, Common((blank,) * 6, tuple(match_views([blank] * 6, capture.cameras))))
+    check = check_rig(capture, SharedFeatures((blank,) * 6, tuple(match_views([blank] * 6, capture.cameras))))
     assert check.fits is None
     assert check.matches == 0
     assert np.isnan(check.error)
     assert "too few matches" in check.advice
 
 
-def test_fewer_than_fifty_matches_are_no_verdict_even_if_they_fit(capture: Capture, common: Common) -> None:
-    first = common.matches[0]
+def test_check_rig__is_undecided_with_fewer_than_fifty_matches(capture: Capture, shared: SharedFeatures) -> None:
+    first = shared.matches[0]
     for count, fits in ((49, None), (50, True)):
-        few = Common(common.features, (replace(first, features=first.features[:count]),))
+        few = SharedFeatures(shared.features, (replace(first, features=first.features[:count]),))
         assert check_rig(capture, few).fits is fits
     assert "no match with cam2, cam3, cam4, cam5" in check_rig(capture, few).advice
 
 
-def test_what_the_check_hardly_sees(capture: Capture, common: Common) -> None:
-    """The price of trusting two views at a time: all principal points off by 5 px still fit."""
+def test_check_rig__hardly_detects_a_common_shift_of_principal_points(capture: Capture, shared: SharedFeatures) -> None:
+    """A limitation of comparing two views at a time: principal points that are all off by 5 px still fit."""
     shift = np.array([[0, 0, 5], [0, 0, 5], [0, 0, 0]])
-    check = check_rig(with_cameras(capture, lambda i, c: replace(c, K=c.K + shift)), common)
+    check = check_rig(with_cameras(capture, lambda i, c: replace(c, K=c.K + shift)), shared)
     assert check.fits
-    assert check.error > 3 * check_rig(capture, common).error
+    assert check.error > 3 * check_rig(capture, shared).error
 
 
-def test_features_lie_where_the_picture_says() -> None:
-    """A blob at a known place, at several sizes of the image: pixel centres lie at +0.5."""
+def test_detect__finds_a_blob_at_its_position() -> None:
+    """A blob at a known position, at several image sizes: pixel centres lie at +0.5."""
     for width, height in ((160, 120), (1600, 1200)):
         scale = width / 160
         u, v = 70.3 * scale, 52.6 * scale
@@ -187,53 +214,53 @@ def test_features_lie_where_the_picture_says() -> None:
         np.testing.assert_allclose(nearest, (u, v), atol=0.1 * scale)
 
 
-def test_features_keep_out_of_what_was_not_recorded(capture: Capture) -> None:
+def test_detect__respects_the_mask(capture: Capture) -> None:
     image = next(capture.frames()).images[0]
     mask = np.zeros(image.shape[:2], bool)
     mask[:, 160:] = True
     assert detect(image, mask).points[:, 0].min() > 158
 
 
-def test_points_are_triangulated_on_the_planes(capture: Capture, common: Common) -> None:
-    points, colors = triangulate(common.matches, common.features, capture.cameras)
+def test_triangulate__finds_points_on_the_planes(capture: Capture, shared: SharedFeatures) -> None:
+    points, colors = triangulate(shared.matches, shared.features, capture.cameras)
     assert points.dtype == colors.dtype == np.float32
     assert len(points) > 1000
-    # 0.1 px at 4 units, 277 px focal length and a base of 0.5 is 1 cm; occlusion edges make a few wrong.
+    # 0.1 px at 4 units, 277 px focal length and a base of 0.5 is 1 cm; a few points at occlusion edges are wrong.
     distance = textured.distance_to_planes(points)
     assert np.percentile(distance, 90) < 0.05
     assert np.percentile(distance, 98) < 0.3
-    # Their colours are those of the pixels that they project to.
+    # Their colours are those of the pixels onto which they project.
     camera, image = capture.cameras[2], next(capture.frames()).images[2]
-    x = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    u, v = (x[:, :2] / x[:, 2:] * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]).astype(int).T
-    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (x[:, 2] > 0)
+    pixels, depths = camera.project(points)
+    u, v = pixels.astype(int).T
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (depths > 0)
     assert np.median(np.abs(image[v[inside], u[inside]] / 255 - colors[inside])) < 0.05
 
 
-def test_points_under_a_small_angle_are_left_out(capture: Capture, common: Common) -> None:
+def test_triangulate__leaves_out_points_with_a_small_angle(capture: Capture, shared: SharedFeatures) -> None:
     counts = [
-        len(triangulate(common.matches, common.features, capture.cameras, min_angle=angle)[0]) for angle in (1, 20, 60)
+        len(triangulate(shared.matches, shared.features, capture.cameras, min_angle=angle)[0]) for angle in (1, 20, 60)
     ]
     assert counts[0] > counts[1] > counts[2] == 0
 
 
-def test_points_of_a_capture_leave_the_held_out_view_alone(capture: Capture, common: Common) -> None:
-    found = triangulate_points(capture, common)
+def test_triangulate_points__ignores_the_held_out_view(capture: Capture, shared: SharedFeatures) -> None:
+    found = triangulate_points(capture, shared)
     assert len(found.points) == len(found.point_colors) > 1000
     held_out = replace(capture, test_view=3)
-    fewer = triangulate_points(held_out, common)
-    blind = Common(
-        tuple(detect(np.zeros((48, 64, 3), np.uint8)) if i == 3 else f for i, f in enumerate(common.features)),
-        tuple(match for match in common.matches if 3 not in match.views),
+    fewer = triangulate_points(held_out, shared)
+    blind = SharedFeatures(
+        tuple(detect(np.zeros((48, 64, 3), np.uint8)) if i == 3 else f for i, f in enumerate(shared.features)),
+        tuple(match for match in shared.matches if 3 not in match.views),
     )
     np.testing.assert_array_equal(fewer.points, triangulate_points(held_out, blind).points)
     assert len(fewer.points) < len(found.points)
     wrong = with_cameras(capture, lambda i, c: replace(c, viewmat=FLIP @ c.viewmat))
-    assert len(triangulate_points(wrong, common).points) == 0
+    assert len(triangulate_points(wrong, shared).points) == 0
 
 
-def test_a_lens_that_is_undone_fits_and_one_that_is_ignored_does_not(tmp_path: Path) -> None:
-    """The recorded picture is bent by OpenCV's own model; only reading the lens makes the poses fit."""
+def test_check_rig__fits_with_undistortion_only(tmp_path: Path) -> None:
+    """The recorded images are distorted by OpenCV's own model; the poses fit only if the lens is read."""
     planes, k1 = textured.textures(), -0.25
     cameras = textured.rig(4)
     for camera in cameras:
@@ -255,7 +282,7 @@ def test_a_lens_that_is_undone_fits_and_one_that_is_ignored_does_not(tmp_path: P
     assert errors[1] > 5 * errors[0]
 
 
-def test_info_prints_the_check_and_draws_the_rig(capture: Capture, tmp_path: Path, capsys) -> None:
+def test_info_command__prints_the_check_and_draws_the_rig(capture: Capture, tmp_path: Path, capsys) -> None:
     plot = tmp_path / "new" / "rig.png"
     before = {file: file.stat().st_mtime_ns for file in capture.path.rglob("*")}
     assert cli.main(["info", str(capture.path), "--plot", str(plot)]) == 0
@@ -263,18 +290,18 @@ def test_info_prints_the_check_and_draws_the_rig(capture: Capture, tmp_path: Pat
     assert "COLMAP" in out
     assert "1 frames at 30 fps, without points (" in out
     assert "Reprojection check: median 0.0" in out
-    assert "in 15 pairs; the poses fit the pictures." in out
+    assert "in 15 pairs; the poses fit the images." in out
     image = cv2.imread(str(plot))
     assert image.shape == (760, 1440, 3)
     assert {file: file.stat().st_mtime_ns for file in capture.path.rglob("*")} == before
     assert cli.main(["info", str(capture.path), "--no-check"]) == 0
     assert "Reprojection" not in capsys.readouterr().out
     assert cli.main(["info", str(capture.path), "--plot", str(tmp_path / "rig.pdf")]) == 1
-    assert "must be called .png or .jpg, got '.pdf'" in capsys.readouterr().err
+    assert "the suffix of a plot must be .png or .jpg, got '.pdf'" in capsys.readouterr().err
 
 
-def test_the_rig_is_drawn_where_it_stands() -> None:
-    """Cameras on a line: from above they lie side by side, the held-out one in red."""
+def test_draw_rig__draws_cameras_at_their_positions() -> None:
+    """Cameras on a line lie side by side seen from above; the held-out one is red."""
     cameras = [Camera.look_at((x, 0, 0), (x, 0, 5), (0, -1, 0), 60, 64, 48, "") for x in (-1.0, 0.0, 1.0)]
     points = np.array([[0.0, 0, 3], [1e6, 0, 0]])
     image = draw_rig(cameras, points, np.array([[0, 1.0, 0], [0, 1, 0]]), test_view=1).astype(int)
@@ -286,12 +313,12 @@ def test_the_rig_is_drawn_where_it_stands() -> None:
     assert others.max() > 520
     green = np.argwhere((above == (0, 255, 0)).all(-1))
     assert len(green)
-    assert green[:, 0].mean() < rows.min()  # ahead of the cameras, which look to the top
+    assert green[:, 0].mean() < rows.min()  # ahead of the cameras, which face the top
     assert abs(green[:, 1].mean() - 360) < 2
 
 
 @pytest.mark.parametrize("count", [1, 2, 8])
-def test_any_rig_can_be_drawn(count: int) -> None:
+def test_draw_rig__draws_any_rig(count: int) -> None:
     angles = 2 * np.pi * np.arange(count) / count
     cameras = [Camera.look_at((np.cos(a), np.sin(a), 0), (0, 0, 0), (0, 0, 1), 60, 64, 48, "c") for a in angles]
     image = draw_rig(cameras, np.zeros((0, 3)), np.zeros((0, 3)))

@@ -1,4 +1,4 @@
-"""Small captures in every layout, all of the same three cameras; frame t of camera i is filled with (i, t, 0)."""
+"""Small captures in every layout, all with the same three cameras; frame t of camera i is filled with (i, t, 0)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ WIDTH, HEIGHT, COUNT, FPS = 62, 46, 4, 25
 
 
 def rig(names: tuple[str, ...], shift: float = 0.0) -> list[Camera]:
-    """Cameras on a circle, each with another focal length, their principal points off the middle by `shift` px."""
+    """Return cameras on a circle with different focal lengths and principal points `shift` px off the centre."""
     views = [
         Camera.look_at((np.cos(i), np.sin(i), 0.5), (0, 0, 0), (0, 0, 1), 60 + i, WIDTH, HEIGHT, name)
         for i, name in enumerate(names)
@@ -37,7 +37,7 @@ def write_image(file: Path, i: int, t: int) -> None:
 
 
 def videos(path: Path, names: tuple[str, ...], suffix: str = ".mkv") -> None:
-    """Write .mkv, for what is left of it after a cut can still be read."""
+    """Write the clips as .mkv, which can still be read after truncation."""
     for i, name in enumerate(names):
         write_video(path / f"{name}{suffix}", frames(i), FPS)
 
@@ -70,7 +70,7 @@ def meet_room(path: Path, clips: Callable = videos) -> Path:
 
 
 def colmap_text(folder: Path, cameras: list[Camera], model: str, params: list[list[float]], shared: bool) -> None:
-    """Write a model whose cameras have the parameters `params`, the first for all of them if `shared`."""
+    """Write a model whose cameras have the parameters `params`; if `shared`, all have the first."""
     folder.mkdir(parents=True)
     rows = [
         f"{i + 1} {model} {WIDTH} {HEIGHT} {' '.join(map(repr, p))}"

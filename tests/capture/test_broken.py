@@ -1,4 +1,4 @@
-"""Broken captures in every layout: the sentence that the user gets, and nothing is written."""
+"""Broken captures in every layout: the error message, and that nothing is written."""
 
 from __future__ import annotations
 
@@ -14,91 +14,91 @@ from morgs_mi import cli
 from morgs_mi.io.video_writer import write_video
 from tests.capture import small_captures as layouts
 
-Spoil = Callable[[Path], object]
+Damage = Callable[[Path], object]
 
 
-# ---- what goes wrong with clips --------------------------------------------------------------------------
+# ---- damage to clips -------------------------------------------------------------------------------------
 
 
-def missing(name: str) -> Spoil:
+def missing(name: str) -> Damage:
     return lambda path: (path / name).unlink()
 
 
-def truncated(name: str) -> Spoil:
-    def spoil(path: Path) -> None:
+def truncated(name: str) -> Damage:
+    def damage(path: Path) -> None:
         data = (path / name).read_bytes()
         (path / name).write_bytes(data[: len(data) * 2 // 3])
 
-    return spoil
+    return damage
 
 
-def empty(name: str) -> Spoil:
+def empty(name: str) -> Damage:
     return lambda path: (path / name).write_bytes(b"")
 
 
-def headers_only(name: str) -> Spoil:
-    """Leave a video that has begun and holds no frame."""
+def headers_only(name: str) -> Damage:
+    """Cut a video after its headers, before the first frame."""
     return lambda path: (path / name).write_bytes((path / name).read_bytes()[:600])
 
 
-def shorter(name: str, i: int) -> Spoil:
+def shorter(name: str, i: int) -> Damage:
     return lambda path: write_video(path / name, layouts.frames(i, layouts.COUNT - 1), layouts.FPS)
 
 
-# ---- what goes wrong with calibrations -------------------------------------------------------------------
+# ---- damage to calibrations ------------------------------------------------------------------------------
 
 
-def rows(change: Callable[[np.ndarray], np.ndarray | None]) -> Spoil:
-    def spoil(path: Path) -> None:
+def rows(change: Callable[[np.ndarray], np.ndarray | None]) -> Damage:
+    def damage(path: Path) -> None:
         values = np.load(path / "poses_bounds.npy")
         changed = change(values)
         np.save(path / "poses_bounds.npy", values if changed is None else changed)
 
-    return spoil
+    return damage
 
 
-def entry(row: int, columns: slice | int, value: float) -> Spoil:
+def entry(row: int, columns: slice | int, value: float) -> Damage:
     def change(values: np.ndarray) -> None:
         values[row, columns] = value
 
     return rows(change)
 
 
-def replace(name: str, old: str, new: str) -> Spoil:
-    def spoil(path: Path) -> None:
+def replace(name: str, old: str, new: str) -> Damage:
+    def damage(path: Path) -> None:
         text = (path / name).read_text()
         assert old in text
         (path / name).write_text(text.replace(old, new, 1))
 
-    return spoil
+    return damage
 
 
-def quaternion(values: str) -> Spoil:
-    def spoil(path: Path) -> None:
+def quaternion(values: str) -> Damage:
+    def damage(path: Path) -> None:
         file = path / "sparse/0/images.txt"
         lines = file.read_text().splitlines()
         fields = lines[1].split()
         lines[1] = " ".join([fields[0], values, *fields[5:]])
         file.write_text("\n".join(lines) + "\n")
 
-    return spoil
+    return damage
 
 
-def transforms(change: Callable[[dict], object]) -> Spoil:
+def transforms(change: Callable[[dict], object]) -> Damage:
     return in_json("transforms.json", change)
 
 
-def meta(change: Callable[[dict], object]) -> Spoil:
+def meta(change: Callable[[dict], object]) -> Damage:
     return in_json("train_meta.json", change)
 
 
-def in_json(name: str, change: Callable[[dict], object]) -> Spoil:
-    def spoil(path: Path) -> None:
+def in_json(name: str, change: Callable[[dict], object]) -> Damage:
+    def damage(path: Path) -> None:
         values = json.loads((path / name).read_text())
         change(values)
         (path / name).write_text(json.dumps(values))
 
-    return spoil
+    return damage
 
 
 def pose(index: int, scale: float) -> Callable[[dict], None]:
@@ -121,12 +121,12 @@ def moving(values: dict) -> None:
     values["w2c"][2][values["cam_id"][2].index(10)][0][3] += 0.5
 
 
-def faster(name: str, i: int) -> Spoil:
+def faster(name: str, i: int) -> Damage:
     return lambda path: write_video(path / name, layouts.frames(i), 2 * layouts.FPS)
 
 
-def told(*options: str) -> Spoil:
-    """Spoil nothing but what `fit` is told."""
+def with_options(*options: str) -> Damage:
+    """Leave the capture alone and add command-line options of `fit`."""
     return lambda path: OPTIONS.extend(options)
 
 
@@ -144,13 +144,19 @@ POSES_BOUNDS = {
     "truncated clip": (truncated("cam11.mkv"), r"cam11.mkv: frame \d of 4 cannot be read: the file is truncated"),
     "shorter clip": (shorter("cam11.mkv", 2), "the same number of frames, got cam00.mkv 4, cam02.mkv 4, cam11.mkv 3"),
     "faster clip": (faster("cam11.mkv", 2), "frame rate, got cam00.mkv 25, cam02.mkv 25, cam11.mkv 50; .* --trim"),
-    "unknown offset": (told("--offset", "cam01", "2"), "--offset must name cameras of cam00, cam02, cam11, got cam01"),
-    "far offset": (told("--offset", "cam02", "9"), "no instant in common, cam00 0.00 to 0.16 s, cam02 -0.36 to -0.20"),
+    "unknown offset": (
+        with_options("--offset", "cam01", "2"),
+        "--offset must name cameras of cam00, cam02, cam11, got cam01",
+    ),
+    "far offset": (
+        with_options("--offset", "cam02", "9"),
+        "no instant in common, cam00 0.00 to 0.16 s, cam02 -0.36 to -0.20",
+    ),
     "unknown reference": (
-        told("--color", "linear", "--color-reference", "cam01"),
+        with_options("--color", "linear", "--color-reference", "cam01"),
         "--color-reference must be one of cam00, cam02, cam11, got 'cam01'",
     ),
-    "gaps and no clip": (lambda path: (empty("cam00.mkv")(path), told("--gaps")(path)), "got an empty file"),
+    "gaps and no clip": (lambda path: (empty("cam00.mkv")(path), with_options("--gaps")(path)), "got an empty file"),
     "empty clip": (empty("cam00.mkv"), "cam00.mkv: expected a video, got an empty file"),
     "clip of no frames": (headers_only("cam00.mkv"), "cam00.mkv: .* cannot decode one frame"),
 }
@@ -158,7 +164,7 @@ BY_FRAME = {
     "no image": (missing("frame000002/cam_2.png"), "frame000002/cam_2.png: expected an image, found none"),
     "no camera": (missing("frame000000/cam_10.png"), "got 3 rows for 4 videos"),
     "no image at all": (
-        lambda path: ([f.write_bytes(b"") for f in path.glob("frame*/cam_2.png")], told("--gaps")(path)),
+        lambda path: ([f.write_bytes(b"") for f in path.glob("frame*/cam_2.png")], with_options("--gaps")(path)),
         "frame000000/cam_2.png: expected an image, got 0 bytes",
     ),
     "no frame": (
@@ -219,7 +225,7 @@ DYNAMIC3DGS = {
     "other camera": (meta(lambda m: m["cam_id"][1].__setitem__(0, 7)), "frame 1: `cam_id` must name each camera of"),
     "NaN pose": (meta(lambda m: m["w2c"][1][0][0].__setitem__(0, NAN)), "frame 1: the pose must be finite"),
     "no rotation": (meta(stretch), "camera 1: the axes must be a right-handed orthonormal frame"),
-    "moving camera": (meta(moving), "camera 10: its pose in frame 2 must be that of frame 0, for cameras must not"),
+    "moving camera": (meta(moving), "camera 10: the pose in frame 2 must equal that in frame 0, as moving cam"),
     "no size": (meta(lambda m: m.update(w=0)), "`w` and `h` must be positive whole numbers"),
     "broken points": (truncated("init_pt_cld.npz"), "init_pt_cld.npz: expected an array `data`"),
     "truncated image": (empty("ims/1/000000.png"), "ims/1/000000.png: expected an image, got 0 bytes"),
@@ -239,17 +245,17 @@ CASES = [
 ]
 
 
-@pytest.mark.parametrize(("build", "spoil", "sentence"), CASES)
-def test_a_broken_capture_gets_one_sentence_and_nothing_is_written(
-    tmp_path: Path, capsys, build, spoil: Spoil, sentence: str
+@pytest.mark.parametrize(("build", "damage", "message"), CASES)
+def test_fit_command__reports_a_broken_capture_in_one_line_and_writes_nothing(
+    tmp_path: Path, capsys, build, damage: Damage, message: str
 ) -> None:
     path = build(tmp_path / "capture")
     OPTIONS.clear()
-    spoil(path)
+    damage(path)
     before = sorted(tmp_path.rglob("*"))
     status = cli.main(["fit", str(path), str(tmp_path / "out"), *OPTIONS])
     lines = [line for line in capsys.readouterr().err.splitlines() if line.strip() and "━" not in line]
     assert status == 1
     assert len(lines) == 1, lines
-    assert re.search(sentence, lines[0]), lines[0]
+    assert re.search(message, lines[0]), lines[0]
     assert sorted(tmp_path.rglob("*")) == before

@@ -1,4 +1,4 @@
-"""Whole capture folders: layouts, order, downscaling by reprojection, and broken ones."""
+"""Whole capture folders: layouts, order, downscaling, and broken ones."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def camera(i: int, name: str, width: int = WIDTH, shift: float = 0.0) -> Camera:
 
 
 def clip(value: int, count: int = COUNT, width: int = WIDTH) -> list[np.ndarray]:
-    """Frame t of camera `value` is filled with (value, t, 0)."""
+    """Return a clip whose frame t is filled with (value, t, 0)."""
     return [np.full((HEIGHT, width, 3), (value, t, 0), np.uint8) for t in range(count)]
 
 
@@ -45,7 +45,7 @@ def colmap(path: Path, names: tuple[str, ...] = ("cam01", "cam02"), **kwargs) ->
     return path
 
 
-def test_n3dv(tmp_path: Path) -> None:
+def test_load_capture__reads_n3dv(tmp_path: Path) -> None:
     capture = load_capture(n3dv(tmp_path))
     assert capture.names == ("cam00", "cam01", "cam02")
     assert (capture.num_frames, capture.fps, capture.test_view, capture.truth) == (COUNT, 30, None, None)
@@ -58,14 +58,14 @@ def test_n3dv(tmp_path: Path) -> None:
     assert [f.index for f in capture.frames(1, 2)] == [1]
 
 
-def test_cameras_are_ordered_by_number(tmp_path: Path) -> None:
+def test_load_capture__orders_cameras_by_number(tmp_path: Path) -> None:
     names = ("cam_0", "cam_2", "cam_10")
     capture = load_capture(n3dv(tmp_path, names))
     assert capture.names == names
     assert [image[0, 0, 0] for image in next(capture.frames()).images] == [0, 1, 2]
 
 
-def test_the_colmap_model_wins_and_is_ordered_by_number(tmp_path: Path) -> None:
+def test_load_capture__prefers_the_colmap_model_and_orders_it_by_number(tmp_path: Path) -> None:
     points = np.arange(6.0).reshape(2, 3)
     names = ("cam10", "cam2", "cam1")  # a model lists its images in any order
     colmap(tmp_path, names, points=points, point_colors=points / 5)
@@ -80,11 +80,11 @@ def test_the_colmap_model_wins_and_is_ordered_by_number(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("downscale", [2, 3, 4.5])
-def test_downscaling_moves_projections_with_the_pixels(tmp_path: Path, downscale: float) -> None:
+def test_load_capture__downscaling_moves_projections_with_the_pixels(tmp_path: Path, downscale: float) -> None:
     full = camera(0, "cam01", shift=3.0)
     write_colmap(tmp_path / "sparse", [full])
-    x, y, z = full.viewmat[:3, :3] @ (0.03, 0.05, 0.02) + full.viewmat[:3, 3]
-    u, v = full.K[0, 0] * x / z + full.K[0, 2], full.K[1, 1] * y / z + full.K[1, 2]
+    point = np.array([0.03, 0.05, 0.02])
+    u, v = full.project(point)[0]
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     blob = 250 * np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / 50)
     write_video(tmp_path / "cam01", [np.repeat(blob[..., None], 3, -1).astype(np.uint8)], 30)
@@ -96,11 +96,10 @@ def test_downscaling_moves_projections_with_the_pixels(tmp_path: Path, downscale
     assert image.shape == (small.height, small.width)
     rows, columns = np.mgrid[: small.height, : small.width] + 0.5
     centre = np.array([(image * columns).sum(), (image * rows).sum()]) / image.sum()
-    expected = (small.K @ (x / z, y / z, 1))[:2]
-    np.testing.assert_allclose(centre, expected, atol=0.05)
+    np.testing.assert_allclose(centre, small.project(point)[0], atol=0.05)
 
 
-def test_lenses_are_undone_and_masked(tmp_path: Path) -> None:
+def test_load_capture__undistorts_and_masks(tmp_path: Path) -> None:
     colmap(tmp_path, lenses=[Lens("SIMPLE_RADIAL", (0.3,)), Lens()])
     full, small = load_capture(tmp_path), load_capture(tmp_path, 2)
     assert (full.downscale, small.downscale) == (1, 2)
@@ -109,19 +108,19 @@ def test_lenses_are_undone_and_masked(tmp_path: Path) -> None:
     assert small.masks[0] is not None
     assert full.masks[0].shape == (HEIGHT, WIDTH)
     assert small.masks[0].shape == (HEIGHT // 2, WIDTH // 2)
-    # A small pixel is valid exactly where its four large ones are.
+    # A downscaled pixel is valid exactly where the four that it averages are.
     blocks = full.masks[0].reshape(HEIGHT // 2, 2, WIDTH // 2, 2).all(axis=(1, 3))
     np.testing.assert_array_equal(small.masks[0], blocks)
 
 
-def test_lossless_frames_are_preferred(tmp_path: Path) -> None:
+def test_load_capture__prefers_lossless_frames(tmp_path: Path) -> None:
     n3dv(tmp_path)
     write_video(tmp_path / "frames" / "cam01", clip(77), 30)
     images = next(load_capture(tmp_path).frames()).images
     assert [image[0, 0, 0] for image in images] == [0, 77, 2]
 
 
-def test_folders_of_frames_named_in_the_model(tmp_path: Path) -> None:
+def test_load_capture__reads_frame_folders_named_in_the_model(tmp_path: Path) -> None:
     names = ("cam01", "cam02")
     write_colmap(tmp_path / "sparse", [camera(i, f"{n}/0000.png") for i, n in enumerate(names)])
     for i, name in enumerate(names):
@@ -131,7 +130,7 @@ def test_folders_of_frames_named_in_the_model(tmp_path: Path) -> None:
     assert (capture.names, capture.fps) == (names, 24)
 
 
-def test_the_held_out_view(tmp_path: Path) -> None:
+def test_load_capture__selects_the_held_out_view(tmp_path: Path) -> None:
     n3dv(tmp_path, tuple(f"cam{i:02}" for i in range(6)))
     capture = load_capture(tmp_path)
     assert capture.test_view == 0
@@ -144,14 +143,14 @@ def test_the_held_out_view(tmp_path: Path) -> None:
     assert load_capture(tmp_path).test_view is None
 
 
-def test_truth_and_max_frames(tmp_path: Path) -> None:
+def test_load_capture__finds_truth_and_limits_frames(tmp_path: Path) -> None:
     (n3dv(tmp_path) / "truth").mkdir()
     capture = load_capture(tmp_path, max_frames=2)
     assert capture.truth == tmp_path / "truth"
     assert capture.num_frames == len(list(capture.frames())) == 2
 
 
-def test_a_clip_without_calibration_is_left_out_with_a_warning(
+def test_load_capture__leaves_out_uncalibrated_clips_with_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     write_video(colmap(tmp_path) / "cam03.mp4", clip(3), 30)
@@ -210,7 +209,7 @@ def broken_settings(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "error", "message"),
+    ("damage", "error", "message"),
     [
         (no_folder, FileNotFoundError, "expected a capture folder, found none"),
         (no_videos, FileNotFoundError, r"expected videos \(.mp4"),
@@ -223,7 +222,7 @@ def broken_settings(path: Path) -> None:
         (
             other_size,
             ValueError,
-            "cam02.mp4: expected 62x46 as the calibration of cam02 says, or that scaled, got 60x46",
+            "cam02.mp4: expected 62x46, the calibrated size of cam02, or a scaled version of it, got 60x46",
         ),
         (other_length, ValueError, "got cam01.mp4 3, cam02.mp4 5; .*max_frames=3"),
         (other_rate, ValueError, "the same frame rate, got cam01.mp4 30, cam02.mp4 60; .*--trim"),
@@ -238,9 +237,9 @@ def broken_settings(path: Path) -> None:
         (broken_settings, ValueError, "capture.json: expected JSON"),
     ],
 )
-def test_broken_captures(tmp_path: Path, spoil, error: type[Exception], message: str) -> None:
+def test_load_capture__refuses_broken_captures(tmp_path: Path, damage, error: type[Exception], message: str) -> None:
     path = colmap(tmp_path / "capture")
-    spoil(path)
+    damage(path)
     with pytest.raises(error, match=message):
         load_capture(path)
 
@@ -255,7 +254,7 @@ def test_broken_captures(tmp_path: Path, spoil, error: type[Exception], message:
         ({"test_view": -1}, r"`test_view` must be in 0..1, or None .* got -1"),
     ],
 )
-def test_bad_arguments(tmp_path: Path, arguments: dict, message: str) -> None:
+def test_load_capture__refuses_bad_arguments(tmp_path: Path, arguments: dict, message: str) -> None:
     path = colmap(tmp_path)
     with pytest.raises(ValueError, match=message):
         load_capture(path, **arguments)

@@ -1,4 +1,4 @@
-"""The examples of docs/captures.md are read as it says."""
+"""The examples in docs/captures.md are read as the page describes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ TEXT = (Path(__file__).parents[2] / "docs" / "captures.md").read_text(encoding="
 TRANSFORMS, META = re.findall(r"```json\n(.*?)```", TEXT, re.DOTALL)
 
 
-def test_the_example_of_nerfstudio(tmp_path: Path) -> None:
+def test_captures_page__nerfstudio_example_is_read_as_described(tmp_path: Path) -> None:
     (tmp_path / "transforms.json").write_text(TRANSFORMS)
     PlyData([PlyElement.describe(np.array([(1, 2, 3)], [(a, "f4") for a in "xyz"]), "vertex")]).write(
         str(tmp_path / "points.ply")
@@ -29,12 +29,12 @@ def test_the_example_of_nerfstudio(tmp_path: Path) -> None:
     np.testing.assert_allclose(forward, (0, 1, 0), atol=1e-12)
     np.testing.assert_allclose(-down, (0, 0, 1), atol=1e-12)
     np.testing.assert_allclose(right, (1, 0, 0), atol=1e-12)
-    assert capture.record()["cameras"][0]["distortion"] == [-0.05, 0.01, 0, 0]
+    assert capture.metadata()["cameras"][0]["distortion"] == [-0.05, 0.01, 0, 0]
     np.testing.assert_array_equal(capture.points, [[1, 2, 3]])
     np.testing.assert_array_equal(capture.point_colors, [[0.5, 0.5, 0.5]])
 
 
-def test_the_example_of_dynamic_3d_gaussians(tmp_path: Path) -> None:
+def test_captures_page__dynamic_3d_gaussians_example_is_read_as_described(tmp_path: Path) -> None:
     (tmp_path / "train_meta.json").write_text(META)
     names = [name for row in json.loads(META)["fn"] for name in row]
     write_video(tmp_path / "ims" / "1", [np.zeros((360, 640, 3), np.uint8)] * 2, 30)

@@ -32,60 +32,61 @@ def dots(centres: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_a_point_seen_through_the_lens_lands_where_the_pinhole_says(model: str) -> None:
+def test_undistortion__moves_points_to_their_pinhole_projections(model: str) -> None:
     cam, lens = camera(), Lens(model, LENSES[model])
     points = np.array([[x, y, 2.0] for x in (-0.9, -0.1, 0.8) for y in (-0.7, 0.05, 0.6)])
     K = cam.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
     zero, coefficients = np.zeros(3), lens.opencv_coefficients
     if model == "OPENCV_FISHEYE":
-        seen, _ = cv2.fisheye.projectPoints(points[:, None], zero, zero, K, coefficients)
+        distorted, _ = cv2.fisheye.projectPoints(points[:, None], zero, zero, K, coefficients)
     else:
-        seen, _ = cv2.projectPoints(points, zero, zero, K, coefficients)
-    expected = (points @ cam.K.T)[:, :2] / 2
-    shift = np.abs(seen[:, 0] + 0.5 - expected).max()
+        distorted, _ = cv2.projectPoints(points, zero, zero, K, coefficients)
+    expected, _ = cam.project(points)
+    shift = np.abs(distorted[:, 0] + 0.5 - expected).max()
     assert shift > 1, "the case must bend rays by more than a pixel"
 
-    undo = undistortion(cam, lens)
-    assert undo is not None
-    image = undo(dots(seen[:, 0] + 0.5)).astype(float)[..., 0]
+    found = undistortion(cam, lens)
+    assert found is not None
+    image = found(dots(distorted[:, 0] + 0.5)).astype(float)[..., 0]
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     for u, v in expected:
         near = image * ((np.abs(x - u) < 7) & (np.abs(y - v) < 7))
         centre = np.array([(near * x).sum(), (near * y).sum()]) / near.sum()
-        # 1/32 px of the maps, and the blob's own bending.
+        # 1/32 px of the maps, and the distortion of the blob itself.
         np.testing.assert_allclose(centre, (u, v), atol=0.15)
 
 
-def test_no_distortion_needs_no_maps() -> None:
+def test_undistortion__is_none_without_distortion() -> None:
     assert undistortion(camera(), Lens()) is None
     assert undistortion(camera(), Lens("OPENCV", (0.0, 0.0, 0.0, 0.0))) is None
 
 
-def test_the_mask_marks_what_a_pincushion_leaves_empty() -> None:
-    undo = undistortion(camera(), Lens("SIMPLE_RADIAL", (0.3,)))
-    assert undo is not None
-    assert undo.mask.shape == (HEIGHT, WIDTH)
-    assert undo.mask.dtype == bool
-    assert undo.mask[HEIGHT // 2, WIDTH // 2]
-    assert not undo.mask[0, 0]
+def test_undistortion__masks_the_empty_corners_of_a_pincushion() -> None:
+    pincushion = undistortion(camera(), Lens("SIMPLE_RADIAL", (0.3,)))
+    assert pincushion is not None
+    assert pincushion.mask.shape == (HEIGHT, WIDTH)
+    assert pincushion.mask.dtype == bool
+    assert pincushion.mask[HEIGHT // 2, WIDTH // 2]
+    assert not pincushion.mask[0, 0]
     barrel = undistortion(camera(), Lens("SIMPLE_RADIAL", (-0.1,)))
     assert barrel is not None
     assert barrel.mask.all()
 
 
 @pytest.mark.parametrize(("model", "fold"), [("SIMPLE_RADIAL", (3 * 0.5) ** -0.5), ("OPENCV_FISHEYE", None)])
-def test_the_mask_ends_where_the_lens_model_turns_back(model: str, fold: float | None) -> None:
-    """R (1 - 0.5 r^2) falls beyond r = 0.816; theta (1 - 0.5 theta^2) beyond that angle, whose tangent is 1.066."""
+def test_undistortion__mask_ends_where_the_polynomial_folds(model: str, fold: float | None) -> None:
+    """R (1 - 0.5 r^2) decreases beyond r = 0.816; theta (1 - 0.5 theta^2) beyond that angle, whose tangent is 1.066."""
     radius = fold or np.tan((3 * 0.5) ** -0.5)
     cam = camera(focal=60.0)
-    undo = undistortion(cam, Lens(model, (-0.5,)))
-    assert undo is not None
+    found = undistortion(cam, Lens(model, (-0.5,)))
+    assert found is not None
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    r = np.hypot((columns - cam.K[0, 2]) / cam.K[0, 0], (rows - cam.K[1, 2]) / cam.K[1, 1])
+    x, y, _ = np.moveaxis(cam.unproject(np.stack([columns, rows], -1), np.ones((HEIGHT, WIDTH))), -1, 0)
+    r = np.hypot(x, y)
     assert r.max() > 1.2 * radius
     pixel = 1.5 / cam.K[0, 0]
-    assert undo.mask[r < radius - pixel].all()
-    assert not undo.mask[r > radius + pixel].any()
+    assert found.mask[r < radius - pixel].all()
+    assert not found.mask[r > radius + pixel].any()
 
 
 @pytest.mark.parametrize(
@@ -95,6 +96,6 @@ def test_the_mask_ends_where_the_lens_model_turns_back(model: str, fold: float |
         ("OPENCV", (1, 2, 3, 4), "OPENCV takes 8 parameters, got 4"),
     ],
 )
-def test_bad_input(model: str, params: tuple[float, ...], message: str) -> None:
+def test_lens_and_intrinsics__refuses_bad_input(model: str, params: tuple[float, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         lens_and_intrinsics(model, params)

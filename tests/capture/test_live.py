@@ -1,4 +1,4 @@
-"""Live sources: iterators, pipes, whatever FFmpeg opens; seen as the rig's clips are, and fed to the loop."""
+"""Live sources: iterators, pipes and anything that FFmpeg opens, processed like the rig's clips, in a loop."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NAMES = ("cam1", "cam2", "cam3")
 
 @pytest.fixture
 def rig(tmp_path: Path) -> Capture:
-    """Three cameras, the second with a lens, halved."""
+    """Three cameras at half size, the second with lens distortion."""
     lenses = [Lens(), Lens("SIMPLE_RADIAL", (0.2,)), Lens()]
     write_colmap(tmp_path / "rig/sparse/0", layouts.rig(NAMES), lenses=lenses)
     for name in NAMES:
@@ -45,14 +45,14 @@ def assert_as_recorded(rig: Capture, frames) -> None:
             np.testing.assert_array_equal(a, b)
 
 
-def test_an_iterator_a_pipe_and_a_file_are_seen_as_the_clips_are(rig: Capture, tmp_path: Path) -> None:
+def test_live_frames__process_iterators_pipes_and_files_like_clips(rig: Capture, tmp_path: Path) -> None:
     np.array(clip()).tofile(tmp_path / "raw")
     program = f"import sys; sys.stdout.buffer.write(open({str(tmp_path / 'raw')!r}, 'rb').read())"
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as process:
         assert_as_recorded(rig, live_frames(rig, [iter(clip()), process.stdout, rig.path / "cam3.mkv"]))
 
 
-def test_a_named_pipe_is_read_while_it_is_written(rig: Capture, tmp_path: Path) -> None:
+def test_live_frames__read_a_named_pipe_while_it_is_written(rig: Capture, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     data = (rig.path / "cam1.mkv").read_bytes()
     writer = threading.Thread(target=(tmp_path / "pipe").write_bytes, args=(data,), daemon=True)
@@ -61,14 +61,14 @@ def test_a_named_pipe_is_read_while_it_is_written(rig: Capture, tmp_path: Path) 
     writer.join(timeout=5)
 
 
-def test_a_source_that_misses_an_instant_or_ends_is_left_out(rig: Capture) -> None:
+def test_live_frames__leave_out_a_source_that_misses_an_instant_or_ends(rig: Capture) -> None:
     a, b, c = clip()
     frames = list(live_frames(rig, [[a, None, c], [a, b], clip()]))
     assert [[image is not None for image in frame.images] for frame in frames] == [[1, 1, 1], [0, 1, 1], [1, 0, 1]]
-    assert [frame.problems for frame in frames] == [(), ("cam1: no picture",), ("cam2: no picture",)]
+    assert [frame.problems for frame in frames] == [(), ("cam1: no image",), ("cam2: no image",)]
 
 
-def test_an_endless_source_is_taken_as_it_comes(rig: Capture) -> None:
+def test_live_frames__read_an_endless_source(rig: Capture) -> None:
     def endless():
         while True:
             yield clip()[0]
@@ -80,18 +80,18 @@ def test_an_endless_source_is_taken_as_it_comes(rig: Capture) -> None:
     ("sources", "error", "message"),
     [
         ([[]], ValueError, r"`sources` must be one for each of 3 cameras \(cam1, cam2, cam3\), got 1"),
-        ([63, [], []], OSError, "the source 63 cannot be opened; check that it is there and not in use"),
+        ([63, [], []], OSError, "the source 63 cannot be opened; check that it exists and is not in use"),
         ([[], [], "/nowhere/cam.sdp"], OSError, "the source /nowhere/cam.sdp cannot be opened"),
         ([[np.zeros((8, 8, 3), np.uint8)], [], []], ValueError, r"of cam1 must be uint8 \[46, 62, 3\] as in its clip"),
     ],
 )
-def test_bad_sources_get_a_sentence(rig: Capture, sources, error, message: str) -> None:
+def test_live_frames__refuse_bad_sources(rig: Capture, sources, error, message: str) -> None:
     with pytest.raises(error, match=message):
         list(live_frames(rig, sources))
 
 
-def test_the_example_of_the_page_runs(rig: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    """docs/captures.md: a loop over live frames, with raw pipes in place of FFmpeg's."""
+def test_captures_page__live_example_runs(rig: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop over live frames in docs/captures.md, with raw pipes in place of FFmpeg's."""
     text = (Path(__file__).parents[2] / "docs" / "captures.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     reads, pushed = iter(NAMES), []

@@ -1,4 +1,4 @@
-"""Clips that do not fit each other: other lengths, rates and beginnings, and pictures that are missing."""
+"""Clips with different lengths, rates and starts, and missing images."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from tests.capture import small_captures as layouts
 
 
 def capture_of(path: Path, clips: dict[str, tuple[int, float]]) -> Path:
-    """Write clips of so many frames at such a rate; frame t of camera i is filled with (i, t, 0)."""
+    """Write clips given by number of frames and frame rate; frame t of camera i is filled with (i, t, 0)."""
     layouts.n3dv(path, tuple(clips), lambda *_: None)
     for i, (name, (count, fps)) in enumerate(clips.items()):
         write_video(path / f"{name}.mkv", layouts.frames(i, count), fps)
     return path
 
 
-def shown(capture: Capture) -> list[list[int | None]]:
-    """Which frame of each clip the instants show, None where a picture is missing."""
+def frame_numbers(capture: Capture) -> list[list[int | None]]:
+    """Return per instant the frame of each clip, None for a missing image."""
     frames = capture.partial_frames()
     return [[None if image is None else int(image[0, 0, 1]) for image in frame.images] for frame in frames]
 
@@ -32,49 +32,49 @@ def shown(capture: Capture) -> list[list[int | None]]:
 @pytest.mark.parametrize(
     ("clips", "config", "fps", "instants"),
     [
-        # What all hold.
+        # The instants that both cover.
         ({"a": (4, 25), "b": (6, 25)}, ReadConfig(trim=True), 25, [[0, 0], [1, 1], [2, 2], [3, 3]]),
-        # b began two frames earlier and ends one frame before a.
+        # b started two frames earlier and ends one frame before a.
         ({"a": (4, 25), "b": (5, 25)}, ReadConfig(offset={"b": 2}), 25, [[0, 2], [1, 3], [2, 4]]),
-        # b began a frame later.
+        # b started a frame later.
         ({"a": (4, 25), "b": (4, 25)}, ReadConfig(offset={"b": -1}), 25, [[1, 0], [2, 1], [3, 2]]),
-        # b is twice as fast, and began three of its frames earlier.
+        # b has twice the rate; the second time it started three of its frames earlier.
         ({"a": (4, 25), "b": (8, 50)}, ReadConfig(trim=True), 25, [[0, 0], [1, 2], [2, 4], [3, 6]]),
         ({"a": (4, 25), "b": (8, 50)}, ReadConfig(offset={"b": 3}), 25, [[0, 3], [1, 5], [2, 7]]),
-        # 2 frames of a take 66.7 ms, in which b has 3.33: the nearest.
+        # 2 frames of a take 66.7 ms, which is 3.33 frames of b: the nearest is used.
         ({"a": (3, 30), "b": (6, 50)}, ReadConfig(trim=True), 30, [[0, 0], [1, 2], [2, 3]]),
-        # 29.97 and 30 are the same.
+        # 29.97 and 30 fps count as the same.
         ({"a": (2, 30), "b": (3, 29.97)}, ReadConfig(trim=True), 29.97, [[0, 0], [1, 1]]),
-        # With gaps nothing is trimmed: a is left out of what it lacks.
+        # With gaps nothing is trimmed: a is left out of the frames that it lacks.
         ({"a": (2, 25), "b": (3, 25)}, ReadConfig(gaps=True), 25, [[0, 0], [1, 1], [None, 2]]),
     ],
 )
-def test_clips_are_put_on_one_clock(tmp_path: Path, clips, config, fps, instants) -> None:
+def test_timeline__aligns_clips(tmp_path: Path, clips, config, fps, instants) -> None:
     capture = load_capture(capture_of(tmp_path / "c", clips), reading=config)
     assert capture.fps == pytest.approx(fps, abs=0.01)
     assert capture.num_frames == len(instants)
-    assert shown(capture) == instants
+    assert frame_numbers(capture) == instants
     assert [frame.index for frame in capture.partial_frames(1)] == list(range(1, len(instants)))
 
 
-def test_the_true_rate_and_the_number_of_frames_count_on_one_clock_too(tmp_path: Path) -> None:
+def test_timeline__uses_the_true_rate_and_the_frame_limit_for_aligned_clips(tmp_path: Path) -> None:
     path = capture_of(tmp_path / "c", {"a": (4, 25), "b": (6, 50)})
     (path / "capture.json").write_text('{"fps": 20}')
     capture = load_capture(path, max_frames=2, reading=ReadConfig(offset={"b": 1}))
-    assert (capture.fps, shown(capture)) == (20, [[0, 1], [1, 2]])
-    assert capture.record()["reading"]["offset"] == {"b": 1}
-    assert [camera["first_frame"] for camera in capture.record()["cameras"]] == [0, 1]
+    assert (capture.fps, frame_numbers(capture)) == (20, [[0, 1], [1, 2]])
+    assert capture.metadata()["reading"]["offset"] == {"b": 1}
+    assert [camera["first_frame"] for camera in capture.metadata()["cameras"]] == [0, 1]
 
 
-def test_pictures_that_are_not_of_one_instant_are_said_to_be_apart(tmp_path: Path, caplog) -> None:
+def test_timeline__warns_about_images_of_different_times(tmp_path: Path, caplog) -> None:
     path = capture_of(tmp_path / "c", {"a": (3, 30), "b": (6, 50)})
     with caplog.at_level(logging.WARNING):
         load_capture(path, reading=ReadConfig(trim=True))
-    # Instant 1 is b's 1.67th frame: a third of its 20 ms off the second.
-    assert "pictures up to 6.7 ms apart are taken" in caplog.text
+    # Instant 1 is b's 1.67th frame: a third of its 20 ms from the second.
+    assert "images of one instant are up to 6.7 ms apart" in caplog.text
 
 
-def test_truth_counts_from_the_first_frames_of_the_clips(tmp_path: Path) -> None:
+def test_timeline__keeps_truth_only_for_unshifted_clips(tmp_path: Path) -> None:
     path = capture_of(tmp_path / "c", {"a": (4, 25), "b": (6, 25)})
     (path / "truth").mkdir()
     assert load_capture(path, reading=ReadConfig(trim=True)).truth == path / "truth"
@@ -98,13 +98,13 @@ def test_truth_counts_from_the_first_frames_of_the_clips(tmp_path: Path) -> None
         ),
     ],
 )
-def test_what_does_not_fit_is_refused(tmp_path: Path, clips, config, message: str) -> None:
+def test_timeline__refuses_clips_that_do_not_match(tmp_path: Path, clips, config, message: str) -> None:
     path = capture_of(tmp_path / "c", clips)
     with pytest.raises(ValueError, match=message):
         load_capture(path, reading=config)
 
 
-def test_a_clip_that_was_cut_off_can_be_trimmed_or_left_out_but_not_shifted_into(tmp_path: Path) -> None:
+def test_timeline__truncated_clip_can_be_trimmed_or_left_out_but_not_shifted(tmp_path: Path) -> None:
     path = capture_of(tmp_path / "c", {"a": (6, 25), "b": (6, 25)})
     data = (path / "b.mkv").read_bytes()
     (path / "b.mkv").write_bytes(data[: len(data) * 2 // 3])
@@ -113,18 +113,18 @@ def test_a_clip_that_was_cut_off_can_be_trimmed_or_left_out_but_not_shifted_into
             load_capture(path, reading=config)
     held = load_capture(path, reading=ReadConfig(trim=True)).num_frames
     assert 0 < held < 6
-    assert shown(load_capture(path, reading=ReadConfig(trim=True))) == [[t, t] for t in range(held)]
+    assert frame_numbers(load_capture(path, reading=ReadConfig(trim=True))) == [[t, t] for t in range(held)]
     expected = [[t, t if t < held else None] for t in range(6)]
-    assert shown(load_capture(path, reading=ReadConfig(gaps=True))) == expected
+    assert frame_numbers(load_capture(path, reading=ReadConfig(gaps=True))) == expected
 
 
 def images(path: Path, names: Sequence[str] = ("cam_0", "cam_2", "cam_10")) -> Path:
-    """Three folders of images 0000.png ... 0003.png."""
+    """Write three folders of images 0000.png ... 0003.png."""
     return layouts.n3dv(path, tuple(names), layouts.folder_per_camera)
 
 
-def test_images_that_are_missing_or_broken_are_left_out(tmp_path: Path, caplog) -> None:
-    """By their numbers: the first one too, though it tells the size."""
+def test_partial_frames__leave_out_missing_and_broken_images(tmp_path: Path, caplog) -> None:
+    """Images are aligned by number; even the first, which determines the size, may be missing."""
     path = images(tmp_path / "c")
     (path / "cam_0" / "0000.png").unlink()
     (path / "cam_2" / "0002.png").write_bytes(b"no image")
@@ -132,7 +132,7 @@ def test_images_that_are_missing_or_broken_are_left_out(tmp_path: Path, caplog) 
     (tmp_path / "small" / "0000.png").rename(path / "cam_10" / "0003.png")
     capture = load_capture(path, reading=ReadConfig(gaps=True))
     with caplog.at_level(logging.WARNING):
-        assert shown(capture) == [[None, 0, 0], [1, 1, 1], [2, None, 2], [3, 3, None]]
+        assert frame_numbers(capture) == [[None, 0, 0], [1, 1, 1], [2, None, 2], [3, 3, None]]
     problems = [frame.problems for frame in capture.partial_frames()]
     assert [len(problem) for problem in problems] == [1, 0, 1, 1]
     assert "cam_0: " in problems[0][0]
@@ -141,16 +141,16 @@ def test_images_that_are_missing_or_broken_are_left_out(tmp_path: Path, caplog) 
     assert "frame 2: cam_2 is left out: " in caplog.text
 
 
-def test_images_that_lie_by_frame_may_be_missing_too(tmp_path: Path) -> None:
+def test_partial_frames__leave_out_missing_images_in_frame_folders(tmp_path: Path) -> None:
     path = layouts.meet_room(tmp_path / "c", layouts.folder_per_frame)
     (path / "frame000002/cam_2.png").unlink()
     capture = load_capture(path, reading=ReadConfig(gaps=True))
-    assert shown(capture) == [[0, 0, 0], [1, 1, 1], [2, None, 2], [3, 3, 3]]
+    assert frame_numbers(capture) == [[0, 0, 0], [1, 1, 1], [2, None, 2], [3, 3, 3]]
     with pytest.raises(FileNotFoundError, match=r"frame000002/cam_2.png: expected an image, found none; .* \(--gaps\)"):
         load_capture(path)
 
 
-def test_a_broken_image_stops_whoever_needs_all_of_them(tmp_path: Path) -> None:
+def test_frames__stop_at_a_broken_image(tmp_path: Path) -> None:
     path = images(tmp_path / "c")
     (path / "cam_2" / "0002.png").write_bytes(b"")
     frames = load_capture(path).frames()

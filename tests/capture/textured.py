@@ -1,4 +1,4 @@
-"""Pictures of textured planes from known cameras, drawn exactly by homographies."""
+"""Images of textured planes from known cameras, rendered exactly by homographies."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 
 _TEXTURE = 512
-# Corner, and the edges that span it; far ones first, for the near ones hide them.
+# Corner, and the edges that span it; far planes first, as near ones occlude them.
 _PLANES = (
     ((-4.0, -3.0, 6.0), (8.0, 0, 0), (0, 6.0, 0)),  # back wall
     ((-4.0, 1.5, 1.0), (8.0, 0, 0), (0, 0, 5.0)),  # floor (y points down)
@@ -20,7 +20,7 @@ _PLANES = (
 
 
 def rig(count: int = 6, width: int = 320, height: int = 240, shift: float = 0.0) -> list[Camera]:
-    """Cameras on an arc in front of the planes, `shift` px off the middle of their images."""
+    """Return cameras on an arc in front of the planes, with principal points `shift` px off the centre."""
     cameras = []
     for i, angle in enumerate(np.linspace(-0.35, 0.35, count)):
         place = (4.0 * np.sin(angle), -0.5 + 0.5 * np.cos(5 * i), 4.2 - 4.0 * np.cos(angle))
@@ -31,7 +31,7 @@ def rig(count: int = 6, width: int = 320, height: int = 240, shift: float = 0.0)
 
 
 def textures() -> list[np.ndarray]:
-    """One texture per plane, RGB uint8, with detail at several scales."""
+    """Return one texture per plane, RGB uint8, with detail at several scales."""
     rng = np.random.default_rng(0)
     found = []
     for _ in _PLANES:
@@ -42,28 +42,28 @@ def textures() -> list[np.ndarray]:
 
 
 def render(camera: Camera, planes: Sequence[np.ndarray]) -> np.ndarray:
-    """Draw the planes' textures as the camera sees them: RGB uint8 [H, W, 3]."""
+    """Return the image of the planes in a camera, RGB uint8 [H, W, 3]."""
     image = np.zeros((camera.height, camera.width, 3), np.uint8)
     R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV's pixel centres are integers
     for (corner, across, down), texture in zip(_PLANES, planes, strict=True):
         plane = np.stack([R @ across, R @ down, R @ corner + t], axis=1) @ np.diag([1 / _TEXTURE, 1 / _TEXTURE, 1])
         H = np.linalg.inv(centre) @ camera.K @ plane @ centre
-        # Twice as large and shrunk: less aliasing.
+        # Rendered at twice the size and downscaled, against aliasing.
         double = np.array([[2, 0, 0.5], [0, 2, 0.5], [0, 0, 1.0]])
         size = (2 * camera.width, 2 * camera.height)
-        seen = cv2.warpPerspective(texture, double @ H, size, flags=cv2.INTER_LINEAR)
+        warped = cv2.warpPerspective(texture, double @ H, size, flags=cv2.INTER_LINEAR)
         cover = cv2.warpPerspective(
             np.full(texture.shape[:2], 255, np.uint8), double @ H, size, flags=cv2.INTER_NEAREST
         )
         shrink = (camera.width, camera.height)
-        seen, cover = (cv2.resize(x, shrink, interpolation=cv2.INTER_AREA) for x in (seen, cover))
-        image[cover > 127] = seen[cover > 127]
+        warped, cover = (cv2.resize(x, shrink, interpolation=cv2.INTER_AREA) for x in (warped, cover))
+        image[cover > 127] = warped[cover > 127]
     return image
 
 
 def distance_to_planes(points: np.ndarray) -> np.ndarray:
-    """Return how far each point [n, 3] is from the nearest of the planes (taken as endless), world units."""
+    """Return the distance of each point [n, 3] from the nearest of the planes (taken as infinite), world units."""
     found = []
     for corner, across, down in _PLANES:
         normal = np.cross(across, down)

@@ -1,4 +1,4 @@
-"""Covariances, colours and turned axes, against the float64 twins and the renderer."""
+"""Covariances, colours and rotated axes, against the float64 reference and the renderer."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests import reference
 R = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
 
 
-def some(N: int = 30, degree: int = 3) -> Gaussians:
+def cloud(N: int = 30, degree: int = 3) -> Gaussians:
     rng = np.random.default_rng(degree)
     return Gaussians(
         rng.uniform(-1, 1, (N, 3)),
@@ -30,16 +30,16 @@ def some(N: int = 30, degree: int = 3) -> Gaussians:
     )
 
 
-def test_covariances_are_those_of_the_twin():
-    raw, found = some().numpy(), covariances(some())
+def test_covariances__agree_with_the_reference():
+    raw, found = cloud().numpy(), covariances(cloud())
     for log_scale, quat, covariance in zip(raw["log_scales"], raw["quats"].astype(float), found, strict=True):
         M = reference.rotation(quat) * np.exp(log_scale)
         np.testing.assert_allclose(covariance, M @ M.T, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_harmonics_and_colours_are_those_of_the_twin(degree):
-    gaussians, eye = some(degree=degree), np.array([0.2, 0.1, -4])
+def test_colors_seen_from__agree_with_the_reference(degree):
+    gaussians, eye = cloud(degree=degree), np.array([0.2, 0.1, -4])
     raw = gaussians.numpy()
     directions = raw["means"] - eye
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -50,15 +50,15 @@ def test_harmonics_and_colours_are_those_of_the_twin(degree):
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_a_turned_world_looks_the_same_to_a_turned_camera(degree):
+def test_rotated__looks_the_same_to_a_rotated_camera(degree):
     camera = Camera.look_at((0.2, 0.1, -4), (0, 0, 0), (0, -1, 0), 45, 48, 40)
     turn = np.eye(4)
     turn[:3, :3] = R.T
     turned = replace(camera, viewmat=camera.viewmat @ turn)
-    gaussians, channels = some(degree=degree), ("color", "motion", "depth", "confidence")
+    gaussians, channels = cloud(degree=degree), ("color", "motion", "depth", "confidence")
     a, b = rasterize(gaussians, camera, channels), rasterize(rotated(gaussians, R), turned, channels)
     vectors = replace(gaussians, offset=gaussians.motion)
     np.testing.assert_array_equal(rotated(vectors, R).offset, rotated(vectors, R).motion)
     for name in channels:
-        # Turning rounds every attribute once in float32; where depths nearly agree nothing may swap on these seeds.
+        # A rotation rounds every attribute once in float32; nearly equal depths do not swap on these seeds.
         np.testing.assert_allclose(np.array(getattr(b, name)), np.array(getattr(a, name)), atol=2e-4, err_msg=name)

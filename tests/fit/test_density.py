@@ -1,4 +1,4 @@
-"""Density control: the right ones are born and die, in the agreed order, and the optimiser remembers the rest."""
+"""Density control: which Gaussians are added and pruned, their order, and the state of the optimiser."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.fit.config import DensityConfig
 from morgs_mi.fit.density import DensityPlan, apply_plan, plan_additions, plan_growth, resize_optimizer
 from morgs_mi.fit.optimise import adam, values_of
-from morgs_mi.losses.attribution import NOISE_TOLERANCE, DensificationScores, densification_scores
+from morgs_mi.losses.attribution import DensificationScores, densification_scores
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 
 CONFIG = DensityConfig(max_gaussians=100, split_scale=0.1, min_opacity=0.005, births=1.0)
 
 
-def some(n=6, opacity=0.6, scale=0.05):
+def cloud(n=6, opacity=0.6, scale=0.05):
     rng = np.random.default_rng(0)
     return Gaussians.from_activated(
         rng.uniform(-1, 1, (n, 3)),
@@ -32,7 +32,7 @@ def some(n=6, opacity=0.6, scale=0.05):
     )
 
 
-def need(error, weight=None):
+def scores(error, weight=None):
     return DensificationScores(
         np.asarray(error, float), np.ones(len(error)) if weight is None else np.asarray(weight, float)
     )
@@ -40,41 +40,41 @@ def need(error, weight=None):
 
 def growth(gaussians, error):
     n = len(gaussians)
-    return plan_growth(gaussians, need(error), n, 2 * n, 10.0, CONFIG, np.random.default_rng(1))
+    return plan_growth(gaussians, scores(error), n, 2 * n, 10.0, CONFIG, np.random.default_rng(1))
 
 
 def additions(gaussians, error, weight=None, **settings):
     config = dataclasses.replace(CONFIG, **settings)
-    return plan_additions(gaussians, need(error, weight), config, np.random.default_rng(1))
+    return plan_additions(gaussians, scores(error, weight), config, np.random.default_rng(1))
 
 
-def test_survivors_come_first_and_births_last():
-    faint = dataclasses.replace(some(), logit_opacities=np.array([1, -9, 1, 1, -9, 1.0]))
+def test_plan_additions__survivors_come_first_and_births_last():
+    faint = dataclasses.replace(cloud(), logit_opacities=np.array([1, -9, 1, 1, -9, 1.0]))
     found = additions(faint, [0, 9, 5, 1, 8, 3], births=1 / 3)
     assert found.source.tolist() == [0, 2, 3, 5, -1, -1]
-    assert found.parent.tolist() == [0, 2, 3, 5, 2, 5]  # the neediest of those who live
+    assert found.parent.tolist() == [0, 2, 3, 5, 2, 5]  # the survivors with the largest error
 
 
 @pytest.mark.parametrize(("births", "limit", "expected"), [(0, 100, 6), (0.5, 100, 9), (1, 100, 12), (1, 8, 8)])
-def test_births_stay_within_the_budget_and_the_bound(births, limit, expected):
-    assert len(additions(some(), np.arange(1, 7), births=births, max_gaussians=limit).source) == expected
+def test_plan_additions__births_stay_within_budget_and_limit(births, limit, expected):
+    assert len(additions(cloud(), np.arange(1, 7), births=births, max_gaussians=limit).source) == expected
 
 
-def test_at_the_bound_those_who_cover_least_make_room():
-    found = additions(some(), [0, 1, 2, 3, 4, 5], [3, 9, 1, 2, 9, 0], births=1 / 3, max_gaussians=6)
-    assert found.source.tolist() == [0, 1, 4, 5, -1, -1]  # parents stay, however little they cover
+def test_plan_additions__prunes_the_least_visible_at_the_limit():
+    found = additions(cloud(), [0, 1, 2, 3, 4, 5], [3, 9, 1, 2, 9, 0], births=1 / 3, max_gaussians=6)
+    assert found.source.tolist() == [0, 1, 4, 5, -1, -1]  # parents survive, however little they cover
     assert found.parent[-2:].tolist() == [4, 5]
-    beyond = additions(some(), [0, 1, 2, 3, 4, 5], births=1 / 3, max_gaussians=3)
-    assert (beyond.num_births, beyond.num_survivors) == (2, 4)  # no more die than are born
+    beyond = additions(cloud(), [0, 1, 2, 3, 4, 5], births=1 / 3, max_gaussians=3)
+    assert (beyond.num_births, beyond.num_survivors) == (2, 4)  # no more are pruned than added
 
 
-def test_nobody_is_born_where_all_is_well_and_somebody_always_stays():
-    assert additions(some(), np.full(6, CONFIG.min_error)).num_births == 0
-    assert additions(some(opacity=1e-4), np.zeros(6)).num_survivors == 6
+def test_plan_additions__adds_none_without_error_and_never_prunes_all():
+    assert additions(cloud(), np.full(6, CONFIG.min_error)).num_births == 0
+    assert additions(cloud(opacity=1e-4), np.zeros(6)).num_survivors == 6
 
 
-def test_narrow_ones_are_cloned_and_cover_together_what_one_did():
-    before = some(scale=0.05)
+def test_plan_growth__clones_small_gaussians_with_the_same_coverage():
+    before = cloud(scale=0.05)
     after = apply_plan(before, growth(before, [0, 0, 0, 0, 0, 1]))
     o, scales = np.asarray(after.opacities), np.asarray(after.scales)
     assert 1 - (1 - o[5]) * (1 - o[6]) == pytest.approx(0.6, rel=1e-5)
@@ -82,8 +82,8 @@ def test_narrow_ones_are_cloned_and_cover_together_what_one_did():
     assert scales[6] == pytest.approx(np.asarray(before.scales)[5], rel=1e-5)
 
 
-def test_wide_ones_are_split_and_survivors_stay_where_they_are():
-    before = some(scale=1.0)
+def test_plan_growth__splits_large_gaussians_and_keeps_means():
+    before = cloud(scale=1.0)
     after = apply_plan(before, growth(before, [0, 0, 0, 0, 0, 1]))
     assert np.asarray(after.scales)[5:] == pytest.approx(np.tile([1, 2, 3], (2, 1)) / 1.6, rel=1e-5)
     assert np.asarray(after.opacities) == pytest.approx(np.full(7, 0.6), rel=1e-5)
@@ -91,8 +91,8 @@ def test_wide_ones_are_split_and_survivors_stay_where_they_are():
     assert np.asarray(after.logit_confidence)[6] == 5
 
 
-def test_additions_are_faint_and_leave_their_parents_alone():
-    before = some(scale=1.0)
+def test_plan_additions__births_are_faint_and_parents_unchanged():
+    before = cloud(scale=1.0)
     after = apply_plan(before, additions(before, [0, 0, 0, 0, 0, 1], birth_opacity=0.1))
     for name, value in after.numpy().items():
         assert np.array_equal(value[:6], before.numpy()[name]), name
@@ -100,17 +100,17 @@ def test_additions_are_faint_and_leave_their_parents_alone():
     assert np.asarray(after.scales)[6] == pytest.approx(np.array([1, 2, 3]) / 1.6, rel=1e-5)
 
 
-def test_opaque_parents_have_finite_children():
-    before = dataclasses.replace(some(), logit_opacities=np.full(6, 40.0))
+def test_density_plan__opaque_parents_have_finite_births():
+    before = dataclasses.replace(cloud(), logit_opacities=np.full(6, 40.0))
     for found in (growth(before, np.ones(6)), additions(before, np.ones(6))):
         for name, value in apply_plan(before, found).numpy().items():
             assert np.isfinite(value).all(), name
 
 
-def test_births_are_drawn_from_their_parents_density():
-    """Whitened by the parent's axes, thousands of births have no mean and unit covariance."""
+def test_plan_growth__draws_births_from_the_parents_density():
+    """Whitened by the parent's axes, thousands of births have zero mean and unit covariance."""
     n = 4000
-    one = some(1, scale=0.05)
+    one = cloud(1, scale=0.05)
     found = growth(one.select(np.zeros(n, int)), np.ones(n))
     w, x, y, z = (one.numpy()["quats"][0] / np.linalg.norm(one.numpy()["quats"][0])).astype(float)
     axes = np.array(
@@ -126,8 +126,8 @@ def test_births_are_drawn_from_their_parents_density():
     assert np.abs(np.cov(white.T) - np.eye(3)).max() < 0.1
 
 
-def test_optimiser_remembers_survivors_and_knows_nothing_of_births():
-    """After a plan that only adds and removes, survivors step as if nothing had happened."""
+def test_resize_optimizer__keeps_moments_of_survivors_only():
+    """After a plan that only adds and removes, survivors take the same steps as without it."""
     rng = np.random.default_rng(2)
     start, slope = rng.normal(size=(2, 6, 3)).astype(np.float32)
     found = DensityPlan(np.array([0, 2, 5, 2]), np.array([0, 2, 5, -1]))
@@ -150,8 +150,8 @@ def test_optimiser_remembers_survivors_and_knows_nothing_of_births():
     assert not np.array_equal(rebuilt[3], rebuilt[1])
 
 
-def test_edits_reach_the_parameters():
-    before = some()
+def test_resize_optimizer__applies_edits_to_the_parameters():
+    before = cloud()
     found = growth(before, np.ones(6))
     optimizer = adam({"means": before.means, "log_scales": before.log_scales})
     resize_optimizer(optimizer, found, found.edits)
@@ -160,7 +160,7 @@ def test_edits_reach_the_parameters():
         assert np.array_equal(np.asarray(value), np.asarray(getattr(after, name))), name
 
 
-def test_need_points_at_the_gaussian_that_is_wrong():
+def test_densification_scores__attribute_the_error_to_the_wrong_gaussian():
     camera = Camera.look_at((0, 0, -4), (0, 0, 0), (0, -1, 0), 40, 64, 48)
     x = np.linspace(-1, 1, 6)
     truth = Gaussians.from_activated(
@@ -177,11 +177,11 @@ def test_need_points_at_the_gaussian_that_is_wrong():
     found = densification_scores(wrong, [ActiveView(camera)], [Target(image)])
     assert found.error.argmax() == 4
     assert found.error[[0, 1, 2]].max() < 0.01 * found.error[4]
-    # w sums to the alpha of the whole picture
+    # the weights sum to the alpha of the whole image
     assert found.weight.sum() == pytest.approx(np.asarray(rasterize(wrong, camera, ("alpha",)).alpha).sum(), rel=1e-4)
     noisy = [Target(np.float32(image + rng.normal(0, 0.02, image.shape))) for rng in [np.random.default_rng(3)]]
     assert (
-        densification_scores(truth, [ActiveView(camera)], noisy, NOISE_TOLERANCE).error.max()
+        densification_scores(truth, [ActiveView(camera)], noisy, DensityConfig().noise_tolerance).error.max()
         < DensityConfig().min_error
     )
     hidden = np.ones((48, 64), bool)
@@ -199,6 +199,6 @@ def test_need_points_at_the_gaussian_that_is_wrong():
         ({"birth_opacity": 0.0}, "`birth_opacity` must lie between 0 and 1, got 0.0"),
     ],
 )
-def test_bad_settings_get_a_sentence(settings, message):
+def test_density_config__refuses_bad_settings(settings, message):
     with pytest.raises(ValueError, match=message):
         DensityConfig(**settings)

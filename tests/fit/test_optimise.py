@@ -1,4 +1,4 @@
-"""The optimisation loop: it converges, draws every view, and says when it breaks."""
+"""The optimisation loop: convergence, rates, order of the views, and losses that are not finite."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def bowl(values, view):
 
 
 @pytest.mark.parametrize("decay", [None, lambda step: 0.1 ** (step / 200)])
-def test_weights_decide_where_it_ends(decay):
+def test_optimise__minimises_the_weighted_sum(decay):
     start = {"x": mi.TensorXf(np.zeros(4, np.float32))}
     near = adam(start)
     losses = optimise(near, {"x": 0.1}, [0] * 200, bowl, {"far": 0.0}, decay)
@@ -27,8 +27,8 @@ def test_weights_decide_where_it_ends(decay):
     assert np.asarray(values_of(both)["x"]) == pytest.approx(np.full(4, 2.0), abs=0.02)
 
 
-def test_every_step_moves_by_about_the_rate():
-    """Adam's steps stay as long as the rate says, from the first to the last."""
+def test_optimise__steps_are_as_long_as_the_rate():
+    """Adam's steps have the length of the rate, from the first to the last."""
     start, path = {"x": mi.TensorXf(np.zeros(1, np.float32))}, []
 
     def slope(values, view):
@@ -39,13 +39,13 @@ def test_every_step_moves_by_about_the_rate():
     assert np.diff(path) == pytest.approx(np.full(11, -0.5), rel=1e-3)
 
 
-def test_broken_losses_are_named():
+def test_optimise__names_losses_that_are_not_finite():
     start = {"x": mi.TensorXf(np.zeros(1, np.float32))}
     with pytest.raises(FloatingPointError, match="recon are not finite after 3 steps"):
         optimise(adam(start), {"x": 1.0}, [0] * 3, lambda v, _: {"recon": dr.log(dr.sum(v["x"], axis=None) - 100)}, {})
 
 
-def test_stages_continue_where_the_last_one_ended():
+def test_optimise__continues_where_it_ended():
     """Twelve steps in one go and in two are the same steps."""
     ends = []
     for stages in ([12], [5, 7]):
@@ -57,8 +57,8 @@ def test_stages_continue_where_the_last_one_ended():
     assert np.array_equal(*ends)
 
 
-def test_a_parameter_that_widens_keeps_its_momentum():
-    """Columns that come in later start afresh; those that are there step as if nothing had happened."""
+def test_replace_parameter__keeps_moments():
+    """New columns start without moments; the others take the same steps as without them."""
     ends = []
     for widens in (False, True):
         optimizer = adam({"x": mi.TensorXf(np.zeros((2, 1), np.float32))})
@@ -73,7 +73,7 @@ def test_a_parameter_that_widens_keeps_its_momentum():
     assert 0 < ends[1][0, 1] < ends[1][0, 0]
 
 
-def test_views_are_drawn_without_repetition():
+def test_view_order__draws_without_repetition():
     order = view_order(5, 13, np.random.default_rng(0))
     assert len(order) == 13
     assert sorted(order[:5]) == sorted(order[5:10]) == list(range(5))

@@ -1,4 +1,4 @@
-"""Two frames in which a textured disc moves over a textured ground."""
+"""Two frames in which a textured disc moves over a textured background."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def moving_disc(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return I_{t-1}, I_t [H, W, 3] and the disc's mask [H, W] in frame t; `shift` is (x, y) in pixels."""
     rng = np.random.default_rng(seed)
-    ground, disc = texture(height, width, 1), texture(height, width, 2) * (1.0, 0.6, 0.4)
+    background, disc = texture(height, width, 1), texture(height, width, 2) * (1.0, 0.6, 0.4)
     y, x = np.mgrid[:height, :width]
     frames = []
     for dx, dy in ((0, 0), shift):
         mask = np.hypot(x - 0.4 * width - dx, y - 0.5 * height - dy) < 0.2 * height
-        frame = np.where(mask[..., None], np.roll(disc, (dy, dx), (0, 1)), ground)
+        frame = np.where(mask[..., None], np.roll(disc, (dy, dx), (0, 1)), background)
         frames.append(np.clip(frame + rng.normal(0, noise, frame.shape), 0, 1))
     return frames[0], frames[1], mask

@@ -1,4 +1,4 @@
-"""Who may change is told by all views together, and a frame that is fitted so is the frame that is fitted whole."""
+"""The active set: which Gaussians all views select, and that a frame fitted with it equals one fitted in full."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.fit.config import DensityConfig, FitConfig
-from morgs_mi.fit.later_frame import fit_later_frame
+from morgs_mi.fit.later_frame import FrameProblem, LaterFrame, fit_later_frame
 from morgs_mi.losses.ssim import Target
-from morgs_mi.method.active_set import find_active_set, full_active_set
+from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
 from morgs_mi.method.config import MotionConfig
 
 RENDER, EXTENT, V = RenderConfig(), 3.0, 5
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
-CHANNELS = [("color",)] * V
+CHANNELS = {view: ("color",) for view in range(V)}
 HIDDEN = 300  # the wall's Gaussians come first
 
 
-def cameras() -> list[Camera]:
+def cameras() -> dict[int, Camera]:
     angles = np.linspace(-0.6, 0.6, V)
-    return [Camera.look_at((4 * np.sin(a), -0.3, -4 * np.cos(a)), (0, 0, 0), (0, -1, 0), 40, 128, 96) for a in angles]
+    origins = [(4 * np.sin(a), -0.3, -4 * np.cos(a)) for a in angles]
+    return {view: Camera.look_at(o, (0, 0, 0), (0, -1, 0), 40, 128, 96) for view, o in enumerate(origins)}
 
 
 def scene(shift=0.0, colors=None) -> Gaussians:
@@ -40,8 +41,14 @@ def scene(shift=0.0, colors=None) -> Gaussians:
     )
 
 
-def pictures(gaussians: Gaussians) -> list[np.ndarray]:
-    return [np.asarray(rasterize(gaussians, camera, ("color",)).color) for camera in cameras()]
+def images_of(gaussians: Gaussians) -> list[np.ndarray]:
+    return [np.asarray(rasterize(gaussians, camera, ("color",)).color) for camera in cameras().values()]
+
+
+def fit(before: Gaussians, active: ActiveSet, images: list[np.ndarray], config: FitConfig) -> LaterFrame:
+    targets = {view: Target(image) for view, image in enumerate(images)}
+    problem = FrameProblem(before, active, targets, {}, None, EXTENT)
+    return fit_later_frame(problem, config, PLAIN, np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")
@@ -54,61 +61,61 @@ def after(before) -> Gaussians:
     return scene(0.08, np.asarray(before.sh_coeffs))
 
 
-def changes(before, after) -> list[np.ndarray]:
-    return [np.abs(b - a).max(-1) > 0.02 for a, b in zip(pictures(before), pictures(after), strict=True)]
+def changes(before, after) -> dict[int, np.ndarray]:
+    pairs = zip(images_of(before), images_of(after), strict=True)
+    return {view: np.abs(b - a).max(-1) > 0.02 for view, (a, b) in enumerate(pairs)}
 
 
-def test_who_moves_takes_part_and_who_is_hidden_now_and_then_does_not(before, after):
-    part = find_active_set(before, cameras(), changes(before, after), CHANNELS, RENDER)
-    chosen = np.isin(np.arange(len(before)), part.indices)
+def test_find_active_set__selects_what_moves_and_not_what_is_occluded(before, after):
+    active = find_active_set(before, cameras(), changes(before, after), CHANNELS, RENDER)
+    chosen = np.isin(np.arange(len(before)), active.indices)
     assert chosen[HIDDEN:].mean() > 0.9
     assert chosen[:HIDDEN].mean() < 0.1
-    assert len(part.views) == V
-    assert part.fractions["pixels"] < 0.4
-    assert part.fractions["gaussians"] == chosen.mean()
+    assert len(active.views) == V
+    assert active.fractions["pixels"] < 0.4
+    assert active.fractions["gaussians"] == chosen.mean()
 
 
-def test_nothing_has_changed(before):
-    nothing = [np.zeros((96, 128), bool)] * V
-    part = find_active_set(before, cameras(), nothing, CHANNELS, RENDER)
-    assert not part.views
-    assert part.fractions == {"gaussians": 0, "views": 0, "pixels": 0}
-    fitted = fit_later_frame(before, part, {}, {}, EXTENT, FitConfig(sh_degree=0), PLAIN, np.random.default_rng(0))
+def test_find_active_set__is_empty_without_changes(before):
+    nothing = {view: np.zeros((96, 128), bool) for view in range(V)}
+    active = find_active_set(before, cameras(), nothing, CHANNELS, RENDER)
+    assert not active.views
+    assert active.fractions == {"gaussians": 0, "views": 0, "pixels": 0}
+    fitted = fit(before, active, [], FitConfig(sh_degree=0))
     assert fitted.epochs == 0
     assert np.array_equal(fitted.gaussians.means, before.means)
     assert not np.asarray(fitted.gaussians.motion).any()
 
 
-def test_what_appears_before_a_still_wall_wakes_it(before):
-    """The ball is new: no Gaussian is there, and every view sees it before another part of the wall."""
+def test_find_active_set__covers_what_appears_before_a_static_wall(before):
+    """The ball is new: no Gaussian is there, and every view sees it before another active of the wall."""
     wall = before.select(np.arange(HIDDEN))
-    part = find_active_set(wall, cameras(), changes(wall, before), CHANNELS, RENDER)
+    active = find_active_set(wall, cameras(), changes(wall, before), CHANNELS, RENDER)
     covered = []
     for view in range(V):
-        region = part.views[view].region
+        region = active.views[view].region
         covered.append(region.paste(np.ones(region.shape(1)[:3]), np.zeros((96, 128))))
-    for change, drawn in zip(changes(wall, before), covered, strict=True):
+    for change, drawn in zip(changes(wall, before).values(), covered, strict=True):
         assert drawn[change].mean() > 0.9
 
 
 @pytest.mark.parametrize("grows", [False, True])
-def test_a_part_is_fitted_as_the_whole_is(before, after, grows):
-    """Error of the moved picture, and who is there: what stands still is as it was, to the bit."""
+def test_fit_later_frame__with_the_active_set_equals_the_full_fit(before, after, grows):
+    """Error of the moved image, and the survivors: static Gaussians are unchanged to the bit."""
     density = DensityConfig(later_frames=grows, births=0.05, min_error=0)
-    config, truth = FitConfig(sh_degree=0, epochs=12, density=density), pictures(after)
-    part = find_active_set(before, cameras(), changes(before, after), CHANNELS, RENDER)
+    config, truth = FitConfig(sh_degree=0, epochs=12, density=density), images_of(after)
+    active = find_active_set(before, cameras(), changes(before, after), CHANNELS, RENDER)
     errors = {}
-    for name, some in (("whole", full_active_set(before, cameras(), RENDER)), ("part", part)):
-        targets = {view: Target(image) for view, image in enumerate(truth)}
-        fitted = fit_later_frame(before, some, targets, {}, EXTENT, config, PLAIN, np.random.default_rng(0))
-        errors[name] = np.sqrt(np.mean([(a - b) ** 2 for a, b in zip(pictures(fitted.gaussians), truth, strict=True)]))
-    start = np.sqrt(np.mean([(a - b) ** 2 for a, b in zip(pictures(before), truth, strict=True)]))
+    for name, some in (("whole", full_active_set(before, cameras(), RENDER)), ("active", active)):
+        fitted = fit(before, some, truth, config)
+        errors[name] = np.sqrt(np.mean([(a - b) ** 2 for a, b in zip(images_of(fitted.gaussians), truth, strict=True)]))
+    start = np.sqrt(np.mean([(a - b) ** 2 for a, b in zip(images_of(before), truth, strict=True)]))
     assert errors["whole"] < 0.4 * start
-    # Half a dB; it is better where the whole fit disturbs what was right.
-    assert errors["part"] < 1.06 * errors["whole"]
+    # Half a dB; it is better where the full fit disturbs what was right.
+    assert errors["active"] < 1.06 * errors["whole"]
     assert np.array_equal(fitted.source[fitted.source >= 0], np.unique(fitted.source[fitted.source >= 0]))
     assert (fitted.source == -1).any() == grows
-    still = np.setdiff1d(np.arange(len(before)), part.indices)
+    still = np.setdiff1d(np.arange(len(before)), active.indices)
     where = np.searchsorted(fitted.source[fitted.source >= 0], still)
     assert not np.asarray(fitted.gaussians.motion)[where].any()
     assert not np.asarray(fitted.gaussians.offset)[where].any()
@@ -117,11 +124,10 @@ def test_a_part_is_fitted_as_the_whole_is(before, after, grows):
         assert np.array_equal(kept, np.asarray(getattr(before, attribute))[still]), attribute
 
 
-def test_a_frame_that_has_settled_ends_early(before):
-    targets = {view: Target(image) for view, image in enumerate(pictures(before))}
-    config = FitConfig(sh_degree=0, epochs=12, density=DensityConfig(later_frames=False), early_stopping_tolerance=0.0)
-    whole = full_active_set(before, cameras(), RENDER)
-    fitted = fit_later_frame(before, whole, targets, {}, EXTENT, config, PLAIN, np.random.default_rng(0))
-    assert fitted.epochs == 12
-    config = replace(config, density=DensityConfig(births=0.0))
-    assert fit_later_frame(before, whole, targets, {}, EXTENT, config, PLAIN, np.random.default_rng(0)).epochs < 12
+@pytest.mark.parametrize("density", [DensityConfig(births=0.0), DensityConfig(later_frames=False)])
+def test_fit_later_frame__ends_early_once_the_loss_stops_falling(before, density):
+    """With and without density control; a tolerance of 0 switches it off."""
+    whole, images = full_active_set(before, cameras(), RENDER), images_of(before)
+    config = FitConfig(sh_degree=0, epochs=12, density=density)
+    assert fit(before, whole, images, replace(config, early_stopping_tolerance=0)).epochs == 12
+    assert fit(before, whole, images, config).epochs < 12

@@ -1,25 +1,16 @@
-"""Motion masks: nothing where nothing moves, the object where one does."""
+"""Motion masks: empty for a static scene, and the object where one moves."""
 
 from __future__ import annotations
 
-import json
-from pathlib import Path
-
-import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.method.confidence import (
-    MASK_METHODS,
-    flow_mask,
-    flow_threshold,
-    mask_refiner,
-    refine_mask,
-    vote_superpixels,
-)
+from morgs_mi.method.confidence import flow_mask, flow_threshold, motion_floor, motion_mask
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import observe_flow, observe_key_views
 from morgs_mi.method.flow_sources.registry import FramePair
+from morgs_mi.method.mask_refiners.config import MaskConfig
+from morgs_mi.method.mask_refiners.registry import MASK_REFINERS, mask_refiner
 from tests.method.moving_disc import moving_disc
 
 CAMERA_NOISE = 2 / 255  # standard deviation of a video camera in room light
@@ -30,15 +21,15 @@ def overlap(a: np.ndarray, b: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("size", [(120, 160), (240, 320)])
-@pytest.mark.parametrize("method", MASK_METHODS)
-def test_static_pair_gives_an_empty_mask_under_camera_noise(method, size):
+@pytest.mark.parametrize("method", MASK_REFINERS.names)
+def test_motion_mask__is_empty_for_a_static_pair_under_camera_noise(method, size):
     previous, image, _ = moving_disc(*size, shift=(0, 0), noise=CAMERA_NOISE)
     assert not observe_flow(image, previous, mask_method=method).mask.any()
 
 
 @pytest.mark.parametrize("shift", [(6, -4), (1, 0)])
-@pytest.mark.parametrize("method", MASK_METHODS)
-def test_moving_disc_is_found(method, shift):
+@pytest.mark.parametrize("method", MASK_REFINERS.names)
+def test_motion_mask__finds_a_moving_disc(method, shift):
     previous, image, disc = moving_disc(240, 320, shift, CAMERA_NOISE)
     mask = observe_flow(image, previous, mask_method=method).mask
     # DIS spreads motion by up to half a patch, 4 px: the bound is a disc of 48 px radius grown by that much.
@@ -46,86 +37,62 @@ def test_moving_disc_is_found(method, shift):
     assert mask[disc].mean() > 0.95
 
 
-def test_refinement_recovers_an_object_from_a_part_of_it():
-    _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
-    part = disc.copy()
-    part[120:140] = False
-    assert overlap(refine_mask(image, part), disc) > 0.95 > overlap(part, disc)
-
-
-def test_union_never_loses_flow():
+def test_motion_mask__with_grabcut_contains_the_flow_mask():
     previous, image, _ = moving_disc(120, 160, (3, 2))
-    cue = observe_flow(image, previous, mask_method="grabcut")
-    assert not (flow_mask(cue.motion, cue.reliable) & ~cue.mask).any()
+    observation = observe_flow(image, previous, mask_method="grabcut")
+    assert not (flow_mask(observation.motion, observation.reliable) & ~observation.mask).any()
 
 
-def test_without_refinement_the_mask_is_the_flows():
+def test_motion_mask__without_refinement_is_the_flow_mask():
     previous, image, _ = moving_disc(120, 160, (3, 2))
-    cue = observe_flow(image, previous, mask_method="none")
-    np.testing.assert_array_equal(cue.mask, flow_mask(cue.motion, cue.reliable))
+    observation = observe_flow(image, previous, mask_method="none")
+    np.testing.assert_array_equal(observation.mask, flow_mask(observation.motion, observation.reliable))
 
 
-def test_superpixels_give_up_what_the_flow_smeared_over_an_edge():
-    _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
-    smeared = cv2.dilate(disc.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
-    voted = vote_superpixels(image, smeared)
-    assert overlap(voted, disc) > 0.9 > overlap(smeared, disc)
-    assert voted[disc].mean() > 0.98
+def test_motion_mask__passes_its_config_to_threshold_and_refiner():
+    previous, image, _ = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
+    motion = observe_flow(image, previous).motion
+    for config in (MaskConfig(floor=20), MaskConfig(superpixel_share=0.2)):
+        expected = mask_refiner("superpixels", config)(image, flow_mask(motion, config=config))
+        np.testing.assert_array_equal(motion_mask(image, motion, method="superpixels", config=config), expected)
+        assert not np.array_equal(expected, motion_mask(image, motion, method="superpixels"))
 
 
-def test_superpixels_give_up_specks():
-    _, image, _ = moving_disc(240, 320, (0, 0))
-    specks = np.zeros((240, 320), bool)
-    specks[10:230:12, 10:310:12] = True
-    assert not vote_superpixels(image, specks).any()
-
-
-def test_masks_are_those_of_the_method_that_the_settings_name():
+def test_observe_key_views__masks_are_those_of_the_configured_method():
     previous, image, _ = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
     pair = {7: FramePair(image, previous)}
-    for method in MASK_METHODS:
-        cue = observe_key_views(pair, MotionConfig(mask_method=method), with_masks=True)[7]
-        moves = flow_mask(cue.motion, cue.reliable)
-        np.testing.assert_array_equal(cue.mask, mask_refiner(method)(image, moves))
+    for method in MASK_REFINERS.names:
+        observation = observe_key_views(pair, MotionConfig(mask_method=method), with_masks=True)[7]
+        mask = flow_mask(observation.motion, observation.reliable)
+        np.testing.assert_array_equal(observation.mask, mask_refiner(method)(image, mask))
     assert observe_key_views(pair, MotionConfig(), with_masks=False)[7].mask is None
 
 
-@pytest.mark.parametrize("size", [(1, 1), (3, 5), (40, 30), (700, 20)])
-@pytest.mark.parametrize("fill", ["nothing", "speck", "all", "half"])
-@pytest.mark.parametrize("refine", [refine_mask, vote_superpixels])
-def test_refinement_takes_any_mask(refine, size, fill):
-    image = np.random.default_rng(0).random((*size, 3))
-    mask = np.full(size, fill == "all")
-    if fill == "half":
-        mask[: size[0] // 2] = True
-    mask[size[0] // 2, size[1] // 2] |= fill == "speck"
-    refined = refine(image, mask)
-    assert refined.shape == size
-    assert refined.dtype == bool
-    if fill == "nothing":
-        assert not refined.any()
-    if fill == "all":
-        assert refined.all()
-
-
-@pytest.mark.parametrize("method", MASK_METHODS)
-def test_refinement_is_repeatable(method):
-    _, image, disc = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
-    refine = mask_refiner(method)
-    np.testing.assert_array_equal(refine(image, disc), refine(image, disc))
-    np.testing.assert_array_equal(refine((image * 255 + 0.5).astype(np.uint8), disc), refine(image, disc))
-
-
-def test_threshold_follows_width_and_noise():
+def test_flow_threshold__follows_width_and_noise():
     assert flow_threshold(np.zeros((4, 1352, 2))) == 0.5
     assert flow_threshold(np.zeros((4, 2704, 2))) == 1.0
     assert flow_threshold(np.zeros((4, 160, 2))) == 0.2
     noisy = np.random.default_rng(0).normal(0, 1, (100, 100, 2))
     # Rayleigh: median 1.18, MAD 0.45; 1 % of it lies above 3.
     assert flow_threshold(noisy) == pytest.approx(1.18 + 4 * 0.45, rel=0.05)
+    assert flow_threshold(noisy, config=MaskConfig(threshold_mads=2)) == pytest.approx(1.18 + 2 * 0.45, rel=0.05)
 
 
-def test_unreliable_pixels_are_static():
+@pytest.mark.parametrize(
+    ("width", "config", "floor"),
+    [
+        (1352, MaskConfig(), 0.5),
+        (1352, MaskConfig(floor=0.8), 0.8),
+        (1352, MaskConfig(floor_width=676), 1.0),
+        (160, MaskConfig(), 0.2),
+        (160, MaskConfig(noise_floor=0.3), 0.3),
+    ],
+)
+def test_motion_floor__is_that_of_the_config(width, config, floor):
+    assert motion_floor(width, config) == pytest.approx(floor, rel=1e-12)
+
+
+def test_flow_mask__excludes_unreliable_pixels():
     motion = np.zeros((8, 8, 2))
     motion[:2] = 9
     reliable = np.ones((8, 8), bool)
@@ -134,34 +101,12 @@ def test_unreliable_pixels_are_static():
 
 
 @pytest.mark.parametrize(
-    ("call", "message"),
+    ("arguments", "message"),
     [
-        (lambda: flow_mask(np.zeros((4, 4))), r"\[H, W, 2\], got \(4, 4\)"),
-        (lambda: flow_mask(np.zeros((4, 4, 2)), np.ones((3, 4), bool)), r"got \(3, 4\)"),
-        (lambda: refine_mask(np.zeros((4, 4, 3)), np.ones((3, 4), bool)), r"got \(4, 4, 3\)"),
-        (lambda: vote_superpixels(np.zeros((4, 4, 3)), np.ones((3, 4), bool)), r"got \(4, 4, 3\)"),
-        (lambda: MotionConfig(mask_method="sam"), r"one of none, grabcut, .*DECODER.onnx, got 'sam'"),
-        (lambda: MotionConfig(mask_method="sam2:encoder.onnx"), r"got 'sam2:encoder.onnx'"),
+        ((np.zeros((4, 4)),), r"\[H, W, 2\], got \(4, 4\)"),
+        ((np.zeros((4, 4, 2)), np.ones((3, 4), bool)), r"got \(3, 4\)"),
     ],
 )
-def test_bad_input_is_named(call, message):
+def test_flow_mask__rejects_bad_input(arguments, message):
     with pytest.raises(ValueError, match=message):
-        call()
-
-
-def test_documented_figures_are_those_of_the_committed_result():
-    root = Path(__file__).parents[2]
-    clips = json.loads((root / "benchmarks/results/masks.json").read_text(encoding="utf-8"))["clips"]
-    text = (root / "docs/masks.md").read_text(encoding="utf-8")
-
-    def cell(row: dict) -> str:
-        return f"{row['iou']:.2f} ({row['found']:.2f}, {row['true']:.2f})"
-
-    lines = [[f"`{clip['name']}`" for clip in clips]]
-    lines += [[cell(clip["masks"][method]) for clip in clips] for method in (*MASK_METHODS, "lifted")]
-    for start in ("lifted", "as before"):
-        for method in clips[0]["loops"][start]:
-            rows = [clip["loops"][start][method]["held_out"] for clip in clips]
-            lines.append([f"{cell(row)}, {row['psnr_moving']:.2f} dB" for row in rows])
-    for line in lines:
-        assert f"| {' | '.join(line)} |" in text
+        flow_mask(*arguments)

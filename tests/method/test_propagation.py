@@ -1,4 +1,4 @@
-"""Motion that the flow has missed is found again: from the frame before, and from neighbours."""
+"""Motion proposals: from the previous frame and from neighbours, where flow fails."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def cameras():
 
 @pytest.fixture(scope="module")
 def scene():
-    """A bright clump of 60 in front of a dark wall; the clump moves by SHIFT, the wall stands."""
+    """A bright clump of 60 in front of a dark wall; the clump moves by SHIFT, the wall is static."""
     rng = np.random.default_rng(0)
     wall = np.stack([*rng.uniform(-1.2, 1.2, (2, 400)), np.full(400, 0.6)], axis=1)
     means = np.concatenate([rng.normal(0, 0.12, (60, 3)), wall])
@@ -32,9 +32,9 @@ def scene():
     before = Gaussians.from_activated(means, scales, quats, np.full(460, 0.9), colors)
     moves = np.arange(460) < 60
     after = replace(before, means=mi.TensorXf(np.asarray(before.means) + SHIFT * moves[:, None]))
-    windows = {view: ActiveView(camera) for view, camera in enumerate(cameras())}
-    targets = {view: Target(np.asarray(window.render(after).color)) for view, window in windows.items()}
-    return before, moves, windows, targets
+    views = {view: ActiveView(camera) for view, camera in enumerate(cameras())}
+    targets = {v: Target(np.asarray(view.render(after).color)) for v, view in views.items()}
+    return before, moves, views, targets
 
 
 def still(n):
@@ -42,56 +42,56 @@ def still(n):
 
 
 def start(scene, lifted, motion=None):
-    before, _, windows, targets = scene
+    before, _, views, targets = scene
     known = before if motion is None else replace(before, motion=mi.TensorXf(motion.astype(np.float32)))
-    return propagate_motion(known, lifted, windows, targets, np.random.default_rng(0))
+    return propagate_motion(known, lifted, views, targets, np.random.default_rng(0))
 
 
 def found(lift, moves):
-    """The share of those that move which do so by SHIFT, and of the others which stand still.
+    """Fractions of the moving Gaussians that move by SHIFT, and of the static ones that do not move.
 
-    Measured, all are 1 but for one of the 60, which hardly shows; the bounds below allow for two.
+    Measured, all are 1 but for one of the 60, which is hardly visible; the bounds below allow for two.
     """
     right = np.linalg.norm(lift.displacement - SHIFT * moves[:, None], axis=1) < 0.05
     return right[moves].mean(), right[~moves].mean()
 
 
-def test_what_moved_goes_on_where_flow_says_nothing(scene):
+def test_propagate_motion__continues_motion_without_flow(scene):
     moves = scene[1]
     lift = start(scene, still(460), SHIFT * moves[:, None])
-    hit, stood = found(lift, moves)
+    hit, static = found(lift, moves)
     assert hit > 0.96
-    assert stood > 0.99
+    assert static > 0.99
     assert (lift.logit_confidence[moves] > 0).mean() > 0.96
     assert (lift.logit_confidence[~moves] < 0).mean() > 0.99
 
 
-def test_what_stopped_does_not_go_on(scene):
-    """The pictures are those of `before`: whoever moved, stands."""
-    before, moves, windows, _ = scene
-    targets = {view: Target(np.asarray(window.render(before).color)) for view, window in windows.items()}
-    gone_on = start((before, moves, windows, targets), still(460), SHIFT * moves[:, None])
+def test_propagate_motion__stops_what_stopped(scene):
+    """The images are those of `before`: nothing moves any more."""
+    before, moves, views, _ = scene
+    targets = {v: Target(np.asarray(view.render(before).color)) for v, view in views.items()}
+    gone_on = start((before, moves, views, targets), still(460), SHIFT * moves[:, None])
     assert not gone_on.displacement[moves].any()
 
 
-def test_neighbours_of_the_few_that_flow_has_seen_follow(scene):
+def test_propagate_motion__spreads_to_neighbours(scene):
     moves = scene[1]
     seen = moves & (np.arange(460) % 3 == 0)
     lift = Lift((SHIFT * seen[:, None]).astype(np.float32), np.where(seen, 2, -2).astype(np.float32))
-    hit, stood = found(start(scene, lift), moves)
+    hit, static = found(start(scene, lift), moves)
     assert hit > 0.96  # a third to begin with
-    assert stood > 0.99
+    assert static > 0.99
 
 
-def test_true_motion_stays(scene):
+def test_propagate_motion__keeps_true_motion(scene):
     moves = scene[1]
     lift = Lift((SHIFT * moves[:, None]).astype(np.float32), np.where(moves, 2, -2).astype(np.float32))
     result = start(scene, lift, -SHIFT * moves[:, None])
     assert found(result, moves)[0] > 0.96
 
 
-def test_without_motion_or_views_nothing_is_offered(scene):
-    before, _, windows, targets = scene
+def test_propagate_motion__does_nothing_without_motion_or_views(scene):
+    before, _, views, targets = scene
     lifted, rng = still(460), np.random.default_rng(0)
-    assert propagate_motion(before, lifted, windows, targets, rng) is lifted
+    assert propagate_motion(before, lifted, views, targets, rng) is lifted
     assert propagate_motion(before, lifted, {}, targets, rng) is lifted

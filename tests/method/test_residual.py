@@ -1,4 +1,4 @@
-"""The gated residual: eq. 12, and what reaches which parameter."""
+"""The gated residual (eq. 12): values, gates and gradients."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.lift import Lift
-from morgs_mi.method.residual import apply_residual, join_sh, residual_parameters, split_sh
+from morgs_mi.method.residual import apply_residual, residual_parameters
 from tests.render.test_rasterize import RAW, make_scene, to_gaussians
 
 OFF = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
@@ -23,7 +23,7 @@ def random_parameters(previous, config, seed=0):
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 @pytest.mark.parametrize("config", [MotionConfig(), OFF])
-def test_zero_residual_changes_nothing(degree, config):
+def test_apply_residual__zero_changes_nothing(degree, config):
     previous = to_gaussians(make_scene(degree))
     current = apply_residual(previous, residual_parameters(previous, config), config)
     for name in RAW:
@@ -34,8 +34,8 @@ def test_zero_residual_changes_nothing(degree, config):
 
 @pytest.mark.parametrize("two_gates", [False, True])
 @pytest.mark.parametrize("degree", [0, 2])
-def test_gate_scales_every_attribute(degree, two_gates):
-    """A_t = A_{t-1} + m R_t (eq. 12), with the confidence as gate; of two, colour has its own."""
+def test_apply_residual__gate_scales_every_attribute(degree, two_gates):
+    """A_t = A_{t-1} + m R_t (eq. 12); with two gates, that of the appearance is 1."""
     config, previous = MotionConfig(two_gates=two_gates), to_gaussians(make_scene(degree))
     parameters = random_parameters(previous, config)
     m = 1 / (1 + np.exp(-np.asarray(parameters["logit_confidence"], np.float64)))
@@ -54,7 +54,7 @@ def test_gate_scales_every_attribute(degree, two_gates):
         assert change[:, 1:] == pytest.approx(m[:, None, None] * R["sh_rest"], abs=1e-6)
 
 
-def test_modules_add_their_parameters():
+def test_residual_parameters__follow_the_modules():
     previous = to_gaussians(make_scene())
     assert "offset" not in residual_parameters(previous, MotionConfig(learn_offset=False))
     assert "logit_confidence" not in residual_parameters(previous, MotionConfig(learn_confidence=False))
@@ -62,7 +62,7 @@ def test_modules_add_their_parameters():
 
 
 @pytest.mark.parametrize("lift_confidence", [False, True])
-def test_lifted_motion_passes_the_gate_whole(lift_confidence):
+def test_residual_parameters__lifted_motion_passes_the_gate_at_full_length(lift_confidence):
     previous, rng = to_gaussians(make_scene()), np.random.default_rng(1)
     lifted = Lift(np.float32(rng.normal(size=(10, 3))), np.float32(rng.uniform(-2, 2, 10)))
     config = MotionConfig(lift_confidence=lift_confidence)
@@ -74,7 +74,7 @@ def test_lifted_motion_passes_the_gate_whole(lift_confidence):
     assert np.array_equal(current.logit_confidence, logit)
 
 
-def test_gradient_of_the_gate_agrees_with_the_product_rule():
+def test_apply_residual__gradient_of_the_gate_follows_the_product_rule():
     config, previous = MotionConfig(), to_gaussians(make_scene())
     parameters = random_parameters(previous, config)
     dr.enable_grad(parameters["logit_confidence"], parameters["motion"])
@@ -85,13 +85,3 @@ def test_gradient_of_the_gate_agrees_with_the_product_rule():
     assert np.asarray(dr.grad(parameters["motion"])) == pytest.approx(np.repeat(m[:, None], 3, 1), rel=1e-5)
     expected = m * (1 - m) * R.sum(1)
     assert np.asarray(dr.grad(parameters["logit_confidence"])) == pytest.approx(expected, abs=1e-6)
-
-
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_joining_split_sh_is_the_identity_with_gradient(degree):
-    sh = to_gaussians(make_scene(degree)).sh_coeffs
-    dr.enable_grad(sh)
-    concatenated = join_sh(*split_sh(sh))
-    assert np.array_equal(np.asarray(concatenated), np.asarray(sh))
-    dr.backward(dr.sum(dr.square(concatenated), axis=None))
-    assert np.asarray(dr.grad(sh)) == pytest.approx(2 * np.asarray(sh), rel=1e-6)

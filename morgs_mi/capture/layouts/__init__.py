@@ -1,1 +1,1 @@
-"""Readers of capture folders: COLMAP, Nerfstudio, Dynamic 3D Gaussians, poses_bounds.npy."""
+"""Readers of capture folders: COLMAP, Nerfstudio, Dynamic 3D Gaussians and poses_bounds.npy."""

@@ -1,12 +1,12 @@
-"""Finding each camera's clip in a capture folder, by what lies there.
+"""Search for each camera's clip in a capture folder.
 
-A clip is a video file, a folder of numbered images, or a list of image files (one per frame). Clips are laid out per
+A clip is a video file, a folder of numbered images, or a list of image files (one per frame). Clips are stored per
 camera or per frame; cameras are ordered numerically, cam_2 before cam_10:
 
 - per camera: ``cam01.mp4``, ``cam01/0000.png`` or ``cam01/images/0000.png``, in the capture or in a folder of it
-  (``videos/cam01.mp4``, ``images/cam01/0000.png``). Of several clips of a name the lossless one in ``frames/``
-  wins, then a video, then a folder, and those in the capture itself win over those in a folder;
-- per frame: ``0000/cam01.png`` or ``0000/images/cam01.png``, every folder with the same cameras.
+  (``videos/cam01.mp4``, ``images/cam01/0000.png``). Of several clips of one name the lossless one in ``frames/``
+  takes precedence, then a video, then a folder; clips in the capture itself take precedence over those in a folder;
+- per frame: ``0000/cam01.png`` or ``0000/images/cam01.png``, with the same cameras in every folder.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from morgs_mi.io.video import IMAGE_SUFFIXES, VIDEO_SUFFIXES, natural_key, numbe
 
 __all__ = ["check_frames", "clips_by_camera", "clips_by_frame", "view_of_image"]
 
-# Folders that hold no clips at all, and those whose own images are no camera's.
+# Folders without clips, and folders whose own images do not belong to a camera.
 _NOT_CLIPS = {"sparse", "truth", "masks", "seg"}
 _NOT_CAMERAS = _NOT_CLIPS | {"frames", "images"}
 
@@ -27,7 +27,7 @@ def clips_by_camera(path: Path) -> dict[str, Path]:
     """Return each camera's video or folder of images by the camera's name, in numerical order."""
     inner = [f for f in path.iterdir() if f.is_dir() and f.name not in _NOT_CLIPS and not f.name.startswith(".")]
     found: dict[str, Path] = {}
-    # The last one to name a camera wins.
+    # The last clip found for a camera takes precedence.
     for folder in [*sorted(f for f in inner if f.name != "frames"), path]:
         found |= _folders(folder) | {f.stem: f for f in folder.iterdir() if _is_video(f)}
     if (path / "frames").is_dir():
@@ -36,9 +36,9 @@ def clips_by_camera(path: Path) -> dict[str, Path]:
 
 
 def clips_by_frame(path: Path) -> dict[str, tuple[Path, ...]]:
-    """Return each camera's images, one per frame folder, by the camera's name; empty where there are no such folders.
+    """Return each camera's images, one per frame folder, by the camera's name; empty without such folders.
 
-    The first frame says which cameras there are; an image that a later one lacks is listed all the same.
+    The first frame determines the cameras; images that are missing in later frames are listed too.
     """
     frames = sorted(_folders(path).values(), key=lambda f: natural_key(str(f)))
     if not frames:
@@ -51,7 +51,7 @@ def check_frames(path: Path, clips: Mapping[str, Sequence[Path]]) -> None:
     """Check that the folders of `clips_by_frame` are numbered without gaps.
 
     Raises:
-        ValueError: they are not.
+        ValueError: a number is missing.
     """
     folders = [f.relative_to(path).parts[0] for f in next(iter(clips.values()))]
     if gap := numbering_gap(folders):
@@ -62,9 +62,9 @@ def check_frames(path: Path, clips: Mapping[str, Sequence[Path]]) -> None:
 
 
 def view_of_image(views: Collection[str], image: str) -> str | None:
-    """Return which of the cameras `views` an image of a calibration belongs to, or None.
+    """Return the camera in `views` to which an image of a calibration belongs, or None.
 
-    That is cam01 for ``cam01.png``, ``cam01.mp4``, ``cam01/0000.png`` and ``cam01/images/0000.png``.
+    It is cam01 for ``cam01.png``, ``cam01.mp4``, ``cam01/0000.png`` and ``cam01/images/0000.png``.
     """
     place = PurePosixPath(image.replace("\\", "/"))
     names = (place.stem, *(parent.name for parent in place.parents))
@@ -77,7 +77,7 @@ def _folders(folder: Path) -> dict[str, Path]:
 
 
 def _image_folder(folder: Path) -> Path | None:
-    """Return where a camera's or a frame's images lie: in its folder or in `images` there."""
+    """Return the folder that holds a camera's or a frame's images: its own or the `images` folder in it, or None."""
     for place in (folder, folder / "images"):
         if place.is_dir() and any(_is_image(f) for f in place.iterdir()):
             return place

@@ -1,9 +1,9 @@
-"""COLMAP's sparse models: text or binary in, text out.
+"""COLMAP's sparse models: reader for text and binary files, writer for text.
 
-A model is a folder of cameras, images and points3D (newer ones add rigs and frames, which repeat the
-poses). COLMAP's pixel centres lie at +0.5 and its axes are OpenCV's, as in `Camera`: nothing is flipped.
+A model is a folder of cameras, images and points3D (newer versions add rigs and frames, which repeat the
+poses). COLMAP's pixel centres lie at +0.5 and its axes are OpenCV's, as in `Camera`, so no axis is flipped.
 
-Reading is done here and not by pycolmap because pycolmap 4.2 never returns from a truncated binary file
+The reader does not use pycolmap because pycolmap 4.2 never returns from a truncated binary file
 and silently drops every second image of a text model without blank lines.
 """
 
@@ -15,21 +15,23 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from morgs_mi.capture.layouts.calibration import Calibration, Layout, match_clips, required_clips
 from morgs_mi.capture.lens import MODELS, Lens, lens_and_intrinsics
 from morgs_mi.core.camera import Camera
 
-__all__ = ["ColmapModel", "find_colmap", "read_colmap", "write_colmap"]
+__all__ = ["LAYOUT", "ColmapModel", "find_colmap", "read_colmap", "write_colmap"]
 
 _FILES = ("cameras", "images", "points3D")
 
 
 @dataclass(frozen=True)
 class ColmapModel:
-    """A COLMAP model as it was recorded, before the lenses are undone.
+    """A COLMAP model, before undistortion.
 
     Attributes:
-        cameras: one camera per image in the order of the file; `name` is the image's name.
+        cameras: one camera per image in the order of the file; `name` is the name of the image.
         lenses: one lens per camera.
         points: [P, 3] float32, world units.
         point_colors: [P, 3] float32 in [0, 1], display-referred.
@@ -44,23 +46,22 @@ class ColmapModel:
 def find_colmap(folder: Path) -> Path | None:
     """Return the folder of the COLMAP model in a capture, or None.
 
-    It lies in `sparse/0`, `sparse`, `colmap/sparse/0` or the folder itself, the first of these that has one.
+    It is the first of `sparse/0`, `sparse`, `colmap/sparse/0` and the folder itself that holds a model.
     """
     for place in (folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0"):
         if any((place / f"cameras.{kind}").exists() for kind in ("bin", "txt")):
             return place
-    # Among other files the name of one says little.
+    # In the capture folder itself all three files are required: a single name may belong to something else.
     here = any(all((folder / f"{name}.{kind}").exists() for name in _FILES) for kind in ("bin", "txt"))
     return folder if here else None
 
 
 def read_colmap(folder: str | Path) -> ColmapModel:
-    """Read the COLMAP model in `folder`, binary if present, else text.
+    """Read the COLMAP model in `folder`, binary if present, otherwise text.
 
     Raises:
         FileNotFoundError: one of the three files is missing.
-        ValueError: a file is broken, names a camera that is not there, holds a pose that is not one,
-            or a lens that is not supported.
+        ValueError: a file is broken, refers to a missing camera, or holds an invalid pose or an unsupported lens.
     """
     folder = Path(folder)
     kind = "bin" if (folder / "cameras.bin").exists() else "txt"
@@ -92,7 +93,7 @@ def read_colmap(folder: str | Path) -> ColmapModel:
             raise ValueError(f"{images_path}, image {name!r}: {error}") from None
         lenses.append(lens)
     if not cameras:
-        raise ValueError(f"{images_path}: at least one image was expected, got none; register the images.")
+        raise ValueError(f"{images_path}: expected at least one image, got none; register the images.")
     points = np.array(list((_text_points if text else _binary_points)(points_path)), dtype=np.float64)
     points = points.reshape(-1, 6)
     if not np.isfinite(points).all():
@@ -115,16 +116,16 @@ def write_colmap(
     """Write a COLMAP text model that COLMAP itself can read.
 
     Args:
-        folder: made if need be.
-        cameras: the views; an image is called `name`, with ``.png`` added where it has no suffix.
+        folder: created if missing.
+        cameras: the views; the image of a view is called `name`, with ``.png`` added if it has no suffix.
         points: [P, 3] world units, or None for no points.
-        point_colors: [P, 3] in [0, 1]; grey where None.
-        lenses: one per camera, as in `ColmapModel`; pinholes where None.
+        point_colors: [P, 3] in [0, 1]; grey if None.
+        lenses: one per camera, as in `ColmapModel`; pinholes if None.
 
     Raises:
         OSError: a file could not be written.
     """
-    import pycolmap  # takes 0.3 s to import, which only writing needs
+    import pycolmap  # takes 0.3 s to import, and only the writer needs it
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -157,28 +158,33 @@ def write_colmap(
 
 
 def _viewmat(pose: Sequence[float]) -> np.ndarray:
-    """Return world -> camera [4, 4] of a wxyz quaternion and a translation."""
+    """Return the world-to-camera matrix [4, 4] of a wxyz quaternion and a translation."""
     quat, t = np.array(pose[:4]), np.array(pose[4:])
-    norm = np.linalg.norm(quat)
-    # COLMAP writes unit quaternions; Camera refuses one that is not finite.
-    if np.isfinite(norm) and abs(norm - 1) > 1e-2:
+    if not np.isfinite(pose).all():
+        raise ValueError(f"the pose must be finite, got {[*pose]}; export the model again.")
+    # COLMAP writes unit quaternions.
+    if not abs(np.linalg.norm(quat) - 1) <= 1e-2:
         raise ValueError(f"its quaternion must have length 1, got {quat.tolist()}; check the order of the columns.")
-    w, x, y, z = quat / norm
     viewmat = np.eye(4)
-    viewmat[:3, :3] = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    viewmat[:3, 3] = t
+    viewmat[:3, :3], viewmat[:3, 3] = Rotation.from_quat(quat[[1, 2, 3, 0]]).as_matrix(), t
     return viewmat
+
+
+def _read_calibration(path: Path) -> Calibration:
+    clips, folder = required_clips(path), find_colmap(path)
+    assert folder is not None
+    model = read_colmap(folder)
+    return Calibration(*match_clips(path, folder, clips, model.cameras, model.lenses), model.points, model.point_colors)
+
+
+LAYOUT = Layout("COLMAP", ("sparse/0", "sparse"), lambda path: find_colmap(path) is not None, _read_calibration)
 
 
 # ---- text ------------------------------------------------------------------------------------------------
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield (number from 1, line) of all lines that are not comments, blank ones included."""
+    """Yield the number, from 1, and the text of all lines that are not comments, including blank ones."""
     text = path.read_text(encoding="utf-8", errors="replace")
     return ((i, s) for i, s in enumerate(text.splitlines(), start=1) if not s.startswith("#"))
 
@@ -228,13 +234,13 @@ def _text_points(path: Path) -> Iterator[list[float]]:
 
 
 class _Bytes:
-    """A file read from its front; every read is bounded by what is left."""
+    """A binary file that is read sequentially; reads past its end raise ValueError."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.data, self.at = path, path.read_bytes(), 0
 
     def take(self, layout: str) -> tuple:
-        """Unpack one little-endian record."""
+        """Return the fields of one little-endian record."""
         layout = "<" + layout
         self.skip(struct.calcsize(layout))
         return struct.unpack_from(layout, self.data, self.at - struct.calcsize(layout))
@@ -242,7 +248,7 @@ class _Bytes:
     def skip(self, count: int) -> None:
         if count > len(self.data) - self.at:
             raise ValueError(
-                f"{self.path}: {count} more bytes expected at byte {self.at}, got "
+                f"{self.path}: expected {count} more bytes at byte {self.at}, got "
                 f"{len(self.data) - self.at}: the file is truncated or broken; export the model again."
             )
         self.at += count
@@ -258,7 +264,7 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, str, int, int, tuple[floa
     for _ in range(*file.take("Q")):
         camera_id, model, width, height = file.take("IiQQ")
         if not 0 <= model < len(names):
-            # Refused by name in lens_and_intrinsics; what follows it cannot be read.
+            # lens_and_intrinsics refuses this name; the rest of the file cannot be read.
             yield camera_id, f"number {model}", width, height, ()
             return
         focals, coefficients = MODELS[names[model]]

@@ -1,14 +1,14 @@
 """The layout of Dynamic 3D Gaussians: images in `ims/`, cameras in `train_meta.json`, points in `init_pt_cld.npz`.
 
 `train_meta.json` has `w` and `h`, and per frame and camera `fn` (the image below `ims/`), `cam_id`, `k` [3, 3] in
-pixels with centres at +0.5, and `w2c` [4, 4], world -> camera with OpenCV's axes: nothing is flipped.
-`test_meta.json` lists the cameras that are held out in the same way. The rows of `init_pt_cld.npz` are x, y, z,
+pixels with centres at +0.5, and `w2c` [4, 4], world -> camera with OpenCV's axes, so no axis is flipped.
+`test_meta.json` lists the held-out cameras in the same way. The rows of `init_pt_cld.npz` are x, y, z,
 r, g, b in [0, 1] and a label.
 """
 
 from __future__ import annotations
 
-import json
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +16,14 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from morgs_mi.capture.layouts.calibration import NO_POINTS, Calibration, Layout, read_json
+from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.io.video import natural_key
 
-__all__ = ["MetaCamera", "read_meta", "read_point_cloud"]
+__all__ = ["LAYOUT", "MetaCamera", "read_meta", "read_point_cloud"]
+
+_LOG = logging.getLogger(__name__)
 
 _KEYS = ("w", "h", "k", "w2c", "fn", "cam_id")
 
@@ -33,15 +37,12 @@ class MetaCamera:
 
 
 def read_meta(path: Path) -> list[MetaCamera]:
-    """Read `train_meta.json` or `test_meta.json`: the fixed cameras in the order of their ids, named by them.
+    """Return the fixed cameras of `train_meta.json` or `test_meta.json`, named by their ids and in their order.
 
     Raises:
         ValueError: the file is broken, a key or an entry is missing, a pose is not rigid, or a camera moves.
     """
-    try:
-        meta = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: expected JSON, got a broken file ({error}); export it again.") from None
+    meta = read_json(path)
     missing = [key for key in _KEYS if not isinstance(meta, dict) or key not in meta]
     if missing:
         raise ValueError(f"{path}: expected the keys {', '.join(_KEYS)}, {', '.join(missing)} missing; export again.")
@@ -86,8 +87,8 @@ def _camera(path: Path, meta: dict[str, Any], camera_id: Any) -> MetaCamera:
         moved = np.flatnonzero(np.abs(values - values[0]).max((1, 2)) > 1e-4 * (1 + np.abs(values[0]).max()))
         if len(moved):
             raise ValueError(
-                f"{where}: its {what} in frame {moved[0]} must be that of frame 0, for cameras must not move here; "
-                "use a recording of fixed cameras."
+                f"{where}: the {what} in frame {moved[0]} must equal that in frame 0, as moving cameras are not "
+                "supported; use a recording of fixed cameras."
             )
     sizes = meta["w"], meta["h"]
     if not all(isinstance(size, int) and size > 0 for size in sizes):
@@ -102,10 +103,10 @@ def _camera(path: Path, meta: dict[str, Any], camera_id: Any) -> MetaCamera:
 
 
 def read_point_cloud(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read `init_pt_cld.npz`: positions [P, 3] and colours [P, 3] in [0, 1].
+    """Return the positions [P, 3] and colours [P, 3] in [0, 1] in `init_pt_cld.npz`.
 
     Raises:
-        ValueError: it is no NumPy archive with an array `data` [P, 6 or more] of finite numbers.
+        ValueError: it is not a NumPy archive with an array `data` [P, 6 or more] of finite numbers.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -115,3 +116,29 @@ def read_point_cloud(path: Path) -> tuple[np.ndarray, np.ndarray]:
     if rows.ndim != 2 or rows.shape[1] < 6 or rows.dtype.kind not in "fiu" or not np.isfinite(rows).all():
         raise ValueError(f"{path}: `data` must be [P, 7], finite, got {rows.dtype} {rows.shape}; export it again.")
     return rows[:, :3].astype(np.float32), np.clip(rows[:, 3:6], 0, 1).astype(np.float32)
+
+
+def _read_calibration(path: Path) -> Calibration:
+    """Return the training cameras and the first test camera, which is held out."""
+    rig = read_meta(path / "train_meta.json")
+    test_view = None
+    if (path / "test_meta.json").is_file():
+        held_out, *others = read_meta(path / "test_meta.json")
+        if others:
+            names = ", ".join(view.camera.name for view in others)
+            _LOG.info("%s: %s is held out, %s not used.", path / "test_meta.json", held_out.camera.name, names)
+        others = [view for view in rig if view.camera.name != held_out.camera.name]
+        rig = sorted([*others, held_out], key=lambda view: natural_key(view.camera.name))
+        test_view = [view.camera.name for view in rig].index(held_out.camera.name)
+    cloud = path / "init_pt_cld.npz"
+    points, colors = read_point_cloud(cloud) if cloud.is_file() else (NO_POINTS, NO_POINTS)
+    cameras, clips = tuple(view.camera for view in rig), tuple(view.files for view in rig)
+    return Calibration(cameras, (Lens(),) * len(rig), clips, points, colors, test_view)
+
+
+LAYOUT = Layout(
+    "Dynamic 3D Gaussians",
+    ("train_meta.json",),
+    lambda path: (path / "train_meta.json").is_file(),
+    _read_calibration,
+)

@@ -1,41 +1,46 @@
 """Nerfstudio's `transforms.json`: poses as camera -> world with OpenGL's axes.
 
-Each of its `frames` names a file and gives `transform_matrix` [4, 4]: camera -> world, x right, y up, z backward.
-Intrinsics (`fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`) and lens coefficients stand at the top or with the frame, which
-wins. Pixel centres lie at +0.5, as in `Camera`. The world is that of the matrices: `applied_transform` and
-`applied_scale` say how they came about and are not undone.
+Each of its `frames` names a file and has a `transform_matrix` [4, 4]: camera -> world, x right, y up, z backward.
+Intrinsics (`fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`) and lens coefficients are keys of the file or of a frame; the frame's
+take precedence. Pixel centres lie at +0.5, as in `Camera`. World units are those of the matrices: `applied_transform`
+and `applied_scale` are not undone.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from morgs_mi.capture.layouts.calibration import (
+    NO_POINTS,
+    Calibration,
+    Layout,
+    PoseConvention,
+    match_clips,
+    read_json,
+    required_clips,
+)
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera, rigid
 
-__all__ = ["read_points_ply", "read_transforms"]
+__all__ = ["LAYOUT", "read_points_ply", "read_transforms"]
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-# Nerfstudio takes all of these for its one perspective model.
+# Nerfstudio treats all of these as its single perspective model.
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
 
 
 def read_transforms(path: Path) -> tuple[list[Camera], list[Lens], Path | None]:
-    """Read the cameras, named by their `file_path`, their lenses, and where the points lie if it says so.
+    """Return the cameras, named by their `file_path`, their lenses, and the path of the points' PLY file or None.
 
     Raises:
-        ValueError: the file is broken, a key is missing or no number, a pose is not rigid, or the camera model is
+        ValueError: the file is broken, a key is missing or not a number, a pose is not rigid, or the camera model is
             not supported.
     """
-    try:
-        meta = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: expected JSON, got a broken file ({error}); export it again.") from None
+    meta = read_json(path)
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         raise ValueError(f"{path}: expected an object with a list of `frames`, got none; export it again.")
@@ -85,7 +90,7 @@ def _lens(where: str, values: Mapping[str, Any]) -> Lens:
             "undistort the images first."
         )
     if k4:
-        # Nerfstudio's k4 is the factor of r^8, OpenCV's divides: no model of ours has the former.
+        # Nerfstudio's k4 is the coefficient of r^8, OpenCV's is in the denominator: COLMAP has no model for the former.
         raise ValueError(f"{where}: `k4` must be 0 in a perspective camera, got {k4}; undistort the images first.")
     return Lens("FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)) if k3 else Lens("OPENCV", (k1, k2, p1, p2))
 
@@ -99,11 +104,11 @@ def _number(where: str, values: Mapping[str, Any], key: str, default: float | No
 
 
 def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Read a point cloud: positions [P, 3] and colours [P, 3] in [0, 1], grey where the file has none.
+    """Return the positions [P, 3] and colours [P, 3] in [0, 1] of a point cloud; grey if the file has no colours.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is no PLY file with vertices x, y, z, or they are not finite.
+        ValueError: it is not a PLY file with vertices x, y, z, or they are not finite.
     """
     from plyfile import PlyData, PlyParseError
 
@@ -121,3 +126,19 @@ def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
     colors = np.stack([vertices[band] for band in ("red", "green", "blue")], axis=1)
     scale = 255 if colors.dtype.kind in "iu" else 1
     return points, np.clip(colors.astype(np.float32) / scale, 0, 1)
+
+
+def _read_calibration(path: Path) -> Calibration:
+    clips, source = required_clips(path), path / "transforms.json"
+    cameras, lenses, ply = read_transforms(source)
+    points, colors = read_points_ply(ply) if ply else (NO_POINTS, NO_POINTS)
+    return Calibration(*match_clips(path, source, clips, cameras, lenses), points, colors)
+
+
+LAYOUT = Layout(
+    "Nerfstudio",
+    ("transforms.json",),
+    lambda path: (path / "transforms.json").is_file(),
+    _read_calibration,
+    PoseConvention("camera to world", "OpenGL"),
+)

@@ -1,46 +1,50 @@
 """`poses_bounds.npy`, the calibration of LLFF and of Neural 3D Video (N3DV).
 
-One row [17] per camera, in the order of the sorted videos that exist: a 3x5 matrix in row-major order,
+One row [17] per camera, in the order of the existing videos by number: a 3x5 matrix in row-major order,
 whose columns are the camera's down, right and backward axes, its centre (all in the world) and
-(height, width, focal length); then the nearest and farthest depth. The principal point is the image's middle.
+(height, width, focal length); then the nearest and farthest depth. The principal point is the image centre.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from morgs_mi.capture.layouts.calibration import Calibration, Layout, required_clips
+from morgs_mi.capture.layouts.clips import check_frames, clips_by_frame
+from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
+from morgs_mi.io.video import Clip
 
-__all__ = ["count_rows", "read_poses_bounds", "write_poses_bounds"]
+__all__ = ["LAYOUT", "count_rows", "read_poses_bounds", "write_poses_bounds"]
 
 
 def read_poses_bounds(path: str | Path, names: Sequence[str]) -> tuple[tuple[Camera, ...], np.ndarray]:
-    """Read one camera per name, and their depth bounds [C, 2] in world units.
+    """Return one camera per name, and their depth bounds [C, 2] in world units.
 
     Args:
         path: the file.
-        names: the cameras' names, in the order of the rows.
+        names: names of the cameras, in the order of the rows.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not a NumPy array [C, 17] with one row per name, or a row is no pose.
+        ValueError: it is not a NumPy array [C, 17] with one row per name, or a row is not a valid pose.
     """
     path = Path(path)
     rows = _rows(path)
     if len(rows) != len(names):
         raise ValueError(
             f"{path}: expected one row per camera, got {len(rows)} rows for {len(names)} videos "
-            f"({', '.join(names)}); remove the rows of the videos that are missing."
+            f"({', '.join(names)}); remove the rows of missing videos."
         )
     cameras = tuple(_camera(path, i, row, name) for i, (row, name) in enumerate(zip(rows, names, strict=True)))
     return cameras, rows[:, 15:].astype(np.float64)
 
 
 def count_rows(path: Path) -> int:
-    """Return the number of cameras in the file; raises what `read_poses_bounds` raises."""
+    """Return the number of cameras in the file; raises the same errors as `read_poses_bounds`."""
     return len(_rows(path))
 
 
@@ -83,7 +87,7 @@ def write_poses_bounds(path: str | Path, cameras: Sequence[Camera], bounds: np.n
 
     Raises:
         ValueError: a camera has two focal lengths or an off-centre principal point, which the format
-            cannot hold, or `bounds` is not [C, 2].
+            cannot represent, or `bounds` is not [C, 2].
         OSError: the file could not be written.
     """
     bounds = np.asarray(bounds, dtype=np.float64)
@@ -102,3 +106,23 @@ def write_poses_bounds(path: str | Path, cameras: Sequence[Camera], bounds: np.n
         rows.append([*np.stack([down, right, -forward, camera.position, hwf], axis=1).ravel(), *near_far])
     with open(path, "wb") as file:
         np.save(file, np.array(rows))
+
+
+def _read_calibration(path: Path) -> Calibration:
+    """Match the rows to the clips: a folder per camera or, if their number fits better, a folder per frame."""
+    source = path / "poses_bounds.npy"
+    clips: Mapping[str, Clip] = required_clips(path)
+    if len(clips) != count_rows(source) == len(by_frame := clips_by_frame(path)):
+        check_frames(path, by_frame)
+        clips = by_frame
+    cameras, _ = read_poses_bounds(source, list(clips))
+    return Calibration(cameras, (Lens(),) * len(cameras), tuple(clips.values()))
+
+
+LAYOUT = Layout(
+    "poses_bounds",
+    ("poses_bounds.npy",),
+    lambda path: (path / "poses_bounds.npy").is_file(),
+    _read_calibration,
+    poses=None,
+)

@@ -1,1 +1,10 @@
-"""Sources of optical flow: OpenCV, files, ONNX networks."""
+"""Sources of optical flow.
+
+Every module of this package is imported here, so that a new one only has to register itself (see `registry`).
+"""
+
+from importlib import import_module
+from pkgutil import iter_modules
+
+for _module in iter_modules(__path__):
+    import_module(f"{__name__}.{_module.name}")

@@ -5,25 +5,28 @@ Layout of a folder of flow, one folder per camera of the capture and direction:
     FLOW/cam00/forward/0000.flo     from frame 0 to frame 1, on frame 0's grid
     FLOW/cam00/backward/0001.flo    from frame 1 to frame 0, on frame 1's grid
 
-so a file bears the number of the frame whose grid it lives on, as flow tools name their output after the first
-image of a pair: run one over the frames in order, then once more over the frames in reverse. The number is the last
-one in the file's name, whatever stands before it or how many zeros (`frame_0001.flo`); frames count from 0.
+A file has the number of the frame on whose grid its flow lives. Flow tools name their output after the first image of
+a pair, so run the tool over the frames in order, then again in reverse order. The number is the last one in the file's
+name, with any prefix and any number of zeros (`frame_0001.flo`); frames count from 0.
 
-Flow is in pixels of the pictures as the package sees them (undistorted, downscaled), x to the right and y down. A
-`.flo` file (Middlebury) holds the float32 202021.25, width and height as int32, then x and y of every pixel row by
-row as float32, all little-endian. An EXR file holds the channels `flow.X` and `flow.Y`, `X` and `Y`, `u` and `v`, or
-`R` and `G`. The renderer's own `motion.X` and `motion.Y` point the other way and are not taken for a flow.
+Flow is in pixels of the images that the package fits (undistorted, downscaled), x to the right and y down. A `.flo`
+file (Middlebury) holds the float32 202021.25, width and height as int32, then x and y of every pixel row by row as
+float32, all little-endian. An EXR file holds the channels `flow.X` and `flow.Y`, `X` and `Y`, `u` and `v`, or `R` and
+`G`. The renderer's own `motion.X` and `motion.Y` point the other way and are rejected.
 """
 
 from __future__ import annotations
 
 import re
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from morgs_mi.core.files import whole
 from morgs_mi.io.exr import read_exr, write_exr
+from morgs_mi.method.flow_sources.config import FlowConfig
+from morgs_mi.method.flow_sources.registry import FLOW_SOURCES, FlowSource, FramePair
 
 __all__ = ["SUFFIXES", "FlowFolder", "read_flow", "write_flow"]
 
@@ -32,15 +35,15 @@ SUFFIXES = (".flo", ".exr")
 _MAGIC = 202021.25
 _HEADER = np.dtype([("magic", "<f4"), ("width", "<i4"), ("height", "<i4")])
 _CHANNELS = (("flow.X", "flow.Y"), ("X", "Y"), ("u", "v"), ("R", "G"))
-# Middlebury's files mark a pixel whose flow is not known by a value beyond this.
+# In Middlebury's files, a larger value marks a pixel of unknown flow.
 _UNKNOWN = 1e9
 
 
 class FlowFolder:
-    """A folder of flow files in the layout above.
+    """Folder of flow files in the layout above.
 
     Args:
-        folder: holds one folder per camera; files may still be coming.
+        folder: holds one folder per camera; files may be added later.
 
     Raises:
         FileNotFoundError: there is no such folder.
@@ -52,16 +55,16 @@ class FlowFolder:
             raise FileNotFoundError(f"{folder}: expected a folder of flow files, found none; check the path.")
 
     def flows(self, camera: str, frame: int, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """Return the flow from frame t to t - 1 on frame t's grid, and that from t - 1 to t on frame t - 1's.
+        """Return the flow from frame t to t - 1 on frame t's grid, and from t - 1 to t on frame t - 1's grid.
 
         Args:
             camera: name of the camera.
             frame: t, from 1.
-            size: height and width of the camera's pictures.
+            size: height and width of the camera's images.
 
         Raises:
             FileNotFoundError: a file or its folder is missing.
-            ValueError: two files claim one frame, a flow has another size, or as `read_flow`.
+            ValueError: a frame has two files, a flow has another size, or as `read_flow`.
         """
         back, forward_flow = self._read(camera, "backward", frame, size), self._read(camera, "forward", frame - 1, size)
         return back, forward_flow
@@ -72,8 +75,8 @@ class FlowFolder:
         if flow.shape[:2] != size:
             (height, width), (rows, columns) = size, flow.shape[:2]
             raise ValueError(
-                f"{path}: expected {width}x{height} pixels as the pictures of {camera} have, got {columns}x{rows}; "
-                "compute the flow on undistorted and downscaled pictures."
+                f"{path}: expected {width}x{height} pixels as the images of {camera} have, got {columns}x{rows}; "
+                "compute the flow on undistorted and downscaled images."
             )
         return flow
 
@@ -87,7 +90,7 @@ class FlowFolder:
             got = f"those of frames {min(numbered)} to {max(numbered)}" if numbered else "no flow at all"
             raise FileNotFoundError(
                 f"{folder}: expected a .flo or .exr file of frame {frame}, found {got}; name each file after the frame "
-                "on whose grid it lives, counting from 0."
+                "on whose grid its flow lives, counting from 0."
             )
         if len(found) > 1:
             names = ", ".join(path.name for path in found)
@@ -101,8 +104,8 @@ def read_flow(path: str | Path) -> np.ndarray:
     Raises:
         FileNotFoundError: there is no such file.
         OSError: an EXR file cannot be read.
-        ValueError: neither kind of file, a `.flo` file that does not begin with its magic number or has not the
-            length that its header says, an EXR file without one known pair of channels, or pixels without flow.
+        ValueError: another kind of file, a `.flo` file without its magic number or of another length than its header
+            states, an EXR file without exactly one known pair of channels, or pixels without flow.
     """
     path = Path(path)
     reader = _read_flo if _suffix("read_flow()", path) == ".flo" else _read_exr
@@ -114,13 +117,13 @@ def read_flow(path: str | Path) -> np.ndarray:
         y, x = np.argwhere(unknown)[0]
         raise ValueError(
             f"{path}: expected a flow at every pixel, got none at {unknown.sum()} of {unknown.size}, the first at "
-            f"x={x}, y={y}; use a method that fills its gaps."
+            f"x={x}, y={y}; use a method that returns dense flow."
         )
     return flow
 
 
 def write_flow(path: str | Path, flow: np.ndarray) -> None:
-    """Write a flow [H, W, 2] in pixels as a `.flo` or EXR file that appears whole or not at all.
+    """Write a flow [H, W, 2] in pixels as a `.flo` or EXR file, atomically.
 
     Raises:
         ValueError: the suffix is neither `.flo` nor `.exr`, or the flow has another shape.
@@ -156,13 +159,23 @@ def _read_flo(path: Path) -> np.ndarray:
 def _read_exr(path: Path) -> np.ndarray:
     channels = read_exr(path)
     pairs = [pair for pair in _CHANNELS if set(pair) <= channels.keys()]
-    # The renderer's files hold colours beside the motion, whose R and G are no flow.
+    # The renderer's files hold colours beside the motion: their R and G are not flow.
     if len(pairs) != 1 or "motion.X" in channels:
         names = ", ".join("/".join(pair) for pair in _CHANNELS)
         raise ValueError(
             f"{path}: expected one pair of the channels {names}, and no motion map, got {', '.join(sorted(channels))}."
         )
     return np.stack([channels[name] for name in pairs[0]], axis=-1)
+
+
+@FLOW_SOURCES.register("files", "FOLDER")
+def _make(folder: str, config: FlowConfig) -> FlowSource:
+    return partial(_from_folder, FlowFolder(folder))
+
+
+def _from_folder(folder: FlowFolder, pair: FramePair) -> tuple[np.ndarray, np.ndarray]:
+    height, width = pair.image.shape[:2]
+    return folder.flows(pair.camera, pair.frame, (height, width))
 
 
 def _suffix(place: str, path: Path) -> str:

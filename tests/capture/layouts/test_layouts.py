@@ -1,4 +1,4 @@
-"""Every layout is found by what lies in the folder, and gives the same cameras and frames."""
+"""Every layout is found by the files in the folder and yields the same cameras and frames."""
 
 from __future__ import annotations
 
@@ -12,18 +12,20 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.layouts import registry
+from morgs_mi.capture.layouts.calibration import Calibration, Layout, required_clips
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
-from morgs_mi.capture.lens import MODELS
+from morgs_mi.capture.lens import MODELS, Lens
 from morgs_mi.io.video_writer import write_video
 from tests.capture import small_captures as layouts
 from tests.capture.small_captures import COUNT, FPS, HEIGHT, WIDTH, folder_per_camera, folder_per_frame, rig
 
-# Files keep poses in text or float64; the focal length of a rig is near 50 px.
+# Files store poses in text or float64; the focal length of a rig is near 50 px.
 POSE_ABS, PIXEL_ABS = 1e-9, 1e-6
 
 
 def assert_holds(capture: Capture, names: tuple[str, ...], order: tuple[int, ...], shift: float = 0.0) -> None:
-    """Camera `names[j]` must be the rig's camera `order[j]`, in poses, intrinsics and pictures."""
+    """Check that camera j has the name, pose, intrinsics and images of the rig's camera `order[j]`."""
     cameras = rig(names, shift)
     assert capture.names == tuple(names[i] for i in order)
     assert capture.num_frames == COUNT
@@ -34,19 +36,19 @@ def assert_holds(capture: Capture, names: tuple[str, ...], order: tuple[int, ...
         assert [tuple(image[20, 30, :2]) for image in frame.images] == [(i, t) for i in order]
 
 
-def test_n3dv_with_cameras_missing_from_the_numbering(tmp_path: Path) -> None:
+def test_poses_bounds__reads_n3dv_with_missing_camera_numbers(tmp_path: Path) -> None:
     capture = load_capture(layouts.n3dv(tmp_path / "a"))
     assert (capture.layout, capture.fps) == ("poses_bounds", FPS)
     assert_holds(capture, ("cam00", "cam02", "cam11"), (0, 1, 2))
 
 
-def test_n3dv_at_its_own_size_is_halved(tmp_path: Path) -> None:
+def test_poses_bounds__halves_n3dv_at_its_own_size(tmp_path: Path) -> None:
     camera = rig(("cam00",))[0].resized(2704, 2028)
     K = np.array([[1460.0, 0, 1352], [0, 1460, 1014], [0, 0, 1]])
     camera = type(camera)(K, camera.viewmat, 2704, 2028, "cam00")
     write_poses_bounds(tmp_path / "poses_bounds.npy", [camera], [[1, 9]])
     image = np.zeros((2028, 2704, 3), np.uint8)
-    image[::2] = 200  # the area filter averages rows, picking them would give 0 or 200
+    image[::2] = 200  # area averages are 100, nearest-neighbour sampling would give 0 or 200
     write_video(tmp_path / "cam00.mp4", [image], 30)
     capture = load_capture(tmp_path, downscale=2)
     half = capture.cameras[0]
@@ -68,14 +70,14 @@ def test_n3dv_at_its_own_size_is_halved(tmp_path: Path) -> None:
     ],
     ids=["videos", "inner videos", "folders", "inner folders", "cam/images", "frames", "frames/images"],
 )
-def test_meet_room(tmp_path: Path, clips) -> None:
+def test_poses_bounds__reads_meet_room(tmp_path: Path, clips) -> None:
     assert_holds(load_capture(layouts.meet_room(tmp_path / "a", clips)), ("cam_0", "cam_2", "cam_10"), (0, 1, 2))
 
 
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("shared", [True, False])
 @pytest.mark.parametrize("kind", ["txt", "bin"])
-def test_colmap(tmp_path: Path, model: str, shared: bool, kind: str) -> None:
+def test_colmap__reads_all_models(tmp_path: Path, model: str, shared: bool, kind: str) -> None:
     names, (focals, coefficients) = ("cam10", "cam2", "cam1"), MODELS[model]
     cameras = rig(names)
     lens = [0.01 * (k + 1) for k in range(coefficients)]
@@ -83,10 +85,10 @@ def test_colmap(tmp_path: Path, model: str, shared: bool, kind: str) -> None:
     folder = tmp_path / "sparse" / "0"
     layouts.colmap_text(folder, cameras, model, params, shared)
     if kind == "bin":
-        theirs = pycolmap.Reconstruction(str(folder))
+        converted = pycolmap.Reconstruction(str(folder))
         for file in folder.iterdir():
             file.unlink()
-        theirs.write_binary(str(folder))
+        converted.write_binary(str(folder))
     (folder_per_camera if shared else layouts.videos)(tmp_path, names)
     capture = load_capture(tmp_path)
     assert (capture.layout, capture.names) == ("COLMAP", ("cam1", "cam2", "cam10"))
@@ -94,15 +96,15 @@ def test_colmap(tmp_path: Path, model: str, shared: bool, kind: str) -> None:
         np.testing.assert_allclose(camera.viewmat, cameras[i].viewmat, atol=POSE_ABS)
         own = 0 if shared else i
         np.testing.assert_allclose(camera.K, [[50 + own, 0, 33], [0, 50 + own, 20 + own], [0, 0, 1]])
-    record = capture.record()
-    assert [view["lens"] for view in record["cameras"]] == [model] * 3
-    np.testing.assert_allclose(record["cameras"][0]["distortion"], lens)
+    metadata = capture.metadata()
+    assert [view["lens"] for view in metadata["cameras"]] == [model] * 3
+    np.testing.assert_allclose(metadata["cameras"][0]["distortion"], lens)
     np.testing.assert_allclose(capture.points, [[0.1, 0.2, 0.3]], rtol=1e-6)
     np.testing.assert_allclose(capture.point_colors, [[1, 0, 0.2]], atol=1e-6)
 
 
 @pytest.mark.parametrize("place", ["sparse", "colmap/sparse/0", "."])
-def test_colmap_models_lie_in_several_places(tmp_path: Path, place: str) -> None:
+def test_colmap__finds_models_in_several_places(tmp_path: Path, place: str) -> None:
     layouts.colmap(tmp_path / "a")
     for file in (tmp_path / "a/sparse/0").iterdir():
         (tmp_path / "a" / place).mkdir(parents=True, exist_ok=True)
@@ -110,8 +112,8 @@ def test_colmap_models_lie_in_several_places(tmp_path: Path, place: str) -> None
     assert_holds(load_capture(tmp_path / "a"), ("cam1", "cam2", "cam10"), (0, 1, 2), shift=3)
 
 
-def test_the_first_calibration_that_is_there_counts(tmp_path: Path) -> None:
-    """COLMAP before Nerfstudio before Dynamic 3D Gaussians before poses_bounds, binary before text."""
+def test_find_layout__follows_the_order_of_precedence(tmp_path: Path) -> None:
+    """COLMAP, Nerfstudio, Dynamic 3D Gaussians, poses_bounds; binary before text."""
     path = layouts.nerfstudio(tmp_path / "a")
     write_poses_bounds(path / "poses_bounds.npy", rig(("cam1", "cam2", "cam10")), [[1, 9]] * 3)
     assert load_capture(path).layout == "Nerfstudio"
@@ -130,7 +132,33 @@ def test_the_first_calibration_that_is_there_counts(tmp_path: Path) -> None:
     assert load_capture(meta).layout == "Nerfstudio"
 
 
-def test_folders_that_hold_no_clips(tmp_path: Path) -> None:
+def test_find_layout__finds_a_layout_that_is_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new layout costs its `Layout` and an entry in `LAYOUTS`."""
+    names, path = ("cam1", "cam2", "cam10"), tmp_path / "a"
+
+    def read(path: Path) -> Calibration:
+        clips = required_clips(path)
+        return Calibration(tuple(rig(tuple(clips))), (Lens(),) * len(clips), tuple(clips.values()))
+
+    toy = Layout("toy", ("toy.txt",), lambda path: (path / "toy.txt").is_file(), read)
+    monkeypatch.setattr(registry, "LAYOUTS", (*registry.LAYOUTS, toy))
+    layouts.videos(path, names)
+    with pytest.raises(FileNotFoundError, match=r"sparse/0, sparse, .*, poses_bounds.npy or toy.txt\), found none"):
+        load_capture(path)
+    (path / "toy.txt").touch()
+    capture = load_capture(path)
+    assert (capture.layout, len(capture.points), capture.test_view) == ("toy", 0, None)
+    assert_holds(capture, names, (0, 1, 2))
+    write_poses_bounds(path / "poses_bounds.npy", rig(names), [[1, 9]] * 3)
+    assert load_capture(path).layout == "poses_bounds"
+
+
+def test_layout_called__returns_every_layout_by_its_name() -> None:
+    assert [registry.layout_called(layout.name) for layout in registry.LAYOUTS] == list(registry.LAYOUTS)
+    assert registry.layout_called("toy") is None
+
+
+def test_clips_by_camera__ignores_folders_without_clips(tmp_path: Path) -> None:
     path = layouts.n3dv(tmp_path / "a")
     for place in (
         "images/cam05.png",
@@ -143,21 +171,21 @@ def test_folders_that_hold_no_clips(tmp_path: Path) -> None:
     assert load_capture(path).names == ("cam00", "cam02", "cam11")
 
 
-def test_frame_rates_may_differ_by_a_hundredth(tmp_path: Path) -> None:
+def test_timeline__accepts_frame_rates_that_differ_by_one_percent(tmp_path: Path) -> None:
     path = layouts.n3dv(tmp_path / "a")
     write_video(path / "cam02.mkv", layouts.frames(1), 1.005 * FPS)
     assert load_capture(path).fps == FPS
 
 
-def test_nerfstudio(tmp_path: Path) -> None:
+def test_nerfstudio__reads_cameras(tmp_path: Path) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
     capture = load_capture(path)
     assert (capture.layout, len(capture.points)) == ("Nerfstudio", 0)
     assert_holds(capture, ("cam1", "cam2", "cam10"), (0, 1, 2), shift=3)
-    assert capture.record()["cameras"][0]["distortion"] == [0.01, 0, 0, 0]
+    assert capture.metadata()["cameras"][0]["distortion"] == [0.01, 0, 0, 0]
 
 
-def test_nerfstudios_axes_are_opengls(tmp_path: Path) -> None:
+def test_nerfstudio__has_opengl_axes(tmp_path: Path) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
     # A camera at (5, 6, 7) that looks along world +y with world +x to its right and world +z up.
     pose = [[1, 0, 0, 5], [0, 0, -1, 6], [0, 1, 0, 7], [0, 0, 0, 1]]
@@ -173,7 +201,7 @@ def edit(path: Path, change, name: str = "transforms.json") -> None:
     (path / name).write_text(json.dumps(meta))
 
 
-def test_nerfstudios_frames_override_the_top_of_the_file(tmp_path: Path) -> None:
+def test_nerfstudio__frames_override_the_keys_of_the_file(tmp_path: Path) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
 
     def change(meta: dict) -> None:
@@ -185,12 +213,12 @@ def test_nerfstudios_frames_override_the_top_of_the_file(tmp_path: Path) -> None
     edit(path, change)
     capture = load_capture(path)
     np.testing.assert_allclose(capture.cameras[1].K, [[40, 0, WIDTH / 2], [0, 40, HEIGHT / 2], [0, 0, 1]])
-    first, second, _ = capture.record()["cameras"]
+    first, second, _ = capture.metadata()["cameras"]
     assert (first["lens"], first["distortion"]) == ("OPENCV_FISHEYE", [0.07, 0, 0.05, 0.09])
     assert (second["lens"], second["distortion"]) == ("FULL_OPENCV", [0.02, 0, 0, 0.03, 0.05, 0, 0, 0])
 
 
-def test_nerfstudio_from_a_field_of_view_with_all_frames_listed_and_points(tmp_path: Path) -> None:
+def test_nerfstudio__reads_a_field_of_view_all_frames_and_points(tmp_path: Path) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
     for file in path.glob("*.mkv"):
         file.unlink()
@@ -217,7 +245,7 @@ def test_nerfstudio_from_a_field_of_view_with_all_frames_listed_and_points(tmp_p
     assert [image[20, 30, 0] for image in next(capture.frames()).images] == [0, 1, 2]
 
 
-def test_nerfstudio_with_a_folder_per_frame(tmp_path: Path) -> None:
+def test_nerfstudio__reads_a_folder_per_frame(tmp_path: Path) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
     for file in path.glob("*.mkv"):
         file.unlink()
@@ -226,7 +254,7 @@ def test_nerfstudio_with_a_folder_per_frame(tmp_path: Path) -> None:
     assert_holds(load_capture(path), ("cam1", "cam2", "cam10"), (0, 1, 2), shift=3)
 
 
-def test_dynamic3dgs(tmp_path: Path) -> None:
+def test_dynamic3dgs__reads_cameras(tmp_path: Path) -> None:
     capture = load_capture(layouts.dynamic3dgs(tmp_path / "a"))
     assert (capture.layout, capture.test_view, capture.fps) == ("Dynamic 3D Gaussians", None, 30)
     assert_holds(capture, ("2", "1", "10"), (1, 0, 2), shift=3)
@@ -234,7 +262,7 @@ def test_dynamic3dgs(tmp_path: Path) -> None:
     np.testing.assert_allclose(capture.point_colors, [[0.1, 0.2, 0.3]], rtol=1e-6)
 
 
-def test_the_first_test_camera_of_dynamic3dgs_is_held_out(tmp_path: Path) -> None:
+def test_dynamic3dgs__holds_out_the_first_test_camera(tmp_path: Path) -> None:
     path = layouts.dynamic3dgs(tmp_path / "a")
     meta = json.loads((path / "train_meta.json").read_text())
     for name, kept in (("train_meta", (1,)), ("test_meta", (10, 2))):
@@ -249,25 +277,25 @@ def test_the_first_test_camera_of_dynamic3dgs_is_held_out(tmp_path: Path) -> Non
     assert load_capture(path, test_view=None).test_view is None
 
 
-def test_smaller_clips_scale_the_intrinsics(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_at_clip_size__scales_the_intrinsics_of_smaller_clips(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = layouts.colmap(tmp_path / "a")
     small = np.full((HEIGHT // 2, WIDTH // 2, 3), 7, np.uint8)
     write_video(path / "frames" / "cam2", [small] * COUNT, FPS)
     with caplog.at_level(logging.WARNING):
         capture = load_capture(path)
-    assert "the clips of cam2 are not of the size that was calibrated, 31x23 for one: the intrinsics" in caplog.text
+    assert "the clips of cam2 do not have the calibrated size (the first has 31x23); the intrinsics" in caplog.text
     assert [(c.width, c.height) for c in capture.cameras] == [(62, 46), (31, 23), (62, 46)]
     np.testing.assert_allclose(capture.cameras[1].K[:2], rig(("a", "b"), shift=3)[1].K[:2] / 2, atol=PIXEL_ABS)
 
 
-def test_the_record_says_how_frames_come_about(tmp_path: Path) -> None:
+def test_metadata__describes_how_frames_were_read(tmp_path: Path) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
-    record = load_capture(path, downscale=2, test_view=1, max_frames=3).record()
-    assert json.loads(json.dumps(record)) == record
-    assert (record["filter"], record["downscale"], record["test_view"], record["frames"]) == ("area", 2, 1, 3)
-    assert (record["layout"], record["fps"], record["points"]) == ("Nerfstudio", FPS, 0)
-    view = record["cameras"][2]
+    metadata = load_capture(path, downscale=2, test_view=1, max_frames=3).metadata()
+    assert json.loads(json.dumps(metadata)) == metadata
+    assert (metadata["filter"], metadata["downscale"], metadata["test_view"], metadata["frames"]) == ("area", 2, 1, 3)
+    assert (metadata["layout"], metadata["fps"], metadata["points"]) == ("Nerfstudio", FPS, 0)
+    view = metadata["cameras"][2]
     assert (view["name"], view["recorded_size"], view["size"]) == ("cam10", [WIDTH, HEIGHT], [WIDTH // 2, HEIGHT // 2])
     assert (view["lens"], view["undistortion"]) == ("OPENCV", "cubic, same intrinsics")
     assert 0.5 < view["valid_share"] <= 1
-    assert load_capture(path).record()["filter"] == "none"
+    assert load_capture(path).metadata()["filter"] == "none"

@@ -20,7 +20,7 @@ def cameras() -> list[Camera]:
     ]
 
 
-def test_round_trip(tmp_path: Path) -> None:
+def test_read_poses_bounds__reads_what_write_poses_bounds_writes(tmp_path: Path) -> None:
     path = tmp_path / "poses_bounds.npy"
     write_poses_bounds(path, cameras(), BOUNDS)
     assert np.load(path).shape == (2, 17)
@@ -32,14 +32,14 @@ def test_round_trip(tmp_path: Path) -> None:
         np.testing.assert_allclose(got.viewmat, expected.viewmat, atol=1e-12)
 
 
-def test_columns_are_down_right_back(tmp_path: Path) -> None:
+def test_read_poses_bounds__columns_are_down_right_back(tmp_path: Path) -> None:
     # A camera at (5, 6, 7) that looks along world +y with world +x to its right: down is -z, back is -y.
     pose = [[0, 1, 0, 5, 48], [0, 0, -1, 6, 64], [-1, 0, 0, 7, 100]]
     np.save(tmp_path / "p.npy", [[*np.ravel(pose).astype(float), 1.0, 2.0]])
     (camera,), _ = read_poses_bounds(tmp_path / "p.npy", ["cam"])
     np.testing.assert_allclose(camera.position, (5, 6, 7))
-    seen = camera.viewmat @ [5 + 1, 6 + 10, 7 + 2, 1]
-    np.testing.assert_allclose(seen[:3], (1, -2, 10), atol=1e-12)
+    local = camera.viewmat @ [5 + 1, 6 + 10, 7 + 2, 1]
+    np.testing.assert_allclose(local[:3], (1, -2, 10), atol=1e-12)
     assert (camera.width, camera.height, camera.K[0, 0]) == (64, 48, 100)
 
 
@@ -70,12 +70,12 @@ def mirrored(rows: np.ndarray) -> np.ndarray:
         (lambda rows: rows.astype(object), "got a broken file"),
     ],
 )
-def test_bad_files(tmp_path: Path, change, message: str) -> None:
+def test_read_poses_bounds__refuses_bad_files(tmp_path: Path, change, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         read_poses_bounds(broken(tmp_path / "poses_bounds.npy", change), ["cam00", "cam01"])
 
 
-def test_what_the_format_cannot_hold_is_refused(tmp_path: Path) -> None:
+def test_write_poses_bounds__refuses_cameras_that_the_format_cannot_represent(tmp_path: Path) -> None:
     K = np.array([[50, 0, 30], [0, 50, 24], [0, 0, 1.0]])
     camera = Camera(K, np.eye(4), 64, 48, "cam00")
     with pytest.raises(ValueError, match=r"'cam00' must have one focal length .* use write_colmap"):

@@ -1,4 +1,4 @@
-"""Flow from files: what is written is read, and what is wrong is named."""
+"""Flow from files: reading inverts writing, and errors name the file."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def folder(tmp_path):
 
 @pytest.mark.parametrize("name", ["a.flo", "a.exr", "A.FLO"])
 @pytest.mark.parametrize("size", [(6, 9), (1, 1), (33, 2)])
-def test_reading_gives_what_was_written(tmp_path, name, size):
+def test_read_flow__inverts_write_flow(tmp_path, name, size):
     flow = random_flow(*size)
     write_flow(tmp_path / name, flow)
     read = read_flow(tmp_path / name)
@@ -38,7 +38,7 @@ def test_reading_gives_what_was_written(tmp_path, name, size):
     assert read.dtype == np.float32
 
 
-def test_flo_files_are_those_of_opencv(tmp_path):
+def test_write_flow__writes_flo_files_as_opencv_does(tmp_path):
     flow = random_flow()
     write_flow(tmp_path / "ours.flo", flow)
     np.testing.assert_array_equal(cv2.readOpticalFlow(str(tmp_path / "ours.flo")), flow)
@@ -47,36 +47,36 @@ def test_flo_files_are_those_of_opencv(tmp_path):
 
 
 @pytest.mark.parametrize("names", ["XY", "uv", "RG", "RGB"])
-def test_exr_files_of_other_programs(tmp_path, names):
+def test_read_flow__accepts_exr_channels_of_other_programs(tmp_path, names):
     flow = random_flow()
     x, y = flow[..., 0], flow[..., 1]
     write_exr(tmp_path / "a.exr", dict(zip(names, (x, y, 0 * x), strict=False)))
     np.testing.assert_array_equal(read_flow(tmp_path / "a.exr"), flow)
 
 
-def test_a_frame_gets_its_own_flow_in_both_directions(folder):
+def test_flow_source__reads_both_directions_of_a_frame(folder):
     for frame in (1, 2):
-        pictures = np.zeros((2, 6, 9, 3), np.uint8)
-        pair = FramePair(*pictures, camera="cam00", frame=frame)
+        images = np.zeros((2, 6, 9, 3), np.uint8)
+        pair = FramePair(*images, camera="cam00", frame=frame)
         back, forward_flow = flow_source(f"files:{folder}")(pair)
         np.testing.assert_array_equal(back, random_flow(seed=frame))
         np.testing.assert_array_equal(forward_flow, random_flow(seed=frame - 1 + 10))
 
 
-def test_cues_from_files_move_the_other_way_and_are_checked(tmp_path):
+def test_observe_key_views__negates_and_checks_flow_from_files(tmp_path):
     forward_flow = np.full((40, 60, 2), (3, 1), np.float32)
     back = -forward_flow
-    back[:, :10] = (5, 5)  # leads nowhere that leads back
+    back[:, :10] = (5, 5)  # the forward flow there does not lead back
     for direction, frame, flow in (("backward", 7, back), ("forward", 6, forward_flow)):
         (tmp_path / "cam01" / direction).mkdir(parents=True)
         write_flow(tmp_path / "cam01" / direction / f"{frame}.exr", flow)
-    pictures = np.zeros((2, 40, 60, 3), np.uint8)
-    pair = FramePair(*pictures, camera="cam01", frame=7)
-    cue = observe_key_views({5: pair}, MotionConfig(flow_method=f"files:{tmp_path}"), with_masks=False)[5]
-    np.testing.assert_array_equal(cue.motion[:, 10:], forward_flow[:, 10:])
-    np.testing.assert_array_equal(cue.forward_flow, forward_flow)
-    assert cue.reliable[3:, 12:].all()
-    assert not cue.reliable[:, :10].any()
+    images = np.zeros((2, 40, 60, 3), np.uint8)
+    pair = FramePair(*images, camera="cam01", frame=7)
+    observation = observe_key_views({5: pair}, MotionConfig(flow_method=f"files:{tmp_path}"), with_masks=False)[5]
+    np.testing.assert_array_equal(observation.motion[:, 10:], forward_flow[:, 10:])
+    np.testing.assert_array_equal(observation.forward_flow, forward_flow)
+    assert observation.reliable[3:, 12:].all()
+    assert not observation.reliable[:, :10].any()
 
 
 def flo(magic=202021.25, width=3, height=2, values=12):
@@ -97,29 +97,32 @@ def flo(magic=202021.25, width=3, height=2, values=12):
         (flo()[:-4] + np.float32(1.7e9).tobytes(), "none at 1 of 6"),
     ],
 )
-def test_a_broken_flo_file_is_named(tmp_path, content, message):
+def test_read_flow__rejects_a_broken_flo_file(tmp_path, content, message):
     (tmp_path / "bad.flo").write_bytes(content)
     with pytest.raises(ValueError, match=rf"bad\.flo: expected (.* )?{message}"):
         read_flow(tmp_path / "bad.flo")
 
 
-def test_bad_files_are_named(tmp_path, folder):
+def test_read_flow__rejects_missing_and_foreign_files(tmp_path):
     with pytest.raises(FileNotFoundError, match="expected a flow file, found none"):
         read_flow(tmp_path / "none.flo")
     with pytest.raises(ValueError, match=r"must end in \.flo or \.exr, got 'a\.png'"):
         read_flow(tmp_path / "a.png")
-    with pytest.raises(ValueError, match=r"`flow` must be \[H, W, 2\], got \(4, 5\)"):
-        write_flow(tmp_path / "a.flo", np.zeros((4, 5)))
-    (tmp_path / "a.exr").write_bytes(b"no picture")
+    (tmp_path / "a.exr").write_bytes(b"no image")
     with pytest.raises(OSError, match="cannot read"):
         read_flow(tmp_path / "a.exr")
+
+
+def test_write_flow__rejects_another_shape(tmp_path):
+    with pytest.raises(ValueError, match=r"`flow` must be \[H, W, 2\], got \(4, 5\)"):
+        write_flow(tmp_path / "a.flo", np.zeros((4, 5)))
 
 
 @pytest.mark.parametrize(
     "names", [("motion.X", "motion.Y"), ("B", "G", "R", "motion.X", "motion.Y"), ("X", "Y", "u", "v"), ("u",)]
 )
-def test_channels_that_are_no_flow_are_named(tmp_path, names):
-    # The renderer's motion points the other way, and the colours beside it are no flow.
+def test_read_flow__rejects_channels_that_are_not_flow(tmp_path, names):
+    # The renderer's motion points the other way, and the colours beside it are not flow.
     write_exr(tmp_path / "b.exr", dict.fromkeys(names, np.zeros((2, 2))))
     with pytest.raises(ValueError, match=rf"flow\.X/flow\.Y.*, got {', '.join(names)}\."):
         read_flow(tmp_path / "b.exr")
@@ -130,20 +133,20 @@ def test_channels_that_are_no_flow_are_named(tmp_path, names):
     [
         ("cam00", 3, (6, 9), FileNotFoundError, "cam00/backward: .* of frame 3, found those of frames 1 to 2; name"),
         ("cam01", 1, (6, 9), FileNotFoundError, "cam01/backward: .* of frame 1, found no flow at all"),
-        ("cam00", 1, (9, 6), ValueError, r"0001\.flo: expected 6x9 pixels as the pictures of cam00 have, got 9x6"),
+        ("cam00", 1, (9, 6), ValueError, r"0001\.flo: expected 6x9 pixels as the images of cam00 have, got 9x6"),
     ],
 )
-def test_a_flow_that_does_not_fit_is_named(folder, camera, frame, size, exception, message):
+def test_flow_folder__rejects_missing_frames_and_other_sizes(folder, camera, frame, size, exception, message):
     with pytest.raises(exception, match=message):
         FlowFolder(folder).flows(camera, frame, size)
 
 
-def test_two_files_of_one_frame_are_named(folder):
+def test_flow_folder__rejects_two_files_of_one_frame(folder):
     write_flow(folder / "cam00/backward/frame_1.exr", random_flow())
     with pytest.raises(ValueError, match=r"one file of frame 1, got frame_1\.exr, v2_frame_0001\.flo"):
         FlowFolder(folder).flows("cam00", 1, (6, 9))
 
 
-def test_a_missing_folder_is_refused_before_the_first_frame(tmp_path):
+def test_motion_config__rejects_a_missing_flow_folder(tmp_path):
     with pytest.raises(FileNotFoundError, match="expected a folder of flow files, found none"):
         MotionConfig(flow_method=f"files:{tmp_path / 'flow'}")

@@ -1,4 +1,4 @@
-"""Flow networks: order, channels, range, padding and scale of what goes in and comes out."""
+"""Flow networks: order, channels, range, padding and scale of inputs and outputs."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ def network(tmp_path_factory):
     return export(tmp_path_factory.mktemp("network") / "tiny.onnx")
 
 
-def pictures(height, width):
+def image_pair(height, width):
     return np.random.default_rng(height).integers(0, 255, (2, height, width, 3), dtype=np.uint8)
 
 
 @pytest.mark.parametrize("size", [(32, 48), (40, 24), (17, 31), (90, 50), (33, 33)])
-def test_the_flow_is_the_networks_own_at_any_size(network, size):
-    image, other = pictures(*size)
+def test_flow_network__returns_the_known_flow_at_any_size(network, size):
+    image, other = image_pair(*size)
     flow = FlowNetwork(network)(image, other)
     assert flow.shape == (*size, 2)
     assert flow.dtype == np.float32
@@ -34,18 +34,18 @@ def test_the_flow_is_the_networks_own_at_any_size(network, size):
 
 
 @pytest.mark.parametrize(("kind", "low", "high"), [("onnx", 0, 255), ("onnx-unit", 0, 1), ("onnx-signed", -1, 1)])
-def test_both_directions_in_the_range_that_the_name_says(network, kind, low, high):
-    image, previous = pictures(24, 40)
+def test_flow_source__runs_a_network_both_ways_in_its_value_range(network, kind, low, high):
+    image, previous = image_pair(24, 40)
     back, forward_flow = flow_source(f"{kind}:{network}")(FramePair(image, previous))
-    a, b = (low + (high - low) / 255 * picture.astype(float) for picture in (image, previous))
+    a, b = (low + (high - low) / 255 * each.astype(float) for each in (image, previous))
     np.testing.assert_allclose(back, known_flow(a, b), atol=TOLERANCE)
     np.testing.assert_allclose(forward_flow, known_flow(b, a), atol=TOLERANCE)
     floats = flow_source(f"{kind}:{network}")(FramePair(image / 255, previous / 255))
     np.testing.assert_allclose(floats[0], back, atol=TOLERANCE)
 
 
-def test_a_network_of_fixed_size_gets_and_gives_resized_pictures(tmp_path):
-    # Colours that vary linearly survive any resizing away from the border.
+def test_flow_network__of_fixed_size_resizes_images_and_flow(tmp_path):
+    # Away from the border, resizing does not change colours that vary linearly.
     y, x = np.mgrid[:60, :100] / 100
     image, other = np.stack([x, y, x + y], -1) / 2, np.stack([y, x, x], -1) / 2
     flow = FlowNetwork(export(tmp_path / "fixed.onnx", 32, 40), 0, 1)(image, other)
@@ -54,14 +54,14 @@ def test_a_network_of_fixed_size_gets_and_gives_resized_pictures(tmp_path):
     np.testing.assert_allclose(flow[5:-5, 5:-5], expected[5:-5, 5:-5], atol=0.01)
 
 
-def test_the_signature_is_read_from_the_file(tmp_path, network):
+def test_read_signature__returns_names_and_shapes(tmp_path, network):
     assert read_signature(network).inputs == {"image1": (1, 3, None, None), "image2": (1, 3, None, None)}
     assert read_signature(network).outputs == ("flow_low", "flow_up")
     assert read_signature(export(tmp_path / "fixed.onnx", 64, 96)).inputs["image2"] == (1, 3, 64, 96)
 
 
 def bad(tmp_path, name):
-    """Return the path of a file that is no flow network."""
+    """Return the path of a file that is not a flow network."""
     path = tmp_path / f"{name}.onnx"
     content = {"text": b"not a network, but long enough to look like one", "empty": b""}
     if name in content:
@@ -81,40 +81,40 @@ def bad(tmp_path, name):
     ("name", "exception", "message"),
     [
         ("missing", FileNotFoundError, "missing.onnx: expected an ONNX file, found none"),
-        ("text", ValueError, "text.onnx: expected an ONNX file, got something else"),
+        ("text", ValueError, "text.onnx: expected an ONNX file, got another format"),
         ("empty", ValueError, "empty.onnx: expected an ONNX file"),
         ("cut", ValueError, "cut.onnx: expected an ONNX file"),
-        ("one", ValueError, r"two pictures \[1, 3, H, W\] as its inputs, got \[1, 3, \?, \?\];"),
-        ("three", ValueError, r"two pictures .* and \[1, 3, \?, \?\] and"),
+        ("one", ValueError, r"two images \[1, 3, H, W\] as its inputs, got \[1, 3, \?, \?\];"),
+        ("three", ValueError, r"two images .* and \[1, 3, \?, \?\] and"),
         ("half", ValueError, r"both fixed or both open, got \[1, 3, 64, \?\]"),
     ],
 )
-def test_what_is_no_flow_network_is_refused_before_the_first_frame(tmp_path, name, exception, message):
+def test_motion_config__rejects_a_file_that_is_not_a_flow_network(tmp_path, name, exception, message):
     path = bad(tmp_path, name)
     with pytest.raises(exception, match=message):
         MotionConfig(flow_method=f"onnx:{path}")
 
 
-def test_an_output_that_is_no_flow_is_named(tmp_path):
+def test_flow_network__rejects_an_output_that_is_not_flow(tmp_path):
     path = export(tmp_path / "scalar.onnx", channels=1)
     with pytest.raises(ValueError, match=r"output \[1, 2, 16, 24\], the flow, got \[1, 1, 2, 3\] and \[1, 1, 16, 24\]"):
-        FlowNetwork(path)(*pictures(16, 24))
+        FlowNetwork(path)(*image_pair(16, 24))
 
 
-def test_a_network_that_fails_says_where(network, monkeypatch):
+def test_flow_network__names_the_file_where_it_fails(network, monkeypatch):
     monkeypatch.setattr("morgs_mi.method.flow_sources.network._MULTIPLE", 1)
-    # Without the padding, OpenCV 4 refuses the sizes inside and OpenCV 5 gives a flow of another size.
+    # Without the padding, OpenCV 4 rejects the sizes inside and OpenCV 5 returns a flow of another size.
     with pytest.raises(ValueError, match=r"tiny\.onnx: (OpenCV .* on 30x20 pixels|expected an output)"):
-        FlowNetwork(network)(*pictures(20, 30))
+        FlowNetwork(network)(*image_pair(20, 30))
 
 
-def test_the_lookup_that_raft_needs_runs_or_is_named(tmp_path):
-    image, other = pictures(24, 40)
+def test_flow_network__runs_the_lookup_of_raft_or_names_it(tmp_path):
+    image, other = image_pair(24, 40)
     path = export_lookup(tmp_path / "lookup.onnx", 24, 40)
     if int(cv2.__version__.split(".")[0]) < 5:
         with pytest.raises(ValueError, match=r"lookup.onnx: OpenCV 4\..* cannot load this network .*GridSample"):
             FlowNetwork(path)
         return
     expected = 0.5 * (other[::-1, ::-1, :2].astype(float) - image[..., :2])
-    # Grid coordinates in float32 put a lookup up to 1e-5 px beside its pixel.
+    # With grid coordinates in float32, a lookup is up to 1e-5 px off its pixel.
     np.testing.assert_allclose(FlowNetwork(path)(image, other), expected, atol=0.01)

@@ -1,4 +1,4 @@
-"""Optical flow and the motion cue: sign, grid, reliability."""
+"""Optical flow and the flow observation: sign, grid, reliability."""
 
 from __future__ import annotations
 
@@ -6,40 +6,42 @@ import numpy as np
 import pytest
 
 from morgs_mi.method.flow import observe_flow
+from morgs_mi.method.flow_sources.config import FlowConfig
 from morgs_mi.method.flow_sources.opencv import FLOW_METHODS, optical_flow
+from morgs_mi.method.flow_sources.registry import FramePair, flow_source
 from tests.method.moving_disc import moving_disc, texture
 
 
 @pytest.mark.parametrize("method", FLOW_METHODS)
 @pytest.mark.parametrize("shift", [(5, 3), (-4, 0), (0, -2)])
-def test_translation_is_recovered_with_its_sign(method, shift):
+def test_optical_flow__recovers_a_translation_with_its_sign(method, shift):
     dx, dy = shift
     scene = texture(140, 180, seed=1)
     previous, image = scene[10:130, 10:170], scene[10 - dy : 130 - dy, 10 - dx : 170 - dx]
     motion = -optical_flow(image, previous, method)
     error = np.linalg.norm(motion - shift, axis=-1)[10:-10, 10:-10]
-    # Ultrafast and fast stop at a quarter of the resolution.
+    # `dis-ultrafast` and `dis-fast` stop at a quarter of the resolution.
     assert np.median(error) < 0.5
 
 
-def test_motion_is_the_shift_on_frame_ts_grid():
+def test_observe_flow__motion_is_the_shift_on_frame_ts_grid():
     previous, image, disc = moving_disc(240, 320, shift=(6, -4))
-    cue = observe_flow(image, previous)
-    motion, reliable = cue.motion, cue.reliable
+    observation = observe_flow(image, previous)
+    motion, reliable = observation.motion, observation.reliable
     # 0.25 px: DIS smooths over 8x8 patches.
     assert np.abs(motion[disc & reliable] - (6, -4)).mean() < 0.25
     assert np.linalg.norm(motion[~disc & reliable], axis=-1).mean() < 0.25
     assert reliable[disc].mean() > 0.8
 
 
-def test_what_was_hidden_is_not_reliable():
+def test_observe_flow__uncovered_pixels_are_unreliable():
     previous, image, disc = moving_disc(240, 320, shift=(10, 0))
     reliable = observe_flow(image, previous).reliable
     uncovered = np.roll(disc, (0, -10), (0, 1)) & ~disc
     assert reliable[uncovered].mean() < 0.5 < 0.95 < reliable.mean()
 
 
-def test_float_and_bytes_agree():
+def test_optical_flow__float_and_bytes_agree():
     previous, image, _ = moving_disc(64, 96, shift=(2, 1))
     as_bytes = [(frame * 255 + 0.5).astype(np.uint8) for frame in (image, previous)]
     np.testing.assert_array_equal(optical_flow(image, previous), optical_flow(*as_bytes))
@@ -47,7 +49,7 @@ def test_float_and_bytes_agree():
 
 @pytest.mark.parametrize("method", FLOW_METHODS)
 @pytest.mark.parametrize("size", [(1, 1), (1, 40), (15, 15), (16, 16), (16, 90), (90, 16), (24, 24), (31, 70)])
-def test_any_size_gives_a_finite_flow(method, size):
+def test_optical_flow__is_finite_at_any_size(method, size):
     rng = np.random.default_rng(0)
     image, previous = rng.integers(0, 255, (2, *size, 3), dtype=np.uint8)
     flow = optical_flow(image, previous, method)
@@ -58,14 +60,15 @@ def test_any_size_gives_a_finite_flow(method, size):
 
 
 @pytest.mark.parametrize("method", FLOW_METHODS)
-def test_pictures_with_nothing_to_match_give_a_finite_flow(method):
+def test_optical_flow__is_finite_with_nothing_to_match(method):
     scene = (255 * texture(130, 150, seed=3)).astype(np.uint8)
     image, flat = scene[:60, :80], np.full((60, 80, 3), 90, np.uint8)
-    part = np.where(np.arange(80)[:, None] < 20, image, flat)
-    for previous, following in ((flat, flat), (flat, image), (image, flat), (part, part), (image, scene[70:, 70:])):
+    textured_left = np.where(np.arange(80)[:, None] < 20, image, flat)
+    same = ((flat, flat), (textured_left, textured_left))
+    for previous, following in (*same, (flat, image), (image, flat), (image, scene[70:, 70:])):
         flow = optical_flow(following, previous, method)
         assert np.isfinite(flow).all()
-    # A picture that stands still does so in every method; RLOF and PCAFlow interpolate between sparse matches.
+    # Every method finds no motion between equal images; RLOF and PCAFlow interpolate between sparse matches.
     assert np.abs(optical_flow(image, image, method)).max() < 0.1
 
 
@@ -80,6 +83,63 @@ RGB = np.zeros((20, 20, 3), np.uint8)
         ((RGB[..., 0], RGB[..., 0]), r"RGB .* \(20, 20\)"),
     ],
 )
-def test_bad_input_is_named(arguments, message):
+def test_optical_flow__rejects_bad_input(arguments, message):
     with pytest.raises(ValueError, match=message):
         optical_flow(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("method", "settings"),
+    [
+        ("dis", {"fine_width": 64}),
+        ("farneback", {"farneback_levels": 1}),
+        ("farneback", {"farneback_window": 31}),
+        ("dis-fine", {"min_side": 145}),
+    ],
+)
+def test_flow_config__settings_of_a_method_act(method, settings):
+    # At 64 rows, OpenCV reduces Farneback's pyramid to one level.
+    previous, image, _ = moving_disc(144, 200, shift=(6, 1))
+    flow = optical_flow(image, previous, method)
+    changed = optical_flow(image, previous, method, FlowConfig(**settings))
+    assert not np.array_equal(flow, changed)
+    source_flow, _ = flow_source(method, FlowConfig(**settings))(FramePair(image, previous))
+    np.testing.assert_array_equal(source_flow, changed)
+
+
+def test_flow_config__fine_width_selects_the_finest_level_of_dis():
+    previous, image, _ = moving_disc(64, 96, shift=(6, 1))
+    for fine_width, reference in ((96, "dis-fine"), (95, "dis-medium")):
+        flow = optical_flow(image, previous, "dis", FlowConfig(fine_width=fine_width))
+        np.testing.assert_array_equal(flow, optical_flow(image, previous, reference))
+
+
+def test_flow_config__min_side_is_the_least_side_with_flow():
+    previous, image, _ = moving_disc(64, 96, shift=(6, 1))
+    assert optical_flow(image, previous, config=FlowConfig(min_side=64)).any()
+    assert not optical_flow(image, previous, config=FlowConfig(min_side=65)).any()
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"min_side": 15}, "`min_side` must be at least 16, got 15"),
+        ({"farneback_window": 0}, "`farneback_window` must be at least 1, got 0"),
+        ({"consistency_absolute": float("nan")}, "`consistency_absolute` must be at least 0, got nan"),
+    ],
+)
+def test_flow_config__rejects_numbers_out_of_range(settings, message):
+    with pytest.raises(ValueError, match=message):
+        FlowConfig(**settings)
+
+
+def test_both_directions__computes_flow_inside_the_box_alone():
+    previous, image, _ = moving_disc(64, 96, shift=(6, 1))
+    box = slice(10, 60), slice(20, 90)
+    flow, forward_flow = flow_source("dis")(FramePair(image, previous, box=box))
+    np.testing.assert_array_equal(flow[box], optical_flow(image[box], previous[box]))
+    np.testing.assert_array_equal(forward_flow[box], optical_flow(previous[box], image[box]))
+    for each in (flow, forward_flow):
+        outside = each.copy()
+        outside[box] = 0
+        assert not outside.any()

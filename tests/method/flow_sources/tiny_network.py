@@ -8,20 +8,20 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-# Per flow component, of red, green and blue: no two alike, so that a swap of anything shows.
+# Weights of red, green and blue per flow component. They all differ, so that any swap shows.
 OF_IMAGE = np.array([[0.1, 0.2, 0.3], [0.02, 0.05, 0.01]], np.float32)
 OF_OTHER = np.array([[-0.3, 0.1, 0.2], [0.04, 0.03, -0.02]], np.float32)
 
 
 def known_flow(image: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return the flow [H, W, 2] that the network gives for two pictures [H, W, 3] in its own range of values."""
+    """Return the network's flow [H, W, 2] for two images [H, W, 3] in its own range of values."""
     return image @ OF_IMAGE.T + other @ OF_OTHER.T
 
 
 def export(path: Path, height: int | str = "h", width: int | str = "w", inputs: int = 2, channels: int = 2) -> Path:
-    """Write a network with RAFT's signature: two pictures in, flow at an eighth and at the whole size out.
+    """Write a network with RAFT's signature: it takes two images and returns flow at an eighth and at the full size.
 
-    It wants multiples of 8, as RAFT does: the whole flow takes up the small one enlarged, times 0.
+    It requires multiples of 8, as RAFT does: the full flow includes the small one enlarged, times 0.
     """
     names = [f"image{k}" for k in range(1, inputs + 1)]
     weights = dict(zip(names, (OF_IMAGE, OF_OTHER, OF_OTHER), strict=False))
@@ -42,7 +42,7 @@ def export(path: Path, height: int | str = "h", width: int | str = "w", inputs: 
 
 
 def export_lookup(path: Path, height: int, width: int) -> Path:
-    """Write a network that looks up the second picture in the first one's grid turned by 180 degrees, as RAFT looks up
+    """Write a network that looks up the second image in the first one's grid turned by 180 degrees, as RAFT looks up
     correlations: the flow is the difference of red and of green, at half weight.
     """
     y, x = np.linspace(1, -1, height), np.linspace(1, -1, width)
@@ -53,8 +53,8 @@ def export_lookup(path: Path, height: int, width: int) -> Path:
         helper.make_node("Sub", ["turned", "image1"], ["difference"]),
         helper.make_node("Conv", ["difference", "weights"], ["flow"]),
     ]
-    pictures = dict.fromkeys(("image1", "image2"), (1, 3, height, width))
-    return write(path, nodes, pictures, {"flow": [1, 2, height, width]}, {"weights": weights, "grid": grid})
+    inputs = dict.fromkeys(("image1", "image2"), (1, 3, height, width))
+    return write(path, nodes, inputs, {"flow": [1, 2, height, width]}, {"weights": weights, "grid": grid})
 
 
 def write(path: Path, nodes: list, inputs: dict, outputs: dict, constants: dict[str, np.ndarray]) -> Path:

@@ -1,4 +1,4 @@
-"""Two networks with SAM2's signature, as ONNX files: they find what is redder than blue, as prompts tell."""
+"""Two networks with SAM2's signature, as ONNX files: they segment pixels redder than blue around the prompts."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from onnx import helper
 from tests.method.flow_sources.tiny_network import write
 
 SIZE, CELL = 1024, 4
-# What a point on the object reaches, pixels of the network's picture.
+# Radius around a point on the object within which pixels are segmented, in pixels of the network's image.
 REACH = 300.0
-# Which of three masks the decoder trusts most.
+# Index of the decoder's mask with the highest predicted IoU, of three.
 BEST = 1
 MEAN, DEVIATION = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
 
 
 def export_encoder(path: Path, open_size: bool = False) -> Path:
-    """Write an encoder whose features are the picture itself, at a quarter, an eighth and a sixteenth of its side."""
+    """Write an encoder whose features are the image itself, at a quarter, an eighth and a sixteenth of its side."""
     names = {"high_res_feats_0": 4, "high_res_feats_1": 8, "image_embed": 16}
     nodes = [
         helper.make_node("AveragePool", ["image"], [name], kernel_shape=[k, k], strides=[k, k])
@@ -30,10 +30,10 @@ def export_encoder(path: Path, open_size: bool = False) -> Path:
 
 
 def export_decoder(path: Path, extra: str = "", scale: float = 1.0) -> Path:
-    """Write a decoder that gives three masks and is right with the second.
+    """Write a decoder that returns three masks, of which the second is the correct one.
 
-    That one holds what is redder than blue by more than 0.2, inside the box (the first two points), and within `REACH`
-    of a point of label 1. It empties if there is a mask on input, or labels other than 2 and 3 for the box.
+    It contains the pixels that are redder than blue by more than 0.2, inside the box (the first two points), and within
+    `REACH` of a point of label 1. It is empty if there is a mask on input, or labels other than 2 and 3 for the box.
     """
     cells = SIZE // CELL
     centres = (np.arange(cells, dtype=np.float32) + 0.5) * CELL - 0.5
@@ -92,14 +92,14 @@ def export_decoder(path: Path, extra: str = "", scale: float = 1.0) -> Path:
         node("Sum", "dx2 dy2 column_apart", "distances"),
         node("ReduceMin", "distances", "distance", axes=[1], keepdims=1),
         node("Sub", "reach distance", "near"),
-        # 0 where all is as it should be, and else far below.
+        # 0 if labels and mask inputs are as expected, and otherwise far below.
         node("Slice", "point_labels zero two axis1", "corner_labels"),
         node("Sub", "corner_labels corners", "corners_off"),
         node("Abs", "corners_off", "corners_wrong"),
         node("ReduceSum", "corners_wrong", "wrong_labels", keepdims=0),
         node("ReduceMax", "mask_input", "mask_given", keepdims=0),
-        node("ReduceSum", "has_mask_input", "mask_said", keepdims=0),
-        node("Sum", "wrong_labels mask_given mask_said", "wrong"),
+        node("ReduceSum", "has_mask_input", "mask_flag", keepdims=0),
+        node("Sum", "wrong_labels mask_given mask_flag", "wrong"),
         node("Mul", "wrong far", "penalty"),
         node("Mul", "redness far", "sharp_redness"),
         node("Min", "sharp_redness inside_left inside_right inside_upper inside_lower near", "bare"),

@@ -1,4 +1,4 @@
-"""Segmentation networks: what goes into SAM2's two networks, and what is made of what comes out."""
+"""SAM2: inputs of its two networks, and the mask from their outputs."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import sys
 import numpy as np
 import pytest
 
-from morgs_mi.method.confidence import mask_refiner, motion_mask
+from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.config import MotionConfig
-from morgs_mi.method.segment_network import SegmentNetwork, prompts
+from morgs_mi.method.mask_refiners.config import MaskConfig, PromptConfig
+from morgs_mi.method.mask_refiners.network import SegmentNetwork, prompts
+from morgs_mi.method.mask_refiners.registry import mask_refiner
 from tests.method.flow_sources.tiny_network import export as export_flow
-from tests.method.tiny_segmenter import export_decoder, export_encoder
+from tests.method.mask_refiners.tiny_segmenter import export_decoder, export_encoder
 
 pytest.importorskip("onnxruntime")
 
@@ -30,7 +32,7 @@ def network(files):
 
 
 def discs(height, width, *centres, radius=20, color=RED):
-    """A picture with discs on a grey ground, and the mask of each."""
+    """Return an image with discs on a grey background, and the mask of each."""
     y, x = np.mgrid[:height, :width] + 0.5
     masks = [np.hypot(x - u, y - v) < radius for u, v in centres]
     image = np.broadcast_to(np.array(BACK), (height, width, 3)).copy()
@@ -43,78 +45,78 @@ def overlap(a, b):
 
 
 @pytest.mark.parametrize("size", [(120, 160), (160, 120), (480, 640), (1100, 1400)])
-def test_an_object_is_found_to_the_pixel_at_any_size(network, size):
+def test_segment_network__segments_an_object_to_the_pixel_at_any_size(network, size):
     height, width = size
     image, (disc,) = discs(height, width, (0.4 * width, 0.55 * height), radius=0.2 * height)
-    # A cell of the network's mask is width / 256 pixels wide, and may miss half of itself around the disc.
+    # A cell of the network's mask is width / 256 pixels wide; half a cell may be wrong around the disc.
     off = np.pi * 0.4 * height * (max(size) / 256) / 2
     assert overlap(network(image, disc), disc) > 1 - off / disc.sum()
 
 
-def test_nothing_moves_gives_nothing(network):
+def test_segment_network__returns_an_empty_mask_for_an_empty_mask(network):
     image, _ = discs(60, 80, (30, 30))
     assert not network(image, np.zeros((60, 80), bool)).any()
 
 
-def test_every_connected_part_is_a_prompt_of_its_own(network):
+def test_segment_network__prompts_with_each_connected_component(network):
     image, (one, other, still) = discs(240, 320, (60, 60), (220, 60), (140, 180))
     found = network(image, one | other)
     assert overlap(found, one | other) > 0.9
     assert not found[still].any()
 
 
-def test_colours_go_in_as_rgb(network):
+def test_segment_network__passes_colours_as_rgb(network):
     image, (disc,) = discs(120, 160, (80, 60), color=BLUE)
     assert not network(image, disc).any()
 
 
-def test_bytes_and_unit_floats_are_the_same_picture(network):
+def test_segment_network__bytes_and_unit_floats_agree(network):
     image, (disc,) = discs(120, 160, (80, 60))
     as_bytes = (image * 255 + 0.5).astype(np.uint8)
     np.testing.assert_array_equal(network(as_bytes, disc), network(image, disc))
 
 
-def test_normalisation_is_imagenets(network):
-    # The tiny decoder's limit is R - B = 0.2 of the colours that went in: a ramp of R crosses it at R = 0.5.
+def test_segment_network__normalises_as_imagenet(network):
+    # The tiny decoder's limit is R - B = 0.2 of the input colours: a ramp of R crosses it at R = 0.5.
     image = np.full((64, 256, 3), 0.3)
     image[..., 0] = (np.arange(256) + 0.5) / 256
     mask = np.ones((64, 256), bool)
     mask[:, :100] = False
     found = network(image, mask)[32]
-    # Red from 0.5 on, as far as the points reach; half a cell on either side.
+    # R >= 0.5 within reach of the points; half a cell on either side.
     assert np.flatnonzero(found)[0] == pytest.approx(128, abs=1)
 
 
-def test_points_lie_deep_and_apart_and_the_box_encloses():
-    part = np.zeros((60, 80), bool)
-    part[20:30, 10:70] = True
-    part[30:50, 10:20] = True
-    coordinates, labels = prompts(part)
+def test_prompts__points_lie_deep_and_apart_inside_the_box():
+    component = np.zeros((60, 80), bool)
+    component[20:30, 10:70] = True
+    component[30:50, 10:20] = True
+    coordinates, labels = prompts(component)
     np.testing.assert_array_equal(labels, [2, 3, 1, 1, 1])
     np.testing.assert_array_equal(coordinates[:2], [[10, 20], [70, 50]])
     points = coordinates[2:]
     columns, rows = np.floor(points).astype(int).T
-    assert part[rows, columns].all()
-    gaps = np.linalg.norm(points[:, None] - points, axis=-1)[np.triu_indices(3, 1)]
-    assert gaps.min() >= 60 / 4
-    # Nothing of the L is deeper than 5 pixels but its corner.
+    assert component[rows, columns].all()
+    distances = np.linalg.norm(points[:, None] - points, axis=-1)[np.triu_indices(3, 1)]
+    assert distances.min() >= 60 / 4
+    # Only the corner of the L is deeper than 5 pixels.
     for column, row in zip(columns, rows, strict=True):
-        assert part[max(row - 3, 0) : row + 4, max(column - 3, 0) : column + 4].all()
+        assert component[max(row - 3, 0) : row + 4, max(column - 3, 0) : column + 4].all()
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 1)])
-def test_prompts_of_the_smallest_parts(size):
+def test_prompts__of_the_smallest_components(size):
     coordinates, labels = prompts(np.ones(size, bool))
     assert len(coordinates) == len(labels) >= 3
     np.testing.assert_array_equal(coordinates[:2], [[0, 0], size[::-1]])
 
 
-def test_the_motion_mask_is_united_with_the_objects(files):
+def test_motion_mask__is_the_union_of_flow_mask_and_sam2_objects(files):
     image, (disc,) = discs(240, 320, (160, 120), radius=40)
     motion = np.zeros((240, 320, 2))
     motion[disc] = 3
-    motion[110:125, 150:170] = 0  # a hole in what moves
-    motion[10:14, 10:40] = 3  # what the network finds nothing at
+    motion[110:125, 150:170] = 0  # a hole in the moving object
+    motion[10:14, 10:40] = 3  # the network segments nothing here
     method = f"sam2:{files[0]},{files[1]}"
     mask = motion_mask(image, motion, method=method)
     assert mask[motion[..., 0] > 0].all()
@@ -122,7 +124,7 @@ def test_the_motion_mask_is_united_with_the_objects(files):
     assert mask_refiner(method) is mask_refiner(method)
 
 
-def test_an_encoder_may_leave_its_size_open(tmp_path, files):
+def test_segment_network__accepts_an_encoder_of_open_size(tmp_path, files):
     image, (disc,) = discs(120, 160, (80, 60))
     found = SegmentNetwork(export_encoder(tmp_path / "open.onnx", open_size=True), files[1])(image, disc)
     assert overlap(found, disc) > 0.9
@@ -154,19 +156,45 @@ def bad(folder, files, name):
         ("extra", ValueError, "other.onnx: expected a mask decoder with inputs among .*orig_im_size and masks"),
     ],
 )
-def test_what_is_no_sam2_is_refused_before_the_first_frame(tmp_path, files, name, exception, message):
+def test_motion_config__rejects_files_that_are_not_sam2(tmp_path, files, name, exception, message):
     encoder, decoder = bad(tmp_path, files, name)
     with pytest.raises(exception, match=message):
         MotionConfig(mask_method=f"sam2:{encoder},{decoder}")
 
 
-def test_masks_that_are_not_finite_are_named(tmp_path, files):
+def test_segment_network__rejects_masks_that_are_not_finite(tmp_path, files):
     image, (disc,) = discs(60, 80, (40, 30))
     with pytest.raises(ValueError, match=r"decoder\.onnx: expected finite masks"):
         SegmentNetwork(files[0], export_decoder(tmp_path / "decoder.onnx", scale=float("inf")))(image, disc)
 
 
-def test_a_missing_onnxruntime_is_one_sentence(files, monkeypatch):
+def test_segment_network__names_the_remedy_without_onnxruntime(files, monkeypatch):
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(ValueError, match=r"expected onnxruntime, found none; .*morgs-mi\[sam2\]"):
         SegmentNetwork(*files)
+
+
+def test_prompt_config__limits_points_and_their_spacing():
+    component = np.ones((10, 100), bool)
+    assert len(prompts(component, PromptConfig(points=2))[0]) == 2 + 2
+    points = prompts(component, PromptConfig(points=9, spacing=0.4))[0][2:]
+    distances = np.linalg.norm(points[:, None] - points, axis=-1)[np.triu_indices(len(points), 1)]
+    assert len(points) == 3
+    assert distances.min() >= 0.4 * 100
+
+
+def test_prompt_config__limits_objects_to_the_largest(files):
+    image, (small, large) = discs(240, 320, (60, 60), (220, 120))
+    hole = np.zeros((240, 320), bool)
+    hole[55:65, 55:65] = hole[115:122, 215:222] = True
+    mask = (small | large) & ~hole
+    config = MaskConfig(prompts=PromptConfig(objects=1))
+    for found, filled in ((mask_refiner(f"sam2:{files[0]},{files[1]}", config), large), (SegmentNetwork(*files), hole)):
+        assert found(image, mask)[hole & filled].mean() > 0.9
+    assert not mask_refiner(f"sam2:{files[0]},{files[1]}", config)(image, mask)[hole & small].any()
+
+
+@pytest.mark.parametrize("name", ["objects", "points"])
+def test_prompt_config__rejects_numbers_out_of_range(name):
+    with pytest.raises(ValueError, match=rf"PromptConfig\(\): `{name}` must be at least 1, got 0"):
+        PromptConfig(**{name: 0})

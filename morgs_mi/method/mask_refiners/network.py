@@ -1,25 +1,30 @@
-"""Objects from a promptable segmentation network, SAM2 in two ONNX files, run on the CPU by `onnxruntime`.
+"""Motion masks refined by SAM2, a promptable segmentation network in two ONNX files, run on the CPU by `onnxruntime`.
 
 SAM2 (Ravi et al., "SAM 2: Segment anything in images and videos", 2024) is exported as an image encoder, run once per
-picture, and a mask decoder, run once per prompt. Names and shapes are those that `samexporter` writes:
+image, and a mask decoder, run once per prompt. Names and shapes are those that `samexporter` writes:
 
     encoder   image [1, 3, 1024, 1024] -> high_res_feats_0, high_res_feats_1, image_embed
     decoder   these three, point_coords [1, P, 2], point_labels [1, P], mask_input [1, 1, 256, 256], has_mask_input [1]
               -> masks [1, M, 256, 256], logits, and iou_predictions [1, M]
 
-Pictures are stretched to the encoder's size and normalised by ImageNet's mean and deviation. A point's label is 1 for a
-point on the object, 2 and 3 for the upper left and lower right corner of its box. No weights come with the package;
-docs/masks.md says how to export them.
+Images are stretched to the encoder's size and normalised by ImageNet's mean and standard deviation. A point's label is
+1 for a point on the object, 2 and 3 for the upper left and lower right corner of its box. The package contains no
+weights; docs/masks.md explains how to export them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+
+from morgs_mi.method.mask_refiners.config import MaskConfig, PromptConfig
+from morgs_mi.method.mask_refiners.opencv import clean_mask
+from morgs_mi.method.mask_refiners.registry import MASK_REFINERS, MaskRefiner
 
 __all__ = ["SegmentNetwork", "prompts"]
 
@@ -27,22 +32,20 @@ _MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
 # SAM2's own size, for an encoder that leaves it open.
 _SIZE = 1024
-# A mask that the decoder may take, and that is not given here, has a quarter of the picture's side.
+# The decoder's optional mask input, which is left empty here, has a quarter of the image's side.
 _MASK_SHRINK = 4
 _PROMPTS = ("point_coords", "point_labels", "mask_input", "has_mask_input")
 _RESULTS = ("masks", "iou_predictions")
 _ON_OBJECT, _UPPER_LEFT, _LOWER_RIGHT = 1, 2, 3
-_POINTS = 3
-# Each costs a run of the decoder; what is smaller than the largest few stays as the flow has it.
-_MOST_OBJECTS = 16
 
 
 class SegmentNetwork:
-    """SAM2: called with a picture and a mask, it returns the objects that the mask's connected parts point at.
+    """SAM2: called with an image and a mask, it returns the objects that the mask's connected components lie on.
 
     Args:
         encoder: the image encoder's ONNX file.
         decoder: the mask decoder's ONNX file.
+        config: settings of the prompts; None: the defaults.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -50,7 +53,8 @@ class SegmentNetwork:
             those of the module's docstring.
     """
 
-    def __init__(self, encoder: str | Path, decoder: str | Path) -> None:
+    def __init__(self, encoder: str | Path, decoder: str | Path, config: PromptConfig | None = None) -> None:
+        self._config = config or PromptConfig()
         self._encoder, self._decoder = _Network(encoder), _Network(decoder)
         shapes = list(self._encoder.inputs.values())
         if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
@@ -66,21 +70,21 @@ class SegmentNetwork:
             raise ValueError(
                 f"{decoder}: expected a mask decoder with inputs among {', '.join(sorted(known))} and outputs "
                 f"{' and '.join(_RESULTS)}, got {', '.join(self._decoder.inputs)} and "
-                f"{', '.join(self._decoder.outputs)}; export both networks as docs/masks.md says."
+                f"{', '.join(self._decoder.outputs)}; export both networks as described in docs/masks.md."
             )
 
     def __call__(self, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Return the objects [H, W] bool; nothing where the mask is empty.
+        """Return the mask of the objects [H, W] bool; it is empty if `mask` is.
 
         Args:
             image: [H, W, 3], RGB, uint8 or float in [0, 1].
             mask: [H, W] bool.
 
         Raises:
-            ValueError: the networks cannot run on each other's values, or give other results than promised.
+            ValueError: the decoder cannot run on the encoder's outputs, or its results are not those of SAM2.
         """
         objects = np.zeros(mask.shape, bool)
-        components = _components(mask)
+        components = _components(mask, self._config.objects)
         if not components:
             return objects
         features = self._encoder.run({next(iter(self._encoder.inputs)): self._blob(image)})
@@ -89,18 +93,18 @@ class SegmentNetwork:
         return objects
 
     def _blob(self, image: np.ndarray) -> np.ndarray:
-        """Return a picture as the encoder takes it, [1, 3, H, W] float32."""
+        """Return an image as the encoder's input, [1, 3, H, W] float32."""
         unit = image.astype(np.float32) / (255 if image.dtype == np.uint8 else 1)
         shrinks = image.shape[1] > self._size[0]
         unit = cv2.resize(unit, self._size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
         return np.ascontiguousarray(np.moveaxis((unit - _MEAN) / _DEVIATION, 2, 0)[None])
 
     def _segment(self, features: Mapping[str, np.ndarray], component: np.ndarray) -> np.ndarray:
-        """Return the object [H, W] that one connected part points at: of the decoder's masks the one it trusts most."""
+        """Return the object [H, W] under one component: the decoder's mask with the highest predicted IoU."""
         (height, width), (across, down) = component.shape, self._size
-        points, labels = prompts(component)
-        # The decoder adds half a pixel: for it, a pixel's centre has whole coordinates.
-        scaled = points * np.float32((across / width, down / height)) - np.float32(0.5)
+        points, labels = prompts(component, self._config)
+        # The decoder adds half a pixel: its pixel centres have whole coordinates.
+        scaled = points * np.array((across / width, down / height), np.float32) - np.float32(0.5)
         quarter = down // _MASK_SHRINK, across // _MASK_SHRINK
         given = {
             **features,
@@ -122,25 +126,27 @@ class SegmentNetwork:
         return cv2.resize(logits, (width, height), interpolation=cv2.INTER_LINEAR) > 0
 
 
-def prompts(component: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return what tells SAM2 which object is meant: the box of a connected part, and up to 3 points deep inside it.
+def prompts(component: np.ndarray, config: PromptConfig | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Return SAM2's prompt for the object under a connected component: its box and a few points deep inside it.
 
-    Points lie as deep as can be and at least a quarter of the box's longer side apart.
+    Each point is the deepest one at least `PromptConfig.spacing` times the box's longer side from the others.
 
     Args:
         component: [H, W] bool, not empty.
+        config: number and spacing of the points; None: the defaults.
 
     Returns:
-        Coordinates [P, 2] in pixels of the picture, float32, pixel centres at +0.5, and labels [P], float32; first the
+        Coordinates [P, 2] in pixels of the image, float32, pixel centres at +0.5, and labels [P], float32; first the
         box's corners, then the points.
     """
+    config = config or PromptConfig()
     rows, columns = np.flatnonzero(component.any(1)), np.flatnonzero(component.any(0))
     upper_left, lower_right = (columns[0], rows[0]), (columns[-1] + 1, rows[-1] + 1)
     depth = cv2.distanceTransform(np.pad(component, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
-    apart = max(np.subtract(lower_right, upper_left)) / 4
+    apart = max(np.subtract(lower_right, upper_left)) * config.spacing
     y, x = np.mgrid[: component.shape[0], : component.shape[1]]
     points = []
-    while len(points) < _POINTS and depth.any():
+    while len(points) < config.points and depth.any():
         row, column = np.unravel_index(np.argmax(depth), depth.shape)
         points.append((column + 0.5, row + 0.5))
         depth = np.where(np.hypot(x - column, y - row) < apart, 0, depth)
@@ -148,25 +154,26 @@ def prompts(component: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.array([upper_left, lower_right, *points], np.float32), np.array(labels, np.float32)
 
 
-def _components(mask: np.ndarray) -> list[np.ndarray]:
-    """Return the mask's connected parts [H, W] bool, the largest first."""
+def _components(mask: np.ndarray, most: int) -> list[np.ndarray]:
+    """Return the mask's largest connected components [H, W] bool, at most `most`, the largest first."""
     count, labels, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
     order = 1 + np.argsort(-stats[1:count, cv2.CC_STAT_AREA], kind="stable")
-    return [labels == label for label in order[:_MOST_OBJECTS]]
+    return [labels == label for label in order[:most]]
 
 
 class _Network:
-    """An ONNX file in `onnxruntime`: values by name go in, values by name come out."""
+    """ONNX file in `onnxruntime`; inputs and outputs are arrays by name."""
 
     def __init__(self, path: str | Path) -> None:
         try:
             import onnxruntime
-            from onnxruntime.capi import onnxruntime_pybind11_state as state
+
+            state = import_module("onnxruntime.capi.onnxruntime_pybind11_state")
         except ImportError as error:
             raise ValueError(
                 "SegmentNetwork(): expected onnxruntime, found none; install it: pip install 'morgs-mi[sam2]'."
             ) from error
-        # Its exceptions have no base class of their own.
+        # onnxruntime's exceptions have no base class of their own.
         kinds = [kind for kind in vars(state).values() if isinstance(kind, type) and issubclass(kind, Exception)]
         self._errors: tuple[type[Exception], ...] = tuple(kinds)
         self.path = Path(path)
@@ -193,6 +200,17 @@ class _Network:
                 f"{self.path}: expected a network that takes {shapes}, got an error of onnxruntime "
                 f"({_reason(error)}); export encoder and decoder from one model."
             ) from error
+
+
+@MASK_REFINERS.register("sam2", "ENCODER.onnx,DECODER.onnx")
+def _make(files: str, config: MaskConfig) -> MaskRefiner:
+    encoder, _, decoder = files.partition(",")
+    if not encoder or not decoder:
+        raise ValueError(
+            f"mask_refiner(): `mask_method` must be sam2:ENCODER.onnx,DECODER.onnx, got {'sam2:' + files!r}."
+        )
+    network = SegmentNetwork(encoder, decoder, config.prompts)
+    return lambda image, mask: mask | network(image, clean_mask(mask, config))
 
 
 def _reason(error: Exception) -> str:

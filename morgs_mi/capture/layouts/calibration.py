@@ -1,0 +1,164 @@
+"""The interface of a capture layout, and helpers that the readers share.
+
+A reader module exposes a `Layout`, which `registry.py` lists.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from morgs_mi.capture.layouts.clips import check_frames, clips_by_camera, clips_by_frame, view_of_image
+from morgs_mi.capture.lens import Lens
+from morgs_mi.core.camera import Camera
+from morgs_mi.io.video import VIDEO_SUFFIXES, Clip, natural_key
+
+__all__ = ["NO_POINTS", "Calibration", "Layout", "PoseConvention", "match_clips", "read_json", "required_clips"]
+
+_LOG = logging.getLogger(__name__)
+
+NO_POINTS = np.zeros((0, 3), np.float32)
+"""The points, and their colours, of a layout without points."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Cameras, clips and points of a capture folder, at the calibrated size.
+
+    Attributes:
+        cameras: in numerical order of their names.
+        lenses: one per camera.
+        clips: one per camera: its video, folder of images or list of images.
+        points: [P, 3] float32, world units; P = 0 if the layout has none.
+        point_colors: [P, 3] float32 in [0, 1].
+        test_view: index of the camera that the layout holds out, or None.
+    """
+
+    cameras: tuple[Camera, ...]
+    lenses: tuple[Lens, ...]
+    clips: tuple[Clip, ...]
+    points: np.ndarray = field(default_factory=lambda: NO_POINTS)
+    point_colors: np.ndarray = field(default_factory=lambda: NO_POINTS)
+    test_view: int | None = None
+
+
+@dataclass(frozen=True)
+class PoseConvention:
+    """Meaning of the 4x4 pose matrices in a calibration file.
+
+    Attributes:
+        direction: from which frame to which the matrices map points.
+        axes: OpenCV's (x right, y down, z forward) or OpenGL's (x right, y up, z backward).
+    """
+
+    direction: Literal["world to camera", "camera to world"] = "world to camera"
+    axes: Literal["OpenCV", "OpenGL"] = "OpenCV"
+
+
+@dataclass(frozen=True)
+class Layout:
+    """One way to store a calibration in a capture folder.
+
+    Attributes:
+        name: name of the layout in reports, e.g. ``COLMAP``.
+        files: names of the files or folders that hold the calibration, for error messages.
+        find: returns whether a capture folder holds such a calibration.
+        read: returns the calibration of a capture folder. Raises FileNotFoundError if a file or clip is missing and
+            ValueError if a file is broken or does not match the clips.
+        poses: convention of the pose matrices, by which the rig check names a wrong one; None if poses are not stored
+            as 4x4 matrices.
+    """
+
+    name: str
+    files: tuple[str, ...]
+    find: Callable[[Path], bool]
+    read: Callable[[Path], Calibration]
+    poses: PoseConvention | None = PoseConvention()
+
+
+def required_clips(path: Path) -> dict[str, Path]:
+    """Return each camera's video or folder of images by the camera's name, in numerical order.
+
+    Raises:
+        FileNotFoundError: the capture folder has none.
+    """
+    if clips := clips_by_camera(path):
+        return clips
+    raise FileNotFoundError(
+        f"{path}: expected videos ({', '.join(VIDEO_SUFFIXES)}) or folders of frames, found none; check the path."
+    )
+
+
+def read_json(path: Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        ValueError: the file is broken.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ValueError(f"{path}: expected JSON, got a broken file ({error}); export it again.") from None
+
+
+def match_clips(
+    path: Path, source: Path, clips: Mapping[str, Clip], cameras: Sequence[Camera], lenses: Sequence[Lens]
+) -> tuple[tuple[Camera, ...], tuple[Lens, ...], tuple[Clip, ...]]:
+    """Return one camera, lens and clip per fixed camera, in numerical order of the clips' names.
+
+    Args:
+        path: the capture folder; its frame folders are tried if `clips` do not match.
+        source: file or folder of the calibration, for messages.
+        clips: from `required_clips`.
+        cameras: one or more per fixed camera; their names are those of the calibration's images.
+        lenses: one per camera.
+
+    Raises:
+        FileNotFoundError: an image of the calibration has no clip.
+        ValueError: two images of one clip have different poses or lenses, or a frame folder is missing.
+    """
+    try:
+        index = _camera_of_clip(source, clips, cameras, lenses)
+    except (FileNotFoundError, ValueError) as error:
+        clips = by_frame = clips_by_frame(path)
+        try:
+            index = _camera_of_clip(source, clips, cameras, lenses)
+        except (FileNotFoundError, ValueError):
+            raise error from None
+        check_frames(path, by_frame)
+    if unused := [name for name in clips if name not in index]:
+        _LOG.warning("%s does not calibrate %s: not used.", source, ", ".join(unused))
+    names = sorted(index, key=natural_key)
+    return (
+        tuple(replace(cameras[index[name]], name=name) for name in names),
+        tuple(lenses[index[name]] for name in names),
+        tuple(clips[name] for name in names),
+    )
+
+
+def _camera_of_clip(
+    source: Path, clips: Mapping[str, Clip], cameras: Sequence[Camera], lenses: Sequence[Lens]
+) -> dict[str, int]:
+    """Return, by the clip's name, the index of its first camera in `cameras`."""
+    found: dict[str, int] = {}
+    for index, camera in enumerate(cameras):
+        name = view_of_image(clips, camera.name)
+        if name is None:
+            raise FileNotFoundError(
+                f"{source}: its image {camera.name!r} needs a clip called {Path(camera.name).stem}, found "
+                f"{', '.join(clips) or 'none'}; name the clips after the calibration's images."
+            )
+        first = found.setdefault(name, index)
+        same = np.allclose(cameras[first].viewmat, camera.viewmat, atol=1e-6) and lenses[first] == lenses[index]
+        if not (same and np.allclose(cameras[first].K, camera.K)):
+            raise ValueError(
+                f"{source}: cameras must not move, but {cameras[first].name!r} and {camera.name!r}, both of {name}, "
+                "have different poses or lenses; keep one image of each fixed camera, and name the clips after them."
+            )
+    return found

@@ -1,0 +1,202 @@
+"""The objective (eq. 13) as data: L = L_recon + sum of lambda L over further terms.
+
+A `Term` declares its weight, the channels that must be rendered for it, and the observations that it compares them
+with. Which channels a view renders, which static splats it needs and which losses a report lists follow from `TERMS`.
+
+An observation is an array of one view at one frame, by name. `target` exists in all views; those of `OBSERVERS` exist
+in key views, where an observer returns them. A term acts in the views that have all its observations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from math import inf
+from typing import Any
+
+import numpy as np
+
+from morgs_mi.core.types import Tensor
+from morgs_mi.losses.losses import flow_loss, mask_loss, offset_loss, recon_loss
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.flow import FlowObservation
+from morgs_mi.method.flow_sources.registry import FramePair
+from morgs_mi.render.rasterize import Image
+from morgs_mi.render.region import Region
+
+__all__ = [
+    "OBSERVERS",
+    "TERMS",
+    "KeyView",
+    "ObjectiveConfig",
+    "Prediction",
+    "Term",
+    "channels_of",
+    "losses_of",
+    "observe",
+    "weights_of",
+]
+
+Observations = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class ObjectiveConfig:
+    """Weights of the terms; 0 switches one off."""
+
+    dssim_weight: float = 0.2
+    """lambda of eq. 2."""
+    flow_weight: float = 0.01
+    """lambda_flow of eq. 13, per px of endpoint error."""
+    mask_weight: float = 0.5
+    """lambda_mask of eq. 13."""
+    offset_weight: float = 0.01
+    """lambda_off of eq. 13, per scene extent."""
+    detach_weights: bool = True
+    """Keep all terms but L_recon from moving opacity and geometry: they are about motion and confidence."""
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not 0 <= value < inf:
+                raise ValueError(f"ObjectiveConfig(): `{name}` must be finite and not negative, got {value}.")
+
+
+@dataclass(frozen=True, eq=False)
+class KeyView:
+    """What observers read: one key view at one frame.
+
+    Attributes:
+        pair: its images at frames t and t - 1.
+        flow: its optical flow.
+    """
+
+    pair: FramePair
+    flow: FlowObservation
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What terms compare with the observations: one view at one step.
+
+    Attributes:
+        image: the rendered channels.
+        parameters: of the residual, by name.
+        region: the rendered blocks; None: the whole view.
+        num_pixels: of the whole view.
+        num_gaussians: of the whole scene.
+        extent: of the scene, world units.
+    """
+
+    image: Image
+    parameters: Mapping[str, Tensor]
+    region: Region | None
+    num_pixels: int
+    num_gaussians: int
+    extent: float
+
+
+@dataclass(frozen=True)
+class Term:
+    """One term of the objective.
+
+    Attributes:
+        name: in reports.
+        weight: lambda, by the settings.
+        loss: (prediction, observations, settings) -> scalar.
+        channels: that must be rendered.
+        observations: that must exist.
+        parameters: of the residual that must exist.
+    """
+
+    name: str
+    weight: Callable[[ObjectiveConfig], float]
+    loss: Callable[[Prediction, Observations, ObjectiveConfig], Tensor]
+    channels: tuple[str, ...] = ()
+    observations: tuple[str, ...] = ()
+    parameters: tuple[str, ...] = ()
+
+
+TERMS: tuple[Term, ...] = (
+    Term(  # eq. 2
+        "recon",
+        lambda config: 1.0,
+        lambda p, o, config: recon_loss(p.image.color, o["target"], config.dssim_weight, p.region),
+        channels=("color",),
+        observations=("target",),
+    ),
+    Term(  # eq. 7
+        "flow",
+        lambda config: config.flow_weight,
+        lambda p, o, config: flow_loss(p.image.motion, o["motion"], o["reliable"], p.num_pixels),
+        channels=("motion",),
+        observations=("motion", "reliable"),
+    ),
+    Term(  # eq. 11
+        "mask",
+        lambda config: config.mask_weight,
+        lambda p, o, config: mask_loss(p.image.confidence, o["mask"], p.num_pixels),
+        channels=("confidence",),
+        observations=("mask",),
+    ),
+    Term(  # L_off
+        "offset",
+        lambda config: config.offset_weight,
+        lambda p, o, config: offset_loss(p.parameters["offset"], p.extent, p.num_gaussians),
+        parameters=("offset",),
+    ),
+)
+
+
+def _observe_motion(view: KeyView, motion: MotionConfig, config: ObjectiveConfig) -> dict[str, np.ndarray]:
+    """Return the motion by optical flow [H, W, 2] in px, and where it is reliable [H, W]."""
+    return {"motion": view.flow.motion, "reliable": view.flow.reliable} if motion.learn_motion else {}
+
+
+def _observe_mask(view: KeyView, motion: MotionConfig, config: ObjectiveConfig) -> dict[str, np.ndarray]:
+    """Return the motion mask [H, W], in frames that have one."""
+    return {"mask": view.flow.mask} if motion.learn_confidence and view.flow.mask is not None else {}
+
+
+Observer = Callable[[KeyView, MotionConfig, ObjectiveConfig], Mapping[str, np.ndarray]]
+OBSERVERS: tuple[Observer, ...] = (
+    _observe_motion,
+    _observe_mask,
+)
+
+
+def observe(
+    views: Mapping[int, KeyView], motion: MotionConfig, config: ObjectiveConfig
+) -> dict[int, dict[str, np.ndarray]]:
+    """Return the observations of the key views, arrays [H, W, ...] by name, by view index."""
+    observations: dict[int, dict[str, np.ndarray]] = {}
+    for index, view in views.items():
+        found = (observer(view, motion, config) for observer in OBSERVERS)
+        observations[index] = {name: array for arrays in found for name, array in arrays.items()}
+    return observations
+
+
+def active_terms(observations: Observations, parameters: Mapping[str, Tensor], config: ObjectiveConfig) -> list[Term]:
+    """Return the terms that act in a view with these observations."""
+
+    def acts(term: Term) -> bool:
+        given = all(name in observations for name in term.observations)
+        return given and all(name in parameters for name in term.parameters)
+
+    return [term for term in TERMS if term.weight(config) and acts(term)]
+
+
+def channels_of(observations: Observations, config: ObjectiveConfig) -> tuple[str, ...]:
+    """Return the channels to render in a view with these observations, besides its `target`."""
+    terms = active_terms({"target": None, **observations}, {}, config)
+    return tuple(dict.fromkeys(channel for term in terms for channel in term.channels))
+
+
+def losses_of(prediction: Prediction, observations: Observations, config: ObjectiveConfig) -> dict[str, Tensor]:
+    """Return the losses of one view, by the names of the terms."""
+    terms = active_terms(observations, prediction.parameters, config)
+    return {term.name: term.loss(prediction, observations, config) for term in terms}
+
+
+def weights_of(config: ObjectiveConfig) -> dict[str, float]:
+    """Return the weights of the terms, by name."""
+    return {term.name: term.weight(config) for term in TERMS}

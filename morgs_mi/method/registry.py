@@ -1,0 +1,73 @@
+"""Registry of implementations, one of which a setting selects by a string: NAME or NAME:ARGUMENT."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+__all__ = ["Registry"]
+
+Made = TypeVar("Made")
+Config = TypeVar("Config")
+
+
+class Registry(Generic[Made, Config]):
+    """Factories by name.
+
+    A factory takes the argument of the string (empty for a NAME alone) and a config, and returns the implementation.
+
+    Args:
+        place: the public function that looks names up, for error messages.
+        setting: the setting that holds the string, for error messages.
+    """
+
+    def __init__(self, place: str, setting: str) -> None:
+        self._place, self._setting = place, setting
+        self._factories: dict[str, Callable[[str, Config], Made]] = {}
+        self._arguments: dict[str, str] = {}
+
+    def register(
+        self, name: str, argument: str = ""
+    ) -> Callable[[Callable[[str, Config], Made]], Callable[[str, Config], Made]]:
+        """Return a decorator that registers a factory.
+
+        Args:
+            name: the name that selects it.
+            argument: placeholder of the argument in messages, e.g. ``FOLDER``; empty: the name takes no argument.
+
+        Raises:
+            ValueError: the name is empty, has a colon or is taken.
+        """
+        if not name or ":" in name:
+            raise ValueError(f"register(): `name` must be a name without a colon, got {name!r}.")
+        if name in self._factories:
+            raise ValueError(f"register(): `name` must be new, got {name!r}, which is registered already; rename one.")
+
+        def add(factory: Callable[[str, Config], Made]) -> Callable[[str, Config], Made]:
+            self._factories[name], self._arguments[name] = factory, argument
+            return factory
+
+        return add
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names that take no argument, in the order of their registration."""
+        return tuple(name for name, argument in self._arguments.items() if not argument)
+
+    @property
+    def usages(self) -> tuple[str, ...]:
+        """What the setting may hold: the names that take no argument, then NAME:ARGUMENT of the others."""
+        return (*self.names, *(f"{name}:{argument}" for name, argument in self._arguments.items() if argument))
+
+    def make(self, text: str, config: Config) -> Made:
+        """Return the implementation that `text` selects.
+
+        Raises:
+            ValueError: `text` selects none, or as its factory.
+        """
+        name, colon, argument = text.partition(":")
+        takes_argument = bool(self._arguments.get(name))
+        if name not in self._factories or not (takes_argument == bool(colon) == bool(argument)):
+            known = ", ".join(self.usages)
+            raise ValueError(f"{self._place}: `{self._setting}` must be one of {known}, got {text!r}.")
+        return self._factories[name](argument, config)

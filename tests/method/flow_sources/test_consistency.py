@@ -1,0 +1,45 @@
+"""Forward-backward check: which pixels pass, and what its two tolerances do."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from morgs_mi.method.flow_sources.config import FlowConfig
+from morgs_mi.method.flow_sources.consistency import consistency_mask
+
+
+def constant_flow(x, y=0.0):
+    return np.full((20, 30, 2), (x, y), np.float32)
+
+
+def test_consistency_mask__passes_flow_that_returns_inside_the_image():
+    mask = consistency_mask(constant_flow(3), constant_flow(-3))
+    assert mask.dtype == bool
+    np.testing.assert_array_equal(mask, np.arange(30)[None] + 3 < np.full((20, 1), 30))
+
+
+def test_consistency_mask__samples_the_flow_back_where_the_flow_leads():
+    back = constant_flow(9)
+    back[:, 15:20] = (-5, 0)
+    mask = consistency_mask(constant_flow(5), back)
+    np.testing.assert_array_equal(np.flatnonzero(mask.all(axis=0)), np.arange(10, 15))
+    assert mask.sum() == 5 * 20
+
+
+@pytest.mark.parametrize(
+    ("back", "config", "passes"),
+    [
+        # |F| = 6: by default a squared mismatch of 0.01 (36 + |B|^2) + 0.5 is tolerated.
+        (-7.0, FlowConfig(), True),
+        (-7.5, FlowConfig(), False),
+        (-7.0, FlowConfig(consistency_relative=0), False),
+        (-7.0, FlowConfig(consistency_absolute=0), False),
+        (-7.5, FlowConfig(consistency_relative=0.03), True),
+        (-7.5, FlowConfig(consistency_absolute=2), True),
+    ],
+)
+def test_consistency_mask__tolerates_the_configured_mismatch(back, config, passes):
+    mask = consistency_mask(constant_flow(6), constant_flow(back), config)
+    assert mask[:, :20].all() == passes
+    assert mask[:, :20].any() == passes

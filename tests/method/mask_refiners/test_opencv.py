@@ -1,0 +1,113 @@
+"""GrabCut and superpixels: objects from partial masks, any mask and size, repeatable results."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.method.mask_refiners.config import MaskConfig
+from morgs_mi.method.mask_refiners.opencv import clean_mask, refine_mask, vote_superpixels
+from tests.method.moving_disc import moving_disc
+
+CAMERA_NOISE = 2 / 255  # standard deviation of a video camera in room light
+
+
+def overlap(a: np.ndarray, b: np.ndarray) -> float:
+    return (a & b).sum() / (a | b).sum()
+
+
+def test_refine_mask__recovers_an_object_from_a_part_of_it():
+    _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
+    partial = disc.copy()
+    partial[120:140] = False
+    assert overlap(refine_mask(image, partial), disc) > 0.95 > overlap(partial, disc)
+
+
+def test_vote_superpixels__removes_flow_that_bleeds_over_an_edge():
+    _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
+    bleeding = cv2.dilate(disc.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    voted = vote_superpixels(image, bleeding)
+    assert overlap(voted, disc) > 0.9 > overlap(bleeding, disc)
+    assert voted[disc].mean() > 0.98
+
+
+def test_vote_superpixels__removes_specks():
+    _, image, _ = moving_disc(240, 320, (0, 0))
+    specks = np.zeros((240, 320), bool)
+    specks[10:230:12, 10:310:12] = True
+    assert not vote_superpixels(image, specks).any()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 5), (40, 30), (700, 20)])
+@pytest.mark.parametrize("fill", ["nothing", "speck", "all", "half"])
+@pytest.mark.parametrize("refine", [refine_mask, vote_superpixels])
+def test_refine_mask__and_vote_superpixels_accept_any_mask(refine, size, fill):
+    image = np.random.default_rng(0).random((*size, 3))
+    mask = np.full(size, fill == "all")
+    if fill == "half":
+        mask[: size[0] // 2] = True
+    mask[size[0] // 2, size[1] // 2] |= fill == "speck"
+    refined = refine(image, mask)
+    assert refined.shape == size
+    assert refined.dtype == bool
+    if fill == "nothing":
+        assert not refined.any()
+    if fill == "all":
+        assert refined.all()
+
+
+def test_clean_mask__removes_specks_and_closes_holes():
+    mask = np.zeros((200, 400), bool)
+    mask[50:150, 50:150] = True
+    mask[100:102, 100:102] = False
+    mask[10:12, 300:302] = True
+    cleaned = clean_mask(mask)
+    assert cleaned[52:148, 52:148].all()
+    assert not cleaned[:, 250:].any()
+
+
+@pytest.mark.parametrize(
+    ("refine", "settings"),
+    [
+        (clean_mask, {"opening": 4}),
+        (clean_mask, {"closing": 0.05}),
+        (refine_mask, {"working_width": 160}),
+        (refine_mask, {"grabcut_iterations": 1}),
+        (refine_mask, {"grabcut_reach": 0.01}),
+        (refine_mask, {"grabcut_coverage": 0.01}),
+        (vote_superpixels, {"working_width": 160}),
+        (vote_superpixels, {"superpixel_side": 16}),
+        (vote_superpixels, {"superpixel_share": 0.5}),
+        (vote_superpixels, {"superpixel_iterations": 1}),
+        (vote_superpixels, {"superpixel_compactness": 40.0}),
+    ],
+)
+def test_mask_config__every_setting_acts(refine, settings):
+    _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
+    # Away from the disc, so that GrabCut takes several iterations, with holes for the closing.
+    mask = np.roll(disc, (25, 19), (0, 1))
+    if refine is clean_mask:
+        mask &= np.random.default_rng(0).random(disc.shape) < 0.97
+    arguments = (mask,) if refine is clean_mask else (image, mask)
+    assert not np.array_equal(refine(*arguments, MaskConfig(**settings)), refine(*arguments))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"threshold_mads": -1}, "`threshold_mads` must be at least 0, got -1"),
+        ({"floor_width": 0}, "`floor_width` must be at least 1, got 0"),
+        ({"superpixel_side": 0}, "`superpixel_side` must be at least 1, got 0"),
+        ({"closing": float("nan")}, "`closing` must be at least 0, got nan"),
+    ],
+)
+def test_mask_config__rejects_numbers_out_of_range(settings, message):
+    with pytest.raises(ValueError, match=message):
+        MaskConfig(**settings)
+
+
+@pytest.mark.parametrize("refine", [refine_mask, vote_superpixels])
+def test_refine_mask__and_vote_superpixels_reject_another_size(refine):
+    with pytest.raises(ValueError, match=r"got \(4, 4, 3\)"):
+        refine(np.zeros((4, 4, 3)), np.ones((3, 4), bool))

@@ -1,0 +1,58 @@
+"""Mask refiners by name, and the page that describes them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.mask_refiners.registry import MASK_REFINERS, mask_refiner
+from tests.method.moving_disc import moving_disc
+
+ROOT = Path(__file__).parents[3]
+CAMERA_NOISE = 2 / 255  # standard deviation of a video camera in room light
+
+
+@pytest.mark.parametrize("method", MASK_REFINERS.names)
+def test_mask_refiner__is_repeatable(method):
+    _, image, disc = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
+    refine = mask_refiner(method)
+    np.testing.assert_array_equal(refine(image, disc), refine(image, disc))
+    np.testing.assert_array_equal(refine((image * 255 + 0.5).astype(np.uint8), disc), refine(image, disc))
+
+
+@pytest.mark.parametrize(
+    ("method", "message"),
+    [
+        ("sam", r"one of none, grabcut, .*DECODER.onnx, got 'sam'"),
+        ("sam2:encoder.onnx", r"got 'sam2:encoder.onnx'"),
+    ],
+)
+def test_motion_config__rejects_unknown_mask_methods(method, message):
+    with pytest.raises(ValueError, match=message):
+        MotionConfig(mask_method=method)
+
+
+def test_masks_page__lists_every_refiner():
+    text = (ROOT / "docs/masks.md").read_text(encoding="utf-8")
+    assert [usage for usage in MASK_REFINERS.usages if f"- `{usage}`: " not in text] == []
+
+
+def test_masks_page__quotes_the_committed_figures():
+    clips = json.loads((ROOT / "benchmarks/results/masks.json").read_text(encoding="utf-8"))["clips"]
+    text = (ROOT / "docs/masks.md").read_text(encoding="utf-8")
+
+    def cell(row: dict) -> str:
+        return f"{row['iou']:.2f} ({row['found']:.2f}, {row['true']:.2f})"
+
+    lines = [[f"`{clip['name']}`" for clip in clips]]
+    lines += [[cell(clip["masks"][method]) for clip in clips] for method in (*MASK_REFINERS.names, "lifted")]
+    for start in ("lifted", "as before"):
+        for method in clips[0]["loops"][start]:
+            rows = [clip["loops"][start][method]["held_out"] for clip in clips]
+            lines.append([f"{cell(row)}, {row['psnr_moving']:.2f} dB" for row in rows])
+    for line in lines:
+        assert f"| {' | '.join(line)} |" in text

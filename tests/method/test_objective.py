@@ -1,0 +1,89 @@
+"""The objective: which terms act where, what they need rendered, and what they add up."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi.losses.ssim import Target
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.flow import FlowObservation
+from morgs_mi.method.flow_sources.registry import FramePair
+from morgs_mi.method.objective import (
+    TERMS,
+    KeyView,
+    ObjectiveConfig,
+    Prediction,
+    channels_of,
+    losses_of,
+    observe,
+    weights_of,
+)
+from morgs_mi.render.rasterize import Image
+
+H, W = 16, 24
+NAMES = [term.name for term in TERMS]
+
+
+def key_view(mask: bool) -> KeyView:
+    image, flow, everywhere = np.zeros((H, W, 3), np.uint8), np.ones((H, W, 2), np.float32), np.ones((H, W), bool)
+    return KeyView(
+        FramePair(image, image), FlowObservation(flow, everywhere, flow, everywhere, everywhere if mask else None)
+    )
+
+
+@pytest.mark.parametrize(
+    ("motion", "mask", "expected"),
+    [
+        (MotionConfig(), True, {"motion", "reliable", "mask"}),
+        (MotionConfig(), False, {"motion", "reliable"}),
+        (MotionConfig(learn_motion=False), True, {"mask"}),
+        (MotionConfig(learn_confidence=False), True, {"motion", "reliable"}),
+    ],
+)
+def test_observe__follows_the_modules(motion, mask, expected):
+    assert observe({3: key_view(mask)}, motion, ObjectiveConfig())[3].keys() == expected
+
+
+def test_channels_of__are_those_of_the_terms_that_act():
+    everything = {"motion": 0, "reliable": 0, "mask": 0}
+    assert channels_of({}, ObjectiveConfig()) == ("color",)
+    assert channels_of(everything, ObjectiveConfig()) == ("color", "motion", "confidence")
+    assert channels_of(everything, ObjectiveConfig(flow_weight=0)) == ("color", "confidence")
+
+
+def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
+    rng = np.random.default_rng(0)
+
+    def tensor(*shape: int) -> mi.TensorXf:
+        values = mi.TensorXf(rng.uniform(0.2, 0.8, shape).astype(np.float32))
+        dr.enable_grad(values)
+        return values
+
+    image = Image(color=tensor(H, W, 3), motion=tensor(H, W, 2), confidence=tensor(H, W, 1))
+    inputs = {"recon": image.color, "flow": image.motion, "mask": image.confidence, "offset": tensor(5, 3)}
+    assert list(inputs) == NAMES, "a new term needs an input here"
+    prediction = Prediction(image, {"offset": inputs["offset"]}, None, H * W, 10, 2.0)
+    observations = {
+        "target": Target(np.zeros((H, W, 3), np.float32)),
+        "motion": mi.TensorXf(np.zeros((H, W, 2), np.float32)),
+        "reliable": mi.TensorXf(np.ones((H, W), np.float32)),
+        "mask": mi.TensorXf(np.zeros((H, W), np.float32)),
+    }
+    assert losses_of(prediction, {"target": observations["target"]}, ObjectiveConfig()).keys() == {"recon", "offset"}
+    losses = losses_of(prediction, observations, ObjectiveConfig())
+    assert list(losses) == NAMES
+    for name, loss in losses.items():
+        dr.backward(loss, flags=dr.ADFlag.ClearVertices)
+        assert np.abs(np.asarray(dr.grad(inputs[name]))).max() > 0, name
+    offset = np.asarray(dr.detach(inputs["offset"]))
+    assert np.asarray(losses["offset"]).item() == pytest.approx(offset.sum() / (10 * 2.0), rel=1e-5)
+
+
+def test_weights_of__are_those_of_the_settings():
+    config = ObjectiveConfig(flow_weight=2.0, mask_weight=3.0, offset_weight=4.0)
+    assert weights_of(config) == {"recon": 1, "flow": 2, "mask": 3, "offset": 4}
+    with pytest.raises(ValueError, match="`flow_weight` must be finite and not negative, got -1"):
+        ObjectiveConfig(flow_weight=-1)
