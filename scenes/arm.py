@@ -1,6 +1,6 @@
-"""An articulated robot arm that swings through a room: 5 pixels a frame on average and up to 14 at 320x240.
+"""An articulated robot arm that swings in a room: 5 pixels per frame on average and up to 14 at 320x240.
 
-Every link is rigid; its pose is its parent's pose times a joint, so the hand adds up all the motion.
+Every link is rigid. Its pose is its parent's pose times a joint, so the motion of all joints accumulates at the hand.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ UPPER, FORE = 0.70, 0.60
 
 
 def build(seed: int = 0) -> Scene:
-    """Return the scene; `seed` chooses its textures."""
+    """Return the scene; `seed` determines its textures."""
     steel = textured(pattern(seed + 20, (0.24, 0.26, 0.30), (0.44, 0.42, 0.38), 4, 20))
     orange = textured(pattern(seed + 21, (0.76, 0.34, 0.08), (0.70, 0.56, 0.20), 4, 16))
     blue = textured(pattern(seed + 22, (0.14, 0.32, 0.66), (0.60, 0.66, 0.70), 4, 16), roughness=0.3)
@@ -50,20 +50,20 @@ def build(seed: int = 0) -> Scene:
 
 
 def turntable(time: float) -> np.ndarray:
-    """Turn about the vertical."""
+    """Return the pose of the turntable, which rotates about the vertical axis."""
     return translate(0, 0.30, 0) @ rotate("y", 1.0 * np.sin(2.2 * time - 0.3))
 
 
 def upper_arm(time: float) -> np.ndarray:
-    """Lean at the shoulder."""
+    """Return the pose of the upper arm, which rotates at the shoulder."""
     return turntable(time) @ translate(0, 0.32, 0) @ rotate("z", 0.35 + 0.45 * np.sin(2.4 * time + 2.5))
 
 
 def forearm(time: float) -> np.ndarray:
-    """Bend at the elbow."""
+    """Return the pose of the forearm, which rotates at the elbow."""
     return upper_arm(time) @ translate(0, UPPER, 0) @ rotate("z", -1.3 + 0.7 * np.sin(2.3 * time + 2.3))
 
 
 def hand(time: float) -> np.ndarray:
-    """Twist at the wrist."""
+    """Return the pose of the hand, which twists at the wrist."""
     return forearm(time) @ translate(0, FORE, 0) @ rotate("y", 2.4 * time)

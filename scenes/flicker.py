@@ -1,8 +1,8 @@
-"""Still life under a swinging lamp, through an exposure that flickers: light changes everywhere, little moves.
+"""A still life under a swinging lamp with a flickering exposure: the light changes everywhere, few objects move.
 
-From frame to frame every pixel becomes brighter or darker by up to a tenth in linear light, and shadows sweep by
-several pixels, over a few slow objects of 1 to 4 pixels a frame at 320x240. Shadows and light are no motion in the
-ground truth.
+From frame to frame every pixel becomes brighter or darker by up to a tenth in linear light, and shadows move by several
+pixels, while a few slow objects move by 1 to 4 pixels per frame at 320x240. Changes of shadow and light are not motion
+in the ground truth.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from morgs_mi.synth.textures import RGB, lights, pattern, room, textured
 
 
 def build(seed: int = 0) -> Scene:
-    """Return the scene; `seed` chooses its textures."""
+    """Return the scene; `seed` determines its textures."""
     stone = _paint(seed + 40, (0.42, 0.38, 0.32), (0.24, 0.20, 0.18))
     clay = _paint(seed + 41, (0.62, 0.32, 0.20), (0.72, 0.52, 0.36))
     slate = _paint(seed + 42, (0.20, 0.26, 0.34), (0.48, 0.52, 0.54))
@@ -40,28 +40,28 @@ def build(seed: int = 0) -> Scene:
 
 
 def turning(time: float) -> np.ndarray:
-    """Turn on the spot."""
+    """Return a pose that rotates in place about the vertical axis."""
     return translate(0.05, 0.30, 0.25) @ rotate("y", 1.6 * time)
 
 
 def rolling(time: float) -> np.ndarray:
-    """Roll to and fro along x without slipping."""
+    """Return the pose of a ball that rolls back and forth along x without slipping."""
     x = 0.9 + 0.4 * np.sin(1.5 * time)
     return translate(x, 0.27, 0.75) @ rotate("z", -x / 0.27)
 
 
 def sliding(time: float) -> np.ndarray:
-    """Slide along the floor towards the cameras and back."""
+    """Return a pose that slides along the floor towards the cameras and back."""
     return translate(-0.85, 0.16, 0.7 + 0.35 * np.sin(1.8 * time)) @ rotate("y", 0.5)
 
 
 def swinging(time: float) -> np.ndarray:
-    """Swing the lamp about the vertical through the room's middle."""
+    """Return the pose of the lamp, which swings about the vertical axis through the room's centre."""
     return rotate("y", 0.45 * np.sin(3.0 * time))
 
 
 def flickering(time: float) -> float:
-    """Return the exposure: two sines that never come round together, up to 12 % off their mean."""
+    """Return the exposure: two sines without a short common period, up to 12 % off their mean."""
     return 1 + 0.07 * np.sin(2 * np.pi * 7.3 * time) + 0.05 * np.sin(2 * np.pi * 4.1 * time + 1.0)
 
 

@@ -1,7 +1,7 @@
-"""Thin parts that move fast: a propeller, a rope, pendulums and a baton, 4 to 9 pixels wide at 320x240.
+"""Thin, fast objects: a propeller, a rope, pendulums and a baton, 4 to 9 pixels wide at 320x240.
 
-Their tips go 8 to 12 pixels a frame, farther than they are wide, so that there what a part covers in one frame and in
-the next hardly overlaps. The rope is a chain of rigid links, each hinged to the one before.
+Their tips move by 8 to 12 pixels per frame, more than their width, so the regions that a tip covers in successive
+frames hardly overlap. The rope is a chain of rigid links, each hinged to the previous one.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ HINGES = {"pendulum": (0.62, 2.08, 0.05), "far_pendulum": (1.35, 2.16, -0.60)}
 
 
 def build(seed: int = 0) -> Scene:
-    """Return the scene; `seed` chooses its textures."""
+    """Return the scene; `seed` determines its textures."""
     wood, steel = _paint(seed + 30, (0.50, 0.34, 0.18), (0.26, 0.16, 0.10), 5), _paint(seed + 31, repeat=4)
     blue, green = _paint(seed + 33, (0.10, 0.28, 0.70), repeat=6), _paint(seed + 34, (0.16, 0.58, 0.26), repeat=6)
     hemp = _paint(seed + 35, (0.72, 0.60, 0.30), (0.26, 0.18, 0.10))
@@ -49,13 +49,13 @@ def build(seed: int = 0) -> Scene:
 
 
 def propeller(time: float, blade: int = 0) -> np.ndarray:
-    """Spin at 5.2 rad/s about an axis that leans up and to the side; blades are pitched by 25 degrees."""
+    """Return the pose of a blade, which spins at 5.2 rad/s about a tilted axis; its pitch is 25 degrees."""
     turn = rotate("y", 0.35) @ rotate("x", -0.15) @ rotate("z", 5.2 * time + 2 * np.pi * blade / BLADES)
     return translate(MAST[0], MAST[1] + 0.05, MAST[2] + 0.12) @ turn @ rotate("x", 0.44)
 
 
 def link(time: float, index: int) -> np.ndarray:
-    """Swing in a wave that runs down the rope, wider towards its end."""
+    """Return the pose of a link of the rope: a travelling wave whose amplitude grows towards the end."""
     pose = translate(*HOOK)
     for k in range(index + 1):
         wave = 4.4 * time - 0.55 * k
@@ -65,18 +65,18 @@ def link(time: float, index: int) -> np.ndarray:
 
 
 def pendulum(time: float) -> np.ndarray:
-    """Swing across the view."""
+    """Return the pose of the pendulum that swings across the view."""
     return translate(*HINGES["pendulum"]) @ rotate("z", 0.66 * np.sin(3.7 * time + 0.6))
 
 
 def far_pendulum(time: float) -> np.ndarray:
-    """Swing aslant."""
+    """Return the pose of the pendulum that swings at an angle to the view."""
     hinge = translate(*HINGES["far_pendulum"])
     return hinge @ rotate("y", 0.9) @ rotate("z", 0.62 * np.sin(4.0 * time - 1.2))
 
 
 def baton(time: float) -> np.ndarray:
-    """Tumble while it hovers above the floor."""
+    """Return the pose of the baton, which tumbles above the floor."""
     place = translate(-0.1 + 0.15 * np.sin(2 * time), 0.42 + 0.12 * np.sin(3 * time), 0.75)
     return place @ rotate("y", 0.5) @ rotate("z", 6.0 * time)
 
@@ -92,5 +92,5 @@ def _ends(half: float, material: dict) -> dict[str, dict]:
 
 
 def _paint(seed: int, first: RGB = (0.24, 0.26, 0.30), second: RGB = (0.66, 0.64, 0.58), repeat: float = 1) -> dict:
-    """Return a material for a rod `repeat` times as long as around; motion along the rod shows by its squares."""
+    """Return a material for a rod `repeat` times as long as its circumference; its squares show motion along it."""
     return textured(pattern(seed, first, second, 4, 8), repeat=(1, repeat))

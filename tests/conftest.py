@@ -1,4 +1,4 @@
-"""One variant for all tests, whose kernels are shared; and a capture beside a stream that reproduces it exactly."""
+"""One Mitsuba variant for all tests, and a capture with a stream that reproduces it exactly."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from morgs_mi.render.rasterize import rasterize
 from morgs_mi.synth.ground_truth import GroundTruth, save_truth
 from tests.moving_splats import CAMERAS, DISTANCE, FRAMES, PIXELS, STEP, moved, write_stream
 
-mi.set_variant("llvm_ad_rgb")
+mi.set_variant("llvm_ad_rgb")  # one for all tests, which then share its kernels
 
 
 @pytest.fixture(autouse=True)
 def llvm_variant():
-    """Leave every test with the variant it started from."""
+    """Restore the variant after every test."""
     mi.set_variant("llvm_ad_rgb")
     yield
     mi.set_variant("llvm_ad_rgb")
@@ -30,16 +30,16 @@ def llvm_variant():
 
 @pytest.fixture(scope="session")
 def fitted_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a recording, its truth and its stream; every picture is the stream's own."""
+    """A folder with a capture, its ground truth and its stream; all images are rendered from the stream."""
     folder = tmp_path_factory.mktemp("clip")
     write_colmap(folder / "capture" / "sparse", CAMERAS)
     for camera in CAMERAS:
         images = [rasterize(moved(t), camera) for t in range(FRAMES)]
         write_video(folder / "capture" / camera.name, [to_uint8(np.array(i.color)) for i in images], 25)
         for t, image in enumerate(images):
-            seen = np.array(image.alpha)[..., 0] > 0
-            motion = seen[..., None] * np.float32([PIXELS, 0]) * (t > 0)
-            truth = GroundTruth(motion, np.float32(DISTANCE * seen), np.where(seen, 0, -1), seen)
+            covered = np.array(image.alpha)[..., 0] > 0
+            motion = covered[..., None] * np.float32([PIXELS, 0]) * (t > 0)
+            truth = GroundTruth(motion, np.float32(DISTANCE * covered), np.where(covered, 0, -1), covered)
             save_truth(folder / "capture" / "truth", camera.name, t, truth)
     steps = np.arange(FRAMES)[:, None] * (STEP, 0, 0)
     corners = np.array([(0.0, 0, 0), (1, 0, 0), (0, 1, 0)])

@@ -1,4 +1,4 @@
-"""Five splats that step along x, their stream, and cameras that see them: what the room's tests have in common."""
+"""Five splats that move along x in equal steps, their stream, and cameras: shared by several test modules."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ CAMERAS = [
     Camera.look_at((0, 0, -DISTANCE), (0, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT, "cam0"),
     Camera.look_at((0.5, 0, -DISTANCE), (0.5, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT, "cam1"),
 ]
-# As good as float32: what is judged is the judge.
+# As exact as float32, so that only the code under test contributes errors.
 EXACT = CodecConfig(quality=1e5)
-# Pixels per frame of a step along x in a plane that is parallel to both images.
+# Pixels per frame of one step along x, in a plane that is parallel to both image planes.
 PIXELS = CAMERAS[0].K[0, 0] * STEP / DISTANCE
 
 
 def moved(frame: float, logit: float | None = 0.0) -> Gaussians:
-    """Five splats in the plane z = 0 that have gone `frame` steps along x, with a confidence unless `logit` is None."""
+    """Return five splats in the plane z = 0 after `frame` steps along x, with a confidence unless `logit` is None."""
     rng = np.random.default_rng(0)
     means = np.float32(rng.uniform(-1, 1, (5, 3)) * (1, 1, 0) + (frame * STEP, 0, 0))
     sh = np.float32(rng.uniform(-1, 1.5, (5, 1, 3)))
@@ -36,9 +36,9 @@ def moved(frame: float, logit: float | None = 0.0) -> Gaussians:
 def write_stream(
     path: Path, metadata: dict, logit: float | None = 0.0, shift: float = 0, offset: float | None = None
 ) -> list[Packet]:
-    """Write the splats' stream, `shift` steps ahead of them, and return its packets.
+    """Write the stream of the splats, shifted by `shift` steps, and return its packets.
 
-    With an `offset`, that share of each step along x was learned.
+    With an `offset`, that share of each step along x is the learned offset.
     """
     first = keyframe_packet(moved(shift, logit), 0, CAMERAS, EXACT)
     state, packets = decode(None, first), [first]

@@ -26,12 +26,12 @@ class Ply:
     """Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."""
 
     def run(self) -> None:
-        from morgs_mi.export.clips import chosen_frames, write_each
+        from morgs_mi.export.clips import select_frames, write_each
         from morgs_mi.io.ply import write_ply
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
-        frames, output = chosen_frames(stream, self.frames), self.output or stream.path.with_name("ply")
+        frames, output = select_frames(stream, self.frames), self.output or stream.path.with_name("ply")
         with progress() as report:
             write_each(stream, output, ".ply", write_ply, frames, lambda done, of: report("Writing", done, of))
         print_result(f"{output}: {len(frames)} PLY files.")
@@ -50,12 +50,12 @@ class Gltf:
 
     def run(self) -> None:
         from morgs_mi.export.axes import gltf_axes
-        from morgs_mi.export.clips import chosen_frames, write_each
+        from morgs_mi.export.clips import select_frames, write_each
         from morgs_mi.export.gltf import write_gltf
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
-        frames, output = chosen_frames(stream, self.frames), self.output or stream.path.with_name("gltf")
+        frames, output = select_frames(stream, self.frames), self.output or stream.path.with_name("gltf")
         axes = gltf_axes(stream.cameras)
         with progress() as report:
             write_each(
@@ -93,19 +93,19 @@ class Flight:
     def run(self) -> None:
         from morgs_mi.codec.packets import play
         from morgs_mi.export.clips import frame_numbers, write_flight
-        from morgs_mi.export.paths import between, focus, load_path, orbit
+        from morgs_mi.export.paths import focus, load_path, orbit, through_cameras
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
         clip = len(frame_numbers(stream)) / stream.fps
         if self.path == "between":
-            path = between(stream.cameras, clip)
+            path = through_cameras(stream.cameras, clip)
         elif self.path == "orbit":
             means = next(gaussians for _, gaussians in play(stream)).numpy()["means"]
             path = orbit(stream.cameras, focus(stream.cameras, means), self.degrees, clip)
         else:
             path = load_path(self.path, stream.cameras)
-        path = path if self.seconds is None else path.lasting(self.seconds)
+        path = path if self.seconds is None else path.with_duration(self.seconds)
         if self.width is not None:
             height = round(self.width * path.keys[0].height / path.keys[0].width)
             path = replace(path, keys=tuple(key.resized(self.width, height) for key in path.keys))
@@ -133,13 +133,13 @@ class Tracks:
 
     def run(self) -> None:
         from morgs_mi.export.clips import frame_numbers
-        from morgs_mi.export.tracks import follow, write_tracks
+        from morgs_mi.export.tracks import extract_tracks, write_tracks
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
         output, total = self.output or stream.path.with_name("tracks.npz"), len(frame_numbers(stream))
         with progress() as report:
-            tracks = follow(stream, lambda done: report("Following", done, total))
+            tracks = extract_tracks(stream, lambda done: report("Following", done, total))
         write_tracks(output, tracks)
         T, N = tracks.positions.shape[:2]
         print_result(f"{output}: {N} Gaussians through {T} frames.")

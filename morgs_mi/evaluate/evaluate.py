@@ -30,7 +30,7 @@ from morgs_mi.playback.player import (
     has_confidence,
     open_stream,
     open_stream_capture,
-    playback,
+    playback_speed,
     render,
     render_config,
     truth_for_camera,
@@ -141,7 +141,7 @@ def evaluate_stream(
         "regions": "recorded change" if recording.truth is None else "true masks",
         **_summary(stream.path.stat().st_size, rows),
         "mtv": _means([variation.result() for variation in variations.values()]),
-        "playback": playback(stream, stream.cameras[views[0]]),
+        "playback": playback_speed(stream, stream.cameras[views[0]]),
         "views": {
             name: {score: _mean([row["views"][name][score] for row in rows]) for score in _SCORES}
             for name in rows[0]["views"]

@@ -19,7 +19,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.synth.ground_truth import GroundTruth, project
+from morgs_mi.synth.ground_truth import GroundTruth
 
 __all__ = ["compare_motion", "evaluate_motion", "rigid_motions", "surface_ids"]
 
@@ -92,7 +92,7 @@ def surface_ids(points: np.ndarray, views: Sequence[tuple[Camera, GroundTruth]])
     for camera, truth in views:
         depth = points @ np.asarray(camera.viewmat)[2, :3] + np.asarray(camera.viewmat)[2, 3]
         front = np.flatnonzero(depth > camera.near)
-        pixels = np.floor(project(camera, points[front])[0])
+        pixels = np.floor(camera.project(points[front])[0])
         inside = ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
         front, (column, row) = front[inside], pixels[inside].astype(int).T
         seen = truth.ids[row, column]

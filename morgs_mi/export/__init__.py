@@ -1,1 +1,1 @@
-"""Streams as files that other programs read."""
+"""Export of streams to the file formats of other programs."""

@@ -1,4 +1,4 @@
-"""The axes that glTF asks for: x right, y up, and the viewer before the scene on the positive z side."""
+"""The axes of glTF: x to the right, y up, and the viewer on the positive z side of the scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["gltf_axes", "up_direction"]
 
 
 def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the unit vector [3] that is up to the cameras on average, or to the first where they disagree."""
+    """Return the mean up direction of the cameras [3], of unit length; that of the first one where they cancel out."""
     ups = np.stack([-np.asarray(camera.viewmat, np.float64)[1, :3] for camera in cameras])
     mean = ups.mean(axis=0)
     up = mean if np.linalg.norm(mean) > 0.1 else ups[0]
@@ -20,11 +20,11 @@ def up_direction(cameras: Sequence[Camera]) -> np.ndarray:
 
 
 def gltf_axes(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the rotation [3, 3] from world axes to glTF's: the cameras' up is y, the first one's right nearly x."""
+    """Return the rotation [3, 3] from world to glTF axes: y is the cameras' mean up, x nearly the first one's right."""
     up = up_direction(cameras)
     views = np.asarray(cameras[0].viewmat, np.float64)
     right, forward = (side - (side @ up) * up for side in (views[0, :3], views[2, :3]))
-    if np.linalg.norm(right) < 0.5:  # it lies on its side, so what is up lies to its right
+    if np.linalg.norm(right) < 0.5:  # the camera is rolled by 90 degrees: its right is nearly up
         right = forward
     right /= np.linalg.norm(right)
     return np.stack([right, up, np.cross(right, up)])

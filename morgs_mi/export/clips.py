@@ -1,4 +1,4 @@
-"""Parts of a stream as files: one file per frame, or a video along a camera path."""
+"""Export of a stream's frames: one file per frame, or a video along a camera path."""
 
 from __future__ import annotations
 
@@ -11,34 +11,34 @@ from morgs_mi.codec.packets import play, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import atomic_folder
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.export.frames import PLAYABLE, even
+from morgs_mi.export.frames import PLAYABLE, pad_to_even
 from morgs_mi.export.paths import CameraPath
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.player import channel_image, render, render_config
 from morgs_mi.playback.visualise import side_by_side
 
-__all__ = ["chosen_frames", "frame_numbers", "write_each", "write_flight"]
+__all__ = ["frame_numbers", "select_frames", "write_each", "write_flight"]
 
 Progress = Callable[[int, int], None] | None
 
 
 def frame_numbers(stream: StreamReader) -> list[int]:
-    """Return the indices of a stream's frames, without decoding any.
+    """Return the indices of a stream's frames, without decoding them.
 
     Raises:
-        ValueError: it has none.
+        ValueError: the stream has no frame.
     """
     numbers = list(dict.fromkeys(frame for _, frame, _ in stream.index()))
     if not numbers:
-        raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has a header alone.")
+        raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has only a header.")
     return numbers
 
 
-def chosen_frames(stream: StreamReader, span: str | None) -> list[int]:
-    """Return those of a stream's frames that `span` names: ``12``, ``10:20`` (without 20), ``::5``; None is all.
+def select_frames(stream: StreamReader, span: str | None) -> list[int]:
+    """Return the frames of a stream that `span` selects: ``12``, ``10:20`` (without 20), ``::5``; None selects all.
 
     Raises:
-        ValueError: it is not written so, or names no frame of the stream.
+        ValueError: `span` has another syntax, or selects no frame of the stream.
     """
     numbers = frame_numbers(stream)
     if span is None:
@@ -53,9 +53,9 @@ def chosen_frames(stream: StreamReader, span: str | None) -> list[int]:
         start, stop = start, None if start is None else start + 1
     low, high = numbers[0] if start is None else start, numbers[-1] + 1 if stop is None else stop
     wanted = set(range(low, high, step or 1))
-    if not (found := [number for number in numbers if number in wanted]):
+    if not (selected := [number for number in numbers if number in wanted]):
         raise ValueError(f"{stream.path}: the frames must lie in {numbers[0]}..{numbers[-1]}, got {span!r}.")
-    return found
+    return selected
 
 
 def write_each(
@@ -66,15 +66,15 @@ def write_each(
     frames: Sequence[int],
     progress: Progress = None,
 ) -> None:
-    """Write frames as ``0000.ply``, ``0001.ply``, ... into a new folder, which appears whole or not at all.
+    """Write frames as ``0000.ply``, ``0001.ply``, ... into a new folder, which is written atomically.
 
     Args:
         stream: the file.
-        folder: it must not exist yet.
+        folder: must not exist.
         suffix: of the files, e.g. ``.ply``.
-        write: writes the Gaussians of one frame.
-        frames: their indices, ascending.
-        progress: called with the number of files done and to do.
+        write: function that writes the Gaussians of one frame.
+        frames: indices of the frames, ascending.
+        progress: called with (files done, total number of files).
 
     Raises:
         ValueError: a broken packet.
@@ -100,20 +100,20 @@ def write_flight(
     freeze: int | None = None,
     progress: Progress = None,
 ) -> None:
-    """Render a stream along a camera path into a video at the stream's frame rate; whole or not at all.
+    """Render a stream along a camera path into a video at the stream's frame rate; the file is written atomically.
 
-    Time goes on while the camera moves, and starts over after the last frame.
+    The clip plays while the camera moves, and restarts after its last frame.
 
     Args:
         stream: the file.
-        path: where the camera goes; its length is the video's.
+        path: the moving camera; it determines the duration of the video.
         output: ``FILE.mp4``.
-        channels: out of `CHANNELS`, side by side.
-        freeze: index of the one frame to show; None lets time go on.
-        progress: called with the number of pictures done and to do.
+        channels: out of `CHANNELS`, drawn side by side.
+        freeze: index of a single frame to show; None plays the clip.
+        progress: called with (images done, total number of images).
 
     Raises:
-        ValueError: another kind of file, an unknown channel or frame, or a broken packet.
+        ValueError: another type of file, an unknown channel or frame, or a broken packet.
         OSError: the file cannot be written.
     """
     if Path(output).suffix.lower() != ".mp4":
@@ -121,17 +121,18 @@ def write_flight(
     frame_numbers(stream)
     count, config = max(1, round(path.seconds * stream.fps)), render_config(stream)
 
-    def pictures() -> Iterator[np.ndarray]:
-        for i, gaussians in zip(range(count), _over_time(stream, freeze), strict=False):
-            images = render(gaussians, path.at(i / stream.fps), channels, config)
-            yield even(side_by_side([channel_image(name, image) for name, image in images.items()]))
+    def images() -> Iterator[np.ndarray]:
+        for i, gaussians in zip(range(count), _repeated_frames(stream, freeze), strict=False):
+            rendered = render(gaussians, path.at(i / stream.fps), channels, config)
+            yield pad_to_even(side_by_side([channel_image(name, values) for name, values in rendered.items()]))
             if progress is not None:
                 progress(i + 1, count)
 
-    write_video(output, pictures(), stream.fps, PLAYABLE)
+    write_video(output, images(), stream.fps, PLAYABLE)
 
 
-def _over_time(stream: StreamReader, freeze: int | None) -> Iterator[Gaussians]:
+def _repeated_frames(stream: StreamReader, freeze: int | None) -> Iterator[Gaussians]:
+    """Yield the frames of a stream, or the one frame `freeze`, without end."""
     frozen = None if freeze is None else seek(stream, freeze).gaussians
     while True:
         yield from (frozen,) if frozen is not None else (gaussians for _, gaussians in play(stream))

@@ -1,4 +1,4 @@
-"""A stream's frames as files: a video that ordinary players play, EXR files for compositing, PNG files."""
+"""Export of rendered frames: videos for common players, EXR files for compositing, PNG files."""
 
 from __future__ import annotations
 
@@ -9,23 +9,17 @@ import numpy as np
 
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import srgb_to_linear
 from morgs_mi.core.files import atomic_folder
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.player import channel_image, render_stream
 from morgs_mi.playback.visualise import side_by_side, write_png
 
-__all__ = ["PLAYABLE", "even", "exr_channels", "linear_light", "write_frames"]
+__all__ = ["PLAYABLE", "exr_channels", "pad_to_even", "write_frames"]
 
-# Of what OpenCV's wheels can encode, what every browser plays: H.264 is not among it, and none plays mp4v.
 PLAYABLE = "vp09"
-_EXR_NAMES = {
-    "color": ("R", "G", "B"),
-    "alpha": ("A",),
-    "depth": ("depth.Y",),
-    "motion": ("motion.X", "motion.Y"),
-    "confidence": ("confidence.Y",),
-}
+"""Codec that OpenCV's wheels encode and all browsers play: the wheels have no H.264, and browsers do not play mp4v."""
 
 
 def write_frames(
@@ -35,20 +29,20 @@ def write_frames(
     channels: Sequence[str] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> None:
-    """Render a stream for one camera into files, which appear whole or not at all.
+    """Render a stream for one camera into files, which are written atomically.
 
     Args:
         stream: the file.
         camera: any view.
-        output: ``FILE.mp4`` for a video of the channels side by side, a folder ending in ``png`` for the same as
+        output: ``FILE.mp4`` for a video of the channels side by side, a folder ending in ``png`` for the same images as
             ``0000.png`` ..., any other folder for multichannel ``0000.exr`` ... (see `exr_channels`).
-        channels: out of `CHANNELS`; by default the colour, in EXR files all that the stream holds.
+        channels: out of `CHANNELS`; default: the colour, for EXR files all channels that the stream stores.
         progress: called with the number of frames done.
 
     Raises:
-        ValueError: an unknown channel, one that the stream does not hold, another kind of video, a stream that is
-            truncated, broken or without a frame.
-        OSError: the folder exists, or the files cannot be written.
+        ValueError: an unknown channel, a channel that the stream does not store, another type of video, or a stream
+            that is truncated, broken or has no frame.
+        OSError: the folder exists, or a file cannot be written.
     """
     output = Path(output)
     name = output.name.lower()
@@ -66,37 +60,44 @@ def write_frames(
                 progress(done)
 
     if video:
-        write_video(output, (even(_picture(images)) for _, images in frames()), stream.fps, PLAYABLE)
+        write_video(output, (pad_to_even(_combined_image(images)) for _, images in frames()), stream.fps, PLAYABLE)
         return
     with atomic_folder(output, "write_frames()") as folder:
         for frame, images in frames():
             if png:
-                write_png(folder / f"{frame:04d}.png", _picture(images))
+                write_png(folder / f"{frame:04d}.png", _combined_image(images))
             else:
                 write_exr(folder / f"{frame:04d}.exr", exr_channels(images))
         if not any(folder.iterdir()):
-            raise ValueError(f"{output}: at least one frame was expected, got none; the stream has a header alone.")
+            raise ValueError(f"{output}: at least one frame was expected, got none; the stream has only a header.")
 
 
 def exr_channels(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return rendered images [H, W, 1 to 3] as EXR channels [H, W] under the names of the renderer's AOVs.
+    """Return rendered images [H, W, C] as EXR channels [H, W] under the names of the renderer's AOVs.
 
-    Colour becomes linear light (R, G, B), as EXR readers expect; motion stays in pixels, depth in world units.
+    Colour is R, G, B in linear light, as EXR readers expect, and alpha is A. Other channels are called ``depth.Y`` if
+    they have one component, ``motion.X``, ``motion.Y`` if they have several. Motion is in pixels, depth in world units.
     """
-    planes = {**images, **({"color": linear_light(images["color"])} if "color" in images else {})}
-    return {name: plane[..., i] for key, plane in planes.items() for i, name in enumerate(_EXR_NAMES[key])}
+    planes = {**images, **({"color": srgb_to_linear(images["color"])} if "color" in images else {})}
+    return {
+        name: plane[..., i] for key, plane in planes.items() for i, name in enumerate(_exr_names(key, plane.shape[2]))
+    }
 
 
-def even(picture: np.ndarray) -> np.ndarray:
-    """Return the picture [H, W, 3] with its last row and column doubled where it takes that to make them even."""
-    H, W = picture.shape[:2]
-    return np.pad(picture, ((0, H % 2), (0, W % 2), (0, 0)), mode="edge")
+def _exr_names(channel: str, components: int) -> list[str]:
+    if channel == "color":
+        return ["R", "G", "B"]
+    if channel == "alpha":
+        return ["A"]
+    suffixes = "Y" if components == 1 else "XYZW"[:components] if components <= 4 else map(str, range(components))
+    return [f"{channel}.{suffix}" for suffix in suffixes]
 
 
-def _picture(images: Mapping[str, np.ndarray]) -> np.ndarray:
+def pad_to_even(image: np.ndarray) -> np.ndarray:
+    """Return the image [H, W, 3] with its last row and column repeated where their number is odd."""
+    H, W = image.shape[:2]
+    return np.pad(image, ((0, H % 2), (0, W % 2), (0, 0)), mode="edge")
+
+
+def _combined_image(images: Mapping[str, np.ndarray]) -> np.ndarray:
     return side_by_side([channel_image(name, image) for name, image in images.items()])
-
-
-def linear_light(encoded: np.ndarray) -> np.ndarray:
-    """Undo sRGB's encoding (IEC 61966-2-1), beyond 1 too, where splats overshoot."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0) + 0.055) / 1.055) ** 2.4)

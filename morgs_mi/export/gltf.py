@@ -1,7 +1,7 @@
 """Gaussians as a binary glTF 2.0 file with the extension `KHR_gaussian_splatting`.
 
-A .glb file is a header, a JSON chunk and a chunk of bytes. The Gaussians are one point primitive; each attribute has an
-accessor and a view of the bytes of its own, little-endian float32:
+A .glb file consists of a header, a JSON chunk and a binary chunk. The Gaussians are one point primitive. Each attribute
+has its own accessor and buffer view, little-endian float32:
 
     POSITION                                        VEC3    centre
     KHR_gaussian_splatting:ROTATION                 VEC4    unit quaternion, xyzw
@@ -10,7 +10,8 @@ accessor and a view of the bytes of its own, little-endian float32:
     KHR_gaussian_splatting:SH_DEGREE_l_COEF_n       VEC3    RGB coefficient of degree l and order n - l
     COLOR_0                                         VEC4    linear RGB and opacity, for viewers that draw points
 
-glTF wants y up. Centres, rotations and harmonics are turned, not the node: a viewer need not turn harmonics then.
+glTF's axes have y up. Centres, rotations and spherical harmonics are rotated rather than the node, so that a viewer
+does not have to rotate the harmonics.
 """
 
 from __future__ import annotations
@@ -22,31 +23,30 @@ from typing import Any
 
 import numpy as np
 
+from morgs_mi.core.color_space import SH_C0, srgb_to_linear
 from morgs_mi.core.files import whole
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import rotated, unit_quats
-from morgs_mi.export.frames import linear_light
 
 __all__ = ["glb", "write_gltf"]
 
 _NAME = "KHR_gaussian_splatting"
 _FLOAT, _ARRAY_BUFFER, _POINTS = 5126, 34962, 0
 _TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
-_Y00 = 0.28209479177387814
 
 
 def write_gltf(path: str | Path, gaussians: Gaussians, axes: np.ndarray | None = None) -> None:
-    """Write Gaussians as a .glb file that needs no other and appears whole or not at all.
+    """Write Gaussians as a self-contained .glb file; the file is written atomically.
 
-    Motion and confidence have no place in the extension and are left out.
+    The extension has no attributes for motion and confidence, which are not written.
 
     Args:
         path: the file.
         gaussians: N Gaussians in world axes.
-        axes: rotation [3, 3] from world axes to glTF's, see `gltf_axes`; None where the world has y up already.
+        axes: rotation [3, 3] from world axes to glTF's, see `gltf_axes`; None if the world has y up already.
 
     Raises:
-        ValueError: no Gaussians, or more than the 4 GiB of a .glb file hold.
+        ValueError: there is no Gaussian, or there are more than fit into the 4 GiB of a .glb file.
         OSError: the file cannot be written.
     """
     data = glb(gaussians, axes)
@@ -58,9 +58,9 @@ def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
     """Return the bytes of the file that `write_gltf` writes.
 
     Raises:
-        ValueError: as there.
+        ValueError: as for `write_gltf`.
     """
-    if not len(gaussians):  # an accessor has at least one element
+    if not len(gaussians):  # an accessor must have at least one element
         raise ValueError("write_gltf(): at least one Gaussian was expected, got none; glTF cannot hold an empty set.")
     columns = _attributes(gaussians if axes is None else rotated(gaussians, axes))
     binary = b"".join(column.tobytes() for column in columns.values())
@@ -79,7 +79,7 @@ def glb(gaussians: Gaussians, axes: np.ndarray | None = None) -> bytes:
 def _attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
     raw = gaussians.numpy()
     opacities = np.asarray(gaussians.opacities, np.float32)
-    diffuse = linear_light(np.clip(0.5 + _Y00 * raw["sh_coeffs"][:, 0], 0, 1))
+    diffuse = srgb_to_linear(np.clip(0.5 + SH_C0 * raw["sh_coeffs"][:, 0], 0, 1))
     columns = {
         "POSITION": raw["means"],
         f"{_NAME}:ROTATION": np.roll(unit_quats(gaussians), -1, axis=1),
@@ -100,8 +100,8 @@ def _document(columns: dict[str, np.ndarray], axes: np.ndarray | None) -> dict[s
         {"bufferView": i, "componentType": _FLOAT, "count": len(column), "type": _TYPES[column.shape[1]]}
         for i, column in enumerate(columns.values())
     ]
-    place = columns["POSITION"]
-    accessors[0] |= {"min": place.min(axis=0).tolist(), "max": place.max(axis=0).tolist()}
+    means = columns["POSITION"]
+    accessors[0] |= {"min": means.min(axis=0).tolist(), "max": means.max(axis=0).tolist()}
     splats = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", "projection": "perspective"}
     primitive = {
         "mode": _POINTS,
@@ -123,6 +123,6 @@ def _document(columns: dict[str, np.ndarray], axes: np.ndarray | None) -> dict[s
         "buffers": [{"byteLength": int(starts[-1])}],
     }
     if axes is not None:
-        # How to come back to the capture's axes: x_world = M x_gltf.
+        # Rotation back to the capture's axes: x_world = M x_gltf.
         document["nodes"][0]["extras"] = {"world_from_gltf": np.asarray(axes, float).T.tolist()}
     return document

@@ -1,4 +1,4 @@
-"""Where each Gaussian of a stream was in each frame: tracks for NumPy."""
+"""Tracks of a stream's Gaussians: the position of each one in each frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from morgs_mi.codec.packets import CodedFrame, decode
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import whole
 
-__all__ = ["Tracks", "follow", "write_tracks"]
+__all__ = ["Tracks", "extract_tracks", "write_tracks"]
 
 
 @dataclass(frozen=True)
@@ -21,10 +21,10 @@ class Tracks:
     """Tracks of N Gaussians through T frames.
 
     Attributes:
-        ids: uint32 [N], ascending: the stream's numbers of the Gaussians.
-        frames: int64 [T], the frames' indices.
+        ids: uint32 [N], the Gaussians' ids in the stream, ascending.
+        frames: int64 [T], indices of the frames.
         positions: float32 [T, N, 3], centres in world units; NaN before birth and after death.
-        confidence: float32 [T, N] in [0, 1], NaN likewise, and everywhere where the stream carries none.
+        confidence: float32 [T, N] in [0, 1]; NaN before birth, after death, and throughout if the stream stores none.
     """
 
     ids: np.ndarray
@@ -33,10 +33,10 @@ class Tracks:
     confidence: np.ndarray
 
 
-def follow(stream: StreamReader, progress: Callable[[int], None] | None = None) -> Tracks:
-    """Follow all Gaussians through a stream; 16 bytes of memory per Gaussian and frame.
+def extract_tracks(stream: StreamReader, progress: Callable[[int], None] | None = None) -> Tracks:
+    """Return the tracks of all Gaussians of a stream; they take 16 bytes of memory per Gaussian and frame.
 
-    Where a keyframe starts a new set of Gaussians, which number from zero, their ids count on behind the earlier ones.
+    Where a keyframe starts a new set of Gaussians with ids from 0, these ids are shifted behind the earlier ones.
 
     Args:
         stream: the file.
@@ -45,29 +45,29 @@ def follow(stream: StreamReader, progress: Callable[[int], None] | None = None) 
     Raises:
         ValueError: a broken packet, or a stream without a frame.
     """
-    numbers, rows, frames = [], [], []
-    for first_id, coded in _numbered(stream):
+    ids_of_frames, rows, frames = [], [], []
+    for first_id, coded in _frames_with_first_id(stream):
         gaussians = coded.gaussians
-        known = gaussians.confidence is not None
-        confidence = np.asarray(gaussians.confidence) if known else np.full(len(coded), np.nan, np.float32)
+        has_confidence = gaussians.confidence is not None
+        confidence = np.asarray(gaussians.confidence) if has_confidence else np.full(len(coded), np.nan, np.float32)
         frames.append(coded.frame)
-        numbers.append(coded.ids.astype(np.int64) + first_id)
+        ids_of_frames.append(coded.ids.astype(np.int64) + first_id)
         rows.append((gaussians.numpy()["means"], confidence))
         if progress is not None:
             progress(len(frames))
     if not frames:
-        raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has a header alone.")
-    ids = np.unique(np.concatenate(numbers))
+        raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has only a header.")
+    ids = np.unique(np.concatenate(ids_of_frames))
     positions = np.full((len(frames), len(ids), 3), np.nan, np.float32)
     confidences = np.full((len(frames), len(ids)), np.nan, np.float32)
-    for t, (number, (means, confidence)) in enumerate(zip(numbers, rows, strict=True)):
-        at = np.searchsorted(ids, number)
-        positions[t, at], confidences[t, at] = means, confidence
+    for t, (present, (means, confidence)) in enumerate(zip(ids_of_frames, rows, strict=True)):
+        columns = np.searchsorted(ids, present)
+        positions[t, columns], confidences[t, columns] = means, confidence
     return Tracks(ids.astype(np.uint32), np.asarray(frames), positions, confidences)
 
 
 def write_tracks(path: str | Path, tracks: Tracks) -> None:
-    """Write tracks as .npz with the arrays `ids`, `frames`, `positions`, `confidence`; whole or not at all.
+    """Write tracks as .npz with the arrays `ids`, `frames`, `positions`, `confidence`; the file is written atomically.
 
     Raises:
         OSError: the file cannot be written.
@@ -78,12 +78,12 @@ def write_tracks(path: str | Path, tracks: Tracks) -> None:
         )
 
 
-def _numbered(stream: StreamReader) -> Iterator[tuple[int, CodedFrame]]:
-    """Yield every frame with what its ids are to be counted from."""
+def _frames_with_first_id(stream: StreamReader) -> Iterator[tuple[int, CodedFrame]]:
+    """Yield (first_id, frame) for every frame; `first_id` is added to the frame's ids."""
     first_id, coded = 0, None
     for packet in stream:
         if coded is not None and packet.frame == coded.frame:
-            continue  # restates the frame for those who start there
+            continue  # a re-emitted keyframe, from which a receiver can start
         if coded is not None and packet.kind == PacketKind.KEYFRAME:
             first_id += coded.next_id
         coded = decode(coded, packet)

@@ -57,7 +57,7 @@ class ObjectiveConfig:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not 0 <= value < inf:
+            if name.endswith("_weight") and not 0 <= value < inf:
                 raise ValueError(f"ObjectiveConfig(): `{name}` must be finite and not negative, got {value}.")
 
 

@@ -1,1 +1,1 @@
-"""Streams decoded and rendered, and channels visualised as images."""
+"""Decoding and rendering of streams, and visualisation of their channels."""

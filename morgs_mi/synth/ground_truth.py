@@ -1,7 +1,7 @@
-"""Exact ground truth of a clip whose objects are rigid: what moved, by how much, and how far away it is.
+"""Exact ground truth of a clip of rigid objects: motion, depth, object ids and motion masks.
 
 A surface point x_t of an object with pose M_t was at x_{t-1} = M_{t-1} M_t^{-1} x_t. With pi the projection,
-the motion map of frame t is pi(x_t) - pi(x_{t-1}) at each pixel of frame t: where each pixel came from.
+the motion map of frame t is pi(x_t) - pi(x_{t-1}) at each pixel of frame t.
 
 On disk: ``truth/cam00/0000.exr`` holds one camera's frame, ``truth/tracks.npz`` the clip's trajectories.
 """
@@ -17,17 +17,25 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.exr import read_exr, write_exr
 
-__all__ = ["GroundTruth", "Tracks", "carry", "ground_truth_of", "load_tracks", "load_truth", "project", "save_truth"]
+__all__ = [
+    "GroundTruth",
+    "Tracks",
+    "compute_ground_truth",
+    "load_tracks",
+    "load_truth",
+    "move_with_objects",
+    "save_truth",
+]
 
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """Ground truth on one camera's frame t.
+    """Ground truth of one camera's frame t.
 
     Attributes:
         motion: x_t - x_{t-1} in pixels [H, W, 2]; zero in frame 0.
-        depth: along the camera's z axis, world units [H, W]; 0 where the pixel sees nothing.
-        ids: object id [H, W], int32; -1 where the pixel sees nothing.
+        depth: along the camera's z axis, world units [H, W]; 0 where there is no surface.
+        ids: object id [H, W], int32; -1 where there is no surface.
         mask: whether the surface point moved in the world since t-1 (in frame 0: until frame 1) [H, W], bool.
     """
 
@@ -50,28 +58,29 @@ class Tracks:
     ids: np.ndarray
 
 
-def project(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixel positions [..., 2] and the depths [...] of world points [..., 3]."""
-    V = np.asarray(camera.viewmat, float)
-    local = points @ V[:3, :3].T + V[:3, 3]
-    return (local @ camera.K.T)[..., :2] / local[..., 2:], local[..., 2]
+def move_with_objects(
+    points: np.ndarray, ids: np.ndarray, poses: Sequence[np.ndarray], new_poses: Sequence[np.ndarray]
+) -> np.ndarray:
+    """Return the positions of surface points after their objects have moved.
 
+    Points of static objects are returned bit for bit.
 
-def carry(points: np.ndarray, ids: np.ndarray, poses: Sequence[np.ndarray], to: Sequence[np.ndarray]) -> np.ndarray:
-    """Return where world points [..., 3] of objects `ids` [...] go when the objects leave `poses` for `to`.
-
-    What does not move keeps its coordinates to the bit.
+    Args:
+        points: world positions [..., 3] on the objects at `poses`.
+        ids: index of each point's object [...].
+        poses: object-to-world [4, 4] of each object.
+        new_poses: the same after the motion.
     """
-    carried = points.copy()
-    for index, (here, there) in enumerate(zip(poses, to, strict=True)):
-        if not np.array_equal(here, there):
-            motion = there @ np.linalg.inv(here)
+    moved = points.copy()
+    for index, (pose, new_pose) in enumerate(zip(poses, new_poses, strict=True)):
+        if not np.array_equal(pose, new_pose):
+            motion = new_pose @ np.linalg.inv(pose)
             own = ids == index
-            carried[own] = points[own] @ motion[:3, :3].T + motion[:3, 3]
-    return carried
+            moved[own] = points[own] @ motion[:3, :3].T + motion[:3, 3]
+    return moved
 
 
-def ground_truth_of(
+def compute_ground_truth(
     camera: Camera,
     points: np.ndarray,
     ids: np.ndarray,
@@ -79,23 +88,23 @@ def ground_truth_of(
     before: Sequence[np.ndarray] | None,
     after: Sequence[np.ndarray],
 ) -> GroundTruth:
-    """Return the truth on a frame whose pixel centres see `points` [H, W, 3] of objects `ids` [H, W].
+    """Return the ground truth of a frame from the surface points at its pixel centres.
 
     Args:
         camera: the view.
-        points: world units; ignored where the id is negative.
-        ids: index into the poses, or -1.
-        poses: object-to-world [4, 4] of each object now.
-        before: the same one frame ago; None in the first frame.
-        after: the same one frame later, which decides the mask of the first frame.
+        points: surface points [H, W, 3], world units; ignored where the id is negative.
+        ids: index into the poses [H, W]; -1 where there is no surface.
+        poses: object-to-world [4, 4] of each object in this frame.
+        before: the same in the previous frame; None in the first frame.
+        after: the same in the next frame, which determines the mask of the first frame.
     """
     hit = ids >= 0
-    # Any point in front of the camera will do where there is no surface: nothing is kept of it.
+    # Where there is no surface, any point in front of the camera avoids a division by zero; its values are not used.
     points = np.where(hit[..., None], points, camera.position + np.asarray(camera.viewmat)[2, :3])
-    pixels, depth = project(camera, points)
-    other = carry(points, ids, poses, after if before is None else before)
-    motion = np.zeros_like(pixels) if before is None else pixels - project(camera, other)[0]
-    # Coordinates are single-precision: what moves less than their rounding stands still.
+    pixels, depth = camera.project(points)
+    other = move_with_objects(points, ids, poses, after if before is None else before)
+    motion = np.zeros_like(pixels) if before is None else pixels - camera.project(other)[0]
+    # Coordinates are single-precision: motion below their rounding error counts as none.
     mask = np.linalg.norm(other - points, axis=-1) > 1e-6 * np.abs(points).max()
     return GroundTruth(
         motion.astype(np.float32), np.where(hit, depth, 0).astype(np.float32), ids.astype(np.int32), mask
@@ -103,10 +112,10 @@ def ground_truth_of(
 
 
 def save_truth(folder: str | Path, camera: str, frame: int, truth: GroundTruth) -> None:
-    """Write one camera's frame as ``folder/camera/0000.exr``.
+    """Write the ground truth of one camera's frame as ``folder/camera/0000.exr``.
 
     Raises:
-        OSError: if it cannot be written.
+        OSError: the file cannot be written.
     """
     path = _path(folder, camera, frame)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -124,15 +133,15 @@ def load_truth(folder: str | Path, camera: str, frame: int) -> GroundTruth:
     """Read the ground truth of a camera's frame from a capture's ``truth`` folder.
 
     Raises:
-        FileNotFoundError: if the folder has no such camera or frame.
-        OSError: if the file is damaged.
-        ValueError: if a channel is missing.
+        FileNotFoundError: the folder has no such camera or frame.
+        OSError: the file is damaged.
+        ValueError: a channel is missing.
     """
     path = _path(folder, camera, frame)
     channels = read_exr(path)
     missing = {"motion.X", "motion.Y", "depth.Y", "id.Y", "mask.Y"} - set(channels)
     if missing:
-        raise ValueError(f"load_truth(): {path} lacks the channels {sorted(missing)}; synthesize the capture again.")
+        raise ValueError(f"load_truth(): {path} lacks the channels {sorted(missing)}; synthesise the capture again.")
     return GroundTruth(
         np.stack([channels["motion.X"], channels["motion.Y"]], axis=-1),
         channels["depth.Y"],
@@ -145,11 +154,13 @@ def load_tracks(folder: str | Path) -> Tracks:
     """Read the trajectories from a capture's ``truth`` folder.
 
     Raises:
-        FileNotFoundError: if the folder has none.
+        FileNotFoundError: the folder has none.
     """
     path = Path(folder) / "tracks.npz"
     if not path.is_file():
-        raise FileNotFoundError(f"load_tracks(): there is no file {path}; give a synthetic capture's truth folder.")
+        raise FileNotFoundError(
+            f"load_tracks(): there is no file {path}; pass the truth folder of a synthetic capture."
+        )
     with np.load(path) as arrays:
         return Tracks(arrays["points"], arrays["ids"])
 

@@ -1,4 +1,4 @@
-"""Descriptions of moving scenes: rigid objects with a pose per instant, lights, and a rig of cameras.
+"""Descriptions of moving scenes: rigid objects with a pose at each time, lights, and a rig of cameras.
 
 A scene is a Python file with a function ``build(seed: int) -> Scene``. Poses are functions of the time in
 seconds, so a clip may have any frame rate and length. World space has y up; lengths are world units.
@@ -28,9 +28,8 @@ class Object:
     """A rigid object.
 
     Attributes:
-        shapes: Mitsuba shape dictionaries by name, placed in the object's own space.
-        pose: seconds -> rigid object-to-world matrix [4, 4]; None for what never moves, whose own space
-            is the world.
+        shapes: Mitsuba shape dictionaries by name, in object space.
+        pose: seconds -> rigid object-to-world matrix [4, 4]; None for a static object, whose space is the world's.
     """
 
     shapes: Mapping[str, dict[str, Any]]
@@ -39,11 +38,11 @@ class Object:
 
 @dataclass(frozen=True)
 class Light:
-    """A lamp. It has no id in the ground truth: keep it out of view.
+    """A lamp. It has no id in the ground truth, so it must not be visible.
 
     Attributes:
-        shape: Mitsuba dictionary of an emitter, or of a shape that carries one, placed in the lamp's own space.
-        pose: seconds -> rigid lamp-to-world matrix [4, 4]; None for what never moves, whose own space is the world.
+        shape: Mitsuba dictionary of an emitter, or of a shape with one, in the lamp's space.
+        pose: seconds -> rigid lamp-to-world matrix [4, 4]; None for a static lamp, whose space is the world's.
     """
 
     shape: dict[str, Any]
@@ -52,13 +51,13 @@ class Light:
 
 @dataclass(frozen=True)
 class Rig:
-    """Fixed cameras on a cap of a sphere in front of the scene, all looking at its centre.
+    """Fixed cameras on a spherical cap in front of the scene, all looking at its centre.
 
     Attributes:
-        center: where the cameras look [3].
+        center: point that the cameras look at [3].
         distance: from the cameras to the centre, world units.
-        fov: field of view across the image, degrees.
-        elevation: of the cap's middle above the horizon, degrees.
+        fov: horizontal field of view, degrees.
+        elevation: of the cap's centre above the horizon, degrees.
         spread: half-width and half-height of the cap, degrees.
     """
 
@@ -69,8 +68,8 @@ class Rig:
     spread: tuple[float, float] = (26.0, 10.0)
 
     def cameras(self, count: int, width: int, height: int) -> list[Camera]:
-        """Return `count` cameras: ``cam00`` in the middle of the cap, the others spread evenly about it."""
-        # A sunflower fills the cap evenly for any count.
+        """Return `count` cameras: ``cam00`` at the centre of the cap, the others evenly distributed around it."""
+        # A sunflower spiral covers the cap evenly for any count.
         radius = np.sqrt(np.arange(count) / max(count - 1, 1))
         angle = np.arange(count) * np.pi * (3 - np.sqrt(5))
         azimuth = np.deg2rad(self.spread[0] * radius * np.cos(angle))
@@ -88,11 +87,11 @@ class Scene:
     """A moving scene.
 
     Attributes:
-        name: what the capture calls it.
-        objects: by name; an object's position in this mapping is its id in the ground truth.
+        name: the scene's name in the capture.
+        objects: by name; an object's index in this mapping is its id in the ground truth.
         lights: lamps by name.
-        rig: where the cameras stand.
-        exposure: seconds -> factor on the light that every camera receives; None for 1.
+        rig: positions of the cameras.
+        exposure: seconds -> exposure factor of all cameras; None for 1.
     """
 
     name: str
@@ -103,16 +102,16 @@ class Scene:
 
 
 def load_scene(scene: str | Path, seed: int = 0) -> Scene:
-    """Build the scene of a Python file, given by its path or by the name of one in ``scenes/``.
+    """Build the scene of a Python file, given by its path or by its name in ``scenes/``.
 
     Raises:
-        ValueError: if there is no such scene, or its file has no ``build``.
+        ValueError: there is no such scene, or its file has no ``build``.
     """
     known = _scene_files()
     path = Path(scene) if Path(scene).suffix == ".py" else known.get(str(scene))
     if path is None or not path.is_file():
         raise ValueError(
-            f"load_scene(): no scene {str(scene)!r}; name one of {sorted(known)} or give the path of a .py file."
+            f"load_scene(): no scene {str(scene)!r}; name one of {sorted(known)} or pass the path of a .py file."
         )
     spec = importlib.util.spec_from_file_location(f"morgs_mi_scene_{path.stem}", path)
     assert spec
@@ -139,7 +138,7 @@ def rotate(axis: str, angle: float) -> np.ndarray:
 
 
 def _scene_files() -> dict[str, Path]:
-    """Return the scenes that come with the package: beside a checkout, or where pip put its data files."""
+    """Return the package's scenes: from the repository, or from the data files that pip installed."""
     checkout = Path(__file__).parents[2] / "scenes"
     if checkout.is_dir():
         return {path.stem: path for path in checkout.glob("*.py")}

@@ -1,4 +1,4 @@
-"""The simple solids that the synthetic scenes are built of, as Mitsuba dictionaries in world units."""
+"""Simple solids of the synthetic scenes, as Mitsuba dictionaries in world units."""
 
 from __future__ import annotations
 

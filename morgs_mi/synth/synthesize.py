@@ -1,7 +1,7 @@
 """Synthetic captures: a scene path-traced from a rig of cameras, with exact ground truth.
 
-Light is linear inside the path tracer and sRGB-encoded once, on its way into the video. Surfaces are asked
-at pixel centres, so that the truth has no noise and no blend of foreground and background.
+Light is linear inside the path tracer and sRGB-encoded once, for the video. The ground truth is sampled at pixel
+centres, so it has no noise and does not mix foreground and background.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import whole, write_json
 from morgs_mi.io.video import VideoReader
 from morgs_mi.io.video_writer import write_video
-from morgs_mi.synth.ground_truth import Tracks, carry, ground_truth_of, project, save_truth
+from morgs_mi.synth.ground_truth import Tracks, compute_ground_truth, move_with_objects, save_truth
 from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import Scene, load_scene
 
@@ -47,34 +47,33 @@ def synthesize(
 ) -> Path:
     """Path-trace a moving scene into a multi-view capture in N3DV's layout, with exact ground truth.
 
-    Writes ``cam00.mp4`` ..., ``poses_bounds.npy``, a COLMAP text model ``sparse/0`` with points as structure
-    from motion would find them, ``capture.json`` and ``truth/`` (see `truth`). ``cam00`` stands in the middle
-    of the rig and is the held-out test view, as in N3DV. The folder appears whole or not at all.
+    Writes ``cam00.mp4`` ..., ``poses_bounds.npy``, a COLMAP text model ``sparse/0`` with points like those of structure
+    from motion, ``capture.json`` and ``truth/`` (see `ground_truth`). ``cam00`` is the central camera of the rig and
+    the held-out test view, as in N3DV. The folder is written atomically.
 
     Args:
         scene: a scene, its name, or the path of its Python file.
-        out: the folder to make.
-        num_cameras: the test view included, at least 2.
+        out: the folder to write.
+        num_cameras: including the test view, at least 2.
         num_frames: at least 1.
         width: in pixels, even.
         height: in pixels, even.
-        spp: samples per pixel; 16 leaves noise at 42 dB, below that of a good camera.
-        noise: standard deviation of the sensor's noise, of white; 0.01, 2.5 grey levels, is that of a camera indoors.
+        spp: samples per pixel; the noise of 16 is at 42 dB, below that of a good camera.
+        noise: standard deviation of the sensor noise, relative to white; 0.01 (2.5 grey levels) is typical of a camera
+            indoors.
         fps: frames per second.
         lossless: also write ``frames/cam00/0000.png`` ....
-        seed: of textures, sampling noise and the choice of points.
+        seed: of the textures, the sampling noise and the choice of points.
         overwrite: replace an earlier capture in `out`.
-        progress: called with (pictures done, pictures in all).
+        progress: called with (images done, total number of images).
 
     Returns:
         The folder `out`.
 
     Raises:
-        ValueError: if an argument is out of range, there is no such scene, or Mitsuba's variant is not a
-            vectorised one.
-        FileExistsError: if `out` is not empty and `overwrite` is not set, or `out` holds something else
-            than a capture.
-        OSError: if something cannot be written.
+        ValueError: an argument is out of range, there is no such scene, or Mitsuba's variant is not vectorised.
+        FileExistsError: `out` is not empty and `overwrite` is not set, or `out` is not a capture.
+        OSError: a file cannot be written.
     """
     if not str(mi.variant()).startswith(("llvm", "cuda")):
         raise ValueError(
@@ -103,29 +102,29 @@ def synthesize(
     _check_folder(Path(out), overwrite)
     with whole(out, "synthesize()") as folder:
         folder.mkdir(parents=True)
-        stage = PathTracer(scene)
+        tracer = PathTracer(scene)
         done = 0
 
-        def film(index: int) -> Iterator[np.ndarray]:
+        def render_view(index: int) -> Iterator[np.ndarray]:
             nonlocal done
             for frame, time in enumerate(times):
-                stage.move(time)
-                # Noise must differ between views and frames, or it would look like texture that moves along.
-                grain = int(np.random.SeedSequence([seed, index, frame]).generate_state(1)[0])
-                yield stage.picture(cameras[index], spp, grain, noise)
+                tracer.set_time(time)
+                # The noise must differ between views and frames; otherwise it would look like a moving texture.
+                noise_seed = int(np.random.SeedSequence([seed, index, frame]).generate_state(1)[0])
+                yield tracer.render(cameras[index], spp, noise_seed, noise)
                 done += 1
                 if progress is not None:
                     progress(done, num_cameras * num_frames)
 
         for index, camera in enumerate(cameras):
             video = folder / f"{camera.name}.mp4"
-            write_video(video, film(index), fps)
+            write_video(video, render_view(index), fps)
             if lossless:
                 write_video(folder / "frames" / camera.name, VideoReader.open(video).frames(), fps)
-            _write_truth(stage, camera, times, fps, folder / "truth")
-        tracks = _tracks(stage, cameras, times, np.random.default_rng([seed, 1]))
+            _write_truth(tracer, camera, times, fps, folder / "truth")
+        tracks = _sample_tracks(tracer, cameras, times, np.random.default_rng([seed, 1]))
         np.savez_compressed(folder / "truth" / "tracks.npz", points=tracks.points, ids=tracks.ids)
-        _write_calibration(stage, cameras, folder, np.random.default_rng([seed, 2]))
+        _write_calibration(tracer, cameras, folder, np.random.default_rng([seed, 2]))
         about = {
             "scene": scene.name,
             "test_view": 0,
@@ -144,51 +143,56 @@ def synthesize(
     return Path(out)
 
 
-def _write_truth(stage: PathTracer, camera: Camera, times: np.ndarray, fps: float, folder: Path) -> None:
+def _write_truth(tracer: PathTracer, camera: Camera, times: np.ndarray, fps: float, folder: Path) -> None:
     for frame, time in enumerate(times):
-        stage.move(time)
-        points, ids = stage.surface(camera)
-        before = stage.poses(times[frame - 1]) if frame else None
-        truth = ground_truth_of(camera, points, ids, stage.poses(time), before, stage.poses(time + 1 / fps))
+        tracer.set_time(time)
+        points, ids = tracer.surface_points(camera)
+        before = tracer.poses(times[frame - 1]) if frame else None
+        truth = compute_ground_truth(camera, points, ids, tracer.poses(time), before, tracer.poses(time + 1 / fps))
         save_truth(folder, camera.name, frame, truth)
 
 
-def _tracks(stage: PathTracer, cameras: Sequence[Camera], times: np.ndarray, rng: np.random.Generator) -> Tracks:
-    """Follow surface points seen by any camera in the first, middle or last frame; half of them can move."""
+def _sample_tracks(
+    tracer: PathTracer, cameras: Sequence[Camera], times: np.ndarray, rng: np.random.Generator
+) -> Tracks:
+    """Return the tracks of surface points that are visible in the first, middle or last frame.
+
+    Half of the points lie on moving objects.
+    """
     starts = sorted({0, len(times) // 2, len(times) - 1})
-    can_move = np.array([thing.pose is not None for thing in stage.scene.objects.values()])
+    can_move = np.array([item.pose is not None for item in tracer.scene.objects.values()])
     share = -(-_NUM_TRACKS // (2 * len(starts) * len(cameras)))
     points, owners = [], []
     for start in starts:
-        stage.move(times[start])
-        poses = stage.poses(times[start])
+        tracer.set_time(times[start])
+        poses = tracer.poses(times[start])
         for camera in cameras:
-            seen, ids = stage.surface(camera)
+            visible, ids = tracer.surface_points(camera)
             for moving in (False, True):
                 pixels = np.flatnonzero((ids >= 0) & (can_move[ids] == moving))
                 pixels = rng.choice(pixels, min(share, len(pixels)), replace=False)
-                here, own = seen.reshape(-1, 3)[pixels], ids.ravel()[pixels]
-                points.append(np.stack([carry(here, own, poses, stage.poses(t)) for t in times], axis=1))
+                here, own = visible.reshape(-1, 3)[pixels], ids.ravel()[pixels]
+                points.append(np.stack([move_with_objects(here, own, poses, tracer.poses(t)) for t in times], axis=1))
                 owners.append(own)
     return Tracks(np.concatenate(points), np.concatenate(owners))
 
 
-def _write_calibration(stage: PathTracer, cameras: Sequence[Camera], folder: Path, rng: np.random.Generator) -> None:
+def _write_calibration(tracer: PathTracer, cameras: Sequence[Camera], folder: Path, rng: np.random.Generator) -> None:
     """Write the cameras as `poses_bounds.npy` and as a COLMAP model with points from the training views."""
-    stage.move(0.0)
+    tracer.set_time(0.0)
     points, colors, bounds = [], [], []
     for index, camera in enumerate(cameras):
-        seen, ids = stage.surface(camera)
-        seen, pixels = seen.reshape(-1, 3), np.flatnonzero(ids >= 0)
-        depths = project(camera, seen[pixels])[1]
-        # LLFF's percentiles, so that readers of the file see the bounds they expect.
+        visible, ids = tracer.surface_points(camera)
+        visible, pixels = visible.reshape(-1, 3), np.flatnonzero(ids >= 0)
+        depths = camera.project(visible[pixels])[1]
+        # LLFF's percentiles, which readers of the file expect.
         bounds.append(np.percentile(depths, [0.1, 99.9]))
         if index == 0:
-            continue  # the held-out view may not help to place or colour points
+            continue  # the held-out view must not contribute points or colours
         chosen = rng.choice(len(pixels), min(_NUM_SFM_POINTS // (len(cameras) - 1), len(pixels)), replace=False)
-        # Structure from motion leaves about half a pixel of error; here it is the same along the ray.
+        # Structure from motion has an error of about half a pixel; here it is the same along the ray.
         noise = rng.normal(size=(len(chosen), 3)) * (0.5 * depths[chosen, None] / camera.K[0, 0])
-        points.append(seen[pixels[chosen]] + noise)
+        points.append(visible[pixels[chosen]] + noise)
         image = next(VideoReader.open(folder / f"{camera.name}.mp4").frames(0, 1))
         colors.append(image.reshape(-1, 3)[pixels[chosen]] / 255)
     write_poses_bounds(folder / "poses_bounds.npy", cameras, np.array(bounds))
@@ -196,11 +200,11 @@ def _write_calibration(stage: PathTracer, cameras: Sequence[Camera], folder: Pat
 
 
 def _check_folder(out: Path, overwrite: bool) -> None:
-    """Raise if `out` holds what must not be replaced."""
+    """Raise `FileExistsError` if `out` must not be replaced."""
     if out.exists() and not out.is_dir():
-        raise FileExistsError(f"synthesize(): {out} is a file; give another folder.")
+        raise FileExistsError(f"synthesize(): {out} is a file; choose another folder.")
     occupied = out.is_dir() and any(out.iterdir())
     if occupied and not overwrite:
-        raise FileExistsError(f"synthesize(): {out} is not empty; give another folder or set overwrite.")
+        raise FileExistsError(f"synthesize(): {out} is not empty; choose another folder or set overwrite.")
     if occupied and not (out / "capture.json").is_file():
-        raise FileExistsError(f"synthesize(): {out} holds no capture, so it is not replaced; give another folder.")
+        raise FileExistsError(f"synthesize(): {out} is not a capture, so it is not replaced; choose another folder.")

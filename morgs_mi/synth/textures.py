@@ -1,7 +1,7 @@
-"""Procedural textures and the room in which the synthetic scenes play.
+"""Procedural textures, and the walls and lights that the synthetic scenes share.
 
-Optical flow and splats live on texture, so every surface carries detail at all scales down to a few
-pixels; a 1/f spectrum, unlike white noise, keeps its contrast when it is seen from farther away.
+Optical flow and splats need texture, so every surface has detail at all scales down to a few pixels. Unlike white
+noise, a 1/f spectrum has the same contrast at any distance.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def pattern(seed: int, first: RGB, second: RGB, cells: int, finest: float, size:
         seed: of the noise.
         first: one colour of the checker.
         second: the other.
-        cells: squares across (even, so that the texture wraps around).
+        cells: squares across; even, so that the texture is periodic.
         finest: highest frequency of the noise in cycles across.
         size: texels across.
     """
@@ -48,12 +48,12 @@ def pattern(seed: int, first: RGB, second: RGB, cells: int, finest: float, size:
 def textured(
     texture: np.ndarray, roughness: float | None = None, repeat: tuple[float, float] = (1, 1)
 ) -> dict[str, Any]:
-    """Return a Mitsuba material: diffuse, or plastic of that `roughness` over the same colours.
+    """Return a textured Mitsuba material, diffuse or rough plastic.
 
     Args:
-        texture: [size, size, 3], linear.
+        texture: reflectance [size, size, 3], linear.
         roughness: of the plastic; None for diffuse.
-        repeat: how often the texture lies along u and v, so that it is not stretched on what is long and thin.
+        repeat: repetitions of the texture along u and v, so that it is not stretched on long, thin shapes.
     """
     import mitsuba as mi
 
@@ -70,7 +70,7 @@ def textured(
 
 
 def room(seed: int, half_width: float = 2.4, height: float = 3.2, depth: float = 1.7) -> dict[str, Object]:
-    """Return floor, back wall and side walls about the origin, open towards the cameras (+z) and above."""
+    """Return a room's floor, back wall and side walls around the origin, open above and towards the cameras (+z)."""
     import mitsuba as mi
 
     T = mi.ScalarTransform4f
@@ -101,7 +101,7 @@ def room(seed: int, half_width: float = 2.4, height: float = 3.2, depth: float =
 
 
 def lights() -> dict[str, Light]:
-    """Return a lamp above the room and a weaker one beside the cameras, which lights the shadows."""
+    """Return a lamp above the room and a weaker one beside the cameras, which brightens the shadows."""
     import mitsuba as mi
 
     T = mi.ScalarTransform4f

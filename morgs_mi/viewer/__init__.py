@@ -1,1 +1,1 @@
-"""Streams in the browser."""
+"""Browser viewer of streams."""

@@ -1,44 +1,58 @@
-"""What colour a Gaussian gets in each mode, as seen by a camera; the same scales as in the renderer's pictures."""
+"""Colours of the Gaussians in each mode, as a camera sees them, with the same scales as the renderer's images."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import colors_seen_from
-from morgs_mi.playback.player import OFFSET_SCALE
-from morgs_mi.playback.visualise import confidence_image, depth_image, motion_image, to_uint8
+from morgs_mi.playback.player import CHANNELS, MOTION_SCALE, channel_image
 
-__all__ = ["BACKGROUNDS", "FULL_SPEED", "MODES", "splat_colors"]
+__all__ = ["BACKGROUNDS", "MODES", "available_modes", "splat_colors"]
 
-MODES = ("color", "motion", "confidence", "offset", "depth")
-# Behind splats that let light through: nothing, no motion, no confidence, no offset, no depth.
-BACKGROUNDS = {"color": 0, "motion": 255, "confidence": 0, "offset": 255, "depth": 128}
-# Of the picture's width per frame: the speed of full saturation, as in `channel_image`.
-FULL_SPEED = {"motion": 0.03, "offset": 0.03 * OFFSET_SCALE}
+_ATTRIBUTE_MODES = {row.channel: row for row in ATTRIBUTES if row.channel is not None}
+
+MODES = tuple(channel for channel in CHANNELS if channel != "alpha")
+"""All channels that can be shown, apart from alpha."""
+BACKGROUNDS = dict.fromkeys(MODES, 0) | {"motion": 255, "offset": 255, "depth": 128}
+"""Grey level behind translucent splats: the colour of no motion, confidence, offset or depth; black behind colours."""
+
+
+def available_modes(gaussians: Gaussians) -> tuple[str, ...]:
+    """Return the modes for which Gaussians have an attribute; motion, offset and depth always count."""
+    missing = {mode for mode, row in _ATTRIBUTE_MODES.items() if getattr(gaussians, row.name) is None}
+    return tuple(mode for mode in MODES if mode not in missing)
 
 
 def splat_colors(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray:
     """Return the colours of N Gaussians as a camera sees them, uint8 [N, 3].
 
-    Motion is what it is on the camera's screen, by the first-order projection of the displacement; so is the offset,
-    none where nothing is known of it.
+    Motion and offset are the first-order projections of the displacements; the offset is zero where none is stored.
 
     Raises:
-        ValueError: another mode than one of `MODES`, or one that the Gaussians carry nothing for.
+        ValueError: `mode` is not one of `MODES`, or the Gaussians do not have its attribute.
     """
+    values = _mode_values(gaussians, camera, mode)
+    if values is None:
+        raise ValueError(
+            f"splat_colors(): the mode must be one of {', '.join(MODES)} that the stream stores, got {mode!r}."
+        )
+    return channel_image(mode, values[:, None], MOTION_SCALE * camera.width)[:, 0]
+
+
+def _mode_values(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray | None:
+    """Return the values [N, C] that a mode shows, in the channel's units; None where there are none."""
     if mode == "color":
-        return to_uint8(colors_seen_from(gaussians, camera.position)[:, None])[:, 0]
-    raw, view = gaussians.numpy(), np.asarray(camera.viewmat, np.float64)
-    x, y, z = (raw["means"] @ view[:3, :3].T + view[:3, 3]).T
+        return colors_seen_from(gaussians, camera.position)
+    raw = gaussians.numpy()
     if mode == "depth":
-        return depth_image(z[:, None])[:, 0]
+        return camera.project(raw["means"])[1][:, None]
     if mode == "offset" or (mode == "motion" and gaussians.motion is not None):
-        dx, dy, dz = (raw.get(mode, np.zeros_like(raw["means"])) @ view[:3, :3].T).T
-        safe = np.where(z > camera.near, z, np.inf)  # what lies behind does not move on the screen
-        screen = np.stack([camera.K[0, 0] * (dx - x / safe * dz) / safe, camera.K[1, 1] * (dy - y / safe * dz) / safe])
-        return motion_image(screen.T[:, None], FULL_SPEED[mode] * camera.width)[:, 0]
-    if mode == "confidence" and gaussians.confidence is not None:
-        return confidence_image(np.asarray(gaussians.confidence)[:, None])[:, 0]
-    raise ValueError(f"splat_colors(): the mode must be one of {', '.join(MODES)} that the stream holds, got {mode!r}.")
+        displacements = raw.get(mode, np.zeros_like(raw["means"]))
+        return np.einsum("nij,nj->ni", camera.projection_jacobian(raw["means"]), displacements)
+    row = _ATTRIBUTE_MODES.get(mode)
+    if row is None or getattr(gaussians, row.name) is None:
+        return None
+    return np.asarray(getattr(gaussians, row.activated_name)).reshape(len(gaussians), -1)

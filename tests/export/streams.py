@@ -1,4 +1,4 @@
-"""A small stream for the tests of what is made of streams: splats that move, are born and die."""
+"""A small stream for the tests of export and viewer, with splats that move, are born and die."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 
 NAMES = ("left", "middle", "right")
-# What of a step of 0.1 along x was learned: two steps of its grid.
+# Learned part of a displacement of 0.1 along x: two steps of its quantisation grid.
 OFFSET = (0, 0, 0.008)
 
 
 def rig(width: int = 64, height: int = 48) -> tuple[Camera, ...]:
-    places = zip(((-1, -4, 1), (0, -4, 1), (1, -4, 1)), NAMES, strict=True)
-    return tuple(Camera.look_at(place, (0, 0, 0.2), (0, 0, 1), 45, width, height, name) for place, name in places)
+    positions = ((-1, -4, 1), (0, -4, 1), (1, -4, 1))
+    named = zip(positions, NAMES, strict=True)
+    return tuple(Camera.look_at(p, (0, 0, 0.2), (0, 0, 1), 45, width, height, name) for p, name in named)
 
 
 def splats(N: int = 40, degree: int = 1, seed: int = 0) -> Gaussians:
@@ -36,9 +37,9 @@ def splats(N: int = 40, degree: int = 1, seed: int = 0) -> Gaussians:
 
 
 def write_stream(path: Path, frames: int = 4, start: Gaussians | None = None) -> list[CodedFrame]:
-    """Write a stream and return its states, with offsets.
+    """Write a stream with offsets and return its decoded frames.
 
-    From frame 1 the first half moves; in frame 2 one dies, two are born.
+    The first half of the splats moves from frame 1. In frame 2 one dies and two are born.
     """
     cameras, states = rig(), []
     with StreamWriter(path, cameras, 10) as writer:

@@ -1,4 +1,4 @@
-"""`morgs-mi export` and `render`: files per frame and videos, through the command line."""
+"""`morgs-mi export` and `render`: one file per frame and videos, through the command line."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ import pytest
 
 from morgs_mi import cli
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.export.clips import chosen_frames
-from morgs_mi.export.frames import linear_light
+from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.export.clips import select_frames
+from morgs_mi.export.frames import exr_channels, pad_to_even
 from morgs_mi.io.ply import read_ply
 from morgs_mi.render.rasterize import rasterize
 from tests.export.streams import rig, write_stream
@@ -29,12 +30,12 @@ def run(*args: object) -> int:
 
 def video(path) -> list[np.ndarray]:
     file, frames = cv2.VideoCapture(str(path)), []
-    while (found := file.read())[0]:
-        frames.append(cv2.cvtColor(found[1], cv2.COLOR_BGR2RGB))
+    while (result := file.read())[0]:
+        frames.append(cv2.cvtColor(result[1], cv2.COLOR_BGR2RGB))
     return frames
 
 
-def test_every_frame_as_ply(stream, tmp_path):
+def test_export_ply__writes_every_frame(stream, tmp_path):
     assert run("export", "ply", tmp_path) == 0
     assert [path.name for path in sorted((tmp_path / "ply").iterdir())] == [f"{t:04d}.ply" for t in range(4)]
     for t, state in enumerate(stream):
@@ -42,30 +43,30 @@ def test_every_frame_as_ply(stream, tmp_path):
         np.testing.assert_array_equal(read.numpy()["means"], state.gaussians.numpy()["means"])
 
 
-def test_some_frames_as_gltf(stream, tmp_path):
+def test_export_gltf__writes_selected_frames(stream, tmp_path):
     assert run("export", "gltf", tmp_path / "stream.morgs", "--frames", "1:4:2", "--output", tmp_path / "g") == 0
     assert [path.name for path in sorted((tmp_path / "g").iterdir())] == ["0001.glb", "0003.glb"]
 
 
-def test_tracks(stream, tmp_path):
+def test_export_tracks__writes_all_ids(stream, tmp_path):
     assert run("export", "tracks", tmp_path) == 0
     assert np.load(tmp_path / "tracks.npz")["positions"].shape == (4, 42, 3)
 
 
-def test_a_video_shows_what_the_renderer_shows_and_time_starts_over(stream, tmp_path):
+def test_write_flight__shows_rendered_images_and_restarts_the_clip(stream, tmp_path):
     keys = [{"time": 0, "camera": "middle"}, {"time": 0.6, "camera": "middle"}]
     (tmp_path / "still.json").write_text(json.dumps({"keys": keys}))
     assert run("export", "video", tmp_path, "--path", tmp_path / "still.json") == 0
-    drawn = [np.clip(np.array(rasterize(state.gaussians, rig()[1]).color), 0, 1) for state in stream]
+    expected = [np.clip(np.array(rasterize(state.gaussians, rig()[1]).color), 0, 1) for state in stream]
     frames = video(tmp_path / "still.mp4")
     assert len(frames) == 6
     for t, frame in enumerate(frames):
-        errors = [np.abs(frame / 255 - picture).mean() for picture in drawn]
+        errors = [np.abs(frame / 255 - image).mean() for image in expected]
         assert np.argmin(errors) == t % 4
-        assert errors[t % 4] < 0.03  # what the lossy codec leaves on so small a picture
+        assert errors[t % 4] < 0.03  # the error of the lossy codec on such a small image
 
 
-def test_time_can_stand_still_while_the_camera_flies(stream, tmp_path):
+def test_write_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
     more = ("--freeze", 2, "--seconds", 0.5, "--width", 32, "--channels", "color", "depth")
     assert run("export", "video", tmp_path, "--path", "orbit", *more) == 0
     assert [frame.shape for frame in video(tmp_path / "orbit.mp4")] == [(24, 68, 3)] * 5
@@ -82,26 +83,45 @@ def test_time_can_stand_still_while_the_camera_flies(stream, tmp_path):
         (("video", "--path", "none.json"), "expected a camera path, found none"),
     ],
 )
-def test_complaints_are_one_sentence(stream, tmp_path, capsys, args, message):
+def test_export__errors_are_one_sentence(stream, tmp_path, capsys, args, message):
     assert run("export", args[0], tmp_path, *args[1:]) == 1
     assert message in " ".join(capsys.readouterr().err.split())
 
 
-def test_frames_are_chosen_like_slices(stream, tmp_path):
+def test_select_frames__like_slices(stream, tmp_path):
     reader = StreamReader(tmp_path / "stream.morgs")
-    chosen = {span: chosen_frames(reader, span) for span in ("2", "1:3", ":2", "::2", "3:")}
-    assert chosen == {"2": [2], "1:3": [1, 2], ":2": [0, 1], "::2": [0, 2], "3:": [3]}
+    selected = {span: select_frames(reader, span) for span in ("2", "1:3", ":2", "::2", "3:")}
+    assert selected == {"2": [2], "1:3": [1, 2], ":2": [0, 1], "::2": [0, 2], "3:": [3]}
 
 
-def test_exr_channels_are_what_mitsuba_finds(stream, tmp_path):
+def test_exr_channels__are_read_by_mitsuba(stream, tmp_path):
     assert run("render", tmp_path, "--camera", "middle", "--output", tmp_path / "exr") == 0
     image = mi.Bitmap(str(tmp_path / "exr" / "0001.exr"))
     names = [field.name for field in image.struct_()]
     assert sorted(names) == sorted(["R", "G", "B", "motion.X", "motion.Y", "confidence.Y", "depth.Y"])
     planes = dict(zip(names, np.moveaxis(np.array(image), -1, 0), strict=True))
-    drawn = rasterize(stream[1].gaussians, rig()[1], ("color", "motion", "confidence", "depth"))
-    np.testing.assert_allclose(planes["motion.X"], np.array(drawn.motion)[..., 0], atol=1e-5)
-    np.testing.assert_allclose(planes["confidence.Y"], np.array(drawn.confidence)[..., 0], atol=1e-6)
-    np.testing.assert_allclose(planes["depth.Y"], np.array(drawn.depth)[..., 0], atol=1e-5)
-    linear = linear_light(np.array(drawn.color))
+    rendered = rasterize(stream[1].gaussians, rig()[1], ("color", "motion", "confidence", "depth"))
+    np.testing.assert_allclose(planes["motion.X"], np.array(rendered.motion)[..., 0], atol=1e-5)
+    np.testing.assert_allclose(planes["confidence.Y"], np.array(rendered.confidence)[..., 0], atol=1e-6)
+    np.testing.assert_allclose(planes["depth.Y"], np.array(rendered.depth)[..., 0], atol=1e-5)
+    linear = srgb_to_linear(np.array(rendered.color))
     np.testing.assert_allclose(np.stack([planes[c] for c in "RGB"], -1), linear, atol=1e-6)
+
+
+def test_exr_channels__names_follow_the_number_of_components():
+    sizes = {"color": 3, "alpha": 1, "wetness": 1, "offset": 2, "normal": 3, "wide": 5}
+    images = {name: np.random.default_rng(0).uniform(size=(2, 3, size)) for name, size in sizes.items()}
+    planes = exr_channels(images)
+    wide = [f"wide.{i}" for i in range(5)]
+    normal = ["normal.X", "normal.Y", "normal.Z"]
+    assert list(planes) == ["R", "G", "B", "A", "wetness.Y", "offset.X", "offset.Y", *normal, *wide]
+    np.testing.assert_array_equal(planes["offset.Y"], images["offset"][..., 1])
+
+
+def test_pad_to_even__repeats_the_last_row_and_column():
+    image = np.arange(45, dtype=np.uint8).reshape(3, 5, 3)
+    padded = pad_to_even(image)
+    assert padded.shape == (4, 6, 3)
+    np.testing.assert_array_equal(padded[:3, :5], image)
+    np.testing.assert_array_equal(padded[3, 5], image[2, 4])
+    np.testing.assert_array_equal(pad_to_even(padded), padded)

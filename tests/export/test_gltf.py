@@ -1,4 +1,4 @@
-"""glTF: the file is read back by a reader written from the specifications, and shows the same picture."""
+"""glTF: the file is read by a reader written from the specifications, and renders to the same image."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 TYPES = {f"{KHR}:ROTATION": "VEC4", f"{KHR}:OPACITY": "SCALAR", "COLOR_0": "VEC4"}
 
 
-def opened(data: bytes) -> tuple[dict, bytes]:
-    """Return the JSON and the bytes of a .glb file, by glTF 2.0's section on the binary format."""
+def read_glb(data: bytes) -> tuple[dict, bytes]:
+    """Return the JSON and binary chunks of a .glb file, according to glTF 2.0's section on the binary format."""
     assert struct.unpack_from("<4sII", data) == (b"glTF", 2, len(data))
     chunks, at = [], 12
     while at < len(data):
@@ -38,7 +38,7 @@ def opened(data: bytes) -> tuple[dict, bytes]:
 
 
 def attributes(document: dict, binary: bytes) -> dict[str, np.ndarray]:
-    """Return the arrays of the one primitive, checked by glTF 2.0's rules on accessors and views."""
+    """Return the arrays of the one primitive, checked against glTF 2.0's rules on accessors and buffer views."""
     arrays = {}
     for name, index in document["meshes"][0]["primitives"][0]["attributes"].items():
         accessor = document["accessors"][index]
@@ -67,8 +67,8 @@ def gaussians_of(arrays: dict[str, np.ndarray]) -> Gaussians:
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_file_keeps_the_rules_of_the_extension(degree):
-    document, binary = opened(glb(splats(degree=degree), gltf_axes(rig())))
+def test_glb__conforms_to_the_extension(degree):
+    document, binary = read_glb(glb(splats(degree=degree), gltf_axes(rig())))
     assert document["asset"]["version"] == "2.0"
     assert document["extensionsUsed"] == [KHR]
     assert "uri" not in document["buffers"][0]
@@ -81,9 +81,9 @@ def test_file_keeps_the_rules_of_the_extension(degree):
     assert arrays.keys() == {"POSITION", f"{KHR}:SCALE", *TYPES, *bands}
     for name, index in primitive["attributes"].items():
         assert document["accessors"][index]["type"] == TYPES.get(name, "VEC3")
-    place = document["accessors"][primitive["attributes"]["POSITION"]]
-    np.testing.assert_array_equal(place["min"], arrays["POSITION"].min(0))
-    np.testing.assert_array_equal(place["max"], arrays["POSITION"].max(0))
+    position = document["accessors"][primitive["attributes"]["POSITION"]]
+    np.testing.assert_array_equal(position["min"], arrays["POSITION"].min(0))
+    np.testing.assert_array_equal(position["max"], arrays["POSITION"].max(0))
     np.testing.assert_allclose(np.linalg.norm(arrays[f"{KHR}:ROTATION"], axis=1), 1, atol=1e-6)
     assert arrays[f"{KHR}:SCALE"].min() >= 0
     for name in ("COLOR_0", f"{KHR}:OPACITY"):
@@ -91,33 +91,34 @@ def test_file_keeps_the_rules_of_the_extension(degree):
         assert arrays[name].max() <= 1
 
 
-def test_the_fallback_colour_is_linear():
+def test_glb__fallback_colour_is_linear():
     grey = replace(splats(1), sh_coeffs=np.zeros((1, 1, 3)))
     # sRGB's 0.5 is 0.21404 in linear light.
-    assert attributes(*opened(glb(grey)))["COLOR_0"][0, :3] == pytest.approx([0.21404] * 3, abs=1e-5)
+    assert attributes(*read_glb(glb(grey)))["COLOR_0"][0, :3] == pytest.approx([0.21404] * 3, abs=1e-5)
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_a_viewer_with_y_up_sees_the_same_picture(tmp_path, degree):
+def test_write_gltf__renders_the_same_image_in_gltf_axes(tmp_path, degree):
     gaussians, camera, axes = splats(degree=degree), rig()[0], gltf_axes(rig())
     write_gltf(tmp_path / "g.glb", gaussians, axes)
-    document, binary = opened((tmp_path / "g.glb").read_bytes())
-    turn = np.eye(4)
-    turn[:3, :3] = axes.T
+    document, binary = read_glb((tmp_path / "g.glb").read_bytes())
+    rotation = np.eye(4)
+    rotation[:3, :3] = axes.T
     np.testing.assert_array_equal(document["nodes"][0]["extras"]["world_from_gltf"], axes.T)
-    seen = rasterize(gaussians_of(attributes(document, binary)), replace(camera, viewmat=camera.viewmat @ turn)).color
-    # float32 attributes are rounded once more by the rotation.
-    np.testing.assert_allclose(np.array(seen), np.array(rasterize(gaussians, camera).color), atol=2e-4)
+    exported = gaussians_of(attributes(document, binary))
+    image = rasterize(exported, replace(camera, viewmat=camera.viewmat @ rotation)).color
+    # The rotation rounds the float32 attributes once more.
+    np.testing.assert_allclose(np.array(image), np.array(rasterize(gaussians, camera).color), atol=2e-4)
 
 
-def test_axes_are_those_of_gltf():
+def test_gltf_axes__have_y_up_and_the_cameras_at_positive_z():
     axes = gltf_axes(rig())
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(axes) == pytest.approx(1)
-    assert (axes @ [0, 0, 1])[1] > 0.95  # the world's up is nearly y, for the cameras look down a little
-    assert (axes @ rig()[1].position)[2] > 3  # the cameras stand where z is positive
+    assert (axes @ [0, 0, 1])[1] > 0.95  # the world's up is nearly y, since the cameras look down a little
+    assert (axes @ rig()[1].position)[2] > 3  # the cameras are at positive z
 
 
-def test_nothing_is_refused_in_a_sentence():
+def test_glb__rejects_an_empty_set():
     with pytest.raises(ValueError, match="at least one Gaussian was expected"):
         glb(splats().select(np.zeros(0, int)))

@@ -1,4 +1,4 @@
-"""Camera paths go through their keys, smoothly, and look where they should."""
+"""Camera paths: interpolation of key views, orbits, paths through the rig, JSON files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.export.axes import up_direction
-from morgs_mi.export.paths import CameraPath, between, focus, load_path, orbit
+from morgs_mi.export.paths import CameraPath, focus, load_path, orbit, through_cameras
 from tests.export.streams import rig
 
 TARGET = np.array([0, 0, 0.2])
@@ -18,11 +18,11 @@ TARGET = np.array([0, 0, 0.2])
 
 def ring(count: int) -> tuple[Camera, ...]:
     angles = 2 * np.pi * np.arange(count) / count
-    places = np.stack([3 * np.cos(angles), 3 * np.sin(angles), np.full(count, 1.0)], 1)
-    return tuple(Camera.look_at(p, TARGET, (0, 0, 1), 45, 64, 48, f"c{i}") for i, p in enumerate(places))
+    positions = np.stack([3 * np.cos(angles), 3 * np.sin(angles), np.full(count, 1.0)], 1)
+    return tuple(Camera.look_at(p, TARGET, (0, 0, 1), 45, 64, 48, f"c{i}") for i, p in enumerate(positions))
 
 
-def test_a_path_goes_through_its_keys_with_their_lenses():
+def test_camera_path__interpolates_its_keys_smoothly():
     wide = replace(rig()[2], K=np.array([[30.0, 0, 31], [0, 33, 25], [0, 0, 1]]))
     path = CameraPath(np.array([0, 1, 2.5]), (*rig()[:2], wide))
     for time, key in zip(path.times, path.keys, strict=True):
@@ -34,48 +34,49 @@ def test_a_path_goes_through_its_keys_with_their_lenses():
     np.testing.assert_allclose(after - at, at - before, atol=1e-7)
 
 
-def test_rotations_stay_rotations():
-    path = between(ring(7), 3)
+def test_camera_path__rotations_are_orthonormal():
+    path = through_cameras(ring(7), 3)
     for time in np.linspace(0, 3, 40):
         R = path.at(time).viewmat[:3, :3]
         np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(R) > 0
 
 
-def test_between_takes_the_nearest_next_and_an_even_pace():
+def test_through_cameras__visits_the_nearest_next_at_constant_speed():
     cameras = rig()
-    path = between((cameras[0], cameras[2], cameras[1]), 2)
+    path = through_cameras((cameras[0], cameras[2], cameras[1]), 2)
     assert [key.name for key in path.keys] == ["left", "middle", "right"]
     np.testing.assert_allclose(path.times, [0, 1, 2])
 
 
-def test_an_orbit_keeps_its_distance_and_looks_at_the_centre():
+def test_orbit__has_a_constant_distance_and_looks_at_the_centre():
     path = orbit(ring(8), TARGET, seconds=4)
     np.testing.assert_allclose(path.at(0).position, path.at(4).position, atol=1e-9)  # no gap of 90 degrees: a full turn
     for time in np.linspace(0, 4, 30):
         camera = path.at(time)
-        x, y, z = camera.viewmat[:3, :3] @ TARGET + camera.viewmat[:3, 3]
-        # Splines through keys 10 degrees apart: off by less than a hundredth of a pixel at this lens.
-        assert np.hypot(x, y) / z < 1e-4
+        pixel, depth = camera.project(TARGET)
+        # Splines through keys 10 degrees apart: less than a hundredth of a pixel at this focal length.
+        assert np.linalg.norm((pixel - camera.K[:2, 2]) / np.diag(camera.K)[:2]) < 1e-4
+        assert depth > 0
         assert np.linalg.norm(camera.position - TARGET) == pytest.approx(np.hypot(3, 0.8), rel=1e-4)
 
 
-def test_an_orbit_of_a_frontal_rig_is_as_wide_as_the_rig():
+def test_orbit__of_a_frontal_rig_is_as_wide_as_the_rig():
     path = orbit(rig(), TARGET, seconds=1)
     a, b = (path.at(time).position - TARGET for time in (0, 1))
-    # Around the mean up of the rig, which is tilted against z by the 11 degrees that the cameras look down.
+    # Around the rig's mean up, which is tilted from z by the 11 degrees by which the cameras look down.
     x, y = (rig()[k].position - TARGET for k in (0, 2))
     assert np.arccos(a @ b / (a @ a)) == pytest.approx(np.arccos(x @ y / (x @ x)), abs=0.02)
 
 
-def test_focus_is_where_the_axes_meet_or_among_the_gaussians():
+def test_focus__is_the_intersection_of_the_axes_or_the_median_of_the_gaussians():
     means = np.random.default_rng(0).normal(size=(99, 3))
     np.testing.assert_allclose(focus(ring(8), means), TARGET, atol=0.02)
     parallel = [Camera.look_at((x, -4, 0), (x, 0, 0), (0, 0, 1), 45, 64, 48) for x in (-1, 1)]
     assert focus(parallel, means + np.array([0, 2, 0]))[1] == pytest.approx(np.median(means[:, 1]) + 2)
 
 
-def test_json_paths_take_cameras_matrices_and_places(tmp_path):
+def test_load_path__accepts_cameras_matrices_and_positions(tmp_path):
     keys = [
         {"time": 0, "camera": "right"},
         {"time": 1, "viewmat": rig()[1].viewmat.tolist()},
@@ -99,17 +100,17 @@ def test_json_paths_take_cameras_matrices_and_places(tmp_path):
         ('{"keys": [{"time": 0}]}', "key 0: 'position' is missing"),
         ('{"keys": [{"time": 0, "position": [0, 0], "target": [0, 0, 1]}]}', "key 0: `position`, `target`"),
         ('{"keys": [{"time": 0, "viewmat": [[1, 0], [0, 1]]}]}', "key 0: `viewmat`: the pose must be a matrix"),
-        ('{"keys": [{"time": 1, "camera": "left"}, {"time": 0, "camera": "left"}]}', "must rise from 0"),
+        ('{"keys": [{"time": 1, "camera": "left"}, {"time": 0, "camera": "left"}]}', "must increase from 0"),
     ],
 )
-def test_broken_json_is_named(tmp_path, text, message):
+def test_load_path__reports_broken_json(tmp_path, text, message):
     (tmp_path / "path.json").write_text(text)
     with pytest.raises(ValueError, match=r"path\.json: ") as caught:
         load_path(tmp_path / "path.json", rig())
     assert message in str(caught.value)
 
 
-def test_a_camera_right_above_has_no_orbit():
+def test_orbit__rejects_a_camera_directly_above():
     top = Camera.look_at((0, 0, 5), (0, 0, 0), (0, 1, 0), 45, 64, 48, "top")
     rig = (top, *ring(4))
     with pytest.raises(ValueError, match="'top' must stand beside the scene"):

@@ -1,4 +1,4 @@
-"""Tracks follow the stream's numbers through births and deaths."""
+"""Tracks of the stream's ids through births and deaths."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ import pytest
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.export.tracks import follow, write_tracks
+from morgs_mi.export.tracks import extract_tracks, write_tracks
 from tests.export.streams import rig, splats, write_stream
 
 
-def test_a_track_is_where_its_gaussian_was(tmp_path):
+def test_extract_tracks__positions_are_those_of_the_gaussians(tmp_path):
     states = write_stream(tmp_path / "s.morgs")
-    write_tracks(tmp_path / "tracks.npz", follow(StreamReader(tmp_path / "s.morgs")))
+    write_tracks(tmp_path / "tracks.npz", extract_tracks(StreamReader(tmp_path / "s.morgs")))
     tracks = np.load(tmp_path / "tracks.npz")
     assert tracks["ids"].tolist() == list(range(42))
     assert tracks["frames"].tolist() == [0, 1, 2, 3]
@@ -27,21 +27,21 @@ def test_a_track_is_where_its_gaussian_was(tmp_path):
     # The first died in frame 2, the last two were born there.
     assert np.isnan(tracks["positions"][:, 0, 0]).tolist() == [False, False, True, True]
     assert np.isnan(tracks["positions"][:, -1, 0]).tolist() == [True, True, False, False]
-    # The second moved by 0.1 a frame, but for the steps of the codec, of a tenth of a pixel or 0.007.
+    # The second moved by 0.1 per frame, up to the codec's quantisation steps of a tenth of a pixel, or 0.007.
     np.testing.assert_allclose(np.diff(tracks["positions"][:, 1, 0]), 0.1, atol=0.007)
 
 
-def test_new_sets_of_gaussians_are_others(tmp_path):
+def test_extract_tracks__new_sets_of_gaussians_get_new_ids(tmp_path):
     with StreamWriter(tmp_path / "s.morgs", rig(), 10) as writer:
         for t in range(2):
             writer.write(keyframe_packet(splats(3), t, rig()))
-    tracks = follow(StreamReader(tmp_path / "s.morgs"))
+    tracks = extract_tracks(StreamReader(tmp_path / "s.morgs"))
     assert tracks.ids.tolist() == [0, 1, 2, 3, 4, 5]
     assert np.isnan(tracks.positions[:, :, 0]).tolist() == [[False] * 3 + [True] * 3, [True] * 3 + [False] * 3]
 
 
-def test_no_frames_are_named(tmp_path):
+def test_extract_tracks__rejects_a_stream_without_frames(tmp_path):
     with StreamWriter(tmp_path / "s.morgs", rig(), 10):
         pass
     with pytest.raises(ValueError, match="at least one frame was expected, got none"):
-        follow(StreamReader(tmp_path / "s.morgs"))
+        extract_tracks(StreamReader(tmp_path / "s.morgs"))

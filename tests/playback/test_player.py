@@ -1,4 +1,4 @@
-"""Streams played: channels, cameras, truth on the stream's grid, time."""
+"""Playback: channels, cameras, ground truth on the stream's grid, speed."""
 
 from __future__ import annotations
 
@@ -10,20 +10,23 @@ import pytest
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
+from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.playback.player import (
+    CHANNELS,
+    available_channels,
     channel_image,
     find_camera,
     has_confidence,
     has_offset,
     open_stream,
-    playback,
+    playback_speed,
     render_stream,
     truth_for_camera,
 )
 from tests.moving_splats import CAMERAS, FRAMES, HEIGHT, WIDTH, moved, write_stream
 
 
-def test_truth_on_a_coarser_grid(fitted_clip: Path) -> None:
+def test_truth_for_camera__resamples_to_a_coarser_grid(fitted_clip: Path) -> None:
     small = load_capture(fitted_clip / "capture", downscale=2)
     full, half = (truth_for_camera(small, c, 1) for c in (CAMERAS[0], small.cameras[0]))
     assert full is not None
@@ -33,7 +36,7 @@ def test_truth_on_a_coarser_grid(fitted_clip: Path) -> None:
     assert truth_for_camera(small, CAMERAS[0], FRAMES) is None
 
 
-def test_every_carried_channel_is_rendered(fitted_clip: Path, tmp_path: Path) -> None:
+def test_render_stream__renders_the_available_channels(fitted_clip: Path, tmp_path: Path) -> None:
     reader = open_stream(fitted_clip)
     frames = list(render_stream(reader, find_camera(reader, 1)))
     assert [index for index, _ in frames] == list(range(FRAMES))
@@ -45,17 +48,17 @@ def test_every_carried_channel_is_rendered(fitted_clip: Path, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(("camera", "name"), [(1, "cam1"), ("1", "cam1"), ("cam0", "cam0")])
-def test_cameras_by_index_and_name(fitted_clip: Path, camera: int | str, name: str) -> None:
+def test_find_camera__by_index_and_name(fitted_clip: Path, camera: int | str, name: str) -> None:
     assert find_camera(open_stream(fitted_clip), camera).name == name
 
 
 @pytest.mark.parametrize("camera", [2, -1, "7", "-1", "cam7", ""])
-def test_cameras_that_are_not_there(fitted_clip: Path, camera: int | str) -> None:
+def test_find_camera__rejects_unknown_cameras(fitted_clip: Path, camera: int | str) -> None:
     with pytest.raises(ValueError, match=r"index in 0..1 or one of cam0, cam1, got"):
         find_camera(open_stream(fitted_clip), camera)
 
 
-def test_confidence_counts_where_it_was_learned(fitted_clip: Path, tmp_path: Path) -> None:
+def test_has_confidence__only_where_it_was_learned(fitted_clip: Path, tmp_path: Path) -> None:
     assert has_confidence(open_stream(fitted_clip))
     off = {"config": {"motion": {"learn_confidence": False}}}
     write_stream(tmp_path / "off.morgs", off)
@@ -64,12 +67,12 @@ def test_confidence_counts_where_it_was_learned(fitted_clip: Path, tmp_path: Pat
     assert not has_confidence(open_stream(tmp_path / "none.morgs"))
 
 
-def test_offsets_are_drawn_as_the_share_of_motion_that_they_are(fitted_clip: Path, tmp_path: Path) -> None:
+def test_render_stream__offset_is_its_share_of_the_motion(fitted_clip: Path, tmp_path: Path) -> None:
     write_stream(tmp_path / "s.morgs", {}, offset=0.25)
     assert has_offset(open_stream(tmp_path / "s.morgs"))
     assert not has_offset(open_stream(fitted_clip))
     played = list(render_stream(open_stream(tmp_path / "s.morgs"), CAMERAS[0], ("motion", "offset")))
-    assert not played[0][1]["offset"].any(), "nothing is known of the first frame"
+    assert not played[0][1]["offset"].any(), "the first frame stores no offset"
     for _, images in played[1:]:
         assert np.abs(images["motion"]).max() > 0.4
         np.testing.assert_allclose(images["offset"], 0.25 * images["motion"], atol=1e-4)
@@ -79,12 +82,27 @@ def test_offsets_are_drawn_as_the_share_of_motion_that_they_are(fitted_clip: Pat
     np.testing.assert_array_equal(tenth, channel_image("motion", images["offset"] + 0.5))
 
 
-def test_playback_is_the_time_of_a_frame(fitted_clip: Path, tmp_path: Path) -> None:
+def test_playback_speed__is_the_inverse_of_the_time_per_frame(fitted_clip: Path, tmp_path: Path) -> None:
     reader = open_stream(fitted_clip)
-    times = playback(reader, reader.cameras[0])
+    times = playback_speed(reader, reader.cameras[0])
     assert times["fps"] == pytest.approx(1e3 / (times["decode_ms"] + times["render_ms"]))
     assert min(times.values()) > 0
     with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25) as writer:
-        assert np.isnan(playback(open_stream(tmp_path / "s.morgs"), CAMERAS[0])["fps"])
+        assert np.isnan(playback_speed(open_stream(tmp_path / "s.morgs"), CAMERAS[0])["fps"])
         writer.write(keyframe_packet(moved(0), 0))
-    assert playback(open_stream(tmp_path / "s.morgs"), CAMERAS[0])["fps"] > 0
+    assert playback_speed(open_stream(tmp_path / "s.morgs"), CAMERAS[0])["fps"] > 0
+
+
+def test_channels__include_those_of_the_attribute_table() -> None:
+    rows = [row for row in ATTRIBUTES if row.channel is not None]
+    assert {row.channel for row in rows} <= set(CHANNELS)
+    absent = moved(0, logit=None)
+    assert not set(available_channels(absent)) & {row.channel for row in rows}
+    assert "confidence" in available_channels(moved(0))
+
+
+def test_channel_image__draws_other_channels_as_grey_values() -> None:
+    ramp = np.linspace(0, 1, 8, dtype=np.float32)[None, :, None]
+    image = channel_image("wetness", ramp)
+    assert (image == image[..., :1]).all()
+    np.testing.assert_array_equal(image, channel_image("alpha", ramp))

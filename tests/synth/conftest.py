@@ -1,4 +1,4 @@
-"""One tiny capture, and one scene on stage, shared by the tests of this room."""
+"""A tiny capture and one path tracer, shared by the tests of this subpackage."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from morgs_mi.synth.synthesize import synthesize
 
 
 @pytest.fixture(scope="session")
-def stage() -> PathTracer:
-    """The balls, at whatever time the last test left them."""
+def tracer() -> PathTracer:
+    """The scene `spheres`, at the time that the previous test has set."""
     return PathTracer(load_scene("spheres"))
 
 
 @pytest.fixture(scope="session")
 def clip(tmp_path_factory) -> Path:
-    """The arm from 3 cameras in 3 frames of 64x48, with lossless frames."""
+    """The scene `arm` from 3 cameras, 3 frames of 64x48, with lossless frames."""
     out = tmp_path_factory.mktemp("synth") / "arm"
     return synthesize("arm", out, num_cameras=3, num_frames=3, width=64, height=48, spp=4, lossless=True)

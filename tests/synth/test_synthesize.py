@@ -1,4 +1,4 @@
-"""Synthetic captures: the files, and the ground truth against routes that share no code with it."""
+"""Synthetic captures: the files, and the ground truth against independent computations."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from morgs_mi.capture.layouts.colmap import read_colmap
 from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds
 from morgs_mi.io.video import open_frames
-from morgs_mi.synth.ground_truth import carry, ground_truth_of, load_tracks, load_truth, project
+from morgs_mi.synth.ground_truth import compute_ground_truth, load_tracks, load_truth, move_with_objects
 from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import Light, Object, Scene, load_scene, translate
 from morgs_mi.synth.synthesize import synthesize
@@ -26,22 +26,22 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(10 * np.log10(255**2 / np.mean((a.astype(float) - b) ** 2)))
 
 
-def look(stage: PathTracer, camera, frame: int):
-    """Return the picture and the truth of a frame."""
+def render_frame(tracer: PathTracer, camera, frame: int):
+    """Return the image and the ground truth of a frame."""
     time = frame / FPS
-    stage.move(time)
-    points, ids = stage.surface(camera)
-    poses = [stage.poses(time + step / FPS) for step in (0, -1, 1)]
-    return stage.picture(camera, 16, frame), ground_truth_of(camera, points, ids, *poses)
+    tracer.set_time(time)
+    points, ids = tracer.surface_points(camera)
+    poses = [tracer.poses(time + step / FPS) for step in (0, -1, 1)]
+    return tracer.render(camera, 16, frame), compute_ground_truth(camera, points, ids, *poses)
 
 
 @pytest.fixture(scope="module")
-def pair(stage):
-    camera = stage.scene.rig.cameras(3, 320, 240)[1]
-    return camera, look(stage, camera, 4), look(stage, camera, 5)
+def pair(tracer):
+    camera = tracer.scene.rig.cameras(3, 320, 240)[1]
+    return camera, render_frame(tracer, camera, 4), render_frame(tracer, camera, 5)
 
 
-def test_layout_is_n3dvs_with_a_colmap_model(clip):
+def test_synthesize__writes_the_layout_of_n3dv_with_a_colmap_model(clip):
     about = json.loads((clip / "capture.json").read_text())
     assert about["test_view"] == 0
     assert (about["fps"], about["num_frames"], about["seed"]) == (30.0, 3, 0)
@@ -62,24 +62,24 @@ def test_layout_is_n3dvs_with_a_colmap_model(clip):
         assert len(list((clip / "truth" / name).glob("*.exr"))) == 3
 
 
-def test_lossless_frames_are_what_was_rendered(clip):
+def test_synthesize__lossless_frames_equal_the_rendered_images(clip):
     scene = load_scene("arm")
-    stage = PathTracer(scene)
-    stage.move(1 / FPS)
+    tracer = PathTracer(scene)
+    tracer.set_time(1 / FPS)
     noise = int(np.random.SeedSequence([0, 1, 1]).generate_state(1)[0])
-    picture = stage.picture(scene.rig.cameras(3, 64, 48)[1], 4, noise)
+    image = tracer.render(scene.rig.cameras(3, 64, 48)[1], 4, noise)
     stored = list(open_frames(clip / "frames" / "cam01").frames())[1]
-    np.testing.assert_array_equal(stored, picture)
+    np.testing.assert_array_equal(stored, image)
 
 
-def test_warping_by_the_motion_map_brings_the_last_frame_onto_this_one(pair):
+def test_compute_ground_truth__motion_map_warps_the_previous_frame_onto_the_current_one(pair):
     _, (before, truth_before), (now, truth) = pair
     grid = np.stack(np.meshgrid(np.arange(320), np.arange(240)), axis=-1).astype(np.float32)
     source = grid - truth.motion
-    # Seen in both frames: all neighbours of the source belong to the same object.
+    # Visible in both frames: all neighbours of the source belong to the same object.
     corners = [np.floor(source).astype(int) + corner for corner in ((0, 0), (0, 1), (1, 0), (1, 1))]
-    seen = [truth_before.ids[np.clip(c[..., 1], 0, 239), np.clip(c[..., 0], 0, 319)] for c in corners]
-    same = truth.mask & (np.stack(seen) == truth.ids).all(axis=0)
+    found = [truth_before.ids[np.clip(c[..., 1], 0, 239), np.clip(c[..., 0], 0, 319)] for c in corners]
+    same = truth.mask & (np.stack(found) == truth.ids).all(axis=0)
     same = cv2.erode(same.astype(np.uint8), np.ones((3, 3))) > 0
     assert same.sum() > 5000
 
@@ -87,7 +87,7 @@ def test_warping_by_the_motion_map_brings_the_last_frame_onto_this_one(pair):
         warped = cv2.remap(before, grid - motion, None, cv2.INTER_CUBIC)
         return psnr(warped[same], now[same])
 
-    # Resampling and light that falls differently leave 31 dB; noise costs 0.2 of it (measured).
+    # Resampling and changes of shading limit the score to 31 dB, of which noise costs 0.2 dB (measured).
     assert score(truth.motion) > 29
     for wrong in (
         0 * truth.motion,
@@ -98,32 +98,32 @@ def test_warping_by_the_motion_map_brings_the_last_frame_onto_this_one(pair):
         assert score(wrong) < score(truth.motion) - 1.5
 
 
-def test_only_moving_objects_move(pair, stage):
+def test_compute_ground_truth__only_moving_objects_have_motion(pair, tracer):
     _, _, (_, truth) = pair
-    moves = np.array([thing.pose is not None for thing in stage.scene.objects.values()])
+    moves = np.array([item.pose is not None for item in tracer.scene.objects.values()])
     assert (truth.ids >= 0).all()
     np.testing.assert_array_equal(truth.mask, moves[truth.ids])
     assert (truth.motion[~moves[truth.ids]] == 0).all()
     assert 2 < np.linalg.norm(truth.motion[truth.mask], axis=-1).mean() < 6
 
 
-def test_first_frame_has_no_motion_but_the_mask_of_the_second_step(clip):
+def test_compute_ground_truth__first_frame_has_no_motion_and_the_mask_of_the_next_step(clip):
     first, second = (load_truth(clip / "truth", "cam01", frame) for frame in (0, 1))
     assert (first.motion == 0).all()
     assert first.mask.any()
     assert (first.mask == np.isin(first.ids, np.unique(second.ids[second.mask]))).all()
 
 
-def test_tracks_reproject_to_the_motion_map(clip):
+def test_load_tracks__tracks_reproject_to_the_motion_map(clip):
     tracks = load_tracks(clip / "truth")
     assert tracks.points.shape == (len(tracks.ids), 3, 3)
     compared = 0
     for camera in load_scene("arm").rig.cameras(3, 64, 48):
         for frame in (1, 2):
             truth = load_truth(clip / "truth", camera.name, frame)
-            now, depth = project(camera, tracks.points[:, frame])
-            before, _ = project(camera, tracks.points[:, frame - 1])
-            # Points that were picked at a pixel centre of this view and frame.
+            now, depth = camera.project(tracks.points[:, frame])
+            before, _ = camera.project(tracks.points[:, frame - 1])
+            # Points that were sampled at a pixel centre of this view and frame.
             col, row = (np.floor(now).astype(int) * [1, 1]).T
             at_centre = np.abs(now - np.floor(now) - 0.5).max(axis=1) < 1e-3
             at_centre &= (col >= 0) & (col < 64) & (row >= 0) & (row < 48)
@@ -135,29 +135,29 @@ def test_tracks_reproject_to_the_motion_map(clip):
     assert compared > 100
 
 
-def test_depth_and_points_agree_with_rays_of_the_mitsuba_sensor(stage):
-    camera = stage.scene.rig.cameras(3, 64, 48)[2]
+def test_surface_points__agree_with_rays_of_the_mitsuba_sensor(tracer):
+    camera = tracer.scene.rig.cameras(3, 64, 48)[2]
     K = camera.K.copy()
     K[:2, 2] += 7, -5
     camera = replace(camera, K=K)
-    points, ids = stage.surface(camera)
+    points, ids = tracer.surface_points(camera)
     y, x = np.mgrid[:48, :64].reshape(2, -1) + 0.5
     rays, _ = mi.load_dict(camera.sensor()).sample_ray(0, 0, mi.Point2f(x / 64, y / 48), 0)
-    hit = stage._scene.ray_intersect(mi.Ray3f(rays.o, rays.d))
+    hit = tracer._scene.ray_intersect(mi.Ray3f(rays.o, rays.d))
     np.testing.assert_allclose(np.array(hit.p).T.reshape(48, 64, 3)[5:-5, 5:-5], points[5:-5, 5:-5], atol=2e-3)
-    pixels, depth = project(camera, points)
+    pixels, depth = camera.project(points)
     np.testing.assert_allclose(pixels, np.stack([x, y], axis=-1).reshape(48, 64, 2), atol=1e-3)
-    poses = stage.poses(0)
-    np.testing.assert_allclose(ground_truth_of(camera, points, ids, poses, None, poses).depth, depth, rtol=1e-6)
+    poses = tracer.poses(0)
+    np.testing.assert_allclose(compute_ground_truth(camera, points, ids, poses, None, poses).depth, depth, rtol=1e-6)
 
 
-def test_pixels_that_see_nothing_are_marked():
+def test_compute_ground_truth__marks_pixels_without_a_surface():
     square = {"type": "rectangle"}
     scene = Scene("square", {"square": Object({"square": square}, lambda t: translate(t, 0.8, 0))}, {})
-    stage = PathTracer(scene)
+    tracer = PathTracer(scene)
     camera = scene.rig.cameras(2, 64, 48)[0]
-    points, ids = stage.surface(camera)
-    truth = ground_truth_of(camera, points, ids, stage.poses(0), None, stage.poses(1))
+    points, ids = tracer.surface_points(camera)
+    truth = compute_ground_truth(camera, points, ids, tracer.poses(0), None, tracer.poses(1))
     assert set(np.unique(truth.ids)) == {-1, 0}
     nothing = truth.ids < 0
     assert (truth.depth[nothing] == 0).all()
@@ -166,112 +166,114 @@ def test_pixels_that_see_nothing_are_marked():
 
 
 @pytest.mark.parametrize("radiance", [0.001, 0.18, 0.6, 3.0])
-def test_pictures_are_srgb_encoded(radiance):
+def test_render__returns_srgb_encoded_images(radiance):
     light = Light({"type": "constant", "radiance": {"type": "rgb", "value": radiance}})
     scene = Scene("sky", {}, {"sky": light})
-    picture = PathTracer(scene).picture(scene.rig.cameras(2, 8, 8)[0], 1, 0)
+    image = PathTracer(scene).render(scene.rig.cameras(2, 8, 8)[0], 1, 0)
     linear = min(radiance, 1.0)
     encoded = 12.92 * linear if linear <= 0.0031308 else 1.055 * linear ** (1 / 2.4) - 0.055
-    np.testing.assert_array_equal(picture, np.uint8(round(255 * encoded)))
+    np.testing.assert_array_equal(image, np.uint8(round(255 * encoded)))
 
 
-def test_noise_stays_below_that_of_a_camera(stage):
-    camera = stage.scene.rig.cameras(3, 96, 72)[1]
-    stage.move(0.1)
-    # Measured: 41 dB at 320x240. A small picture has coarser pixels, hence more texture in each.
-    assert psnr(stage.picture(camera, 16, 1), stage.picture(camera, 1024, 2)) > 38
+def test_render__sampling_noise_is_below_that_of_a_camera(tracer):
+    camera = tracer.scene.rig.cameras(3, 96, 72)[1]
+    tracer.set_time(0.1)
+    # Measured: 41 dB at 320x240. A small image has larger pixels, with more texture in each.
+    assert psnr(tracer.render(camera, 16, 1), tracer.render(camera, 1024, 2)) > 38
 
 
-def test_points_lie_on_the_surface_within_their_noise(clip):
+def test_synthesize__colmap_points_lie_on_the_surface_within_their_noise(clip):
     model = read_colmap(clip / "sparse" / "0")
     assert len(model.points) > 1000
     best = np.full(len(model.points), np.inf)
     for camera in load_scene("arm").rig.cameras(3, 64, 48)[1:]:
         depth = load_truth(clip / "truth", camera.name, 0).depth
-        pixels, z = project(camera, model.points.astype(float))
+        pixels, z = camera.project(model.points.astype(float))
         col, row = np.clip(np.floor(pixels).astype(int), 0, [63, 47]).T
         footprint = z / camera.K[0, 0]
         best = np.minimum(best, np.abs(z - depth[row, col]) / footprint)
-    # Half a pixel of noise, and up to a pixel's width of slope under it.
+    # Half a pixel of noise, and a surface that may slope by up to a pixel's width.
     assert np.median(best) < 1
     assert np.percentile(best, 95) < 4
 
 
 @pytest.mark.parametrize("name", ["spheres", "arm", "thin", "flicker"])
-def test_poses_are_rigid_and_repeatable(name):
-    for thing in load_scene(name).objects.values():
-        if thing.pose is not None:
+def test_load_scene__poses_are_rigid_and_repeatable(name):
+    for item in load_scene(name).objects.values():
+        if item.pose is not None:
             for time in (0.0, 0.31, 7.7):
-                pose = thing.pose(time)
+                pose = item.pose(time)
                 np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
                 assert np.linalg.det(pose[:3, :3]) > 0
-                np.testing.assert_array_equal(pose, thing.pose(time))
+                np.testing.assert_array_equal(pose, item.pose(time))
 
 
 @pytest.mark.parametrize(("name", "radius"), [("roller", 0.38), ("circler", 0.28)])
-def test_balls_roll_without_slipping(name, radius):
+def test_spheres__balls_roll_without_slipping(name, radius):
     pose, step = load_scene("spheres").objects[name].pose, 1e-5
     for time in (0.0, 0.4, 2.0):
         here = pose(time)
         contact = here[:3, 3] - [0, radius, 0]
-        ahead, behind = (carry(contact[None], np.zeros(1, int), [here], [pose(time + s)])[0] for s in (step, -step))
+        ahead, behind = (
+            move_with_objects(contact[None], np.zeros(1, int), [here], [pose(time + s)])[0] for s in (step, -step)
+        )
         assert abs(contact[1]) < 1e-12
         assert np.linalg.norm(ahead - behind) / (2 * step) < 1e-6
         assert np.linalg.norm(pose(time + step)[:3, 3] - here[:3, 3]) / step > 0.1
 
 
-def test_thin_parts_move_farther_than_they_are_wide():
-    stage = PathTracer(load_scene("thin"))
-    camera = stage.scene.rig.cameras(3, 320, 240)[0]
-    _, truth = look(stage, camera, 5)
+def test_thin__objects_move_farther_than_their_width():
+    tracer = PathTracer(load_scene("thin"))
+    camera = tracer.scene.rig.cameras(3, 320, 240)[0]
+    _, truth = render_frame(tracer, camera, 5)
     speed = np.linalg.norm(truth.motion, axis=-1)
     assert 0.03 < truth.mask.mean() < 0.08
     assert 8 < np.percentile(speed[truth.mask], 90) < 12
-    # Nothing that moves is wider than 10 pixels: an opening of 11 leaves none of it.
+    # No moving object is wider than 10 pixels: an opening of 11 removes them.
     opened = cv2.morphologyEx(truth.mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((11, 11)))
     assert opened.sum() < 0.15 * truth.mask.sum()
 
 
-def test_where_light_flickers_pictures_change_and_surfaces_do_not():
-    stage = PathTracer(load_scene("flicker"))
-    camera = stage.scene.rig.cameras(3, 160, 120)[0]
-    pictures, truths = zip(*(look(stage, camera, frame) for frame in range(6)), strict=True)
+def test_flicker__images_change_where_surfaces_are_static():
+    tracer = PathTracer(load_scene("flicker"))
+    camera = tracer.scene.rig.cameras(3, 160, 120)[0]
+    images, truths = zip(*(render_frame(tracer, camera, frame) for frame in range(6)), strict=True)
     still = ~np.any([truth.mask for truth in truths], axis=0)
     assert still.mean() > 0.8
     assert all((truth.motion[still] == 0).all() for truth in truths)
-    means = np.array([picture[still].mean() for picture in pictures])
+    means = np.array([image[still].mean() for image in images])
     assert (np.abs(np.diff(means)) / means[1:] > 0.01).sum() >= 4
-    # The lamp swings: apart from a common factor, shading changes as well.
-    first, last = (picture[still].mean(-1) / picture[still].mean() for picture in (pictures[0], pictures[-1]))
+    # The lamp swings: the shading changes by more than a common factor.
+    first, last = (image[still].mean(-1) / image[still].mean() for image in (images[0], images[-1]))
     assert np.percentile(np.abs(first - last), 95) > 0.05
 
 
-def test_sensor_noise_has_the_size_asked_for(stage):
-    stage.move(0.0)
-    camera = stage.scene.rig.cameras(3, 160, 120)[0]
-    clean = stage.picture(camera, 64, 0).astype(float)
-    noisy, again = (stage.picture(camera, 64, 0, 0.02).astype(float) for _ in range(2))
+def test_render__sensor_noise_has_the_requested_standard_deviation(tracer):
+    tracer.set_time(0.0)
+    camera = tracer.scene.rig.cameras(3, 160, 120)[0]
+    clean = tracer.render(camera, 64, 0).astype(float)
+    noisy, again = (tracer.render(camera, 64, 0, 0.02).astype(float) for _ in range(2))
     np.testing.assert_array_equal(noisy, again)
     inside = (clean > 30) & (clean < 225)
-    # Rounding to bytes twice adds 1/6 of a grey level squared to 26.
+    # Rounding two images to bytes adds 1/6 to a variance of 26 squared grey levels.
     assert abs((noisy - clean)[inside].std() / (255 * 0.02) - 1) < 0.03
     assert abs((noisy - clean)[inside].mean()) < 0.15
 
 
-def test_rig_has_its_test_view_in_the_middle():
+def test_rig__test_view_is_at_the_centre():
     cameras = load_scene("spheres").rig.cameras(10, 320, 240)
     others = np.mean([camera.position for camera in cameras[1:]], axis=0)
     assert np.linalg.norm(cameras[0].position - others) < 0.5
     for camera in cameras:
-        np.testing.assert_allclose(project(camera, np.array([0, 0.8, 0]))[0], [160, 120], atol=1e-9)
+        np.testing.assert_allclose(camera.project(np.array([0, 0.8, 0]))[0], [160, 120], atol=1e-9)
 
 
-def test_a_full_folder_is_refused_and_a_capture_replaced_on_demand(tmp_path, clip):
+def test_synthesize__rejects_a_non_empty_folder_and_replaces_a_capture_with_overwrite(tmp_path, clip):
     small = {"num_cameras": 2, "num_frames": 1, "width": 16, "height": 16, "spp": 1}
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(FileExistsError, match="not empty; give another folder"):
+    with pytest.raises(FileExistsError, match="not empty; choose another folder"):
         synthesize("spheres", tmp_path, **small)
-    with pytest.raises(FileExistsError, match="holds no capture"):
+    with pytest.raises(FileExistsError, match="is not a capture"):
         synthesize("spheres", tmp_path, **small, overwrite=True)
     out = shutil.copytree(clip, tmp_path / "clip")
     seen = []
@@ -282,7 +284,7 @@ def test_a_full_folder_is_refused_and_a_capture_replaced_on_demand(tmp_path, cli
     assert sorted(path.name for path in tmp_path.iterdir()) == ["clip", "notes.txt"]
 
 
-def test_a_failed_run_leaves_nothing(tmp_path, monkeypatch):
+def test_synthesize__removes_its_output_after_a_failure(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, "No space left on device")
 
@@ -305,12 +307,12 @@ def test_a_failed_run_leaves_nothing(tmp_path, monkeypatch):
         ({"scene": "nowhere"}, "no scene 'nowhere'; name one of .*'arm', 'flicker', 'spheres', 'thin'"),
     ],
 )
-def test_bad_arguments_are_refused(tmp_path, arguments, message):
+def test_synthesize__rejects_invalid_arguments(tmp_path, arguments, message):
     with pytest.raises(ValueError, match=message):
         synthesize(**{"scene": "spheres", "out": tmp_path / "clip", **arguments})
 
 
-def test_a_scene_file_may_lie_anywhere(tmp_path):
+def test_load_scene__accepts_any_file_path(tmp_path):
     (tmp_path / "mine.py").write_text(
         "from morgs_mi.synth.scene import Scene\n\n\ndef build(seed):\n    return Scene('mine', {}, {})\n"
     )

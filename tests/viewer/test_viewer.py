@@ -1,4 +1,4 @@
-"""The page in headless Chromium: it loads, scrubs, switches, follows a growing file, shows the renderer's picture."""
+"""The page in headless Chromium: loading, scrubbing, modes, exact images, a growing file."""
 
 from __future__ import annotations
 
@@ -20,48 +20,52 @@ from morgs_mi.export.axes import up_direction
 from morgs_mi.playback.player import channel_image, open_stream, render, render_config
 from tests.export.streams import write_stream
 
-pytest.importorskip("viser", reason="comes with the extra `viewer`")
-playwright = pytest.importorskip("playwright.sync_api", reason="comes with the extra `viewer-test`")
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium: apt-get install chromium")
+pytest.importorskip("viser", reason="install it with pip install 'morgs-mi[viewer]'")
+playwright = pytest.importorskip("playwright.sync_api", reason="install it with pip install 'morgs-mi[viewer-test]'")
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
+pytestmark = pytest.mark.skipif(
+    CHROMIUM is None,
+    reason="no Chromium found; install it with tools/setup_browser.sh (apt-get install chromium)",
+)
 
 WIDTH, HEIGHT = 480, 360
-# viser's own: its quads have flat positions, of which three.js cannot make a bounding sphere.
-KNOWN = "THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN"
-# A software rasteriser on a busy machine is slow to begin.
-PATIENCE_MS = 60_000
+# An error message of viser: three.js cannot compute a bounding sphere of its flat quads.
+KNOWN_ERROR = "THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN"
+# A software rasteriser on a busy machine starts slowly.
+TIMEOUT_MS = 60_000
 
 
 @pytest.fixture
 def page(tmp_path):
-    """Serve a stream of which the last frame is still to come, and open it; give (page, states, grow)."""
+    """Serve a stream without its last frame, and yield (page, states, grow); `grow` completes the file."""
     states = write_stream(tmp_path / "stream.morgs")
-    whole = (tmp_path / "stream.morgs").read_bytes()
+    complete = (tmp_path / "stream.morgs").read_bytes()
     last = open_stream(tmp_path).index()[-1][2]
-    (tmp_path / "stream.morgs").write_bytes(whole[:last])
+    (tmp_path / "stream.morgs").write_bytes(complete[:last])
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     code = "import sys; from morgs_mi.cli import main; sys.exit(main())"
     arguments = ["view", str(tmp_path), "--port", str(port), "--no-open-browser"]
     server = subprocess.Popen([sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, stdout=subprocess.PIPE)
-    complaints = []
+    console_errors = []
     try:
         with playwright.sync_playwright() as driver:
             options = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
             browser = driver.chromium.launch(executable_path=CHROMIUM, args=options)
             page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
-            page.set_default_timeout(PATIENCE_MS)
-            page.on("console", lambda m: complaints.append(m.text) if m.type == "error" else None)
-            page.on("pageerror", lambda error: complaints.append(str(error)))
+            page.set_default_timeout(TIMEOUT_MS)
+            page.on("console", lambda m: console_errors.append(m.text) if m.type == "error" else None)
+            page.on("pageerror", lambda error: console_errors.append(str(error)))
             for _ in range(100):
                 with socket.socket() as probe:
                     if probe.connect_ex(("127.0.0.1", port)) == 0:
                         break
                 page.wait_for_timeout(200)
-            # Left to itself, the page lowers its resolution on a busy machine.
+            # Without this parameter, the page lowers its resolution on a busy machine.
             page.goto(f"http://127.0.0.1:{port}/?fixedDpr=1")
-            yield page, states, lambda: (tmp_path / "stream.morgs").write_bytes(whole)
+            yield page, states, lambda: (tmp_path / "stream.morgs").write_bytes(complete)
             browser.close()
     finally:
         server.send_signal(signal.SIGINT)
@@ -70,74 +74,74 @@ def page(tmp_path):
         finally:
             server.kill()
     assert server.returncode == 130, errors
-    assert not [text for text in complaints if not text.startswith(KNOWN)]
+    assert not [text for text in console_errors if not text.startswith(KNOWN_ERROR)]
 
 
-def seen(page) -> np.ndarray:
-    """Return what the page shows behind its controls."""
+def screenshot(page) -> np.ndarray:
+    """Return the image that the page shows behind its controls."""
     style = page.add_style_tag(content="body *:not(canvas):not(:has(canvas)) {visibility: hidden !important}")
-    picture = cv2.cvtColor(cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), 1), cv2.COLOR_BGR2RGB)
+    image = cv2.cvtColor(cv2.imdecode(np.frombuffer(page.screenshot(), np.uint8), 1), cv2.COLOR_BGR2RGB)
     style.evaluate("node => node.remove()")
-    return picture
+    return image
 
 
 def wait_for(page, expected: np.ndarray, least: float) -> None:
-    """Wait until the page shows a picture, at least that alike (dB): it comes some draws after the controls."""
+    """Wait until the page shows an image with at least that PSNR (dB); it appears some time after the controls."""
     found = 0.0
     for _ in range(300):
-        found = psnr(seen(page) / 255, expected / 255)
+        found = psnr(screenshot(page) / 255, expected / 255)
         if found >= least:
             return
         page.wait_for_timeout(100)
     raise AssertionError(f"{found:.1f} dB, expected {least}")
 
 
-def drawn(stream: StreamReader, state: CodedFrame, mode: str) -> np.ndarray:
-    """Return the renderer's picture from where the page begins: the first camera, held upright to the rig's mean up."""
+def rendered(stream: StreamReader, state: CodedFrame, mode: str) -> np.ndarray:
+    """Return the renderer's image from the page's initial view: the first camera, upright to the mean up."""
     first = stream.cameras[0]
     ahead = first.position + first.viewmat[2, :3]
     camera = Camera.look_at(first.position, ahead, up_direction(stream.cameras), 45, WIDTH, HEIGHT)
     return channel_image(mode, render(state.gaussians, camera, (mode,), render_config(stream))[mode])
 
 
-def choose(page, mode: str) -> None:
+def select_mode(page, mode: str) -> None:
     page.get_by_label("Mode", exact=True).click()
     page.get_by_role("option", name=mode).click()
 
 
-def test_the_page_shows_what_the_renderer_shows(page, tmp_path):
+def test_viewer__shows_the_images_of_the_renderer(page, tmp_path):
     page, states, grow = page
     stream = open_stream(tmp_path)
 
     page.get_by_text("Frame 0 of 2, 40 Gaussians").wait_for()
-    # Half-precision covariances, 8-bit colours and opacities: 47 dB. A camera off by a degree makes it 22.
-    wait_for(page, drawn(stream, states[0], "color"), 40)
+    # Half-precision covariances, 8-bit colours and opacities: 47 dB. A camera that is off by a degree: 22 dB.
+    wait_for(page, rendered(stream, states[0], "color"), 40)
 
-    choose(page, "offset")
-    page.get_by_text("It holds no offset: fit with codec.offset = true").wait_for()
+    select_mode(page, "offset")
+    page.get_by_text("This frame stores no offset: set codec.offset").wait_for()
     frame = page.locator("input[inputmode=decimal]").first
     frame.fill("1")
     frame.press("Enter")
     page.get_by_text("Frame 1 of 2, 40 Gaussians", exact=True).wait_for()
-    # The picture colours the blend, the page blends colours; a white page gives 13 dB.
-    wait_for(page, drawn(stream, states[1], "offset"), 16)
-    choose(page, "color")
-    wait_for(page, drawn(stream, states[1], "color"), 40)
+    # The renderer colours the blended values, the page blends colours; a white page has 13 dB.
+    wait_for(page, rendered(stream, states[1], "offset"), 16)
+    select_mode(page, "color")
+    wait_for(page, rendered(stream, states[1], "color"), 40)
 
-    page.get_by_label("Exact picture").check()
+    page.get_by_label("Exact image").check()
     for mode in ("motion", "confidence", "offset", "depth", "color"):
-        choose(page, mode)
-        wait_for(page, drawn(stream, states[1], mode), 50)  # the page rounds the camera: some pixels differ by one
-    page.get_by_label("Exact picture").uncheck()
-    choose(page, "confidence")
-    wait_for(page, drawn(stream, states[1], "confidence"), 17)  # as above
+        select_mode(page, mode)
+        wait_for(page, rendered(stream, states[1], mode), 50)  # the page rounds the camera: some pixels differ by 1
+    page.get_by_label("Exact image").uncheck()
+    select_mode(page, "confidence")
+    wait_for(page, rendered(stream, states[1], "confidence"), 17)  # as above
 
-    choose(page, "color")
-    wait_for(page, drawn(stream, states[1], "color"), 40)
-    still = seen(page)
+    select_mode(page, "color")
+    wait_for(page, rendered(stream, states[1], "color"), 40)
+    before = screenshot(page)
     page.get_by_label("Trajectories").check()
     page.wait_for_timeout(1000)
-    lines = np.abs(seen(page).astype(int) - still).max(-1) > 40
+    lines = np.abs(screenshot(page).astype(int) - before).max(-1) > 40
     assert 0 < lines.mean() < 0.2
 
     grow()

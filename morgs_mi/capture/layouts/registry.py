@@ -1,18 +1,24 @@
 """The supported capture layouts.
 
-To add a layout, write a module that exposes a `Layout` and add it to `LAYOUTS`.
+To add a layout, write a module in this package that exposes a `LAYOUT`, and add its name to `_READERS`.
 """
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 
-from morgs_mi.capture.layouts import colmap, dynamic3dgs, nerfstudio, poses_bounds
 from morgs_mi.capture.layouts.calibration import Layout, required_clips
 
 __all__ = ["LAYOUTS", "find_layout", "layout_called"]
 
-LAYOUTS: tuple[Layout, ...] = (colmap.LAYOUT, nerfstudio.LAYOUT, dynamic3dgs.LAYOUT, poses_bounds.LAYOUT)
+_READERS = (
+    "colmap",
+    "nerfstudio",
+    "dynamic3dgs",
+    "poses_bounds",
+)
+LAYOUTS: tuple[Layout, ...] = tuple(import_module(f"{__package__}.{name}").LAYOUT for name in _READERS)
 """The layouts in order of precedence, for folders with several calibrations: the most complete one comes first, which
 is COLMAP's with lenses, principal points and points."""
 

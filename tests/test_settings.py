@@ -1,0 +1,114 @@
+"""Every setting acts: another value of any field changes the stream of a small clip."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from morgs_mi import Camera, RenderConfig
+from morgs_mi.codec.config import CodecConfig
+from morgs_mi.codec.container import encode_packet
+from morgs_mi.config import StreamConfig
+from morgs_mi.fit.config import DensityConfig, FitConfig
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.stream_loop import StreamLoop
+
+BASE = StreamConfig(
+    fit=FitConfig(
+        sh_degree=1,
+        num_gaussians=160,
+        first_frame_steps=30,
+        confidence_steps=6,
+        epochs=6,
+        density=DensityConfig(rounds=2, births=0.05, max_gaussians=150, min_error=0, split_scale=0.03),
+    ),
+    motion=MotionConfig(key_views=2, mask_interval=2),
+    codec=CodecConfig(),
+    render=RenderConfig(reproducible=True),
+)
+# Values that act on a clip this small, where the default rule (not x, x + 1, 3 x) gives none.
+VALUES: dict[str, Any] = {
+    "motion.flow_method": "farneback",
+    "motion.mask_method": "superpixels",
+}
+# Fields that cannot change this stream, each with the reason and the test that shows that it acts.
+ELSEWHERE: dict[str, str] = {
+    "render.reproducible": "changes the order of sums only: tests/render",
+}
+
+
+def leaves(config: Any, path: str = "") -> list[str]:
+    """Return the dotted names of all fields that hold no further config."""
+    found = []
+    for field in fields(config):
+        value, name = getattr(config, field.name), f"{path}{field.name}"
+        found += leaves(value, f"{name}.") if is_dataclass(value) else [name]
+    return found
+
+
+def with_value(config: Any, name: str, value: Any) -> Any:
+    """Return a config with the field of a dotted name replaced."""
+    head, _, rest = name.partition(".")
+    return replace(config, **{head: with_value(getattr(config, head), rest, value) if rest else value})
+
+
+def value_of(config: Any, name: str) -> Any:
+    for part in name.split("."):
+        config = getattr(config, part)
+    return config
+
+
+def other(name: str) -> Any:
+    value = value_of(BASE, name)
+    if name in VALUES:
+        return VALUES[name]
+    if isinstance(value, bool):
+        return not value
+    return value + 1 if isinstance(value, int) else 3 * value
+
+
+@pytest.fixture(scope="module")
+def clip() -> tuple[list[Camera], np.ndarray, np.ndarray, list[list[np.ndarray]]]:
+    """Five views of a bright textured square before a textured wall; it moves, and the light grows slowly."""
+    rng = np.random.default_rng(0)
+    origins = [(x, y, -3) for x, y in ((-1, 0), (1, 0), (0, 0.8), (0, -0.8), (0.4, 0.4))]
+    views = [Camera.look_at(o, (0, 0, 0), (0, -1, 0), 50, 64, 48, f"cam{i}") for i, o in enumerate(origins)]
+    wall = np.stack([*rng.uniform(-1.5, 1.5, (2, 260)), np.full(260, 0.5)], axis=1)
+    square = np.stack([*rng.uniform(-0.35, 0.35, (2, 80)), np.full(80, -0.4)], axis=1)
+    points = np.concatenate([wall, square])
+    colors = np.concatenate([rng.uniform(0.1, 0.6, (260, 3)), rng.uniform(0.5, 1.0, (80, 3))])
+    frames = [[image(view, wall, square + (0.06 * t, 0.02 * t, 0), colors, rng, t) for view in views] for t in range(4)]
+    return views, points, colors, frames
+
+
+def image(
+    view: Camera, wall: np.ndarray, square: np.ndarray, colors: np.ndarray, rng: np.random.Generator, t: int
+) -> np.ndarray:
+    """Draw the points as squares, the far ones first, with noise of a grey level."""
+    picture = np.full((48, 64, 3), 0.2)
+    for points, own, radius in ((wall, colors[:260], 4), (square, colors[260:], 3)):
+        for (x, y), color in zip(view.project(points)[0].astype(int), own, strict=True):
+            picture[max(y - radius, 0) : max(y + radius, 0), max(x - radius, 0) : max(x + radius, 0)] = color
+    noisy = picture * (1 + 0.01 * t) * 255 + rng.normal(0, 1, picture.shape)
+    return np.clip(noisy, 0, 255).astype(np.uint8)
+
+
+def stream(clip, config: StreamConfig) -> bytes:
+    views, points, colors, frames = clip
+    loop = StreamLoop(views, points, colors, config)
+    return b"".join(encode_packet(loop.push(images)[0]) for images in frames)
+
+
+@pytest.fixture(scope="module")
+def base(clip) -> bytes:
+    assert stream(clip, BASE) == stream(clip, BASE), "the comparison needs a reproducible fit"
+    return stream(clip, BASE)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in leaves(BASE) if name not in ELSEWHERE])
+def test_settings__every_field_acts(clip, base, name):
+    assert stream(clip, with_value(BASE, name, other(name))) != base
