@@ -1,9 +1,9 @@
-"""The Mitsuba integrator `gaussian_splat`: a scene's Gaussians through the rasteriser onto its film.
+"""The Mitsuba integrator `gaussian_splat`, which renders the Gaussians of a scene by rasterisation.
 
     "integrator": {"type": "gaussian_splat", "aovs": "motion,depth"}
 
 It draws every `ellipsoids` (and `ellipsoidsmesh`) shape of a scene and reads the attributes that Mitsuba's own
-`volprim_rf_basic` reads, so one scene file renders with both. N is the number of Gaussians of a shape,
+`volprim_rf_basic` reads, so that one scene file renders with both. N is the number of Gaussians of a shape,
 K = (degree + 1)^2:
 
     data [N, 10]          centre, standard deviations, quaternion xyzw
@@ -12,74 +12,93 @@ K = (degree + 1)^2:
     motion [N, 3]         world units per frame; only for the AOV `motion`
     confidence [N, 1]     in [0, 1]; only for the AOV `confidence`
 
+Every attribute of the table of attributes with a `channel` is rendered in the same way as `confidence`.
+
 `mi.render(scene, params)` is differentiable, in both modes, in these attributes and in the sensor's `to_world`.
 
-Importing this module registers the plugin with the variant that is set and with every one set later.
+Importing this module registers the plugin with the active variant and with every variant set later.
 """
 
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians, tensor_rows
+from morgs_mi.core.types import Float, Tensor, UInt32
+from morgs_mi.render.channels import attribute_channels, exr_names
 from morgs_mi.render.rasterize import rasterize
 
 __all__ = ["ellipsoids"]
 
 _log = logging.getLogger(__name__)
 
-_AOV_NAMES = {"motion": ("motion.X", "motion.Y"), "confidence": ("confidence.Y",), "depth": ("depth.Y",)}
-_ATTRIBUTE_WIDTHS = {"opacities": (1,), "sh_coeffs": (3, 12, 27, 48), "motion": (3,), "confidence": (1,)}
+
+def _aov_attributes() -> dict[str, str | None]:
+    """Return the shape attribute that each AOV requires, by the name of the AOV; None: no attribute."""
+    attributes = {name: attribute.activated_name for name, attribute in attribute_channels().items()}
+    return {"motion": "motion", **attributes, "depth": None}
+
+
+def _attribute_widths() -> dict[str, tuple[int, ...]]:
+    """Return the admissible numbers of floats per Gaussian of every shape attribute beside `data`, by name."""
+    names = [name for name in _aov_attributes().values() if name]
+    return {
+        "opacities": (1,),
+        "sh_coeffs": (3, 12, 27, 48),
+        **{name: (BY_ACTIVATED_NAME[name].width,) for name in names},
+    }
 
 
 def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
-    """Return the dictionary of the `ellipsoids` shape that holds a copy of N Gaussians' activated attributes.
+    """Return the dictionary of an `ellipsoids` shape with a copy of N Gaussians' activated attributes.
 
-    The scene's parameters are what is optimised from then on: gradients do not reach `gaussians`.
+    The parameters to optimise are then those of the scene: gradients do not reach `gaussians`.
     """
-    names = ("means", "scales", "quats", *_ATTRIBUTE_WIDTHS)
-    values = {name: getattr(gaussians, name) for name in names}
+    names = ("means", "scales", "quats", *_attribute_widths())
+    values = {name: getattr(gaussians, name, None) for name in names}
     values = {name: np.array(dr.detach(value)) for name, value in values.items() if value is not None}
     means, scales, quats = (values.pop(name) for name in names[:3])
-    # Mitsuba takes unit quaternions for granted.
+    # Mitsuba expects unit quaternions.
     quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
     data = np.concatenate([means, scales, np.roll(quats, -1, axis=1)], axis=1)
     attributes = {name: mi.TensorXf(value.reshape(len(data), -1)) for name, value in values.items()}
     return {"type": "ellipsoids", "data": mi.TensorXf(data), **attributes}
 
 
-@dataclass(frozen=True)
 class _SceneGaussians:
     """The Gaussians of all shapes, in the scene's order (see `ActivatedGaussians`)."""
 
-    means: Any
-    scales: Any
-    quats: Any
-    opacities: Any
-    sh_coeffs: Any
-    motion: Any = None
-    confidence: Any = None
+    means: Tensor
+    scales: Tensor
+    quats: Tensor
+    opacities: Tensor
+    sh_coeffs: Tensor
+    motion: Tensor = None
+    confidence: Tensor = None
 
-    def rows(self, name: str, index: Any) -> list[Any]:
+    def __init__(self, tensors: dict[str, Tensor]) -> None:
+        vars(self).update(tensors)
+
+    def rows(self, name: str, index: UInt32) -> list[Float]:
         """Return rows of an attribute, see `ActivatedGaussians`."""
         return tensor_rows(getattr(self, name), index)
 
 
 def _scene_gaussians(scene: Any, attributes: list[str]) -> _SceneGaussians:
-    """Gather the Gaussians of all shapes; those with fewer SH coefficients are padded with zeros."""
+    """Return the Gaussians of all shapes; those with fewer SH coefficients are padded with zeros."""
     shapes = scene.shapes()
     for shape in shapes:
         if not shape.is_ellipsoids():
             raise ValueError(
                 f"gaussian_splat: expected `ellipsoids` shapes only, got {shape.class_name()} {shape.id()!r}; "
-                "remove it from the scene, or use an integrator that meets surfaces, such as `path`."
+                "remove it from the scene, or use an integrator for surfaces, such as `path`."
             )
     if not shapes:
         raise ValueError("gaussian_splat: expected a scene with an `ellipsoids` shape, got none; add one.")
@@ -90,43 +109,45 @@ def _scene_gaussians(scene: Any, attributes: list[str]) -> _SceneGaussians:
         if present < K:
             part["sh_coeffs"] = dr.concat([part["sh_coeffs"], dr.zeros(mi.TensorXf, (N, K - present, 3))], axis=1)
     if len(parts) == 1:
-        return _SceneGaussians(**parts[0])
-    return _SceneGaussians(**{name: dr.concat([part[name] for part in parts], axis=0) for name in parts[0]})
+        return _SceneGaussians(parts[0])
+    return _SceneGaussians({name: dr.concat([part[name] for part in parts], axis=0) for name in parts[0]})
 
 
-def _shape_gaussians(shape: Any, attributes: list[str]) -> dict[str, Any]:
-    """Return one shape's attributes under the rasteriser's names, attached to the shape's parameters."""
-    params = mi.traverse(shape)
+def _shape_gaussians(shape: Any, attributes: list[str]) -> dict[str, Tensor]:
+    """Return one shape's attributes by the rasteriser's names, attached to the shape's parameters."""
+    params: Any = mi.traverse(shape)
     data = mi.TensorXf(params["data"], (dr.width(params["data"]) // 10, 10))
     N = data.shape[0]
     part = {"means": data[:, :3], "scales": data[:, 3:6], "quats": data[:, mi.UInt32(9, 6, 7, 8)]}
+    allowed = _attribute_widths()
     for name in attributes:
-        widths = _ATTRIBUTE_WIDTHS[name]
+        widths = allowed[name]
         size = dr.width(params[name]) if name in params else 0
         if size not in [N * width for width in widths]:
             expected = " or ".join(map(str, widths))
             found = f"{size} values" if name in params else f"only {sorted(params.keys())}"
             raise ValueError(
-                f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must carry `{name}` [N, {expected}] with "
+                f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have `{name}` [N, {expected}] with "
                 f"N={N}, got {found}; set it where the shape is defined."
             )
-        tail = {"sh_coeffs": (size // N // 3, 3), "motion": (3,)}.get(name, ())
+        tail = (size // N // 3, 3) if name == "sh_coeffs" else BY_ACTIVATED_NAME[name].shape
         part[name] = mi.TensorXf(params[name], (N, *tail))
     return part
 
 
 def _sensor_camera(sensor: Any, border: int) -> Camera:
-    """Return the sensor's view of its whole film and of `border` pixels around it."""
+    """Return the camera of the sensor's whole film with a margin of `border` pixels."""
     if sensor.class_name() != "PerspectiveCamera":
         raise ValueError(
-            f"gaussian_splat: expected a `perspective` sensor, got {sensor.class_name()}; splats are drawn by pinhole "
-            "cameras without lens distortion only."
+            f"gaussian_splat: expected a `perspective` sensor, got {sensor.class_name()}; splats are drawn only by "
+            "pinhole cameras without lens distortion."
         )
-    params, (W, H) = mi.traverse(sensor), (int(size) for size in sensor.film().size())
+    params: Any = mi.traverse(sensor)
+    W, H = (int(size) for size in sensor.film().size())
     names = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
     fov, offset_x, offset_y = (float(params[name][0]) for name in names)
     f = 0.5 * W / np.tan(np.deg2rad(0.5 * fov))
-    # Mitsuba adds its offset to the pixel's position, so the principal point moves the other way.
+    # Mitsuba adds its offset to the pixel's position, so that the principal point moves the other way.
     cx, cy = W * (0.5 - offset_x) + border, H * (0.5 - offset_y) + border
     K = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]])
     world_to_sensor = mi.TensorXf(dr.rcp(params["to_world"].matrix))[..., 0]
@@ -150,17 +171,17 @@ def _plugin() -> type:
 
          * - background
            - |rgb|
-           - Colour behind everything, encoded as the primitives are. (Default: black)
+           - Colour behind all Gaussians, encoded like the primitives. (Default: black)
 
          * - aovs
            - |string|
-           - Further channels, a comma-separated list of `motion` (`motion.X`, `motion.Y`: where each pixel came
-             from, px), `confidence` (`confidence.Y`) and `depth` (`depth.Y`: expected z, world units). What is not
-             asked for costs nothing. (Default: none)
+           - Further channels, a comma-separated list of `motion` (`motion.X`, `motion.Y`: displacement since the
+             last frame, px), `depth` (`depth.Y`: expected z, world units) and the channels of attributes such as
+             `confidence` (`confidence.Y`). Channels that are not listed are not computed. (Default: none)
 
         The film's size, crop, border, reconstruction filter and pixel format are honoured; every pixel gets one
-        sample at its centre, so `spp`, the seeds and the sampler have no effect. It ignores emitters (with a
-        warning), the sensor's far plane and shutter, and the shapes' `extent`. A crop saves no time.
+        sample at its centre, so that `spp`, the seeds and the sampler have no effect. Emitters (with a warning), the
+        sensor's far plane and shutter, and the shapes' `extent` are ignored. A crop saves no time.
         """
 
         def __init__(self, props: Any) -> None:
@@ -176,12 +197,16 @@ def _plugin() -> type:
             names = (name.strip() for name in props.get("aovs", "").split(","))
             self.aovs = list(dict.fromkeys(name for name in names if name))
             self.warned = False
+            known = _aov_attributes()
             for name in self.aovs:
-                if name not in _AOV_NAMES:
-                    raise ValueError(f"gaussian_splat: `aovs` must be out of {', '.join(_AOV_NAMES)}, got {name!r}.")
+                if name not in known:
+                    raise ValueError(
+                        f"gaussian_splat: `aovs` must be out of {', '.join(known)}, got {name!r}; separate them by "
+                        "commas."
+                    )
 
         def aov_names(self) -> list[str]:
-            return [channel for name in self.aovs for channel in _AOV_NAMES[name]]
+            return [channel for name in self.aovs for channel in exr_names(name)]
 
         def render(
             self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
@@ -210,28 +235,32 @@ def _plugin() -> type:
                 dr.backward_from(image)
 
         def _expose(self, scene: Any, sensor: Any) -> Any:
-            """Draw the scene onto the sensor's film and return the film."""
+            """Render the scene to the sensor's film and return the film."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             film = sensor.film()
             if mi.has_flag(film.flags(), mi.FilmFlags.Special):
-                raise ValueError(f"gaussian_splat: expected an `hdrfilm`, got {film.class_name()}; only RGB is drawn.")
+                raise ValueError(
+                    f"gaussian_splat: expected an `hdrfilm`, got {film.class_name()}; replace it, because only RGB is "
+                    "drawn."
+                )
             if scene.emitters() and not self.warned:
-                _log.warning("gaussian_splat ignores the scene's emitters; a `background` colour can be given to it.")
+                _log.warning("gaussian_splat ignores the scene's emitters; set its `background` colour instead.")
                 self.warned = True
 
             border = film.rfilter().border_size() if film.sample_border() else 0
             has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
-            attributes = ["opacities", "sh_coeffs", *(name for name in self.aovs if name != "depth")]
+            required = (_aov_attributes()[name] for name in self.aovs)
+            attributes = ["opacities", "sh_coeffs", *(name for name in required if name)]
             image = rasterize(
                 _scene_gaussians(scene, attributes),
                 _sensor_camera(sensor, border),
                 ("color", *(["alpha"] if has_alpha else []), *self.aovs),
                 self.background,
             )
-            # Cut out only now: the projection's linearisation depends on the extent of the whole view.
+            # Cropped after rendering: the projection's linearisation depends on the extent of the whole view.
             (x0, y0), (w, h) = film.crop_offset(), film.crop_size() + 2 * border
 
-            def columns(tensor: Any) -> list[Any]:
+            def columns(tensor: Tensor) -> list[Float]:
                 return [tensor[y0 : y0 + h, x0 : x0 + w, i].array for i in range(tensor.shape[2])]
 
             values = columns(image.color)
@@ -240,11 +269,11 @@ def _plugin() -> type:
             values += columns(image.alpha) if has_alpha else []
             values += [mi.Float(1)]  # the sample's weight
             for name in self.aovs:
-                values += columns(getattr(image, name))
+                values += columns(image[name])
 
             film.prepare(self.aov_names())
             block, index = film.create_block(), dr.arange(mi.UInt32, w * h)
-            block.set_coalesce(False)  # worth it for many samples a pixel only
+            block.set_coalesce(False)  # useful for many samples per pixel only
             block.put(mi.Point2f(index % w, index // w) + mi.Point2f(x0, y0) + (0.5 - border), values)
             film.put_block(block)
             return film
@@ -259,7 +288,7 @@ def _plugin() -> type:
 
 
 def _register(*_: Any) -> None:
-    """Make the plugin known to the active variant."""
+    """Register the plugin with the active variant."""
     plugin = _plugin()
     mi.register_integrator("gaussian_splat", lambda props: plugin(props))
 

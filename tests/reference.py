@@ -1,7 +1,7 @@
-"""Slow, obvious float64 twins of the package's mathematics.
+"""Slow float64 reference implementations of the package's mathematics.
 
-They loop over everything, know no blocks, no early stop and no rounding tricks. All of them are analytic in
-their floating-point inputs apart from the documented cut-offs, which are taken on real parts, so that
+They loop over all Gaussians and pixels, without blocks, early stop or rounding tricks. All of them are analytic in
+their floating-point inputs apart from the documented cut-offs, which depend on real parts only, so that
 `complex_step` returns derivatives that are exact to rounding.
 """
 
@@ -10,13 +10,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from morgs_mi import Camera
+
 SH_C0, SH_C1 = 0.28209479177387814, 0.4886025119029199
 SH_C2 = (1.0925484305920792, 0.31539156525252005, 0.5462742152960396)
 SH_C3 = (0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277)
 
 
 def sh_basis(d: NDArray, degree: int) -> list:
-    """Real spherical harmonics with 3DGS's signs, up to degree 3, of a unit direction [3]."""
+    """Return the real spherical harmonics with 3DGS's signs, up to degree 3, of a unit direction [3]."""
     x, y, z = d
     basis = [SH_C0 + 0 * x]
     if degree > 0:
@@ -43,7 +45,7 @@ def sh_basis(d: NDArray, degree: int) -> list:
 
 
 def rotation(q: NDArray) -> NDArray:
-    """Rotation matrix of a wxyz quaternion of any length."""
+    """Return the rotation matrix of a wxyz quaternion of any length."""
     w, x, y, z = q / np.sqrt(np.sum(q * q))
     return np.array(
         [
@@ -68,7 +70,7 @@ def rasterize(
 ) -> dict[str, NDArray]:
     """Blend raw Gaussian attributes (as `Gaussians.numpy()` returns them) over every pixel, nearest first.
 
-    Returns all five channels [H, W, D], and `margin`: how near any alpha came to a cut-off, relative.
+    Returns all five channels [H, W, D], and `margin`: the smallest relative distance of any alpha to a cut-off.
     """
     means, quats = raw["means"], raw["quats"]
     scales, opacities = np.exp(raw["log_scales"]), 1 / (1 + np.exp(-raw["logit_opacities"]))
@@ -79,7 +81,7 @@ def rasterize(
     eye = -R.T @ t
 
     gx, gy = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    light = np.ones((height, width), dtype)
+    transmittance = np.ones((height, width), dtype)
     sums = {"color": 3, "depth": 1, "motion": 2, "confidence": 1}
     sums = {name: np.zeros((height, width, size), dtype) for name, size in sums.items()}
     margin = np.inf
@@ -115,10 +117,10 @@ def rasterize(
         if "logit_confidence" in raw:
             values["confidence"] = np.array([1 / (1 + np.exp(-raw["logit_confidence"][i]))])
         for name, value in values.items():
-            sums[name] += (light * alpha)[..., None] * value
-        light = light * (1 - alpha)
+            sums[name] += (transmittance * alpha)[..., None] * value
+        transmittance = transmittance * (1 - alpha)
 
-    alpha = (1 - light)[..., None]
+    alpha = (1 - transmittance)[..., None]
     covered = alpha.real > 0
     for name in ("depth", "motion"):
         sums[name] = np.where(covered, sums[name] / np.where(covered, alpha, 1), 0)
@@ -127,8 +129,20 @@ def rasterize(
     return {**sums, "alpha": alpha, "margin": np.float64(margin)}
 
 
+def rasterize_view(
+    raw: dict[str, NDArray],
+    camera: Camera,
+    background: tuple[float, float, float] | None = None,
+    viewmat: NDArray | None = None,
+) -> dict[str, NDArray]:
+    """Return `rasterize` for a camera rounded to float32, as the renderer reads it; `viewmat` replaces its pose."""
+    viewmat = np.float32(camera.viewmat).astype(np.float64) if viewmat is None else viewmat
+    K = np.float32(camera.K).astype(np.float64)
+    return rasterize(raw, K, viewmat, camera.width, camera.height, background)
+
+
 def complex_step(function, inputs: dict[str, NDArray], names: list[str], step: float = 1e-30) -> dict[str, NDArray]:
-    """Gradient of a real-valued `function(inputs)` with respect to `inputs[name]`, exact to rounding."""
+    """Return the gradient of a real-valued `function(inputs)` with respect to `inputs[name]`, exact to rounding."""
     grads = {}
     for name in names:
         value = inputs[name].astype(np.complex128)
@@ -142,6 +156,6 @@ def complex_step(function, inputs: dict[str, NDArray], names: list[str], step: f
 
 
 def directional(function, inputs: dict[str, NDArray], direction: dict[str, NDArray], step: float = 1e-30):
-    """Derivative of `function(inputs)` along `direction`, exact to rounding; any output shape."""
+    """Return the derivative of `function(inputs)` along `direction`, exact to rounding; any output shape."""
     nudged = {k: v + 1j * step * direction[k] if k in direction else v for k, v in inputs.items()}
     return function(nudged).imag / step

@@ -1,4 +1,4 @@
-"""The plugin `gaussian_splat`: what mi.render(scene, params) returns and differentiates."""
+"""The plugin `gaussian_splat`: images and derivatives of mi.render(scene, params)."""
 
 from __future__ import annotations
 
@@ -13,12 +13,22 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, ellipsoids, rasterize
+from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from tests import reference
 from tests import tolerances as tol
-from tests.render.test_rasterize import as_float32, make_camera, make_scene, relative, to_gaussians, twin
+from tests.assertions import assert_close
+from tests.reference import rasterize_view
+from tests.scenes import (
+    AOVS,
+    NEW_ATTRIBUTES,
+    ExtendedGaussians,
+    make_mitsuba_scene,
+    make_sensor_camera,
+    make_unit_scene,
+    to_gaussians,
+)
 
-AOVS = "motion,confidence,depth"
-# What Mitsuba optimises, and the derivative of its raw counterpart with respect to it.
+# Raw attributes, and their derivatives with respect to the activated parameters of a Mitsuba scene.
 ACTIVATED = {
     "log_scales": lambda raw: 1 / np.exp(raw["log_scales"]),
     "logit_opacities": lambda raw: 2 + 2 * np.cosh(raw["logit_opacities"]),
@@ -26,47 +36,21 @@ ACTIVATED = {
 }
 
 
-def make_raw(degree: int = 1) -> dict[str, np.ndarray]:
-    """The rasteriser's test scene with unit quaternions, which Mitsuba wants."""
-    raw = make_scene(degree)
-    raw["quats"] /= np.linalg.norm(raw["quats"], axis=1, keepdims=True)
-    return as_float32(raw)
-
-
-def make_view() -> Camera:
-    """Mitsuba's sensors have one focal length; the principal point is off centre."""
-    camera = make_camera()
-    K = camera.K.copy()
-    K[1, 1] = K[0, 0]
-    return replace(camera, K=K)
-
-
-def make_mitsuba_scene(gaussians, film=None, sensor=None, **props):
-    return mi.load_dict(
-        {
-            "type": "scene",
-            "gaussians": ellipsoids(gaussians),
-            "sensor": {**make_view().sensor(**(film or {})), **(sensor or {})},
-            "integrator": {"type": "gaussian_splat", **props},
-        }
-    )
-
-
 def to_linear(color):
-    """The sRGB transfer function, analytic for `complex_step`."""
+    """Return the linear light of an sRGB-encoded colour, analytic for `complex_step`."""
     low = color.real <= 0.04045
     return np.where(low, color / 12.92, ((np.where(low, 1, color) + 0.055) / 1.055) ** 2.4)
 
 
 def expected_image(raw, viewmat=None):
-    """The float64 twin of an rgba film with all AOVs."""
-    image = twin(raw, make_view(), viewmat=viewmat)
+    """Return the reference image of an rgba film with all AOVs."""
+    image = rasterize_view(raw, make_sensor_camera(), viewmat=viewmat)
     parts = [to_linear(image["color"]), *(image[name] for name in ("alpha", "motion", "confidence", "depth"))]
     return np.concatenate(parts, axis=2)
 
 
 def parameter_gradients(gradient, raw):
-    """Turn a gradient by raw attribute into one by Mitsuba's parameter."""
+    """Return the gradient with respect to Mitsuba's parameters from the one with respect to raw attributes."""
     gradient = {name: g * ACTIVATED[name](raw) if name in ACTIVATED else g for name, g in gradient.items()}
     quats = np.roll(gradient["quats"], -1, axis=1)
     return {
@@ -80,13 +64,13 @@ def parameter_gradients(gradient, raw):
 
 @pytest.fixture(scope="module")
 def raw():
-    return make_raw()
+    return make_unit_scene()
 
 
 @pytest.fixture(scope="module")
 def weight(raw):
-    """A random linear loss on all channels, where normalised ones do not divide by almost nothing."""
-    solid = twin(raw, make_view())["alpha"] > 0.02
+    """A random linear loss on all channels, where normalised channels do not divide by a small alpha."""
+    solid = rasterize_view(raw, make_sensor_camera())["alpha"] > 0.02
     return np.float32(np.random.default_rng(1).normal(size=(*solid.shape[:2], 8)) * solid)
 
 
@@ -101,42 +85,42 @@ def gradients(raw, weight):
 
 
 @pytest.mark.parametrize("srgb_primitives", [True, False])
-def test_image_is_the_rasterisers_in_linear_light(raw, srgb_primitives):
+def test_gaussian_splat__image_is_the_rasterisers_in_linear_light(raw, srgb_primitives):
     gaussians = to_gaussians(raw)
     image = np.asarray(mi.render(make_mitsuba_scene(gaussians, srgb_primitives=srgb_primitives)))
-    color = np.asarray(rasterize(gaussians, make_view()).color, np.float64)
+    color = np.asarray(rasterize(gaussians, make_sensor_camera()).color, np.float64)
     expected = to_linear(color) if srgb_primitives else color
-    assert np.abs(image - expected).max() < tol.IMAGE_ABS
+    assert_close(image, expected, atol=tol.IMAGE_ABS)
 
 
-def test_all_channels_agree_with_twin_under_their_exr_names(raw):
+def test_gaussian_splat__channels_agree_with_the_reference_under_their_exr_names(raw):
     scene = make_mitsuba_scene(to_gaussians(raw), {"pixel_format": "rgba"}, aovs=AOVS)
     image, expected = np.asarray(mi.render(scene)), expected_image(raw)
     solid = expected[..., 3:4] > 0.02
-    assert np.abs((image - expected) * solid).max() < tol.IMAGE_ABS * np.abs(expected).max()
+    assert_close(image, expected, atol=tol.IMAGE_ABS * np.abs(expected).max(), where=solid)
     fields = [field.name for field in scene.sensors()[0].film().bitmap().struct_()]
     assert fields == ["R", "G", "B", "A", "motion.X", "motion.Y", "confidence.Y", "depth.Y"]
 
 
-def test_aovs_come_in_the_order_asked_for(raw):
+def test_gaussian_splat__writes_aovs_in_the_requested_order(raw):
     scene = make_mitsuba_scene(to_gaussians(raw), aovs=" depth, motion ")
     assert scene.integrator().aov_names() == ["depth.Y", "motion.X", "motion.Y"]
-    image = rasterize(to_gaussians(raw), make_view(), ("depth", "motion"))
+    image = rasterize(to_gaussians(raw), make_sensor_camera(), ("depth", "motion"))
     expected = np.concatenate([np.asarray(image.depth), np.asarray(image.motion)], axis=2)
-    # The sensor's angles and inverse pose are rounded on their way.
-    solid = np.asarray(rasterize(to_gaussians(raw), make_view()).alpha) > 0.02
-    assert np.abs((np.asarray(mi.render(scene))[..., 3:] - expected) * solid).max() < 5 * tol.IMAGE_ABS
+    # The sensor's angles and inverse pose are rounded.
+    solid = np.asarray(rasterize(to_gaussians(raw), make_sensor_camera()).alpha) > 0.02
+    assert_close(np.asarray(mi.render(scene))[..., 3:], expected, atol=5 * tol.IMAGE_ABS, where=solid)
 
 
-def test_pixel_formats(raw):
+def test_gaussian_splat__supports_pixel_formats(raw):
     rgb = np.asarray(mi.render(make_mitsuba_scene(to_gaussians(raw))))
     scene = make_mitsuba_scene(to_gaussians(raw), {"pixel_format": "luminance"}, aovs="confidence")
     luminance = np.asarray(mi.render(scene))
     assert luminance.shape == (*rgb.shape[:2], 2)
-    assert np.abs(luminance[..., 0] - rgb @ (0.212671, 0.715160, 0.072169)).max() < tol.IMAGE_ABS
+    assert_close(luminance[..., 0], rgb @ (0.212671, 0.715160, 0.072169), atol=tol.IMAGE_ABS)
 
 
-def test_crop_is_cut_out_of_the_full_image(raw):
+def test_gaussian_splat__crop_equals_that_of_the_full_image(raw):
     full = np.asarray(mi.render(make_mitsuba_scene(to_gaussians(raw), aovs=AOVS)))
     crop = {"crop_offset_x": 5, "crop_offset_y": 7, "crop_width": 9, "crop_height": 4}
     image = np.asarray(mi.render(make_mitsuba_scene(to_gaussians(raw), crop, aovs=AOVS)))
@@ -144,24 +128,24 @@ def test_crop_is_cut_out_of_the_full_image(raw):
 
 
 @pytest.mark.parametrize("axis", ["x", "y", "diagonal", "smaller", "larger"])
-def test_field_of_view_along_any_axis(raw, axis):
-    camera = make_view()
+def test_gaussian_splat__supports_a_field_of_view_along_any_axis(raw, axis):
+    camera = make_sensor_camera()
     W, H, f = camera.width, camera.height, camera.K[0, 0]
     extent = {"x": W, "y": H, "diagonal": np.hypot(W, H), "smaller": min(W, H), "larger": max(W, H)}[axis]
     sensor = {"fov_axis": axis, "fov": float(np.rad2deg(2 * np.arctan(0.5 * extent / f)))}
     image = mi.render(make_mitsuba_scene(to_gaussians(raw), sensor=sensor))
     expected = mi.render(make_mitsuba_scene(to_gaussians(raw)))
-    assert np.abs(np.asarray(image) - np.asarray(expected)).max() < tol.IMAGE_ABS
+    assert_close(image, expected, atol=tol.IMAGE_ABS)
 
 
-def test_background_lies_behind(raw):
+def test_gaussian_splat__composites_over_the_background(raw):
     scene = make_mitsuba_scene(to_gaussians(raw), background={"type": "rgb", "value": [0.2, 0.5, 0.9]})
-    color = np.asarray(rasterize(to_gaussians(raw), make_view(), background=(0.2, 0.5, 0.9)).color, np.float64)
-    assert np.abs(np.asarray(mi.render(scene)) - to_linear(color)).max() < tol.IMAGE_ABS
+    color = np.asarray(rasterize(to_gaussians(raw), make_sensor_camera(), background=(0.2, 0.5, 0.9)).color, np.float64)
+    assert_close(mi.render(scene), to_linear(color), atol=tol.IMAGE_ABS)
 
 
 @pytest.mark.parametrize("sample_border", [False, True])
-def test_reconstruction_filter_weights_the_pixel_centres(raw, sample_border):
+def test_gaussian_splat__reconstruction_filter_weights_the_pixel_centres(raw, sample_border):
     crop = {"crop_offset_x": 4, "crop_offset_y": 5, "crop_width": 10, "crop_height": 8}
     film = {**crop, "rfilter": {"type": "gaussian", "stddev": 0.6}, "sample_border": sample_border}
     image = np.asarray(mi.render(make_mitsuba_scene(to_gaussians(raw), film)))
@@ -178,12 +162,12 @@ def test_reconstruction_filter_weights_the_pixel_centres(raw, sample_border):
         return values
 
     expected = (blur(samples) / blur(np.ones_like(samples)))[b : b + 8, b : b + 10]
-    # The border widens the view, and with it the region where splats are linearised at their own centre.
-    assert np.abs(image - expected).max() < (1e-3 if sample_border else tol.IMAGE_ABS)
+    # The border enlarges the view, and with it the region where splats are linearised at their own centre.
+    assert_close(image, expected, atol=1e-3 if sample_border else tol.IMAGE_ABS)
 
 
-def test_several_shapes_of_several_degrees_are_one_cloud():
-    raw = make_raw(degree=2)
+def test_gaussian_splat__renders_shapes_of_several_degrees_as_one_cloud():
+    raw = make_unit_scene(degree=2)
     raw["sh_coeffs"][4:, 1:] = 0
     parts = [to_gaussians({k: v[s] for k, v in raw.items()}) for s in (slice(0, 4), slice(4, 7), slice(7, None))]
     parts[1] = replace(parts[1], sh_coeffs=parts[1].sh_coeffs[:, :1])
@@ -191,9 +175,9 @@ def test_several_shapes_of_several_degrees_are_one_cloud():
     scene = {f"shape{i}": ellipsoids(part) for i, part in enumerate(parts)}
     scene["shape1"]["type"] = "ellipsoidsmesh"
     integrator = {"type": "gaussian_splat", "aovs": AOVS}
-    scene = mi.load_dict({"type": "scene", "sensor": make_view().sensor(), "integrator": integrator, **scene})
+    scene = mi.load_dict({"type": "scene", "sensor": make_sensor_camera().sensor(), "integrator": integrator, **scene})
     one = make_mitsuba_scene(to_gaussians(raw), aovs=AOVS)
-    assert np.abs(np.asarray(mi.render(scene)) - np.asarray(mi.render(one))).max() < tol.IMAGE_ABS
+    assert_close(mi.render(scene), mi.render(one), atol=tol.IMAGE_ABS)
 
     params, expected = mi.traverse(scene), mi.traverse(one)
     for p, keys in ((params, ["shape0.data", "shape1.data", "shape2.data"]), (expected, ["gaussians.data"])):
@@ -201,11 +185,11 @@ def test_several_shapes_of_several_degrees_are_one_cloud():
     for s, p in ((scene, params), (one, expected)):
         dr.backward(dr.sum(dr.square(mi.render(s, p)[..., :3]), axis=None))
     found = np.concatenate([np.asarray(dr.grad(params[f"shape{i}.data"])) for i in range(3)])
-    assert relative(found, np.asarray(dr.grad(expected["gaussians.data"]))) < tol.GRADIENT_REL
+    assert_close(found, dr.grad(expected["gaussians.data"]), rtol=tol.GRADIENT_REL)
 
 
-def test_one_scene_renders_with_mitsubas_own_integrator_too():
-    """Ray tracing knows no low-pass filter, no linearised projection and orders by entry: alike, not equal."""
+def test_gaussian_splat__agrees_with_mitsubas_own_integrator():
+    """Ray tracing has no low-pass filter, no linearised projection and orders by entry: similar, not equal."""
     rng = np.random.default_rng(3)
     quats = rng.normal(size=(20, 4))
     sh_coeffs = rng.normal(size=(20, 4, 3)) * 0.4
@@ -218,28 +202,48 @@ def test_one_scene_renders_with_mitsubas_own_integrator_too():
     splatted = np.asarray(mi.render(scene, integrator=mi.load_dict({"type": "gaussian_splat"})))
     traced = np.asarray(mi.render(scene, integrator=mi.load_dict({"type": "volprim_rf_basic"}), spp=16))
     psnr = -10 * np.log10(np.mean((splatted - traced) ** 2))
-    assert psnr > 45  # 51 dB, of which Mitsuba's cut at `extent` standard deviations costs one
+    assert psnr > 45  # 51 dB, of which Mitsuba's cut-off at `extent` standard deviations costs one
+
+
+def test_gaussian_splat__renders_a_new_attribute_of_the_table(raw, monkeypatch):
+    """Every attribute with a channel is a shape attribute and an AOV."""
+    for attribute in NEW_ATTRIBUTES:
+        monkeypatch.setitem(BY_ACTIVATED_NAME, attribute.activated_name, attribute)
+    normals = np.float32(np.random.default_rng(6).normal(size=(len(raw["means"]), 3)))
+    gaussians = ExtendedGaussians(**raw, logit_roughness=raw["logit_confidence"], normals=normals)
+    scene = make_mitsuba_scene(gaussians, aovs="roughness,confidence,normal")
+    assert scene.integrator().aov_names() == ["roughness.Y", "confidence.Y", "normal.X", "normal.Y", "normal.Z"]
+    image = np.asarray(mi.render(scene))
+    assert np.abs(image[..., 3]).max() > 0
+    assert_close(image[..., 3], image[..., 4])
+    assert_close(image[..., 5:], rasterize(gaussians, make_sensor_camera(), ("normal",))["normal"], atol=tol.IMAGE_ABS)
+    integrator, bare = (
+        mi.load_dict({"type": "gaussian_splat", "aovs": "roughness"}),
+        make_mitsuba_scene(to_gaussians(raw)),
+    )
+    with pytest.raises(ValueError, match=r"must have `roughness` \[N, 1\] with N=10, got only"):
+        integrator.render(bare)
 
 
 # ----------------------------------------------------------------- gradients
 
 
-def test_backward_agrees_with_twin_for_every_parameter(raw, weight, gradients):
+def test_gaussian_splat__backward_agrees_with_the_reference_for_every_parameter(raw, weight, gradients):
     scene = make_mitsuba_scene(to_gaussians(raw), {"pixel_format": "rgba"}, aovs=AOVS)
     params = mi.traverse(scene)
     dr.enable_grad([params[name] for name in gradients])
     dr.backward(dr.sum(mi.render(scene, params) * mi.TensorXf(weight), axis=None))
     for name, expected in gradients.items():
-        assert relative(np.asarray(dr.grad(params[name])), expected) < tol.GRADIENT_REL, name
+        assert_close(dr.grad(params[name]), expected, rtol=tol.GRADIENT_REL, name=name)
 
 
-def test_forward_agrees_with_twin(raw, weight, gradients):
-    """All parameters move at once; the loss's derivative is <gradient, direction>."""
+def test_gaussian_splat__forward_agrees_with_the_reference(raw, weight, gradients):
+    """All parameters change at once; the derivative of the loss is <gradient, direction>."""
     scene = make_mitsuba_scene(to_gaussians(raw), {"pixel_format": "rgba"}, aovs=AOVS)
     params, rng = mi.traverse(scene), np.random.default_rng(2)
     slope = 0.0
     for name, gradient in gradients.items():
-        # The sign of the gradient as direction: no cancellation hides an error.
+        # The direction is the sign of the gradient, so that no cancellation hides an error.
         direction = np.float32(np.sign(gradient) * rng.uniform(0.5, 1, gradient.shape))
         dr.enable_grad(params[name])
         dr.set_grad(params[name], mi.Float(direction))
@@ -250,11 +254,11 @@ def test_forward_agrees_with_twin(raw, weight, gradients):
     assert found == pytest.approx(slope, rel=tol.GRADIENT_REL)
 
 
-def test_backward_agrees_with_central_differences(raw):
+def test_gaussian_splat__backward_agrees_with_central_differences(raw):
     scene = make_mitsuba_scene(to_gaussians(raw))
     params = mi.traverse(scene)
     for name in ("gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs"):
-        start = np.array(params[name])  # a copy: the parameter is a reference to what the scene holds
+        start = np.array(params[name])  # a copy: the parameter is a reference to the scene's array
         dr.enable_grad(params[name])
         dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
         gradient = np.asarray(dr.grad(params[name]), np.float64)
@@ -269,8 +273,8 @@ def test_backward_agrees_with_central_differences(raw):
         assert slope == pytest.approx(np.vdot(gradient, direction), rel=tol.CENTRAL_DIFFERENCE_REL), name
 
 
-def test_gradient_of_the_sensors_pose(raw):
-    """The camera moves to its left by t: to_world = M T(t), so viewmat moves its points to the right."""
+def test_gaussian_splat__gradient_of_the_sensors_pose(raw):
+    """The camera moves to its left by t: to_world = M T(t), so that viewmat moves points to the right."""
     scene = make_mitsuba_scene(to_gaussians(raw))
     params = mi.traverse(scene)
     t = mi.Float(0)
@@ -280,15 +284,15 @@ def test_gradient_of_the_sensors_pose(raw):
     dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
     right = np.zeros((4, 4))
     right[0, 3] = 1
-    viewmat = np.float32(make_view().viewmat).astype(np.float64)
+    viewmat = np.float32(make_sensor_camera().viewmat).astype(np.float64)
     expected = reference.directional(
         lambda v: np.sum(expected_image(raw, v["viewmat"])[..., :3] ** 2), {"viewmat": viewmat}, {"viewmat": right}
     )
     assert dr.grad(t)[0] == pytest.approx(expected, rel=10 * tol.GRADIENT_REL)
 
 
-def test_filter_and_crop_are_differentiated(raw):
-    """<g, J v> = <J' g, v> through a film that blurs, crops and weighs."""
+def test_gaussian_splat__differentiates_filter_and_crop(raw):
+    """<g, J v> = <J' g, v> through a film that blurs, crops and normalises."""
     film = {
         "rfilter": {"type": "gaussian"},
         "crop_offset_x": 3,
@@ -313,8 +317,8 @@ def test_filter_and_crop_are_differentiated(raw):
 # ---------------------------------------------------------------- as a plugin
 
 
-def test_undeveloped_renders_can_be_written(raw, tmp_path):
-    """The command `mitsuba scene.xml` asks for no tensor and writes the film."""
+def test_gaussian_splat__writes_undeveloped_renders(raw, tmp_path):
+    """The command `mitsuba scene.xml` requests no tensor and writes the film."""
     scene = make_mitsuba_scene(to_gaussians(raw), aovs=AOVS)
     image = np.asarray(mi.render(scene))
     assert scene.integrator().render(scene, develop=False).shape == (0,)
@@ -323,7 +327,7 @@ def test_undeveloped_renders_can_be_written(raw, tmp_path):
     np.testing.assert_array_equal(np.array(mi.Bitmap(str(path)))[..., :3], image[..., :3])
 
 
-def test_xml_scene_with_props(raw):
+def test_gaussian_splat__reads_props_of_an_xml_scene(raw):
     text = """<integrator version="3.0.0" type="gaussian_splat">
         <string name="aovs" value="depth"/><boolean name="srgb_primitives" value="false"/>
         <rgb name="background" value="0.1, 0.2, 0.3"/>
@@ -331,12 +335,12 @@ def test_xml_scene_with_props(raw):
     integrator = mi.load_string(text)
     assert integrator.background == pytest.approx([0.1, 0.2, 0.3])
     image = np.asarray(mi.render(make_mitsuba_scene(to_gaussians(raw)), integrator=integrator))
-    expected = np.asarray(rasterize(to_gaussians(raw), make_view(), background=(0.1, 0.2, 0.3)).color)
-    assert np.abs(image[..., :3] - expected).max() < tol.IMAGE_ABS
+    expected = np.asarray(rasterize(to_gaussians(raw), make_sensor_camera(), background=(0.1, 0.2, 0.3)).color)
+    assert_close(image[..., :3], expected, atol=tol.IMAGE_ABS)
 
 
-def test_emitters_are_ignored_with_one_warning(raw, caplog):
-    shape, sensor = ellipsoids(to_gaussians(raw)), make_view().sensor()
+def test_gaussian_splat__ignores_emitters_with_one_warning(raw, caplog):
+    shape, sensor = ellipsoids(to_gaussians(raw)), make_sensor_camera().sensor()
     scene = {"type": "scene", "gaussians": shape, "sensor": sensor, "integrator": {"type": "gaussian_splat"}}
     dark, lit = mi.load_dict(scene), mi.load_dict({**scene, "sky": {"type": "constant"}})
     with caplog.at_level(logging.WARNING):
@@ -345,8 +349,8 @@ def test_emitters_are_ignored_with_one_warning(raw, caplog):
     assert [r.getMessage().split(";")[0] for r in caplog.records] == ["gaussian_splat ignores the scene's emitters"]
 
 
-def test_switching_variants_keeps_the_plugin_registered():
-    """Importing before any variant is set works; a variant without derivatives is refused in words."""
+def test_gaussian_splat__stays_registered_when_variants_are_switched():
+    """Importing before any variant is set works; a variant without derivatives is refused with an explanation."""
     script = r"""
 import morgs_mi, mitsuba as mi
 for variant in ("scalar_rgb", "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
@@ -366,7 +370,7 @@ for variant in ("scalar_rgb", "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
     ]
 
 
-def test_reusing_a_shape_after_density_control(raw):
+def test_gaussian_splat__renders_a_shape_after_density_control(raw):
     """All attributes of a shape may change their length together."""
     scene = make_mitsuba_scene(to_gaussians(raw))
     params = mi.traverse(scene)
@@ -375,12 +379,12 @@ def test_reusing_a_shape_after_density_control(raw):
     for name in ("data", "opacities", "sh_coeffs", "motion", "confidence"):
         params[f"gaussians.{name}"] = shape[name].array
     params.update()
-    expected = to_linear(np.asarray(rasterize(to_gaussians(half), make_view()).color, np.float64))
-    assert np.abs(np.asarray(mi.render(scene)) - expected).max() < tol.IMAGE_ABS
+    expected = to_linear(np.asarray(rasterize(to_gaussians(half), make_sensor_camera()).color, np.float64))
+    assert_close(mi.render(scene), expected, atol=tol.IMAGE_ABS)
 
 
 def with_shape(**changes):
-    shape = {**ellipsoids(to_gaussians(make_raw())), **changes}
+    shape = {**ellipsoids(to_gaussians(make_unit_scene())), **changes}
     return {"gaussians": {name: value for name, value in shape.items() if value is not None}}
 
 
@@ -391,8 +395,8 @@ def ones(*shape):
 BAD_SCENES = {
     "no shape": (lambda: {"gaussians": None}, {}, "expected a scene with an `ellipsoids` shape, got none"),
     "mesh": (lambda: {"wall": {"type": "rectangle"}}, {}, "expected `ellipsoids` shapes only, got Rectangle 'wall'"),
-    "no opacities": (lambda: with_shape(opacities=None), {}, r"'gaussians' must carry `opacities` \[N, 1\] with N=10"),
-    "no sh": (lambda: with_shape(sh_coeffs=None), {}, r"must carry `sh_coeffs` \[N, 3 or 12 or 27 or 48\]"),
+    "no opacities": (lambda: with_shape(opacities=None), {}, r"'gaussians' must have `opacities` \[N, 1\] with N=10"),
+    "no sh": (lambda: with_shape(sh_coeffs=None), {}, r"must have `sh_coeffs` \[N, 3 or 12 or 27 or 48\]"),
     "odd sh": (lambda: with_shape(sh_coeffs=ones(10, 6)), {}, r"with N=10, got 60 values"),
     "no motion": (
         lambda: with_shape(motion=None),
@@ -410,20 +414,20 @@ BAD_SCENES = {
 
 
 @pytest.mark.parametrize("case", BAD_SCENES)
-def test_bad_scenes_say_what_was_expected(case):
+def test_gaussian_splat__refuses_bad_scenes(case):
     change, props, message = BAD_SCENES[case]
-    scene = {"type": "scene", "sensor": make_view().sensor(), **with_shape(), **change()}
+    scene = {"type": "scene", "sensor": make_sensor_camera().sensor(), **with_shape(), **change()}
     scene = mi.load_dict({name: value for name, value in scene.items() if value is not None})
     integrator = mi.load_dict({"type": "gaussian_splat", **props})
     with pytest.raises(ValueError, match=message):
         integrator.render(scene)
-    # mi.render wraps whatever an integrator raises.
+    # mi.render wraps the errors of an integrator.
     with pytest.raises(RuntimeError) as error:
         mi.render(scene, integrator=integrator)
     assert isinstance(error.value.__cause__, ValueError)
 
 
-def test_films_of_other_quantities_than_rgb_are_refused():
+def test_gaussian_splat__refuses_films_other_than_rgb():
     mi.set_variant("llvm_ad_spectral")
     film = {"type": "specfilm", "band": {"type": "spectrum", "value": [(400, 0.5), (700, 0.5)]}}
     scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "film": film}, **with_shape()})
@@ -439,6 +443,6 @@ def test_films_of_other_quantities_than_rgb_are_refused():
         ({"background": [0.5, 0.5]}, "background"),
     ],
 )
-def test_bad_props_are_refused_when_the_scene_is_loaded(props, message):
+def test_gaussian_splat__refuses_bad_props_when_the_scene_is_loaded(props, message):
     with pytest.raises(RuntimeError, match=message):
         mi.load_dict({"type": "gaussian_splat", **props})

@@ -1,4 +1,4 @@
-"""CUDA against LLVM: the same kernels, compiled for another machine. Run with `pytest -m gpu`."""
+"""CUDA against LLVM: the same kernels on both backends. Run with `pytest -m gpu`."""
 
 from __future__ import annotations
 
@@ -9,8 +9,17 @@ import pytest
 
 from morgs_mi import rasterize
 from tests import tolerances as tol
-from tests.render.test_rasterize import CHANNELS, RAW, make_camera, make_scene, relative, to_gaussians
-from tests.test_gaussian_integrator import AOVS, make_mitsuba_scene, make_raw
+from tests.assertions import assert_close
+from tests.scenes import (
+    AOVS,
+    CHANNELS,
+    RAW,
+    make_camera,
+    make_mitsuba_scene,
+    make_scene,
+    make_unit_scene,
+    to_gaussians,
+)
 
 pytestmark = [
     pytest.mark.gpu,
@@ -19,7 +28,7 @@ pytestmark = [
 
 
 def on(variant, function):
-    """Run `function` with this variant; what it returns must be NumPy arrays by name."""
+    """Return the arrays by name that `function` returns with this variant."""
     mi.set_variant(variant)
     return {name: np.array(value, np.float64) for name, value in function().items()}
 
@@ -29,11 +38,11 @@ def assert_variants_agree(function):
     assert cpu.keys() == gpu.keys()
     for name in cpu:
         assert np.isfinite(gpu[name]).all(), name
-        assert relative(gpu[name], cpu[name]) < tol.GRADIENT_REL, name
+        assert_close(gpu[name], cpu[name], rtol=tol.GRADIENT_REL, name=name)
 
 
 @pytest.mark.parametrize("n", [10, 300])
-def test_rasterize(n):
+def test_rasterize__agrees_between_cuda_and_llvm(n):
     camera = make_camera(70, 45)
     raw = make_scene(n=n)
     weight = np.float32(np.random.default_rng(1).normal(size=(45, 70, 3)))
@@ -41,16 +50,16 @@ def test_rasterize(n):
     def run():
         gaussians = to_gaussians(raw, grad=True)
         image = rasterize(gaussians, camera, CHANNELS)
-        solid = np.asarray(image.alpha) > 0.02  # elsewhere normalised channels divide by almost nothing
-        images = {name: np.asarray(dr.detach(getattr(image, name))) * solid for name in CHANNELS}
+        solid = np.asarray(image.alpha) > 0.02  # elsewhere normalised channels divide by a small alpha
+        images = {name: np.asarray(dr.detach(image[name])) * solid for name in CHANNELS}
         dr.backward(dr.sum(image.color * mi.TensorXf(weight), axis=None) + dr.sum(image.confidence, axis=None))
         return images | {f"gradient of {name}": dr.grad(getattr(gaussians, name)) for name in RAW}
 
     assert_variants_agree(run)
 
 
-def test_plugin():
-    raw = make_raw()
+def test_gaussian_splat__agrees_between_cuda_and_llvm():
+    raw = make_unit_scene()
 
     def run():
         scene = make_mitsuba_scene(
@@ -66,11 +75,11 @@ def test_plugin():
     assert_variants_agree(run)
 
 
-def test_switching_back_and_forth_keeps_the_plugin():
-    raw = make_raw()
+def test_gaussian_splat__survives_switching_variants():
+    raw = make_unit_scene()
     images = [
         on(variant, lambda: {"image": mi.render(make_mitsuba_scene(to_gaussians(raw)))})["image"]
         for variant in ("cuda_ad_rgb", "llvm_ad_rgb", "cuda_ad_rgb")
     ]
     np.testing.assert_array_equal(images[0], images[2])
-    assert np.abs(images[0] - images[1]).max() < tol.IMAGE_ABS
+    assert_close(images[0], images[1], atol=tol.IMAGE_ABS)

@@ -1,4 +1,4 @@
-"""Every numerical bound of the tests, with its reason."""
+"""Numerical tolerances of the tests, each with its reason."""
 
 # The traced renderer works in float32 with a 2^p of relative error 3e-6 and sums some tens of layers.
 IMAGE_ABS = 2e-5
@@ -18,7 +18,7 @@ FUZZ_GRADIENT_REL = 2e-3
 DUALITY_REL = 2e-4
 # Central differences of a float32 image at the best step are good to the cube root of its rounding.
 CENTRAL_DIFFERENCE_REL = 2e-2
-# SSIM subtracts squares of float32 means; the loss averages that over the picture.
+# SSIM subtracts squares of float32 means; the loss averages that over the image.
 LOSS_REL = 1e-4
 # The derivative of a float32 SSIM map against float64 differences.
 LOSS_GRADIENT_REL = 5e-3

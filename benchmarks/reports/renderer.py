@@ -25,6 +25,7 @@ from benchmarks.workloads import ball
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.evaluate.environment import machine, versions
+from morgs_mi.render.backend import block_shape
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 
@@ -84,7 +85,7 @@ def ladder() -> list[Setting]:
         settings.append(Setting("alpha_min", name, replace(default, alpha_min=default.alpha_min * factor)))
     for stop in (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2):
         settings.append(Setting("stop_transmittance", f"{stop:g}", replace(default, stop_transmittance=stop)))
-    own = default.block_shape(dr.backend_v(mi.Float) == dr.JitBackend.CUDA)
+    own = block_shape(default)
     for shape in dict.fromkeys([(4, 2), (4, 4), (8, 2), (8, 4), (8, 8), (16, 4), own]):
         width, height = (None, None) if shape == own else shape
         config = replace(default, block_width=width, block_height=height)

@@ -27,7 +27,7 @@ from benchmarks import workloads
 from benchmarks.speed import timing
 from morgs_mi import Camera, Gaussians
 from morgs_mi.evaluate.environment import machine, versions
-from morgs_mi.render.projection import CHANNEL_SIZES
+from morgs_mi.render.channels import channel_sizes
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def climb(options: Options) -> dict[str, Any]:
         gaussians, camera = workloads.build(rung, options.seed)
         row: dict[str, Any] = {"name": rung.name, "series": rung.series, "gaussians": rung.count}
         row |= {"size": list(rung.size), "scale": rung.scale, "channels": list(rung.channels)}
-        row |= {"columns": rung.features + sum(CHANNEL_SIZES.get(name, 0) for name in rung.channels)}
+        row |= {"columns": rung.features + sum(channel_sizes().get(name, 0) for name in rung.channels)}
         patience = 0.7 if options.quick else 2
         row |= figures(gaussians, camera, rung.channels, options, patience, rung.features)
         print(

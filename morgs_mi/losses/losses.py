@@ -24,9 +24,9 @@ def recon_loss(image: Tensor, target: Target, dssim_weight: float = 0.2, region:
         image: rendered image [H, W, 3], or an image on the region.
         target: image to match.
         dssim_weight: lambda.
-        region: the pixels that have changed since the target was given an image to `remember`; the first image stands
-            for a missing one. The derivative is that of the whole view; the value leaves out what cannot have changed:
-            pixels outside, and SSIM windows that contain none inside.
+        region: the only pixels that have changed since `Target.set_surroundings` was called; without that call, the
+            target itself surrounds the region. The derivative is that of the whole view; the value leaves out what
+            cannot have changed: pixels outside, and SSIM windows that contain none inside.
 
     Raises:
         ValueError: image and target differ in size.

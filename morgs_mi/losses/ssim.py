@@ -1,29 +1,29 @@
 """L_recon (eq. 2) and its derivative in two traced passes.
 
 L_recon is (1 - lambda) L1 + lambda (1 - SSIM). SSIM (Wang et al. 2004) has the 11x11 Gaussian window of sigma 1.5 and
-takes what is outside the picture as black. With x the picture, y its target and M the mean over a window,
+takes pixels outside the image as black. With x the image, y its target and M the mean over a window,
 
     SSIM = (2 Mx My + C1) (2 (Mxy - Mx My) + C2) / ((Mx^2 + My^2 + C1) (Mxx - Mx^2 + Myy - My^2 + C2)).
 
 Two traced passes, over a whole view or a region of it: the first computes SSIM's derivatives D by Mx, Mxx and Mxy at
-every window, the second sends them back through the window, which is its own transpose:
+every window, the second propagates them back through the window, which is its own transpose:
 
     dL/dx = (1 - lambda) sign(x - y) - lambda (M D_x + 2 x M D_xx + y M D_xy).
 
-In both, a SIMD lane walks down a run of rows of a strip (see `planes`). It blurs each row across as it comes, and adds
-it to the 11 windows that the row is part of: every number is read once, and no blurred row goes to memory.
+In both, a SIMD lane walks down a run of rows of a strip (see `ssim_layout`). It blurs each row horizontally and adds
+it to the 11 windows that contain the row: every number is read once, and no blurred row is written to memory.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.types import Bool, Float, Int32, Jit, Tensor, UInt32
 from morgs_mi.losses.ssim_layout import (
     COLUMN,
     RADIUS,
@@ -35,13 +35,13 @@ from morgs_mi.losses.ssim_layout import (
     read_packet,
     write_packet,
 )
-from morgs_mi.render.loops import on_aligned_stack
+from morgs_mi.render.backend import on_aligned_stack
 from morgs_mi.render.recording import recorded
 from morgs_mi.render.region import Region, owned_copy
 
 __all__ = ["OnRegion", "Target", "WholeView"]
 
-_Read = Callable[[Any], list[Any]]  # plane -> its numbers around the lane's row
+_Read = Callable[[Float], list[Float]]  # plane -> its numbers around the lane's row
 
 _C1, _C2 = 0.01**2, 0.03**2
 _WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
@@ -50,18 +50,18 @@ _TAPS = [float(tap) for tap in _WINDOW]
 
 
 class Target:
-    """A picture to be matched, with what SSIM needs of it computed once.
+    """A target image, with its terms of SSIM computed once.
 
     Args:
         image: [H, W, 3], RGB, uint8 or float in [0, 1], display-referred.
-        mask: [H, W] bool; what is False does not count. None: everything counts.
+        mask: [H, W] bool; pixels that are False do not count. None: all pixels count.
     """
 
     def __init__(self, image: np.ndarray, mask: np.ndarray | None = None) -> None:
         pixels = image.astype(np.float32) / 255 if image.dtype == np.uint8 else image.astype(np.float32)
         self.shape: tuple[int, ...] = pixels.shape
         self.planes = Planes(*pixels.shape[:2])
-        self.weight: Any = None
+        self.weight: Float | None = None
         if mask is not None and not mask.all():
             weight = np.repeat(mask[..., None], 3, axis=2).astype(np.float32)
             pixels, self.weight = pixels * weight, self._planes(weight)
@@ -69,37 +69,37 @@ class Target:
         self.pixels, self.mean = self._planes(pixels), self._planes(mean)
         self.variance = self._planes(_blur(pixels * pixels) - mean * mean)
         self.windows, self.lines = self.planes.runs(None, RADIUS), self.planes.runs(None, 0)
-        self.surroundings: Any = None
-        self.parts: dict[Region, tuple[Any, ...]] = {}
+        self.surroundings: Float | None = None
+        self._layouts: dict[Region, tuple[UInt32, Bool, Runs, Runs]] = {}
 
-    def _planes(self, picture: np.ndarray) -> Any:
-        planes = self.planes.of(owned_copy(mi.Float(picture.ravel())))
+    def _planes(self, image: np.ndarray) -> Float:
+        planes = self.planes.of(owned_copy(mi.Float(image.ravel())))
         dr.eval(planes)
         return planes
 
-    def difference(self, image: Any, region: Region | None = None) -> np.ndarray:
-        """Return this picture minus another, [H, W, 3] or on a region of it; 0 where masked."""
+    def difference(self, image: Tensor, region: Region | None = None) -> np.ndarray:
+        """Return the target minus an image, [H, W, 3] or on a region of it; 0 where masked."""
         if region is None or region.whole:
-            wrong = self.pixels - self.weighed(self.planes.of(owned_copy(dr.detach(image).array)))
-            return np.asarray(self.planes.picture(wrong)).reshape(self.shape)
-        places, inside, *_ = self.part(region)
-        own = dr.gather(mi.Float, self.pixels, places, active=inside)
-        return np.asarray(own - self.weighed(dr.detach(image).array, places)).reshape(region.shape(3))
+            error = self.pixels - self.masked(self.planes.of(owned_copy(dr.detach(image).array)))
+            return np.asarray(self.planes.image(error)).reshape(self.shape)
+        places, inside, *_ = self.layout_on(region)
+        pixels = dr.gather(mi.Float, self.pixels, places, active=inside)
+        return np.asarray(pixels - self.masked(dr.detach(image).array, places)).reshape(region.shape(3))
 
-    def part(self, region: Region) -> tuple[Any, ...]:
-        """Return where the numbers of a picture on a region lie, which are in the view, and the runs of both passes."""
-        if region not in self.parts:
+    def layout_on(self, region: Region) -> tuple[UInt32, Bool, Runs, Runs]:
+        """Return (places of the numbers of an image on a region, mask of those in the view, runs of both passes)."""
+        if region not in self._layouts:
             runs = self.planes.runs(region, RADIUS), self.planes.runs(region, 0)
-            self.parts[region] = (*self.planes.places_on(region), *runs)
-        return self.parts[region]
+            self._layouts[region] = (*self.planes.places_on(region), *runs)
+        return self._layouts[region]
 
-    def remember(self, image: Any) -> None:
-        """Keep a rendered picture [H, W, 3]: it surrounds what is compared on a region from now on."""
-        self.surroundings = self.weighed(self.planes.of(owned_copy(dr.detach(image).array)))
+    def set_surroundings(self, image: Tensor) -> None:
+        """Store a rendered image [H, W, 3] as the surroundings of the regions that are compared from now on."""
+        self.surroundings = self.masked(self.planes.of(owned_copy(dr.detach(image).array)))
         dr.eval(self.surroundings)
 
-    def weighed(self, values: Any, places: Any = None) -> Any:
-        """Return planes, or the numbers of them at `places`, without what does not count."""
+    def masked(self, values: Float, places: UInt32 | None = None) -> Float:
+        """Return planes, or their numbers at `places`, set to 0 where the mask is False."""
         if self.weight is None:
             return values
         return values * (self.weight if places is None else dr.gather(mi.Float, self.weight, places))
@@ -110,10 +110,10 @@ def _blur(image: np.ndarray) -> np.ndarray:
 
 
 class _Recon(dr.CustomOp):
-    gradient: Any
+    gradient: Float
 
-    def finish(self, gradient: Any, loss: Any) -> Any:
-        """Keep the derivative for `backward`, and return the value."""
+    def finish(self, gradient: Float, loss: Float) -> Float:
+        """Store the derivative for `backward`, and return the value."""
         self.gradient = gradient
         dr.eval(gradient, loss)
         return loss
@@ -129,46 +129,46 @@ class _Recon(dr.CustomOp):
 
 
 class WholeView(_Recon):
-    def eval(self, x: Any, target: Target, weight: float) -> Any:
+    def eval(self, x: Float, target: Target, weight: float) -> Float:
         planes = target.planes
-        picture = target.weighed(planes.of(x * dr.opaque(mi.Float, 1)))  # in memory of our own
-        gradient, loss = _passes(picture, target, weight, target.windows, target.lines)
-        return self.finish(planes.picture(target.weighed(gradient)), loss)
+        image = target.masked(planes.of(x * dr.opaque(mi.Float, 1)))  # in memory allocated by Dr.Jit
+        gradient, loss = _passes(image, target, weight, target.windows, target.lines)
+        return self.finish(planes.image(target.masked(gradient)), loss)
 
 
 class OnRegion(_Recon):
-    def eval(self, x: Any, target: Target, weight: float, region: Region) -> Any:
+    def eval(self, x: Float, target: Target, weight: float, region: Region) -> Float:
         if target.surroundings is None:
             target.surroundings = target.pixels + 0
-        picture, (places, inside, windows, pixels) = target.surroundings, target.part(region)
-        dr.scatter(picture, target.weighed(x, places), places, active=inside, mode=dr.ReduceMode.NoConflicts)
-        gradient, loss = _passes(picture, target, weight, windows, pixels)
-        return self.finish(target.weighed(dr.gather(mi.Float, gradient, places, active=inside), places), loss)
+        image, (places, inside, windows, pixels) = target.surroundings, target.layout_on(region)
+        dr.scatter(image, target.masked(x, places), places, active=inside, mode=dr.ReduceMode.NoConflicts)
+        gradient, loss = _passes(image, target, weight, windows, pixels)
+        return self.finish(target.masked(dr.gather(mi.Float, gradient, places, active=inside), places), loss)
 
 
-def _passes(picture: Any, target: Target, weight: float, windows: Runs, pixels: Runs) -> tuple[Any, Any]:
-    """Return dL/dx in planes, set on the runs of `pixels`, and L over the runs of `windows` and `pixels`."""
+def _passes(image: Float, target: Target, weight: float, windows: Runs, pixels: Runs) -> tuple[Float, Float]:
+    """Return dL/dx in planes, defined on the runs of `pixels`, and L over the runs of `windows` and `pixels`."""
     planes, scale = target.planes, dr.opaque(mi.Float, 1 / int(np.prod(target.shape)))
     height = dr.opaque(mi.Int32, planes.height)
-    dr.eval(picture)
-    given = (windows.lanes, height, picture, target.pixels, target.mean, target.variance)
-    derivatives, ssim = recorded(_similarity_pass, planes.size)(*given)
-    given = (pixels.lanes, height, picture, target.pixels, derivatives, scale)
-    (gradient,), error = recorded(_gradient_pass, planes.size, weight)(*given)
+    dr.eval(image)
+    arguments = (windows.lanes, height, image, target.pixels, target.mean, target.variance)
+    derivatives, ssim = recorded(_similarity_pass, planes.size)(*arguments)
+    arguments = (pixels.lanes, height, image, target.pixels, derivatives, scale)
+    (gradient,), error = recorded(_gradient_pass, planes.size, weight)(*arguments)
     structure = dr.opaque(mi.Float, windows.num_pixels) - dr.sum(ssim)
     return gradient, scale * ((1 - weight) * dr.sum(error) + weight * structure)
 
 
 def _similarity_pass(
-    size: int, lanes: Lanes, height: Any, picture: Any, target: Any, mean: Any, variance: Any
-) -> tuple[list[Any], Any]:
+    size: int, lanes: Lanes, height: Int32, image: Float, target: Float, mean: Float, variance: Float
+) -> tuple[list[Float], Float]:
     """Return the planes of SSIM's derivatives by M x, M xx and M xy, and the sum of SSIM over each run."""
 
-    def products(read: _Read) -> list[list[Any]]:
-        x, y = read(picture), read(target)
+    def products(read: _Read) -> list[list[Float]]:
+        x, y = read(image), read(target)
         return [x, [v * v for v in x], [v * w for v, w in zip(x, y, strict=True)]]
 
-    def similarity(read: _Read, blurred: list[list[Any]]) -> tuple[list[list[Any]], list[Any]]:
+    def similarity(read: _Read, blurred: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
         terms = [_similarity(*values) for values in zip(*blurred, read(mean), read(variance), strict=True)]
         ssim, *derivatives = map(list, zip(*terms, strict=True))
         return derivatives, ssim
@@ -176,7 +176,7 @@ def _similarity_pass(
     return _walk(size, lanes, height, products, similarity, 3)
 
 
-def _similarity(mx: Any, xx: Any, xy: Any, my: Any, variance: Any) -> tuple[Any, Any, Any, Any]:
+def _similarity(mx: Float, xx: Float, xy: Float, my: Float, variance: Float) -> tuple[Float, Float, Float, Float]:
     """Return SSIM of a window and its derivatives by M x, M xx and M xy."""
     a1, a2 = dr.fma(2 * mx, my, _C1), dr.fma(2.0, dr.fma(-mx, my, xy), _C2)
     b1, b2 = dr.fma(mx, mx, dr.fma(my, my, _C1)), dr.fma(-mx, mx, xx) + (variance + _C2)
@@ -188,89 +188,96 @@ def _similarity(mx: Any, xx: Any, xy: Any, my: Any, variance: Any) -> tuple[Any,
 
 
 def _gradient_pass(
-    size: int, weight: float, lanes: Lanes, height: Any, picture: Any, target: Any, derivatives: list[Any], scale: Any
-) -> tuple[list[Any], Any]:
+    size: int,
+    weight: float,
+    lanes: Lanes,
+    height: Int32,
+    image: Float,
+    target: Float,
+    derivatives: list[Float],
+    scale: Float,
+) -> tuple[list[Float], Float]:
     """Return the planes of dL/dx, and the sum of |x - y| over each run."""
 
-    def as_they_are(read: _Read) -> list[list[Any]]:
+    def unchanged(read: _Read) -> list[list[Float]]:
         return [read(plane) for plane in derivatives]
 
-    def gradient(read: _Read, blurred: list[list[Any]]) -> tuple[list[list[Any]], list[Any]]:
+    def gradient(read: _Read, blurred: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
         row, errors = [], []
-        for x, y, d_x, d_xx, d_xy in zip(read(picture), read(target), *blurred, strict=True):
+        for x, y, d_x, d_xx, d_xy in zip(read(image), read(target), *blurred, strict=True):
             error, structure = x - y, dr.fma(y, d_xy, dr.fma(2 * x, d_xx, d_x))
             sign = dr.select(error > 0, 1.0, dr.select(error < 0, -1.0, 0.0))
             row.append(scale * ((1 - weight) * sign - weight * structure))
             errors.append(dr.abs(error))
         return [row], errors
 
-    return _walk(size, lanes, height, as_they_are, gradient, 1)
+    return _walk(size, lanes, height, unchanged, gradient, 1)
 
 
 def _walk(
     size: int,
     lanes: Lanes,
-    height: Any,
-    across: Callable[[_Read], list[list[Any]]],
-    finish: Callable[[_Read, list[list[Any]]], tuple[list[list[Any]], list[Any]]],
+    height: Int32,
+    across: Callable[[_Read], list[list[Float]]],
+    finish: Callable[[_Read, list[list[Float]]], tuple[list[list[Float]], list[Float]]],
     outputs: int,
-) -> tuple[list[Any], Any]:
-    """Walk down the runs with a window: blur what `across` reads of each row, and write what `finish` makes of it.
+) -> tuple[list[Float], Float]:
+    """Walk down the runs with a window: blur the rows that `across` returns, and write those that `finish` returns.
 
     Args:
-        size: of the planes.
+        size: size of the planes.
         lanes: the runs.
-        height: of the picture.
-        across: read -> three rows of numbers, 5 more on both sides than a strip is wide.
-        finish: (read, three blurred rows of a strip) -> (rows of a strip to write, row of a strip to sum up).
-        outputs: how many rows it writes.
+        height: height of the image.
+        across: read -> three rows of numbers, wider than a strip by 5 on both sides.
+        finish: (read, three blurred rows of a strip) -> (rows of a strip to write, row of a strip to sum).
+        outputs: number of rows to write.
 
     Returns:
-        The planes that were written, set on the runs, and the sum over the pixels of each run.
+        The planes that were written, defined on the runs, and the sum over the pixels of each run.
     """
-    many = packet_type()
+    packet = packet_type()
     targets = [dr.empty(mi.Float, size) for _ in range(outputs)]
 
-    def blurred(row: Any, height: Any, places: Any) -> Any:
+    def blurred(row: Int32, height: Int32, places: tuple[UInt32, UInt32, UInt32]) -> Jit:
         inside, down = (row >= 0) & (row < height), mi.UInt32(row) * COLUMN
 
-        def wide(plane: Any) -> list[Any]:
+        def wide(plane: Float) -> list[Float]:
             numbers = [v for place in places for v in read_packet(plane, place + down, inside)]
             return numbers[STRIP - RADIUS : 2 * STRIP + RADIUS]
 
         sums = []
         for values in across(wide):
-            shifted = [many(values[k : k + STRIP]) for k in range(2 * RADIUS + 1)]
+            shifted = [packet(values[k : k + STRIP]) for k in range(2 * RADIUS + 1)]
             total = shifted[0] * _TAPS[0]
             for tap, v in zip(_TAPS[1:], shifted[1:], strict=True):
                 total = dr.fma(v, tap, total)
             sums += list(total)
-        return many(sums)
+        return packet(sums)
 
     def body(row, end, first, places, columns, height, windows, total, targets):
-        # Two rows at a time, so that the windows are read and written half as often. Window k ends k rows further down.
+        # Two rows per turn, so that the windows are read and written half as often. Window k ends k rows further down.
         a, b, w = blurred(row, height, places), blurred(row + 1, height, places), _TAPS
         done = dr.fma(a, w[0], windows[0]), dr.fma(b, w[0], dr.fma(a, w[1], windows[1]))
         windows = [dr.fma(a, w[k], dr.fma(b, w[k - 1], windows[k])) for k in range(2, 2 * RADIUS)]
         windows += [dr.fma(a, w[-1], b * w[-2]), b * w[-1]]
 
-        there = [columns > k for k in range(STRIP)]
+        inside = [columns > k for k in range(STRIP)]
         for k in range(2):
             at = row + k - RADIUS
             center, ready = places[1] + mi.UInt32(at) * COLUMN, (at >= first) & (at < end)
 
-            def narrow(plane: Any, center: Any = center, ready: Any = ready) -> list[Any]:
+            def narrow(plane: Float, center: UInt32 = center, ready: Bool = ready) -> list[Float]:
                 return list(read_packet(plane, center, ready))
 
             sums = list(done[k])
             written, summed = finish(narrow, [sums[STRIP * c : STRIP * (c + 1)] for c in range(3)])
             for target, values in zip(targets, written, strict=True):
-                write_packet(target, [dr.select(t, v, 0) for t, v in zip(there, values, strict=True)], center, ready)
-            for t, v in zip(there, summed, strict=True):
+                write_packet(target, [dr.select(t, v, 0) for t, v in zip(inside, values, strict=True)], center, ready)
+            for t, v in zip(inside, summed, strict=True):
                 total = total + dr.select(t & ready, v, 0)
         return row + 2, end, first, places, columns, height, windows, total, targets
 
-    windows = [many([mi.Float(0) for _ in range(3 * STRIP)]) for _ in range(2 * RADIUS)]
+    windows = [packet([mi.Float(0) for _ in range(3 * STRIP)]) for _ in range(2 * RADIUS)]
     end = on_aligned_stack(lanes.end)
     state = (lanes.first - RADIUS, end, lanes.first, lanes.places, lanes.columns, height, windows, mi.Float(0), targets)
     *_, total, targets = dr.while_loop(state, lambda row, end, *_: row < end + RADIUS, body, label="window")

@@ -1,59 +1,59 @@
-"""Pictures as planes, and the runs of rows in which a separable window walks over them.
+"""Memory layout of images as planes, and the runs of rows over which a separable window walks.
 
-A strip is 8 pixels across, a column 16 strips. The three components of a picture [H, W, 3] lie one after the other,
-each column by column, and a column row by row: 16 SIMD lanes that walk down 16 strips side by side read one stretch of
-memory. Two strips of zeros lie on either side of a picture: there the derivatives of its windows are 0, and read.
+A strip is 8 pixels wide, a column 16 strips. The three components of an image [H, W, 3] are stored one after the other,
+each column by column, and a column row by row: 16 SIMD lanes that walk down 16 neighbouring strips read one contiguous
+section of memory. Two strips of zeros lie on either side of an image: derivatives of windows there are 0, and are read.
 """
 
 from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.types import Bool, Float, Int32, Jit, UInt32
 from morgs_mi.render.region import Region, owned_copy, quotient
 
 __all__ = ["COLUMN", "RADIUS", "STRIP", "Lanes", "Planes", "Runs", "packet_type", "read_packet", "write_packet"]
 
 RADIUS = 5
-STRIP = 8  # pixels across: a window reaches at most into the next strip
+STRIP = 8  # pixels wide: a window extends at most into the next strip
 COLUMN = 16  # strips
 _SPARE = 2  # strips on either side
-# Rows of a run: enough that the 10 rows before it hardly count, few enough to keep every thread busy.
+# Rows of a run: enough that the 10 rows before it cost little, few enough to occupy every thread.
 _LONGEST = 64
 
 
 @dataclass(frozen=True)
 class Lanes:
-    """Stretches of rows of strips, in all three planes, one for each SIMD lane.
+    """Runs of rows of strips, in all three planes, one for each SIMD lane.
 
     Attributes:
-        places: where row 0 of the strip to the left, of the strip, and of the one to the right lie, in strips.
-        first: row.
-        end: row.
-        columns: of the strip that lie in the picture, 0 to 8.
+        places: places of row 0 of the strip to the left, of the strip, and of the one to the right, in strips.
+        first: first row.
+        end: row past the last.
+        columns: number of the strip's columns that lie in the image, 0 to 8.
     """
 
-    places: tuple[Any, Any, Any]
-    first: Any
-    end: Any
-    columns: Any
+    places: tuple[UInt32, UInt32, UInt32]
+    first: Int32
+    end: Int32
+    columns: UInt32
 
 
 @dataclass(frozen=True)
 class Runs:
-    """What a window walks over: the lanes, and how many numbers of the picture they cover."""
+    """The lanes over which a window walks, and the number of the image's numbers that they cover."""
 
     lanes: Lanes
     num_pixels: int
 
 
 class Planes:
-    """The layout of a picture [H, W, 3] in planes."""
+    """The layout of an image [H, W, 3] in planes."""
 
     def __init__(self, height: int, width: int) -> None:
         self.height, self.width = height, width
@@ -61,13 +61,13 @@ class Planes:
         self.num_columns = -(-(self.num_strips + 2 * _SPARE) // COLUMN)
         self.size = 3 * self.num_columns * height * COLUMN * STRIP
 
-    def of(self, picture: Any) -> Any:
-        """Return the planes of a flat picture [H * W * 3] in memory of Dr.Jit's own (see `region.owned_copy`)."""
+    def of(self, image: Float) -> Float:
+        """Return the planes of a flat image [H * W * 3] in memory allocated by Dr.Jit (see `region.owned_copy`)."""
         if self.width % STRIP == 0:
             target = dr.empty(mi.Float, self.size)
             strip, y, places = self._strips(self.num_columns * COLUMN)
             strip, strips = strip - _SPARE, dr.opaque(mi.UInt32, self.num_strips)
-            reads = [read_packet(picture, 3 * (y * strips + strip) + k, strip < strips) for k in range(3)]
+            reads = [read_packet(image, 3 * (y * strips + strip) + k, strip < strips) for k in range(3)]
             values = [v for read in reads for v in read]
             for component, place in enumerate(places):
                 write_packet(target, values[component::3], place)
@@ -80,10 +80,10 @@ class Planes:
         column -= component * dr.opaque(mi.UInt32, self.num_columns)
         x += column * (COLUMN * STRIP) - _SPARE * STRIP
         width = dr.opaque(mi.UInt32, self.width)
-        return dr.gather(mi.Float, picture, (y * width + x) * 3 + component, active=x < width)
+        return dr.gather(mi.Float, image, (y * width + x) * 3 + component, active=x < width)
 
-    def picture(self, planes: Any) -> Any:
-        """Return the flat picture [H * W * 3] of planes."""
+    def image(self, planes: Float) -> Float:
+        """Return the flat image [H * W * 3] of planes."""
         if self.width % STRIP == 0:
             target = dr.empty(mi.Float, 3 * self.height * self.width)
             strip, y, places = self._strips(self.num_strips, _SPARE)
@@ -99,19 +99,19 @@ class Planes:
         place = self._place(lane - 3 * pixel, y, pixel - y * dr.opaque(mi.UInt32, self.width))
         return dr.gather(mi.Float, planes, place)
 
-    def _strips(self, count: int, first: int = 0) -> tuple[Any, Any, list[Any]]:
-        """Return (strip, row) of `count` strips of every row, and where strip `first` + strip lies in each plane."""
+    def _strips(self, count: int, first: int = 0) -> tuple[UInt32, UInt32, list[UInt32]]:
+        """Return (strip, row) of `count` strips of every row, and the place of strip `first` + strip in each plane."""
         lane = dr.arange(mi.UInt32, self.height * count)
         y = quotient(lane, count)
         strip = lane - y * dr.opaque(mi.UInt32, count)
         x = (strip + first) * STRIP - _SPARE * STRIP
         return strip, y, [self._place(mi.UInt32(component), y, x) // STRIP for component in range(3)]
 
-    def _place(self, component: Any, y: Any, x: Any) -> Any:
+    def _place(self, component: UInt32, y: UInt32, x: UInt32) -> UInt32:
         return _place(component, y, x, dr.opaque(mi.UInt32, self.height), dr.opaque(mi.UInt32, self.num_columns))
 
-    def places_on(self, region: Region) -> tuple[Any, Any]:
-        """Return where the numbers of a flat picture on a region lie, and which of them are in the view."""
+    def places_on(self, region: Region) -> tuple[UInt32, Bool]:
+        """Return the places of the numbers of a flat image on a region, and the mask of those in the view."""
         x, y = (np.repeat(v.ravel(), 3) for v in region.pixels())
         component = np.tile(np.arange(3), len(x) // 3)
         inside = (x < self.width) & (y < self.height)
@@ -132,13 +132,13 @@ class Planes:
             drawn[:, 0], drawn[:, -1] = drawn[:, 1], drawn[:, -2]
             count = np.pad(drawn, ((1, 0), (0, 0))).cumsum(0)
             drawn = count[2 * reach + 1 :] > count[: -2 * reach - 1]
-        strip, first, end = _stretches(drawn.T)
+        strip, first, end = _cell_runs(drawn.T)
         columns = np.clip(self.width - (strip - 1) * STRIP, 0, STRIP) * (strip > 0)
         component = np.repeat(np.arange(3), len(strip))
         x = np.tile(strip - 1, 3) * STRIP
         places = (_place(component, 0, x + k * STRIP, self.height, self.num_columns) // STRIP for k in (-1, 0, 1))
         lanes = Lanes(
-            tuple(owned_copy(mi.UInt32(place)) for place in places),  # type: ignore[arg-type]
+            tuple(owned_copy(mi.UInt32(place)) for place in places),  # pyright: ignore[reportArgumentType]
             owned_copy(mi.Int32(np.tile(first, 3))),
             owned_copy(mi.Int32(np.tile(end, 3))),
             owned_copy(mi.UInt32(np.tile(columns, 3))),
@@ -146,37 +146,37 @@ class Planes:
         return Runs(lanes, 3 * int(((end - first) * columns).sum()))
 
 
-def read_packet(values: Any, place: Any, active: Any = True) -> Any:
+def read_packet(values: Float, place: UInt32, active: Bool | bool = True) -> Jit:
     """Return the 8 floats at 8 `place`."""
     return dr.gather(packet_type(), values, place, active=active, shape=(STRIP, dr.width(place)))
 
 
-def write_packet(target: Any, values: list[Any], place: Any, active: Any = True) -> None:
-    """Write 8 floats to 8 `place`; no two lanes to the same."""
+def write_packet(target: Float, values: list[Float], place: UInt32, active: Bool | bool = True) -> None:
+    """Write 8 floats to 8 `place`, which differs between lanes."""
     dr.scatter(target, packet_type()(values), place, active=active, mode=dr.ReduceMode.NoConflicts)
 
 
-def packet_type() -> Any:
-    """Return Dr.Jit's array of arrays of floats: it is read and written in packets, and as many at once as it holds."""
-    return sys.modules[mi.Float.__module__].ArrayXf  # type: ignore[attr-defined]
+def packet_type() -> type[Jit]:
+    """Return Dr.Jit's dynamic array of float arrays, which is read and written in packets of its size."""
+    return sys.modules[mi.Float.__module__].ArrayXf
 
 
-def _place(component: Any, y: Any, x: Any, height: Any, num_columns: Any) -> Any:
-    """Return where a number lies; of integers, NumPy's or Dr.Jit's."""
+def _place(component: Jit, y: Jit, x: Jit, height: Jit, num_columns: Jit) -> Jit:
+    """Return the place of a number; all arguments are integers, NumPy's or Dr.Jit's."""
     x = x + _SPARE * STRIP
     column = component * num_columns + x // (COLUMN * STRIP)
     return (column * height + y) * (COLUMN * STRIP) + x % (COLUMN * STRIP)
 
 
-def _stretches(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return (line, first, end) of all stretches of set cells in the lines of [L, M], none longer than `_LONGEST`."""
+def _cell_runs(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return (line, first, end) of all runs of set cells in the lines of [L, M], none longer than `_LONGEST`."""
     edges = np.diff(np.pad(cells, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     line, first = np.nonzero(edges == 1)
     end = np.nonzero(edges == -1)[1]
     parts = -(-(end - first) // _LONGEST)
-    which = np.repeat(np.arange(len(line)), parts)
-    first = first[which] + _LONGEST * (np.arange(len(which)) - np.repeat(parts.cumsum() - parts, parts))
-    end, line = np.minimum(end[which], first + _LONGEST), line[which]
+    index = np.repeat(np.arange(len(line)), parts)
+    first = first[index] + _LONGEST * (np.arange(len(index)) - np.repeat(parts.cumsum() - parts, parts))
+    end, line = np.minimum(end[index], first + _LONGEST), line[index]
     # The lanes of a packet are neighbours in one column.
     order = np.lexsort((line, first, (line + _SPARE - 1) // COLUMN))
     return line[order], first[order], end[order]

@@ -1,4 +1,4 @@
-"""A view, or that part of it where something may change, before what stands still in it."""
+"""Active views: a camera, the blocks of pixels that are drawn, and the static splats behind the active Gaussians."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ __all__ = ["ActiveView", "make_active_view"]
 
 @dataclass(frozen=True, eq=False)
 class ActiveView:
-    """What is looked at when Gaussians are drawn.
+    """A view, or its active region, through which Gaussians are rendered.
 
     Attributes:
         camera: the view.
         config: cut-offs and block shape.
         region: the blocks of pixels that are drawn; None: the whole view.
-        static_splats: what is drawn there besides, and gets no gradients; None: nothing.
+        static_splats: further splats that are drawn there and get no gradients; None: none.
     """
 
     camera: Camera
@@ -39,7 +39,7 @@ class ActiveView:
     def render(
         self, gaussians: ActivatedGaussians, channels: Sequence[str] = ("color",), detach_weights: Sequence[str] = ()
     ) -> Image:
-        """Draw Gaussians through this window, as `rasterize` does."""
+        """Return the image of Gaussians in this view, see `rasterize`."""
         return rasterize(
             gaussians,
             self.camera,
@@ -50,17 +50,17 @@ class ActiveView:
             config=self.config,
         )
 
-    def backproject(self, gaussians: ActivatedGaussians, picture: np.ndarray) -> np.ndarray:
-        """Return what the window's pixels of a picture, as from `crop`, are worth to each Gaussian [N, C]."""
-        return backproject(gaussians, self.camera, picture, self.config, self.region, self.static_splats)
+    def backproject(self, gaussians: ActivatedGaussians, image: np.ndarray) -> np.ndarray:
+        """Return the sums [N, C] of an image's pixels, laid out as by `crop`, weighted per Gaussian."""
+        return backproject(gaussians, self.camera, image, self.config, self.region, self.static_splats)
 
-    def crop(self, picture: np.ndarray) -> np.ndarray:
-        """Return what a picture [H, W, ...] of the view shows in this window."""
-        return picture if self.region is None else self.region.crop(picture)
+    def crop(self, image: np.ndarray) -> np.ndarray:
+        """Return the drawn pixels of an image [H, W, ...] of the view."""
+        return image if self.region is None else self.region.crop(image)
 
     @property
     def pixel_fraction(self) -> float:
-        """The drawn pixels' share of the view."""
+        """Fraction of the view's pixels that is drawn, in [0, 1]."""
         if self.region is None:
             return 1.0
         width, height = self.region.block
@@ -68,27 +68,27 @@ class ActiveView:
 
 
 def make_active_view(
-    camera: Camera, mask: np.ndarray, still: ActivatedGaussians, channels: Sequence[str], config: RenderConfig
+    camera: Camera, mask: np.ndarray, static: ActivatedGaussians, channels: Sequence[str], config: RenderConfig
 ) -> ActiveView:
-    """Return the window onto the blocks around a mask [H, W], with Gaussians that stand still behind it.
+    """Return the active view of the blocks that contain a pixel of `mask` [H, W].
 
-    They are projected here, once: what is drawn in front of them later costs as if they had never moved.
+    The static Gaussians are projected here, once, and not again when active Gaussians are rendered with them.
 
     Args:
         camera: the view.
-        mask: bool [H, W], the pixels that will be drawn, at least one.
-        still: N >= 0 Gaussians, detached.
-        channels: all that will be drawn.
+        mask: bool [H, W], the pixels to draw, at least one.
+        static: N >= 0 Gaussians, detached.
+        channels: all channels that will be rendered.
         config: cut-offs and block shape.
     """
     region, blended = Region(mask, config), tuple(name for name in channels if name != "alpha")
-    if not int(still.means.shape[0]):
+    if not int(static.means.shape[0]):
         return ActiveView(camera, config, region)
     with dr.suspend_grad():
-        rows = dr.compress(touches(project(still, camera, (), config), region))
+        rows = dr.compress(touches(project(static, camera, (), config), region))
         if not dr.width(rows):
             return ActiveView(camera, config, region)
-        static_splats = project(still, camera, blended, config, rows)
+        static_splats = project(static, camera, blended, config, rows)
         dr.eval(
             static_splats.shape,
             static_splats.channels,

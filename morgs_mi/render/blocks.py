@@ -1,10 +1,10 @@
-"""Who touches which block of pixels, in depth order.
+"""Depth-ordered lists of the Gaussians that touch each block of pixels.
 
 Two levels. Coarse: every Gaussian is entered into the tiles (4 x 8 blocks) that its extent touches; one counting
-sort by tile, fed in depth order, gives each tile its list. Fine: each entry of a tile's list is tested exactly
+sort by tile, applied in depth order, gives the list of each tile. Fine: each entry of a tile's list is tested exactly
 against the tile's 32 blocks, one bit each; 32 entries by 32 blocks of bits are transposed in registers, so that
-every block has its own string of bits over its tile's list. The blending loops walk the set bits: what a block
-draws is never written out, and a pair of Gaussian and block costs one bit.
+every block has its own string of bits over its tile's list. The blending loops walk the set bits: a block's list is
+never written out, and a pair of Gaussian and block costs one bit.
 
 "Rank" is a Gaussian's place in depth order; equal depths keep the order of the input.
 """
@@ -13,29 +13,30 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import log2
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from morgs_mi.core.types import Bool, Float, UInt32
+from morgs_mi.render.backend import stable_order
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.projection import Splats
 from morgs_mi.render.region import ACROSS, DOWN, NO_SLOT, Region
 
 __all__ = ["BlockLists", "build_lists", "fetch_record", "next_entry", "pack_records", "sorted_buckets", "touches"]
 
-# Half a thousandth of an octave: the block test may keep too much, never too little.
+# A thousandth of an octave: the block test may accept too many entries, never too few.
 _TEST_SLACK = 1e-3
 
 
 @dataclass(frozen=True)
 class BlockLists:
-    """Depth-ordered lists, one per block of pixels: which bits of which words, over which entries.
+    """Depth-ordered lists, one per block of pixels, as bits over the entries of its tile.
 
     Attributes:
         records: (mean_x, mean_y, a, b, c, log2_opacity, blended columns) of each rank, see `pack_records`.
-        words: bit k of a block's i-th word says that it draws entry `first` + 32 i + k.
-        entries: ranks, tile after tile.
+        words: bit k of a block's i-th word is set if the block draws entry `first` + 32 i + k.
+        entries: ranks, tile by tile.
         begin: place of each block's first word [A]; the next ones follow at steps of 32.
         end: place past its last word [A].
         first: first entry of its tile [A].
@@ -45,62 +46,62 @@ class BlockLists:
         by_rank: splat of each rank [N].
     """
 
-    records: Any
-    words: Any
-    entries: Any
-    begin: Any
-    end: Any
-    first: Any
-    count: Any
-    order: Any
-    rank_of: Any
-    by_rank: Any
+    records: Float
+    words: UInt32
+    entries: UInt32
+    begin: UInt32
+    end: UInt32
+    first: UInt32
+    count: UInt32
+    order: UInt32
+    rank_of: UInt32
+    by_rank: UInt32
 
 
-def build_lists(splats: Splats, columns: list[Any], region: Region, config: RenderConfig) -> BlockLists:
-    """List the splats (N > 0) that each block of a region may show, nearest first.
+def build_lists(splats: Splats, columns: list[Float], region: Region, config: RenderConfig) -> BlockLists:
+    """List the splats (N > 0) that may touch each block of a region, nearest first.
 
     Args:
-        splats: what to list.
-        columns: what is blended, floats [N].
+        splats: the splats to list.
+        columns: the blended values, floats [N].
         region: the blocks.
         config: cut-offs.
     """
-    UInt32, N = mi.UInt32, len(splats)
+    N = len(splats)
     depths = dr.select(splats.valid, splats.depths, dr.inf)
     if splats.order is None:
         by_rank = dr.argsort(depths)
     else:
-        by_rank = dr.gather(UInt32, splats.order, dr.argsort(dr.gather(mi.Float, depths, splats.order)))
-    rank_of = dr.empty(UInt32, N)
-    dr.scatter(rank_of, dr.arange(UInt32, N), by_rank, mode=dr.ReduceMode.Permute)
+        by_rank = dr.gather(mi.UInt32, splats.order, dr.argsort(dr.gather(mi.Float, depths, splats.order)))
+    rank_of = dr.empty(mi.UInt32, N)
+    dr.scatter(rank_of, dr.arange(mi.UInt32, N), by_rank, mode=dr.ReduceMode.Permute)
     rectangles = _tile_rectangles(splats, region)
     dr.eval(rectangles)
-    tiles = _tile_lists([dr.gather(UInt32, v, by_rank) for v in rectangles], region)
+    tiles = _tile_lists([dr.gather(mi.UInt32, v, by_rank) for v in rectangles], region)
 
     records = pack_records([*splats.shape, *columns], by_rank)
     geometry = fetch_record(records, tiles.entries, 6, dr.width(records) // (4 * N))
     words, first_word, end_word = _block_bits(geometry, tiles, region, config)
-    begin = dr.gather(UInt32, first_word, region.home) * 32 + region.part
-    end = dr.gather(UInt32, end_word, region.home) * 32 + region.part
-    first = dr.gather(UInt32, tiles.first, region.home)
+    begin = dr.gather(mi.UInt32, first_word, region.tile) * 32 + region.bit
+    end = dr.gather(mi.UInt32, end_word, region.tile) * 32 + region.bit
+    first = dr.gather(mi.UInt32, tiles.first, region.tile)
     count = _set_bits(words, begin, end)
     dr.eval(begin, end, first, count)
-    # Where lengths differ by less than an eighth, neighbours stay together: they draw the same and go dark alike.
-    bucket = UInt32(6 * dr.log2(mi.Float(count) + 1))
-    order = dr.detail.block_mkperm(255 - bucket, dr.width(count), 256)
+    # Neighbours whose lengths differ by less than an eighth stay together: they draw the same splats and stop alike.
+    bucket = mi.UInt32(6 * dr.log2(mi.Float(count) + 1))
+    order = dr.detail.block_mkperm(255 - bucket, dr.width(count), 256)  # pyright: ignore[reportArgumentType]
     return BlockLists(records, words, tiles.entries, begin, end, first, count, order, rank_of, by_rank)
 
 
-def touches(splats: Splats, region: Region) -> Any:
-    """Return whether the extent of each splat reaches a block of the region, bool [N]."""
+def touches(splats: Splats, region: Region) -> Bool:
+    """Return the mask of the splats whose extent reaches a block of the region [N]."""
     return splats.valid & (_cells_within(region.block_table, region, splats, (1, 1))[1] > 0)
 
 
-def next_entry(place: Any, word: Any, base: Any, end: Any, words: Any) -> tuple[Any, Any, Any]:
-    """Walk on to a word with a set bit: return (place of the word after it, word, entry that its bit 0 stands for).
+def next_entry(place: UInt32, word: UInt32, base: UInt32, end: UInt32, words: UInt32) -> tuple[UInt32, UInt32, UInt32]:
+    """Advance to a word with a set bit and return (place of the word after it, word, entry of the word's bit 0).
 
-    The word is 0 where there is none left.
+    The word is 0 where none is left.
     """
 
     def step(place, word, base, end, words):
@@ -113,10 +114,10 @@ def next_entry(place: Any, word: Any, base: Any, end: Any, words: Any) -> tuple[
     return walked[:3]
 
 
-def pack_records(columns: list[Any], order: Any) -> Any:
-    """Interleave columns [N] to one record per Gaussian, in the order given, padded to 4 floats.
+def pack_records(columns: list[Float], order: UInt32) -> Float:
+    """Return the columns [N] interleaved to one record per Gaussian, in the given order, padded to 4 floats.
 
-    Records are read by packets of 4 floats, one cache line or less for each Gaussian.
+    Records are read in packets of 4 floats, one cache line or less for each Gaussian.
     """
     N, width = dr.width(order), -(-len(columns) // 4)
     values = [dr.gather(mi.Float, column, order) for column in columns]
@@ -130,8 +131,8 @@ def pack_records(columns: list[Any], order: Any) -> Any:
     return records
 
 
-def fetch_record(records: Any, rank: Any, length: int, packets: int | None = None) -> list[Any]:
-    """Return the first `length` floats of the record at `rank`; a record has `packets`, by default just enough."""
+def fetch_record(records: Float, rank: UInt32, length: int, packets: int | None = None) -> list[Float]:
+    """Return the first `length` floats of the record at `rank`, which has `packets`, by default as many as needed."""
     needed = -(-length // 4)
     reads = (dr.gather(mi.Vector4f, records, rank * (packets or needed) + j) for j in range(needed))
     return [v for packet in reads for v in packet][:length]
@@ -139,72 +140,73 @@ def fetch_record(records: Any, rank: Any, length: int, packets: int | None = Non
 
 @dataclass(frozen=True)
 class _Tiles:
-    """The coarse lists: ranks `entries` by tile and depth, the slot of each's tile, each slot's first and end."""
+    """The coarse lists: ranks by tile and depth, the slot of each entry's tile, first and end entry of each slot."""
 
-    entries: Any
-    slots: Any
-    first: Any
-    end: Any
+    entries: UInt32
+    slots: UInt32
+    first: UInt32
+    end: UInt32
 
 
-def _cells_within(table: Any, region: Region, splats: Splats, cell: tuple[int, int]) -> tuple[Any, Any]:
-    """Return the rectangle (x0, y0, x1, y1) of cells that each splat's extent touches, and how many of them are set.
+def _cells_within(
+    table: UInt32, region: Region, splats: Splats, cell: tuple[int, int]
+) -> tuple[tuple[UInt32, UInt32, UInt32, UInt32], UInt32]:
+    """Return the rectangle (x0, y0, x1, y1) of cells that each splat's extent touches, and its number of set cells.
 
     Args:
-        table: summed area of the cells.
-        region: whose grid it is.
-        splats: N of them.
-        cell: width and height in blocks.
+        table: summed areas of the cells.
+        region: the region of the cells.
+        splats: N splats.
+        cell: width and height of a cell in blocks.
     """
-    UInt32 = mi.UInt32
-    across = dr.gather(UInt32, region.grid, UInt32(0)) * (ACROSS // cell[0])
-    down = dr.gather(UInt32, region.grid, UInt32(1)) * (DOWN // cell[1])
+    across = dr.gather(mi.UInt32, region.grid, mi.UInt32(0)) * (ACROSS // cell[0])
+    down = dr.gather(mi.UInt32, region.grid, mi.UInt32(1)) * (DOWN // cell[1])
 
-    def span(axis: int, cells: Any) -> tuple[Any, Any]:
+    def span(axis: int, cells: UInt32) -> tuple[UInt32, UInt32]:
         center, half, top = dr.detach(splats.shape[axis]), splats.extent[axis], mi.Float(cells)
         bound = 1.0 / (cell[axis] * region.block[axis])
         low = dr.clip(dr.floor((center - half) * bound), 0, top)
         high = dr.clip(dr.floor((center + half) * bound) + 1, 0, top)
-        return UInt32(low), UInt32(high)
+        return mi.UInt32(low), mi.UInt32(high)
 
     (x0, x1), (y0, y1) = span(0, across), span(1, down)
     if region.whole:
         return (x0, y0, x1, y1), (x1 - x0) * (y1 - y0)
 
-    def before(x: Any, y: Any) -> Any:
-        return dr.gather(UInt32, table, y * (across + 1) + x)
+    def before(x: UInt32, y: UInt32) -> UInt32:
+        return dr.gather(mi.UInt32, table, y * (across + 1) + x)
 
     return (x0, y0, x1, y1), before(x1, y1) - before(x0, y1) - before(x1, y0) + before(x0, y0)
 
 
-def _tile_rectangles(splats: Splats, region: Region) -> tuple[Any, Any, Any, Any]:
-    """Return each splat's first tile (x, y), its tiles across, and how many of its tiles are the region's."""
+def _tile_rectangles(splats: Splats, region: Region) -> tuple[UInt32, UInt32, UInt32, UInt32]:
+    """Return each splat's first tile (x, y), its tiles across, and the number of its tiles in the region."""
     (x0, y0, x1, _), counts = _cells_within(region.tile_table, region, splats, (ACROSS, DOWN))
     return x0, y0, x1 - x0, dr.select(splats.valid, counts, 0)
 
 
-def _tile_lists(rectangles: list[Any], region: Region) -> _Tiles:
-    """Enter every rank into those tiles of its rectangle that are the region's, and sort by tile."""
+def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
+    """Enter every rank into the region's tiles within its rectangle, and sort by tile."""
     x0, y0, columns, counts = rectangles
-    UInt32, N, slots = mi.UInt32, dr.width(counts), region.num_tiles
+    N, slots = dr.width(counts), region.num_tiles
     if N * slots >= 2**32 and (entries := dr.sum(mi.Float64(counts))[0]) >= 2**32:
         raise ValueError(
             f"rasterize(): the lists must have fewer than 2^32 entries, got {entries:.3g} for {N} Gaussians in "
-            f"{slots} tiles; make the Gaussians smaller or fewer, or render the image in parts."
+            f"{slots} tiles; make the Gaussians smaller or fewer, or render the image in several regions."
         )
     end = dr.cumsum(counts)
     total = int(end[-1])  # the one number that must reach the host: the size of the lists
     if total == 0:
-        return _Tiles(dr.zeros(UInt32, 1), dr.zeros(UInt32, 1), dr.zeros(UInt32, slots), dr.zeros(UInt32, slots))
-    slot_at, rank_at = dr.empty(UInt32, total), dr.empty(UInt32, total)
-    across = dr.gather(UInt32, region.grid, UInt32(0))
+        return _Tiles(*(dr.zeros(mi.UInt32, size) for size in (1, 1, slots, slots)))
+    slot_at, rank_at = dr.empty(mi.UInt32, total), dr.empty(mi.UInt32, total)
+    across = dr.gather(mi.UInt32, region.grid, mi.UInt32(0))
 
     def enter(place, end, column, tile, columns, rank, across, slot_of, slot_at, rank_at):
-        slot = tile if region.whole else dr.gather(UInt32, slot_of, tile)
-        ours = region.whole or slot != NO_SLOT
-        dr.scatter(slot_at, slot, place, active=ours, mode=dr.ReduceMode.NoConflicts)
-        dr.scatter(rank_at, rank, place, active=ours, mode=dr.ReduceMode.NoConflicts)
-        place = place + 1 if region.whole else dr.select(ours, place + 1, place)
+        slot = tile if region.whole else dr.gather(mi.UInt32, slot_of, tile)
+        drawn = region.whole or slot != NO_SLOT
+        dr.scatter(slot_at, slot, place, active=drawn, mode=dr.ReduceMode.NoConflicts)
+        dr.scatter(rank_at, rank, place, active=drawn, mode=dr.ReduceMode.NoConflicts)
+        place = place + 1 if region.whole else dr.select(drawn, place + 1, place)
         wrap = column + 1 == columns
         column, tile = dr.select(wrap, 0, column + 1), dr.select(wrap, tile + across + 1 - columns, tile + 1)
         return place, end, column, tile, columns, rank, across, slot_of, slot_at, rank_at
@@ -212,10 +214,10 @@ def _tile_lists(rectangles: list[Any], region: Region) -> _Tiles:
     state = (
         end - counts,
         end,
-        UInt32(0),
+        mi.UInt32(0),
         y0 * across + x0,
         columns,
-        dr.arange(UInt32, N),
+        dr.arange(mi.UInt32, N),
         across,
         region.slot_of,
         slot_at,
@@ -225,23 +227,21 @@ def _tile_lists(rectangles: list[Any], region: Region) -> _Tiles:
     dr.eval(slot_at, rank_at)
 
     perm, slot_at, first, end = sorted_buckets(slot_at, slots)
-    entries = dr.gather(UInt32, rank_at, perm)
+    entries = dr.gather(mi.UInt32, rank_at, perm)
     dr.eval(entries)
     return _Tiles(entries, slot_at, first, end)
 
 
-def sorted_buckets(keys: Any, buckets: int) -> tuple[Any, Any, Any, Any]:
+def sorted_buckets(keys: UInt32, buckets: int) -> tuple[UInt32, UInt32, UInt32, UInt32]:
     """Return (permutation that sorts `keys` stably, sorted keys, first place of each bucket, end of each bucket)."""
-    UInt32, total = mi.UInt32, dr.width(keys)
-    # On the CPU one counting pass sorts, stably. On the GPU that pass is stable for few buckets only.
-    on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
-    perm = dr.detail.block_mkperm(keys, total, buckets) if on_cpu else dr.argsort(keys)
-    ordered = dr.gather(UInt32, keys, perm)
+    total = dr.width(keys)
+    perm = stable_order(keys, buckets)
+    ordered = dr.gather(mi.UInt32, keys, perm)
     dr.eval(ordered)
-    first, end = dr.zeros(UInt32, buckets), dr.zeros(UInt32, buckets)
-    j = dr.arange(UInt32, total)
-    is_last = j + 1 == dr.opaque(UInt32, total)
-    following = dr.gather(UInt32, ordered, j + 1, active=~is_last)
+    first, end = dr.zeros(mi.UInt32, buckets), dr.zeros(mi.UInt32, buckets)
+    j = dr.arange(mi.UInt32, total)
+    is_last = j + 1 == dr.opaque(mi.UInt32, total)
+    following = dr.gather(mi.UInt32, ordered, j + 1, active=~is_last)
     edge = is_last | (following != ordered)
     dr.scatter(end, j + 1, ordered, active=edge)
     dr.scatter(first, j + 1, following, active=edge & ~is_last)
@@ -249,11 +249,15 @@ def sorted_buckets(keys: Any, buckets: int) -> tuple[Any, Any, Any, Any]:
     return perm, ordered, first, end
 
 
-def _block_bits(geometry: list[Any], tiles: _Tiles, region: Region, config: RenderConfig) -> tuple[Any, Any, Any]:
-    """Return (words, first word of each tile, end): bit k of word 32 w + b says that block b of the tile is
-    touched by entry 32 w + k, counted from the tile's first word and first entry. `geometry` is the entries'.
+def _block_bits(
+    geometry: list[Float], tiles: _Tiles, region: Region, config: RenderConfig
+) -> tuple[UInt32, UInt32, UInt32]:
+    """Return (words, first word of each tile, end word of each tile) for the geometry of the entries.
+
+    Bit k of word 32 w + b is set if block b of the tile is touched by entry 32 w + k, both counted from the tile's
+    first.
     """
-    UInt32, (bw, bh), num_tiles = mi.UInt32, region.block, region.num_tiles
+    (bw, bh), num_tiles = region.block, region.num_tiles
     length = (tiles.end - tiles.first + 31) // 32
     end_word = dr.cumsum(length)
     first_word = end_word - length
@@ -262,7 +266,7 @@ def _block_bits(geometry: list[Any], tiles: _Tiles, region: Region, config: Rend
 
     slot = tiles.slots
     mx, my, a, b, c, log2_opacity = geometry
-    # dx/dy and dy/dx along which p is largest for given dy and for given dx.
+    # Slopes dx/dy and dy/dx along which p is largest for a given dy and for a given dx.
     tilt = b / dr.maximum(c, 1e-30)
     slope_x, slope_y = -b / dr.maximum(a, 1e-30), -a / dr.maximum(c, 1e-30) * tilt / dr.fma(tilt, tilt, 1)
     px, py = dr.gather(mi.Float, region.corner_x, slot) - mx, dr.gather(mi.Float, region.corner_y, slot) - my
@@ -272,7 +276,7 @@ def _block_bits(geometry: list[Any], tiles: _Tiles, region: Region, config: Rend
         x0, x1 = px + (i * bw + 0.5), px + (i * bw + bw - 0.5)
         x = _clipped(0, x0, x1)
         columns.append((x0, x1, a * x, slope_y * x))
-    mask = UInt32(0)
+    mask = mi.UInt32(0)
     for j in range(DOWN):
         y0, y1 = py + (j * bh + 0.5), py + (j * bh + bh - 0.5)
         y = _clipped(0, y0, y1)
@@ -282,11 +286,11 @@ def _block_bits(geometry: list[Any], tiles: _Tiles, region: Region, config: Rend
             u1, y_edge = dr.fma(a, _clipped(best_x, x0, x1), by), _clipped(best_y, y0, y1)
             u2, v2 = dr.fma(b, y_edge, ax), c * y_edge
             touches = (dr.fma(u1, u1, v * v) <= reach) | (dr.fma(u2, u2, v2 * v2) <= reach)
-            mask |= dr.select(touches, UInt32(1 << (j * ACROSS + i)), UInt32(0))
+            mask |= dr.select(touches, mi.UInt32(1 << (j * ACROSS + i)), mi.UInt32(0))
 
-    # Over the tile, u^2 + v^2 is largest at a corner: a lower bound of alpha, so an upper bound of the light that
-    # is left behind an entry. What no light can reach in any block is not listed; it would not have been blended.
-    def distance(x: Any, y: Any) -> Any:
+    # Over the tile, u^2 + v^2 is largest at a corner: a lower bound of alpha, hence an upper bound of the transmittance
+    # behind an entry. Entries below the stop in all blocks are not listed; they would not have been blended.
+    def distance(x: Float, y: Float) -> Float:
         u, v = dr.fma(a, x, b * y), c * y
         return dr.fma(u, u, v * v)
 
@@ -295,34 +299,34 @@ def _block_bits(geometry: list[Any], tiles: _Tiles, region: Region, config: Rend
     for x, y in ((x0, y1), (x1, y0), (x1, y1)):
         farthest = dr.maximum(farthest, distance(x, y))
     alpha = dr.select(farthest < reach - 2 * _TEST_SLACK, dr.exp2(log2_opacity - farthest), 0)
-    dimming = dr.log2(1 - dr.minimum(alpha, config.alpha_max))
-    dr.eval(mask, dimming)
-    behind = dr.prefix_sum(mi.Float64(dimming))
-    light = behind - dr.gather(mi.Float64, behind, dr.gather(UInt32, tiles.first, slot))
-    # Half an octave is more than the blend's own rounding can lose; with no stop at all nothing is left out.
-    mask = dr.select(light < log2(max(config.stop_transmittance, 1e-38)) - 0.5, 0, mask)
+    log2_transmitted = dr.log2(1 - dr.minimum(alpha, config.alpha_max))
+    dr.eval(mask, log2_transmitted)
+    behind = dr.prefix_sum(mi.Float64(log2_transmitted))
+    log2_transmittance = behind - dr.gather(mi.Float64, behind, dr.gather(mi.UInt32, tiles.first, slot))
+    # Half an octave exceeds the rounding error of the blend; a stop at 0 omits nothing.
+    mask = dr.select(log2_transmittance < log2(max(config.stop_transmittance, 1e-38)) - 0.5, 0, mask)
 
-    place = dr.gather(UInt32, first_word, slot) * 32 + dr.arange(UInt32, dr.width(slot))
-    masks = dr.zeros(UInt32, num_words * 32)
-    dr.scatter(masks, mask, place - dr.gather(UInt32, tiles.first, slot), mode=dr.ReduceMode.NoConflicts)
+    place = dr.gather(mi.UInt32, first_word, slot) * 32 + dr.arange(mi.UInt32, dr.width(slot))
+    masks = dr.zeros(mi.UInt32, num_words * 32)
+    dr.scatter(masks, mask, place - dr.gather(mi.UInt32, tiles.first, slot), mode=dr.ReduceMode.NoConflicts)
     dr.eval(masks)
-    word = dr.arange(UInt32, num_words) * 32
-    rows = _transposed([dr.gather(UInt32, masks, word + k) for k in range(32)])
-    words = dr.empty(UInt32, num_words * 32)
+    word = dr.arange(mi.UInt32, num_words) * 32
+    rows = _transposed([dr.gather(mi.UInt32, masks, word + k) for k in range(32)])
+    words = dr.empty(mi.UInt32, num_words * 32)
     for k, row in enumerate(rows):
         dr.scatter(words, row, word + k, mode=dr.ReduceMode.NoConflicts)
     dr.eval(words)
     return words, first_word, end_word
 
 
-def _clipped(value: Any, low: Any, high: Any) -> Any:
-    """Return `value` within [low, high]: two instructions, where `dr.clip` takes six to be right about NaN."""
+def _clipped(value: Float | int, low: Float, high: Float) -> Float:
+    """Return `value` clipped to [low, high]: two instructions, where `dr.clip` takes six to handle NaN."""
     value = dr.select(value < low, low, value)
     return dr.select(value > high, high, value)
 
 
-def _transposed(rows: list[Any]) -> list[Any]:
-    """Transpose 32 words of 32 bits: swap off-diagonal squares of 16, 8, ... 1 bits (Hacker's Delight, 7-3)."""
+def _transposed(rows: list[UInt32]) -> list[UInt32]:
+    """Return 32 words of 32 bits transposed: swap off-diagonal squares of 16, 8, ... 1 bits (Hacker's Delight, 7-3)."""
     rows, size, mask = list(rows), 16, 0x0000FFFF
     while size:
         for k in range(32):
@@ -334,7 +338,7 @@ def _transposed(rows: list[Any]) -> list[Any]:
     return rows
 
 
-def _set_bits(words: Any, begin: Any, end: Any) -> Any:
+def _set_bits(words: UInt32, begin: UInt32, end: UInt32) -> UInt32:
     """Return the number of set bits in every block's words."""
 
     def add(place, count, end, words):

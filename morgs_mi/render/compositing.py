@@ -1,13 +1,14 @@
-"""Blending as one differentiable operation: lists in, channels out, traced loops behind it (see `loops`)."""
+"""Blending as one differentiable operation, implemented by the traced loops of `loops`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import drjit as dr
 import mitsuba as mi
 
+from morgs_mi.core.types import Float
 from morgs_mi.render.blocks import BlockLists, pack_records, sorted_buckets
 from morgs_mi.render.loops import (
     GEOMETRY,
@@ -28,37 +29,37 @@ __all__ = ["Channel", "Layout", "blend"]
 
 
 def blend(
-    geometry: tuple[Any, ...], channels: list[tuple[Any, ...]], region: Region, lists: BlockLists, layout: Layout
-) -> list[Any]:
+    geometry: tuple[Float, ...], channels: list[tuple[Float, ...]], region: Region, lists: BlockLists, layout: Layout
+) -> list[Float]:
     """Blend every channel's columns over a region.
 
     Args:
         geometry: (mean_x, mean_y, a, b, c, log2_opacity), six floats [N].
-        channels: per channel its columns, floats [N].
+        channels: the columns of each channel, floats [N].
         region: the blocks that are drawn.
-        lists: who touches them; made of the same geometry and columns.
-        layout: the channels' sizes, what the gradients reach, and cut-offs.
+        lists: the splats that touch them, built from the same geometry and columns.
+        layout: sizes of the channels, whether their gradients reach the weights, and cut-offs.
 
     Returns:
-        Per channel its picture on the region, flat; and, if the layout has it, alpha, twice: one to be shown, one to
-        divide by, for forward mode clears the gradients of what is used further. Differentiable in `geometry` and
-        `channels` by `dr.backward` and `dr.forward`.
+        The image of each channel on the region, flat; and, if the layout has it, alpha, twice: one for output, one to
+        divide by, because forward mode clears the gradients of an array that is used further. Differentiable in
+        `geometry` and `channels` by `dr.backward` and `dr.forward`.
     """
     columns = [column for channel in channels for column in channel]
     return dr.custom(_Blend, [*geometry, *columns], region, lists, layout)
 
 
 class _Blend(dr.CustomOp):
-    def eval(self, values: list[Any], region: Region, lists: BlockLists, layout: Layout) -> list[Any]:
-        # The values are in the lists' records already: they are named here to be differentiated.
+    def eval(self, values: list[Float], region: Region, lists: BlockLists, layout: Layout) -> list[Float]:
+        # The lists' records contain the values already: they are arguments only to be differentiated.
         self.region, self.lists, self.layout, self.blocks = region, lists, layout, Blocks.of(region, lists)
-        self.pictures = self._run(primal, layout, self.blocks, lists.records, self._blank())
-        return self._shown(self.pictures)
+        self.images = self._run(primal, layout, self.blocks, lists.records, self._allocated())
+        return self._outputs(self.images)
 
     def backward(self) -> None:
         lists, layout = self.lists, self.layout
-        N, grads = dr.width(lists.by_rank), self._hidden(list(self.grad_out()))
-        arrays, stride = (self.blocks, self.lists.records, self.pictures, grads), 4 * record_packets(layout)
+        N, grads = dr.width(lists.by_rank), self._image_grads(cast(list[Float], self.grad_out()))
+        arrays, stride = (self.blocks, self.lists.records, self.images, grads), 4 * record_packets(layout)
         if layout.config.reproducible:
             end = dr.cumsum(lists.count)
             first = end - lists.count
@@ -67,32 +68,32 @@ class _Blend(dr.CustomOp):
             pairs = self._run(adjoint_of_pairs, layout, *arrays, first, pairs)
             sums, stride = _summed_by_rank(pairs, N, layout), 4 * pair_packets(layout)
         else:
-            sums = self._run(adjoint, layout, _ladder(N), *arrays)
+            sums = self._run(adjoint, layout, _rounded_up(N), *arrays)
         lane, skipped = lists.rank_of * stride, 0 if layout.reaches_weights else GEOMETRY
         columns = [dr.gather(mi.Float, sums, lane + k) for k in range(skipped, GEOMETRY + layout.columns)]
         self.set_grad_in("values", [mi.Float(0)] * skipped + columns)
 
     def forward(self) -> None:
-        grads = [dr.zeros(mi.Float, 1) + g for g in list(self.grad_in("values"))]  # type: ignore[call-overload]
+        grads = [dr.zeros(mi.Float, 1) + g for g in cast(list[Float], self.grad_in("values"))]
         tangents = pack_records(grads, self.lists.by_rank)
-        pictures = self._run(tangent, self.layout, self.blocks, self.lists.records, tangents, self._blank())
-        self.set_grad_out(self._shown(pictures))
+        images = self._run(tangent, self.layout, self.blocks, self.lists.records, tangents, self._allocated())
+        self.set_grad_out(self._outputs(images))
 
     def _run(self, loop: Callable[..., Any], *arguments: Any) -> Any:
         static = [v for v in arguments if isinstance(v, (Layout, int))]
         return recorded(loop, *static)(*arguments[len(static) :])
 
-    def _blank(self) -> list[Any]:
-        """Return memory to write to: a frozen function cannot know sizes of its own."""
+    def _allocated(self) -> list[Float]:
+        """Return memory for the images: a frozen function cannot allocate arrays of a size of its own."""
         return [dr.empty(mi.Float, self.region.num_pixels * size) for size in self.layout.sizes]
 
-    def _shown(self, pictures: list[Any]) -> list[Any]:
-        """Return what the caller gets: without the padding to whole blocks, and alpha twice."""
-        shown = [_cropped(v, self.region, size) for v, size in zip(pictures, self.layout.sizes, strict=True)]
-        return [*shown, shown[-1] + 0] if self.layout.alpha else shown
+    def _outputs(self, images: list[Float]) -> list[Float]:
+        """Return the images without the padding to whole blocks, and alpha twice."""
+        outputs = [_cropped(v, self.region, size) for v, size in zip(images, self.layout.sizes, strict=True)]
+        return [*outputs, outputs[-1] + 0] if self.layout.alpha else outputs
 
-    def _hidden(self, grads: list[Any]) -> list[Any]:
-        """Transpose `_shown`."""
+    def _image_grads(self, grads: list[Float]) -> list[Float]:
+        """Return the gradients of the images from those of the outputs: the transpose of `_outputs`."""
         if self.layout.alpha:
             *grads, alpha, coverage = grads
             grads = [*grads, alpha + coverage]
@@ -102,31 +103,31 @@ class _Blend(dr.CustomOp):
         return "morgs_mi.blend"
 
 
-def _cropped(picture: Any, region: Region, size: int) -> Any:
-    """Return a picture without the columns that make its blocks whole."""
+def _cropped(image: Float, region: Region, size: int) -> Float:
+    """Return a flat image without the columns of pixels that pad it to whole blocks."""
     if not region.whole or region.row == region.width:
-        return picture
+        return image
     lane = dr.arange(mi.UInt32, region.width * region.height * size)
     row = quotient(lane, region.width * size)
-    return dr.gather(mi.Float, picture, lane + row * dr.opaque(mi.UInt32, (region.row - region.width) * size))
+    return dr.gather(mi.Float, image, lane + row * dr.opaque(mi.UInt32, (region.row - region.width) * size))
 
 
-def _padded(picture: Any, region: Region, size: int) -> Any:
-    """Transpose `_cropped`; a literal 0 becomes a picture of zeros."""
+def _padded(image: Float, region: Region, size: int) -> Float:
+    """Return a flat image padded to whole blocks, or zeros for a literal 0: the transpose of `_cropped`."""
     total = region.num_pixels * size
-    if dr.width(picture) != dr.prod(region.shape(size)):
+    if dr.width(image) != dr.prod(region.shape(size)):
         return dr.opaque(mi.Float, 0, total)
     if not region.whole or region.row == region.width:
-        # In memory of our own (see `region.owned_copy`), by what fuses with whatever computes the gradient.
-        return picture * dr.opaque(mi.Float, 1)
+        # In memory allocated by Dr.Jit (see `region.owned_copy`); a product fuses with the kernel of the gradient.
+        return image * dr.opaque(mi.Float, 1)
     lane = dr.arange(mi.UInt32, total)
     row = quotient(lane, region.row * size)
     column, width = lane - row * dr.opaque(mi.UInt32, region.row * size), dr.opaque(mi.UInt32, region.width * size)
-    return dr.gather(mi.Float, picture, row * width + column, active=column < width)
+    return dr.gather(mi.Float, image, row * width + column, active=column < width)
 
 
-def _summed_by_rank(pairs: Any, N: int, layout: Layout) -> Any:
-    """Sum the records of all pairs of a rank, one lane per rank, in the order of the blocks."""
+def _summed_by_rank(pairs: Float, N: int, layout: Layout) -> Float:
+    """Return the sums of the records of all pairs of each rank, one lane per rank, in the order of the blocks."""
     packets, place = pair_packets(layout), GEOMETRY + layout.columns
     lane = dr.arange(mi.UInt32, dr.width(pairs) // (4 * packets)) * (4 * packets)
     rank = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, pairs, lane + place))
@@ -147,7 +148,7 @@ def _summed_by_rank(pairs: Any, N: int, layout: Layout) -> Any:
     return total
 
 
-def _ladder(n: int) -> int:
-    """Round up to a quarter octave, for each size of a scatter-reduction's target has a kernel of its own."""
+def _rounded_up(n: int) -> int:
+    """Return n rounded up to a quarter octave: each target size of a scatter-reduction compiles its own kernel."""
     step = max(1024, 1 << max(n.bit_length() - 3, 0))
     return -(-n // step) * step

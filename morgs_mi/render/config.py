@@ -1,4 +1,4 @@
-"""The renderer's cut-offs and block shape: their one home."""
+"""The renderer's settings: cut-offs and block shape."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class RenderConfig:
     stop_transmittance: float = 1e-4
     """A block ends when its most transparent pixel falls below this; bounds the error of the colour."""
     block_width: int | None = None
-    """Pixels across in the block that one SIMD lane owns: 4, 8, 12 or 16; None: 8 on the CPU, 4 on the GPU."""
+    """Width in pixels of the block that one SIMD lane owns: 4, 8, 12 or 16; None: 8 on the CPU, 4 on the GPU."""
     block_height: int | None = None
-    """Pixels down in that block, 1 to 16; None: 4."""
+    """Height in pixels of that block, 1 to 16; None: 4."""
     reproducible: bool = False
     """Sum gradients in a fixed order: the same bytes on every run and any number of threads. A step takes 1.9 to 2.4
     times as long (20k and 100k Gaussians, two cores), and 48 bytes for every pair of Gaussian and block."""
@@ -31,14 +31,10 @@ class RenderConfig:
         if self.block_width not in (None, 4, 8, 12, 16):
             raise ValueError(
                 f"RenderConfig(): `block_width` must be 4, 8, 12 or 16 px, got {self.block_width}; pixels are read and "
-                "written by fours."
+                "written in packets of 4."
             )
         if self.block_height is not None and not 1 <= self.block_height <= 16:
             raise ValueError(
                 f"RenderConfig(): `block_height` must be 1 to 16 px, got {self.block_height}; the block's pixels are "
                 "unrolled."
             )
-
-    def block_shape(self, cuda: bool) -> tuple[int, int]:
-        """Return (width, height) in pixels of one lane's block on this backend."""
-        return self.block_width or (4 if cuda else 8), self.block_height or 4

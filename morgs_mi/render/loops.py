@@ -1,20 +1,20 @@
 """Front-to-back blending of the block lists (eq. 1), and its two derivatives, by hand.
 
 Each SIMD lane owns a block of pixels and walks its own list once; the pixels of the block are unrolled.
-For Gaussian i at one pixel, with values c_i and T the light that is left:
+For Gaussian i at one pixel, with values c_i and transmittance T:
 
     p = log2(opacity) - u^2 - v^2        alpha = 2^p, 0 below alpha_min, at most alpha_max
     w = T alpha                          C += w c_i        T <- T - w
 
-The adjoint walks the same list in the same direction. With g the gradient of the pixel, it needs one number
-more per pixel, the suffix S = <g, C_final> - sum_j<=i w_j <g, c_j>, and
+The adjoint walks the same list in the same direction. With g the gradient of the pixel, it needs one more number
+per pixel, the suffix S = <g, C_final> - sum_j<=i w_j <g, c_j>, and
 
     dL/dp = ln(2) (w <g, c_i> - alpha S / (1 - alpha)).
 
 A channel is *attached* if its gradient reaches the weights w (geometry and opacity), detached if it reaches
 only the blended value itself. Alpha is blended as one more channel of ones.
 
-Every channel has a picture of its own, rows of blocks times its columns (see `region`), so that a row of a block is a
+Every channel has its own image, rows of blocks times its columns (see `region`), so that a row of a block is a
 run of packets of 4 floats.
 """
 
@@ -23,11 +23,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import log, log2
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
+from morgs_mi.core.types import Bool, Float, UInt32
+from morgs_mi.render.backend import add_mode, block_shape, on_aligned_stack
 from morgs_mi.render.blocks import BlockLists, fetch_record, next_entry
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.region import Region
@@ -39,7 +40,6 @@ __all__ = [
     "Layout",
     "adjoint",
     "adjoint_of_pairs",
-    "on_aligned_stack",
     "pair_packets",
     "primal",
     "record_packets",
@@ -52,7 +52,7 @@ GEOMETRY = 6  # mean_x, mean_y, a, b, c, log2_opacity
 
 @dataclass(frozen=True)
 class Channel:
-    """A picture to blend: its floats per pixel, and whether its gradient reaches the weights."""
+    """A channel to blend: its floats per pixel, and whether its gradient reaches the weights."""
 
     size: int
     attached: bool
@@ -60,10 +60,10 @@ class Channel:
 
 @dataclass(frozen=True)
 class Layout:
-    """What the loops are traced for: one recording for each.
+    """Static description of a blend: the loops are traced once for each.
 
     Attributes:
-        channels: what is blended, in the order of the records' columns.
+        channels: the blended channels, in the order of the records' columns.
         alpha: whether alpha is an output.
         alpha_attached: whether the gradient of alpha is wanted.
         config: cut-offs.
@@ -96,44 +96,44 @@ class Layout:
 
 
 def record_packets(layout: Layout) -> int:
-    """Return the packets of 4 floats that a Gaussian's record takes, and its gradient too."""
+    """Return the number of packets of 4 floats of a Gaussian's record, which is also that of its gradient."""
     return -(-(GEOMETRY + layout.columns) // 4)
 
 
 # --------------------------------------------------------------------------------------------------
-#  What the three loops share
+#  Shared by the three loops
 # --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Blocks:
-    """What the loops read of a region and its lists, see `Region` and `BlockLists`; one entry per block."""
+    """The arrays of a region and its lists that the loops read, see `Region` and `BlockLists`; one entry per block."""
 
-    x: Any
-    y: Any
-    place: Any
-    rows: Any
-    pitch: Any
-    words: Any
-    entries: Any
-    begin: Any
-    end: Any
-    first: Any
-    order: Any
+    x: UInt32
+    y: UInt32
+    place: UInt32
+    rows: UInt32
+    pitch: UInt32
+    words: UInt32
+    entries: UInt32
+    begin: UInt32
+    end: UInt32
+    first: UInt32
+    order: UInt32
 
     @staticmethod
     def of(region: Region, lists: BlockLists) -> Blocks:
-        """Join a region and its lists."""
-        where = (region.x, region.y, region.place, region.rows, region.pitch)
-        return Blocks(*where, lists.words, lists.entries, lists.begin, lists.end, lists.first, lists.order)
+        """Return the arrays of a region and its lists."""
+        geometry = (region.x, region.y, region.place, region.rows, region.pitch)
+        return Blocks(*geometry, lists.words, lists.entries, lists.begin, lists.end, lists.first, lists.order)
 
 
 class _Block:
-    """The lanes' blocks: their pixels, their stretch of the lists, and the shape they are unrolled in."""
+    """The lanes' blocks: their pixels, their section of the lists, and the shape in which they are unrolled."""
 
     def __init__(self, layout: Layout, blocks: Blocks) -> None:
         config, order = layout.config, blocks.order
-        self.width, self.height = config.block_shape(dr.backend_v(mi.Float) == dr.JitBackend.CUDA)
+        self.width, self.height = block_shape(config)
         self.area = self.width * self.height
         self.log_min, self.alpha_max = log2(config.alpha_min), config.alpha_max
         self.stop = config.stop_transmittance
@@ -143,29 +143,29 @@ class _Block:
         self.x, self.y = (mi.Float(dr.gather(mi.UInt32, v, order)) + 0.5 for v in (blocks.x, blocks.y))
         begin, first = dr.gather(mi.UInt32, blocks.begin, order), dr.gather(mi.UInt32, blocks.first, order)
         self.end = on_aligned_stack(dr.gather(mi.UInt32, blocks.end, order))
-        # Before a block's first word, as `next_entry` wants it.
+        # One word before the block's first, as `next_entry` expects.
         self.walk = next_entry(begin, mi.UInt32(0), first - 32, self.end, blocks.words)
 
-    def continues(self, walk: tuple[Any, Any, Any], light: list[Any]) -> Any:
-        """Return whether a lane goes on: entries are left, and its most transparent pixel lets light through."""
-        while len(light) > 1:
-            pairs = zip(light[::2], light[1::2], strict=False)
-            light = [dr.select(a > b, a, b) for a, b in pairs] + light[len(light) & ~1 :]
-        return (walk[1] != 0) & (light[0] >= self.stop)
+    def continues(self, walk: tuple[UInt32, UInt32, UInt32], T: list[Float]) -> Bool:
+        """Return whether a lane continues: entries are left, and its most transparent pixel is above the stop."""
+        while len(T) > 1:
+            pairs = zip(T[::2], T[1::2], strict=False)
+            T = [dr.select(a > b, a, b) for a, b in pairs] + T[len(T) & ~1 :]
+        return (walk[1] != 0) & (T[0] >= self.stop)
 
-    def packets(self, size: int) -> list[tuple[Any, Any]]:
-        """Return (place, is there) of all packets of 4 in a picture of `size` floats per pixel, row by row."""
+    def packets(self, size: int) -> list[tuple[UInt32, Bool]]:
+        """Return (place, in the image) of all packets of 4 in an image of `size` floats per pixel, row by row."""
         run = self.width * size // 4
         starts = [((self.place + j * self.pitch) * size, self.rows > j) for j in range(self.height)]
-        return [(start + k, there) for start, there in starts for k in range(run)]
+        return [(start + k, inside) for start, inside in starts for k in range(run)]
 
-    def offsets(self, x: Any, y: Any, geometry: list[Any]) -> tuple[list[Any], list[Any]]:
-        """Return the distances dx [width] and dy [height] of the block's columns and rows to the mean."""
+    def offsets(self, x: Float, y: Float, geometry: list[Float]) -> tuple[list[Float], list[Float]]:
+        """Return the offsets dx [width] and dy [height] of the block's columns and rows from the mean."""
         dx, dy = x - geometry[0], y - geometry[1]
         return [dx + i for i in range(self.width)], [dy + j for j in range(self.height)]
 
-    def powers(self, dx: list[Any], dy: list[Any], geometry: list[Any]) -> list[tuple[Any, Any]]:
-        """Return (p, u) for every pixel, row by row."""
+    def powers(self, dx: list[Float], dy: list[Float], geometry: list[Float]) -> list[tuple[Float, Float]]:
+        """Return (p, u) of every pixel, row by row."""
         _, _, a, b, c, log2_opacity = geometry
         ax, rows = [a * x for x in dx], []
         for y in dy:
@@ -176,73 +176,65 @@ class _Block:
                 rows.append((dr.fma(-u, u, top), u))
         return rows
 
-    def alpha(self, p: Any) -> tuple[Any, Any]:
+    def alpha(self, p: Float) -> tuple[Float, Float]:
         """Return (alpha, alpha before the cap and the cut-off)."""
         full = _exp2(p)
-        # One instruction; `dr.minimum` takes three, to be right about NaN.
+        # One instruction; `dr.minimum` takes three to handle NaN.
         capped = dr.select(full < self.alpha_max, full, self.alpha_max)
         return dr.select(p >= self.log_min, capped, 0), full
 
 
-def _taken(walk: tuple[Any, Any, Any], end: Any, words: Any, entries: Any) -> tuple[Any, tuple[Any, Any, Any]]:
-    """Return the rank that a lane has come to, and where it goes next."""
+def _advance(
+    walk: tuple[UInt32, UInt32, UInt32], end: UInt32, words: UInt32, entries: UInt32
+) -> tuple[UInt32, tuple[UInt32, UInt32, UInt32]]:
+    """Return the rank at a lane's current entry, and the walk advanced to the next entry."""
     place, word, base = walk
     rank = dr.gather(mi.UInt32, entries, base + dr.tzcnt(word))
     return rank, next_entry(place, word & (word - 1), base, end, words)
-
-
-def on_aligned_stack(value: Any) -> Any:
-    """Return an integer as it is, from a kernel whose spilled packets are aligned.
-
-    LLVM aligns a kernel's stack only for variables that need it, and finds its own spills too late: they straddle
-    cache lines, and the step takes 3 to 6 % longer. An array that is indexed at run time is such a variable.
-    """
-    if dr.backend_v(mi.Float) != dr.JitBackend.LLVM:
-        return value
-    local, place = dr.alloc_local(type(value), 2), mi.UInt32(value) & 1
-    local[place] = value
-    return local[place]
 
 
 # Minimax over [-1/2, 1/2], highest power first: relative error 2.7e-6 in float32, like Taylor's fifth degree.
 _EXP2 = (0.009570102207362652, 0.05591786280274391, 0.240247443318367, 0.6931217908859253, 0.9999992847442627)
 
 
-def _exp2(p: Any) -> Any:
-    """Return 2^p for |p| < 126, relative error 3e-6; out of that range the result is garbage, not a trap.
+def _exp2(p: Float) -> Float:
+    """Return 2^p for |p| < 126, relative error 3e-6; out of that range the result is undefined, without a trap.
 
-    Adding 1.5 * 2^23 rounds to an integer in the low mantissa bits, ready to be shifted into the exponent.
+    Adding 1.5 * 2^23 rounds to an integer in the low mantissa bits, which is then shifted into the exponent.
     """
     shifted = p + 12582912.0
     f = p - (shifted - 12582912.0)
     value = mi.Float(_EXP2[0])
     for coefficient in _EXP2[1:]:
         value = dr.fma(value, f, coefficient)
-    bits = dr.reinterpret_array(mi.Int32, value) + (dr.reinterpret_array(mi.Int32, shifted) << 23)
+    exponent = dr.reinterpret_array(mi.Int32, shifted) << 23  # pyright: ignore[reportOperatorIssue]
+    bits = dr.reinterpret_array(mi.Int32, value) + exponent
     return dr.reinterpret_array(mi.Float, bits)
 
 
-def _floats(count: int, value: float = 0.0) -> list[Any]:
+def _floats(count: int, value: float = 0.0) -> list[Float]:
     return [mi.Float(value) for _ in range(count)]
 
 
-def _store(block: _Block, layout: Layout, sums: list[list[Any]], alpha: list[Any], pictures: list[Any]) -> list[Any]:
-    """Write every pixel's columns, and alpha if it is wanted, to the channels' pictures."""
+def _store(
+    block: _Block, layout: Layout, sums: list[list[Float]], alpha: list[Float], images: list[Float]
+) -> list[Float]:
+    """Write every pixel's columns, and alpha if it is an output, to the channels' images."""
     pixels, first = [[*row, a] for row, a in zip(sums, alpha, strict=True)], 0
-    for picture, size in zip(pictures, layout.sizes, strict=True):
+    for image, size in zip(images, layout.sizes, strict=True):
         values = [value for pixel in pixels for value in pixel[first : first + size]]
-        for k, (place, there) in enumerate(block.packets(size)):
+        for k, (place, inside) in enumerate(block.packets(size)):
             packet = mi.Vector4f(*values[4 * k : 4 * k + 4])
-            dr.scatter(picture, packet, place, active=there, mode=dr.ReduceMode.NoConflicts)
+            dr.scatter(image, packet, place, active=inside, mode=dr.ReduceMode.NoConflicts)
         first += size
-    return pictures
+    return images
 
 
-def _load(block: _Block, layout: Layout, pictures: list[Any]) -> list[list[Any]]:
-    """Read every pixel's columns, and alpha if there is one; zeros outside the image."""
-    pixels: list[list[Any]] = [[] for _ in range(block.area)]
-    for picture, size in zip(pictures, layout.sizes, strict=True):
-        packets = (dr.gather(mi.Vector4f, picture, place, active=there) for place, there in block.packets(size))
+def _load(block: _Block, layout: Layout, images: list[Float]) -> list[list[Float]]:
+    """Return every pixel's columns, and alpha if it is an output; zeros outside the image."""
+    pixels: list[list[Float]] = [[] for _ in range(block.area)]
+    for image, size in zip(images, layout.sizes, strict=True):
+        packets = (dr.gather(mi.Vector4f, image, place, active=inside) for place, inside in block.packets(size))
         values = [value for packet in packets for value in packet]
         for k, pixel in enumerate(pixels):
             pixel += values[k * size : (k + 1) * size]
@@ -254,12 +246,12 @@ def _load(block: _Block, layout: Layout, pictures: list[Any]) -> list[list[Any]]
 # --------------------------------------------------------------------------------------------------
 
 
-def primal(layout: Layout, blocks: Blocks, records: Any, pictures: list[Any]) -> list[Any]:
-    """Blend the records' columns into the channels' pictures, whatever is in them."""
+def primal(layout: Layout, blocks: Blocks, records: Float, images: list[Float]) -> list[Float]:
+    """Blend the records' columns into the channels' images, whose contents are overwritten."""
     block, C = _Block(layout, blocks), layout.columns
 
     def body(walk, end, x, y, T, sums, records, words, entries):
-        rank, walk = _taken(walk, end, words, entries)
+        rank, walk = _advance(walk, end, words, entries)
         record = fetch_record(records, rank, GEOMETRY + C)
         geometry, values = record[:GEOMETRY], record[GEOMETRY:]
         T_next, sums_next = [], []
@@ -269,12 +261,12 @@ def primal(layout: Layout, blocks: Blocks, records: Any, pictures: list[Any]) ->
             sums_next.append([dr.fma(w, c, total) for c, total in zip(values, sums[k], strict=True)])
         return walk, end, x, y, T_next, sums_next, records, words, entries
 
-    light, sums = _floats(block.area, 1.0), [_floats(C) for _ in range(block.area)]
-    state = (block.walk, block.end, block.x, block.y, light, sums, records, blocks.words, blocks.entries)
+    T, sums = _floats(block.area, 1.0), [_floats(C) for _ in range(block.area)]
+    state = (block.walk, block.end, block.x, block.y, T, sums, records, blocks.words, blocks.entries)
     *_, T, sums, _, _, _ = dr.while_loop(
         state, lambda walk, end, x, y, T, *_: block.continues(walk, T), body, label="blend"
     )
-    return _store(block, layout, sums, [1 - t for t in T], pictures)
+    return _store(block, layout, sums, [1 - t for t in T], images)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -285,49 +277,47 @@ def primal(layout: Layout, blocks: Blocks, records: Any, pictures: list[Any]) ->
 
 
 def adjoint(
-    layout: Layout, ranks: int, blocks: Blocks, records: Any, pictures: list[Any], picture_grads: list[Any]
-) -> Any:
-    """Return dL/d(record) of `ranks` ranks, a record each: the six geometry floats, the columns, padding.
+    layout: Layout, ranks: int, blocks: Blocks, records: Float, images: list[Float], image_grads: list[Float]
+) -> Float:
+    """Return dL/d(record) of `ranks` ranks, one record each: the six geometry floats, the columns, padding.
 
     Args:
-        layout: what is blended.
+        layout: description of the blend.
         ranks: at least N. Scatter-reductions have their target's size as a literal in the kernel.
-        blocks: where to walk.
-        records: of N ranks.
-        pictures: what `primal` returned.
-        picture_grads: their gradients.
+        blocks: the blocks and their lists.
+        records: records of N ranks.
+        images: images that `primal` returned.
+        image_grads: their gradients.
     """
     packets = record_packets(layout)
     sums = dr.zeros(mi.Float, 4 * packets * ranks)
-    # One copy of the target per thread beats atomics on few cores: 1.8 times faster than `Direct` on two.
-    on_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
-    mode = dr.ReduceMode.Expand if on_cpu else dr.ReduceMode.Auto
+    mode = add_mode()
 
-    def add(sums: Any, grads: list[Any], rank: Any, pair: Any) -> None:
+    def add(sums: Float, grads: list[Float], rank: UInt32, pair: UInt32) -> None:
         grads = [*grads, *_floats(packets * 4 - len(grads))]
         for k in range(packets):
             packet = mi.Vector4f(*grads[4 * k : 4 * k + 4])
             dr.scatter_reduce(dr.ReduceOp.Add, sums, packet, rank * packets + k, mode=mode)
 
-    return _adjoint(layout, blocks, records, pictures, picture_grads, mi.UInt32(0), sums, add)
+    return _adjoint(layout, blocks, records, images, image_grads, mi.UInt32(0), sums, add)
 
 
 def adjoint_of_pairs(
     layout: Layout,
     blocks: Blocks,
-    records: Any,
-    pictures: list[Any],
-    picture_grads: list[Any],
-    first_pair: Any,
-    pairs: Any,
-) -> Any:
-    """Write dL/d(record) of every pair of block and Gaussian, with the rank behind it, to a stretch of `pairs`.
+    records: Float,
+    images: list[Float],
+    image_grads: list[Float],
+    first_pair: UInt32,
+    pairs: Float,
+) -> Float:
+    """Write dL/d(record) of every pair of block and Gaussian, followed by the rank, to a section of `pairs`.
 
-    `first_pair` [A] says where each block's stretch begins. Nothing depends on the order of execution.
+    `first_pair` [A] is the first pair of each block's section. Nothing depends on the order of execution.
     """
     packets = pair_packets(layout)
 
-    def add(pairs: Any, grads: list[Any], rank: Any, pair: Any) -> None:
+    def add(pairs: Float, grads: list[Float], rank: UInt32, pair: UInt32) -> None:
         grads = [*grads, dr.reinterpret_array(mi.Float, rank)]
         grads += _floats(packets * 4 - len(grads))
         for k in range(packets):
@@ -335,33 +325,33 @@ def adjoint_of_pairs(
             dr.scatter(pairs, packet, pair * packets + k, mode=dr.ReduceMode.NoConflicts)
 
     pair = dr.gather(mi.UInt32, first_pair, blocks.order)
-    return _adjoint(layout, blocks, records, pictures, picture_grads, pair, pairs, add)
+    return _adjoint(layout, blocks, records, images, image_grads, pair, pairs, add)
 
 
 def pair_packets(layout: Layout) -> int:
-    """Return the packets of 4 floats of a pair's gradient and rank."""
+    """Return the number of packets of 4 floats of a pair's gradient and rank."""
     return (GEOMETRY + layout.columns) // 4 + 1
 
 
 def _adjoint(
     layout: Layout,
     blocks: Blocks,
-    records: Any,
-    pictures: list[Any],
-    picture_grads: list[Any],
-    pair: Any,
-    target: Any,
-    add: Callable[[Any, list[Any], Any, Any], None],
-) -> Any:
+    records: Float,
+    images: list[Float],
+    image_grads: list[Float],
+    pair: UInt32,
+    target: Float,
+    add: Callable[[Float, list[Float], UInt32, UInt32], None],
+) -> Float:
     block, C, geometric = _Block(layout, blocks), layout.columns, layout.reaches_weights
-    gradients = _load(block, layout, picture_grads)
+    gradients = _load(block, layout, image_grads)
     suffix = [
         _inner(g, v, layout, v[C] if layout.alpha else None)
-        for g, v in zip(gradients, _load(block, layout, pictures), strict=True)
+        for g, v in zip(gradients, _load(block, layout, images), strict=True)
     ]
 
     def body(walk, pair, end, x, y, T, S, g, records, words, entries, target):
-        rank, walk = _taken(walk, end, words, entries)
+        rank, walk = _advance(walk, end, words, entries)
         record = fetch_record(records, rank, GEOMETRY + C)
         geometry, values = record[:GEOMETRY], record[GEOMETRY:]
         dx, dy = block.offsets(x, y, geometry)
@@ -382,17 +372,17 @@ def _adjoint(
         add(target, [*geometry_grads, *value_grads], rank, pair)
         return walk, pair + 1, end, x, y, T_next, S_next, g, records, words, entries, target
 
-    light, suffix = _floats(block.area, 1.0), suffix if geometric else []
-    where = (block.walk, pair, block.end, block.x, block.y)
-    state = (*where, light, suffix, gradients, records, blocks.words, blocks.entries, target)
+    T, suffix = _floats(block.area, 1.0), suffix if geometric else []
+    walk = (block.walk, pair, block.end, block.x, block.y)
+    state = (*walk, T, suffix, gradients, records, blocks.words, blocks.entries, target)
     *_, target = dr.while_loop(
         state, lambda walk, pair, end, x, y, T, *_: block.continues(walk, T), body, label="blend (adjoint)"
     )
     return target
 
 
-def _inner(g: list[Any], values: list[Any], layout: Layout, alpha: Any) -> Any:
-    """Return <g, values> over the attached columns, plus g_alpha alpha; `alpha` None stands for 1."""
+def _inner(g: list[Float], values: list[Float], layout: Layout, alpha: Float | None) -> Float:
+    """Return <g, values> over the attached columns, plus g_alpha alpha; `alpha` None means 1."""
     total = None
     if layout.alpha_attached:
         total = g[layout.columns] if alpha is None else g[layout.columns] * alpha
@@ -403,14 +393,14 @@ def _inner(g: list[Any], values: list[Any], layout: Layout, alpha: Any) -> Any:
 
 
 class _Moments:
-    """Sums over a block of d times 1, u, u dx, u dy, dy, dy^2; rows first, so a pixel costs four additions."""
+    """Sums over a block of d times 1, u, u dx, u dy, dy, dy^2; rows first, so that a pixel costs four additions."""
 
     def __init__(self, block: _Block) -> None:
         self.width = block.width
         self.d, self.du, self.dui, self.duj, self.dj, self.djj = _floats(6)
         self.row_d, self.row_du = mi.Float(0), mi.Float(0)
 
-    def add(self, k: int, d: Any, u: Any) -> None:
+    def add(self, k: int, d: Float, u: Float) -> None:
         """Add pixel k (row by row) with its d and u."""
         j, i = divmod(k, self.width)
         du = d * u
@@ -424,8 +414,8 @@ class _Moments:
             )
             self.duj = dr.fma(self.row_du, float(j), self.duj)
 
-    def gradients(self, x0: Any, y0: Any, geometry: list[Any]) -> list[Any]:
-        """Return the gradients of (mean_x, mean_y, a, b, c, log2_opacity); (x0, y0): first pixel's offset."""
+    def gradients(self, x0: Float, y0: Float, geometry: list[Float]) -> list[Float]:
+        """Return the gradients of (mean_x, mean_y, a, b, c, log2_opacity); (x0, y0) is the first pixel's offset."""
         _, _, a, b, c, _ = geometry
         du_dx, du_dy = dr.fma(self.du, x0, self.dui), dr.fma(self.du, y0, self.duj)
         d_dy = dr.fma(self.d, y0, self.dj)
@@ -446,12 +436,12 @@ class _Moments:
 # --------------------------------------------------------------------------------------------------
 
 
-def tangent(layout: Layout, blocks: Blocks, records: Any, tangents: Any, pictures: list[Any]) -> list[Any]:
-    """Write the directional derivative along the records' tangents into `pictures`, whatever is in them."""
+def tangent(layout: Layout, blocks: Blocks, records: Float, tangents: Float, images: list[Float]) -> list[Float]:
+    """Write the directional derivative along the records' tangents to `images`, whose contents are overwritten."""
     block, C = _Block(layout, blocks), layout.columns
 
     def body(walk, end, x, y, T, dT, dsums, records, tangents, words, entries):
-        rank, walk = _taken(walk, end, words, entries)
+        rank, walk = _advance(walk, end, words, entries)
         record, tangent = (fetch_record(r, rank, GEOMETRY + C) for r in (records, tangents))
         geometry, values = record[:GEOMETRY], record[GEOMETRY:]
         (a, b, c), (tx, ty, ta, tb, tc, t_log2) = geometry[2:5], tangent[:GEOMETRY]
@@ -475,10 +465,10 @@ def tangent(layout: Layout, blocks: Blocks, records: Any, tangents: Any, picture
         return walk, end, x, y, T_next, dT_next, dsums_next, records, tangents, words, entries
 
     dsums = [_floats(C) for _ in range(block.area)]
-    light, dlight = _floats(block.area, 1.0), _floats(block.area)
-    where = (block.walk, block.end, block.x, block.y)
-    state = (*where, light, dlight, dsums, records, tangents, blocks.words, blocks.entries)
+    T, dT = _floats(block.area, 1.0), _floats(block.area)
+    walk = (block.walk, block.end, block.x, block.y)
+    state = (*walk, T, dT, dsums, records, tangents, blocks.words, blocks.entries)
     _, _, _, _, _, dT, dsums, *_ = dr.while_loop(
         state, lambda walk, end, x, y, T, *_: block.continues(walk, T), body, label="blend (tangent)"
     )
-    return _store(block, layout, dsums, [-t if layout.alpha_attached else mi.Float(0) for t in dT], pictures)
+    return _store(block, layout, dsums, [-t if layout.alpha_attached else mi.Float(0) for t in dT], images)

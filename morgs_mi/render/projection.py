@@ -1,4 +1,4 @@
-"""From Gaussians in the world to splats on the screen, differentiated by Dr.Jit.
+"""Projection of Gaussians in the world to splats on the screen, differentiated by Dr.Jit.
 
 Notation: x = R mean + t in camera space, z its depth, J the Jacobian of the projection at x, and
 U = J R Q diag(s) [2, 3], so that the screen covariance is U U' + eps2d I (EWA splatting, Zwicker 2001).
@@ -6,19 +6,18 @@ A pixel at offset d = (dx, dy) from the splat's centre gets alpha = 2^p with
 
     p = log2(opacity) - u^2 - v^2,    u = a dx + b dy,    v = c dy,
 
-where [a b; 0 c] is the Cholesky factor of the conic times log2(e) / 2. Written so, p never exceeds
-log2(opacity), however thin the needle, and the pixel loop needs no exponential but 2^p.
+where [a b; 0 c] is the Cholesky factor of the conic times log2(e) / 2. In this form p never exceeds
+log2(opacity), however thin the needle, and the only exponential in the pixel loop is 2^p.
 
-Nothing overflows on the way: U is computed in units of the splat's own size, and what the camera cannot see is
-projected from a stand-in, so that no 0 * inf spoils a gradient. x is summed in double precision: scenes far
-from the origin, and cameras far from the scene, would lose as many digits as the one exceeds the other.
+No intermediate value overflows: U is computed in units of the splat's own size, and a Gaussian that the camera cannot
+see is projected from a substitute position, so that 0 * inf does not reach a gradient. x is summed in double precision:
+for scenes far from the origin, and cameras far from the scene, single precision would lose the digits that cancel.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from math import log2, sqrt
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -26,18 +25,17 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians, tensor_rows
+from morgs_mi.core.types import Bool, Float, Jit, Tensor, UInt32
+from morgs_mi.render.channels import attribute_channels
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["CHANNEL_SIZES", "Splats", "concatenated", "project"]
-
-# What a channel blends, and how many numbers that takes; `alpha` is blended with every call.
-CHANNEL_SIZES = {"color": 3, "depth": 1, "motion": 2, "confidence": 1}
+__all__ = ["Splats", "concatenated", "project"]
 
 _HALF_LOG2E = 0.5 * log2(2.718281828459045)
 
 # World units; squares of what is farther overflow.
 _FARTHEST = 1e18
-# A float32 rotation aims a needle no better than 1e-7 of its length: thinner than this it is not drawn.
+# A float32 rotation orients a needle to 1e-7 of its length at best: aspects below this are clamped.
 _THINNEST = 1e-6
 
 
@@ -47,27 +45,27 @@ class Splats:
 
     Attributes:
         shape: (mean_x, mean_y, a, b, c, log2_opacity), the differentiable geometry (see module docstring).
-        channels: what is blended, by channel name.
+        channels: blended values, by channel name.
         depths: camera-space z in world units, detached.
         extent: (half width, half height) in px of the region where alpha >= alpha_min, detached; 0 if culled.
         valid: False where culled: behind the near plane, too faint, or not finite.
-        finite: False where an attribute, or what becomes of it, is not finite.
-        order: splats in the order in which equal depths are blended; None: as they come.
+        finite: False where an attribute, or a value computed from it, is not finite.
+        order: splats in the order in which equal depths are blended; None: that of the input.
     """
 
-    shape: tuple[Any, ...]
-    channels: dict[str, tuple[Any, ...]]
-    depths: Any
-    extent: tuple[Any, Any]
-    valid: Any
-    finite: Any
-    order: Any | None = None
+    shape: tuple[Float, ...]
+    channels: dict[str, tuple[Float, ...]]
+    depths: Float
+    extent: tuple[Float, Float]
+    valid: Bool
+    finite: Bool
+    order: UInt32 | None = None
 
     def __len__(self) -> int:
         return dr.width(self.depths)
 
-    def concatenated_with(self, other: Splats, order: Any) -> Splats:
-        """Return these splats and the others, to be blended in `order` where depths are equal."""
+    def concatenated_with(self, other: Splats, order: UInt32 | None) -> Splats:
+        """Return these splats followed by the others, blended in `order` where depths are equal."""
         return Splats(
             concatenated(self.shape, other.shape),
             {name: concatenated(value, other.channels[name]) for name, value in self.channels.items()},
@@ -79,15 +77,15 @@ class Splats:
         )
 
 
-def concatenated(a: Any, b: Any) -> Any:
-    """Return two arrays, or tuples of them, end to end; `dr.concat` would compile a kernel for every length."""
+def concatenated(a: Jit, b: Jit) -> Jit:
+    """Return two arrays, or tuples of arrays, end to end; `dr.concat` would compile a kernel for every length."""
     if isinstance(a, tuple):
         return tuple(concatenated(v, w) for v, w in zip(a, b, strict=True))
     n, mode = dr.opaque(mi.UInt32, dr.width(a)), dr.ReduceMode.NoConflicts
     lane = dr.arange(mi.UInt32, dr.width(a) + dr.width(b))
-    ours = lane < n
-    front = dr.gather(type(a), a, lane, active=ours, mode=mode)
-    return dr.select(ours, front, dr.gather(type(b), b, lane - n, active=~ours, mode=mode))
+    first = lane < n
+    front = dr.gather(type(a), a, lane, active=first, mode=mode)
+    return dr.select(first, front, dr.gather(type(b), b, lane - n, active=~first, mode=mode))
 
 
 def project(
@@ -95,24 +93,24 @@ def project(
     camera: Camera,
     channels: tuple[str, ...],
     config: RenderConfig,
-    rows: Any | None = None,
-    features: Any | None = None,
+    rows: UInt32 | None = None,
+    features: Tensor | None = None,
 ) -> Splats:
-    """Project Gaussians to the screen of `camera` and evaluate the channels asked for.
+    """Project Gaussians to the screen of `camera` and evaluate the requested channels.
 
     Args:
         gaussians: N Gaussians with activated attributes.
         camera: the view; a Dr.Jit `viewmat` receives gradients.
-        channels: names out of `CHANNEL_SIZES`, or ``features``.
+        channels: names of `channel_sizes()`, or ``features``.
         config: cut-offs.
-        rows: which Gaussians, UInt32 [M], none of them twice; None: all N, in order.
+        rows: indices of the Gaussians [M], without repetition; None: all N, in order.
         features: tensor [N, F] that the channel ``features`` blends.
 
     Returns:
         Splats of length M, differentiable in every attribute and in the camera's pose.
     """
     if rows is None:
-        rows = dr.arange(mi.UInt32, dr.prod(gaussians.means.shape[:1]))
+        rows = dr.arange(mi.UInt32, int(dr.prod(gaussians.means.shape[:1])))
     means, quats = gaussians.rows("means", rows), mi.Vector4f(*gaussians.rows("quats", rows))
     scales, (opacities,) = mi.Vector3f(*gaussians.rows("scales", rows)), gaussians.rows("opacities", rows)
     R, pose, eye = _pose(camera.viewmat)
@@ -137,7 +135,8 @@ def project(
     log2_opacity = dr.log2(dr.maximum(opacities, 1e-9))
     shape = (mean_x, mean_y, a, b, c, log2_opacity)
 
-    blended: dict[str, tuple[Any, ...]] = {}
+    blended: dict[str, tuple[Float, ...]] = {}
+    attributes = attribute_channels()
     for name in channels:
         if name == "color":
             direction = dr.select(front, mi.Vector3f(*(mi.Float(v - e) for v, e in zip(world, eye, strict=True))), 1)
@@ -146,25 +145,26 @@ def project(
             blended[name] = (z,)
         elif name == "motion":
             blended[name] = _screen_motion(gaussians.rows("motion", rows), x * rz, y * rz, fx * rz, fy * rz, R)
-        elif name == "confidence":
-            blended[name] = tuple(gaussians.rows("confidence", rows))
         elif name == "features":
             blended[name] = tuple(tensor_rows(features, rows))
+        elif name in attributes:
+            blended[name] = tuple(gaussians.rows(attributes[name].activated_name, rows))
 
     # alpha >= alpha_min  <=>  u^2 + v^2 <= reach, an ellipse with these half axes along x and y
     reach = dr.maximum(dr.detach(log2_opacity) - log2(config.alpha_min), 0)
     xx, yy = dr.detach(xx), dr.detach(yy)
+    # Not finite where any of these values is not.
     probe += sum(dr.detach(v) for v in (*shape, *(v for values in blended.values() for v in values)))
-    finite = dr.isfinite(probe)
-    valid = front & (reach > 0) & finite
+    finite = dr.isfinite(probe)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    valid = front & (reach > 0) & finite  # pyright: ignore[reportOperatorIssue]
     extent = (dr.sqrt(reach * xx) / s, dr.sqrt(reach * yy) / s)
     return Splats(shape, blended, dr.detach(z), extent, valid, finite)
 
 
-def _pose(viewmat: Any) -> tuple[list[list[Any]], list[list[Any]], list[Any]]:
+def _pose(viewmat: Tensor) -> tuple[list[list[Float]], list[list[Float]], list[Float]]:
     """Return R [3][3] in single, and [R t] [3][4] and the camera's centre -R't [3] in double precision.
 
-    All are width-1 Dr.Jit floats that keep the gradient of a Dr.Jit `viewmat`.
+    All are width-1 Dr.Jit floats, attached to the gradient of a Dr.Jit `viewmat`.
     """
     flat = mi.Float64(viewmat.array if dr.is_tensor_v(viewmat) else np.array(viewmat, np.float64).ravel())
     rows = [[dr.gather(mi.Float64, flat, mi.UInt32(4 * i + k)) for k in range(4)] for i in range(3)]
@@ -172,10 +172,10 @@ def _pose(viewmat: Any) -> tuple[list[list[Any]], list[list[Any]], list[Any]]:
     return [[mi.Float(v) for v in row[:3]] for row in rows], rows, eye
 
 
-def _intrinsics(camera: Camera) -> list[Any]:
+def _intrinsics(camera: Camera) -> list[Float]:
     """Return fx, fy, cx, cy, near and the bounds (low, high) of x/z and of y/z as width-1 Dr.Jit floats.
 
-    They are read from memory: as Python numbers, every camera would compile kernels of its own.
+    They are read from memory: with Python numbers, every camera would compile its own kernels.
     """
     K, bounds = camera.K, []
     for axis, size in enumerate((camera.width, camera.height)):
@@ -183,17 +183,17 @@ def _intrinsics(camera: Camera) -> list[Any]:
         margin = 0.15 * size / f  # 30 % of the half view on every side
         bounds += [-c / f - margin, (size - c) / f + margin]
     values = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.near, *bounds]
-    memory = mi.Float(np.float32(values))
+    memory = mi.Float(np.array(values, np.float32))
     return [dr.gather(mi.Float, memory, mi.UInt32(i)) for i in range(len(values))]
 
 
-def _rotation(quats: Any) -> list[Any]:
-    """Return the columns of the rotation matrix of wxyz quaternions of any length; length 0 does not rotate."""
+def _rotation(quats: Jit) -> list[Jit]:
+    """Return the columns of the rotation matrix of wxyz quaternions of any length; length 0 is the identity."""
     largest = dr.max(dr.abs(dr.detach(quats)))
-    none = largest < 1e-30
-    # Scaled so that squaring neither over- nor underflows; by a product with 0, not a choice, so that NaN stays.
-    scaled = quats * dr.select(none, 0, dr.rcp(dr.minimum(largest, 1e30)))
-    w, x, y, z = dr.normalize(scaled + mi.Vector4f(dr.select(none, 1, 0), 0, 0, 0))
+    zero = largest < 1e-30
+    # Scaled so that squares neither over- nor underflow; by a product with 0 instead of a selection, so that NaN stays.
+    scaled = quats * dr.select(zero, 0, dr.rcp(dr.minimum(largest, 1e30)))
+    w, x, y, z = dr.normalize(scaled + mi.Vector4f(dr.select(zero, 1, 0), 0, 0, 0))
     return [
         mi.Vector3f(1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
         mi.Vector3f(2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
@@ -202,13 +202,13 @@ def _rotation(quats: Any) -> list[Any]:
 
 
 def _screen_axes(
-    tan_x: Any, tan_y: Any, jx: Any, jy: Any, R: list[list[Any]], quats: Any, scales: Any, limits: list[Any]
-) -> tuple[Any, Any, Any]:
+    tan_x: Float, tan_y: Float, jx: Float, jy: Float, R: list[list[Float]], quats: Jit, scales: Jit, limits: list[Float]
+) -> tuple[Jit, Jit, Float]:
     """Return the rows of U = J R Q diag(s), two vectors [3] in units of the splat's size, and 1 / size in 1/px.
 
-    The size, at least one pixel, is any number of the order of the largest entry of U.
+    The size, at least one pixel, is of the order of the largest entry of U.
     """
-    # Outside the view the linearisation blows up: its point is clamped to 1.3 times the half view, as in 3DGS.
+    # Outside the view the linearisation diverges: its point is clamped to 1.3 times the half view, as in 3DGS.
     lo_x, hi_x, lo_y, hi_y = limits
     tan_x, tan_y = dr.clip(tan_x, lo_x, hi_x), dr.clip(tan_y, lo_y, hi_y)
     r_focal = dr.rcp(dr.detach(dr.maximum(jx, jy)))
@@ -221,13 +221,16 @@ def _screen_axes(
     return u0, u1, r_focal * r_scale
 
 
-def _colors(direction: Any, coeffs: list[Any]) -> tuple[Any, ...]:
+def _colors(direction: Jit, coeffs: list[Float]) -> tuple[Float, ...]:
     """Return max(0.5 + SH(direction), 0) per colour component (3DGS's convention) of 3 K coefficients."""
     basis = dr.sh_eval(dr.normalize(direction), int(sqrt(len(coeffs) // 3)) - 1)
-    return tuple(dr.maximum(sum(B * coeffs[3 * k + c] for k, B in enumerate(basis)) + 0.5, 0) for c in range(3))
+    sums: list[Float] = [sum(B * coeffs[3 * k + c] for k, B in enumerate(basis)) for c in range(3)]
+    return tuple(dr.maximum(total + 0.5, 0) for total in sums)
 
 
-def _screen_motion(motion: Any, tan_x: Any, tan_y: Any, jx: Any, jy: Any, R: list[list[Any]]) -> tuple[Any, Any]:
+def _screen_motion(
+    motion: list[Float], tan_x: Float, tan_y: Float, jx: Float, jy: Float, R: list[list[Float]]
+) -> tuple[Float, Float]:
     """Return pi(motion) in px: the first-order projection of a displacement (eq. 6), J R motion."""
     mx, my, mz = (sum(R[i][k] * motion[k] for k in range(3)) for i in range(3))
     return jx * (mx - tan_x * mz), jy * (my - tan_y * mz)

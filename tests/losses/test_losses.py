@@ -1,4 +1,4 @@
-"""The losses against obvious float64 twins, and their derivatives against central differences."""
+"""The losses against float64 reference implementations, and their derivatives against central differences."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from morgs_mi.losses.losses import flow_loss, mask_loss, offset_loss, recon_loss
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.region import Region
 from tests import tolerances as tol
+from tests.assertions import assert_close
 
 SIZE = (19, 23, 3)
 
 
 @pytest.fixture(scope="module")
-def pictures():
+def images():
+    """Return a noisy image and its target."""
     rng = np.random.default_rng(0)
     target = rng.uniform(0, 1, SIZE).astype(np.float32)
     return (target + rng.normal(0, 0.2, SIZE)).astype(np.float32), target
@@ -46,34 +48,34 @@ def slow_recon(image, target, weight, window=11, sigma=1.5):
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
-def test_recon_loss_agrees_with_twin(pictures, weight):
-    image, target = pictures
+def test_recon_loss__agrees_with_the_reference(images, weight):
+    image, target = images
     found = item(recon_loss(mi.TensorXf(image), Target(target), weight))
     assert found == pytest.approx(slow_recon(image, target, weight), rel=tol.LOSS_REL)
 
 
-def test_identical_pictures_have_no_loss(pictures):
-    target = pictures[1]
+def test_recon_loss__of_identical_images_is_zero(images):
+    target = images[1]
     assert item(recon_loss(mi.TensorXf(target), Target(target))) == pytest.approx(0, abs=1e-6)
 
 
 @pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
-def test_recon_gradient_agrees_with_central_differences(pictures, weight):
-    image, target = pictures
+def test_recon_loss__gradient_agrees_with_central_differences(images, weight):
+    image, target = images
     x = mi.TensorXf(image)
     dr.enable_grad(x)
     dr.backward(recon_loss(x, Target(target), weight))
     grad, rng = np.asarray(dr.grad(x), np.float64), np.random.default_rng(1)
     for _ in range(3):
-        # Steps that cross no kink of |I - I*|.
+        # Steps that do not cross the kink of |I - I*|.
         v = rng.normal(size=SIZE) * (np.abs(image - target) > 2e-3)
         h = 1e-4
         up, down = (slow_recon(image + s * h * v, target, weight) for s in (1, -1))
         assert np.vdot(grad, v) == pytest.approx((up - down) / (2 * h), rel=tol.LOSS_GRADIENT_REL, abs=1e-6)
 
 
-def test_masked_pixels_do_not_matter(pictures):
-    image, target = pictures
+def test_recon_loss__ignores_masked_pixels(images):
+    image, target = images
     mask = np.ones(SIZE[:2], bool)
     mask[3:9, 5:11] = False
     other = image.copy()
@@ -82,16 +84,16 @@ def test_masked_pixels_do_not_matter(pictures):
     assert losses[0] == pytest.approx(losses[1], rel=1e-6)
 
 
-def test_dssim_agrees_with_the_metric_away_from_the_border():
-    """The metric leaves the border out, the loss pads it: on pictures that are black there both agree."""
+def test_recon_loss__dssim_agrees_with_the_metric_away_from_the_border():
+    """The metric excludes the border, the loss pads it: on images that are black there both agree."""
     rng = np.random.default_rng(2)
     a, b = (np.zeros((48, 48, 3), np.float32) for _ in range(2))
-    for picture in (a, b):
-        picture[12:-12, 12:-12] = rng.uniform(0, 1, (24, 24, 3))
+    for image in (a, b):
+        image[12:-12, 12:-12] = rng.uniform(0, 1, (24, 24, 3))
     dssim = item(recon_loss(mi.TensorXf(a), Target(b), 1.0))
     inside = ssim(a, b)
     full = 1 - dssim
-    # Both average 1 outside; they differ in how many such pixels they count.
+    # Outside, SSIM is 1 in both; they differ in the number of such pixels that they count.
     assert (1 - full) * 48**2 == pytest.approx((1 - inside) * _counted(48), rel=1e-3)
 
 
@@ -99,40 +101,43 @@ def _counted(side):
     return (side - 10) ** 2
 
 
-def test_flow_loss_is_the_mean_endpoint_error():
+def test_flow_loss__is_the_mean_endpoint_error():
     rng = np.random.default_rng(3)
-    motion, cue = rng.normal(size=(2, 8, 9, 2)).astype(np.float32)
+    motion, observed = rng.normal(size=(2, 8, 9, 2)).astype(np.float32)
     reliable = (rng.uniform(size=(8, 9)) > 0.3).astype(np.float32)
     x = mi.TensorXf(motion)
     dr.enable_grad(x)
-    loss = flow_loss(x, mi.TensorXf(cue), mi.TensorXf(reliable))
-    error = np.linalg.norm(motion - cue, axis=-1)
+    loss = flow_loss(x, mi.TensorXf(observed), mi.TensorXf(reliable))
+    error = np.linalg.norm(motion - observed, axis=-1)
     assert item(loss) == pytest.approx((error * reliable).mean(), rel=1e-3)
     dr.backward(loss)
-    expected = (motion - cue) / error[..., None] * reliable[..., None] / reliable.size
-    assert np.abs(np.asarray(dr.grad(x)) - expected).max() < 1e-2 / reliable.size
+    expected = (motion - observed) / error[..., None] * reliable[..., None] / reliable.size
+    assert_close(dr.grad(x), expected, atol=1e-2 / reliable.size)
 
 
-def test_flow_loss_has_a_finite_gradient_where_both_agree():
+def test_flow_loss__has_a_finite_gradient_where_both_agree():
     x = mi.TensorXf(np.ones((4, 4, 2), np.float32))
     dr.enable_grad(x)
     dr.backward(flow_loss(x, mi.TensorXf(np.ones((4, 4, 2), np.float32)), mi.TensorXf(np.ones((4, 4), np.float32))))
     assert np.asarray(dr.grad(x)).max() == 0
 
 
-def test_mask_and_offset_losses():
+def test_mask_loss__is_the_mean_absolute_difference():
     rng = np.random.default_rng(4)
     confidence, mask = rng.uniform(size=(6, 5, 1)).astype(np.float32), rng.uniform(size=(6, 5)) > 0.5
     found = item(mask_loss(mi.TensorXf(confidence), mi.TensorXf(mask.astype(np.float32))))
     assert found == pytest.approx(np.abs(confidence[..., 0] - mask).mean(), rel=1e-5)
-    offset = rng.normal(size=(7, 3)).astype(np.float32)
+
+
+def test_offset_loss__is_the_mean_l1_norm_in_scene_extents():
+    offset = np.random.default_rng(4).normal(size=(7, 3)).astype(np.float32)
     assert item(offset_loss(mi.TensorXf(offset), 2.0)) == pytest.approx(np.abs(offset).sum(1).mean() / 2, rel=1e-5)
 
 
 @pytest.mark.parametrize("width", [64, 77])
 @pytest.mark.parametrize("masked", [False, True])
-def test_recon_loss_on_a_region_teaches_what_the_whole_view_does(width, masked):
-    """Where only a region has changed, its derivative is the whole view's, and the value changes by as much."""
+def test_recon_loss__gradient_on_a_region_agrees_with_the_full_view(width, masked):
+    """If only a region has changed, its derivative is the full view's, and the value changes by the same amount."""
     height, rng = 150, np.random.default_rng(4)
     y, x = np.mgrid[:height, :width]
     drawn = (x - 30) ** 2 + (y - 100) ** 2 < 15**2
@@ -142,10 +147,10 @@ def test_recon_loss_on_a_region_teaches_what_the_whole_view_does(width, masked):
     changed = region.crop(before) + np.float32(rng.normal(size=region.shape(3))) * region.inside()[..., None] * 0.1
     after = region.paste(changed, before)
     target = Target(truth, rng.uniform(size=drawn.shape) < 0.8 if masked else None)
-    target.remember(mi.TensorXf(before))
+    target.set_surroundings(mi.TensorXf(before))
 
-    def evaluate(picture, where):
-        tensor = mi.TensorXf(np.float32(picture))
+    def evaluate(image, where):
+        tensor = mi.TensorXf(np.float32(image))
         dr.enable_grad(tensor)
         loss = recon_loss(tensor, target, 0.3, where)
         dr.backward(loss)
@@ -154,15 +159,15 @@ def test_recon_loss_on_a_region_teaches_what_the_whole_view_does(width, masked):
     found, found_grad = evaluate(changed, region)
     expected, expected_grad = evaluate(after, None)
     scale = np.abs(expected_grad).max()
-    assert np.abs(found_grad - region.crop(expected_grad)).max() < tol.SUM_ORDER_REL * scale
-    (old, _), (old_part, _) = evaluate(before, None), evaluate(region.crop(before), region)
-    assert found - old_part == pytest.approx(expected - old, abs=tol.LOSS_REL * expected)
-    again, again_grad = evaluate(changed, region)  # the surroundings have not suffered
+    assert_close(found_grad, region.crop(expected_grad), atol=tol.SUM_ORDER_REL * scale)
+    (old, _), (old_on_region, _) = evaluate(before, None), evaluate(region.crop(before), region)
+    assert found - old_on_region == pytest.approx(expected - old, abs=tol.LOSS_REL * expected)
+    again, again_grad = evaluate(changed, region)  # the surroundings are unchanged
     assert (again, np.abs(again_grad - found_grad).max()) == (found, 0)
 
 
 @pytest.mark.parametrize("width", [23, 24])
-def test_difference_is_that_of_every_pixel(width):
+def test_target__difference_is_that_of_every_pixel(width):
     rng = np.random.default_rng(0)
     image, truth = (np.float32(rng.uniform(size=(19, width, 3))) for _ in range(2))
     mask = rng.uniform(size=(19, width)) < 0.7
@@ -175,18 +180,18 @@ def test_difference_is_that_of_every_pixel(width):
     assert np.allclose(found, region.crop(expected), atol=1e-6)
 
 
-def test_a_region_stands_in_its_target_unless_told_otherwise():
+def test_target__is_its_own_surroundings_by_default():
     rng = np.random.default_rng(0)
     truth = np.float32(rng.uniform(size=(32, 40, 3)))
     mask = np.zeros((32, 40), bool)
     mask[3, 4] = True
-    region, told, untold = Region(mask), Target(truth), Target(truth)
-    told.remember(mi.TensorXf(truth))
+    region, given, default = Region(mask), Target(truth), Target(truth)
+    given.set_surroundings(mi.TensorXf(truth))
     image = mi.TensorXf(region.crop(truth) + 0.1)
-    assert item(recon_loss(image, untold, region=region)) == item(recon_loss(image, told, region=region)) > 0
+    assert item(recon_loss(image, default, region=region)) == item(recon_loss(image, given, region=region)) > 0
 
 
-def test_a_picture_of_another_size_is_refused(pictures):
+def test_recon_loss__refuses_an_image_of_another_size(images):
     image, target = (np.zeros((32, 40, 3), np.float32) for _ in range(2))
     mask = np.zeros((32, 40), bool)
     mask[3, 4] = True
@@ -194,10 +199,10 @@ def test_a_picture_of_another_size_is_refused(pictures):
     with pytest.raises(ValueError, match=r"`image` must be \(1, 4, 8, 3\) like its target"):
         recon_loss(mi.TensorXf(image), Target(target), region=region)
     with pytest.raises(ValueError, match="`region` must be of a 23x19 view like its target, got 40x32"):
-        recon_loss(mi.TensorXf(region.crop(image)), Target(pictures[1]), region=region)
+        recon_loss(mi.TensorXf(region.crop(image)), Target(images[1]), region=region)
 
 
-def test_recon_kernels_are_compiled_once_for_all_sizes():
+def test_recon_loss__compiles_its_kernels_once_for_all_sizes():
     rng = np.random.default_rng(0)
 
     def step(height, width):

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from morgs_mi.method.confidence import flow_mask, flow_threshold, motion_floor, motion_mask
-from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import observe_flow, observe_key_views
 from morgs_mi.method.flow_sources.registry import FramePair
 from morgs_mi.method.mask_refiners.config import MaskConfig
@@ -62,10 +61,10 @@ def test_observe_key_views__masks_are_those_of_the_configured_method():
     previous, image, _ = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
     pair = {7: FramePair(image, previous)}
     for method in MASK_REFINERS.names:
-        observation = observe_key_views(pair, MotionConfig(mask_method=method), with_masks=True)[7]
+        observation = observe_key_views(pair, "dis", method)[7]
         mask = flow_mask(observation.motion, observation.reliable)
         np.testing.assert_array_equal(observation.mask, mask_refiner(method)(image, mask))
-    assert observe_key_views(pair, MotionConfig(), with_masks=False)[7].mask is None
+    assert observe_key_views(pair)[7].mask is None
 
 
 def test_flow_threshold__follows_width_and_noise():

@@ -1,4 +1,4 @@
-"""A window draws a part of a view before what stands still, as if everything were drawn anew."""
+"""An active view against the full view: same pixels, same gradients."""
 
 from __future__ import annotations
 
@@ -11,29 +11,20 @@ from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.render.active_view import ActiveView, make_active_view
 from morgs_mi.render.backproject import backproject
 from tests import tolerances as tol
+from tests.assertions import assert_close
+from tests.scenes import CHANNELS, make_wide_camera, make_wide_scene
 
-CHANNELS = ("color", "alpha", "depth", "motion", "confidence")
-N, MOVING = 120, np.arange(0, 120, 5)
+N, ACTIVE = 120, np.arange(0, 120, 5)
 
 
 @pytest.fixture(scope="module")
 def camera() -> Camera:
-    return Camera.look_at((0.3, -0.4, -3.0), (0, 0, 0), (0, -1, 0), 45.0, 101, 75)
+    return make_wide_camera()
 
 
 @pytest.fixture(scope="module")
-def everyone() -> Gaussians:
-    """Of no two equal depths."""
-    rng = np.random.default_rng(7)
-    return Gaussians(
-        rng.uniform((-1.5, -1.0, -0.5), (1.5, 1.0, 0.5), (N, 3)),
-        rng.uniform(np.log(0.02), np.log(0.2), (N, 3)),
-        rng.normal(size=(N, 4)),
-        rng.uniform(-2, 3, N),
-        rng.normal(size=(N, 4, 3)) * 0.3,
-        rng.normal(size=(N, 3)) * 0.1,
-        rng.normal(size=N),
-    )
+def gaussians() -> Gaussians:
+    return Gaussians(**make_wide_scene(N))
 
 
 @pytest.fixture(scope="module")
@@ -42,40 +33,47 @@ def mask(camera: Camera) -> np.ndarray:
     return (x - 30) ** 2 + (y - 20) ** 2 < 20**2
 
 
-def opened(camera, everyone, mask) -> tuple[ActiveView, Gaussians]:
-    moving = np.isin(np.arange(N), MOVING)
-    return make_active_view(camera, mask, everyone.select(~moving), CHANNELS, RenderConfig()), everyone.select(moving)
+def split(camera, gaussians, mask) -> tuple[ActiveView, Gaussians]:
+    """Return the view of the static Gaussians, and the active Gaussians."""
+    active = np.isin(np.arange(N), ACTIVE)
+    view = make_active_view(camera, mask, gaussians.select(~active), CHANNELS, RenderConfig())
+    return view, gaussians.select(active)
 
 
-def test_a_window_shows_and_teaches_what_the_whole_view_does(camera, everyone, mask):
-    window, moving = opened(camera, everyone, mask)
-    assert 0.1 < window.pixel_fraction < 0.4
-    dr.enable_grad(moving.means, moving.sh_coeffs, everyone.means, everyone.sh_coeffs)
-    part, whole = window.render(moving, CHANNELS), rasterize(everyone, camera, CHANNELS)
+def drawn_pixels(view: ActiveView) -> np.ndarray:
+    """Return 1 on the pixels of the view's blocks [H, W], 0 elsewhere."""
+    assert view.region is not None
+    return view.region.paste(np.ones(view.region.shape(1)[:3]), np.zeros((view.camera.height, view.camera.width)))
+
+
+def test_active_view__renders_and_differentiates_like_the_full_view(camera, gaussians, mask):
+    view, active = split(camera, gaussians, mask)
+    assert 0.1 < view.pixel_fraction < 0.4
+    dr.enable_grad(active.means, active.sh_coeffs, gaussians.means, gaussians.sh_coeffs)
+    found, full = view.render(active, CHANNELS), rasterize(gaussians, camera, CHANNELS)
     for name in CHANNELS:
-        assert np.array_equal(getattr(part, name), window.crop(np.asarray(getattr(whole, name)))), name
+        assert_close(found[name], view.crop(np.asarray(full[name])), name=name)
     weight = np.random.default_rng(0).normal(size=(camera.height, camera.width, 3))
-    shown = window.region.paste(np.ones(window.region.shape(1)[:3]), np.zeros(mask.shape))
-    dr.backward(dr.sum(part.color * mi.TensorXf(np.float32(window.crop(weight))), axis=None))
-    dr.backward(dr.sum(whole.color * mi.TensorXf(np.float32(weight * shown[..., None])), axis=None))
+    drawn = drawn_pixels(view)[..., None]
+    dr.backward(dr.sum(found.color * mi.TensorXf(np.float32(view.crop(weight))), axis=None))
+    dr.backward(dr.sum(full.color * mi.TensorXf(np.float32(weight * drawn)), axis=None))
     for name in ("means", "sh_coeffs"):
-        found, expected = np.asarray(dr.grad(getattr(moving, name))), np.asarray(dr.grad(getattr(everyone, name)))
-        assert np.abs(expected[MOVING]).max() > 0
-        assert np.abs(found - expected[MOVING]).max() < tol.SUM_ORDER_REL * np.abs(expected).max(), name
+        expected = np.asarray(dr.grad(getattr(gaussians, name)))
+        assert np.abs(expected[ACTIVE]).max() > 0
+        bound = tol.SUM_ORDER_REL * np.abs(expected).max()
+        assert_close(dr.grad(getattr(active, name)), expected[ACTIVE], atol=bound, name=name)
 
 
-def test_who_stands_still_takes_their_share_of_the_pixels(camera, everyone, mask):
-    window, moving = opened(camera, everyone, mask)
-    drawn = window.region.paste(np.ones(window.region.shape(1)[:3]), np.zeros(mask.shape))
-    picture = np.float32(np.random.default_rng(1).uniform(size=(camera.height, camera.width, 2)))
-    expected = backproject(everyone, camera, picture * np.float32(drawn)[..., None])[MOVING]
-    found = window.backproject(moving, window.crop(picture))
+def test_active_view__backproject_accounts_for_static_splats(camera, gaussians, mask):
+    view, active = split(camera, gaussians, mask)
+    image = np.float32(np.random.default_rng(1).uniform(size=(camera.height, camera.width, 2)))
+    expected = backproject(gaussians, camera, image * np.float32(drawn_pixels(view))[..., None])[ACTIVE]
     assert expected.max() > 10
-    assert np.abs(found - expected).max() < tol.SUM_ORDER_REL * expected.max()
+    assert_close(view.backproject(active, view.crop(image)), expected, rtol=tol.SUM_ORDER_REL)
 
 
-def test_nobody_stands_still(camera, everyone, mask):
-    nobody = everyone.select(np.zeros(0, int))
-    window = make_active_view(camera, mask, nobody, CHANNELS, RenderConfig())
-    whole = rasterize(everyone, camera, ("color",)).color
-    assert np.array_equal(window.render(everyone).color, window.crop(np.asarray(whole)))
+def test_make_active_view__accepts_no_static_gaussians(camera, gaussians, mask):
+    none = gaussians.select(np.zeros(0, int))
+    view = make_active_view(camera, mask, none, CHANNELS, RenderConfig())
+    full = rasterize(gaussians, camera, ("color",)).color
+    assert np.array_equal(view.render(gaussians).color, view.crop(np.asarray(full)))

@@ -1,9 +1,9 @@
-"""The renderer at the extremes: every case against the float64 twin, or finite within a stated bound.
+"""The renderer at the extremes: every case against the reference implementation, or finite within a stated bound.
 
-The twin runs in extended precision here (80-bit `longdouble` where the platform has it), because its textbook
-determinant cancels for needles. Pixels where an alpha lies within `AMBIGUOUS` of a cut-off are left out: there,
-rounding decides what is drawn. Gradients are judged by attribute, relative to the largest entry: those of scales,
-quaternions and opacities per relative change, as an optimiser of logarithms sees them.
+The reference runs in extended precision here (80-bit `longdouble` where the platform has it), because its textbook
+determinant cancels for needles. Pixels where an alpha lies within `AMBIGUOUS` of a cut-off are excluded: there,
+rounding decides what is drawn. Gradients are compared by attribute, relative to the largest entry: those of scales,
+quaternions and opacities per relative change, as for an optimiser of logarithms.
 """
 
 from __future__ import annotations
@@ -21,20 +21,19 @@ from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.core.gaussians import tensor_rows
 from tests import reference
 from tests import tolerances as tol
+from tests.assertions import assert_close
+from tests.scenes import CHANNELS, Values
 
-CHANNELS = ("color", "alpha", "depth", "motion", "confidence")
 SIZES = {"color": 3, "motion": 2}
 ATTRIBUTES = ("means", "scales", "quats", "opacities", "sh_coeffs", "motion", "confidence")
 BACKGROUND = (0.2, 0.5, 0.9)
 AMBIGUOUS = 1e-3  # relative distance of an alpha to a cut-off
-# Nothing hides behind the stop, so that the twin, which knows none, can judge the gradients of opaque scenes.
+# Practically no stop, so that gradients of opaque scenes can be compared with the reference, which has none.
 CONFIG = RenderConfig(stop_transmittance=1e-12)
-
-Values = dict[str, np.ndarray]
 
 
 class Activated:
-    """Activated attributes, as the plugin passes them; nothing has gone through a logit or a logarithm."""
+    """Activated attributes, as the plugin passes them, without a logit or a logarithm."""
 
     def __init__(self, values: Values) -> None:
         one = dr.opaque(mi.Float, 1)  # multiplying copies what Dr.Jit borrows from NumPy
@@ -51,16 +50,17 @@ class Activated:
 
 
 # --------------------------------------------------------------------------------------------------
-#  The twin in extended precision
+#  The reference in extended precision
 # --------------------------------------------------------------------------------------------------
 
 
-def twin(
+def exact_image(
     values: dict[str, Any], camera: Camera, alpha_min: float = 1 / 255, alpha_max: float = 0.99, viewmat: Any = None
 ) -> dict[str, Any]:
+    """Return the reference's channels of activated attributes."""
     with np.errstate(all="ignore"):
 
-        def logit(x):  # of 1 it is infinite; 60 has the same sigmoid
+        def logit(x):  # infinite at 1; 60 has the same sigmoid
             return np.where(x == 1, 60, np.log(x / np.where(x == 1, 1, 1 - x)))
 
         zero = (values["quats"] == 0).all(axis=1, keepdims=True)
@@ -87,14 +87,16 @@ def twin(
 
 
 def clear_pixels(values: Values, camera: Camera) -> np.ndarray:
-    """Return the pixels [H, W] where no alpha is near a cut-off; near one, a nudge of it changes something."""
-    low, high = (twin(values, camera, alpha_min=(1 + s * AMBIGUOUS) / 255)["alpha"][..., 0] for s in (-1, 1))
-    under, at, over = (twin(values, camera, alpha_max=0.99 * (1 + s * 1e-4))["alpha"][..., 0] for s in (-1, 0, 1))
+    """Return the mask of the pixels [H, W] where no alpha is near a cut-off, found by moving the cut-offs."""
+    low, high = (exact_image(values, camera, alpha_min=(1 + s * AMBIGUOUS) / 255)["alpha"][..., 0] for s in (-1, 1))
+    under, at, over = (
+        exact_image(values, camera, alpha_max=0.99 * (1 + s * 1e-4))["alpha"][..., 0] for s in (-1, 0, 1)
+    )
     return (low == high) & (np.abs(under - 2 * at + over) < 1e-6)
 
 
 def weights(expected: dict[str, np.ndarray], clear: np.ndarray, seed: int = 1) -> dict[str, np.ndarray]:
-    """Return random weights per channel that make a loss of all of them, each at its own scale."""
+    """Return random weights per channel, relative to its scale, for a loss of all channels."""
     rng = np.random.default_rng(seed)
     solid = clear & (expected["alpha"][..., 0] > 0.02)
     result = {}
@@ -105,8 +107,8 @@ def weights(expected: dict[str, np.ndarray], clear: np.ndarray, seed: int = 1) -
     return result
 
 
-def twin_gradients(values: Values, camera: Camera, weight: dict[str, np.ndarray]) -> Values:
-    """Complex step, relative to each number, so that nothing between 1e-30 and 1e30 loses its imaginary part."""
+def exact_gradients(values: Values, camera: Camera, weight: dict[str, np.ndarray]) -> Values:
+    """Return gradients by complex steps relative to each number: none from 1e-30 to 1e30 loses its imaginary part."""
     grads = {}
     for name in ATTRIBUTES:
         grad = np.zeros(values[name].shape)
@@ -114,15 +116,15 @@ def twin_gradients(values: Values, camera: Camera, weight: dict[str, np.ndarray]
             nudged = values[name].astype(np.clongdouble)
             step = np.longdouble(1e-30) * (np.abs(values[name][index]) or 1)
             nudged[index] += 1j * step
-            image = twin({**values, name: nudged}, camera)
+            image = exact_image({**values, name: nudged}, camera)
             grad[index] = sum(np.sum(image[c].imag * weight[c]) for c in CHANNELS) / step
         grads[name] = grad
     return grads
 
 
-def twin_slope(values: Values, camera: Camera, weight: dict[str, np.ndarray], name: str, along: np.ndarray) -> float:
+def exact_slope(values: Values, camera: Camera, weight: dict[str, np.ndarray], name: str, along: np.ndarray) -> float:
     """Return the derivative of the weighted channels along a direction of one attribute."""
-    image = twin({**values, name: values[name].astype(np.clongdouble) + 1e-30j * along}, camera)
+    image = exact_image({**values, name: values[name].astype(np.clongdouble) + 1e-30j * along}, camera)
     return float(sum(np.sum(image[c].imag * weight[c]) for c in CHANNELS) / 1e-30)
 
 
@@ -133,14 +135,14 @@ def twin_slope(values: Values, camera: Camera, weight: dict[str, np.ndarray], na
 
 @dataclass(frozen=True)
 class Case:
-    """A scene and a view, and how far the image and any gradient may be from the twin's."""
+    """A scene, a view, and the tolerances of the image and the gradients against the reference."""
 
     name: str
     values: Values
     camera: Camera
     image: float = tol.IMAGE_ABS
     gradient: float = tol.GRADIENT_REL
-    every_entry: bool = True  # else each attribute's gradient along the direction of its signs
+    every_entry: bool = True  # if False, only each attribute's gradient along the direction of its signs
 
 
 def cloud(n: int = 6, seed: int = 5) -> Values:
@@ -167,7 +169,7 @@ def eye(
     near: float = 0.01,
     viewmat: Any = None,
 ) -> Camera:
-    """Return a camera that sees the origin: neither size divides a block, fx and fy differ, cx, cy are off centre."""
+    """Return a camera that sees the origin, whose size no block divides, with fx != fy and off-centre cx, cy."""
     camera = Camera.look_at(origin, np.zeros(3), up, fov, width, height)
     K = camera.K + np.array([[0, 0, shift[0]], [0, 0.08 * camera.K[0, 0], shift[1]], [0, 0, 0]])
     viewmat = camera.viewmat if viewmat is None else viewmat
@@ -177,7 +179,7 @@ def eye(
 def case(
     name: str, camera: Camera | None = None, n: int = 6, bounds: dict[str, Any] | None = None, **change: Any
 ) -> Case:
-    """Return the cloud with some attributes replaced, or changed by a function."""
+    """Return the case of the cloud with some attributes replaced, or changed by a function."""
     values = cloud(n)
     for key, new in change.items():
         values[key] = new(values[key]) if callable(new) else np.broadcast_to(np.asarray(new, float), values[key].shape)
@@ -186,7 +188,7 @@ def case(
 
 
 def screen_bound(pixels: float) -> dict[str, float]:
-    """Return the bounds where screen coordinates are as large as `pixels`: a float32 is that coarse there."""
+    """Return the bounds where screen coordinates are as large as `pixels`, given the spacing of float32 there."""
     return {
         "image": tol.IMAGE_ABS + tol.ALPHA_PER_PIXEL * 2**-24 * pixels,
         "gradient": tol.GRADIENT_REL + tol.ALPHA_SLOPE_PER_PIXEL * 2**-24 * pixels,
@@ -212,11 +214,11 @@ FAR = np.array([1e5, -1e5, 1e5])
 LIFT = np.eye(4)
 LIFT[:3, 3] = -FAR
 BLOCKS = np.stack(np.meshgrid(np.arange(8) * 8 + 4.0, np.arange(8) * 4 + 2.0), -1).reshape(-1, 2)
-SLOW_TWIN = {"every_entry": False}
+SLOW_REFERENCE = {"every_entry": False}
 
-# Errors reached on a 2-core x86, 80-bit twin: image at most 6e-6, gradients at most 2e-5 (4e-5 for needles across the
-# screen), unless a comment says more. What does not work: an aspect beyond 1e6 is drawn at 1e6, because a float32
-# rotation aims no better; beyond 1e18 units nothing is drawn; depths that a float32 cannot tell apart are equal.
+# Errors reached on a 2-core x86, 80-bit reference: image at most 6e-6, gradients at most 2e-5 (4e-5 for needles across
+# the screen), unless a comment states more. Limits: an aspect beyond 1e6 is drawn at 1e6, because a float32 rotation is
+# no more precise; beyond 1e18 units nothing is drawn; depths that a float32 cannot distinguish are equal.
 CASES = [
     case("plain"),
     case("one Gaussian", n=1),
@@ -240,7 +242,7 @@ CASES = [
     case("all behind", ORIGIN, means=moved(0, 0, -5)),
     case("1e-3 units", eye(origin=(3e-4, -4e-4, -3e-3), near=1e-5), **scaled(1e-3)),
     case("1e6 units", eye(origin=(3e5, -4e5, -3e6), near=1e4), **scaled(1e6)),
-    # Means there are multiples of 2^-7; of what they are, nothing is lost, because poses are summed in double.
+    # Means there are multiples of 2^-7; no further precision is lost, because poses are summed in double.
     case("offset by 1e5", eye(viewmat=eye().viewmat @ LIFT), means=moved(*FAR)),
     case("opacities 0, 1 and near", opacities=[0, 1, 1e-7, 1 - 2**-23, 0.99, 0.004]),
     case("opacities 1", opacities=1),
@@ -249,28 +251,28 @@ CASES = [
     case("some quaternions 0", quats=lambda q: q * np.array([[0], [1], [0], [1], [1], [1]])),
     case("quaternions 1e-25", quats=lambda q: q * 1e-25),
     case("quaternions 1e33", quats=lambda q: q * 1e33),
-    # Their gradients of 1e-38 are where float32 underflows to zero.
+    # Their gradients of 1e-38 underflow float32 to zero.
     case("quaternions 1e38", quats=lambda q: np.clip(q, -3, 3) * 1e38, bounds={"gradient": 1.0}),
     case("colours 1e6 and 1e-6", sh_coeffs=lambda c: c * np.array([1e6, 1, 1e-6, 1, -1e6, 1])[:, None, None]),
     case("colours 1e15", sh_coeffs=lambda c: c * 1e15),
     case("image 1x1", eye(1, 1)),
     case("image 33x1", eye(33, 1)),
     case("image 1x65", eye(1, 65)),
-    case("image 4096x1", eye(4096, 1, shift=(1.3, 0)), bounds=SLOW_TWIN),
-    case("image 1x4096", eye(1, 4096, fov=0.02, shift=(0, 0)), bounds=SLOW_TWIN),
+    case("image 4096x1", eye(4096, 1, shift=(1.3, 0)), bounds=SLOW_REFERENCE),
+    case("image 1x4096", eye(1, 4096, fov=0.02, shift=(0, 0)), bounds=SLOW_REFERENCE),
     case(
         "one Gaussian in every block",
         Camera(np.array([[40.0, 0, 32], [0, 40, 16], [0, 0, 1]]), np.eye(4), 64, 32),
         n=64,
         means=np.c_[(BLOCKS - (32, 16)) / 40 * 3, np.full(64, 3.0)],
         scales=(0.04, 0.06, 0.05),
-        bounds=SLOW_TWIN,
+        bounds=SLOW_REFERENCE,
     ),
     case("camera rolled", eye(up=(0.6, -0.3, 0.1))),
     case("camera upside down", eye(up=(0, 1, 0))),
     case("camera mirrored", eye(viewmat=MIRROR @ eye().viewmat)),
     case("principal point outside", eye(viewmat=np.eye(4), shift=(-200, 150)), means=moved(23.7, -16.4, 3)),
-    # Reached: image 1.4e-4, gradients 3e-4. fx x / z + cx cancels; that it could be had in double is not worth it.
+    # Reached: image 1.4e-4, gradients 3e-4. fx x / z + cx cancels; double precision there is not worth its cost.
     case(
         "principal point far outside",
         eye(viewmat=np.eye(4), shift=(-2e4, 1e4)),
@@ -283,7 +285,7 @@ CASES = [
 
 
 # --------------------------------------------------------------------------------------------------
-#  Judging
+#  Comparison
 # --------------------------------------------------------------------------------------------------
 
 
@@ -293,10 +295,10 @@ def run(
     """Return the channels and the gradients of the sum of the weighted channels; all must be finite."""
     gaussians = Activated(values)
     image = rasterize(gaussians, camera, CHANNELS, BACKGROUND, config=config)
-    found = {name: np.asarray(dr.detach(getattr(image, name)), np.float64) for name in CHANNELS}
+    found = {name: np.asarray(dr.detach(image[name]), np.float64) for name in CHANNELS}
     if weight is None:
         weight = weights(found, np.ones((camera.height, camera.width), bool))
-    dr.backward(sum(dr.sum(getattr(image, name) * mi.TensorXf(weight[name]), axis=None) for name in CHANNELS))
+    dr.backward(sum(dr.sum(image[name] * mi.TensorXf(weight[name]), axis=None) for name in CHANNELS))
     grads = gaussians.gradients()
     for name, value in (*found.items(), *grads.items()):
         assert np.isfinite(value).all(), f"{name} is not finite at {np.argwhere(~np.isfinite(value))[:5].tolist()}"
@@ -304,26 +306,26 @@ def run(
 
 
 def errors(case: Case) -> dict[str, float]:
-    """Return how far the image and each attribute's gradient are from the twin's."""
+    """Return the errors of the image and of each attribute's gradient against the reference."""
     values, camera = case.values, case.camera
-    expected = twin(values, camera)
+    expected = exact_image(values, camera)
     weight = weights(expected, clear_pixels(values, camera))
     found, grads = run(values, camera, weight)
     result = {"image": 0.0}
     for name in CHANNELS:
-        wrong = np.abs(found[name] - expected[name])[weight[name] != 0] / max(1.0, np.abs(expected[name]).max())
-        result["image"] = max(result["image"], float(wrong.max(initial=0)))
-    # As an optimiser sees them: per relative change.
+        error = np.abs(found[name] - expected[name])[weight[name] != 0] / max(1.0, np.abs(expected[name]).max())
+        result["image"] = max(result["image"], float(error.max(initial=0)))
+    # Per relative change, as for an optimiser of logarithms.
     unit = {"scales": values["scales"], "opacities": values["opacities"]}
     unit["quats"] = np.linalg.norm(values["quats"], axis=1, keepdims=True)
     if case.every_entry:
-        exact = {n: g * unit.get(n, 1) for n, g in twin_gradients(values, camera, weight).items()}
+        exact = {n: g * unit.get(n, 1) for n, g in exact_gradients(values, camera, weight).items()}
         grads = {n: g * unit.get(n, 1) for n, g in grads.items()}
     else:
         along = {n: np.sign(g) for n, g in grads.items()}
-        exact = {n: twin_slope(values, camera, weight, n, v * unit.get(n, 1)) for n, v in along.items()}
+        exact = {n: exact_slope(values, camera, weight, n, v * unit.get(n, 1)) for n, v in along.items()}
         grads = {n: np.abs(g * unit.get(n, 1)).sum() for n, g in grads.items()}
-    # Those three are sums of the same terms: one that is next to nothing is judged by the largest.
+    # These three are sums of the same terms: one that almost vanishes is compared relative to the largest.
     floor = 0.01 * max(np.abs(exact[name]).max() for name in unit)
     for name in ATTRIBUTES:
         scale = max(np.abs(exact[name]).max(), floor if name in unit else 0, 1e-30)
@@ -331,8 +333,8 @@ def errors(case: Case) -> dict[str, float]:
     return result
 
 
-def complaints(case: Case) -> list[str]:
-    """Return what is wrong with a case, empty if nothing is."""
+def failures(case: Case) -> list[str]:
+    """Return the failed comparisons of a case, empty if all pass."""
     try:
         found = errors(case)
     except (AssertionError, ValueError) as error:
@@ -346,15 +348,15 @@ def complaints(case: Case) -> list[str]:
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_extreme_agrees_with_twin(case):
-    assert not complaints(case)
+def test_rasterize__agrees_with_the_reference_at_the_extremes(case):
+    assert not failures(case)
 
 
-def test_forward_and_reverse_mode_are_dual_at_the_extremes():
+def test_rasterize__forward_and_reverse_mode_are_dual_at_the_extremes():
     """<g, J v> = <J' g, v> along the signs of J' g, where nothing cancels."""
-    wrong = []
+    failed = []
     for case in CASES:
-        weight = weights(twin(case.values, case.camera), np.ones((case.camera.height, case.camera.width), bool))
+        weight = weights(exact_image(case.values, case.camera), np.ones((case.camera.height, case.camera.width), bool))
         _, grads = run(case.values, case.camera, weight)
         gaussians = Activated(case.values)
         image = rasterize(gaussians, case.camera, CHANNELS, BACKGROUND, config=CONFIG)
@@ -363,44 +365,44 @@ def test_forward_and_reverse_mode_are_dual_at_the_extremes():
             step = np.sign(grads[name]) * np.minimum(np.abs(case.values[name]), 1e6)
             dr.set_grad(getattr(gaussians, name), mi.TensorXf(np.float32(step)))
             grads[name] = np.vdot(grads[name], step)
-        outputs = [getattr(image, name) for name in CHANNELS]
+        outputs = [image[name] for name in CHANNELS]
         dr.forward_to(outputs)
         tangents = [np.asarray(dr.grad(output), np.float64) for output in outputs]
         forward = sum(np.vdot(t, weight[name]) for t, name in zip(tangents, CHANNELS, strict=True))
         reverse = sum(grads.values())
         if not abs(forward - reverse) <= tol.DUALITY_REL * abs(reverse):
-            wrong.append(f"{case.name}: forward {forward:.7g}, reverse {reverse:.7g}")
-    assert not wrong
+            failed.append(f"{case.name}: forward {forward:.7g}, reverse {reverse:.7g}")
+    assert not failed
 
 
-def test_gradients_of_the_pose_at_the_extremes():
-    """Column by column: turning a world at 1e5 units moves things 1e5 times as far as shifting it."""
-    wrong = []
+def test_rasterize__gradients_of_the_pose_at_the_extremes():
+    """Columns are compared separately: rotating a world at 1e5 units moves it 1e5 times as far as translating it."""
+    failed = []
     for case in CASES:
         camera, exact = case.camera, np.zeros((3, 4))
         posed = Camera(camera.K, mi.TensorXf(np.float32(camera.viewmat)), camera.width, camera.height, near=camera.near)
         dr.enable_grad(posed.viewmat)
-        weight = weights(twin(case.values, camera), clear_pixels(case.values, camera))
+        weight = weights(exact_image(case.values, camera), clear_pixels(case.values, camera))
         run(case.values, posed, weight)
         found = np.asarray(dr.grad(posed.viewmat), np.float64)[:3]
         for index in np.ndindex(*exact.shape):
             nudged = camera.viewmat.astype(np.clongdouble)
             nudged[index] += 1e-30j
-            image = twin(case.values, camera, viewmat=nudged)
+            image = exact_image(case.values, camera, viewmat=nudged)
             exact[index] = sum(np.sum(image[c].imag * weight[c]) for c in CHANNELS) / 1e-30
         off = np.abs(found - exact).max(axis=0) / np.maximum(np.abs(exact).max(axis=0), 1e-30)
         if not (off <= case.gradient).all():
-            wrong.append(f"{case.name}: columns off by {off}, bound {case.gradient:.1e}")
-    assert not wrong, "\n".join(wrong)
+            failed.append(f"{case.name}: columns off by {off}, bound {case.gradient:.1e}")
+    assert not failed, "\n".join(failed)
 
 
 # --------------------------------------------------------------------------------------------------
-#  Crowds
+#  Many Gaussians
 # --------------------------------------------------------------------------------------------------
 
 
 def stack(n: int, opacity: float) -> Values:
-    """Return n discs of every colour behind each other, before a camera at the origin."""
+    """Return n Gaussians of various colours behind each other, in front of a camera at the origin."""
     values = cloud(n)
     values |= {"means": np.c_[np.zeros((n, 2)), np.linspace(1, 2, n)], "opacities": np.full(n, opacity)}
     values["sh_coeffs"] = np.clip(values["sh_coeffs"], -0.4, 0.4)
@@ -408,41 +410,41 @@ def stack(n: int, opacity: float) -> Values:
 
 
 @pytest.mark.parametrize("opacity", [1.0, 0.99, 0.02])
-def test_ten_thousand_layers_on_one_pixel(opacity):
+def test_rasterize__blends_ten_thousand_layers_on_one_pixel(opacity):
     values, camera = stack(10_000, opacity), Camera(np.array([[9.0, 0, 0.5], [0, 9, 0.5], [0, 0, 1]]), np.eye(4), 1, 1)
-    expected = twin(values, camera)
+    expected = exact_image(values, camera)
     for config in (CONFIG, RenderConfig()):
         found, grads = run(values, camera, config=config)
         hidden = config.stop_transmittance if config is not CONFIG else 0
         for name in CHANNELS:
             bound = (tol.IMAGE_ABS + 2 * hidden) * max(1, np.abs(expected[name]).max())
-            assert np.abs(found[name] - expected[name]).max() < bound, name
+            assert_close(found[name], np.float64(expected[name]), atol=bound, name=name)
         if opacity > 0.9:
-            assert np.abs(grads["sh_coeffs"][8:]).max() < 1e-12, "what nothing shows has no gradient"
+            assert np.abs(grads["sh_coeffs"][8:]).max() < 1e-12, "occluded Gaussians have no gradient"
 
 
-def test_equal_depths_are_blended_in_the_order_of_the_input():
-    """300 layers at one depth: the first in the input is the nearest; turned round, the last is."""
+def test_rasterize__blends_many_equal_depths_in_the_order_of_the_input():
+    """Of 300 layers at one depth, the first in the input is the nearest; in reversed order, the last is."""
     values = stack(300, 0.3)
     values["means"][:, 2] = 1.5
     camera = Camera(np.array([[9.0, 0, 3], [0, 9, 2.5], [0, 0, 1]]), np.eye(4), 6, 5)
-    pictures = []
+    images = []
     for order in (slice(None), slice(None, None, -1)):
         ordered = {name: np.ascontiguousarray(value[order]) for name, value in values.items()}
-        pictures.append(run(ordered, camera)[0]["color"])
-        assert np.abs(pictures[-1] - twin(ordered, camera)["color"]).max() < tol.IMAGE_ABS
-    assert np.abs(pictures[0] - pictures[1]).max() > 0.05
+        images.append(run(ordered, camera)[0]["color"])
+        assert_close(images[-1], np.float64(exact_image(ordered, camera)["color"]), atol=tol.IMAGE_ABS)
+    assert np.abs(images[0] - images[1]).max() > 0.05
 
 
 @pytest.mark.slow
-def test_two_million_gaussians():
-    """All but 1,000 are out of sight: the image is that of the 1,000, and no gradient is lost or not finite."""
-    N, seen = 2_000_000, 1_000
+def test_rasterize__two_million_gaussians_mostly_out_of_view():
+    """All but 1,000 are out of view: the image is that of the 1,000, and their gradients are complete and finite."""
+    N, in_view = 2_000_000, 1_000
     rng = np.random.default_rng(0)
     values = {name: np.repeat(value, N // 1000, axis=0) for name, value in cloud(1000).items()}
     values["means"] += rng.normal(size=(N, 3)) * 0.3
     values["scales"] *= 0.05
-    where = np.sort(rng.choice(N, seen, replace=False))
+    where = np.sort(rng.choice(N, in_view, replace=False))
     away = np.ones(N, bool)
     away[where] = False
     values["means"][away] = values["means"][away] * 100 - (0, 0, 1e4)
@@ -450,14 +452,14 @@ def test_two_million_gaussians():
     found, grads = run(values, camera)
     few, few_grads = run({name: value[where] for name, value in values.items()}, camera)
     for name in CHANNELS:
-        assert np.abs(found[name] - few[name]).max() == 0, name
+        assert_close(found[name], few[name], name=name)
     for name in ATTRIBUTES:
-        assert np.abs(grads[name][where] - few_grads[name]).max() <= 1e-5 * np.abs(few_grads[name]).max(), name
+        assert_close(grads[name][where], few_grads[name], rtol=1e-5, name=name)
         assert np.abs(grads[name][away]).max() == 0, name
 
 
 @pytest.mark.slow
-def test_two_million_gaussians_in_view():
+def test_rasterize__two_million_gaussians_in_view():
     values = {name: np.repeat(value, 2000, axis=0) for name, value in cloud(1000).items()}
     values["means"] += np.random.default_rng(0).normal(size=values["means"].shape) * 0.3
     values["scales"] *= 0.02
@@ -466,8 +468,8 @@ def test_two_million_gaussians_in_view():
     assert np.abs(grads["means"]).max() > 0
 
 
-def test_lists_that_no_index_can_count_are_refused():
-    """2^14 x 2^14 pixels are 2^18 tiles; entries are counted in 32 bits."""
+def test_rasterize__refuses_lists_that_exceed_32_bits():
+    """2^14 x 2^14 pixels are 2^18 tiles, and entries are counted in 32 bits."""
     camera = Camera(np.array([[1e4, 0, 8192], [0, 1e4, 8192], [0, 0, 1]]), np.eye(4), 2**14, 2**14)
     values = stack(2**14 + 1, 0.5) | {"scales": np.full((2**14 + 1, 3), 1e3)}
     with pytest.raises(ValueError, match=r"fewer than 2\^32 entries, got 4\.3e\+09 for 16385 Gaussians"):
@@ -475,7 +477,7 @@ def test_lists_that_no_index_can_count_are_refused():
 
 
 # --------------------------------------------------------------------------------------------------
-#  Raw attributes: what the activations make of extremes
+#  Raw attributes: activations of extreme values
 # --------------------------------------------------------------------------------------------------
 
 
@@ -500,12 +502,12 @@ def raw_gaussians(**change: Any) -> Gaussians:
     ],
     ids=["scales", "needles", "opacities", "confidence", "means", "colours"],
 )
-def test_raw_extremes_stay_finite(change):
+def test_rasterize__raw_extremes_stay_finite(change):
     gaussians = raw_gaussians(**change)
     image = rasterize(gaussians, eye(), CHANNELS, BACKGROUND, config=CONFIG)
     for name in CHANNELS:
-        assert np.isfinite(np.asarray(getattr(image, name))).all(), name
-    dr.backward(sum(dr.mean(getattr(image, name), axis=None) for name in CHANNELS))
+        assert np.isfinite(np.asarray(image[name])).all(), name
+    dr.backward(sum(dr.mean(image[name], axis=None) for name in CHANNELS))
     for name, value in gaussians.items().items():
         assert np.isfinite(np.asarray(dr.grad(value))).all(), name
 
@@ -520,7 +522,7 @@ def test_raw_extremes_stay_finite(change):
     ],
     ids=["overflow", "infinite mean", "behind the camera", "one component"],
 )
-def test_what_is_not_finite_is_refused_wherever_it_is(change, message):
+def test_rasterize__refuses_non_finite_attributes_anywhere(change, message):
     with pytest.raises(ValueError, match=message):
         rasterize(raw_gaussians(**change), eye(), CHANNELS, BACKGROUND, config=CONFIG)
 
@@ -530,8 +532,8 @@ def test_what_is_not_finite_is_refused_wherever_it_is(change, message):
 # --------------------------------------------------------------------------------------------------
 
 
-def strange(seed: int) -> Case:
-    """Return a random mixture of everything in the table."""
+def random_case(seed: int) -> Case:
+    """Return a random mixture of the cases in the table."""
     rng = np.random.default_rng(seed)
     n, unit = int(rng.integers(1, 7)), 10 ** rng.uniform(-3, 6)
     values = cloud(n, seed)
@@ -557,24 +559,24 @@ def strange(seed: int) -> Case:
     viewmat = np.float32(np.diag([rng.choice([-1, 1, 1, 1]), 1, 1, 1]) @ camera.viewmat @ lift).astype(np.float64)
     values = {name: np.float32(value).astype(np.float64) for name, value in values.items()}
 
-    # A float32 cannot order closer ones, nor tell on which side of the near plane they are.
+    # A float32 can neither order closer ones nor decide on which side of the near plane they lie.
     depths, keep = np.unique(np.float32(values["means"] @ viewmat[2, :3] + viewmat[2, 3]), return_index=True)
     values = {name: value[keep] for name, value in values.items()}
     between = rng.choice((depths + np.append(depths[1:], 2 * depths[-1])) / 2)
     near = max(0.01 * unit, rng.choice([0, 0, between]))
     camera = Camera(camera.K, viewmat, camera.width, camera.height, near=float(near))
-    # Needles of which a pixel sees the end may have their centres 100 px away.
+    # Needles whose end covers a pixel may have their centres 100 px away.
     return Case(f"seed {seed}", values, camera, screen_bound(100)["image"], tol.FUZZ_GRADIENT_REL)
 
 
 def fuzz(seeds: range) -> list[str]:
-    return [line for seed in seeds for line in complaints(strange(seed))]
+    return [line for seed in seeds for line in failures(random_case(seed))]
 
 
-def test_fuzz():
+def test_rasterize__fuzz():
     assert not fuzz(range(10))
 
 
 @pytest.mark.slow
-def test_fuzz_at_length():
+def test_rasterize__fuzz_with_many_seeds():
     assert not fuzz(range(10, 210))

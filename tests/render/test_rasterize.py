@@ -1,4 +1,4 @@
-"""The renderer against its float64 twin: image and derivatives, every attribute and every channel."""
+"""The renderer against the float64 reference: image and derivatives, every attribute and every channel."""
 
 from __future__ import annotations
 
@@ -10,83 +10,50 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from morgs_mi.core.attributes import BY_ACTIVATED_NAME
+from morgs_mi.render.region import Region
 from tests import reference
 from tests import tolerances as tol
-
-CHANNELS = ("color", "alpha", "depth", "motion", "confidence")
-RAW = ("means", "log_scales", "quats", "logit_opacities", "sh_coeffs", "motion", "logit_confidence")
-
-
-def make_scene(degree: int = 1, n: int = 10, seed: int = 5) -> dict[str, np.ndarray]:
-    """A cloud that overlaps, spans several blocks and stays clear of cap and stop."""
-    rng = np.random.default_rng(seed)
-    return {
-        "means": rng.uniform((-1.0, -0.8, -0.5), (1.0, 0.8, 0.5), (n, 3)),
-        "log_scales": rng.uniform(np.log(0.1), np.log(0.4), (n, 3)),
-        "quats": rng.normal(size=(n, 4)) * rng.uniform(0.5, 2, (n, 1)),
-        "logit_opacities": rng.uniform(-1.5, 1.5, n),
-        "sh_coeffs": rng.normal(size=(n, (degree + 1) ** 2, 3)) * 0.3 + 0.2,
-        "motion": rng.normal(size=(n, 3)) * 0.1,
-        "logit_confidence": rng.normal(size=n),
-    }
-
-
-def make_camera(width: int = 21, height: int = 18) -> Camera:
-    """Neither size divides a block; the principal point is off centre; fx and fy differ."""
-    camera = Camera.look_at((0.3, -0.4, -3.0), (0, 0, 0), (0, -1, 0), 45.0, width, height)
-    K = camera.K + np.array([[0, 0, 1.3], [0, 2.0, -0.7], [0, 0, 0]])
-    return Camera(K, camera.viewmat, width, height)
-
-
-def as_float32(raw):
-    return {k: np.float32(v).astype(np.float64) for k, v in raw.items()}
-
-
-def to_gaussians(raw, grad=False):
-    gaussians = Gaussians(**raw)
-    if grad:
-        dr.enable_grad(*gaussians.items().values())
-    return gaussians
-
-
-def twin(raw, camera, background=None, viewmat=None):
-    viewmat = np.float32(camera.viewmat).astype(np.float64) if viewmat is None else viewmat
-    K = np.float32(camera.K).astype(np.float64)
-    return reference.rasterize(raw, K, viewmat, camera.width, camera.height, background)
-
-
-def relative(found, expected):
-    return np.abs(np.asarray(found) - expected).max() / max(np.abs(expected).max(), 1e-12)
+from tests.assertions import assert_close
+from tests.reference import rasterize_view
+from tests.scenes import (
+    CHANNELS,
+    NEW_ATTRIBUTES,
+    RAW,
+    ExtendedGaussians,
+    as_float32,
+    make_camera,
+    make_scene,
+    to_gaussians,
+)
 
 
 @pytest.fixture(scope="module")
 def scene():
     raw, camera = as_float32(make_scene()), make_camera()
-    assert twin(raw, camera)["margin"] > 1e-5, "the scene must stay clear of the cut-offs"
+    assert rasterize_view(raw, camera)["margin"] > 1e-5, "the scene must stay clear of the cut-offs"
     return raw, camera
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_image_agrees_with_twin_at_every_sh_degree(degree):
+def test_rasterize__agrees_with_the_reference_at_every_sh_degree(degree):
     raw, camera = as_float32(make_scene(degree)), make_camera()
-    image, expected = rasterize(to_gaussians(raw), camera, ("color", "alpha")), twin(raw, camera)
+    image, expected = rasterize(to_gaussians(raw), camera, ("color", "alpha")), rasterize_view(raw, camera)
     for name in ("color", "alpha"):
-        assert np.abs(np.asarray(getattr(image, name)) - expected[name]).max() < tol.IMAGE_ABS
+        assert_close(image[name], expected[name], atol=tol.IMAGE_ABS, name=name)
 
 
-def test_every_channel_agrees_with_twin(scene):
+def test_rasterize__agrees_with_the_reference_in_every_channel(scene):
     raw, camera = scene
-    image, expected = rasterize(to_gaussians(raw), camera, CHANNELS), twin(raw, camera)
+    image, expected = rasterize(to_gaussians(raw), camera, CHANNELS), rasterize_view(raw, camera)
     for name in CHANNELS:
-        found = np.asarray(getattr(image, name))
-        # Where almost nothing is, a normalised channel divides rounding by a small alpha.
-        solid = np.broadcast_to(expected["alpha"] > 0.02, found.shape)
-        scale = max(1.0, np.abs(expected[name]).max())
-        assert np.abs(found - expected[name])[solid].max() < tol.IMAGE_ABS * scale, name
+        # Where alpha is small, a normalised channel divides rounding errors by it.
+        solid, scale = expected["alpha"] > 0.02, max(1.0, np.abs(expected[name]).max())
+        assert_close(image[name], expected[name], atol=tol.IMAGE_ABS * scale, where=solid, name=name)
 
 
-def test_features_are_blended_like_the_confidence(scene):
-    """Twelve columns beside the colour: image, gradient of the features and of the geometry are the confidence's."""
+def test_rasterize__blends_features_like_the_confidence(scene):
+    """Twelve columns beside the colour have the image and the gradients of the confidence channel."""
     raw, camera = scene
     rng = np.random.default_rng(2)
     values, seed = rng.normal(size=(len(raw["means"]), 12)), rng.normal(size=(camera.height, camera.width, 12))
@@ -106,17 +73,17 @@ def test_features_are_blended_like_the_confidence(scene):
         dr.backward(dr.sum(image * mi.TensorXf(seed[..., column : column + 1]), axis=None))
         return dr.grad(logits)
 
-    image, grad, moved = differentiated(None)
-    expected = sum(w[..., None] * v for w, v in zip(weights_of(raw, camera), values, strict=True))
-    assert np.abs(image - expected).max() < tol.IMAGE_ABS * np.abs(values).max()
-    assert np.abs(moved).max() > 0
+    image, grad, means_grad = differentiated(None)
+    expected = sum(w[..., None] * v for w, v in zip(blend_weights(raw, camera), values, strict=True))
+    assert_close(image, expected, atol=tol.IMAGE_ABS * np.abs(values).max())
+    assert np.abs(means_grad).max() > 0
     for column in (0, 11):
-        # sigmoid' (0) = 1 / 4
-        assert relative(grad[:, column], 4 * np.asarray(differentiated(column))) < tol.GRADIENT_REL
+        # sigmoid'(0) = 1 / 4
+        assert_close(grad[:, column], 4 * np.asarray(differentiated(column)), rtol=tol.GRADIENT_REL)
 
 
-def weights_of(raw, camera):
-    """Return T alpha [H, W] of every Gaussian: the confidence of a scene where nobody else is confident."""
+def blend_weights(raw, camera):
+    """Return T alpha [H, W] of every Gaussian: the confidence channel where only this one has confidence 1."""
     n = len(raw["means"])
     for k in range(n):
         logits = np.where(np.arange(n) == k, 100.0, -100.0)
@@ -125,18 +92,18 @@ def weights_of(raw, camera):
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
-def test_backward_agrees_with_twin_for_every_attribute(scene, channel):
+def test_rasterize__backward_agrees_with_the_reference_for_every_attribute(scene, channel):
     raw, camera = scene
     rng = np.random.default_rng(1)
     size = {"color": 3, "motion": 2}.get(channel, 1)
-    weight = rng.normal(size=(camera.height, camera.width, size)) * (twin(raw, camera)["alpha"] > 0.02)
+    weight = rng.normal(size=(camera.height, camera.width, size)) * (rasterize_view(raw, camera)["alpha"] > 0.02)
     background = (0.2, 0.5, 0.9) if channel == "color" else None
 
     gaussians = to_gaussians(raw, grad=True)
     image = rasterize(gaussians, camera, (channel,), background)
-    dr.backward(dr.sum(getattr(image, channel) * mi.TensorXf(np.float32(weight)), axis=None))
+    dr.backward(dr.sum(image[channel] * mi.TensorXf(np.float32(weight)), axis=None))
     expected = reference.complex_step(
-        lambda values: np.sum(twin(values, camera, background)[channel] * weight), raw, list(RAW)
+        lambda values: np.sum(rasterize_view(values, camera, background)[channel] * weight), raw, list(RAW)
     )
     for name in RAW:
         found = np.asarray(dr.grad(getattr(gaussians, name)))
@@ -144,10 +111,10 @@ def test_backward_agrees_with_twin_for_every_attribute(scene, channel):
         if np.abs(expected[name]).max() == 0:
             assert np.abs(found).max() == 0, f"{channel} must not depend on {name}"
         else:
-            assert relative(found, expected[name]) < tol.GRADIENT_REL, name
+            assert_close(found, expected[name], rtol=tol.GRADIENT_REL, name=name)
 
 
-def test_forward_mode_agrees_with_twin(scene):
+def test_rasterize__forward_mode_agrees_with_the_reference(scene):
     raw, camera = scene
     rng = np.random.default_rng(2)
     direction = {name: np.float32(rng.normal(size=raw[name].shape)).astype(np.float64) for name in RAW}
@@ -155,16 +122,15 @@ def test_forward_mode_agrees_with_twin(scene):
     image = rasterize(gaussians, camera, CHANNELS)
     for name in RAW:
         dr.set_grad(getattr(gaussians, name), mi.TensorXf(np.float32(direction[name])))
-    outputs = [getattr(image, name) for name in CHANNELS]
+    outputs = [image[name] for name in CHANNELS]
     dr.forward_to(outputs)
     for name, output in zip(CHANNELS, outputs, strict=True):
-        expected = reference.directional(lambda v, name=name: twin(v, camera)[name], raw, direction)
-        solid = np.broadcast_to(twin(raw, camera)["alpha"] > 0.02, expected.shape)
-        found = np.asarray(dr.grad(output))
-        assert relative(found[solid], expected[solid]) < tol.GRADIENT_REL, name
+        expected = reference.directional(lambda v, name=name: rasterize_view(v, camera)[name], raw, direction)
+        solid = rasterize_view(raw, camera)["alpha"] > 0.02
+        assert_close(dr.grad(output), expected, rtol=tol.GRADIENT_REL, where=solid, name=name)
 
 
-def test_forward_and_reverse_mode_are_dual(scene):
+def test_rasterize__forward_and_reverse_mode_are_dual(scene):
     """<g, J v> = <J' g, v> for random g and v over all channels and attributes at once."""
     raw, camera = scene
     rng = np.random.default_rng(3)
@@ -186,7 +152,7 @@ def test_forward_and_reverse_mode_are_dual(scene):
     assert forward == pytest.approx(reverse, rel=tol.DUALITY_REL)
 
 
-def test_backward_agrees_with_central_differences_of_the_renderer_itself(scene):
+def test_rasterize__backward_agrees_with_central_differences(scene):
     raw, camera = scene
 
     def loss(values):
@@ -196,7 +162,7 @@ def test_backward_agrees_with_central_differences_of_the_renderer_itself(scene):
     dr.backward(dr.sum(dr.square(rasterize(gaussians, camera, ("color",)).color), axis=None))
     rng = np.random.default_rng(4)
     for name in RAW[:5]:
-        # The sign of the gradient as direction: no cancellation hides an error.
+        # The direction is the sign of the gradient, so that no cancellation hides an error.
         grad = np.asarray(dr.grad(getattr(gaussians, name)), np.float64)
         v = np.sign(grad) * rng.uniform(0.5, 1, grad.shape)
         h = 2e-3
@@ -205,7 +171,7 @@ def test_backward_agrees_with_central_differences_of_the_renderer_itself(scene):
         assert difference == pytest.approx(np.vdot(grad, v), rel=tol.CENTRAL_DIFFERENCE_REL), name
 
 
-def test_gradient_of_the_pose(scene):
+def test_rasterize__gradient_of_the_pose_agrees_with_the_reference(scene):
     raw, camera = scene
     viewmat = np.float32(camera.viewmat).astype(np.float64)
     posed = Camera(camera.K, mi.TensorXf(np.float32(viewmat)), camera.width, camera.height)
@@ -214,14 +180,14 @@ def test_gradient_of_the_pose(scene):
     dr.backward(dr.sum(dr.square(image.color), axis=None) + dr.sum(image.alpha, axis=None))
 
     def loss(values):
-        image = twin(raw, camera, viewmat=values["viewmat"])
+        image = rasterize_view(raw, camera, viewmat=values["viewmat"])
         return np.sum(image["color"] ** 2) + np.sum(image["alpha"])
 
     expected = reference.complex_step(loss, {"viewmat": viewmat}, ["viewmat"])["viewmat"]
-    assert relative(np.asarray(dr.grad(posed.viewmat))[:3], expected[:3]) < tol.GRADIENT_REL
+    assert_close(np.asarray(dr.grad(posed.viewmat))[:3], expected[:3], rtol=tol.GRADIENT_REL)
 
 
-def test_detached_weights_keep_geometry_out(scene):
+def test_rasterize__detached_weights_give_geometry_no_gradient(scene):
     raw, camera = scene
     gaussians = to_gaussians(raw, grad=True)
     image = rasterize(gaussians, camera, ("color", "motion"), detach_weights=("motion",))
@@ -232,38 +198,38 @@ def test_detached_weights_keep_geometry_out(scene):
 
 
 @pytest.mark.parametrize("shape", [(8, 4), (4, 4), (8, 8), (16, 2), (12, 5)])
-def test_block_shape_changes_speed_not_the_image(scene, shape):
+def test_rasterize__image_does_not_depend_on_the_block_shape(scene, shape):
     raw, camera = scene
     config = RenderConfig(block_width=shape[0], block_height=shape[1])
     found = rasterize(to_gaussians(raw), camera, ("color",), config=config).color
-    assert np.abs(np.asarray(found) - twin(raw, camera)["color"]).max() < tol.IMAGE_ABS
+    assert_close(found, rasterize_view(raw, camera)["color"], atol=tol.IMAGE_ABS)
 
 
-def test_dense_opaque_scene_stops_early_within_bound():
-    """Hundreds of nearly opaque layers: the lists are cut, the image moves by no more than the stop value."""
+def test_rasterize__stops_early_within_its_bound_in_a_dense_opaque_scene():
+    """With hundreds of nearly opaque layers the lists are truncated; the image changes by at most the stop value."""
     rng = np.random.default_rng(6)
     raw = as_float32(make_scene(0, 300, seed=6))
     raw["logit_opacities"] = rng.uniform(2, 8, 300)
     raw = as_float32(raw)
     camera = make_camera(70, 45)
-    found, expected = rasterize(to_gaussians(raw), camera), twin(raw, camera)
+    found, expected = rasterize(to_gaussians(raw), camera), rasterize_view(raw, camera)
     assert expected["alpha"].max() > 1 - 1e-5
-    assert np.abs(np.asarray(found.color) - expected["color"]).max() < tol.STOPPED_IMAGE_ABS
+    assert_close(found.color, expected["color"], atol=tol.STOPPED_IMAGE_ABS)
 
 
-def test_gradients_of_a_dense_scene():
+def test_rasterize__backward_agrees_with_the_reference_in_a_dense_scene():
     raw = as_float32(make_scene(0, 60, seed=7))
     camera = make_camera(40, 33)
     weight = np.random.default_rng(8).normal(size=(33, 40, 3))
     gaussians = to_gaussians(raw, grad=True)
     dr.backward(dr.sum(rasterize(gaussians, camera, ("color",)).color * mi.TensorXf(np.float32(weight)), axis=None))
     names = ["means", "log_scales", "logit_opacities"]
-    expected = reference.complex_step(lambda v: np.sum(twin(v, camera)["color"] * weight), raw, names)
+    expected = reference.complex_step(lambda v: np.sum(rasterize_view(v, camera)["color"] * weight), raw, names)
     for name in names:
-        assert relative(np.asarray(dr.grad(getattr(gaussians, name))), expected[name]) < 10 * tol.GRADIENT_REL, name
+        assert_close(dr.grad(getattr(gaussians, name)), expected[name], rtol=10 * tol.GRADIENT_REL, name=name)
 
 
-def test_reproducible_gradients_have_the_same_bytes_and_the_same_values():
+def test_rasterize__reproducible_gradients_have_the_same_bytes_and_values():
     raw, camera = as_float32(make_scene(1, 400, seed=9)), make_camera(120, 90)
 
     def gradients(config, threads):
@@ -282,44 +248,42 @@ def test_reproducible_gradients_have_the_same_bytes_and_the_same_values():
     for name, expected in runs[0].items():
         assert all(np.array_equal(run[name], expected) for run in runs), name
         if np.abs(expected).max() > 0:
-            assert relative(fast[name], expected) < tol.GRADIENT_REL, name
+            assert_close(fast[name], expected, rtol=tol.GRADIENT_REL, name=name)
 
 
-def test_equal_depths_keep_the_order_of_the_input():
+def test_rasterize__blends_equal_depths_in_the_order_of_the_input():
     raw = as_float32(make_scene(0, 2))
     raw["means"][:] = 0
     raw["quats"][:] = (1, 0, 0, 0)
     raw["sh_coeffs"][:] = np.array([1.0, -1.0])[:, None, None]
     camera = make_camera()
-    assert (
-        np.abs(np.asarray(rasterize(to_gaussians(raw), camera).color) - twin(raw, camera)["color"]).max()
-        < tol.IMAGE_ABS
-    )
+    found = rasterize(to_gaussians(raw), camera).color
+    assert_close(found, rasterize_view(raw, camera)["color"], atol=tol.IMAGE_ABS)
 
 
-def test_no_gaussians_leave_the_background():
+def test_rasterize__of_no_gaussians_is_the_background():
     empty = Gaussians(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 4)), np.zeros(0), np.zeros((0, 1, 3)))
     image = rasterize(empty, make_camera(5, 3), background=(0.1, 0.2, 0.3))
     assert np.allclose(np.asarray(image.color), (0.1, 0.2, 0.3))
     assert np.asarray(image.alpha).max() == 0
 
 
-def test_gaussians_out_of_view_leave_the_background(scene):
+def test_rasterize__of_gaussians_out_of_view_is_empty_with_zero_gradients(scene):
     raw, camera = scene
     behind = {**raw, "means": raw["means"] - np.array([0, 0, 50.0])}
     gaussians = to_gaussians(behind, grad=True)
     image = rasterize(gaussians, camera, CHANNELS)
     dr.backward(dr.sum(image.color, axis=None))
     for name in CHANNELS:
-        assert np.asarray(getattr(image, name)).max() == 0
+        assert np.asarray(image[name]).max() == 0
     assert np.abs(np.asarray(dr.grad(gaussians.means))).max() == 0
 
 
-def test_one_pixel_image(scene):
+def test_rasterize__agrees_with_the_reference_in_a_one_pixel_image(scene):
     raw, _ = scene
     camera = make_camera(1, 1)
     found = rasterize(to_gaussians(raw), camera, ("color",)).color
-    assert np.abs(np.asarray(found) - twin(raw, camera)["color"]).max() < tol.IMAGE_ABS
+    assert_close(found, rasterize_view(raw, camera)["color"], atol=tol.IMAGE_ABS)
 
 
 @pytest.mark.parametrize(
@@ -332,7 +296,7 @@ def test_one_pixel_image(scene):
         ({"logit_opacities": np.nan}, r"`opacities` must be finite"),
     ],
 )
-def test_non_finite_attributes_are_refused_by_name_and_index(scene, change, message):
+def test_rasterize__refuses_non_finite_attributes_by_name_and_index(scene, change, message):
     raw, camera = scene
     raw = {k: v.copy() for k, v in raw.items()}
     for name, value in change.items():
@@ -341,7 +305,7 @@ def test_non_finite_attributes_are_refused_by_name_and_index(scene, change, mess
         rasterize(to_gaussians(raw), camera)
 
 
-def test_bad_calls_say_what_was_expected(scene):
+def test_rasterize__refuses_bad_arguments(scene):
     raw, camera = scene
     with pytest.raises(ValueError, match="`channels` must be out of color, alpha"):
         rasterize(to_gaussians(raw), camera, ("colour",))
@@ -355,15 +319,23 @@ def test_bad_calls_say_what_was_expected(scene):
     with pytest.raises(ValueError, match=r"`features` must be finite, got nan at \[3, 0\]"):
         rasterize(to_gaussians(raw), camera, features=broken)
     bare = {k: v for k, v in raw.items() if k not in ("motion", "logit_confidence")}
-    with pytest.raises(ValueError, match="channel 'motion' needs Gaussians that carry it"):
-        rasterize(to_gaussians(bare), camera, ("motion",))
+    for channel, attribute in (("motion", "motion"), ("confidence", "logit_confidence")):
+        with pytest.raises(ValueError, match=f"channel '{channel}' requires Gaussians with `{attribute}`, got none"):
+            rasterize(to_gaussians(bare), camera, (channel,))
+
+
+def test_gaussians__refuse_attributes_of_another_length(scene):
+    raw, _ = scene
     with pytest.raises(ValueError, match=r"`quats` must be \[N, 4\] with N=10, got \(9, 4\)"):
         Gaussians(**{**raw, "quats": raw["quats"][:9]})
+
+
+def test_render_config__refuses_unsupported_blocks():
     with pytest.raises(ValueError, match="must be 4, 8, 12 or 16 px, got 17"):
         RenderConfig(block_width=17)
 
 
-def test_kernels_are_compiled_once_for_all_cameras_and_sizes():
+def test_rasterize__compiles_its_kernels_once_for_all_cameras_and_sizes():
     """No camera, image size or number of Gaussians may end up as a literal in a kernel."""
 
     def step(gaussians, camera):
@@ -379,3 +351,58 @@ def test_kernels_are_compiled_once_for_all_cameras_and_sizes():
         step(large, make_camera(90, 61))
         compiled = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and not k["cache_hit"]]
     assert not compiled
+
+
+# --------------------------------------------------------------------------------------------------
+#  A new attribute of the table
+# --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def new_attributes(monkeypatch):
+    """Add two rows to the table of attributes."""
+    for attribute in NEW_ATTRIBUTES:
+        monkeypatch.setitem(BY_ACTIVATED_NAME, attribute.activated_name, attribute)
+
+
+@pytest.mark.usefixtures("new_attributes")
+def test_rasterize__renders_a_new_attribute_of_the_table(scene):
+    raw, camera = scene
+    rng = np.random.default_rng(6)
+    normals = np.float32(rng.normal(size=(len(raw["means"]), 3)))
+    gaussians = ExtendedGaussians(**raw, logit_roughness=raw["logit_confidence"], normals=normals)
+    dr.enable_grad(gaussians.logit_confidence, gaussians.logit_roughness)
+    channels = ("color", "roughness", "confidence", "normal")
+    image = rasterize(gaussians, camera, channels, features=normals)
+    assert image["color"].shape == (camera.height, camera.width, 3)
+    assert_close(image["roughness"], image.confidence)
+    assert_close(image["normal"], image.features)
+    dr.backward(dr.sum(dr.square(image["roughness"]), axis=None) + dr.sum(dr.square(image.confidence), axis=None))
+    grad = np.asarray(dr.grad(gaussians.logit_confidence))
+    assert np.abs(grad).max() > 0
+    assert_close(dr.grad(gaussians.logit_roughness), grad, rtol=tol.SUM_ORDER_REL)
+    with pytest.raises(ValueError, match="channel 'roughness' requires Gaussians with `logit_roughness`, got none"):
+        rasterize(to_gaussians(raw), camera, ("roughness",))
+    broken = replace(gaussians, normals=np.where(np.arange(30).reshape(10, 3) == 7, np.nan, normals))
+    with pytest.raises(ValueError, match=r"`normals` must be finite, got nan at \[2, 1\]"):
+        rasterize(broken, camera, ("normal",))
+
+
+@pytest.mark.usefixtures("new_attributes")
+def test_rasterize__renders_on_a_region_a_new_attribute_of_the_table(scene):
+    raw, camera = scene
+    gaussians = ExtendedGaussians(**raw, logit_roughness=raw["logit_confidence"])
+    mask = np.zeros((camera.height, camera.width), bool)
+    mask[9, 10] = True
+    region, active = Region(mask), np.arange(len(raw["means"])) % 2 == 0
+    image = rasterize(gaussians, camera, ("roughness", "confidence"), region=region, active=active)
+    assert_close(image["roughness"], image.confidence)
+
+
+def test_image__is_indexed_by_channel(scene):
+    raw, camera = scene
+    image = rasterize(to_gaussians(raw), camera, ("color", "depth"))
+    assert image["color"] is image.color
+    assert image["depth"] is image.depth
+    with pytest.raises(KeyError, match="expected a channel out of color, depth, got 'alpha'"):
+        image["alpha"]

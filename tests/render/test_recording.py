@@ -1,4 +1,4 @@
-"""Recordings are bounded in number, what has made room is recorded again, and other threads do no harm."""
+"""Recordings: their number is bounded, evicted ones are recorded again, and other threads do not interfere."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def scaled(factor: int, *arrays: Any) -> list[Any]:
     return [factor * array for array in arrays]
 
 
-def test_many_combinations_of_sizes_leave_few_recordings(
+def test_recorded__bounds_the_number_of_recordings(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     made, freeze = [], dr.freeze
@@ -66,5 +66,5 @@ assert gc.isenabled()
 """
 
 
-def test_garbage_of_another_thread_does_not_stop_a_recording():
+def test_recorded__does_not_deadlock_with_garbage_collection_in_another_thread():
     subprocess.run([sys.executable, "-c", BUSY], check=True, timeout=120)

@@ -1,4 +1,4 @@
-"""Active blocks and active Gaussians: what is left is what the full computation gives there."""
+"""Regions and active Gaussians against the full computation: the remaining pixels and gradients are the same."""
 
 from __future__ import annotations
 
@@ -10,35 +10,25 @@ import pytest
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.render.region import Region, owned_copy
 from tests import tolerances as tol
+from tests.assertions import assert_close
+from tests.scenes import CHANNELS, RAW, make_wide_camera, make_wide_scene
 
-CHANNELS = ("color", "alpha", "depth", "motion", "confidence")
-RAW = ("means", "log_scales", "quats", "logit_opacities", "sh_coeffs", "motion", "logit_confidence")
 BACKGROUND = (0.2, 0.5, 0.9)
 
 
 @pytest.fixture(scope="module")
 def camera() -> Camera:
-    """Several tiles, and blocks that stick out on both sides."""
-    return Camera.look_at((0.3, -0.4, -3.0), (0, 0, 0), (0, -1, 0), 45.0, 101, 75)
+    return make_wide_camera()
 
 
 @pytest.fixture(scope="module")
 def raw() -> dict[str, np.ndarray]:
-    rng, n = np.random.default_rng(7), 120
-    return {
-        "means": rng.uniform((-1.5, -1.0, -0.5), (1.5, 1.0, 0.5), (n, 3)),
-        "log_scales": rng.uniform(np.log(0.02), np.log(0.2), (n, 3)),
-        "quats": rng.normal(size=(n, 4)),
-        "logit_opacities": rng.uniform(-2, 3, n),
-        "sh_coeffs": rng.normal(size=(n, 4, 3)) * 0.3,
-        "motion": rng.normal(size=(n, 3)) * 0.1,
-        "logit_confidence": rng.normal(size=n),
-    }
+    return make_wide_scene(120)
 
 
 @pytest.fixture(scope="module")
 def mask(camera: Camera) -> np.ndarray:
-    """A disc, a lonely pixel in a tile of its own, and the lower right corner."""
+    """A disc, a single pixel in another tile, and the lower right corner."""
     y, x = np.mgrid[: camera.height, : camera.width]
     mask = (x - 30) ** 2 + (y - 20) ** 2 < 12**2
     mask[70, 5] = mask[74, 100] = True
@@ -46,14 +36,14 @@ def mask(camera: Camera) -> np.ndarray:
 
 
 def run(raw, camera, region=None, active=None, weight=None, config=None):
-    """Return images and gradients of <image, weight>, with the weight laid out for the region."""
+    """Return images and gradients of <image, weight>, with the weight cropped to the region."""
     gaussians = Gaussians(**raw)
     dr.enable_grad(*gaussians.items().values())
     image = rasterize(gaussians, camera, CHANNELS, BACKGROUND, region=region, active=active, config=config)
-    images = {name: getattr(image, name) for name in CHANNELS}
+    images = {name: image[name] for name in CHANNELS}
     if weight is not None:
-        laid_out = {name: region.crop(w) if region else w for name, w in weight.items()}
-        dr.backward(sum(dr.sum(images[n] * mi.TensorXf(np.float32(laid_out[n])), axis=None) for n in CHANNELS))
+        cropped = {name: region.crop(w) if region else w for name, w in weight.items()}
+        dr.backward(sum(dr.sum(images[n] * mi.TensorXf(np.float32(cropped[n])), axis=None) for n in CHANNELS))
     grads = {name: np.asarray(dr.grad(getattr(gaussians, name)), np.float64) for name in RAW}
     return {name: np.asarray(value) for name, value in images.items()}, grads
 
@@ -61,21 +51,25 @@ def run(raw, camera, region=None, active=None, weight=None, config=None):
 @pytest.fixture(scope="module")
 def weight(camera: Camera, mask: np.ndarray) -> dict[str, np.ndarray]:
     """Random weights on the pixels of the region's blocks, 0 elsewhere."""
-    rng, region = np.random.default_rng(3), Region(mask)
-    drawn = region.paste(np.ones(region.shape(1)[:3]), np.zeros(mask.shape))[..., None]
+    rng, drawn = np.random.default_rng(3), drawn_pixels(Region(mask), mask)
     sizes = {"color": 3, "motion": 2}
     return {name: rng.normal(size=(*mask.shape, sizes.get(name, 1))) * drawn for name in CHANNELS}
+
+
+def drawn_pixels(region, mask):
+    """Return 1 on the pixels of the region's blocks [H, W, 1], 0 elsewhere."""
+    return region.paste(np.ones(region.shape(1)[:3]), np.zeros(mask.shape))[..., None]
 
 
 def assert_same_gradients(found, expected, rows=slice(None)):
     for name in RAW:
         scale = np.abs(expected[name]).max()
         assert scale > 0, name
-        assert np.abs(found[name][rows] - expected[name][rows]).max() < tol.SUM_ORDER_REL * scale, name
+        assert_close(found[name][rows], expected[name][rows], atol=tol.SUM_ORDER_REL * scale, name=name)
 
 
 @pytest.mark.parametrize("reproducible", [False, True])
-def test_a_region_shows_and_teaches_what_the_whole_view_does(raw, camera, mask, weight, reproducible):
+def test_rasterize__on_a_region_renders_and_differentiates_like_the_full_view(raw, camera, mask, weight, reproducible):
     config = RenderConfig(reproducible=reproducible)
     region = Region(mask, config)
     assert region.num_blocks < 0.3 * (camera.width * camera.height) / 32
@@ -87,7 +81,7 @@ def test_a_region_shows_and_teaches_what_the_whole_view_does(raw, camera, mask, 
     assert_same_gradients(grads, full_grads)
 
 
-def test_only_active_gaussians_get_gradients(raw, camera, mask, weight):
+def test_rasterize__gives_gradients_to_active_gaussians_only(raw, camera, mask, weight):
     rng = np.random.default_rng(0)
     active = rng.uniform(size=len(raw["means"])) < 0.4
     for region in (None, Region(mask)):
@@ -99,15 +93,15 @@ def test_only_active_gaussians_get_gradients(raw, camera, mask, weight):
         assert all((grads[name][~active] == 0).all() for name in RAW)
 
 
-def test_features_on_a_region_of_the_active(raw, camera, mask):
+def test_rasterize__blends_features_of_active_gaussians_on_a_region(raw, camera, mask):
     rng, region = np.random.default_rng(0), Region(mask)
     values, active = np.float32(rng.normal(size=(len(raw["means"]), 5))), rng.uniform(size=len(raw["means"])) < 0.4
 
-    def run_features(**part):
+    def run_features(**restriction):
         features = mi.TensorXf(values)
         dr.enable_grad(features)
-        image = rasterize(Gaussians(**raw), camera, (), features=features, **part).features
-        shown = image * (1 if part else mi.TensorXf(np.float32(mask_of(region, mask))))
+        image = rasterize(Gaussians(**raw), camera, (), features=features, **restriction).features
+        shown = image * (1 if restriction else mi.TensorXf(np.float32(drawn_pixels(region, mask))))
         dr.backward(dr.sum(dr.square(shown), axis=None))
         return np.asarray(dr.detach(image)), np.asarray(dr.grad(features))
 
@@ -115,17 +109,12 @@ def test_features_on_a_region_of_the_active(raw, camera, mask):
     found, grad = run_features(region=region, active=active)
     assert np.array_equal(found, region.crop(expected))
     assert np.abs(full[active]).max() > 0
-    assert np.abs(grad[active] - full[active]).max() < tol.SUM_ORDER_REL * np.abs(full).max()
+    assert_close(grad[active], full[active], atol=tol.SUM_ORDER_REL * np.abs(full).max())
     assert (grad[~active] == 0).all()
 
 
-def mask_of(region, mask):
-    """Return 1 on the pixels of the region's blocks [H, W, 1], 0 elsewhere."""
-    return region.paste(np.ones(region.shape(1)[:3]), np.zeros(mask.shape))[..., None]
-
-
-def test_equal_depths_keep_their_order_whoever_is_active(camera):
-    """Two opaque Gaussians in one place: the first one hides the second, active or not."""
+def test_rasterize__equal_depths_keep_their_order_for_any_active_set(camera):
+    """Of two opaque Gaussians at one position, the first occludes the second, active or not."""
     raw = {
         "means": np.zeros((2, 3)),
         "log_scales": np.full((2, 3), -1.0),
@@ -141,7 +130,7 @@ def test_equal_depths_keep_their_order_whoever_is_active(camera):
     assert all(np.array_equal(color, colors[0]) for color in colors)
 
 
-def test_a_region_in_forward_mode(raw, camera, mask):
+def test_rasterize__forward_mode_on_a_region_agrees_with_the_full_view(raw, camera, mask):
     rng, region, tangents = np.random.default_rng(1), Region(mask), []
     direction = {name: np.float32(rng.normal(size=raw[name].shape)) for name in RAW}
     for where in (region, None):
@@ -150,14 +139,14 @@ def test_a_region_in_forward_mode(raw, camera, mask):
         image = rasterize(gaussians, camera, CHANNELS, region=where)
         for name in RAW:
             dr.set_grad(getattr(gaussians, name), mi.TensorXf(direction[name]))
-        outputs = [getattr(image, name) for name in CHANNELS]
+        outputs = [image[name] for name in CHANNELS]
         dr.forward_to(outputs)
         tangents.append([np.asarray(dr.grad(output)) for output in outputs])
     for name, found, expected in zip(CHANNELS, *tangents, strict=True):
-        assert np.abs(found - region.crop(expected)).max() < tol.SUM_ORDER_REL * np.abs(expected).max(), name
+        assert_close(found, region.crop(expected), atol=tol.SUM_ORDER_REL * np.abs(expected).max(), name=name)
 
 
-def test_a_region_where_nothing_is(raw, camera, mask):
+def test_rasterize__on_an_empty_region_is_the_background(raw, camera, mask):
     raw = raw | {"means": raw["means"] * (1, 1, 0) + (0, 0, -50)}
     image = rasterize(Gaussians(**raw), camera, ("color", "depth"), BACKGROUND, region=Region(mask))
     inside = Region(mask).inside()
@@ -166,18 +155,18 @@ def test_a_region_where_nothing_is(raw, camera, mask):
     assert (np.asarray(image.depth) == 0).all()
 
 
-def test_cut_and_paste_are_inverse(camera, mask):
+def test_region__crop_and_paste_are_inverse(camera, mask):
     region, rng = Region(mask), np.random.default_rng(0)
-    picture, other = (rng.normal(size=(*mask.shape, 3)) for _ in range(2))
-    pasted = region.paste(region.crop(picture), other)
-    assert (pasted[mask] == picture[mask]).all()
+    image, other = (rng.normal(size=(*mask.shape, 3)) for _ in range(2))
+    pasted = region.paste(region.crop(image), other)
+    assert (pasted[mask] == image[mask]).all()
     drawn = region.paste(np.ones(region.shape(1)[:3], bool), np.zeros(mask.shape, bool))
     assert (pasted[~drawn] == other[~drawn]).all()
     assert drawn.sum() == region.inside().sum()
 
 
-def test_regions_share_their_kernels(raw, camera, mask):
-    """Another region, another number of Gaussians in it: nothing is compiled anew."""
+def test_rasterize__compiles_its_kernels_once_for_all_regions(raw, camera, mask):
+    """Another region with another number of Gaussians compiles no kernel."""
     active = np.arange(len(raw["means"])) % 3 == 0
 
     def step(where):
@@ -196,7 +185,7 @@ def test_regions_share_their_kernels(raw, camera, mask):
     assert not compiled, [k["operation_count"] for k in compiled]
 
 
-def test_bad_regions_are_refused(raw, camera, mask):
+def test_region__refuses_bad_masks_and_other_views(raw, camera, mask):
     gaussians = Gaussians(**raw)
     for bad in (np.zeros((4, 4), bool), np.ones((4, 4)), np.ones(4, bool)):
         with pytest.raises(ValueError, match=r"Region\(\): `mask` must be bool \[H, W\] with at least one pixel"):
@@ -213,8 +202,8 @@ def test_bad_regions_are_refused(raw, camera, mask):
 
 
 @pytest.mark.parametrize("offset", range(4))
-def test_gradients_from_memory_of_any_alignment(raw, offset):
-    """A gradient may lie in NumPy's memory, at any address: the loops read packets of floats."""
+def test_rasterize__backward_reads_gradients_at_any_alignment(raw, offset):
+    """A gradient may lie in NumPy's memory, at any address, although the loops read packets of floats."""
     camera = Camera.look_at((0, 0, -3.0), (0, 0, 0), (0, -1, 0), 45.0, 64, 32)
     memory = np.ones(64 * 32 * 3 + 4, np.float32)
     seed = memory[offset : offset + 64 * 32 * 3].reshape(32, 64, 3)
@@ -227,7 +216,7 @@ def test_gradients_from_memory_of_any_alignment(raw, offset):
     assert np.isfinite(np.asarray(dr.grad(gaussians.means))).all()
 
 
-def test_owned_memory_is_aligned():
+def test_owned_copy__is_aligned():
     borrowed = mi.Float(np.arange(1001, dtype=np.float32)[1:])
     copy = np.asarray(owned_copy(borrowed))
     assert np.array_equal(copy, np.arange(1, 1001))

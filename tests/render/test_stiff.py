@@ -1,4 +1,4 @@
-"""A stiff problem, a needle seen along its axis before an almost opaque disc: the fit stays finite and converges."""
+"""A stiff fit, a needle seen along its axis in front of an almost opaque disc: it stays finite and converges."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from drjit.opt import Adam
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from tests import reference
+from tests.scenes import CHANNELS, Values
 
-# As in test_extremes, so that both share their kernels.
-CHANNELS = ("color", "alpha", "depth", "motion", "confidence")
+# The settings of test_extremes, so that both share their kernels.
 BACKGROUND = (0.2, 0.5, 0.9)
 CONFIG = RenderConfig(stop_transmittance=1e-12)
-Values = dict[str, np.ndarray]
-WINDOW = Camera(np.array([[60.0, 0, 16], [0, 60, 12], [0, 0, 1]]), np.eye(4), 32, 24)
+CAMERA = Camera(np.array([[60.0, 0, 16], [0, 60, 12], [0, 0, 1]]), np.eye(4), 32, 24)
 
 
 def stiff_truth() -> Values:
@@ -35,28 +34,28 @@ def stiff_truth() -> Values:
 
 
 def descend(rate: float, steps: int) -> tuple[list[float], Values]:
-    """Return the losses and the raw attributes at the end of Adam with one rate, falling, for everything."""
+    """Return the losses and the final raw attributes of Adam with one decaying learning rate for all attributes."""
 
-    def picture(gaussians: Gaussians) -> Any:
-        return rasterize(gaussians, WINDOW, CHANNELS, BACKGROUND, config=CONFIG).color
+    def render(gaussians: Gaussians) -> Any:
+        return rasterize(gaussians, CAMERA, CHANNELS, BACKGROUND, config=CONFIG).color
 
     truth, rng = stiff_truth(), np.random.default_rng(0)
-    target = dr.detach(picture(Gaussians(**truth)))
+    target = dr.detach(render(Gaussians(**truth)))
     start = {name: value + 0.03 * rng.normal(size=value.shape) for name, value in truth.items()}
     start["log_scales"] += 0.3 * rng.normal(size=(2, 3))
     start["logit_opacities"] += (1, -3)
     optimizer, losses = Adam(lr=rate, params=Gaussians(**start).items(), epsilon=1e-15), []
     for step in range(steps):
         optimizer.set_learning_rate(rate * 0.01 ** (step / steps))
-        loss = dr.mean(dr.square(picture(Gaussians(**dict(optimizer))) - target), axis=None)
+        loss = dr.mean(dr.square(render(Gaussians(**dict(optimizer))) - target), axis=None)
         dr.backward(loss)
         optimizer.step()
         losses.append(float(np.asarray(dr.detach(loss)).item()))
     return losses, Gaussians(**dict(optimizer)).numpy()
 
 
-def test_the_stiff_problem_is_stiff():
-    """The diagonal of J'J of the picture spans more than 1e6, between tilts of the needle and the disc's opacity."""
+def test_stiff_truth__is_stiff():
+    """The diagonal of J'J of the image spans more than 1e6, between tilts of the needle and the disc's opacity."""
     truth, curvature = stiff_truth(), {}
     for name in ("means", "quats", "log_scales", "logit_opacities"):
         curvature[name] = np.zeros(truth[name].shape)
@@ -64,7 +63,7 @@ def test_the_stiff_problem_is_stiff():
             along = np.zeros(truth[name].shape)
             along[index] = 1
             slope = reference.directional(
-                lambda v: reference.rasterize(v, WINDOW.K, WINDOW.viewmat, 32, 24, BACKGROUND)["color"],
+                lambda v: reference.rasterize(v, CAMERA.K, CAMERA.viewmat, 32, 24, BACKGROUND)["color"],
                 truth,
                 {name: along},
             )
@@ -72,7 +71,7 @@ def test_the_stiff_problem_is_stiff():
     assert curvature["quats"][0].max() > 1e6 * curvature["logit_opacities"][1] > 0
 
 
-def test_stiff_problem_converges_within_bounds():
+def test_rasterize__adam_converges_on_a_stiff_problem():
     losses, found = descend(0.02, 150)
     assert np.isfinite(losses).all()
     assert losses[-1] < 1e-3 * losses[0]
@@ -80,7 +79,7 @@ def test_stiff_problem_converges_within_bounds():
         assert np.abs(found[name] - value).max() < (4 if name == "logit_opacities" else 1), name
 
 
-def test_absurd_learning_rate_does_no_worse_than_lose_the_scene():
+def test_rasterize__stays_finite_with_an_excessive_learning_rate():
     losses, found = descend(10.0, 60)
     assert np.isfinite(losses).all()
     assert all(np.isfinite(value).all() for value in found.values())

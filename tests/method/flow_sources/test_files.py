@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from morgs_mi.io.exr import write_exr
-from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.files import FlowFolder, read_flow, write_flow
 from morgs_mi.method.flow_sources.registry import FramePair, flow_source
@@ -72,7 +71,7 @@ def test_observe_key_views__negates_and_checks_flow_from_files(tmp_path):
         write_flow(tmp_path / "cam01" / direction / f"{frame}.exr", flow)
     images = np.zeros((2, 40, 60, 3), np.uint8)
     pair = FramePair(*images, camera="cam01", frame=7)
-    observation = observe_key_views({5: pair}, MotionConfig(flow_method=f"files:{tmp_path}"), with_masks=False)[5]
+    observation = observe_key_views({5: pair}, f"files:{tmp_path}")[5]
     np.testing.assert_array_equal(observation.motion[:, 10:], forward_flow[:, 10:])
     np.testing.assert_array_equal(observation.forward_flow, forward_flow)
     assert observation.reliable[3:, 12:].all()
@@ -147,6 +146,6 @@ def test_flow_folder__rejects_two_files_of_one_frame(folder):
         FlowFolder(folder).flows("cam00", 1, (6, 9))
 
 
-def test_motion_config__rejects_a_missing_flow_folder(tmp_path):
+def test_flow_source__rejects_a_missing_flow_folder(tmp_path):
     with pytest.raises(FileNotFoundError, match="expected a folder of flow files, found none"):
-        MotionConfig(flow_method=f"files:{tmp_path / 'flow'}")
+        flow_source(f"files:{tmp_path / 'flow'}")

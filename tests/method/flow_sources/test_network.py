@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow_sources.network import FlowNetwork, read_signature
 from morgs_mi.method.flow_sources.registry import FramePair, flow_source
 from tests.method.flow_sources.tiny_network import export, export_lookup, known_flow
@@ -89,10 +88,10 @@ def bad(tmp_path, name):
         ("half", ValueError, r"both fixed or both open, got \[1, 3, 64, \?\]"),
     ],
 )
-def test_motion_config__rejects_a_file_that_is_not_a_flow_network(tmp_path, name, exception, message):
+def test_flow_source__rejects_a_file_that_is_not_a_flow_network(tmp_path, name, exception, message):
     path = bad(tmp_path, name)
     with pytest.raises(exception, match=message):
-        MotionConfig(flow_method=f"onnx:{path}")
+        flow_source(f"onnx:{path}")
 
 
 def test_flow_network__rejects_an_output_that_is_not_flow(tmp_path):

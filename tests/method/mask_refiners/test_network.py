@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from morgs_mi.method.confidence import motion_mask
-from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.mask_refiners.config import MaskConfig, PromptConfig
 from morgs_mi.method.mask_refiners.network import SegmentNetwork, prompts
 from morgs_mi.method.mask_refiners.registry import mask_refiner
@@ -156,10 +155,10 @@ def bad(folder, files, name):
         ("extra", ValueError, "other.onnx: expected a mask decoder with inputs among .*orig_im_size and masks"),
     ],
 )
-def test_motion_config__rejects_files_that_are_not_sam2(tmp_path, files, name, exception, message):
+def test_mask_refiner__rejects_files_that_are_not_sam2(tmp_path, files, name, exception, message):
     encoder, decoder = bad(tmp_path, files, name)
     with pytest.raises(exception, match=message):
-        MotionConfig(mask_method=f"sam2:{encoder},{decoder}")
+        mask_refiner(f"sam2:{encoder},{decoder}")
 
 
 def test_segment_network__rejects_masks_that_are_not_finite(tmp_path, files):

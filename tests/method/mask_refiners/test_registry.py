@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.mask_refiners.registry import MASK_REFINERS, mask_refiner
 from tests.method.moving_disc import moving_disc
 
@@ -31,9 +30,9 @@ def test_mask_refiner__is_repeatable(method):
         ("sam2:encoder.onnx", r"got 'sam2:encoder.onnx'"),
     ],
 )
-def test_motion_config__rejects_unknown_mask_methods(method, message):
+def test_mask_refiner__rejects_unknown_methods(method, message):
     with pytest.raises(ValueError, match=message):
-        MotionConfig(mask_method=method)
+        mask_refiner(method)
 
 
 def test_masks_page__lists_every_refiner():

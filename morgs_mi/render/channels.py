@@ -1,0 +1,33 @@
+"""The renderer's channels.
+
+`color`, `depth` and `motion` have a rule of their own. Every attribute with a `channel` in the table of attributes is a
+further channel, blended like a colour. `alpha` is blended with every call that needs it.
+"""
+
+from __future__ import annotations
+
+from morgs_mi.core.attributes import BY_ACTIVATED_NAME, Attribute
+
+__all__ = ["NORMALISED", "attribute_channels", "channel_sizes", "exr_names"]
+
+_OWN_RULE = {"color": 3, "depth": 1, "motion": 2}
+
+NORMALISED = ("depth", "motion")
+"""Channels that are divided by alpha: expected values, not sums."""
+
+
+def attribute_channels() -> dict[str, Attribute]:
+    """Return the attributes that are blended like a colour, by the names of their channels."""
+    return {attribute.channel: attribute for attribute in BY_ACTIVATED_NAME.values() if attribute.channel}
+
+
+def channel_sizes() -> dict[str, int]:
+    """Return the number of floats that each channel blends, by name, without `alpha` and `features`."""
+    return {**_OWN_RULE, **{name: attribute.width for name, attribute in attribute_channels().items()}}
+
+
+def exr_names(channel: str) -> tuple[str, ...]:
+    """Return the EXR names of a channel's floats: NAME.Y for one, NAME.X, NAME.Y, NAME.Z for 2 or 3."""
+    size = channel_sizes()[channel]
+    suffixes = "Y" if size == 1 else "XYZ"[:size] if size <= 3 else [str(k) for k in range(size)]
+    return tuple(f"{channel}.{suffix}" for suffix in suffixes)
