@@ -455,7 +455,7 @@ def test_main__names_what_is_broken_in_a_stream(stream: Path, tmp_path: Path, ca
     [
         (["--camera", "3"], ("index in 0..2 or one of cam0, cam1, cam2, got '3'",)),
         (["--camera", "cam9"], ("got 'cam9'",)),
-        (["--camera", "0", "--channels", "confidence"], ("channel 'confidence' needs Gaussians that carry it",)),
+        (["--camera", "0", "--channels", "confidence"], ("channel 'confidence' requires Gaussians with `logit_confidence`",)),
         (["--camera", "0", "--output", "a.gif"], ("must be FILE.mp4, or a folder", "'.gif'")),
     ],
 )
