@@ -7,6 +7,7 @@ ensure_llvm()
 
 from morgs_mi.capture.capture import Capture, load_capture  # noqa: E402
 from morgs_mi.capture.live import live_frames  # noqa: E402
+from morgs_mi.config import StreamConfig  # noqa: E402
 from morgs_mi.core.camera import Camera  # noqa: E402
 from morgs_mi.core.gaussians import Gaussians  # noqa: E402
 from morgs_mi.gaussian_integrator import ellipsoids  # noqa: E402  (registers the integrator `gaussian_splat`)
@@ -14,7 +15,7 @@ from morgs_mi.playback.player import open_stream, render_stream  # noqa: E402
 from morgs_mi.recorder import stream_capture  # noqa: E402
 from morgs_mi.render.config import RenderConfig  # noqa: E402
 from morgs_mi.render.rasterize import Image, rasterize  # noqa: E402
-from morgs_mi.stream_loop import FrameReport, StreamConfig, StreamLoop  # noqa: E402
+from morgs_mi.stream_loop import FrameReport, StreamLoop  # noqa: E402
 
 __all__ = [
     "Camera",

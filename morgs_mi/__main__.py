@@ -1,4 +1,4 @@
-"""`python -m morgs_mi` is `morgs-mi`."""
+"""`python -m morgs_mi`, the same as `morgs-mi`."""
 
 import sys
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import write_json
 from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.evaluate.evaluate import evaluate_stream
@@ -23,7 +24,6 @@ from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.player import channel_image, open_stream, render_stream, truth_for_camera
 from morgs_mi.playback.visualise import contact_sheet, label, motion_legend, side_by_side, write_png
 from morgs_mi.recorder import stream_capture
-from morgs_mi.stream_loop import StreamConfig
 from morgs_mi.synth.synthesize import synthesize
 
 __all__ = ["ClipConfig", "DemoConfig", "run_demo"]

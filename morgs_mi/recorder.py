@@ -24,9 +24,10 @@ from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.codec.container import PacketKind, StreamWriter, TruncatedStreamError, header_json
 from morgs_mi.codec.packets import CodedFrame, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import write_json
 from morgs_mi.method.flow import choose_key_views
-from morgs_mi.stream_loop import MIN_POINTS, FrameReport, StreamConfig, StreamLoop
+from morgs_mi.stream_loop import MIN_POINTS, FrameReport, StreamLoop
 
 __all__ = ["stream_capture"]
 

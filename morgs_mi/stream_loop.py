@@ -14,12 +14,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from morgs_mi.codec.config import CodecConfig
-from morgs_mi.codec.container import Packet, encode_packet
+from morgs_mi.codec.container import Packet
 from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, residual_packet
+from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.initialise import from_points, resample_points, scene_extent, seed_points
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
@@ -27,14 +26,12 @@ from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
 from morgs_mi.method.change import box_around, change_mask, update_reference
 from morgs_mi.method.confidence import motion_mask
-from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation, choose_key_views, observe_key_views
 from morgs_mi.method.flow_sources.registry import FramePair
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.objective import KeyView, Observations, channels_of, observe
-from morgs_mi.render.config import RenderConfig
 
-__all__ = ["MIN_POINTS", "FrameReport", "Setup", "StreamConfig", "StreamLoop", "StreamState", "prepare", "step"]
+__all__ = ["MIN_POINTS", "FrameReport", "Setup", "StreamLoop", "StreamState", "prepare", "step"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -43,18 +40,6 @@ MIN_POINTS = 100
 
 # By view index: the images of those views that have one.
 Images = Mapping[int, np.ndarray]
-
-
-@dataclass(frozen=True)
-class StreamConfig:
-    """All settings of the loop, by subpackage."""
-
-    fit: FitConfig = field(default_factory=FitConfig)
-    motion: MotionConfig = field(default_factory=MotionConfig)
-    render: RenderConfig = field(default_factory=RenderConfig)
-    codec: CodecConfig = field(default_factory=CodecConfig)
-    seed: int = 0
-    """Seed of every random choice: the order of the views, the points that are added."""
 
 
 @dataclass(frozen=True)
@@ -174,7 +159,7 @@ def _later_step(
     report = FrameReport(
         state.frame,
         time.perf_counter() - start,
-        len(encode_packet(packet)),
+        packet.num_bytes,
         fitted.losses,
         len(coded),
         "ok" if images else "no view has an image",
@@ -197,7 +182,7 @@ def _first_step(
     gaussians, losses = fit_first_frame(gaussians, cameras, targets, setup.extent, fit, config.render, rng, tick)
     packet = keyframe_packet(gaussians, 0, setup.cameras, config.codec)
     coded = decode(None, packet)
-    seconds, size = time.perf_counter() - start, len(encode_packet(packet))
+    seconds, size = time.perf_counter() - start, packet.num_bytes
     report = FrameReport(0, seconds, size, losses, len(coded), status, _missing(setup, images))
     return StreamState(1, coded, images, _references(setup, state, images, {})), packet, report
 

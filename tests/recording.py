@@ -17,10 +17,10 @@ from morgs_mi import Camera, RenderConfig
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.codec import container
 from morgs_mi.codec.config import CodecConfig
+from morgs_mi.config import StreamConfig
 from morgs_mi.fit.config import DensityConfig, FitConfig
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.recorder import stream_capture
-from morgs_mi.stream_loop import StreamConfig
 
 FRAMES = 6
 # As little as a fit can do with all that it does: births, deaths, masks, keyframes, offsets.

@@ -1,12 +1,17 @@
-"""The command line: the whole way from a scene to figures, and bad input that gets one sentence."""
+"""The command line: from a scene to an evaluation, options and config files, and bad input with one sentence each."""
 
 from __future__ import annotations
 
 import json
+import re
 import resource
 import subprocess
 import sys
+import tomllib
+from dataclasses import asdict, replace
+from functools import reduce
 from pathlib import Path
+from typing import Any, get_type_hints
 
 import cv2
 import numpy as np
@@ -14,11 +19,16 @@ import pytest
 
 from morgs_mi import cli
 from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.cli.console import with_option_names
+from morgs_mi.cli.settings import SETTINGS, Reading
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet, play, reemitted_keyframe
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.config import StreamConfig, apply_values, config_toml
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.demo import DemoConfig
 from morgs_mi.io.exr import read_exr
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.stream_loop import StreamLoop
@@ -26,8 +36,8 @@ from tests.export.streams import write_stream
 
 WIDTH, HEIGHT, FRAMES = 48, 32, 3
 NAMES = ("cam0", "cam1", "cam2")
-# As little work as a fit can do.
-QUICK = ["--fit.num-gaussians", "120", "--fit.first-frame-steps", "4", "--fit.epochs", "1", "--fit.sh-degree", "0"]
+# The smallest possible fit.
+QUICK = ["--num-gaussians", "120", "--first-frame-steps", "4", "--epochs", "1", "--sh-degree", "0"]
 
 
 def run(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str, str]:
@@ -49,7 +59,7 @@ def clip(count: int = FRAMES) -> list[np.ndarray]:
 
 @pytest.fixture
 def capture(tmp_path: Path) -> Path:
-    """Three cameras that see noise go by, in .mkv, whose frames before a cut can be read."""
+    """Three cameras with moving noise, as .mkv, which stays readable up to where it is cut off."""
     path = tmp_path / "capture"
     points = np.random.default_rng(1).uniform(-1, 1, (150, 3))
     write_colmap(path / "sparse" / "0", rig(), points, np.abs(points))
@@ -77,7 +87,7 @@ def assert_one_sentence(error: str, *parts: str) -> None:
         assert part in lines[0]
 
 
-# What is done to the capture, and what the sentence about it must hold.
+# Each breaks the capture and returns parts of the expected message.
 def no_capture(path: Path) -> tuple[str, ...]:
     path.rename(path.with_name("elsewhere"))
     return "expected a capture folder", str(path)
@@ -123,7 +133,7 @@ BROKEN = [no_capture, no_clip, no_calibration, other_length, empty_clip, no_vide
 
 
 @pytest.mark.parametrize("spoil", BROKEN)
-def test_a_broken_capture(capture: Path, tmp_path: Path, capsys, spoil) -> None:
+def test_main__names_what_is_broken_in_a_capture(capture: Path, tmp_path: Path, capsys, spoil) -> None:
     parts = spoil(capture)
     for args in (("info", capture), ("fit", capture, tmp_path / "out", *QUICK)):
         status, _, error = run(capsys, *args)
@@ -132,14 +142,14 @@ def test_a_broken_capture(capture: Path, tmp_path: Path, capsys, spoil) -> None:
     assert not (tmp_path / "out").exists()
 
 
-def test_a_clip_cut_off_meanwhile_leaves_its_camera_out_of_the_rest(
+def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
     capture: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     truncated_clip(capture)
     monkeypatch.setattr("morgs_mi.io.video._count_packets", lambda path: FRAMES)
     assert run(capsys, "fit", capture, tmp_path / "out", *QUICK)[0] == 0
     frames = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
-    assert [frame["left_out"] for frame in frames] == [[], ["cam1"], ["cam1"]]
+    assert [frame["missing_views"] for frame in frames] == [[], ["cam1"], ["cam1"]]
     assert "cam1.mkv: frame 1 of 3 cannot be decoded" in frames[2]["status"]
     assert run(capsys, "eval", tmp_path / "out", "--json", tmp_path / "eval.json")[0] == 0
     frames = json.loads((tmp_path / "eval.json").read_text())["frames"]
@@ -147,7 +157,7 @@ def test_a_clip_cut_off_meanwhile_leaves_its_camera_out_of_the_rest(
     assert all(frame["psnr"] > 0 for frame in frames)
 
 
-def test_a_fit_and_its_evaluation_put_the_clips_on_the_same_clock(capture: Path, tmp_path: Path, capsys) -> None:
+def test_fit__and_eval_use_the_same_instants(capture: Path, tmp_path: Path, capsys) -> None:
     other_length(capture)
     out, options = tmp_path / "out", ("--offset", "cam1", "-1", "cam2", "1", "--exposure")
     assert run(capsys, "info", capture, "--no-check", *options)[1].count("2 frames at 25 fps") == 1
@@ -160,7 +170,7 @@ def test_a_fit_and_its_evaluation_put_the_clips_on_the_same_clock(capture: Path,
     assert (result["complete"], result["num_frames"]) == (True, 2)
 
 
-def test_an_interrupted_fit_leaves_a_stream_that_says_it_is_not_whole(
+def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
     capture: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     push = StreamLoop.push
@@ -181,34 +191,61 @@ def test_an_interrupted_fit_leaves_a_stream_that_says_it_is_not_whole(
 @pytest.mark.parametrize(
     ("args", "parts"),
     [
-        (["--frames", "0"], ("`max_frames` must be at least 1 or None, got 0",)),
-        (["--downscale", "0.5"], ("`downscale` must be at least 1, got 0.5",)),
-        (["--test-view", "3"], ("`test_view` must be in 0..2", "got 3")),
-        (["--preset", "s", "--fit.epochs", "3"], ("preset 's' sets `epochs` to 5", "given as 3")),
+        (["--frames", "0"], ("--frames must be at least 1 or None, got 0",)),
+        (["--downscale", "0.5"], ("--downscale must be at least 1, got 0.5",)),
+        (["--test-view", "3"], ("--test-view must be in 0..2", "got 3")),
+        (["--offset", "cam9", "1"], ("--offset must name cameras of cam0, cam1, cam2, got cam9",)),
+        (["--num-gaussians", "0"], ("--num-gaussians must be at least 1, got 0",)),
+        (["--epochs", "0", "--preset", "s"], ("--epochs must be at least 1, got 0",)),
+        (["--sh-degree", "4"], ("--sh-degree must be 0 to 3, got 4",)),
+        (["--key-views", "0"], ("--key-views must be at least 1, got 0",)),
+        (["--quality", "nan"], ("--quality must be positive and finite, got nan",)),
+        (["--target-size", "-1"], ("--target-size must not be negative, got -1",)),
+        (["--flow", "none"], ("--flow must be one of dis,", "got 'none'")),
+        (["--flow", "files:nowhere"], ("nowhere",)),
+        (["--masks", "some"], ("--masks must be one of none,", "got 'some'")),
+        (["--config", "nowhere.toml"], ("nowhere.toml: expected a TOML file with settings, found none",)),
+        (["--config", "[fit"], ("bad.toml: expected valid TOML",)),
+        (["--config", "[fit]\nepoch = 1"], ("bad.toml: `fit.epoch` is unknown, expected `fit.epochs`",)),
+        (["--config", "[fit]\nepochs = 'many'"], ("bad.toml: `fit.epochs` must be a whole number, got 'many'",)),
+        (["--config", "[fit.rates]\nmeans = nan"], ("bad.toml: `fit.rates.means` must be finite and not negative",)),
+        (["--config", "[render]\nblock_width = 17"], ("bad.toml: `render.block_width` must be 4, 8, 12 or 16",)),
+        (["--config", "[motion]\nflow_method = 'no'"], ("bad.toml: `motion.flow_method` must be one of dis,",)),
+        (["--config", "[motion]\nmask_method = 'no'"], ("bad.toml: `motion.mask_method` must be one of none,",)),
         (["--variant", "cuda_ad_rgb"], ("--variant cuda_ad_rgb cannot be used here", "llvm_ad_rgb")),
     ],
 )
-def test_bad_settings(capture: Path, tmp_path: Path, capsys, args, parts) -> None:
+def test_fit__rejects_bad_input_in_one_sentence(capture: Path, tmp_path: Path, capsys, args, parts) -> None:
     if "cuda_ad_rgb" in args and Path("/dev/nvidiactl").exists():
         pytest.skip("this machine has a GPU")
-    status, _, error = run(capsys, "fit", capture, tmp_path / "out", *args)
+    option, value, *more = args
+    if option == "--config" and "[" in value:
+        value = tmp_path / "bad.toml"
+        value.write_text(args[1])
+    status, _, error = run(capsys, "fit", capture, tmp_path / "out", option, value, *more)
     assert status == 1
     assert_one_sentence(error, *parts)
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("folders", [(), ("capture",)])
+def test_fit__asks_for_its_folders(folders: tuple[str, ...], capsys) -> None:
+    status, _, error = run(capsys, "fit", *folders)
+    assert status == 1
+    assert_one_sentence(error, "expected the folders CAPTURE and OUT")
+
+
 @pytest.mark.parametrize(
     ("args", "part"),
     [
-        (["--fit.num-gaussians", "0"], "`num_gaussians` must be at least 1, got 0"),
-        (["--motion.flow-method", "none"], "`flow_method` must be one of"),
-        (["--render.block-width", "17"], "`block_width` must be 4, 8, 12 or 16"),
-        (["--fit.rates.means", "nan"], "`means` must be finite and not negative"),
-        (["--fit.epochs", "many"], "many"),
+        (["--epochs", "many"], "many"),
+        (["--epochs", "None"], "--epochs"),
+        (["--preset", "xl"], "xl"),
         (["--nonsense"], "--nonsense"),
+        (["--fit.epochs", "1"], "--fit.epochs"),
     ],
 )
-def test_arguments_that_the_parser_refuses(capture: Path, tmp_path: Path, capsys, args, part) -> None:
+def test_fit__rejects_arguments_that_cannot_be_parsed(capture: Path, tmp_path: Path, capsys, args, part) -> None:
     with pytest.raises(SystemExit) as stop:
         cli.main(["fit", str(capture), str(tmp_path / "out"), *args])
     assert stop.value.code == 2
@@ -218,7 +255,168 @@ def test_arguments_that_the_parser_refuses(capture: Path, tmp_path: Path, capsys
     assert not (tmp_path / "out").exists()
 
 
-def test_an_output_that_cannot_be_written(capture: Path, stream: Path, tmp_path: Path, capsys) -> None:
+@pytest.mark.parametrize(
+    ("args", "parts"),
+    [
+        (("synth", "spheres", "OUT", "--cameras", 1), ("--cameras must be at least 2, got 1",)),
+        (("synth", "spheres", "OUT", "--frames", 0), ("--frames must be at least 1, got 0",)),
+        (("synth", "spheres", "OUT", "--width", 3), ("--width and --height must be even, got 3x240",)),
+        (("synth", "spheres", "OUT", "--noise", 2), ("--noise must be at least 0 and below 1, got 2",)),
+        (("demo", "OUT", "--cameras", 1), ("--cameras must be at least 2, got 1",)),
+        (("demo", "OUT", "--seed", -1), ("--seed must be at least 0, got -1",)),
+        (("demo", "OUT", "--config", "nowhere.toml"), ("nowhere.toml: expected a TOML file with settings",)),
+    ],
+)
+def test_main__names_options_not_arguments(tmp_path: Path, capsys, args, parts) -> None:
+    out = tmp_path / "out"
+    status, _, error = run(capsys, *(out if arg == "OUT" else arg for arg in args))
+    assert status == 1
+    assert_one_sentence(error.splitlines()[-1], *parts)
+    assert not out.exists()
+
+
+def printed_config(capsys, *args: object) -> StreamConfig:
+    status, text, error = run(capsys, "fit", *args, "--print-config")
+    assert (status, error) == (0, "")
+    return apply_values(StreamConfig(), tomllib.loads(text))
+
+
+@pytest.mark.parametrize(
+    ("args", "key", "expected"),
+    [
+        ((), "fit.epochs", 8),
+        (("--preset", "s"), "fit.epochs", 5),
+        (("--preset", "s", "--config", "FILE"), "fit.epochs", 3),
+        (("--config", "FILE", "--epochs", "2", "--preset", "s"), "fit.epochs", 2),
+        (("--preset", "paper", "--epochs", "2"), "fit.epochs", 2),
+        (("--preset", "paper", "--epochs", "2"), "motion.lift_flow", False),
+        (("--preset", "paper", "--config", "FILE"), "motion.lift_flow", False),
+        (("--config", "FILE"), "codec.quality", 2.5),
+        (("--config", "FILE", "--quality", "0.5"), "codec.quality", 0.5),
+        (("--config", "FILE", "--quality", "0.5"), "render.block_width", 4),
+        (("--config", "FILE"), "render.reproducible", True),
+        (("--config", "FILE", "--flow", "dis"), "motion.flow_method", "dis"),
+        (("--config", "FILE", "--target-size", "0"), "codec.target_size", 0),
+    ],
+)
+def test_fit__overrides_defaults_by_preset_by_file_by_options(tmp_path: Path, capsys, args, key, expected) -> None:
+    file = tmp_path / "a.toml"
+    file.write_text(
+        "[fit]\nepochs = 3\n[motion]\nflow_method = 'files:nowhere'\n[codec]\nquality = 2.5\ntarget_size = 9\n"
+        "[render]\nreproducible = true\nblock_width = 4\n"
+    )
+    config = printed_config(capsys, *(file if arg == "FILE" else arg for arg in args))
+    assert reduce(getattr, key.split("."), config) == expected
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        (),
+        ("--preset", "paper"),
+        (
+            *("--seed", 3, "--num-gaussians", 7, "--first-frame-steps", 5, "--epochs", 4, "--sh-degree", 2),
+            *("--key-views", 3, "--flow", "farneback", "--masks", "none", "--quality", 0.3, "--target-size", 99),
+            *("--keyframe-interval", 0, "--reproducible"),
+        ),
+    ],
+)
+def test_fit__prints_a_config_that_it_reads_back(tmp_path: Path, capsys, args: tuple[object, ...]) -> None:
+    config = printed_config(capsys, *args)
+    (tmp_path / "a.toml").write_text(config_toml(config))
+    assert printed_config(capsys, "--config", tmp_path / "a.toml") == config
+    if len(args) > 2:
+        default, given = (flattened(asdict(c)) for c in (StreamConfig(), config))
+        assert {key for key in given if given[key] != default[key]} == set(SETTINGS.values())
+
+
+def flattened(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    pairs = [
+        flattened(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+        for name, value in values.items()
+    ]
+    return {key: value for part in pairs for key, value in part.items()}
+
+
+COMMANDS = ("synth", "info", "calibrate", "fit", "render", "view", "eval", "salvage", "demo")
+EXPORTS = ("ply", "gltf", "video", "tracks")
+
+
+@pytest.mark.parametrize("command", [*((name,) for name in COMMANDS), *(("export", name) for name in EXPORTS)])
+def test_main__has_at_most_30_options_per_command(command: tuple[str, ...], capsys) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main([*command, "--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    options = re.findall(r"^[│ ] (?:-\w, )?(--[\w.-]+|\[?[A-Z]+\]?)[, ]", text, re.MULTILINE)
+    assert "--help" in options
+    assert "--variant" in options
+    assert command not in [("fit",), ("eval",)] or any("OUT" in option for option in options)
+    assert len(options) <= 30
+    assert not any("." in option for option in options)
+
+
+def test_fit__shows_the_defaults_of_its_options(capsys) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["fit", "--help"])
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for option, key in SETTINGS.items():
+        shown = (
+            rf"--{option.replace('_', '-')} (?:(?!--).)*\(default: {reduce(getattr, key.split('.'), StreamConfig())}\)"
+        )
+        assert option == "reproducible" or re.search(shown, text), option
+    assert "None)" not in text
+
+
+def test_Reading__has_the_fields_of_the_config() -> None:
+    assert get_type_hints(Reading) == get_type_hints(ReadConfig)
+    assert Reading().read_config() == ReadConfig()
+
+
+def test_demo__passes_its_options_on(tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    calls: list[DemoConfig] = []
+
+    def stop(out: Path, config: DemoConfig, progress: object) -> None:
+        calls.append(config)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("morgs_mi.demo.run_demo", stop)
+    (tmp_path / "a.toml").write_text("seed = 7\n[fit]\nepochs = 2\n")
+    assert run(capsys, "demo", tmp_path)[0] == 130
+    options = ("--scene", "arm", "--cameras", 4, "--frames", 5, "--width", 64, "--height", 48, "--spp", 2)
+    assert run(capsys, "demo", tmp_path, *options, "--config", tmp_path / "a.toml")[0] == 130
+    assert run(capsys, "demo", tmp_path, "--config", tmp_path / "a.toml", "--seed", 1)[0] == 130
+    default, small, seeded = calls
+    assert default == DemoConfig()
+    assert (small.scene, small.stream.seed, small.stream.fit.epochs) == ("arm", 7, 2)
+    assert small.clip == replace(default.clip, num_cameras=4, num_frames=5, width=64, height=48, spp=2)
+    assert small.stream.fit.first_frame_steps == default.stream.fit.first_frame_steps
+    assert (seeded.stream.seed, seeded.stream.fit.epochs) == (1, 2)
+
+
+def test_main__runs_as_a_module() -> None:
+    result = subprocess.run([sys.executable, "-m", "morgs_mi", "fit"], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout) == (1, "")
+    assert_one_sentence(result.stderr, "expected the folders CAPTURE and OUT")
+
+
+@pytest.mark.parametrize(
+    ("sentence", "expected"),
+    [
+        ("f(): `a` must be 1, got 2.", "--a must be 1, got 2."),
+        ("A.f(): `b` must be below `a`.", "`b` must be below --a."),
+        ("f(): `b` must be 1.", "f(): `b` must be 1."),
+        ("clip: `a` must be 1.", "clip: --a must be 1."),
+        ("clip/file.json: `a` must be 1.", "clip/file.json: `a` must be 1."),
+        ("f(): `x.a` must be 1.", "--x-a must be 1."),
+        ("Something about `a`.", "Something about `a`."),
+    ],
+)
+def test_with_option_names__changes_only_arguments(sentence: str, expected: str) -> None:
+    assert with_option_names(sentence, {"a": "--a", "x.a": "--x-a"}, "clip") == expected
+
+
+def test_main__names_an_output_that_cannot_be_written(capture: Path, stream: Path, tmp_path: Path, capsys) -> None:
     (tmp_path / "file").write_text("")
     for args in (
         ("fit", capture, tmp_path / "file" / "out", *QUICK),
@@ -241,7 +439,7 @@ def test_an_output_that_cannot_be_written(capture: Path, stream: Path, tmp_path:
         (lambda data: data[:-5] + b"\1" * 5, ("the bytes are damaged",)),
     ],
 )
-def test_a_broken_stream(stream: Path, tmp_path: Path, capsys, damage, parts) -> None:
+def test_main__names_what_is_broken_in_a_stream(stream: Path, tmp_path: Path, capsys, damage, parts) -> None:
     stream.write_bytes(damage(stream.read_bytes()))
     outputs = [tmp_path / "a.mp4", tmp_path / "exr", tmp_path / "png"]
     commands = [("render", stream, "--camera", 0, "--output", output) for output in outputs]
@@ -257,18 +455,21 @@ def test_a_broken_stream(stream: Path, tmp_path: Path, capsys, damage, parts) ->
     [
         (["--camera", "3"], ("index in 0..2 or one of cam0, cam1, cam2, got '3'",)),
         (["--camera", "cam9"], ("got 'cam9'",)),
-        (["--camera", "0", "--channels", "confidence"], ("channel 'confidence' needs Gaussians that carry it",)),
+        (
+            ["--camera", "0", "--channels", "confidence"],
+            ("channel 'confidence' requires Gaussians with `logit_confidence`",),
+        ),
         (["--camera", "0", "--output", "a.gif"], ("must be FILE.mp4, or a folder", "'.gif'")),
     ],
 )
-def test_a_bad_request_to_render(stream: Path, tmp_path: Path, capsys, args, parts) -> None:
+def test_render__rejects_bad_input_in_one_sentence(stream: Path, tmp_path: Path, capsys, args, parts) -> None:
     status, _, error = run(capsys, "render", stream, *args)
     assert status == 1
     assert_one_sentence(error, *parts)
     assert list(tmp_path.iterdir()) == [stream]
 
 
-def test_other_bad_streams(stream: Path, tmp_path: Path, capsys) -> None:
+def test_main__names_a_missing_or_empty_stream(stream: Path, tmp_path: Path, capsys) -> None:
     status, _, error = run(capsys, "render", tmp_path, "--camera", 0)
     assert status == 1
     assert_one_sentence(error, "stream.morgs: expected a stream, found none")
@@ -284,7 +485,7 @@ def test_other_bad_streams(stream: Path, tmp_path: Path, capsys) -> None:
         assert not output.exists()
 
 
-def test_a_damaged_stream_is_salvaged_and_what_is_lost_is_named(tmp_path: Path, capsys) -> None:
+def test_salvage__writes_the_intact_frames_and_lists_the_lost_ones(tmp_path: Path, capsys) -> None:
     path, new = tmp_path / "stream.morgs", tmp_path / "new.morgs"
     states = write_stream(path, 5)
     packets = list(StreamReader(path))
@@ -294,38 +495,38 @@ def test_a_damaged_stream_is_salvaged_and_what_is_lost_is_named(tmp_path: Path, 
     index, data = StreamReader(path).index(), bytearray(path.read_bytes())
     data[index[2][2] + 40] ^= 1
     path.write_bytes(data)
-    status, said, _ = run(capsys, "salvage", tmp_path, new)
+    status, output, _ = run(capsys, "salvage", tmp_path, new)
     assert status == 0
-    gap, behind, *_, result, lost = said.splitlines()
-    assert gap == f"{path}: bytes {index[2][2]} to {index[3][2]}: the bytes are damaged."
-    assert f"bytes {index[3][2]} to {index[4][2]}: packet of frame 3: it does not continue the state after" in behind
+    damaged, after, *_, result, lost = output.splitlines()
+    assert damaged == f"{path}: bytes {index[2][2]} to {index[3][2]}: the bytes are damaged."
+    assert f"bytes {index[3][2]} to {index[4][2]}: packet of frame 3: it does not continue the state after" in after
     assert result == f"{new}: 2 frames, 0 to 1."
     assert lost.startswith("3 frames cannot be played, 2 to 4: their packets are damaged, missing, or continue one")
     assert [frame for frame, _ in play(StreamReader(new))] == [0, 1]
 
-    # Keyframes behind what is missing: it plays on.
+    # Playback continues at the keyframes after the missing frames.
     with StreamWriter(path, rig(), 25, {"num_frames": 6}) as writer:
         for state in (states[0], states[3], states[4]):
             writer.write(reemitted_keyframe(state))
-    status, said, _ = run(capsys, "salvage", tmp_path, new)
-    assert (status, said.splitlines()[0]) == (0, f"{new}: 3 frames, 0, 3 to 4.")
-    assert "3 frames cannot be played, 1 to 2, 5: " in said
+    status, output, _ = run(capsys, "salvage", tmp_path, new)
+    assert (status, output.splitlines()[0]) == (0, f"{new}: 3 frames, 0, 3 to 4.")
+    assert "3 frames cannot be played, 1 to 2, 5: " in output
 
-    # The metadata may say anything.
+    # The metadata is not checked: any type, any size.
     for total, named in ((10**30, f", 5 to {10**30 - 1}: "), ("many", ", 1 to 2: "), (2, ", 1 to 2: ")):
         with StreamWriter(path, rig(), 25, {"num_frames": total}) as writer:
             for state in (states[0], states[3], states[4]):
                 writer.write(reemitted_keyframe(state))
-        status, said, _ = run(capsys, "salvage", tmp_path, new)
+        status, output, _ = run(capsys, "salvage", tmp_path, new)
         assert status == 0
-        assert named in said
+        assert named in output
 
     status, _, error = run(capsys, "salvage", tmp_path, path)
     assert status == 1
     assert_one_sentence(error, "expected a new file, got the damaged stream itself")
 
 
-def test_a_stream_of_no_gaussians_is_black(tmp_path: Path, capsys) -> None:
+def test_render__draws_a_stream_without_gaussians_black(tmp_path: Path, capsys) -> None:
     empty = Gaussians(*(np.zeros((0, *tail)) for tail in ((3,), (3,), (4,), (), (1, 3))))
     with StreamWriter(tmp_path / "s.morgs", rig(), 25) as writer:
         writer.write(keyframe_packet(empty, 0))
@@ -333,8 +534,8 @@ def test_a_stream_of_no_gaussians_is_black(tmp_path: Path, capsys) -> None:
     assert not any(channel.any() for channel in read_exr(tmp_path / "exr" / "0000.exr").values())
 
 
-def test_a_full_disk_while_fitting(capture: Path, tmp_path: Path) -> None:
-    """The second packet finds no room: the file ends with the first, and says how many there should be."""
+def test_fit__ends_with_a_whole_packet_on_a_full_disk(capture: Path, tmp_path: Path) -> None:
+    """The second packet does not fit: the file ends with the first and still has the intended number of frames."""
     script = (
         "import resource, sys; from morgs_mi.codec import container; from morgs_mi import cli\n"
         "write = container.StreamWriter.write\n"
@@ -355,8 +556,10 @@ def test_a_full_disk_while_fitting(capture: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "exr", "png"])
-def test_a_full_disk_while_rendering(stream: Path, tmp_path: Path, capsys, name: str) -> None:
-    run(capsys, "render", stream, "--camera", 0, "--output", tmp_path / f"warm-{name}")  # kernels are on the disk too
+def test_render__removes_its_output_on_a_full_disk(stream: Path, tmp_path: Path, capsys, name: str) -> None:
+    run(
+        capsys, "render", stream, "--camera", 0, "--output", tmp_path / f"warm-{name}"
+    )  # compiled kernels are cached on disk too
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (200, hard))
     try:
@@ -368,7 +571,9 @@ def test_a_full_disk_while_rendering(stream: Path, tmp_path: Path, capsys, name:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["good.morgs", f"warm-{name}"]
 
 
-def test_an_interruption(stream: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_render__removes_its_output_when_interrupted(
+    stream: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def interrupt(*args: object, **more: object) -> None:
         raise KeyboardInterrupt
 
@@ -379,57 +584,57 @@ def test_an_interruption(stream: Path, tmp_path: Path, capsys, monkeypatch: pyte
     assert list(tmp_path.iterdir()) == [stream]
 
 
-def test_a_fit_that_was_cut_off_is_resumed(capture: Path, tmp_path: Path, capsys) -> None:
+def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, capsys) -> None:
     out = tmp_path / "out"
-    fit = ("fit", capture, out, *QUICK, "--render.reproducible")
+    fit = ("fit", capture, out, *QUICK, "--reproducible")
     assert run(capsys, *fit)[0] == 0
     whole = (out / "stream.morgs").read_bytes()
     (out / "stream.morgs").write_bytes(whole[: len(whole) * 3 // 4])
-    status, said, _ = run(capsys, *fit, "--resume")
+    status, output, _ = run(capsys, *fit, "--resume")
     assert status == 0
-    assert f"stream.morgs: {FRAMES} frames" in said
+    assert f"stream.morgs: {FRAMES} frames" in output
     assert (out / "stream.morgs").read_bytes() == whole
     status, _, error = run(capsys, *fit, "--resume", "--seed", 1)
     assert status == 1
     assert_one_sentence(error, "stream.morgs: expected to resume", "config.seed = 0, got 1")
 
 
-def test_debug_shows_where_an_error_came_from(tmp_path: Path, capsys) -> None:
+def test_main__prints_a_traceback_with_debug(tmp_path: Path, capsys) -> None:
     status, _, error = run(capsys, "info", tmp_path / "nothing", "--debug")
     assert status == 1
     assert "Traceback" in error
     assert "load_capture" in error
 
 
-def test_the_cameras_of_a_capture_are_listed(capture: Path, capsys) -> None:
+def test_info__lists_the_cameras_of_a_capture(capture: Path, capsys) -> None:
     status, out, _ = run(capsys, "info", capture)
     assert status == 0
     assert all(f"{name} {WIDTH}x{HEIGHT}" in " ".join(out.split()) for name in NAMES)
     assert f"{FRAMES} frames at 25 fps, 150 points, without ground truth." in out
 
 
-def test_from_a_scene_to_figures(tmp_path: Path, capsys) -> None:
+def test_main__goes_from_a_scene_to_an_evaluation(tmp_path: Path, capsys) -> None:
     clip, out = tmp_path / "clip", tmp_path / "out"
     size = ("--width", 64, "--height", 48, "--spp", 4)
     assert run(capsys, "synth", "spheres", clip, "--cameras", 4, "--frames", 3, *size)[0] == 0
-    fit = ("--test-view", 0, "--fit.num-gaussians", 600, "--fit.first-frame-steps", 60, "--fit.epochs", 2)
-    status, said, _ = run(capsys, "fit", clip, out, *fit)
+    fit = ("--test-view", 0, "--num-gaussians", 600, "--first-frame-steps", 60, "--epochs", 2)
+    status, output, _ = run(capsys, "fit", clip, out, *fit)
     assert status == 0
-    assert "stream.morgs: 3 frames" in said
+    assert "stream.morgs: 3 frames" in output
 
-    status, said, _ = run(capsys, "eval", out, "--json", "-")
+    status, output, _ = run(capsys, "eval", out, "--json", "-")
     assert status == 0
-    result = json.loads(said)
+    result = json.loads(output)
     assert (result["held_out"], list(result["views"]), result["num_frames"]) == (True, ["cam00"], 3)
     assert result["psnr"]["mean"] > 15
     assert result["bytes"]["file"] == (out / "stream.morgs").stat().st_size
     assert 0 < result["frames"][1]["motion_error_moving"] < 10
     assert result["frames"][1]["seconds"] > 0
-    more = ("--json", tmp_path / "eval.json", "--pictures", tmp_path / "pictures")
-    status, said, _ = run(capsys, "eval", out, *more)
+    more = ("--json", tmp_path / "eval.json", "--figures", tmp_path / "figures")
+    status, output, _ = run(capsys, "eval", out, *more)
     assert status == 0
-    assert "held-out view cam00" in said
-    assert {path.name for path in (tmp_path / "pictures").iterdir()} == {"slice.png", "motion.png", "confidence.png"}
+    assert "held-out view cam00" in output
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"slice.png", "motion.png", "confidence.png"}
     assert 0 < result["motion_3d"]["num_gaussians"] <= 600
     status, _, error = run(capsys, "eval", out, "--lpips", tmp_path / "none.onnx")
     assert (status, "expected an LPIPS network as ONNX, found none" in error) == (1, True)

@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import pytest
 
+from morgs_mi.config import StreamConfig
 from morgs_mi.demo import ClipConfig, DemoConfig, _synthesize_clip, run_demo
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.stream_loop import StreamConfig
 
 SMALL = DemoConfig(
     clip=ClipConfig(num_cameras=6, num_frames=4, width=64, height=48, spp=4),

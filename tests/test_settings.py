@@ -11,9 +11,10 @@ import pytest
 from morgs_mi import Camera, RenderConfig
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import encode_packet
+from morgs_mi.config import StreamConfig
 from morgs_mi.fit.config import DensityConfig, FitConfig
 from morgs_mi.method.config import MotionConfig
-from morgs_mi.stream_loop import StreamConfig, StreamLoop
+from morgs_mi.stream_loop import StreamLoop
 
 BASE = StreamConfig(
     fit=FitConfig(

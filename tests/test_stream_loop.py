@@ -14,12 +14,13 @@ from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.codec.container import PacketKind, encode_packet
 from morgs_mi.codec.packets import coded_frames, decode, play
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.config import StreamConfig
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
 from morgs_mi.fit.config import DensityConfig, FitConfig, LearningRates
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.recorder import stream_capture
-from morgs_mi.stream_loop import StreamConfig, StreamLoop
+from morgs_mi.stream_loop import StreamLoop
 
 SHIFT = np.array([0.06, 0.02, 0.0])  # about 3 px a frame
 QUICK = StreamConfig(  # from all points, as the images were made of them

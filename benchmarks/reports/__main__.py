@@ -29,7 +29,7 @@ from benchmarks.reports.method import MethodReportConfig
 from benchmarks.reports.method_results import MethodResult
 from benchmarks.reports.renderer import Errors, RendererReportConfig, RendererResult, RendererRow
 from morgs_mi.cli import Common, run
-from morgs_mi.cli.console import OUT, progress, say
+from morgs_mi.cli.console import OUT, print_result, progress
 from morgs_mi.core.files import json_finite, write_json
 from morgs_mi.evaluate.tables import figure
 
@@ -77,7 +77,7 @@ class FlowReport:
         if _in_tables(result.as_dict(), self.json):
             for clip in result.clips:
                 title = f"{clip.name}: {clip.pairs} pairs of {clip.width}x{clip.height} pixels"
-                say(f"{title}, motion of {figure(clip.motion, 1)} px\n\n{markdown_table(clip)}")
+                print_result(f"{title}, motion of {figure(clip.motion, 1)} px\n\n{markdown_table(clip)}")
         if self.plot is not None:
             plot_flow(result, self.plot)
 
@@ -103,7 +103,7 @@ class CodecReport:
             result = report_codec(self.captures, self.out, self.config, report)
         if _in_tables(result.as_dict(), self.json):
             for clip in result.clips:
-                say(f"{clip.name}\n\n{markdown_table(clip)}")
+                print_result(f"{clip.name}\n\n{markdown_table(clip)}")
         if self.plot is not None:
             plot_codec(result, self.plot)
 
@@ -133,7 +133,7 @@ class MethodReport:
 
         with progress() as report:
             result = report_method(self.captures, self.out, self.config, report, write)
-        say(f"{method_page(result)}\nAll figures: {self.out / 'method.json'}")
+        print_result(f"{method_page(result)}\nAll figures: {self.out / 'method.json'}")
 
 
 Subject = (
@@ -188,11 +188,11 @@ def _show_renderer(result: RendererResult) -> None:
 def _in_tables(result: Mapping[str, Any], file: Path | None) -> bool:
     """Write all figures to `file`, or print them if it is -; return whether tables remain to be printed."""
     if file == Path("-"):
-        say(json.dumps(json_finite(result), indent=2))
+        print_result(json.dumps(json_finite(result), indent=2))
         return False
     if file is not None:
         write_json(file, result)
-        say(f"All figures: {file}")
+        print_result(f"All figures: {file}")
     return True
 
 

@@ -21,11 +21,11 @@ from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.codec.entropy import column_bits
 from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, residual_packet
 from morgs_mi.codec.quantisation import step_sizes
+from morgs_mi.config import StreamConfig
 from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.playback.player import open_stream
 from morgs_mi.recorder import stream_capture
-from morgs_mi.stream_loop import StreamConfig
 
 __all__ = [
     "CodecClip",

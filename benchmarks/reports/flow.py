@@ -45,7 +45,7 @@ class FlowReportConfig:
     """Methods and effort of the report on optical flow."""
 
     methods: tuple[str, ...] = tuple(FLOW_METHODS)
-    """Sources of flow, as for --motion.flow-method."""
+    """Sources of flow, as for `morgs-mi fit --flow`."""
     views: int = 4
     """Number of cameras, spread over the rig like key views."""
     frames: int | None = None

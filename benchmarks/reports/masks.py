@@ -30,6 +30,7 @@ import tyro
 from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.codec.packets import CodedFrame
+from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import write_json
 from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.evaluate.metrics import iou, psnr
@@ -41,7 +42,7 @@ from morgs_mi.method.flow import FlowObservation, observe_flow
 from morgs_mi.method.lift import lift_flow
 from morgs_mi.method.mask_refiners.registry import MASK_REFINERS, mask_refiner
 from morgs_mi.render.config import RenderConfig
-from morgs_mi.stream_loop import StreamConfig, StreamLoop
+from morgs_mi.stream_loop import StreamLoop
 from morgs_mi.synth.ground_truth import load_truth
 
 

@@ -18,10 +18,9 @@ from benchmarks.reports.flow import FlowReportConfig, report_flow
 from benchmarks.reports.method_cells import DEFAULT, Cell, Clip, Scores, method_version, scores_of, scratch_scores
 from benchmarks.reports.method_results import FlowError, MethodClip, MethodResult, ScratchRow, SettingRow
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.config import PRESETS, StreamConfig
 from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.presets import PRESETS
-from morgs_mi.stream_loop import StreamConfig
 
 __all__ = ["MethodReportConfig", "report_method"]
 

@@ -25,12 +25,12 @@ from benchmarks.reports.records import from_json
 from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import coded_frames
+from morgs_mi.config import StreamConfig, apply_preset
 from morgs_mi.core.files import atomic_path, write_json
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.results import Evaluation, known_mean
 from morgs_mi.playback.player import open_stream
-from morgs_mi.presets import apply_preset
-from morgs_mi.stream_loop import FrameReport, StreamConfig, StreamLoop, StreamState
+from morgs_mi.stream_loop import FrameReport, StreamLoop, StreamState
 
 __all__ = ["DEFAULT", "Cell", "Clip", "Scores", "method_version", "scores_of", "scratch_scores"]
 
@@ -66,12 +66,11 @@ class Cell:
 
     def config(self, base: StreamConfig) -> StreamConfig:
         """Return `base` with this setting."""
-        fit, motion = base.fit, base.motion
         if self.preset != DEFAULT:
-            fit, motion = apply_preset(self.preset, fit, motion)  # pyright: ignore[reportArgumentType]
-        scaled = {name: self.rates * rate for name, rate in asdict(fit.rates).items()}
-        fit = replace(fit, epochs=self.epochs, rates=replace(fit.rates, **scaled))
-        return replace(base, fit=fit, motion=replace(motion, key_views=self.key_views), seed=self.seed)
+            base = apply_preset(base, self.preset)  # pyright: ignore[reportArgumentType]
+        scaled = {name: self.rates * rate for name, rate in asdict(base.fit.rates).items()}
+        fit = replace(base.fit, epochs=self.epochs, rates=replace(base.fit.rates, **scaled))
+        return replace(base, fit=fit, motion=replace(base.motion, key_views=self.key_views), seed=self.seed)
 
     def __str__(self) -> str:
         return f"{self.preset}-{self.epochs}e-{self.key_views}k-{self.rates:g}x-s{self.seed}"

@@ -11,19 +11,18 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import mitsuba as mi
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.cli.settings import GivenReading, GivenSettings, Reading, Settings
 from morgs_mi.core.files import write_json
 from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.recorder import stream_capture
-from morgs_mi.stream_loop import StreamConfig
 
 
 @dataclass(frozen=True)
@@ -40,8 +39,8 @@ class Options:
     """Maximum number of frames from the start."""
     downscale: float = 1
     """Factor by which the images are averaged down."""
-    reading: Annotated[ReadConfig, arg(name="")] = field(default_factory=ReadConfig)
-    config: Annotated[StreamConfig, arg(name="")] = field(default_factory=StreamConfig)
+    reading: GivenReading = field(default_factory=Reading)
+    settings: GivenSettings = field(default_factory=Settings)
 
 
 def resident() -> float:
@@ -52,7 +51,7 @@ def resident() -> float:
 def fit(options: Options) -> None:
     """Fit the remaining frames and log the memory at every frame in OUT/memory.jsonl."""
     options.out.mkdir(parents=True, exist_ok=True)
-    capture = load_capture(options.capture, options.downscale, "auto", options.frames, options.reading)
+    capture = load_capture(options.capture, options.downscale, "auto", options.frames, options.reading.read_config())
     with (options.out / "memory.jsonl").open("a", encoding="utf-8") as log:
 
         def log_memory(frame: int, step: int, steps: int) -> None:
@@ -60,7 +59,7 @@ def fit(options: Options) -> None:
                 log.write(json.dumps({"frame": frame, "resident_mib": resident()}) + "\n")
                 log.flush()
 
-        stream_capture(capture, options.out, options.config, log_memory, resume=True)
+        stream_capture(capture, options.out, options.settings.stream_config(), log_memory, resume=True)
 
 
 def summary(out: Path, capture: Path) -> dict[str, Any]:
@@ -87,7 +86,7 @@ def main() -> None:
     mi.set_variant("llvm_ad_rgb")
     fit(options)
     settings = {"frames": options.frames, "downscale": options.downscale}
-    settings |= {"reading": asdict(options.reading), "config": asdict(options.config)}
+    settings |= {"reading": asdict(options.reading), "config": asdict(options.settings.stream_config())}
     result = {"capture": options.capture.name, "settings": settings, **summary(options.out, options.capture)}
     result |= {"machine": machine(), "versions": versions()}
     write_json(options.json, result)

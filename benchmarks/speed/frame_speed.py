@@ -27,12 +27,12 @@ import tyro
 from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.packets import decode, keyframe_packet
+from morgs_mi.config import StreamConfig, apply_preset
 from morgs_mi.core.files import write_json
 from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.fit.config import DensityConfig, FitConfig
 from morgs_mi.method.config import MotionConfig
-from morgs_mi.presets import apply_preset
-from morgs_mi.stream_loop import StreamConfig, StreamLoop
+from morgs_mi.stream_loop import StreamLoop
 
 # Stages of a frame: file and function that are timed.
 STAGES = {
@@ -191,8 +191,8 @@ def settings(options: Options, name: str, base: StreamConfig) -> dict[str, Strea
     runs = {f"default, {e} epochs": replace(base, fit=replace(base.fit, epochs=e)) for e in options.epochs}
     if name in options.full:
         runs["8 epochs, nothing left out"] = replace(base, fit=replace(base.fit, skip_static=False))
-        fit, motion = apply_preset("paper", base.fit, base.motion)
-        runs["paper, 8 epochs"] = replace(base, fit=replace(fit, skip_static=False), motion=motion)
+        paper = apply_preset(base, "paper")
+        runs["paper, 8 epochs"] = replace(paper, fit=replace(paper.fit, skip_static=False))
     return runs
 
 

@@ -1,10 +1,10 @@
-"""The command line, and the only argument parser.
+"""Command line, the package's only argument parser.
 
 `morgs-mi synth`, `info`, `calibrate`, `fit`, `render`, `export`, `view`, `eval`, `salvage` and `demo`.
 
-Results go to standard output; progress, warnings and complaints to standard error. What the user can set right is
-one sentence and exit status 1, an interruption 130; `--debug` shows where it came from. Arguments that the parser
-refuses give status 2.
+Results go to standard output; progress, warnings and errors to standard error. An error that the user can correct is
+one sentence and exit status 1, an interruption is status 130; `--debug` adds the traceback. Arguments that the parser
+rejects give status 2.
 """
 
 from __future__ import annotations
@@ -12,17 +12,25 @@ from __future__ import annotations
 import logging
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.logging import RichHandler
 from tyro.conf import arg
 
-from morgs_mi.cli.captures import Calibrate, Info, Synth
-from morgs_mi.cli.console import ERR, warn
-from morgs_mi.cli.exports import Export, View
-from morgs_mi.cli.streams import Demo, Eval, Fit, Render, Salvage
+from morgs_mi.cli.calibrate import Calibrate
+from morgs_mi.cli.console import ERR, print_warning, with_option_names
+from morgs_mi.cli.demo import Demo
+from morgs_mi.cli.evaluate import Eval
+from morgs_mi.cli.export import Export
+from morgs_mi.cli.fit import Fit
+from morgs_mi.cli.info import Info
+from morgs_mi.cli.render import Render
+from morgs_mi.cli.salvage import Salvage
+from morgs_mi.cli.settings import Flag, Settings
+from morgs_mi.cli.synth import Synth
+from morgs_mi.cli.view import View
 
 __all__ = ["Common", "main", "run"]
 
@@ -44,15 +52,15 @@ Command = (
 class Common:
     """Options of every command."""
 
-    variant: Literal["llvm_ad_rgb", "cuda_ad_rgb"] = "llvm_ad_rgb"
-    """Mitsuba's variant: llvm_ad_rgb runs on any processor, cuda_ad_rgb on an NVIDIA GPU."""
-    debug: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Show where an error came from, and more of what happens."""
+    variant: Annotated[Literal["llvm_ad_rgb", "cuda_ad_rgb"], arg(metavar="NAME")] = "llvm_ad_rgb"
+    """Mitsuba variant: llvm_ad_rgb for any processor, cuda_ad_rgb for an NVIDIA GPU."""
+    debug: Flag = False
+    """Print tracebacks and debug messages."""
 
 
 @dataclass(frozen=True)
 class Options(Common):
-    """Dynamic Gaussian splatting in Mitsuba 3: a multi-view clip goes in, a stream of moving Gaussians comes out."""
+    """Dynamic Gaussian splatting in Mitsuba 3: from a multi-view clip to a stream of moving Gaussians."""
 
     command: Annotated[Command, arg(name="")] = tyro.MISSING
 
@@ -63,30 +71,50 @@ def main(args: Sequence[str] | None = None) -> int:
 
 
 def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None) -> int:
-    """Parse `args` into options with a `command`, run that, and return the exit status."""
+    """Parse `args` into options with a `command`, run the command, and return the exit status."""
     args = sys.argv[1:] if args is None else list(args)
+    command: Any = None
     try:
-        options = tyro.cli(
+        options: Any = tyro.cli(
             options_type,
             prog=prog,
             args=args,
-            config=(tyro.conf.CascadeSubcommandArgs, tyro.conf.OmitSubcommandPrefixes),
+            config=(
+                tyro.conf.CascadeSubcommandArgs,
+                tyro.conf.OmitSubcommandPrefixes,
+                tyro.conf.PositionalMetavarFromFieldName,
+            ),
         )
+        command = options.command
         _set_up(options)
-        options.command.run()
+        command.run()
         return 0
     except (KeyboardInterrupt, ValueError, OSError, MemoryError, ArithmeticError) as error:
         interrupted = isinstance(error, KeyboardInterrupt)
         sentence = "Interrupted; a stream file is whole up to its last frame." if interrupted else str(error)
-        warn(" ".join(sentence.split()) or f"{type(error).__name__}.")
-        # A setting may be refused before there are options to ask.
+        sentence = with_option_names(sentence, _option_names(command), str(getattr(command, "capture", "")))
+        print_warning(" ".join(sentence.split()) or f"{type(error).__name__}.")
+        # The error may come from parsing, before `options` exist.
         if "--debug" in args:
             ERR.print_exception()
         return 130 if interrupted else 1
 
 
+def _option_names(command: Any) -> dict[str, str]:
+    """Return the options of a command by the Python arguments that they set."""
+    if isinstance(command, Settings):
+        return command.option_names()
+    names: dict[str, str] = {}
+    for field in fields(command) if is_dataclass(command) else ():
+        if is_dataclass(value := getattr(command, field.name)):
+            names |= _option_names(value)
+        elif "Positional" not in str(field.type):
+            names[field.name] = f"--{field.name.replace('_', '-')}"
+    return names | getattr(command, "arguments", {})
+
+
 def _set_up(options: Common) -> None:
-    """Send warnings to standard error and choose Mitsuba's variant."""
+    """Send warnings to standard error and set Mitsuba's variant."""
     import mitsuba as mi
 
     level = logging.DEBUG if options.debug else logging.WARNING

@@ -30,7 +30,7 @@ __all__ = ["Viewer", "ViewerConfig"]
 # digits for splats down to 1/1000 of it, and it fits the page's near and far planes.
 _DISTANCE = 10.0
 _HALF_MAX = 6e4
-_NO_OFFSET = ". This frame stores no offset: fit with --codec.offset to store it in every frame but the first."
+_NO_OFFSET = ". This frame stores no offset: set codec.offset in --config to store it in every frame but the first."
 # In seconds: period of the loop, period of reading the file again, time without motion after which the camera rests.
 _TICK, _REFRESH, _REST = 0.01, 1.0, 0.2
 

@@ -146,7 +146,7 @@ POSES_BOUNDS = {
     "faster clip": (faster("cam11.mkv", 2), "frame rate, got cam00.mkv 25, cam02.mkv 25, cam11.mkv 50; .* --trim"),
     "unknown offset": (
         with_options("--offset", "cam01", "2"),
-        "`offset` must name cameras of cam00, cam02, cam11, got cam01",
+        "--offset must name cameras of cam00, cam02, cam11, got cam01",
     ),
     "far offset": (
         with_options("--offset", "cam02", "9"),
@@ -154,7 +154,7 @@ POSES_BOUNDS = {
     ),
     "unknown reference": (
         with_options("--color", "linear", "--color-reference", "cam01"),
-        "`color_reference` must be one of cam00, cam02, cam11, got 'cam01'",
+        "--color-reference must be one of cam00, cam02, cam11, got 'cam01'",
     ),
     "gaps and no clip": (lambda path: (empty("cam00.mkv")(path), with_options("--gaps")(path)), "got an empty file"),
     "empty clip": (empty("cam00.mkv"), "cam00.mkv: expected a video, got an empty file"),

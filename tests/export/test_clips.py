@@ -79,7 +79,7 @@ def test_write_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
         (("ply", "--frames", "a:b"), "the frames must be given as 12, 10:20 or 0:100:5, got 'a:b'"),
         (("video", "--output", "x.avi"), "the output must be FILE.mp4"),
         (("video", "--freeze", "7"), "expected a frame of the stream, got 7"),
-        (("video", "--seconds", "-1"), "`seconds` must be positive"),
+        (("video", "--seconds", "-1"), "--seconds must be positive"),
         (("video", "--path", "none.json"), "expected a camera path, found none"),
     ],
 )

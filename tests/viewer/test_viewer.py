@@ -118,7 +118,7 @@ def test_viewer__shows_the_images_of_the_renderer(page, tmp_path):
     wait_for(page, rendered(stream, states[0], "color"), 40)
 
     select_mode(page, "offset")
-    page.get_by_text("This frame stores no offset: fit with --codec.offset").wait_for()
+    page.get_by_text("This frame stores no offset: set codec.offset").wait_for()
     frame = page.locator("input[inputmode=decimal]").first
     frame.fill("1")
     frame.press("Enter")

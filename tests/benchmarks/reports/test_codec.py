@@ -11,10 +11,10 @@ import pytest
 
 from benchmarks.reports.codec import CodecReportConfig, CodecResult, markdown_table, plot_codec, report_codec
 from benchmarks.reports.plots import markdown
-from morgs_mi.core.files import finite
+from morgs_mi.config import StreamConfig
+from morgs_mi.core.files import json_finite
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.method.config import MotionConfig
-from morgs_mi.stream_loop import StreamConfig
 from tests.benchmarks.reports.pages import ROOT, page
 
 QUICK = CodecReportConfig(
@@ -65,7 +65,7 @@ def test_report_codec__reuses_complete_streams(reported, fitted_clip: Path) -> N
 
 def test_codec_result__is_read_from_its_json(reported) -> None:
     result, *_ = reported
-    assert CodecResult.from_dict(json.loads(json.dumps(finite(result.as_dict())))).clips == result.clips
+    assert CodecResult.from_dict(json.loads(json.dumps(json_finite(result.as_dict())))).clips == result.clips
 
 
 def test_markdown_table_and_plot_codec__show_every_row(reported, tmp_path: Path) -> None:

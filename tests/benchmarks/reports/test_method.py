@@ -26,9 +26,9 @@ from benchmarks.reports.method_tables import (
     method_page,
 )
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.core.files import finite
+from morgs_mi.config import StreamConfig
+from morgs_mi.core.files import json_finite
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.stream_loop import StreamConfig
 from morgs_mi.synth.synthesize import synthesize
 from tests.benchmarks.reports.pages import ROOT, page
 
@@ -134,7 +134,7 @@ def test_method_command__repeats_a_finished_report_without_a_fit(clip, interrupt
         assert table in page
     value = json.loads((tmp_path / "out" / "method.json").read_text())
     assert value["clips"][0]["scratch"][0]["frame"] == 2
-    assert finite(MethodResult.from_dict(value).as_dict()) == value
+    assert json_finite(MethodResult.from_dict(value).as_dict()) == value
     assert (tmp_path / "out" / "method.png").stat().st_size > 10_000
 
 

@@ -40,7 +40,7 @@ def test_real_capture__fits_and_measures_a_recording(tmp_path: Path):
     for name in names:
         write_video(tmp_path / "clip" / name, rng.integers(0, 255, (2, 32, 48, 3), np.uint8), 25)
     script, out = "benchmarks.reports.real_capture", tmp_path / "figures.json"
-    quick = ["--fit.num-gaussians", "120", "--fit.first-frame-steps", "4", "--fit.epochs", "1", "--fit.sh-degree", "0"]
+    quick = ["--num-gaussians", "120", "--first-frame-steps", "4", "--epochs", "1", "--sh-degree", "0"]
     args = [tmp_path / "clip", tmp_path / "out", "--json", out, *quick]
     subprocess.run([sys.executable, "-m", script, *map(str, args)], check=True, cwd=ROOT, capture_output=True)
     result = json.loads(out.read_text())

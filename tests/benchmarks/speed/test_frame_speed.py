@@ -12,9 +12,9 @@ import pytest
 import morgs_mi
 from benchmarks.speed import frame_speed
 from benchmarks.speed.frame_speed import STAGES, Scene, Size
+from morgs_mi.config import StreamConfig
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.losses.ssim import Target
-from morgs_mi.stream_loop import StreamConfig
 
 SIZE = Size(64, 48, 3, 600, 2)
 

@@ -1,18 +1,17 @@
-"""`morgs-mi export` and `view`: a stream for other programs, and for your own eyes."""
+"""`morgs-mi export`: a stream in the formats of other programs."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional, arg
 
-from morgs_mi.cli.console import progress, say
-from morgs_mi.viewer.viewer import ViewerConfig
+from morgs_mi.cli.console import print_result, progress
 
-__all__ = ["Export", "View"]
+__all__ = ["Export"]
 
 
 @dataclass(frozen=True)
@@ -24,7 +23,7 @@ class Ply:
     output: Path | None = None
     """New folder for 0000.ply, ...; by default OUT/ply."""
     frames: str | None = None
-    """Which frames: 12, 10:20 (without 20) or 0:100:5; all by default."""
+    """Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."""
 
     def run(self) -> None:
         from morgs_mi.export.clips import select_frames, write_each
@@ -35,19 +34,19 @@ class Ply:
         frames, output = select_frames(stream, self.frames), self.output or stream.path.with_name("ply")
         with progress() as report:
             write_each(stream, output, ".ply", write_ply, frames, lambda done, of: report("Writing", done, of))
-        say(f"{output}: {len(frames)} PLY files.")
+        print_result(f"{output}: {len(frames)} PLY files.")
 
 
 @dataclass(frozen=True)
 class Gltf:
-    """Write a .glb file per frame: glTF 2.0 with KHR_gaussian_splatting, turned so that y is up."""
+    """Write a .glb file per frame: glTF 2.0 with KHR_gaussian_splatting, rotated to y up."""
 
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
     output: Path | None = None
     """New folder for 0000.glb, ...; by default OUT/gltf."""
     frames: str | None = None
-    """Which frames: 12, 10:20 (without 20) or 0:100:5; all by default."""
+    """Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."""
 
     def run(self) -> None:
         from morgs_mi.export.axes import gltf_axes
@@ -67,7 +66,7 @@ class Gltf:
                 frames,
                 lambda done, of: report("Writing", done, of),
             )
-        say(f"{output}: {len(frames)} glTF files.")
+        print_result(f"{output}: {len(frames)} glTF files.")
 
 
 @dataclass(frozen=True)
@@ -77,19 +76,19 @@ class Flight:
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
     path: str = "between"
-    """between: through the rig's cameras; orbit: around the scene; or a JSON file of key views, see docs/exports.md."""
+    """Camera path: between (through the rig's cameras), orbit (around the scene), or a JSON file (docs/exports.md)."""
     output: Path | None = None
     """FILE.mp4; by default OUT/PATH.mp4."""
     seconds: float | None = None
-    """How long the camera takes; by default as long as the clip, or what the JSON file says."""
+    """Duration in seconds; by default that of the clip or the JSON file."""
     degrees: float | None = None
-    """How far an orbit goes; less than 360 is a swing to both sides, by default as far as the rig reaches."""
+    """Angle of an orbit; below 360 the camera swings to both sides. By default the extent of the rig."""
     freeze: int | None = None
-    """Stop time at this frame; by default it goes on, and starts over where the clip ends."""
+    """Frame to freeze time at; by default the clip plays and repeats."""
     width: int | None = None
     """Width of the video; by default that of the first camera or the JSON file."""
     channels: tuple[Literal["color", "motion", "confidence", "depth", "alpha"], ...] = ("color",)
-    """What to render, side by side."""
+    """Channels to render, side by side."""
 
     def run(self) -> None:
         from morgs_mi.codec.packets import play
@@ -120,12 +119,12 @@ class Flight:
                 self.freeze,
                 lambda done, of: report("Rendering", done, of),
             )
-        say(f"{output}: {path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}.")
+        print_result(f"{output}: {path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}.")
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Write where every Gaussian is in every frame, for NumPy: ids, frames, positions, confidence."""
+    """Write the track of every Gaussian as NumPy arrays: ids, frames, positions, confidence."""
 
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
@@ -143,12 +142,12 @@ class Tracks:
             tracks = extract_tracks(stream, lambda done: report("Following", done, total))
         write_tracks(output, tracks)
         T, N = tracks.positions.shape[:2]
-        say(f"{output}: {N} Gaussians through {T} frames.")
+        print_result(f"{output}: {N} Gaussians through {T} frames.")
 
 
 @dataclass(frozen=True)
 class Export:
-    """Write a stream for other programs."""
+    """Export a stream for other programs."""
 
     kind: Annotated[
         Annotated[Ply, tyro.conf.subcommand("ply")]
@@ -160,28 +159,3 @@ class Export:
 
     def run(self) -> None:
         self.kind.run()
-
-
-@dataclass(frozen=True)
-class View:
-    """Look at a stream in the browser, also while it is still being fitted."""
-
-    out: Positional[Path]
-    """Folder of a fit, or a stream file."""
-    open_browser: bool = True
-    """Open the page in this machine's browser."""
-    config: Annotated[ViewerConfig, arg(name="")] = field(default_factory=ViewerConfig)
-
-    def run(self) -> None:
-        import webbrowser
-
-        from morgs_mi.viewer.viewer import Viewer
-
-        try:
-            viewer = Viewer(self.out, self.config)
-        except ImportError as error:
-            raise ValueError(str(error)) from error
-        say(f"{viewer.url} (Ctrl-C ends it)")
-        if self.open_browser:
-            webbrowser.open(viewer.url)
-        viewer.run()

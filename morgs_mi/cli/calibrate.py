@@ -1,0 +1,39 @@
+"""`morgs-mi calibrate`: camera poses from images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import Positional, arg
+
+from morgs_mi.calibration.calibrate import CalibrateConfig
+from morgs_mi.cli.console import print_result, print_warning, progress
+
+__all__ = ["Calibrate"]
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Calibrate the cameras of a folder of clips with COLMAP, and write FOLDER/sparse/0."""
+
+    folder: Positional[Path]
+    """Folder of videos, or of one folder of images per camera."""
+    config: Annotated[CalibrateConfig, arg(name="")] = field(default_factory=CalibrateConfig)
+    overwrite: bool = False
+    """Replace an earlier model."""
+
+    def run(self) -> None:
+        from morgs_mi.calibration.calibrate import calibrate
+
+        with progress() as report:
+            found = calibrate(
+                self.folder, self.config, self.overwrite, lambda stage, done, total: report(stage, done, total)
+            )
+        if found.left_out:
+            print_warning(f"{found.model}: {', '.join(found.left_out)} could not be registered and have no camera.")
+        print_result(
+            f"{found.model}: {len(found.cameras)} cameras, {found.points} points, mean reprojection error "
+            f"{found.error:.2f} px; scale and up direction of its world are arbitrary."
+        )

@@ -1,0 +1,80 @@
+"""`morgs-mi info`: the contents of a capture."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+from tyro.conf import Positional
+
+from morgs_mi.calibration.rig_check import RigCheck, check_rig, match_capture, triangulate_points
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.cli.console import OUT, print_result, progress
+from morgs_mi.cli.settings import GivenReading, Reading
+
+__all__ = ["Info"]
+
+
+@dataclass(frozen=True)
+class Info:
+    """List the contents of a capture: layout, cameras, sizes, frames, points; check its poses against the images."""
+
+    capture: Positional[Path]
+    """Folder of the capture."""
+    plot: Path | None = None
+    """File for a plot of the rig, .png or .jpg."""
+    check: bool = True
+    """Check the poses against feature matches between the views of the first frame."""
+    reading: GivenReading = field(default_factory=Reading)
+
+    def run(self) -> None:
+        from morgs_mi.calibration.rig_plot import write_rig
+
+        capture, found = load_capture(self.capture, reading=self.reading.read_config()), None
+        origin = "" if len(capture.points) else "without points"
+        if self.check:
+            with progress() as report:
+                common = match_capture(capture, lambda done, total: report("Matching views", done, total))
+            found = check_rig(capture, common)
+            if origin:
+                capture = triangulate_points(capture, common)
+                origin += f" ({len(capture.points)} can be triangulated)"
+        OUT.print(_camera_table(capture, found))
+        points = origin or f"{len(capture.points)} points"
+        truth = "with ground truth" if capture.truth else "without ground truth"
+        print_result(f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.")
+        if found:
+            error = f"median {found.error:.2f} px over " if found.matches else ""
+            print_result(f"Reprojection check: {error}{found.matches} matches in {found.pairs} pairs; {found.advice}")
+        if fit := capture.colors:
+            changes = zip(capture.names, fit.before, fit.after, fit.samples, strict=True)
+            errors = ", ".join(
+                f"{name} {a:.1f} -> {b:.1f} ({n} points)" if n else f"{name} -" for name, a, b, n in changes
+            )
+            print_result(f"Colours towards {capture.names[fit.reference]}, dE2000 before -> after: {errors}.")
+        if self.plot is not None:
+            write_rig(self.plot, capture)
+            print_result(f"Plot of the rig: {self.plot}")
+
+
+def _camera_table(capture: Capture, found: RigCheck | None) -> Table:
+    """Return a row per camera: size, intrinsics, use, and how well its pose fits the matches."""
+    table = Table(title=f"{capture.path}: {capture.layout}", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for column in ("", "camera", "size", "focal, px", "centre, px", "seen", "use", "matches", "error, px"):
+        table.add_column(column, no_wrap=True)
+    for index, (camera, mask) in enumerate(zip(capture.cameras, capture.masks, strict=True)):
+        K = camera.K
+        table.add_row(
+            str(index),
+            camera.name,
+            f"{camera.width}x{camera.height}",
+            f"{K[0, 0]:.1f}" if f"{K[0, 0]:.1f}" == f"{K[1, 1]:.1f}" else f"{K[0, 0]:.1f} {K[1, 1]:.1f}",
+            f"{K[0, 2]:.1f} {K[1, 2]:.1f}",
+            "100 %" if mask is None else f"{100 * mask.mean():.0f} %",
+            "test" if index == capture.test_view else "train",
+            str(found.camera_matches[index]) if found else "-",
+            f"{found.camera_errors[index]:.2f}" if found and found.camera_matches[index] else "-",
+        )
+    return table

@@ -1,0 +1,160 @@
+"""Options that set a `StreamConfig` or a `ReadConfig`, shared by several commands."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from functools import reduce
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from tyro.conf import DisallowNone, FlagCreatePairsOff, arg
+
+from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.config import PresetName, StreamConfig, apply_preset, apply_values, read_config, relocated
+
+__all__ = ["SETTINGS", "Flag", "GivenReading", "GivenSettings", "Reading", "Settings", "setting"]
+
+# The setting of every option. All others are set in a file.
+SETTINGS = {
+    "seed": "seed",
+    "num_gaussians": "fit.num_gaussians",
+    "first_frame_steps": "fit.first_frame_steps",
+    "epochs": "fit.epochs",
+    "sh_degree": "fit.sh_degree",
+    "key_views": "motion.key_views",
+    "flow": "motion.flow_method",
+    "masks": "motion.mask_method",
+    "quality": "codec.quality",
+    "target_size": "codec.target_size",
+    "keyframe_interval": "codec.keyframe_interval",
+    "reproducible": "render.reproducible",
+}
+
+# A switch that is off by default.
+Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
+
+
+def setting(option: str, config: StreamConfig | None = None) -> Any:
+    """Return the help of an option that is None where it is not given: the type of its setting, and the default."""
+    default = reduce(getattr, SETTINGS[option].split("."), config or StreamConfig())
+    return arg(metavar=type(default).__name__.upper(), help_behavior_hint=f"(default: {default})")
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Options that resolve differences between the clips of a capture: the fields of `ReadConfig`."""
+
+    trim: Flag = False
+    """Use the instants that all clips contain, at their lowest frame rate."""
+    offset: Annotated[dict[str, int], arg(metavar="CAMERA INT ...", help_behavior_hint="")] = field(
+        default_factory=dict
+    )
+    """Frame of a camera's clip that shows frame 0 of the others; negative if it began later."""
+    gaps: Flag = False
+    """Continue where images are missing, without their cameras."""
+    color: Annotated[Literal["none", "linear", "root-polynomial", "vandermonde"], arg(metavar="NAME")] = "none"
+    """Colour correction: none, linear, root-polynomial or vandermonde."""
+    color_reference: Annotated[str, arg(metavar="CAMERA", help_behavior_hint="")] = ""
+    """Reference camera of the correction; by default the best connected one."""
+    exposure: Flag = False
+    """Compensation of exposure changes over time."""
+
+    def read_config(self) -> ReadConfig:
+        """Return the options as `load_capture` takes them."""
+        return ReadConfig(**asdict(self))
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of a fit. Later ones override: defaults, --preset, --config, the other options."""
+
+    preset: Annotated[PresetName | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    """Preset: l, s (the paper's variants, 8 and 5 epochs), baseline, ml, ml-mo, ml-mo-mc (its ablation), or paper."""
+    config: Annotated[Path | None, arg(metavar="FILE.toml", help_behavior_hint="")] = None
+    """File with any settings, as --print-config writes it."""
+    seed: Annotated[int | None, setting("seed")] = None
+    """Seed of every random choice."""
+    num_gaussians: Annotated[int | None, setting("num_gaussians")] = None
+    """Gaussians of the first frame."""
+    first_frame_steps: Annotated[int | None, setting("first_frame_steps")] = None
+    """Optimisation steps of the first frame."""
+    epochs: Annotated[int | None, setting("epochs")] = None
+    """Passes over the views for every later frame."""
+    sh_degree: Annotated[int | None, setting("sh_degree")] = None
+    """Degree of the spherical harmonics, 0 to 3."""
+    key_views: Annotated[int | None, setting("key_views")] = None
+    """Cameras with optical flow and masks."""
+    flow: Annotated[str | None, setting("flow")] = None
+    """Optical flow: a method, files:FOLDER or onnx:FILE (docs/flow.md)."""
+    masks: Annotated[str | None, setting("masks")] = None
+    """Refinement of the motion masks (docs/masks.md)."""
+    quality: Annotated[float | None, setting("quality")] = None
+    """Precision of the stream; 2 halves all errors."""
+    target_size: Annotated[int | None, setting("target_size")] = None
+    """Most bytes of a later frame; 0: no limit."""
+    keyframe_interval: Annotated[int | None, setting("keyframe_interval")] = None
+    """Frames between two keyframes; 0: the first only."""
+    reproducible: Flag = False
+    """Same bytes on every run; about half as fast."""
+
+    def given(self) -> dict[str, Any]:
+        """Return the settings that were given as options, by key."""
+        values = {key: getattr(self, option) for option, key in SETTINGS.items()}
+        return {key: value for key, value in values.items() if value is not None and value is not False}
+
+    def option_names(self) -> dict[str, str]:
+        """Return the options that were given, by their settings' keys and names."""
+        options = {key: f"--{option.replace('_', '-')}" for option, key in SETTINGS.items() if key in self.given()}
+        return options | {key.rpartition(".")[2]: option for key, option in options.items()}
+
+    def stream_config(self, base: StreamConfig | None = None) -> StreamConfig:
+        """Return `base`, by default the default config, with the preset, the file and the given options applied.
+
+        Raises:
+            FileNotFoundError: the file, or what a setting names, is missing.
+            ValueError: a setting is unknown, of the wrong type or out of range.
+        """
+        config = base or StreamConfig()
+        if self.preset is not None:
+            config = apply_preset(config, self.preset)
+        if self.config is not None:
+            config = apply_values(config, read_config(self.config), str(self.config))
+        return apply_values(config, _nested(self.given()))
+
+    def check_methods(self, config: StreamConfig) -> None:
+        """Check the flow method and the mask refinement of a config and load their networks, before a fit begins.
+
+        Raises:
+            FileNotFoundError: one of them names a missing file or folder.
+            ValueError: one of them is unknown, or its network does not fit.
+        """
+        from morgs_mi.method.flow_sources.registry import flow_source
+        from morgs_mi.method.mask_refiners.registry import mask_refiner
+
+        motion = config.motion
+        checks: dict[str, Callable[[], Any]] = {
+            "flow_method": lambda: flow_source(motion.flow_method, motion.flow),
+            "mask_method": lambda: mask_refiner(motion.mask_method, motion.masks),
+        }
+        for name, check in checks.items():
+            try:
+                check()
+            except ValueError as error:
+                if self.config is None or f"motion.{name}" in self.given():
+                    raise
+                raise relocated(error, str(self.config), "motion.", [name]) from None
+
+
+def _nested(values: dict[str, Any]) -> dict[str, Any]:
+    """Return values by key as one mapping per table."""
+    tables: dict[str, Any] = {}
+    for key, value in values.items():
+        *path, name = key.split(".")
+        reduce(lambda table, part: table.setdefault(part, {}), path, tables)[name] = value
+    return tables
+
+
+# As fields of a command: options without a prefix. None means "not given", so it cannot be passed.
+GivenReading = Annotated[Reading, arg(name="")]
+GivenSettings = Annotated[Settings, arg(name=""), DisallowNone]

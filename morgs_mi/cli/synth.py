@@ -1,0 +1,67 @@
+"""`morgs-mi synth`: a synthetic capture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar
+
+from tyro.conf import Positional
+
+from morgs_mi.cli.console import print_result, progress
+
+__all__ = ["Synth"]
+
+
+@dataclass(frozen=True)
+class Synth:
+    """Path-trace a moving scene into a multi-view capture with exact ground truth."""
+
+    scene: Positional[str]
+    """Name of a scene (spheres, arm, thin, flicker) or the path of its Python file."""
+    out: Positional[Path]
+    """New folder."""
+    cameras: int = 10
+    """Number of cameras, the held-out cam00 included."""
+    frames: int = 12
+    """Number of frames per camera."""
+    width: int = 320
+    """Width of the images in pixels, even."""
+    height: int = 240
+    """Height of the images in pixels, even."""
+    spp: int = 16
+    """Samples per pixel; 16 gives noise at 42 dB."""
+    noise: float = 0.0
+    """Standard deviation of sensor noise as a share of white; an indoor camera has 0.01, 2.5 grey levels."""
+    fps: float = 30.0
+    """Frames per second."""
+    lossless: bool = False
+    """Also write the frames as PNG files."""
+    seed: int = 0
+    """Seed of textures, sampling noise and the choice of points."""
+    overwrite: bool = False
+    """Replace an earlier capture."""
+
+    arguments: ClassVar[Mapping[str, str]] = {"num_cameras": "--cameras", "num_frames": "--frames"}
+
+    def run(self) -> None:
+        from morgs_mi.synth.synthesize import synthesize
+
+        with progress() as report:
+            synthesize(
+                self.scene,
+                self.out,
+                num_cameras=self.cameras,
+                num_frames=self.frames,
+                width=self.width,
+                height=self.height,
+                spp=self.spp,
+                noise=self.noise,
+                fps=self.fps,
+                lossless=self.lossless,
+                seed=self.seed,
+                overwrite=self.overwrite,
+                progress=lambda done, total: report("Path-tracing", done, total),
+            )
+        print_result(f"{self.out}: {self.cameras} cameras, {self.frames} frames of {self.width}x{self.height}.")
