@@ -101,7 +101,7 @@ def report_method(
         finished: called with the result after each clip.
 
     Returns:
-        See docs/method.md.
+        See docs/experiments/method.md.
 
     Raises:
         OSError: a capture cannot be read, or a result not written.

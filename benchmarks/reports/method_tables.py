@@ -111,7 +111,7 @@ def aims_table(clips: Sequence[Mapping[str, Any]]) -> str:
 
 
 def method_page(result: Mapping[str, Any]) -> str:
-    """Return all tables of all clips in Markdown; docs/method.md says how to read them."""
+    """Return all tables of all clips in Markdown; docs/experiments/method.md says how to read them."""
     clips, epochs = result["clips"], result["table_epochs"]
     parts = [f"## What the parts add\n\n{gains_table(clips)}", f"## Aims\n\n{aims_table(clips)}"]
     for clip in clips:

@@ -297,7 +297,7 @@ def test_bad_captures_get_a_sentence(clip, tmp_path):
 
 
 def test_the_documentation_names_every_figure(interrupted):
-    text = (ROOT / "docs/method.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/experiments/method.md").read_text(encoding="utf-8")
     result = interrupted[0]
     (found,) = result["clips"]
     row = found["rows"][0]
@@ -308,7 +308,7 @@ def test_the_documentation_names_every_figure(interrupted):
 @pytest.mark.parametrize(("name", "page"), [("method_report", "method.md"), ("method_parts", "method-parts.md")])
 def test_the_documentation_quotes_the_committed_figures(name, page):
     result = json.loads((ROOT / f"benchmarks/results/{name}.json").read_text(encoding="utf-8"))
-    text, tables = (ROOT / "docs" / page).read_text(encoding="utf-8"), method_page(result).strip()
+    text, tables = (ROOT / "docs/experiments" / page).read_text(encoding="utf-8"), method_page(result).strip()
     assert tables in text
     # What is said about them holds no figure of its own.
     (found,) = re.findall(r"^## What was found\n(.*?)^## ", text, re.DOTALL | re.MULTILINE)

@@ -67,4 +67,4 @@ def test_what_is_cut_off_is_what_is_wrong(reported):
 
 def test_documentation_quotes_the_committed_figures():
     result = json.loads((ROOT / "benchmarks/results/renderer_report.json").read_text(encoding="utf-8"))
-    assert markdown_table(result) in (ROOT / "docs/renderer-accuracy.md").read_text(encoding="utf-8")
+    assert markdown_table(result) in (ROOT / "docs/experiments/renderer-accuracy.md").read_text(encoding="utf-8")
