@@ -11,7 +11,7 @@ sys.path[:0] = [str(DOCS.parent), str(DOCS / "_extensions")]
 project = "morgs_mi"
 author = "The morgs_mi authors"
 copyright = "The morgs_mi authors, BSD 3-Clause"
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "plain_docstrings", "package_pages"]
+extensions = ["myst_nb", "sphinx.ext.autodoc", "plain_docstrings", "package_pages"]
 exclude_patterns = ["_build", "_extensions"]
 html_theme = "furo"
 html_title = "morgs_mi"
@@ -22,14 +22,10 @@ nb_execution_mode = "off"
 myst_heading_anchors = 3
 
 add_module_names = False
-autodoc_class_signature = "separated"
-autodoc_default_options = {"members": True, "show-inheritance": False}
+autodoc_default_options = {"members": True}
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 autodoc_typehints = "signature"
-napoleon_numpy_docstring = False
-napoleon_use_ivar = True
-napoleon_use_rtype = False
 toc_object_entries = False
 
 # Every reference is checked, but for types of other packages, whose inventories are online.

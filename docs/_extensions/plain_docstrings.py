@@ -1,22 +1,25 @@
-"""Reads docstrings as plain text with `code`, indented formulas, lists and Google sections, and no other markup.
+"""Reads Google docstrings as plain text with `code`, indented formulas and lists, and no other markup.
 
-Without it, `*`, `|` and a trailing `_` in a formula would be markup, and every docstring would have to escape them.
+Napoleon passes texts on as reStructuredText. There `*`, `|` and a trailing `_` in a formula are markup, a line that
+begins with "N." is a list, and the text before a colon is a type; every docstring would have to avoid that.
 """
 
 from __future__ import annotations
 
 import re
+import textwrap
 from typing import Any
 
 from sphinx.application import Sphinx
 
 SECTION = re.compile(r"(Args|Attributes|Raises|Returns|Yields|Examples?):$")
+FIELDS = {"Args": ":param {}:", "Attributes": "- ``{}``:", "Raises": ":raises {}:"}
 CODE = re.compile(r"(`+)((?:(?!\n\s*\n)[^`])+)\1")
-MARKUP = re.compile(r"[*|\\]|(?<=\w)_(?!\w)")
+MARKUP = re.compile(r"[*|\\]|(?<=\w)_(?!\w)|(?m:^\s*\w{1,3}(?=[.)](?:\s|$)))")
 
 
 def setup(app: Sphinx) -> dict[str, Any]:
-    app.connect("autodoc-process-docstring", convert, priority=400)  # before napoleon
+    app.connect("autodoc-process-docstring", convert)
     return {"parallel_read_safe": True}
 
 
@@ -24,16 +27,16 @@ def convert(app: Sphinx, what: str, name: str, obj: object, options: object, lin
     """Replace the lines of a docstring by reStructuredText with the same content."""
     result: list[str] = []
     for title, body in sections(lines):
-        if title in ("Returns", "Yields"):
-            text = escaped("\n".join(dedented(body))).strip().split("\n")
-            result += [f":{title.lower()}: {text[0]}", *(f"    {line}" for line in text[1:]), ""]
-        elif title in ("Example", "Examples"):
+        if title in FIELDS:
+            entries = [entry(FIELDS[title], item) for item in items(body)]
+            result += [":Attributes:", *indented(entries), ""] if title == "Attributes" else [*entries, ""]
+        elif title.startswith("Example"):
             result += [".. rubric:: Example", "", ".. code-block:: python", "", *body, ""]
         elif title:
-            result += [f"{title}:", *escaped("\n".join(body)).split("\n"), ""]
+            result += [entry(f":{title.lower()}:", "\n".join(body)), ""]
         else:
             result += prose(body)
-    lines[:] = result
+    lines[:] = "\n".join(result).split("\n")
 
 
 def sections(lines: list[str]) -> list[tuple[str, list[str]]]:
@@ -49,23 +52,34 @@ def sections(lines: list[str]) -> list[tuple[str, list[str]]]:
     return parts
 
 
+def items(lines: list[str]) -> list[str]:
+    """Return the items of a section, which begin where the indentation is least."""
+    text = textwrap.dedent("\n".join(lines)).strip()
+    return re.split(r"\n(?=[^\s])", text) if text else []
+
+
+def entry(field: str, item: str) -> str:
+    """Return one field of a field list, from "name: text" if the field has a name."""
+    name, colon, text = item.partition(":") if "{}" in field else ("", "", item)
+    words = " ".join((text if colon or not name else name).split())
+    return f"{field.format(name.strip())} {escaped(words)}"
+
+
 def prose(lines: list[str]) -> list[str]:
     """Return text whose indented blocks are literal and whose lists are lists."""
     result: list[str] = []
     for block in re.split(r"\n\s*\n", "\n".join(lines).strip("\n")):
-        rows = block.split("\n")
-        if rows[0].startswith(" "):
-            result += ["::", "", *(f"    {row}" for row in rows), ""]
+        if block.startswith(" "):
+            result += ["::", "", *indented(block.split("\n")), ""]
             continue
         for item in re.split(r"\n(?=- )", block):
-            first, *rest = escaped(item).split("\n")
-            indent = "  " if first.startswith("- ") else ""
-            result += [first, *(indent + row.strip() for row in rest), ""]
+            bullet = "- " if item.startswith("- ") else ""
+            result += [bullet + escaped(" ".join(item.removeprefix(bullet).split())), ""]
     return result
 
 
-def dedented(lines: list[str]) -> list[str]:
-    return [line.strip() for line in lines]
+def indented(lines: list[str]) -> list[str]:
+    return [f"    {line}" for line in lines]
 
 
 def escaped(text: str) -> str:
@@ -73,9 +87,8 @@ def escaped(text: str) -> str:
     result, end = "", 0
     for match in CODE.finditer(text):
         result += MARKUP.sub(r"\\\g<0>", text[end : match.start()])
-        inner = match[2].strip()
         # Markup needs no letter beside it.
         before = r"\ " if result[-1:].isalnum() else ""
         after = r"\ " if text[match.end() : match.end() + 1].isalnum() else ""
-        result, end = f"{result}{before}``{inner}``{after}", match.end()
+        result, end = f"{result}{before}``{match[2].strip()}``{after}", match.end()
     return result + MARKUP.sub(r"\\\g<0>", text[end:])
