@@ -76,7 +76,9 @@ def test_architecture__lists_every_subpackage():
 @pytest.mark.parametrize("page", PAGES)
 def test_pages__name_only_what_exists(page):
     paths = set(re.findall(r"\bmorgs_mi(?:\.[A-Za-z]\w*)+", PAGES[page]))
-    assert [path for path in sorted(paths) if not exists(path)] == []
+    # The page describes how to write these files.
+    new = {file.replace("/", ".") for file in re.findall(r"<!-- new (\S+)\.py -->", PAGES[page])}
+    assert [path for path in sorted(paths - new) if not exists(path)] == []
 
 
 @pytest.mark.parametrize("page", PAGES)
@@ -88,7 +90,9 @@ def test_pages__link_only_to_what_exists(page):
 
 @pytest.mark.parametrize("page", PAGES)
 def test_pages__examples_compile(page):
-    for example in re.findall(r"```python\n(.*?)```", PAGES[page], re.DOTALL):
+    # A fragment that is inserted after a line is no module; tests/test_extending.py runs it.
+    text = re.sub(r"<!-- after [^\n]*-->\n```python\n.*?```", "", PAGES[page], flags=re.DOTALL)
+    for example in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
         compile(example, page, "exec")
 
 
