@@ -1,4 +1,4 @@
-"""What the renderer is timed on: a workload file, or a ladder of balls of Gaussians.
+"""Workloads of the speed benchmarks: a workload file, or a ladder of balls of Gaussians.
 
 A workload file is an .npz with `means [N,3]`, `quats [N,4]` wxyz, `scales [N,3]`, `opacities [N]`, `colors [N,3]`,
 `K [3,3]`, `viewmat [4,4]`, `width`, `height`.
@@ -12,24 +12,24 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi import Camera, Gaussians
+from morgs_mi.core.color_space import SH_C0
 
 TARGET = (0.4, 0.5, 0.6)
-SH_C0 = 0.28209479177387814
 EVERY_CHANNEL = ("color", "depth", "motion", "confidence", "alpha")
 
 
 @dataclass(frozen=True)
 class Rung:
-    """One size of ball on the ladder.
+    """One ball of the ladder.
 
     Attributes:
-        name: unique on the ladder.
-        series: what it is compared by.
-        count: Gaussians.
+        name: name, unique on the ladder.
+        series: series of rungs that vary the same property.
+        count: number of Gaussians.
         size: image (width, height) in px.
         scale: median standard deviation of a Gaussian; the ball's radius is 1 and fills the view.
-        channels: what is rendered.
-        features: numbers per Gaussian that are blended beside the channels.
+        channels: rendered channels.
+        features: number of additional features per Gaussian.
     """
 
     name: str
@@ -70,12 +70,12 @@ QUICK = (
 def ball(
     seed: int, count: int, width: int, height: int, median_scale: float, sh_degree: int = 0
 ) -> tuple[Gaussians, Camera]:
-    """Return Gaussians uniform in the unit ball, and a camera three units away that sees 50 degrees across."""
+    """Return Gaussians uniform in the unit ball, and a camera at distance 3 that sees 50 degrees horizontally."""
     rng = np.random.default_rng(seed)
     direction = rng.normal(size=(count, 3))
     means = direction / np.linalg.norm(direction, axis=1, keepdims=True) * np.cbrt(rng.uniform(size=(count, 1)))
     sh = 0.1 * rng.normal(size=(count, (sh_degree + 1) ** 2, 3))
-    sh[:, 0] = (rng.uniform(size=(count, 3)) - 0.5) / 0.28209479177387814
+    sh[:, 0] = (rng.uniform(size=(count, 3)) - 0.5) / SH_C0
     scales = median_scale * np.exp(0.4 * rng.normal(size=(count, 3)))
     quats = rng.normal(size=(count, 4))
     gaussians = Gaussians.from_activated(means, scales, quats, rng.uniform(0.1, 0.95, count), sh)
@@ -85,12 +85,12 @@ def ball(
 def build(rung: Rung, seed: int) -> tuple[Gaussians, Camera]:
     """Return the rung's Gaussians, with motion and confidence if they are rendered, and its camera."""
     gaussians, camera = ball(seed, rung.count, *rung.size, rung.scale)
-    rng, more = np.random.default_rng(seed), {}
+    rng, extra = np.random.default_rng(seed), {}
     if "motion" in rung.channels:
-        more["motion"] = 0.01 * rng.normal(size=(rung.count, 3))
+        extra["motion"] = 0.01 * rng.normal(size=(rung.count, 3))
     if "confidence" in rung.channels:
-        more["logit_confidence"] = rng.normal(size=rung.count)
-    return (Gaussians(**gaussians.numpy(), **more) if more else gaussians), camera
+        extra["logit_confidence"] = rng.normal(size=rung.count)
+    return (Gaussians(**gaussians.numpy(), **extra) if extra else gaussians), camera
 
 
 def load(path: Path) -> tuple[Gaussians, Camera]:
@@ -102,7 +102,7 @@ def load(path: Path) -> tuple[Gaussians, Camera]:
 
 
 def write_bin(gaussians: Gaussians, camera: Camera, path: Path) -> None:
-    """Write Gaussians of SH degree 0 and their camera in the yardstick's format."""
+    """Write Gaussians of SH degree 0 and their camera in the binary format that `Yardstick` passes on."""
     raw = gaussians.numpy()
     columns = (
         raw["means"],

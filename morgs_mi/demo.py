@@ -16,6 +16,7 @@ from morgs_mi.core.files import write_json
 from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.figures import motion_scale
+from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.export.frames import PLAYABLE, pad_to_even
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.io.video_writer import write_video
@@ -79,7 +80,7 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Progre
         progress: called with (step, done, total).
 
     Returns:
-        The content of ``report.json``: `evaluate_stream` of both fits as ``full`` and ``plain``, ``comparison`` with
+        The content of ``report.json``: `Evaluation.as_dict` of both fits as ``full`` and ``plain``, ``comparison`` with
         their means over the same frames after the first, seconds per step, machine, versions and seed.
 
     Raises:
@@ -122,7 +123,7 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Progre
         "seconds": {**seconds, "total": sum(seconds.values())},
         "machine": machine(),
         "versions": versions(),
-        **results,
+        **{name: result.as_dict() for name, result in results.items()},
     }
     write_json(root / "report.json", report)
     return report
@@ -142,12 +143,14 @@ def _synthesize_clip(folder: Path, config: DemoConfig, report: Callable[[float, 
     synthesize(config.scene, folder, **settings, overwrite=True, progress=report)
 
 
-def _comparison(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def _comparison(results: Mapping[str, Evaluation]) -> dict[str, Any]:
     """Return both fits' means over their common frames, without the first one, which has no motion."""
-    count = min(result["num_frames"] for result in results.values())
-    rows = {name: result["frames"][1:count] for name, result in results.items()}
-    return {"frames": [row["frame"] for row in rows["full"]]} | {
-        name: {score: float(np.mean([row[score] for row in own])) if own else None for score in _COMPARED}
+    count = min(result.num_frames for result in results.values())
+    rows = {name: result.frames[1:count] for name, result in results.items()}
+    return {"frames": [row.frame for row in rows["full"]]} | {
+        name: {
+            score: float(np.mean([getattr(row.scores, score) for row in own])) if own else None for score in _COMPARED
+        }
         for name, own in rows.items()
     }
 

@@ -140,7 +140,7 @@ def _interrupted(out: Path, capture: Capture, metadata: Mapping[str, Any]) -> _I
             f"{path}: expected to resume a fit with {name} = {shortened(before)}, got {shortened(now)}; give the same "
             "capture and settings, or start again without --resume."
         )
-    index, end = stream.whole()
+    index, end = stream.check()
     if not index:
         return None
     coded = seek(stream, index[-1][1])

@@ -1,10 +1,18 @@
-"""`python -m benchmarks.reports`: error against run time, of the renderer, optical flow, the codec and the method."""
+"""Reports on error and run time of the renderer, optical flow, the codec and the method.
+
+    python -m benchmarks.reports renderer --json out.json
+    python -m benchmarks.reports flow CAPTURE... --json out.json
+    python -m benchmarks.reports codec CAPTURE... --out out/codec
+    python -m benchmarks.reports method CAPTURE... --out out/method
+
+Without `--json` the figures are printed as tables. `morgs-mi synth` writes captures with ground truth.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -18,10 +26,11 @@ from tyro.conf import Positional, arg
 from benchmarks.reports.codec import CodecReportConfig
 from benchmarks.reports.flow import FlowReportConfig
 from benchmarks.reports.method import MethodReportConfig
-from benchmarks.reports.renderer import RendererReportConfig
+from benchmarks.reports.method_results import MethodResult
+from benchmarks.reports.renderer import Errors, RendererReportConfig, RendererResult, RendererRow
 from morgs_mi.cli import Common, run
 from morgs_mi.cli.console import OUT, progress, say
-from morgs_mi.core.files import finite, write_json
+from morgs_mi.core.files import json_finite, write_json
 from morgs_mi.evaluate.tables import figure
 
 __all__ = ["CodecReport", "FlowReport", "MethodReport", "RendererReport"]
@@ -29,12 +38,12 @@ __all__ = ["CodecReport", "FlowReport", "MethodReport", "RendererReport"]
 
 @dataclass(frozen=True)
 class RendererReport:
-    """Measure the renderer's settings: error against a float64 twin beside run time."""
+    """Measure error and run time of the renderer's settings, compared with a float64 reference."""
 
     json: Path | None = None
-    """File for all figures; - prints them in place of the tables."""
+    """JSON file for all figures; - prints them in place of the tables."""
     plot: Path | None = None
-    """Picture of error against run time, .png or .svg; needs matplotlib."""
+    """Plot of error over run time, .png or .svg; needs matplotlib."""
     config: Annotated[RendererReportConfig, arg(name="")] = field(default_factory=RendererReportConfig)
 
     def run(self) -> None:
@@ -42,7 +51,7 @@ class RendererReport:
 
         with progress() as report:
             result = report_renderer(self.config, report)
-        if _in_tables(result, self.json):
+        if _in_tables(result.as_dict(), self.json):
             _show_renderer(result)
         if self.plot is not None:
             plot_renderer(result, self.plot)
@@ -50,14 +59,14 @@ class RendererReport:
 
 @dataclass(frozen=True)
 class FlowReport:
-    """Measure methods of optical flow: error against synthetic clips' true flow beside run time."""
+    """Measure error and run time of optical flow on synthetic clips."""
 
     captures: Positional[tuple[Path, ...]]
-    """Folders of captures with ground truth, as synth makes them."""
+    """Folders of captures with ground truth, as written by synth."""
     json: Path | None = None
-    """File for all figures; - prints them in place of the tables."""
+    """JSON file for all figures; - prints them in place of the tables."""
     plot: Path | None = None
-    """Picture of error against run time, .png or .svg; needs matplotlib."""
+    """Plot of error over run time, .png or .svg; needs matplotlib."""
     config: Annotated[FlowReportConfig, arg(name="")] = field(default_factory=FlowReportConfig)
 
     def run(self) -> None:
@@ -65,26 +74,26 @@ class FlowReport:
 
         with progress() as report:
             result = report_flow(self.captures, self.config, report)
-        if _in_tables(result, self.json):
-            for clip in result["clips"]:
-                title = f"{clip['name']}: {clip['pairs']} pairs of {clip['width']}x{clip['height']} pixels"
-                say(f"{title}, motion of {figure(clip['motion'], 1)} px\n\n{markdown_table(clip)}")
+        if _in_tables(result.as_dict(), self.json):
+            for clip in result.clips:
+                title = f"{clip.name}: {clip.pairs} pairs of {clip.width}x{clip.height} pixels"
+                say(f"{title}, motion of {figure(clip.motion, 1)} px\n\n{markdown_table(clip)}")
         if self.plot is not None:
             plot_flow(result, self.plot)
 
 
 @dataclass(frozen=True)
 class CodecReport:
-    """Measure the stream: bytes per frame against quality against time, beside lzma over raw residuals."""
+    """Measure bytes, quality and time of the codec, compared with lzma over raw residuals."""
 
     captures: Positional[tuple[Path, ...]]
     """Folders of captures; each is fitted once per quality."""
     out: Path = Path("out/codec")
-    """Folder for the streams, which stay there."""
+    """Output folder for the streams."""
     json: Path | None = None
-    """File for all figures; - prints them in place of the tables."""
+    """JSON file for all figures; - prints them in place of the tables."""
     plot: Path | None = None
-    """Picture of bytes against quality and time, .png or .svg; needs matplotlib."""
+    """Plot of quality and time over bytes, .png or .svg; needs matplotlib."""
     config: Annotated[CodecReportConfig, arg(name="")] = field(default_factory=CodecReportConfig)
 
     def run(self) -> None:
@@ -92,38 +101,38 @@ class CodecReport:
 
         with progress() as report:
             result = report_codec(self.captures, self.out, self.config, report)
-        if _in_tables(result, self.json):
-            for clip in result["clips"]:
-                say(f"{clip['name']}\n\n{markdown_table(clip)}")
+        if _in_tables(result.as_dict(), self.json):
+            for clip in result.clips:
+                say(f"{clip.name}\n\n{markdown_table(clip)}")
         if self.plot is not None:
             plot_codec(result, self.plot)
 
 
 @dataclass(frozen=True)
 class MethodReport:
-    """Measure the method: its parts one after the other, key views, and quality against run time, over several seeds.
+    """Measure the method's parts, key views, and quality over run time, with several seeds.
 
-    What OUT holds already is not fitted again, so that an interrupted report goes on.
+    Results stored in OUT are reused, so that an interrupted report continues.
     """
 
     captures: Positional[tuple[Path, ...]]
     """Folders of captures."""
     out: Path = Path("out/method")
-    """Folder for method.md, method.json and, with matplotlib, method.png, and for what was fitted."""
+    """Output folder for method.md, method.json, fitted cells and, with matplotlib, method.png."""
     config: Annotated[MethodReportConfig, arg(name="")] = field(default_factory=MethodReportConfig)
 
     def run(self) -> None:
         from benchmarks.reports.method import report_method
         from benchmarks.reports.method_tables import method_page, plot_method
 
-        def keep(result: Mapping[str, Any]) -> None:
-            write_json(self.out / "method.json", result)
+        def write(result: MethodResult) -> None:
+            write_json(self.out / "method.json", result.as_dict())
             (self.out / "method.md").write_text(method_page(result), encoding="utf-8")
             if find_spec("matplotlib"):
                 plot_method(result, self.out / "method.png")
 
         with progress() as report:
-            result = report_method(self.captures, self.out, self.config, report, keep)
+            result = report_method(self.captures, self.out, self.config, report, write)
         say(f"{method_page(result)}\nAll figures: {self.out / 'method.json'}")
 
 
@@ -137,20 +146,21 @@ Subject = (
 
 @dataclass(frozen=True)
 class Options(Common):
-    """Measure a part of the package: error beside run time."""
+    """Measure error and run time of a part of the package."""
 
     command: Annotated[Subject, arg(name="")] = tyro.MISSING
 
 
-def _show_renderer(result: Mapping[str, Any]) -> None:
-    """Print what `report_renderer` has found."""
-    attributes = list(result["rows"][0]["gradients"])
-    for against, pick in (
+def _show_renderer(result: RendererResult) -> None:
+    """Print the renderer's report."""
+    attributes = list(result.rows[0].gradients)
+    references: tuple[tuple[str, Callable[[RendererRow], Errors | RendererRow]], ...] = (
         ("no cut-off at all", lambda row: row),
-        ("the same alpha_min (float32 and early stop)", lambda row: row["rounding"]),
-    ):
+        ("the same alpha_min (float32 and early stop)", lambda row: row.rounding),
+    )
+    for reference, errors_of in references:
         image, gradients = (
-            Table(title=f"{what} against {against}", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+            Table(title=f"{what} compared with {reference}", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
             for what in ("image", "gradients: relative L2 error")
         )
         for table in (image, gradients):
@@ -162,25 +172,23 @@ def _show_renderer(result: Mapping[str, Any]) -> None:
         ):
             for column in columns:
                 table.add_column(column, justify="right", min_width=max(7, *map(len, column.split())))
-        for row in result["rows"]:
-            errors, name = pick(row), f"{row['knob']} {row['value']}"
-            style = "bold" if row["default"] else None
-            times = (figure(row["forward_ms"], 1), figure(row["step_ms"], 1), figure(row["step_ratio"], 2))
-            pixels = errors["image"]
-            image.add_row(
-                name, *times, f"{pixels['max']:.1e}", f"{pixels['rms']:.1e}", figure(pixels["psnr"], 1), style=style
-            )
-            found = errors["gradients"].values()
-            cosine = min(gradient["cosine"] for gradient in found)
-            gradients.add_row(name, *(f"{g['relative_l2']:.1e}" for g in found), f"{cosine:.5f}", style=style)
+        for row in result.rows:
+            errors, name = errors_of(row), f"{row.knob} {row.value}"
+            style = "bold" if row.default else None
+            times = (figure(row.forward_ms, 1), figure(row.step_ms, 1), figure(row.step_ratio, 2))
+            pixels = errors.image
+            image.add_row(name, *times, f"{pixels.max:.1e}", f"{pixels.rms:.1e}", figure(pixels.psnr, 1), style=style)
+            found = errors.gradients.values()
+            cosine = min(gradient.cosine for gradient in found)
+            gradients.add_row(name, *(f"{g.relative_l2:.1e}" for g in found), f"{cosine:.5f}", style=style)
         OUT.print(image)
         OUT.print(gradients)
 
 
 def _in_tables(result: Mapping[str, Any], file: Path | None) -> bool:
-    """Write all figures to `file`, or print them where it is -; return whether tables are still to be printed."""
+    """Write all figures to `file`, or print them if it is -; return whether tables remain to be printed."""
     if file == Path("-"):
-        say(json.dumps(finite(result), indent=2))
+        say(json.dumps(json_finite(result), indent=2))
         return False
     if file is not None:
         write_json(file, result)

@@ -1,7 +1,7 @@
-"""The codec's knob measured: bytes per frame against quality against time, beside lzma over raw residuals.
+"""Bytes, quality and time of the codec at several quality settings, compared with lzma over raw residuals.
 
-Each setting fits the clip anew, for what the codec drops the next frame has to live with. Fits of one setting differ by
-some hundredths of a dB, so a difference below that says nothing.
+Each setting fits the clip again, because the next frame starts from what the codec has quantised. Fits of one setting
+differ by some hundredths of a dB; smaller differences are not significant.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.reports.plots import blank_figure, label_points, markdown, save_figure
+from benchmarks.reports.records import from_json, to_json
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.codec.entropy import column_bits
 from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, residual_packet
@@ -26,26 +27,35 @@ from morgs_mi.playback.player import open_stream
 from morgs_mi.recorder import stream_capture
 from morgs_mi.stream_loop import StreamConfig
 
-__all__ = ["CodecReportConfig", "markdown_table", "plot_codec", "report_codec"]
+__all__ = [
+    "CodecClip",
+    "CodecQuality",
+    "CodecReportConfig",
+    "CodecResult",
+    "CodecRow",
+    "markdown_table",
+    "plot_codec",
+    "report_codec",
+]
 
-# The best that lzma has takes several times as long for some percent.
+# The best preset of lzma takes several times as long and saves a few percent.
 _LZMA_PRESET = 6
 
 
 @dataclass(frozen=True)
 class CodecReportConfig:
-    """Which settings are fitted, and how."""
+    """Settings of the report on the codec."""
 
     qualities: tuple[float, ...] = (0.5, 1, 2, 4)
     """Values of `codec.quality`."""
     reference: float = 1000
-    """Quality of the stream that stands for the uncompressed one."""
+    """Quality of the stream that serves as the uncompressed reference."""
     frames: int | None = None
-    """Use at most this many frames from the start."""
+    """Maximum number of frames from the start."""
     stream: StreamConfig = field(default_factory=StreamConfig)
-    """The fit."""
+    """Settings of the fit."""
     resume: bool = False
-    """Keep the streams that a report with the same settings has left, and go on with one that is not whole."""
+    """Reuse streams of an earlier report with the same settings, and continue incomplete ones."""
 
     def __post_init__(self) -> None:
         if not self.qualities or not all(0 < quality < self.reference for quality in self.qualities):
@@ -55,39 +65,105 @@ class CodecReportConfig:
             )
 
 
+@dataclass(frozen=True)
+class CodecQuality:
+    """PSNR of a stream, dB."""
+
+    first: float
+    """PSNR of the first frame."""
+    later: float
+    """Mean PSNR of the later frames."""
+
+
+@dataclass(frozen=True)
+class CodecRow:
+    """Quality, bytes and times of one stream; times are medians over the later frames.
+
+    `raw` and `lzma` measure float32 residuals between the decoded frames, without and with lzma. They lead to the same
+    frames, so lzma benefits from values that were rounded to zero; in the reference stream there are none.
+    """
+
+    quality: float
+    """Value of `codec.quality`."""
+    psnr: CodecQuality
+    file: int
+    """Size of the file, bytes."""
+    first: int
+    """Size of the first frame, bytes."""
+    later: float
+    """Mean size of a later frame, bytes."""
+    raw: float
+    """Mean size of a later frame's float32 residual, bytes."""
+    lzma: float
+    """Mean size of a later frame's float32 residual with lzma, bytes."""
+    moved: float
+    """Mean number of Gaussians that a later frame writes."""
+    encode_ms: float
+    decode_ms: float
+    lzma_ms: float
+    bytes_by_group: Mapping[str, float]
+    """Mean entropy of a later frame by group of attributes, bytes."""
+    loss: float
+    """PSNR of the reference's later frames minus that of this stream, dB."""
+
+
+@dataclass(frozen=True)
+class CodecClip:
+    """Results of one clip."""
+
+    name: str
+    rows: tuple[CodecRow, ...]
+    """One row per quality; the reference is last."""
+
+
+@dataclass(frozen=True)
+class CodecResult:
+    """Results of the report on the codec."""
+
+    clips: tuple[CodecClip, ...]
+    settings: Mapping[str, Any]
+    machine: Mapping[str, Any]
+    versions: Mapping[str, str]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the result as JSON."""
+        return to_json(self)
+
+    @classmethod
+    def from_dict(cls, value: Mapping[str, Any]) -> CodecResult:
+        """Return the result that is stored as JSON in `value`."""
+        return from_json(cls, value)
+
+
 def report_codec(
     captures: Sequence[str | Path],
     out: str | Path,
     config: CodecReportConfig,
     progress: Callable[[str, float, float], None] = lambda stage, done, total: None,
-) -> dict[str, Any]:
-    """Fit every capture with every quality and return what it costs; the streams stay in OUT/CLIP/QUALITY.
+) -> CodecResult:
+    """Fit every capture with every quality and measure the streams, which stay in OUT/CLIP/QUALITY.
 
     Args:
-        captures: folders of captures; those without a held-out view are judged in the training views.
+        captures: folders of captures; those without a held-out view are evaluated in the training views.
         out: folder for the streams.
-        config: which settings.
+        config: settings.
         progress: called with (stage, done, total).
 
     Returns:
-        `clips`, one per capture: its `name` and `rows`, one per quality with the reference last: `psnr` of the first
-        frame and mean of the later ones, `loss` against the reference's later frames in dB, `file` and `first` in
-        bytes, `later` mean bytes of a later frame, `encode_ms` and `decode_ms` (medians over later frames), `moved`
-        (mean number of Gaussians that a later frame writes), `bytes_by_group` (of a later frame, by entropy), and
-        `lzma` and `raw`: mean bytes of a later frame's float32 residuals with lzma, in `lzma_ms`, and without. They
-        lead to the very same states, so lzma, too, profits from what was rounded to zero; not so in the reference.
+        One clip per capture, the settings, the machine and the versions.
 
     Raises:
-        ValueError: no captures, one with a single frame, or as `stream_capture` and `evaluate_stream`.
+        ValueError: there is no capture, a capture has a single frame, or as `stream_capture` and `evaluate_stream`.
     """
     if not captures:
         raise ValueError("report_codec(): `captures` must name at least one folder, got none.")
-    clips = [_clip(load_capture(path, max_frames=config.frames), Path(out), config, progress) for path in captures]
-    return {"clips": clips, "settings": asdict(config), "machine": machine(), "versions": versions()}
+    recordings = (load_capture(path, max_frames=config.frames) for path in captures)
+    clips = tuple(_clip(recording, Path(out), config, progress) for recording in recordings)
+    return CodecResult(clips, asdict(config), machine(), versions())
 
 
-def markdown_table(clip: Mapping[str, Any]) -> str:
-    """Return one clip's rows as a table for documentation."""
+def markdown_table(clip: CodecClip) -> str:
+    """Return one clip's rows as a table."""
     titles = (
         "quality",
         "dB later",
@@ -101,38 +177,37 @@ def markdown_table(clip: Mapping[str, Any]) -> str:
         "lzma ms",
     )
     rows = []
-    for row in clip["rows"]:
-        cells = [f"{row['quality']:g}", f"{row['psnr']['later']:.2f}", f"{row['loss']:.2f}", _kilo(row["first"])]
-        cells += [_kilo(row["later"]), _kilo(row["lzma"]), f"{row['moved']:.0f}"]
-        cells += [f"{row[name]:.0f}" for name in ("encode_ms", "decode_ms", "lzma_ms")]
+    for row in clip.rows:
+        cells = [f"{row.quality:g}", f"{row.psnr.later:.2f}", f"{row.loss:.2f}", _kilo(row.first)]
+        cells += [_kilo(row.later), _kilo(row.lzma), f"{row.moved:.0f}"]
+        cells += [f"{ms:.0f}" for ms in (row.encode_ms, row.decode_ms, row.lzma_ms)]
         rows.append(cells)
     return markdown(titles, rows, left=0)
 
 
-def plot_codec(result: Mapping[str, Any], path: str | Path) -> None:
-    """Draw bytes of a later frame against quality, and against the time to encode it.
+def plot_codec(result: CodecResult, path: str | Path) -> None:
+    """Plot quality and encoding time over the bytes of a later frame.
 
     Raises:
         ValueError: matplotlib is not installed.
     """
-    clips = result["clips"]
+    clips = result.clips
     figure = blank_figure(10, 3.8 * len(clips))
     for (left, right), clip in zip(figure.subplots(len(clips), 2, squeeze=False), clips, strict=True):
-        rows = clip["rows"]
-        quality, later, loss = ([row[name] for row in rows] for name in ("quality", "later", "psnr"))
-        packed = [row["lzma"] for row in rows]
-        for axis, values in ((left, [score["later"] for score in loss]), (right, None)):
-            own = [row["encode_ms"] for row in rows] if values is None else values
-            other = [row["lzma_ms"] for row in rows] if values is None else values
-            axis.plot(np.array(later) / 1e3, own, "o-", label="stream")
-            axis.plot(np.array(packed) / 1e3, other, "s--", label="lzma over float32 residuals")
+        rows = clip.rows
+        later, packed = (1e-3 * np.array(column) for column in zip(*((r.later, r.lzma) for r in rows), strict=True))
+        psnr = [row.psnr.later for row in rows]
+        times = [row.encode_ms for row in rows], [row.lzma_ms for row in rows]
+        for axis, (own, other) in ((left, (psnr, psnr)), (right, times)):
+            axis.plot(later, own, "o-", label="stream")
+            axis.plot(packed, other, "s--", label="lzma over float32 residuals")
             axis.set(xscale="log", xlabel="kB per later frame")
             axis.grid(alpha=0.3, which="both")
             axis.tick_params(axis="x", which="minor", labelsize=6, rotation=45)
-            points = zip(np.array(later) / 1e3, own, strict=True)
-            label_points(axis, points, [f"{value:g}" for value in quality], (4, -12), 8)
-        left.set(ylabel="PSNR of later frames, dB", title=f"{clip['name']}: quality at each byte rate")
-        right.set(ylabel="ms to encode a frame", yscale="log", title="and the time it takes")
+            points = zip(later, own, strict=True)
+            label_points(axis, points, [f"{row.quality:g}" for row in rows], (4, -12), 8)
+        left.set(ylabel="PSNR of later frames, dB", title=f"{clip.name}: quality")
+        right.set(ylabel="ms to encode a frame", yscale="log", title=f"{clip.name}: encoding time")
         left.ticklabel_format(axis="y", useOffset=False)
         left.legend(fontsize=8)
     save_figure(figure, path)
@@ -140,7 +215,7 @@ def plot_codec(result: Mapping[str, Any], path: str | Path) -> None:
 
 def _clip(
     capture: Capture, out: Path, config: CodecReportConfig, progress: Callable[[str, float, float], None]
-) -> dict[str, Any]:
+) -> CodecClip:
     name = capture.path.resolve().name
     if capture.num_frames < 2:
         raise ValueError(f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}.")
@@ -150,27 +225,26 @@ def _clip(
         folder = out / name / f"{quality:g}"
         settings = replace(config.stream, codec=replace(config.stream.codec, quality=quality))
         stream_capture(capture, folder, settings, resume=config.resume)
-        rows.append({"quality": quality, **_judged(folder, capture), **_measured(folder, settings)})
+        rows.append({"quality": quality, **_evaluated(folder, capture), **_measured(folder, settings)})
     progress(f"Fitting {name}", len(qualities), len(qualities))
-    best = rows[-1]["psnr"]["later"]
-    return {"name": name, "rows": [{**row, "loss": best - row["psnr"]["later"]} for row in rows]}
+    best = rows[-1]["psnr"].later
+    return CodecClip(name, tuple(CodecRow(**row, loss=best - row["psnr"].later) for row in rows))
 
 
-def _judged(folder: Path, capture: Capture) -> dict[str, Any]:
-    """Return the quality of a stream and its bytes, as a receiver of the file finds them."""
+def _evaluated(folder: Path, capture: Capture) -> dict[str, Any]:
+    """Return the quality and the bytes of the decoded stream."""
     found = evaluate_stream(folder, capture.path)
-    frames = found["frames"]
-    later = float(np.mean([row["psnr"] for row in frames[1:]]))
+    first, *later = found.frames
     return {
-        "psnr": {"first": frames[0]["psnr"], "later": later},
-        "file": found["bytes"]["file"],
-        "first": frames[0]["num_bytes"],
-        "later": float(np.mean([row["num_bytes"] for row in frames[1:]])),
+        "psnr": CodecQuality(first.scores.psnr, float(np.mean([row.scores.psnr for row in later]))),
+        "file": found.sizes.file,
+        "first": first.num_bytes,
+        "later": float(np.mean([row.num_bytes for row in later])),
     }
 
 
 def _measured(folder: Path, settings: StreamConfig) -> dict[str, Any]:
-    """Encode and decode the later frames of a stream once more, and pack their residuals with lzma."""
+    """Return times and bytes of encoding the later frames again, with the codec and with lzma."""
     stream = open_stream(folder)
     cameras, rows, before = stream.cameras, [], None
     for state in coded_frames(stream):
@@ -188,6 +262,7 @@ def _measured(folder: Path, settings: StreamConfig) -> dict[str, Any]:
 
 
 def _frame(before: CodedFrame, now: CodedFrame, cameras: Sequence[Any], settings: StreamConfig) -> dict[str, Any]:
+    """Return times and bytes of one frame, encoded again with the codec and with lzma."""
     source = np.searchsorted(before.ids, now.ids)
     born = now.ids >= before.next_id
     source[born] = -1
@@ -196,23 +271,23 @@ def _frame(before: CodedFrame, now: CodedFrame, cameras: Sequence[Any], settings
     encoded = time.perf_counter()
     decode(before, packet)
     decoded = time.perf_counter()
-    kept = source[~born]
-    change = now.grid.values[~born].astype(np.int64) - before.grid.values[kept]
+    survivors = source[~born]
+    change = now.grid.values[~born].astype(np.int64) - before.grid.values[survivors]
     wrote = (change != 0).any(1)
     old, new = before.gaussians.numpy(), now.gaussians.numpy()
     raw = b"".join(
-        np.concatenate([new[name][~born] - old[name][kept], new[name][born]]).tobytes()
+        np.concatenate([new[name][~born] - old[name][survivors], new[name][born]]).tobytes()
         for name in new
         if name != "motion"
     )
-    begun = time.perf_counter()
+    started = time.perf_counter()
     packed = lzma.compress(raw, preset=_LZMA_PRESET)
     written = np.rint(change / step_sizes(packet.arrays["head"][1].astype(int))).astype(np.int64)
     groups = {name: _bytes(*written[written[:, at].any(1), at].T) for name, at in now.grid.columns.items()}
     return {
         "encode_ms": 1e3 * (encoded - start),
         "decode_ms": 1e3 * (decoded - encoded),
-        "lzma_ms": 1e3 * (time.perf_counter() - begun),
+        "lzma_ms": 1e3 * (time.perf_counter() - started),
         "raw": len(raw),
         "lzma": len(packed),
         "moved": int(wrote.sum()),

@@ -1,17 +1,17 @@
-"""Measure how well motion masks fit the true ones, and what they do to the confidence that is learned from them.
+"""Measure the overlap of motion masks with the true ones, and of the confidence that is learned from them.
 
     python -m benchmarks.reports.masks CAPTURE... --json masks.json
 
-Needs captures with ground truth. The first frame is fitted once. Then, per clip,
+Needs captures with ground truth. The first frame is fitted once. The figures of a clip are
 
-- `masks`: key views' flow masks, refined by each method; `lifted` is the mask that one gets by rendering, in the same
-  views, the Gaussians of the frame before where the flow carries them, as sure of who moves as `motion.lift` is;
-- `loops`: the later frames fitted with some methods' masks in every frame, from the lifted confidence and without it,
-  as in the paper: the rendered confidence beside the true mask, in the key views and in the held-out one, and the
-  held-out view's PSNR where things move;
-- `processor_ms`: what each method costs on one picture, its flow not counted.
+- `masks`: flow masks of the key views, refined by each method. `lifted` is the rendered confidence, in the same views,
+  of the previous frame's Gaussians moved by the lifted flow, with the confidence of `lift_flow` made hard;
+- `loops`: later frames fitted with some methods' masks in every frame, starting from the lifted confidence and without
+  it, as in the paper. Reported are the rendered confidence compared with the true mask, in the key views and in the
+  held-out view, and the PSNR of the held-out view's moving region;
+- `processor_ms`: processor time of each method for one image, without its flow.
 
-All masks are judged by IoU and by the shares of the true mask that is `found` and of the mask that is `true`.
+The overlap of a mask is its IoU, the share of the true mask that is `found` and the share of the mask that is `true`.
 """
 
 from __future__ import annotations
@@ -52,33 +52,33 @@ class Options:
     captures: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of captures with ground truth."""
     json: Path | None = None
-    """File for the figures; they are printed too."""
+    """JSON file for the figures, which are also printed."""
     frames: int = 4
-    """Later frames of each."""
+    """Number of later frames of each clip."""
     first_frame_steps: int = 600
-    """Steps of the first frame's fit."""
+    """Number of steps of the first frame."""
     num_gaussians: int = 10_000
-    """Of the first frame."""
+    """Number of Gaussians of the first frame."""
     loops: tuple[str, ...] = ("grabcut", "superpixels+grabcut")
-    """Methods whose masks the loop is run with; a minute each."""
+    """Methods with whose masks later frames are fitted; a minute each."""
 
 
 def overlap(mask: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """Return how well a mask [H, W] bool fits the true one."""
+    """Return the overlap of a mask [H, W] bool with the true one."""
     both = float((mask & truth).sum())
     return {"iou": iou(mask, truth), "found": both / truth.sum(), "true": both / max(mask.sum(), 1)}
 
 
 def confidence_mask(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """Return where the rendered confidence exceeds a half, [H, W] bool."""
+    """Return the mask of pixels with a rendered confidence above 0.5, [H, W] bool."""
     return np.asarray(rasterize(gaussians, camera, ("confidence",)).confidence)[..., 0] > 0.5
 
 
-def carried(gaussians: Gaussians, cameras: Sequence[Camera], cues: Mapping[int, FlowObservation]) -> Gaussians:
-    """Return the Gaussians where the key views' flow carries them, sure of who moves and who does not."""
-    lift = lift_flow(gaussians, full_active_set(gaussians, cameras, RenderConfig()).views, cues)
-    sure = np.where(lift.logit_confidence > 0, 6, -6).astype(np.float32)
-    return replace(gaussians, means=np.asarray(gaussians.means) + lift.displacement, logit_confidence=sure)
+def lifted(gaussians: Gaussians, cameras: Sequence[Camera], flow: Mapping[int, FlowObservation]) -> Gaussians:
+    """Return the Gaussians moved by the lifted flow of the key views, with a hard confidence."""
+    lift = lift_flow(gaussians, full_active_set(gaussians, dict(enumerate(cameras)), RenderConfig()).views, flow)
+    hard = np.where(lift.logit_confidence > 0, 6, -6).astype(np.float32)
+    return replace(gaussians, means=np.asarray(gaussians.means) + lift.displacement, logit_confidence=hard)
 
 
 def means(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
@@ -88,27 +88,30 @@ def means(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
 
 
 def processor_ms(image: np.ndarray, previous: np.ndarray) -> dict[str, float]:
-    """Return the processor time of each method on one picture, all threads together, ms: medians of 9."""
-    cue, costs = observe_flow(image, previous), {}
-    moves = flow_mask(cue.motion, cue.reliable)
+    """Return the processor time of each method for one image, summed over threads, ms: medians of 9."""
+    flow, costs = observe_flow(image, previous), {}
+    moving = flow_mask(flow.motion, flow.reliable)
     for method in MASK_REFINERS.names:
         refine, times = mask_refiner(method), []
         for _ in range(9):
             start = time.process_time()
-            refine(image, moves)
+            refine(image, moving)
             times.append(1e3 * (time.process_time() - start))
         costs[method] = round(float(np.median(times)), 1)
     return costs
 
 
 class Clip:
-    """A capture whose first frame is fitted."""
+    """A capture with its first frame fitted."""
 
     def __init__(self, path: Path, options: Options) -> None:
         self.capture: Capture = load_capture(path, max_frames=options.frames + 1)
         self.views = self.capture.train_views
         self.cameras = [self.capture.cameras[v] for v in self.views]
-        self.held_out = self.capture.cameras[self.capture.test_view]
+        if self.capture.test_view is None or self.capture.truth is None:
+            raise ValueError(f"{path}: expected a capture with a held-out view and ground truth; make one with synth.")
+        self.test_view, self.truth = self.capture.test_view, self.capture.truth
+        self.held_out = self.capture.cameras[self.test_view]
         self.frames = list(self.capture.frames())
         self.fit = FitConfig(first_frame_steps=options.first_frame_steps, num_gaussians=options.num_gaussians)
         loop = self._loop(MotionConfig())
@@ -125,29 +128,28 @@ class Clip:
         return StreamLoop(self.cameras, self.capture.points, self.capture.point_colors, config, masks)
 
     def _truth(self, camera: Camera, t: int) -> np.ndarray:
-        assert self.capture.truth is not None
-        return load_truth(self.capture.truth, camera.name, t).mask
+        return load_truth(self.truth, camera.name, t).mask
 
     def masks(self) -> dict[str, dict[str, float]]:
-        """Return the figures of each way to a mask of the key views."""
+        """Return the overlap of the key views' masks by method."""
         rows: dict[str, list[dict[str, float]]] = {name: [] for name in (*MASK_REFINERS.names, "lifted")}
         loop = self._loop(MotionConfig())
         loop.resume(self.first, [self._images(0)])
         for t in range(1, len(self.frames)):
             key_views, images, before = loop.setup.key_views, self._images(t), self._images(t - 1)
-            cues = {k: observe_flow(images[k], before[k], valid=loop.setup.masks[k]) for k in key_views}
+            flow = {k: observe_flow(images[k], before[k], valid=loop.setup.masks[k]) for k in key_views}
             assert loop.gaussians is not None
-            lifted = carried(loop.gaussians, self.cameras, cues)
-            for k, cue in cues.items():
-                truth, moves = self._truth(self.cameras[k], t), flow_mask(cue.motion, cue.reliable)
+            moved = lifted(loop.gaussians, self.cameras, flow)
+            for k, observed in flow.items():
+                truth, moving = self._truth(self.cameras[k], t), flow_mask(observed.motion, observed.reliable)
                 for method in MASK_REFINERS.names:
-                    rows[method].append(overlap(mask_refiner(method)(images[k], moves), truth))
-                rows["lifted"].append(overlap(confidence_mask(lifted, self.cameras[k]), truth))
+                    rows[method].append(overlap(mask_refiner(method)(images[k], moving), truth))
+                rows["lifted"].append(overlap(confidence_mask(moved, self.cameras[k]), truth))
             loop.push(images)
         return {name: means(found) for name, found in rows.items()}
 
     def fitted(self, method: str, lift_confidence: bool) -> dict[str, dict[str, float]]:
-        """Return the figures of the confidence that the loop learns from a method's masks."""
+        """Return the overlap of the confidence that the loop learns from a method's masks."""
         loop = self._loop(MotionConfig(mask_method=method, mask_interval=1, lift_confidence=lift_confidence))
         loop.resume(self.first, [self._images(0)])
         key_views, held_out = [], []
@@ -158,14 +160,14 @@ class Clip:
             for camera in (self.cameras[k] for k in loop.setup.key_views):
                 key_views.append(overlap(confidence_mask(now, camera), self._truth(camera, t)))
             color, moving = np.asarray(rasterize(now, self.held_out).color), self._truth(self.held_out, t)
-            recorded = self.frames[t].images[self.capture.test_view]
+            recorded = self.frames[t].images[self.test_view]
             quality = psnr(np.clip(color, 0, 1), recorded, moving)
             held_out.append({**overlap(confidence_mask(now, self.held_out), moving), "psnr_moving": quality})
         return {"key_views": means(key_views), "held_out": means(held_out)}
 
 
 def measure(path: Path, options: Options) -> dict[str, Any]:
-    """Return one clip's figures."""
+    """Return the figures of one clip."""
     clip = Clip(path, options)
     camera = clip.cameras[0]
     masks, last = clip.masks(), clip.capture.num_frames - 1

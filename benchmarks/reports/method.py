@@ -1,9 +1,9 @@
-"""What the method's parts are worth: presets by epochs, key views with and without offset, and how sure that is.
+"""Contribution of the method's parts: presets by epochs, and key views with and without offset, over several seeds.
 
-A *setting* is a preset, a number of epochs, a number of key views and a factor on the learning rates; it is measured
-with several seeds, each of which has a first frame of its own that all settings share. Presets that are tuned are run
-at several rates with the first seed. The rate that counts is the one with the best mean PSNR of the held-out view over
-the later frames; all other seeds are run at that alone.
+A *setting* is a preset, a number of epochs, a number of key views and a factor on the learning rates. It is measured
+with several seeds; each seed has its own first frame, which all settings share. Tuned presets are run at several rates
+with the first seed. The rate with the best mean PSNR of the held-out view over the later frames is selected, and the
+other seeds are run at that rate only.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from benchmarks.reports.flow import FlowReportConfig, report_flow
 from benchmarks.reports.method_cells import DEFAULT, Cell, Clip, Scores, method_version, scores_of, scratch_scores
+from benchmarks.reports.method_results import FlowError, MethodClip, MethodResult, ScratchRow, SettingRow
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.fit.config import FitConfig
@@ -25,7 +25,7 @@ from morgs_mi.stream_loop import StreamConfig
 
 __all__ = ["MethodReportConfig", "report_method"]
 
-# The paper's table of key views has these two rows.
+# Rows of the paper's table of key views.
 _WITHOUT_OFFSET, _WITH_OFFSET = "ml", "ml-mo"
 _PAPER_EPOCHS = 8
 _SCRATCH = 20
@@ -33,36 +33,36 @@ _SCRATCH = 20
 
 @dataclass(frozen=True)
 class MethodReportConfig:
-    """Which settings are fitted, and how."""
+    """Settings of the report on the method."""
 
     presets: tuple[str, ...] = ("baseline", "ml", "ml-mo", "ml-mo-mc", "paper", DEFAULT)
-    """Presets of morgs-mi fit; default stands for none."""
+    """Presets of morgs-mi fit; default means none."""
     epochs: tuple[int, ...] = (1, 2, 3, 5, 8, 12)
     """Passes over the views for every later frame."""
     key_views: tuple[int, ...] = (2, 4, 8, 12)
-    """Numbers of key views that are compared, with and without offset; more than there are views count as all."""
+    """Compared numbers of key views, with and without offset; limited to the number of views."""
     rates: tuple[float, ...] = (1, 2, 4)
-    """Factors on the learning rates of the presets that are tuned; the others have 1."""
+    """Factors on the learning rates of the tuned presets; the others have 1."""
     tuned: tuple[str, ...] = ("baseline", DEFAULT)
-    """Presets that are run at all rates, with the first seed."""
+    """Tuned presets: run at all rates with the first seed."""
     seeds: int = 3
-    """Runs of every setting."""
+    """Number of runs of every setting."""
     frames: int | None = None
-    """Use at most this many frames from the start."""
+    """Maximum number of frames from the start."""
     num_gaussians: int = 10_000
-    """Gaussians of the first frame, in place of stream.fit's."""
+    """Number of Gaussians of the first frame; overrides stream.fit."""
     scratch: int = 0
-    """Frames of each clip that are also fitted from scratch, each with 20 times the steps of 8 epochs."""
+    """Number of frames of each clip that are also fitted from scratch, with 20 times the steps of 8 epochs."""
     version: str | None = None
-    """What stands for the method's sources: kept results of the same version are taken as they are."""
+    """Version of the method, default a digest of its sources; stored results of the same version are reused."""
     stream: StreamConfig = field(default_factory=StreamConfig)
-    """The fit; presets, epochs, key views, rates and seeds are set in it."""
+    """Settings of the fit; presets, epochs, key views, rates and seeds override them."""
 
     def __post_init__(self) -> None:
         unknown = [name for name in (*self.presets, *self.tuned) if name not in (DEFAULT, *PRESETS)]
         if unknown or not self.presets:
             raise ValueError(
-                f"MethodReportConfig(): `presets` and `tuned` must be out of {', '.join((DEFAULT, *PRESETS))}, got "
+                f"MethodReportConfig(): `presets` and `tuned` must be among {', '.join((DEFAULT, *PRESETS))}, got "
                 f"{', '.join(unknown) or 'none'}."
             )
         for name in ("epochs", "rates", "seeds", "num_gaussians"):
@@ -74,13 +74,13 @@ class MethodReportConfig:
 
     @property
     def base(self) -> StreamConfig:
-        """What every cell is a variation of."""
+        """Settings of the fit that all cells share."""
         fit = replace(self.stream.fit, num_gaussians=self.num_gaussians, epochs=FitConfig.epochs)
         return replace(self.stream, fit=fit)
 
     @property
     def table_epochs(self) -> int:
-        """The epochs of the tables: the paper's 8, or what is nearest to them."""
+        """Number of epochs of the tables: the nearest to the paper's 8."""
         return min(self.epochs, key=lambda epochs: abs(epochs - _PAPER_EPOCHS))
 
 
@@ -89,40 +89,40 @@ def report_method(
     out: str | Path,
     config: MethodReportConfig,
     progress: Callable[[str, float, float], None] = lambda *_: None,
-    finished: Callable[[Mapping[str, Any]], None] = lambda _: None,
-) -> dict[str, Any]:
-    """Fit every clip with every setting and seed, as far as that was not done before.
+    finished: Callable[[MethodResult], None] = lambda _: None,
+) -> MethodResult:
+    """Fit every clip with every setting and seed, reusing stored results.
 
     Args:
         captures: folders of captures, two frames or more.
-        out: folder that keeps first frames and cells, so that an interrupted report goes on.
-        config: which settings.
+        out: folder that stores first frames and cells, so that an interrupted report continues.
+        config: settings.
         progress: called with (stage, done, total).
-        finished: called with the result after each clip.
+        finished: called with the result so far after each clip.
 
     Returns:
-        See docs/experiments/method.md.
+        One clip per capture, the settings, the machine and the versions.
 
     Raises:
-        OSError: a capture cannot be read, or a result not written.
-        ValueError: no captures, two of one name, one with a single frame, or a setting does not go with a preset.
+        OSError: a capture cannot be read, or a result cannot be written.
+        ValueError: there is no capture, two captures have the same name, a capture has a single frame, or a setting is
+            incompatible with a preset.
     """
     names = [Path(path).resolve().name for path in captures]
     if not names or len(set(names)) < len(names):
         raise ValueError(
-            f"report_method(): `captures` must be one folder or more, each of another name, got {', '.join(names)}."
+            f"report_method(): `captures` must be one folder or more with distinct names, got {', '.join(names)}."
         )
     version = config.version or method_version()
-    result: dict[str, Any] = {"clips": [], "table_epochs": config.table_epochs, "version": version}
-    result |= {"settings": asdict(config), "machine": machine(), "versions": versions()}
+    result = MethodResult((), config.table_epochs, version, asdict(config), machine(), versions())
     for path in captures:
-        result["clips"].append(_clip(path, Path(out), config, version, progress))
+        result = replace(result, clips=(*result.clips, _clip(path, Path(out), config, version, progress)))
         finished(result)
     return result
 
 
 def cells_of(config: MethodReportConfig, num_views: int) -> tuple[list[Cell], list[Cell]]:
-    """Return the first seed's cells of the presets, and those that compare numbers of key views; some are in both."""
+    """Return the first seed's cells of the presets, and those that compare numbers of key views; both may overlap."""
     usual = min(config.stream.motion.key_views, num_views)
     presets = [
         Cell(preset, epochs, usual, rate, seed=0)
@@ -139,7 +139,7 @@ def cells_of(config: MethodReportConfig, num_views: int) -> tuple[list[Cell], li
 
 
 def best_cells(found: Mapping[Cell, Scores]) -> set[Cell]:
-    """Return the first seed's cells whose rate is best for their preset, epochs and key views."""
+    """Return the first seed's cells with the best rate for their preset, epochs and key views."""
     best: dict[Cell, Cell] = {}
     for cell in (cell for cell in found if cell.seed == 0):
         setting = replace(cell, rates=1.0)
@@ -147,8 +147,8 @@ def best_cells(found: Mapping[Cell, Scores]) -> set[Cell]:
     return set(best.values())
 
 
-def aggregate(found: Mapping[Cell, Scores]) -> list[dict[str, Any]]:
-    """Return one row per setting: mean and standard deviation of every score over the seeds, and which rate is best."""
+def aggregate(found: Mapping[Cell, Scores]) -> tuple[SettingRow, ...]:
+    """Return one row per setting: mean and standard deviation of every score over the seeds."""
     best, groups = best_cells(found), dict[Cell, list[Scores]]()
     for cell, scores in found.items():
         groups.setdefault(replace(cell, seed=0), []).append(scores)
@@ -156,17 +156,24 @@ def aggregate(found: Mapping[Cell, Scores]) -> list[dict[str, Any]]:
     for setting, runs in groups.items():
         names = [name for name in runs[0] if name != "by_frame"]
         table = {name: np.array([run[name] for run in runs], float) for name in names}
-        over_time = {
+        by_frame = {
             name: np.mean([np.array(run["by_frame"][name], float) for run in runs], axis=0).tolist()
             for name in runs[0]["by_frame"]
         }
         rows.append(
-            {name: value for name, value in asdict(setting).items() if name != "seed"}
-            | {"runs": len(runs), "mean": {name: float(values.mean()) for name, values in table.items()}}
-            | {"std": {name: _spread(values) for name, values in table.items()}, "by_frame": over_time}
-            | {"best": setting in best}
+            SettingRow(
+                preset=setting.preset,
+                epochs=setting.epochs,
+                key_views=setting.key_views,
+                rates=setting.rates,
+                runs=len(runs),
+                mean={name: float(values.mean()) for name, values in table.items()},
+                std={name: _spread(values) for name, values in table.items()},
+                by_frame={name: tuple(values) for name, values in by_frame.items()},
+                best=setting in best,
+            )
         )
-    return rows
+    return tuple(rows)
 
 
 def _clip(
@@ -175,7 +182,7 @@ def _clip(
     config: MethodReportConfig,
     version: str,
     progress: Callable[[str, float, float], None],
-) -> dict[str, Any]:
+) -> MethodClip:
     capture = load_capture(path, max_frames=config.frames)
     if capture.num_frames < 2:
         raise ValueError(f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}.")
@@ -183,28 +190,28 @@ def _clip(
     presets, key_views = cells_of(config, len(capture.train_views))
     found = _measured(clip, presets, key_views, config, version, out, progress)
 
-    def rows_of(cells: Sequence[Cell]) -> list[dict[str, Any]]:
+    def rows_of(cells: Sequence[Cell]) -> tuple[SettingRow, ...]:
         return aggregate({cell: scores for cell, scores in found.items() if replace(cell, seed=0) in cells})
 
     steps = _SCRATCH * _PAPER_EPOCHS * len(capture.train_views)
     chosen = np.linspace(capture.num_frames - 1, 1, config.scratch + 1)[: config.scratch].round().astype(int)
-    scratch = []
+    scratch: list[ScratchRow] = []
     for done, frame in enumerate(dict.fromkeys(chosen.tolist())):
         progress(f"Fitting {clip.name} from scratch", done, config.scratch)
-        scratch.append({"frame": frame, "steps": steps, **scratch_scores(clip, frame, base, steps, version, out)})
+        scratch.append(scratch_scores(clip, frame, base, steps, version, out))
     camera = capture.cameras[0]
-    return {
-        "name": clip.name,
-        "views": len(capture.cameras),
-        "frames": capture.num_frames,
-        "width": camera.width,
-        "height": camera.height,
-        "held_out": capture.test_view is not None,
-        "cue": _cue(path, config) if capture.truth is not None else None,
-        "scratch": scratch,
-        "rows": rows_of(presets),
-        "key_view_rows": rows_of(key_views),
-    }
+    return MethodClip(
+        name=clip.name,
+        views=len(capture.cameras),
+        frames=capture.num_frames,
+        width=camera.width,
+        height=camera.height,
+        held_out=capture.test_view is not None,
+        flow=_flow_error(path, config) if capture.truth is not None else None,
+        scratch=tuple(scratch),
+        rows=rows_of(presets),
+        key_view_rows=rows_of(key_views),
+    )
 
 
 def _measured(
@@ -216,7 +223,7 @@ def _measured(
     out: Path,
     progress: Callable[[str, float, float], None],
 ) -> dict[Cell, Scores]:
-    """Return the scores of the first seed's cells, and of the other seeds' at the best rates and all key views."""
+    """Return the scores of the first seed's cells, and of the others' at the best rates and all key views."""
     found: dict[Cell, Scores] = {}
 
     def measure(cells: Sequence[Cell], seed: int) -> None:
@@ -229,20 +236,20 @@ def _measured(
     first = list(dict.fromkeys([*presets, *key_views]))
     measure(first, seed=0)
     later = best_cells({cell: found[cell] for cell in presets}) | set(key_views)
-    # Seed by seed: after an interruption, a report with fewer seeds has all that it needs.
+    # Seed by seed: after an interruption, a report with fewer seeds is complete.
     for seed in range(1, config.seeds):
         measure([cell for cell in first if cell in later], seed)
     return found
 
 
-def _cue(path: str | Path, config: MethodReportConfig) -> dict[str, float]:
-    """Return the error of the flow that guides the motion, in px where things move, and of what passes its check."""
+def _flow_error(path: str | Path, config: MethodReportConfig) -> FlowError:
+    """Return the error of the flow that guides the motion."""
     motion = config.stream.motion
     flow = FlowReportConfig((motion.flow_method,), motion.key_views, config.frames)
-    moving = report_flow([path], flow)["clips"][0]["rows"][0]["moving"]
-    return {"error": moving["error"], "reliable_error": moving["reliable_error"]}
+    moving = report_flow([path], flow).clips[0].rows[0].moving
+    return FlowError(moving.error, moving.reliable_error)
 
 
 def _spread(values: np.ndarray) -> float:
-    """Return the standard deviation of runs, NaN of a single one."""
+    """Return the standard deviation of several runs; NaN for a single run."""
     return float(values.std(ddof=1)) if len(values) > 1 else float("nan")

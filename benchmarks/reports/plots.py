@@ -1,4 +1,4 @@
-"""Tables for documentation, and plots."""
+"""Markdown tables and plots of the reports."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["blank_figure", "label_points", "markdown", "save_figure"]
 
 
 def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
-    """Return a table in Markdown; the first `left` columns are words, the others numbers."""
+    """Return a Markdown table; its first `left` columns are aligned left, the others right."""
     rule = "|---" * left + "|---:" * (len(titles) - left) + "|"
     lines = [f"| {' | '.join(cells)} |" for cells in (titles, *rows)]
     return "\n".join([lines[0], rule, *lines[1:]]) + "\n"
@@ -36,7 +36,7 @@ def save_figure(figure: Figure, path: str | Path) -> None:
     """Write a figure as .png or .svg.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     figure.savefig(path, dpi=90)
 
@@ -44,6 +44,6 @@ def save_figure(figure: Figure, path: str | Path) -> None:
 def label_points(
     axis: Any, points: Iterable[tuple[float, float]], names: Iterable[str], shift: tuple[float, float], size: float = 7
 ) -> None:
-    """Write a name beside each point, `shift` typographic points away from it."""
+    """Write a name beside each point, offset by `shift` typographic points."""
     for name, point in zip(names, points, strict=True):
         axis.annotate(name, point, xytext=shift, textcoords="offset points", fontsize=size)

@@ -1,9 +1,9 @@
-"""Fit a recording from end to end, and tell quality per view, seconds, bytes and memory.
+"""Fit a recording and report quality per view, seconds, bytes and memory.
 
     python -m benchmarks.reports.real_capture CAPTURE OUT --downscale 2 --json out.json
 
-Memory is the process's resident set, MiB, when a frame has begun. Without a held-out view, quality is that of the
-training views. What has been fitted into OUT already is gone on with.
+Memory is the process's resident set, MiB, at the first step of a frame. Without a held-out view, quality is that of the
+training views. A fit that OUT holds already is continued.
 """
 
 from __future__ import annotations
@@ -28,18 +28,18 @@ from morgs_mi.stream_loop import StreamConfig
 
 @dataclass(frozen=True)
 class Options:
-    """Fit a recording and measure it."""
+    """Fit a recording and measure the result."""
 
     capture: Positional[Path]
     """Folder of the capture."""
     out: Positional[Path]
-    """Folder for the stream."""
+    """Output folder for the stream."""
     json: Path
-    """File for the figures."""
+    """JSON file for the figures."""
     frames: int | None = None
-    """Use at most this many frames from the start."""
+    """Maximum number of frames from the start."""
     downscale: float = 1
-    """Average the images down by this factor."""
+    """Factor by which the images are averaged down."""
     reading: Annotated[ReadConfig, arg(name="")] = field(default_factory=ReadConfig)
     config: Annotated[StreamConfig, arg(name="")] = field(default_factory=StreamConfig)
 
@@ -50,22 +50,22 @@ def resident() -> float:
 
 
 def fit(options: Options) -> None:
-    """Fit what is not fitted yet, and note the memory at every frame in OUT/memory.jsonl."""
+    """Fit the remaining frames and log the memory at every frame in OUT/memory.jsonl."""
     options.out.mkdir(parents=True, exist_ok=True)
     capture = load_capture(options.capture, options.downscale, "auto", options.frames, options.reading)
     with (options.out / "memory.jsonl").open("a", encoding="utf-8") as log:
 
-        def note(frame: int, step: int, steps: int) -> None:
-            if step == 1:  # a frame that has settled has no last one
+        def log_memory(frame: int, step: int, steps: int) -> None:
+            if step == 1:  # a frame that stops early has no last step
                 log.write(json.dumps({"frame": frame, "resident_mib": resident()}) + "\n")
                 log.flush()
 
-        stream_capture(capture, options.out, options.config, note, resume=True)
+        stream_capture(capture, options.out, options.config, log_memory, resume=True)
 
 
 def summary(out: Path, capture: Path) -> dict[str, Any]:
     """Return the figures of the stream in `out`."""
-    result = evaluate_stream(out, capture)
+    result = evaluate_stream(out, capture).as_dict()
     lines = (out / "memory.jsonl").read_text(encoding="utf-8").splitlines()
     memory = {row["frame"]: row["resident_mib"] for row in map(json.loads, lines)}
     keys = ("frame", "psnr", "psnr_moving", "ssim", "seconds", "num_bytes")

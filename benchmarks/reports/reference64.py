@@ -1,16 +1,16 @@
-"""The renderer once more, slow and in double precision: what its error is measured against.
+"""Reference implementation of the renderer in double precision, with which its error is measured.
 
-NumPy float64, for a list of pixels rather than a whole image, so that scenes of any size can be judged by a sample.
-Every pixel meets every Gaussian: there are no lists, and no early stop. N Gaussians, P pixels; A = alpha before the
+NumPy float64, for a list of pixels instead of a whole image, so that scenes of any size can be evaluated by a sample.
+Every pixel evaluates every Gaussian: there are no lists, and no early stop. N Gaussians, P pixels; A = alpha before the
 cap, T = transmittance in front of a Gaussian, w = T alpha, values c = (colour, 1).
 
 The adjoint of the blend is written by hand: with g the gradient at a pixel and S_i = sum_{j > i} w_j <g, c_j>,
 
     dL/dalpha_i = T_i <g, c_i> - S_i / (1 - alpha_i),
 
-and its chain through A = opacity exp(-sigma) likewise. Eleven numbers (centre, size, rotation, opacity) make a splat
-of nine, colour included; that Jacobian comes from complex steps, exact to rounding: derivatives written once more by
-hand might share the renderer's mistakes.
+and so is its chain through A = opacity exp(-sigma). The Jacobian of the projection, from eleven numbers (mean, scales,
+rotation, opacity) to a splat's nine numbers with colour, is computed by complex steps, exact to rounding: derivatives
+derived by hand might share the renderer's mistakes.
 """
 
 from __future__ import annotations
@@ -21,25 +21,26 @@ from dataclasses import dataclass
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import SH_C0
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["ATTRIBUTES", "Twin"]
+__all__ = ["ATTRIBUTES", "Reference64"]
 
 ATTRIBUTES = ("means", "log_scales", "quats", "logit_opacities", "sh_coeffs")
 _GEOMETRY = ATTRIBUTES[:4]
 _STEP = 1e-30
-# Pairs of pixel and Gaussian worked on at once: 8 MB per array.
+# Pairs of pixel and Gaussian per chunk: 8 MB per array.
 _PAIRS = 1_000_000
 
 
 @dataclass(frozen=True)
-class Twin:
+class Reference64:
     """N Gaussians seen by a camera, in float64.
 
     Attributes:
-        raw: raw attributes by name, as `Gaussians.numpy()` gives them.
-        camera: the view; its intrinsics are rounded to float32, as the renderer takes them.
-        config: `eps2d`, `alpha_min` and `alpha_max` count, the rest is ignored.
+        raw: raw attributes by name, as returned by `Gaussians.numpy()`.
+        camera: camera of the view; its intrinsics are rounded to float32, as in the renderer.
+        config: `eps2d`, `alpha_min` and `alpha_max` are used, the other fields are ignored.
     """
 
     raw: Mapping[str, np.ndarray]
@@ -56,12 +57,12 @@ class Twin:
         splats, values, order = self._splats()
         N = len(values)
         to_splats, to_values = np.zeros((N, 6)), np.zeros((N, 4))
-        for part, distance, weights, light, alpha, free in self._blended(splats, order, pixels):
-            g = gradient[part]
-            seen = g @ values[order].T  # <g, c_i>
-            inner = weights * seen
+        for chunk, distance, weights, light, alpha, free in self._blended(splats, order, pixels):
+            g = gradient[chunk]
+            product = g @ values[order].T  # <g, c_i>
+            inner = weights * product
             behind = inner[:, ::-1].cumsum(axis=1)[:, ::-1] - inner
-            to_full = np.where(free, light * seen - behind / (1 - alpha), 0) * alpha  # dL/dA A
+            to_full = np.where(free, light * product - behind / (1 - alpha), 0) * alpha  # dL/dA A
             (dx, dy), (_, _, a, b, c, opacity) = distance, splats[order].T
             moments = (
                 a * (to_full * dx).sum(0) + b * (to_full * dy).sum(0),
@@ -76,7 +77,7 @@ class Twin:
         return self._to_attributes(np.column_stack([to_splats, to_values[:, :3]]))
 
     def _splats(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return splats (mean, conic, opacity) [N, 6], values (colour, 1) [N, 4] and who is drawn, nearest first."""
+        """Return splats (mean, conic, opacity) [N, 6], values (colour, 1) [N, 4] and the drawn indices by depth."""
         numbers, depths = _project(self._float64(), self.camera, self.config.eps2d)
         order = np.argsort(depths, kind="stable")
         drawn = (depths >= self.camera.near) & (numbers[:, 5] > self.config.alpha_min)
@@ -84,20 +85,20 @@ class Twin:
         return numbers[:, :6], values, order[drawn[order]]
 
     def _blended(self, splats: np.ndarray, order: np.ndarray, pixels: np.ndarray) -> Iterator[tuple]:
-        """Yield (part, (dx, dy), w, T, alpha, whether alpha follows A) for a part of the pixels at a time."""
+        """Yield (chunk, (dx, dy), w, T, alpha, whether alpha is A) for one chunk of the pixels at a time."""
         mean_x, mean_y, a, b, c, opacity = splats[order].T
         rows = max(1, _PAIRS // max(len(order), 1))
         for first in range(0, len(pixels), rows):
-            part = slice(first, first + rows)
-            dx, dy = pixels[part, :1] + 0.5 - mean_x, pixels[part, 1:] + 0.5 - mean_y
+            chunk = slice(first, first + rows)
+            dx, dy = pixels[chunk, :1] + 0.5 - mean_x, pixels[chunk, 1:] + 0.5 - mean_y
             full = opacity * np.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
             drawn, free = full >= self.config.alpha_min, full <= self.config.alpha_max
             alpha = np.where(drawn, np.minimum(full, self.config.alpha_max), 0)
             light = np.cumprod(np.column_stack([np.ones(len(alpha)), 1 - alpha]), axis=1)[:, :-1]
-            yield part, (dx, dy), light * alpha, light, alpha, drawn & free
+            yield chunk, (dx, dy), light * alpha, light, alpha, drawn & free
 
     def _to_attributes(self, incoming: np.ndarray) -> dict[str, np.ndarray]:
-        """Chain the gradients of splats and colours [N, 9] through the projection."""
+        """Return the gradients of the attributes, given those of splats and colours [N, 9]."""
         raw, grads = self._float64(), {}
         for name in _GEOMETRY:
             columns = raw[name].reshape(len(incoming), -1)
@@ -108,9 +109,9 @@ class Twin:
                 numbers, _ = _project({**raw, name: nudged.reshape(raw[name].shape)}, self.camera, self.config.eps2d)
                 grad[:, k] = (numbers.imag / _STEP * incoming).sum(axis=1)
             grads[name] = grad.reshape(raw[name].shape)
-        shown = _project(raw, self.camera, self.config.eps2d)[0][:, 6:] > 0
+        positive = _project(raw, self.camera, self.config.eps2d)[0][:, 6:] > 0
         basis = _sh_basis(_directions(raw["means"], self.camera), raw["sh_coeffs"].shape[1])
-        return grads | {"sh_coeffs": basis[:, :, None] * (shown * incoming[:, 6:])[:, None, :]}
+        return grads | {"sh_coeffs": basis[:, :, None] * (positive * incoming[:, 6:])[:, None, :]}
 
     def _float64(self) -> dict[str, np.ndarray]:
         return {name: np.asarray(self.raw[name], np.float64) for name in ATTRIBUTES}
@@ -126,7 +127,7 @@ def _project(raw: Mapping[str, np.ndarray], camera: Camera, eps2d: float) -> tup
     (R, t), K = _pose(camera), np.asarray(np.float32(camera.K), np.float64)
     x, y, z = (raw["means"] @ R.T + t).T
     depths = z.real
-    z = np.where(depths >= camera.near, z, 1)  # what the camera cannot see only has to stay finite
+    z = np.where(depths >= camera.near, z, 1)  # Gaussians behind the camera only need finite values
     means2d, jacobian = [], np.zeros((len(z), 2, 3), z.dtype)
     for axis, (slope, size) in enumerate(((x / z, camera.width), (y / z, camera.height))):
         f, c = K[axis, axis], K[axis, 2]
@@ -167,7 +168,7 @@ def _sh_basis(directions: np.ndarray, K: int) -> np.ndarray:
     """Return the real spherical harmonics [N, K] of unit directions [N, 3] with 3DGS's signs."""
     x, y, z = directions.T
     xx, yy, zz = x * x, y * y, z * z
-    basis = [0.28209479177387814 + 0 * x]
+    basis = [SH_C0 + 0 * x]
     basis += [0.4886025119029199 * v for v in (-y, z, -x)]
     basis += [1.0925484305920792 * x * y, -1.0925484305920792 * y * z, 0.31539156525252005 * (2 * zz - xx - yy)]
     basis += [-1.0925484305920792 * x * z, 0.5462742152960396 * (xx - yy)]

@@ -1,9 +1,10 @@
-"""Measure the memory and the time that it takes to read a long capture of many cameras.
+"""Measure memory and time of reading a long capture of many cameras.
 
     python -m benchmarks.speed.capture_memory --json out.json
 
-One noisy clip is written once and stands for every camera. Its frames are read as a fit reads them; memory is the
-process's resident set, MiB, after every tenth. It may grow by the few frames that wait at a time, not with the clip.
+One noisy clip is written once and copied for every camera. Its frames are read as by a fit; memory is the process's
+resident set, MiB, after every tenth frame. It may grow by the few frames of the read-ahead, but not with the length of
+the clip.
 """
 
 from __future__ import annotations
@@ -30,20 +31,20 @@ from morgs_mi.io.video_writer import write_video
 
 @dataclass(frozen=True)
 class Options:
-    """Measure the memory that reading a capture takes."""
+    """Measure the memory of reading a capture."""
 
     json: Path | None = None
-    """File for the figures; they are printed too."""
+    """JSON file for the figures, which are also printed."""
     cameras: int = 20
-    """How many there are."""
+    """Number of cameras."""
     frames: int = 300
-    """How many each has."""
+    """Number of frames per camera."""
     width: int = 1352
-    """Of the clips, pixels."""
+    """Width of the clips, px."""
     height: int = 1014
-    """Of the clips, pixels."""
+    """Height of the clips, px."""
     downscale: float = 2
-    """The frames are averaged down by this factor."""
+    """Factor by which the frames are averaged down."""
 
 
 def resident() -> float:
@@ -53,7 +54,7 @@ def resident() -> float:
 
 
 def clip(options: Options) -> Iterator[np.ndarray]:
-    """Yield smooth pictures that drift, with noise."""
+    """Yield smooth, drifting images with noise."""
     rng, (y, x) = np.random.default_rng(0), np.mgrid[: options.height, : options.width].astype(np.float32)
     noise = rng.normal(0, 4, (8, options.height, options.width, 3)).astype(np.float32)
     for t in range(options.frames):
@@ -74,7 +75,7 @@ def write_capture(folder: Path, options: Options) -> Path:
 
 
 def measure(options: Options) -> dict[str, Any]:
-    """Return the figures."""
+    """Return the figures of one capture."""
     with tempfile.TemporaryDirectory() as folder:
         capture = load_capture(write_capture(Path(folder), options), options.downscale)
         before, rows, start = resident(), [], time.perf_counter()
@@ -82,13 +83,13 @@ def measure(options: Options) -> dict[str, Any]:
         for frame in islice(capture.frames(), 0, None, every):
             rows.append({"frame": frame.index, "resident_mib": resident()})
         seconds = time.perf_counter() - start
-    early_stopping_tolerance = [row["resident_mib"] for row in rows[len(rows) // 10 :]]
+    steady = [row["resident_mib"] for row in rows[len(rows) // 10 :]]
     one = sum(camera.width * camera.height * 3 for camera in capture.cameras) / 2**20
     return {
         "before_mib": before,
-        "settled_mib": early_stopping_tolerance[0],
-        "largest_mib": max(early_stopping_tolerance),
-        "growth_mib": early_stopping_tolerance[-1] - early_stopping_tolerance[0],
+        "settled_mib": steady[0],
+        "largest_mib": max(steady),
+        "growth_mib": steady[-1] - steady[0],
         "frame_mib": one,
         "seconds_per_frame": seconds / options.frames,
         "rows": rows,

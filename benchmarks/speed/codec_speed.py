@@ -2,9 +2,9 @@
 
     python -m benchmarks.speed.codec_speed --json out.json
 
-A ball of Gaussians as for the renderer, with SH of degree 1 and a confidence. Those that move change in every
-attribute, by about a pixel and by some percent; a hundredth of all dies and as many are born. The figures also tell the
-bytes, and what is lost: how far the centres of all are from where they should be on screen.
+A ball of Gaussians as for the renderer, with SH of degree 1 and a confidence. The moving ones change in every
+attribute, by about a pixel and by some percent. One percent of all are removed and as many are added. The figures
+include the bytes and the quantisation error of the means on screen.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from morgs_mi.codec.container import decode_packet, encode_packet
 from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, residual_packet
 from morgs_mi.evaluate.environment import machine, versions
 
-# Gaussians, and how many of them move.
+# Number of Gaussians, number of moving ones.
 LADDER = ((20_000, 10_000), (200_000, 10_000), (200_000, 200_000))
 
 
@@ -35,20 +35,20 @@ class Options:
     """Time the stream's encoder and decoder."""
 
     json: Path | None = None
-    """File for the figures; they are printed too."""
+    """JSON file for the figures, which are also printed."""
     sizes: tuple[tuple[int, int], ...] = LADDER
-    """Gaussians, and how many of them move."""
+    """Pairs of the number of Gaussians and the number of moving ones."""
     repeats: int = 7
-    """Medians are over so many runs, after one that does not count."""
+    """Number of runs, after one warm-up; medians are reported."""
 
 
 def change(gaussians: Gaussians, moving: int, pixel: float) -> tuple[Gaussians, np.ndarray]:
-    """Return the next frame, and who is who in it (`source`)."""
+    """Return the next frame and the index of each of its Gaussians in the last one (`source`), -1 for new ones."""
     rng, N = np.random.default_rng(0), len(gaussians)
     raw = {name: value.copy() for name, value in gaussians.numpy().items() if name != "motion"}
-    who = rng.permutation(N)[:moving]
+    chosen = rng.permutation(N)[:moving]
     for name, value in raw.items():
-        value[who] += rng.normal(0, pixel if name == "means" else 0.03, value[who].shape).astype(value.dtype)
+        value[chosen] += rng.normal(0, pixel if name == "means" else 0.03, value[chosen].shape).astype(value.dtype)
     now, births = Gaussians(**raw), N // 100
     survivors = np.sort(rng.permutation(N)[births:])
     source = np.concatenate([survivors, np.full(births, -1)])
@@ -63,7 +63,9 @@ def measure(count: int, moving: int, repeats: int) -> dict[str, Any]:
     now, source = change(before.gaussians, moving, float(np.median(depths(before.gaussians, camera)) / camera.K[0, 0]))
     encode_ms, decode_ms, data, after = [], [], b"", before
     for _ in range(repeats + 1):
-        parent = CodedFrame(before.frame, before.grid, before.ids, before.next_id, before.gaussians)  # no digest yet
+        parent = CodedFrame(
+            before.frame, before.grid, before.ids, before.next_id, before.gaussians
+        )  # without a cached digest
         start = time.perf_counter()
         data = encode_packet(residual_packet(parent, now, source, [camera]))
         encoded = time.perf_counter()
@@ -84,7 +86,7 @@ def measure(count: int, moving: int, repeats: int) -> dict[str, Any]:
 
 
 def depths(gaussians: Gaussians, camera: Camera) -> np.ndarray:
-    """Return the centres' distances [N] along the camera's axis."""
+    """Return the depths [N] of the means along the camera's axis."""
     return np.asarray(gaussians.means) @ camera.viewmat[2, :3] + camera.viewmat[2, 3]
 
 

@@ -1,14 +1,14 @@
-"""Count the machine instructions of the blending loops, how often they run, and how fast.
+"""Count the machine instructions of the blending loops, their iterations and their speed.
 
     python -m benchmarks.speed.count_instructions --workload W1.npz W2b.npz --json out.json
 
-Dr.Jit disassembles what it compiles where its log level asks for it: a second process takes one step with an empty
-kernel cache and that log level, and its listing is split into loops here. A turn of such a loop draws one Gaussian on
-one block for every lane of a SIMD packet (16 blocks with AVX-512). It needs an x86-64 processor and Dr.Jit's LLVM
-backend, and no other program.
+Dr.Jit disassembles its kernels at log level Trace: a second process takes one step with an empty kernel cache and that
+log level, and its listing is split into loops here. An iteration of such a loop blends one Gaussian into one block for
+every lane of a SIMD packet (16 blocks with AVX-512). It needs an x86-64 processor and Dr.Jit's LLVM backend, and no
+other program.
 
-The instructions of a turn are those in the body, each counted once: the additions into the gradient, one per lane, as
-if all lanes were active. The loop that walks to the next word of the list lies within and is counted apart.
+The instructions of an iteration are those of the body, each counted once; additions into the gradient, one per lane,
+are counted as if all lanes were active. The inner loop to the next word of the list is counted separately.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -48,49 +48,49 @@ LOOPS = {"blend": "blend", "adjoint": "blend (adjoint)"}
 
 @dataclass(frozen=True)
 class Options:
-    """What to count and where to write it."""
+    """Workloads and output."""
 
     workload: tuple[Path, ...]
-    """Files .npz with one workload each."""
+    """Workload files, .npz."""
     json: Path | None = None
-    """Where the figures go; standard output if left out."""
+    """JSON file for the figures; default is standard output."""
     repeats: int = 15
-    """Timed steps; medians count."""
+    """Number of timed steps; medians are reported."""
 
 
 def take_step(gaussians: Gaussians, camera: Camera) -> None:
-    """Take the one step that is listed and timed: colour, forward and backward."""
+    """Take one step: colour, forward and backward."""
     timing.stages(gaussians, camera)["step"]()
     dr.sync_thread()
 
 
 def print_listing(workload: str) -> None:
-    """Take one step with a log level that prints every kernel; for a process of its own."""
+    """Take one step with a log level that prints every kernel; to be run in a separate process."""
     mi.set_variant("llvm_ad_rgb")
     dr.set_log_level(dr.LogLevel.Trace)
     take_step(*workloads.load(Path(workload)))
 
 
 def listing(workload: Path) -> str:
-    """Return what Dr.Jit prints of one step on a workload, kernels in IR and machine code."""
+    """Return Dr.Jit's log of one step on a workload: kernels in IR and machine code."""
     code = "import sys; from benchmarks.speed.count_instructions import print_listing; print_listing(sys.argv[1])"
     with tempfile.TemporaryDirectory() as folder:
         environment = os.environ | {"DRJIT_CACHE_DIR": folder}
         command = [sys.executable, "-c", code, str(workload.resolve())]
         done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=Path(__file__).parents[2])
     if done.returncode:
-        raise SystemExit(f"count_instructions.py: the step that is listed failed:\n{done.stderr[-2000:]}")
+        raise SystemExit(f"count_instructions.py: the listed step failed:\n{done.stderr[-2000:]}")
     return done.stdout + done.stderr
 
 
 # --------------------------------------------------------------------------------------------------
-#  How often, and how fast
+#  Iterations and speed
 # --------------------------------------------------------------------------------------------------
 
 
 def walk_counts(lists: BlockLists, blocks: loops.Blocks, layout: loops.Layout) -> tuple[Any, Any]:
-    """Return, per lane in the order of the packets, entries walked before the stop and pixels that they reach."""
-    # The loops' own parts, so that the stop falls where it falls there.
+    """Return per lane, in the order of the packets, the entries walked before the stop and the pixels they affect."""
+    # The functions of the traced loops, so that the stop is the same.
     block = loops._Block(layout, blocks)
 
     def body(walk, end, x, y, T, walked, reached, records, words, entries):
@@ -112,7 +112,7 @@ def walk_counts(lists: BlockLists, blocks: loops.Blocks, layout: loops.Layout) -
 
 
 def work(gaussians: Gaussians, camera: Camera, lanes: int) -> dict[str, Any]:
-    """Return how often the loops turn, and how much of a turn is of use."""
+    """Return the iterations of the loops and their utilisation."""
     config = RenderConfig()
     layout = loops.Layout((loops.Channel(3, True),), False, False, config)
     with dr.suspend_grad():
@@ -145,14 +145,14 @@ def stage_times(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str,
             dr.sync_thread()
             total = 1e3 * (time.perf_counter() - start)
             history = dr.kernel_history()
-        row, stage = Counter(), "projection and lists"
+        row, stage = defaultdict[str, float](float), "projection and lists"
         for entry in history:
             ir = entry.get("ir") or ""
             ir = ir if isinstance(ir, str) else ir.getvalue()
             found = next((name for name, label in LOOPS.items() if f"; Symbolic loop: {label}\n" in ir), None)
             row[found or stage] += entry["execution_time"]
             stage = {"blend": "loss", "adjoint": "projection's adjoint"}.get(found or "", stage)
-        row["outside kernels"] = total - row.total()
+        row["outside kernels"] = total - sum(row.values())
         row["step"] = total
         if k >= 2:
             rows.append(row)
@@ -160,7 +160,7 @@ def stage_times(gaussians: Gaussians, camera: Camera, repeats: int) -> dict[str,
 
 
 def clock_ghz() -> float:
-    """Return the clock, from a chain of integer additions and exclusive-ors, which take one cycle each."""
+    """Return the clock in GHz, measured by a chain of integer additions and exclusive-ors of one cycle each."""
     a, b = dr.opaque(mi.UInt32, 0x9E3779B9), dr.opaque(mi.UInt32, 0x85EBCA6B)
 
     def chain(turns: int) -> float:
@@ -182,7 +182,7 @@ def clock_ghz() -> float:
 
 
 def report(path: Path, repeats: int) -> dict[str, Any]:
-    """Return all figures of one workload."""
+    """Return the figures of one workload."""
     gaussians, camera = workloads.load(path)
     log = listing(path)
     found = re.search(r"<(\d+) x float>", log)
@@ -192,18 +192,18 @@ def report(path: Path, repeats: int) -> dict[str, Any]:
     result["clock_ghz"] = clock_ghz()
     result["milliseconds"] = stage_times(gaussians, camera, repeats)
     for name, label in LOOPS.items():
-        body, within = main_loop(kernel_code(log, label))
+        body, inner = main_loop(kernel_code(log, label))
         figures = counts(body)
         busy = 1e6 * result["milliseconds"][name] * dr.thread_count() * result["clock_ghz"] / result["turns"]
         figures["per_packet_of_pixels"] = round(figures["total"] / result["pixels_per_block"], 1)
         figures["cycles_per_turn"] = round(busy)
         figures["instructions_per_cycle"] = round(figures["total"] / busy, 2)
-        result[name] = figures | {"next_word": len(within)}
+        result[name] = figures | {"next_word": len(inner)}
     return result
 
 
 def main(options: Options) -> None:
-    """Count, measure and write."""
+    """Run the benchmark."""
     if platform.machine() not in ("x86_64", "AMD64"):
         raise SystemExit(f"count_instructions.py: expected an x86-64 processor, got {platform.machine()}.")
     mi.set_variant("llvm_ad_rgb")

@@ -1,12 +1,12 @@
-"""Time a later frame of the loop, stage by stage, at two sizes, and say what it is worth.
+"""Time the stages of a later frame of the loop at two sizes, and report bytes and PSNR.
 
     python -m benchmarks.speed.frame_speed --json out.json [--sizes small n3dv] [--frames 3]
 
-The scene is made of Gaussians, and so are its pictures, with the noise of a camera: a wall, a floor, 40 balls of
-which some move and turn. The loop starts from the scene at frame 0 with its colours disturbed a little, as a fit
-would leave them. `small` is 640x480, 12 views, 50,000 Gaussians; `n3dv` 1352x1014, 20 views, 200,000 Gaussians.
-One more view is held out. Each setting is run on the same pictures: the default at several numbers of epochs, with
-nothing left out, and the paper's scheme.
+The scene consists of Gaussians: a wall, a floor and 40 balls, of which some move and turn. Its images are rendered from
+them, with camera noise. The loop starts from the scene at frame 0 with small errors in its colours, similar to those of
+a fit. `small` is 640x480, 12 views, 50,000 Gaussians; `n3dv` 1352x1014, 20 views, 200,000 Gaussians. One more view is
+held out. Each setting is run on the same images: the default at several numbers of epochs, without skipping static
+parts, and the paper's scheme.
 """
 
 from __future__ import annotations
@@ -34,32 +34,32 @@ from morgs_mi.method.config import MotionConfig
 from morgs_mi.presets import apply_preset
 from morgs_mi.stream_loop import StreamConfig, StreamLoop
 
-# What a frame spends its time in, by the function that does it.
+# Stages of a frame: file and function that are timed.
 STAGES = {
-    "change": "_changes",
-    "flow": "_cues",
-    "part": "_part",
-    "targets": "Target.__init__",
-    "lift": "lift_flow",
-    "propagation": "propagate_motion",
-    "steps": "optimise",
-    "density": "densification_scores",
-    "packet": "residual_packet",
-    "decoding": "decode",
+    "change": ("stream_loop.py", "_changes"),
+    "flow": ("stream_loop.py", "_observe"),
+    "part": ("stream_loop.py", "_active_set"),
+    "targets": ("losses/ssim.py", "__init__"),
+    "lift": ("method/lift.py", "lift_flow"),
+    "propagation": ("method/propagation.py", "propagate_motion"),
+    "steps": ("fit/optimise.py", "optimise"),
+    "density": ("losses/attribution.py", "densification_scores"),
+    "packet": ("codec/packets.py", "residual_packet"),
+    "decoding": ("codec/packets.py", "decode"),
 }
 NOISE = 2.0  # grey levels
 
 
 @dataclass(frozen=True)
 class Size:
-    """A rig and a scene.
+    """Size of a rig and its scene.
 
     Attributes:
-        width: in px.
-        height: in px.
-        views: that are trained on.
-        gaussians: in all.
-        movers: balls that move, out of 40.
+        width: width of the images, px.
+        height: height of the images, px.
+        views: number of training views.
+        gaussians: number of Gaussians.
+        movers: number of moving balls, out of 40.
     """
 
     width: int
@@ -74,24 +74,24 @@ SIZES = {"small": Size(640, 480, 12, 50_000, 3), "n3dv": Size(1352, 1014, 20, 20
 
 @dataclass(frozen=True)
 class Options:
-    """What to time and where to write it."""
+    """Sizes, settings and output."""
 
     json: Path | None = None
-    """Where the figures go; standard output if left out."""
+    """JSON file for the figures, which are also printed."""
     sizes: tuple[str, ...] = ("small", "n3dv")
-    """Out of small and n3dv."""
+    """Sizes to run, among small and n3dv."""
     frames: int = 3
-    """Later frames; the first compiles and does not count, medians of the others do."""
+    """Number of later frames; the first is warm-up, medians of the others are reported."""
     epochs: tuple[int, ...] = (1, 2, 4, 8)
-    """Of the default settings."""
+    """Numbers of epochs of the default settings."""
     full: tuple[str, ...] = ("small",)
-    """Sizes at which the paper's scheme and a fit that leaves nothing out are run, too; they take minutes."""
+    """Sizes at which the paper's scheme and a fit without skipping are also run; they take minutes."""
     seed: int = 0
-    """Of scene and noise."""
+    """Seed of scene and noise."""
 
 
 class Scene:
-    """Gaussians on a wall, a floor and 40 balls, at any frame."""
+    """Moving scene of Gaussians on a wall, a floor and 40 balls."""
 
     def __init__(self, size: Size, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -111,12 +111,12 @@ class Scene:
         self.sh = (0.9 * waves)[:, None, :].astype(np.float32)
         spacing = np.where(self.owner < 0, (18 / flat) ** 0.5, (4 * np.pi * 0.22**2 / each) ** 0.5)
         self.scales = np.repeat(0.7 * spacing[:, None], 3, 1)
-        # Those that are nearest to the middle move: a compact part of the picture.
+        # The balls nearest to the centre move: a compact region of the image.
         self.moving = np.argsort(np.linalg.norm(centers[:, :2], axis=1))[: size.movers]
         self.direction = rng.normal(size=(40, 3)) * (0.02, 0.02, 0.01)
 
     def at(self, frame: int) -> Gaussians:
-        """Return the truth."""
+        """Return the true Gaussians of a frame."""
         angle = 0.05 * frame
         turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
         own = self.owner[len(self.ground) :]
@@ -125,13 +125,14 @@ class Scene:
         return self.gaussians(np.concatenate([self.ground, balls]))
 
     def gaussians(self, means: np.ndarray, noise: float = 0.0, seed: int = 0) -> Gaussians:
+        """Return Gaussians at the given means [N, 3], with noise of a standard deviation `noise` on the SH."""
         rng, count = np.random.default_rng(seed), len(means)
         sh = self.sh + noise * rng.normal(size=self.sh.shape)
         quats, opacities = np.tile([1.0, 0, 0, 0], (count, 1)), np.full(count, 0.9)
         return Gaussians.from_activated(means, self.scales, quats, opacities, sh, logit_confidence=np.zeros(count))
 
     def cameras(self) -> list[Camera]:
-        """Return the held-out view and then the others, on an arc in two rows."""
+        """Return the held-out camera and then the training cameras, on an arc in two rows."""
         angles = np.linspace(-0.5, 0.5, self.size.views)
         places = [(5 * np.sin(a), -0.6 + 0.5 * (i % 2), -4.5 * np.cos(a)) for i, a in enumerate(angles)]
         size = (self.size.width, self.size.height)
@@ -139,17 +140,17 @@ class Scene:
 
 
 def film(gaussians: Gaussians, cameras: list[Camera], rng: np.random.Generator) -> list[np.ndarray]:
-    """Return what the cameras record."""
-    pictures = []
+    """Return the recorded image of each camera."""
+    images = []
     for camera in cameras:
         image = np.asarray(rasterize(gaussians, camera, ("color",)).color)
         noisy = 255 * image + rng.normal(0, NOISE, image.shape)
-        pictures.append(np.clip(noisy + 0.5, 0, 255).astype(np.uint8))
-    return pictures
+        images.append(np.clip(noisy + 0.5, 0, 255).astype(np.uint8))
+    return images
 
 
 def measure(size: Size, config: StreamConfig, recorded: list[list[np.ndarray]], scene: Scene) -> dict[str, Any]:
-    """Fit the later frames and return seconds by stage, shares of what was worked on, bytes and held-out PSNR."""
+    """Fit the later frames; return seconds by stage, shares of the processed parts, bytes and held-out PSNR."""
     cameras = scene.cameras()
     loop = StreamLoop(cameras[1:], np.zeros((200, 3)), np.zeros((200, 3)), config)
     start = scene.gaussians(np.asarray(scene.at(0).means), 0.02)
@@ -159,13 +160,14 @@ def measure(size: Size, config: StreamConfig, recorded: list[list[np.ndarray]], 
         profile = cProfile.Profile()
         dr.sync_thread()
         _, report = profile.runcall(loop.push, images[1:])
+        assert loop.gaussians is not None
         found = np.asarray(rasterize(loop.gaussians, cameras[0], ("color",)).color)
         squares = (np.clip(found, 0, 1) - images[0] / 255.0) ** 2
         rows.append(
             {
                 "seconds": report.seconds,
                 **{f"{name}_s": value for name, value in stages(profile).items()},
-                **report.effort,
+                **report.active,
                 "bytes": report.num_bytes,
                 "psnr": -10 * np.log10(squares.mean()),
             }
@@ -174,19 +176,18 @@ def measure(size: Size, config: StreamConfig, recorded: list[list[np.ndarray]], 
 
 
 def stages(profile: cProfile.Profile) -> dict[str, float]:
-    """Return the seconds of each stage; what no stage claims is the rest."""
+    """Return the cumulative seconds of each stage."""
     timed = pstats.Stats(profile).stats  # type: ignore[attr-defined]
     seconds = dict.fromkeys(STAGES, 0.0)
-    for (file, _, function), (_, _, _, cumulative, _) in timed.items():
-        for name, wanted in STAGES.items():
-            owner = "losses.py" if wanted == "Target.__init__" else ""
-            if "morgs_mi" in file and file.endswith(owner) and function == wanted.split(".")[-1]:
+    for (path, _, function), (_, _, _, cumulative, _) in timed.items():
+        for name, (file, timed_function) in STAGES.items():
+            if Path(path).as_posix().endswith(f"morgs_mi/{file}") and function == timed_function:
                 seconds[name] += cumulative
     return seconds
 
 
 def settings(options: Options, name: str, base: StreamConfig) -> dict[str, StreamConfig]:
-    """Return what is run at a size, by name."""
+    """Return the settings that are run at a size, by name."""
     runs = {f"default, {e} epochs": replace(base, fit=replace(base.fit, epochs=e)) for e in options.epochs}
     if name in options.full:
         runs["8 epochs, nothing left out"] = replace(base, fit=replace(base.fit, skip_static=False))
@@ -196,6 +197,7 @@ def settings(options: Options, name: str, base: StreamConfig) -> dict[str, Strea
 
 
 def main(options: Options) -> None:
+    """Run the benchmark."""
     mi.set_variant("llvm_ad_rgb")
     result: dict[str, Any] = {
         "seed": options.seed,

@@ -1,4 +1,4 @@
-"""Machine code as Dr.Jit prints it: the instructions of a kernel, its loops, and what they do."""
+"""Machine code as printed by Dr.Jit: instructions of a kernel, loops, and kinds of instructions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 import drjit as dr
 
-# The first pattern that a mnemonic matches from its start decides.
+# The first pattern that matches the start of a mnemonic determines its kind.
 _KINDS = (
     ("multiply-add", r"vfn?m(add|sub)"),
     ("divide", r"v(div|sqrt|rcp|rsqrt)"),
@@ -29,15 +29,15 @@ _KINDS = (
 
 @dataclass(frozen=True)
 class Instruction:
-    """One line of a listing: where it begins, its mnemonic and its operands."""
+    """One line of a listing: address, mnemonic and operands."""
 
-    place: int
+    address: int
     name: str
     operands: str
 
     @property
     def jump(self) -> int | None:
-        """Distance of a direct jump, counted from the next instruction; None for all others."""
+        """Distance of a direct jump from the next instruction; None for other instructions."""
         return int(self.operands) if self.name.startswith("j") and re.fullmatch(r"-?\d+", self.operands) else None
 
 
@@ -49,7 +49,7 @@ def kernel_code(log: str, label: str) -> list[Instruction]:
     found = []
     for text in log[start:].splitlines()[1:] if start >= 0 else ():
         if match := line.match(text):
-            if match[2] != "nop":  # padding: nothing falls through to it
+            if match[2] != "nop":  # padding, never executed
                 found.append(Instruction(int(match[1], 16), match[2], match[3]))
         elif not text.startswith("jit_llvm_disasm(): ..."):
             break
@@ -59,16 +59,16 @@ def kernel_code(log: str, label: str) -> list[Instruction]:
 
 
 def successors(code: list[Instruction]) -> list[list[int]]:
-    """Return which instructions can follow each, by index."""
-    index = {instruction.place: k for k, instruction in enumerate(code)}
+    """Return the indices of the possible successors of each instruction."""
+    index = {instruction.address: k for k, instruction in enumerate(code)}
     result = []
     for k, instruction in enumerate(code):
         follows = [k + 1] if k + 1 < len(code) and not re.match(r"(jmp|ret)", instruction.name) else []
         if instruction.jump is not None:
-            # Padding is left out, so the next line does not tell where a jump ends; its reach tells its size.
+            # Padding is skipped, so the size of a jump is determined from its distance and not from the next line.
             short = -128 <= instruction.jump <= 127
             size = 2 if short else 5 if instruction.name == "jmp" else 6
-            target = index.get(instruction.place + size + instruction.jump)
+            target = index.get(instruction.address + size + instruction.jump)
             if target is not None:
                 follows.append(target)
         result.append(follows)
@@ -76,7 +76,7 @@ def successors(code: list[Instruction]) -> list[list[int]]:
 
 
 def cycles(nodes: set[int], follows: list[list[int]]) -> list[set[int]]:
-    """Return the strongly connected parts of more than one node among `nodes` (Kosaraju)."""
+    """Return the strongly connected components with more than one node among `nodes` (Kosaraju)."""
     order: list[int] = []
     seen: set[int] = set()
     for root in nodes:
@@ -95,37 +95,37 @@ def cycles(nodes: set[int], follows: list[list[int]]) -> list[set[int]]:
         for child in follows[node]:
             if child in nodes:
                 before[child].append(node)
-    parts, left = [], set(nodes)
+    components, remaining = [], set(nodes)
     for root in reversed(order):
-        part, todo = set(), [root]
+        component, todo = set(), [root]
         while todo:
             node = todo.pop()
-            if node in left:
-                left.remove(node)
-                part.add(node)
+            if node in remaining:
+                remaining.remove(node)
+                component.add(node)
                 todo += before[node]
-        if len(part) > 1:
-            parts.append(part)
-    return parts
+        if len(component) > 1:
+            components.append(component)
+    return components
 
 
 def inner_loops(loop: set[int], follows: list[list[int]]) -> list[set[int]]:
-    """Return the loops inside a loop: the cycles that are left without its entry."""
+    """Return the loops inside a loop: the cycles that remain without its entry."""
     entries = {child for k, children in enumerate(follows) if k not in loop for child in children if child in loop}
     return cycles(loop - (entries or {min(loop)}), follows)
 
 
 def main_loop(code: list[Instruction]) -> tuple[list[Instruction], list[Instruction]]:
-    """Return (body of the longest loop inside the loop over packets, what loops inside it once more)."""
+    """Return the body of the longest loop inside the loop over packets, and the instructions of its inner loops."""
     follows = successors(code)
     packets = max(cycles(set(range(len(code))), follows), key=len)
     loop = max(inner_loops(packets, follows), key=len)
-    within = set().union(*inner_loops(loop, follows))
-    return [code[k] for k in sorted(loop - within)], [code[k] for k in sorted(within)]
+    inner = set().union(*inner_loops(loop, follows))
+    return [code[k] for k in sorted(loop - inner)], [code[k] for k in sorted(inner)]
 
 
 def kind(instruction: Instruction) -> str:
-    """Return what an instruction does; moves are told apart by where they read and write."""
+    """Return the kind of an instruction; moves are classified by their operands as load, store or move."""
     if instruction.name.startswith("vpmulld"):
         return "integer"
     if instruction.name in ("vmovq", "vmovd") and "[" not in instruction.operands:
@@ -139,12 +139,12 @@ def kind(instruction: Instruction) -> str:
 
 
 def counts(code: list[Instruction]) -> dict[str, Any]:
-    """Count instructions by what they do, and those that touch memory by where it is."""
+    """Return the number of instructions by kind, and of memory accesses by location."""
     memory = Counter()
     for instruction in code:
         if "[" in instruction.operands and instruction.name != "lea":
-            places = {"rsp": "stack", "rip": "constant"}
-            place = next((name for register, name in places.items() if register in instruction.operands), "data")
-            memory[f"{place} {'stores' if kind(instruction) == 'store' else 'loads'}"] += 1
+            locations = {"rsp": "stack", "rip": "constant"}
+            location = next((name for register, name in locations.items() if register in instruction.operands), "data")
+            memory[f"{location} {'stores' if kind(instruction) == 'store' else 'loads'}"] += 1
     kinds = Counter(map(kind, code))
     return {"total": len(code), "kinds": dict(kinds.most_common()), "memory": dict(memory.most_common())}

@@ -1,8 +1,8 @@
-"""The renderer without its tricks, as a baseline: one lane per pixel walks all Gaussians of its 16x16 tile.
+"""Baseline renderer: one lane per pixel traverses all Gaussians of its 16x16 tile.
 
-It shares the package's projection and cut-offs, hence its image, and nothing else: the lists have one level and no
-test beyond the bounding box, every pixel gathers every record for itself, and its adjoint scatters nine numbers for
-every pair of pixel and Gaussian. The notation is that of `morgs_mi.render.compositing`.
+It shares only the projection and the cut-offs with the package, hence renders the same image. Its lists have one level
+and test only the bounding box, every pixel gathers every record itself, and its adjoint scatters nine numbers for every
+pair of pixel and Gaussian. The notation is that of `morgs_mi.render.compositing`.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def _columns(splats: Splats) -> list[Any]:
 
 
 def _tile_lists(splats: Splats, camera: Camera) -> tuple[Any, Any, Any]:
-    """Return (entries, first, end): Gaussians sorted by tile and depth, and each tile's stretch."""
+    """Return (entries, first, end): Gaussians sorted by tile and depth, and the range of each tile."""
     UInt32, size = mi.UInt32, dr.opaque(mi.UInt32, TILE)
     across, down = (dr.opaque(UInt32, -(-edge // TILE)) for edge in (camera.width, camera.height))
     order = dr.argsort(dr.select(splats.valid, splats.depths, dr.inf))
@@ -82,7 +82,7 @@ def _tile_lists(splats: Splats, camera: Camera) -> tuple[Any, Any, Any]:
         dr.scatter(entries, order, first + k)
         return k + 1, tile_of, entries, x0, y0, columns, counts, first, order, across
 
-    # Lanes without work divide as well, and an integer division by zero ends the process.
+    # Inactive lanes also divide, and an integer division by zero ends the process.
     columns = dr.maximum(columns, 1)
     state = (UInt32(0), tile_of, entries, x0, y0, columns, counts, ends - counts, order, across)
     _, tile_of, entries, *_ = dr.while_loop(state, lambda k, *s: k < s[5], enter, label="plain: tile entries")
@@ -156,9 +156,9 @@ def _adjoint(
         record = [dr.gather(mi.Float, column, i) for column in columns]
         a, b, c = record[2:5]
         alpha, full, dx, dy, u = _alpha(record, x, y, config)
-        w, seen = T * alpha, sum(gc * v for gc, v in zip(g, record[6:], strict=True))
-        S = S - w * seen
-        d = dr.select(full <= config.alpha_max, log(2) * (w * seen - alpha * S / (1 - alpha)), 0)
+        w, product = T * alpha, sum(gc * v for gc, v in zip(g, record[6:], strict=True))
+        S = S - w * product
+        d = dr.select(full <= config.alpha_max, log(2) * (w * product - alpha * S / (1 - alpha)), 0)
         geometry = (2 * d * u * a, 2 * d * (u * b + c * c * dy), -2 * d * u * dx, -2 * d * u * dy, -2 * d * c * dy * dy)
         for total, value in zip(sums, [*geometry, d, *(w * gc for gc in g)], strict=True):
             dr.scatter_add(total, value, i, active=alpha > 0)

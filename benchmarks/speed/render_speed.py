@@ -1,11 +1,12 @@
-"""Time the renderer: one optimisation step on a workload, or a ladder of sizes, beside what else there is.
+"""Time the renderer: one optimisation step on a workload, or on a ladder of sizes, compared with baselines.
 
     python -m benchmarks.speed.render_speed --workload W1.npz --json out.json [--yardstick BIN] [--baselines]
     python -m benchmarks.speed.render_speed [--quick] --json out.json --csv out.csv --plot out.png [--baselines]
 
 The whole step is: projection, lists, forward, L1 loss against a constant, adjoint, the projection's adjoint, and the
-gradients of all attributes in memory. All programs run in turns, so that they meet the same noise: compare ratios.
-Without `--workload` it climbs a ladder, one property at a time: Gaussians, image size, size of the splats, channels.
+gradients of all attributes in memory. All programs run in turn, so that background load affects them equally: compare
+ratios. Without `--workload` a ladder of workloads varies one property at a time: number of Gaussians, image size, size
+of the splats, channels.
 """
 
 from __future__ import annotations
@@ -32,30 +33,30 @@ from morgs_mi.render.channels import channel_sizes
 
 @dataclass(frozen=True)
 class Options:
-    """What to time and where to write it."""
+    """Workloads, programs and output."""
 
     workload: Path | None = None
-    """File .npz with one workload; the ladder if left out."""
+    """Workload file, .npz; default is the ladder."""
     json: Path | None = None
-    """Where the figures go; standard output if left out."""
+    """JSON file for the figures; default is standard output."""
     yardstick: Path | None = None
-    """Program to run on the same workloads."""
+    """Program to compare with on the same workloads."""
     repeats: int = 9
-    """Timed repetitions per round; the median counts."""
+    """Timed repetitions per round; medians are reported."""
     rounds: int = 3
-    """Rounds; ours, the yardstick's and the baselines' take turns, so that all meet the same noise."""
+    """Number of rounds, in each of which the renderer, the yardstick and the baselines run in turn."""
     variant: str = "llvm_ad_rgb"
     """Mitsuba variant."""
     baselines: bool = False
-    """Also time Mitsuba's volprim_rf_basic and a renderer with one lane per pixel."""
+    """Whether to also time Mitsuba's volprim_rf_basic and a renderer with one lane per pixel."""
     quick: bool = False
-    """A short ladder, under a minute."""
+    """Whether to run a short ladder of less than a minute."""
     csv: Path | None = None
-    """The ladder as a table."""
+    """CSV file for the ladder."""
     plot: Path | None = None
-    """The ladder as a picture; needs matplotlib."""
+    """Plot of the ladder; needs matplotlib."""
     seed: int = 1
-    """Of the ladder's Gaussians and of the pixels whose error is measured."""
+    """Seed of the ladder's Gaussians and of the pixels whose error is measured."""
 
 
 def figures(
@@ -68,7 +69,7 @@ def figures(
 ) -> dict[str, Any]:
     """Return medians over the rounds, their ratios, memory and error for one workload."""
     ours = timing.stages(gaussians, camera, channels, num_features)
-    memory = timing.peak_megabytes(ours["step"])  # before the other stages hold what they need
+    memory = timing.peak_megabytes(ours["step"])  # before the other stages allocate memory
     others, left_out = timing.baselines(gaussians, camera, channels) if options.baselines else ({}, {})
     yardstick = timing.Yardstick(options.yardstick) if options.yardstick and channels == ("color",) else None
     rounds: list[dict[str, float]] = []
@@ -76,7 +77,7 @@ def figures(
         row = timing.measure(ours, options.repeats, patience)
         if yardstick:
             row["yardstick_step"] = yardstick.step(gaussians, camera, options.repeats)
-        # What takes a hundred times longer is measured well enough by one run.
+        # The baselines take a hundred times longer; one run is precise enough.
         row |= timing.measure(others, options.repeats, patience=0.5)
         rounds.append(row)
 
@@ -84,13 +85,13 @@ def figures(
     for key in ("yardstick_step", "plain_step", "volprim_step"):
         if key in rounds[0]:
             ratios = [r["step"] / r[key] for r in rounds]
-            # The baselines are so much slower that three decimals would not do.
+            # Ratios to the slow baselines need four decimals.
             result[f"ratio_to_{key.removesuffix('_step')}"] = round(median(ratios), 3 if key == "yardstick_step" else 4)
             if key == "yardstick_step":
                 result["ratio_per_round"] = [round(r, 3) for r in ratios]
-    for key, part, whole in (("tenth_share", "tenth_step", "step"), ("loss_share", "loss", "forward")):
-        if part in rounds[0]:
-            result[key] = round(median(r[part] / r[whole] for r in rounds), 3)
+    for key, share, whole in (("tenth_share", "tenth_step", "step"), ("loss_share", "loss", "forward")):
+        if share in rounds[0]:
+            result[key] = round(median(r[share] / r[whole] for r in rounds), 3)
     if left_out:
         result["left_out"] = left_out
     result["peak_megabytes"] = memory
@@ -137,7 +138,7 @@ def climb(options: Options) -> dict[str, Any]:
 
 
 def write_csv(rows: list[dict[str, Any]], path: Path) -> None:
-    """Write one line per rung; lists of words are joined, what a rung lacks stays empty."""
+    """Write one line per rung; lists are joined by spaces, missing figures are empty."""
     names = list(dict.fromkeys(name for row in rows for name in row if name not in ("left_out", "ratio_per_round")))
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, names, extrasaction="ignore", lineterminator="\n")
@@ -147,7 +148,7 @@ def write_csv(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def plot(rows: list[dict[str, Any]], path: Path) -> None:
-    """Draw time and memory against the pixels on the lists, log-log."""
+    """Plot time and memory over the pixels on the lists, log-log."""
     from matplotlib.figure import Figure
 
     overhead = [row["step_ms"] for row in rows if row.get("series") == "overhead"]
@@ -171,7 +172,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
     slope = largest["step_ms"] / largest["listed_megapixels"]
     left.plot([min(x), max(x)], [slope * min(x), slope * max(x)], "k:", linewidth=1, label="linear")
     if overhead:
-        left.axhline(overhead[0], color="C2", linestyle="--", linewidth=1, label="step of next to nothing")
+        left.axhline(overhead[0], color="C2", linestyle="--", linewidth=1, label="step of the smallest workload")
     right.plot(x, [row["peak_megabytes"] for row in rows], "s", color="C4", label="peak of a step, Dr.Jit")
     right.plot(x, [1e-6 * row["list_bytes"] for row in rows], "v", color="C0", label="lists")
     for axis, key in ((left, "step_ms"), (right, "peak_megabytes")):
@@ -187,7 +188,7 @@ def plot(rows: list[dict[str, Any]], path: Path) -> None:
 
 
 def main(options: Options) -> None:
-    """Run the rounds and write the medians."""
+    """Run the benchmark."""
     mi.set_variant(options.variant)
     result = time_workload(options.workload, options) if options.workload else climb(options)
     text = json.dumps(result, indent=2)

@@ -1,4 +1,4 @@
-"""Timing, peak memory and error of one workload, and the programs it is compared with."""
+"""Timing, peak memory and error of one workload, and the baselines."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from benchmarks.reports.reference64 import Twin
+from benchmarks.reports.reference64 import Reference64
 from benchmarks.speed import plain
 from benchmarks.workloads import TARGET, write_bin
 from morgs_mi import Camera, Gaussians, RenderConfig, ellipsoids, rasterize
@@ -26,8 +26,8 @@ from morgs_mi.render.blocks import build_lists
 from morgs_mi.render.projection import project
 from morgs_mi.render.region import Region, full_view
 
-# Pairs of pixel and Gaussian that the float64 twin is asked for.
-_TWIN_PAIRS = 20_000_000
+# Pairs of pixel and Gaussian that are computed in float64.
+_REFERENCE_PAIRS = 20_000_000
 # Mitsuba's integrator traces rays through a hierarchy: beyond this a step takes many seconds.
 VOLPRIM_GAUSSIANS, VOLPRIM_PIXELS = 20_000, 512 * 384
 
@@ -35,8 +35,8 @@ VOLPRIM_GAUSSIANS, VOLPRIM_PIXELS = 20_000, 512 * 384
 def timed(work: Callable[[], Any], repeats: int, patience: float = float("inf")) -> float:
     """Return the median time of `work` in ms, synchronised, after two runs of warm-up.
 
-    Work that returns a function is what comes before the work: the function is timed alone. Once `patience` seconds are
-    spent, one run of warm-up and one timed one have to do.
+    If `work` returns a function, only that function is timed. After `patience` seconds, one warm-up and one timed run
+    suffice.
     """
     times: list[float] = []
     while len(times) < repeats + 2 and (len(times) < 2 or sum(times) < 1e3 * patience):
@@ -56,7 +56,7 @@ def timed(work: Callable[[], Any], repeats: int, patience: float = float("inf"))
 def stages(
     gaussians: Gaussians, camera: Camera, channels: tuple[str, ...] = ("color",), num_features: int = 0, seed: int = 1
 ) -> dict[str, Callable[[], Any]]:
-    """Return what is timed.
+    """Return the timed stages by name.
 
     Lists (with projection), forward (with lists), adjoint (from the image's gradient to the attributes'), and the whole
     step; for colour alone also the step on a tenth of the tiles, drawn at random, and the L1 + D-SSIM loss with its
@@ -128,18 +128,18 @@ def stages(
 
 
 def _distance(image: Any, channels: tuple[str, ...], target: Any, size: int) -> Any:
-    """Return the L1 distance of the colour to its target and of the other channels to 0.5, summed up, over `size`."""
+    """Return the sum of L1 distances of the colour to its target and of the other channels to 0.5, over `size`."""
     errors = (dr.abs(getattr(image, name) - (target if name == "color" else 0.5)) for name in channels)
     return sum(dr.sum(error, axis=None) for error in errors) / size
 
 
 def measure(works: dict[str, Callable[[], Any]], repeats: int, patience: float = float("inf")) -> dict[str, float]:
-    """Return the median ms of every piece of work."""
+    """Return the median ms of every stage."""
     return {name: timed(work, repeats, patience) for name, work in works.items()}
 
 
 def extent(gaussians: Gaussians, camera: Camera) -> dict[str, float]:
-    """Return how much there is to draw: pairs of Gaussian and block, their pixels in millions, and the lists' bytes."""
+    """Return the number of pairs of Gaussian and block, their pixels in millions, and the bytes of the lists."""
     config = RenderConfig()
     with dr.suspend_grad():
         region = full_view(camera.width, camera.height, config)
@@ -151,7 +151,7 @@ def extent(gaussians: Gaussians, camera: Camera) -> dict[str, float]:
 
 
 def peak_megabytes(work: Callable[[], Any]) -> float:
-    """Return the most memory that Dr.Jit has held at once while `work` was done, in MB, inputs included."""
+    """Return the peak memory of Dr.Jit during `work`, in MB, including the inputs."""
     dr.sync_thread()
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
@@ -161,14 +161,14 @@ def peak_megabytes(work: Callable[[], Any]) -> float:
 
 
 def error(gaussians: Gaussians, camera: Camera, seed: int) -> dict[str, float]:
-    """Return the colour's largest and RMS error against float64 at a sample of pixels."""
-    count = max(16, min(256, _TWIN_PAIRS // len(gaussians)))
+    """Return the largest and the RMS error of the colour at a sample of pixels, compared with float64."""
+    count = max(16, min(256, _REFERENCE_PAIRS // len(gaussians)))
     chosen = np.random.default_rng(seed).choice(camera.width * camera.height, count, replace=False)
     pixels = np.stack([chosen % camera.width, chosen // camera.width], axis=1)
     with dr.suspend_grad():
         image = np.asarray(rasterize(gaussians, camera, ("color",)).color, np.float64)
-    twin = Twin(gaussians.numpy(), camera, RenderConfig()).render(pixels)[:, :3]
-    difference = image[pixels[:, 1], pixels[:, 0]] - twin
+    reference = Reference64(gaussians.numpy(), camera, RenderConfig()).render(pixels)[:, :3]
+    difference = image[pixels[:, 1], pixels[:, 0]] - reference
     figures = {"error_max": np.abs(difference).max(), "error_rms": np.sqrt(np.mean(difference**2))}
     return {name: float(f"{value:.3g}") for name, value in figures.items()}
 
@@ -183,7 +183,7 @@ def plain_stages(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[],
 
 
 def volprim_stages(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[], Any]]:
-    """Return forward and whole step of Mitsuba's own `volprim_rf_basic` over the same Gaussians, one sample a pixel."""
+    """Return forward and whole step of Mitsuba's `volprim_rf_basic` on the same Gaussians, one sample per pixel."""
     scene: Any = mi.load_dict(
         {
             "type": "scene",
@@ -214,7 +214,7 @@ def volprim_stages(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[
 
 
 def baselines(gaussians: Gaussians, camera: Camera, channels: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the baselines' stages for this workload, and why others are left out."""
+    """Return the stages of the baselines, and the reasons for which others are omitted."""
     if channels != ("color",):
         return {}, {"baselines": "they render colour only"}
     works = plain_stages(gaussians, camera)
@@ -225,13 +225,13 @@ def baselines(gaussians: Gaussians, camera: Camera, channels: tuple[str, ...]) -
 
 
 class Yardstick:
-    """A program `BIN FILE.bin REPETITIONS THREADS` that prints the median of its own whole step."""
+    """External program `BIN FILE.bin REPETITIONS THREADS` that prints the median time of its whole step."""
 
     def __init__(self, program: Path) -> None:
         self.program = program.resolve()
 
     def step(self, gaussians: Gaussians, camera: Camera, repeats: int) -> float:
-        """Return its own median of its whole step in ms."""
+        """Return the median time of the program's whole step, ms."""
         with tempfile.TemporaryDirectory() as folder:
             workload = Path(folder) / "workload.bin"
             write_bin(gaussians, camera, workload)

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.capture.layouts.clips import clips_by_camera
-from morgs_mi.core.files import whole
+from morgs_mi.core.files import atomic_path
 from morgs_mi.io.video import open_frames
 
 __all__ = ["CalibrateConfig", "CalibrationResult", "calibrate"]
@@ -107,7 +107,7 @@ def calibrate(
                 f"{', '.join(left_out)}: move these so that neighbours see the same objects, {_MORE_TEXTURE}, "
                 "calibrate on another frame (--frame), or accept the partial model (--partial)."
             )
-        with whole(path / "sparse", "calibrate()") as folder:
+        with atomic_path(path / "sparse", "calibrate()") as folder:
             (folder / "0").mkdir(parents=True)
             model.write_text(str(folder / "0"))
     error = float(model.compute_mean_reprojection_error())

@@ -10,7 +10,7 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.files import whole
+from morgs_mi.core.files import atomic_path
 
 __all__ = ["draw_rig", "write_rig"]
 
@@ -33,7 +33,7 @@ def write_rig(path: Path, capture: Capture) -> None:
         raise ValueError(f"{path}: the suffix of a plot must be .png or .jpg, got {suffix!r}; rename it.")
     image = draw_rig(capture.cameras, capture.points, capture.point_colors, capture.test_view)
     data = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
-    with whole(path, "write_rig()") as partial:
+    with atomic_path(path, "write_rig()") as partial:
         partial.parent.mkdir(parents=True, exist_ok=True)
         partial.write_bytes(data)
 

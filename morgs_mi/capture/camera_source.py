@@ -11,7 +11,7 @@ import numpy as np
 from morgs_mi.capture.color_correction import ColorCorrection
 from morgs_mi.capture.lens import Lens, Undistortion
 from morgs_mi.core.camera import Camera
-from morgs_mi.io.video import FrameReader, Picture
+from morgs_mi.io.video import FrameReader, ImageOrError
 
 __all__ = ["CameraSource", "at_clip_size"]
 
@@ -34,7 +34,7 @@ class CameraSource:
     frame_indices: np.ndarray
     color_correction: ColorCorrection | None = None
 
-    def images(self, camera: Camera, start: int, stop: int) -> Generator[Picture, None, None]:
+    def images(self, camera: Camera, start: int, stop: int) -> Generator[ImageOrError, None, None]:
         """Yield the processed images of the instants start..stop-1, with an error in place of a missing image."""
         for image in self.reader.pick(self.frame_indices[start:stop].tolist()):
             yield self.process(image, camera) if isinstance(image, np.ndarray) else image

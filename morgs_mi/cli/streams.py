@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import groupby, pairwise
@@ -16,6 +16,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cli.console import OUT, progress, say, warn
 from morgs_mi.demo import DemoConfig
+from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.evaluate.tables import evaluation_summary, evaluation_tables, figure
 from morgs_mi.presets import PresetName, apply_preset
 from morgs_mi.stream_loop import StreamConfig
@@ -127,16 +128,16 @@ class Eval:
 
         network = None if self.lpips is None else Lpips(self.lpips)
         with progress() as report:
-            result = evaluate_stream(self.out, self.capture, partial(report, "Judging frames"), network)
+            result = evaluate_stream(self.out, self.capture, partial(report, "Evaluating frames"), network)
             if self.pictures is not None:
                 draw_stream(self.out, self.pictures, self.capture, partial(report, "Drawing frames"))
-        result |= {"machine": machine(), "versions": versions()}
+        figures = {**result.as_dict(), "machine": machine(), "versions": versions()}
         if self.json == Path("-"):
-            say(json.dumps(finite(result), indent=2))
+            say(json.dumps(finite(figures), indent=2))
             return
         _show(result)
         if self.json is not None:
-            write_json(self.json, result)
+            write_json(self.json, figures)
             say(f"All figures: {self.json}")
         if self.pictures is not None:
             say(f"Pictures: {self.pictures}")
@@ -202,14 +203,14 @@ class Demo:
         say(f"all figures are in {self.out / 'report.json'}.")
 
 
-def _show(result: Mapping[str, Any]) -> None:
-    """Print what `evaluate_stream` has found."""
+def _show(result: Evaluation) -> None:
+    """Print an evaluation."""
     for table in evaluation_tables(result):
         OUT.print(table)
     for sentence in evaluation_summary(result):
         say(sentence)
-    if not result["complete"]:
-        warn(f"{result['stream']}: the fit was not finished, its stream holds {result['num_frames']} frames.")
+    if not result.complete:
+        warn(f"{result.stream}: the fit was not finished, its stream holds {result.num_frames} frames.")
 
 
 def _runs(numbers: Sequence[int]) -> list[range]:

@@ -1,1 +1,1 @@
-"""Residuals to bytes and back."""
+"""Encoder and decoder of the stream: Gaussians to bytes and back."""

@@ -1,4 +1,4 @@
-"""How much of a frame is kept in the stream."""
+"""Settings of the stream's encoder."""
 
 from __future__ import annotations
 
@@ -10,35 +10,36 @@ __all__ = ["CodecConfig"]
 
 @dataclass(frozen=True)
 class CodecConfig:
-    """Settings of the stream; a decoder needs none of them.
+    """Settings of the encoder; a decoder needs none of them.
 
-    A step is twice an error that is tolerated, so that rounding stays within. In a later frame a group of numbers that
-    all change by less than a step is left as it is, for that is mostly the fit's jitter, but for colours: such a group
-    may be off by the step.
+    A step is twice the tolerated error, so that rounding stays within it. In a later frame, a group of numbers in which
+    no change reaches a step stays unchanged, as such changes are mostly jitter of the fit. The threshold of the base
+    colour is half a step.
 
     Raises:
         ValueError: a number is out of range.
     """
 
     quality: float = 1.0
-    """Divides the tolerated errors below: 2 doubles the precision of everything, 1000 is as good as float32."""
+    """Divisor of the tolerated errors below: 2 doubles the precision of everything, 1000 is as good as float32."""
     birth_precision: float = 4.0
-    """How much more precise Gaussians are when they appear: that is written once and seen for many frames."""
+    """Factor of the precision of new Gaussians: they are written once and seen for many frames."""
     error_px: float = 0.04
-    """What centres, sizes and rotations may be off on screen, in px, in the camera that sees them largest: a step is
-    about a tenth of a pixel."""
+    """Tolerated error of means, scales and rotations on screen, in px, in the camera that magnifies them most: a step
+    is about a tenth of a pixel."""
     error_color: float = 1 / 255
-    """What a colour may be off, from 0 to 1; in the SH of degree 1 and up for each coefficient."""
+    """Tolerated error of a colour, from 0 to 1; of each coefficient for the SH of degree 1 and up."""
     error_opacity: float = 0.005
-    """What an opacity may be off where it is most sensitive, at 0.5."""
+    """Tolerated error of an opacity where the sigmoid is steepest, at 0.5."""
     error_confidence: float = 0.05
-    """What a confidence may be off where it is most sensitive, at 0.5: it gates the fit, so all else shows its loss."""
+    """Tolerated error of a confidence where the sigmoid is steepest, at 0.5: it gates the fit, so its error affects all
+    other attributes."""
     offset: bool = False
-    """Also write the learned offset of what moves, for viewing: nothing is decoded from it but itself."""
+    """Storage of the learned offset of moving Gaussians, for viewing; no other value is decoded from it."""
     target_size: int = 0
-    """Bytes that a later frame may take: it is coded more coarsely until it fits. 0: as many as the quality takes."""
+    """Bound of the bytes of a later frame, which is coded more coarsely until it fits; 0: no bound."""
     keyframe_interval: int = 30
-    """Every how many frames the whole state is written once more, so that a reader can start there; 0: never."""
+    """Frames between re-emitted keyframes, which contain the whole state and at which a reader can start; 0: never."""
 
     def __post_init__(self) -> None:
         for name in ("quality", "birth_precision", "error_px", "error_color", "error_opacity", "error_confidence"):

@@ -1,4 +1,4 @@
-"""The stream: packets that are checked one by one, appended one by one, and readable while they are written.
+"""The container of the stream: packets that are checked and appended one by one, and readable while they are written.
 
     stream  = magic [8], version uint32, packet*
     packet  = kind uint32, frame uint32, length uint64, crc uint32, payload [length]
@@ -6,8 +6,8 @@
 
 All numbers are little-endian. The CRC-32 covers the packet's first 16 bytes and its payload. Packet 0 is
 the header, whose payload is JSON alone: cameras, frame rate and free metadata. A stream that was closed ends with an
-index: (kind uint32, frame uint32, offset uint64) of each packet but the header, then its own offset uint64 and a magic
-[8]. What is in the arrays is the matter of `codec.gaussians`; docs/stream-format.md has it all.
+index: (kind uint32, frame uint32, offset uint64) of each packet except the header, then its own offset uint64 and a
+magic [8]. `codec.packets` defines the arrays; docs/stream-format.md specifies everything.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from functools import cached_property
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -51,16 +52,16 @@ __all__ = [
 MAGIC, INDEX_MAGIC = b"MORGS-MI", b"MORGSIDX"
 VERSION = 2
 PREAMBLE = struct.Struct("<8sI")
-HEAD = struct.Struct("<IIQ")  # kind, frame, payload length: what the CRC covers beside the payload
+HEAD = struct.Struct("<IIQ")  # kind, frame, payload length; the CRC covers these and the payload
 ENTRY = struct.Struct("<IIQ")  # kind, frame, offset
 TRAILER = struct.Struct("<Q8s")
 _U32 = struct.Struct("<I")
-PAYLOAD = HEAD.size + _U32.size  # where it begins in a packet
+PAYLOAD = HEAD.size + _U32.size  # offset of the payload in a packet
 _DTYPES = ("float32", "uint32", "uint8")
 
 
 class PacketKind(IntEnum):
-    """What a packet is for."""
+    """Kind of a packet."""
 
     HEADER = 0
     KEYFRAME = 1
@@ -69,46 +70,67 @@ class PacketKind(IntEnum):
 
 
 class TruncatedStreamError(ValueError):
-    """The stream ends inside a packet: it was cut off, or its writer has not finished that packet."""
+    """The stream ends inside a packet: it was truncated, or its writer has not finished that packet."""
 
 
 @dataclass(frozen=True, eq=False)
 class Packet:
-    """What the stream says about one frame.
+    """Data of one frame.
 
     Attributes:
-        kind: `KEYFRAME` (stands alone) or `RESIDUAL` (changes the frame before).
+        kind: `KEYFRAME` (self-contained) or `RESIDUAL` (changes since the frame before).
         frame: index of the video frame.
-        arrays: float32, uint32 or uint8 arrays of any shape, by name.
+        arrays: float32, uint32 or uint8 arrays of any shape, by name; read-only copies of those that are passed.
     """
 
     kind: PacketKind
     frame: int
     arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        arrays = {name: np.array(array) for name, array in self.arrays.items()}
+        for array in arrays.values():
+            array.setflags(write=False)
+        object.__setattr__(self, "arrays", MappingProxyType(arrays))
+
+    @cached_property
+    def encoded(self) -> bytes:
+        """The packet as bytes of the file; they are computed once.
+
+        Raises:
+            ValueError: the kind is not `KEYFRAME` or `RESIDUAL`, the frame is not a uint32, or an array has another
+                dtype.
+        """
+        if self.kind not in (PacketKind.KEYFRAME, PacketKind.RESIDUAL):
+            raise ValueError(f"Packet.encoded: `kind` must be KEYFRAME or RESIDUAL, got {self.kind!r}.")
+        if not 0 <= self.frame < 2**32:
+            raise ValueError(f"Packet.encoded: `frame` must be in 0..2^32-1, got {self.frame}.")
+        for name, array in self.arrays.items():
+            if array.dtype.name not in _DTYPES:
+                raise ValueError(
+                    f"Packet.encoded: `{name}` must be one of {', '.join(_DTYPES)}, got {array.dtype}; convert it."
+                )
+        table = json.dumps([[n, a.dtype.name, a.shape] for n, a in self.arrays.items()]).encode()
+        arrays = (a.astype(a.dtype.newbyteorder("<")).tobytes() for a in self.arrays.values())
+        return _sealed(self.kind, self.frame, b"".join([_U32.pack(len(table)), table, *arrays]))
+
+    @property
+    def num_bytes(self) -> int:
+        """Number of bytes that the packet takes in the file."""
+        return len(self.encoded)
+
 
 def encode_packet(packet: Packet) -> bytes:
-    """Return the packet as the bytes that stand in the file.
+    """Return `packet.encoded`, the inverse of `decode_packet`.
 
     Raises:
-        ValueError: the kind is `HEADER`, the frame is not a uint32, or an array has another dtype.
+        ValueError: the packet cannot be encoded.
     """
-    if packet.kind not in (PacketKind.KEYFRAME, PacketKind.RESIDUAL):
-        raise ValueError(f"encode_packet(): `kind` must be KEYFRAME or RESIDUAL, got {packet.kind!r}.")
-    if not 0 <= packet.frame < 2**32:
-        raise ValueError(f"encode_packet(): `frame` must be in 0..2^32-1, got {packet.frame}.")
-    for name, array in packet.arrays.items():
-        if array.dtype.name not in _DTYPES:
-            raise ValueError(
-                f"encode_packet(): `{name}` must be one of {', '.join(_DTYPES)}, got {array.dtype}; convert it."
-            )
-    table = json.dumps([[n, a.dtype.name, a.shape] for n, a in packet.arrays.items()]).encode()
-    arrays = (a.astype(a.dtype.newbyteorder("<")).tobytes() for a in packet.arrays.values())
-    return _sealed(packet.kind, packet.frame, b"".join([_U32.pack(len(table)), table, *arrays]))
+    return packet.encoded
 
 
 def decode_packet(data: bytes) -> Packet:
-    """Return the packet that `encode_packet` turned into `data`.
+    """Return the packet with the encoding `data`.
 
     Raises:
         ValueError: the bytes are not exactly one intact keyframe or residual packet.
@@ -123,17 +145,17 @@ def decode_packet(data: bytes) -> Packet:
 
 
 class StreamWriter:
-    """Appends packets to a new stream; each is on its way when `write` returns.
+    """Writer that appends packets to a new stream; a packet is handed to the system when `write` returns.
 
     Args:
-        sink: the file, an existing one is replaced; or something binary to write to, such as a pipe or a socket's
-            file, which is left open.
+        sink: path of the file, replacing an existing one; or a binary file object, such as a pipe or the file of a
+            socket, which is left open.
         cameras: the rig.
         fps: frames per second.
-        metadata: anything that JSON can hold.
+        metadata: any value that JSON can represent.
 
     Raises:
-        ValueError: `metadata` is no JSON.
+        ValueError: `metadata` is not JSON.
         OSError: the file cannot be opened or written.
     """
 
@@ -145,12 +167,14 @@ class StreamWriter:
         metadata: Mapping[str, Any] | None = None,
     ) -> None:
         payload = header_json(cameras, fps, metadata or {}).encode()
-        self._owned = isinstance(sink, str | Path)
-        self.path = Path(sink if self._owned else str(getattr(sink, "name", "stream")))
         self.num_bytes = 0
         self._index: list[tuple[int, int, int]] | None = []
-        # Unbuffered: a buffer would try to write its rest again after a failed packet has been taken back.
-        self._file = open(self.path, "wb", buffering=0) if self._owned else sink  # noqa: SIM115
+        self._file: BinaryIO
+        if isinstance(sink, str | Path):
+            # Unbuffered: a buffer would write its rest again after a failed packet has been removed.
+            self.path, self._owned, self._file = Path(sink), True, open(sink, "wb", buffering=0)  # noqa: SIM115
+        else:
+            self.path, self._owned, self._file = Path(str(getattr(sink, "name", "stream"))), False, sink
         try:
             self._append(PREAMBLE.pack(MAGIC, VERSION) + _sealed(PacketKind.HEADER, 0, payload))
         except OSError:
@@ -160,15 +184,15 @@ class StreamWriter:
 
     @classmethod
     def continued(cls, path: str | Path, index: Sequence[tuple[int, int, int]], end: int) -> StreamWriter:
-        """Return the writer of a file whose writing was interrupted; what stands from byte `end` on is cut off.
+        """Return the writer of a file whose writing was interrupted; the file is truncated at byte `end`.
 
         Args:
             path: the file.
-            index: (kind, frame, offset) of its packets but the header, as `StreamReader.whole` finds them.
-            end: where the last of them ends.
+            index: (kind, frame, offset) of its packets except the header, as returned by `StreamReader.check`.
+            end: end of the last of them.
 
         Raises:
-            OSError: the file cannot be opened or cut off.
+            OSError: the file cannot be opened or truncated.
         """
         writer = cls.__new__(cls)
         writer._owned, writer.path, writer.num_bytes, writer._index = True, Path(path), end, list(index)
@@ -182,11 +206,11 @@ class StreamWriter:
 
         Raises:
             ValueError: the packet cannot be encoded, or the stream was closed.
-            OSError: it could not be written; a file ends with the last whole packet again.
+            OSError: it could not be written; a file is truncated to its last complete packet.
         """
         if self._index is None:
             raise ValueError(f"{self.path}: expected a stream that is still open, got one that was closed.")
-        at, size = self.num_bytes, self._append(encode_packet(packet))
+        at, size = self.num_bytes, self._append(packet.encoded)
         self._index.append((packet.kind, packet.frame, at))
         return size
 
@@ -196,7 +220,7 @@ class StreamWriter:
             entries = b"".join(ENTRY.pack(*entry) for entry in self._index)
             payload = entries + TRAILER.pack(self.num_bytes, INDEX_MAGIC)
             self._index = None
-            with contextlib.suppress(OSError):  # a full disk, a closed pipe: readers can do without
+            with contextlib.suppress(OSError):  # a full disk or a closed pipe; readers do not need the index
                 self._append(_sealed(PacketKind.INDEX, 0, payload))
         if self._owned:
             self._file.close()
@@ -215,17 +239,17 @@ class StreamWriter:
             while rest:
                 rest = rest[self._file.write(rest) :]
             self._file.flush()
-        except BaseException as error:  # a Ctrl-C must leave whole packets too
+        except BaseException as error:  # Ctrl-C must leave complete packets too
             if self._owned:
-                with contextlib.suppress(OSError):  # a device cannot be taken back
+                with contextlib.suppress(OSError):  # a device cannot be truncated
                     self._file.truncate(self.num_bytes)
                     self._file.seek(self.num_bytes)
             if not isinstance(error, OSError):
                 raise
             raise OSError(
                 error.errno,
-                f"{self.path}: {len(data)} bytes could not be written ({error.strerror}), the file keeps its "
-                f"{self.num_bytes} bytes of whole packets; free space on the disk",
+                f"{self.path}: {len(data)} bytes could not be written ({error.strerror}), the file still has its "
+                f"{self.num_bytes} bytes of complete packets; free space on the disk",
             ) from error
         self.num_bytes += len(data)
         return len(data)
@@ -237,7 +261,7 @@ def _sealed(kind: int, frame: int, payload: bytes) -> bytes:
 
 
 def open_packet(data: bytes) -> tuple[int, int, memoryview]:
-    """Return (kind, frame, payload) of a packet of any kind.
+    """Return (kind, frame, payload) of an encoded packet of any kind.
 
     Raises:
         ValueError: its length or its CRC is wrong.
@@ -261,7 +285,7 @@ def _arrays(payload: memoryview) -> dict[str, np.ndarray]:
     for name, dtype, shape in json.loads(bytes(payload[_U32.size : at])):
         sound = isinstance(name, str) and all(type(n) is int and n >= 0 for n in shape)
         if not sound or dtype not in _DTYPES:
-            raise ValueError(f"`{name}` is said to be {dtype} {shape}")
+            raise ValueError(f"`{name}` is declared as {dtype} {shape}")
         stored = np.dtype(dtype).newbyteorder("<")
         end = at + math.prod(shape) * stored.itemsize
         if end > len(payload):
@@ -277,7 +301,7 @@ def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, An
     """Return a header's payload as JSON.
 
     Raises:
-        ValueError: it does not fit into JSON.
+        ValueError: JSON cannot represent it.
     """
     fields = {"cameras": [_camera_fields(camera) for camera in cameras], "fps": float(fps), "metadata": dict(metadata)}
     try:

@@ -1,19 +1,19 @@
 """Integers <-> words: adaptive entropy coding in columns.
 
-A column is an array of integers that are expected to follow one distribution. Each integer v becomes a token, and
-where the token stands for more than one value the rest of its bits are coded as they are:
+A column is an array of integers that are expected to follow one distribution. Each integer v becomes a token. Where a
+token stands for more than one value, the remaining bits are coded uniformly:
 
     m = |v| below 16, else 12 + k with k = floor(log2 |v|), the rest being |v| - 2^k of k bits
     token = 0 for v = 0, 2 m - 1 for v > 0, 2 m for v < 0
 
 Tokens are coded in blocks of 16, 16, 32, 64, ...; the distribution of a block follows from the tokens of the blocks
-before it, so nothing about it is stored. docs/stream-format.md says it to the bit.
+before it, so it is not stored. docs/stream-format.md specifies every bit.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 import constriction
 import numpy as np
@@ -23,17 +23,18 @@ __all__ = ["LIMIT", "ColumnReader", "ColumnWriter", "column_bits"]
 LIMIT = 2**30
 """Integers must lie between -LIMIT and LIMIT."""
 
-_QUEUE, _MODEL = constriction.stream.queue, constriction.stream.model
+_stream = cast(Any, constriction).stream  # a compiled submodule, which type checkers cannot see
+_QUEUE, _MODEL = _stream.queue, _stream.model
 _DIRECT = 16
 _TOKENS = 2 * 42 + 1
 _BLOCK = 16
-_LOW = 16  # bits that one uniform model takes; it has room for fewer than 24
-_WEIGHT = 32  # of a token that was seen, against the prior below
+_LOW = 16  # bits of one uniform model, which must have fewer than 24
+_WEIGHT = 32  # of an observed token, relative to the prior below
 _PRIOR = np.maximum(1, 256 // (1 + np.arange(_TOKENS)) ** 2)
 
 
 class ColumnWriter:
-    """Collects columns of integers and turns them into words."""
+    """Encoder of columns of integers."""
 
     def __init__(self) -> None:
         self._encoder = _QUEUE.RangeEncoder()
@@ -45,21 +46,21 @@ class ColumnWriter:
         for block in _blocks(len(tokens)):
             self._encoder.encode(tokens[block], _model(counts) if block.start else _FIRST)
             counts += _WEIGHT * np.bincount(tokens[block], minlength=_TOKENS)
-        for shift, some in _parts(bits):
-            part = (rest[some] >> shift) & (2**_LOW - 1)
+        for shift, some in _halves(bits):
+            half = (rest[some] >> shift) & (2**_LOW - 1)
             width = np.minimum(bits[some] - shift, _LOW)
-            self._encoder.encode(part.astype(np.int32), _MODEL.Uniform(), (1 << width).astype(np.int32))
+            self._encoder.encode(half.astype(np.int32), _MODEL.Uniform(), (1 << width).astype(np.int32))
 
     def words(self) -> np.ndarray:
-        """Return everything so far as uint32."""
+        """Return the words of all columns so far, uint32."""
         return self._encoder.get_compressed()
 
 
 class ColumnReader:
-    """Takes columns out of words in the order in which they were put in.
+    """Decoder of columns, in the order in which they were encoded.
 
     Args:
-        words: uint32, of any content: damage gives wrong integers or a ValueError, never more of them.
+        words: uint32 with any content: damage results in wrong integers or a ValueError, never in more integers.
     """
 
     def __init__(self, words: np.ndarray) -> None:
@@ -69,7 +70,7 @@ class ColumnReader:
         """Return the next column, int64 [count].
 
         Raises:
-            ValueError: the words cannot be those of such a column.
+            ValueError: the words do not encode such a column.
         """
         tokens, counts = np.zeros(count, np.int64), _PRIOR.copy()
         try:
@@ -83,19 +84,19 @@ class ColumnReader:
                 return np.where(tokens % 2, m, -m)
             bits = np.where(m < _DIRECT, 0, m - 12)
             rest = np.zeros(count, np.int64)
-            for shift, some in _parts(bits):
+            for shift, some in _halves(bits):
                 width = np.minimum(bits[some] - shift, _LOW)
                 rest[some] |= (
                     self._decoder.decode(_MODEL.Uniform(), (1 << width).astype(np.int32)).astype(np.int64) << shift
                 )
-        except AssertionError as error:  # constriction's way to say that no symbol has this code
+        except AssertionError as error:  # raised by constriction where no symbol has this code
             raise ValueError(f"its code is broken ({error})") from None
         size = np.where(bits > 0, (1 << bits) + rest, m)
         return np.where(tokens % 2, size, -size)
 
 
 def column_bits(values: np.ndarray) -> float:
-    """Return about how many bits a column takes: the entropy of its tokens and the bits beside them."""
+    """Return an estimate of the bits of a column: the entropy of its tokens plus their remaining bits."""
     tokens, bits, _ = _tokens(values)
     counts = np.bincount(tokens)
     counts = counts[counts > 0]
@@ -103,7 +104,7 @@ def column_bits(values: np.ndarray) -> float:
 
 
 def _tokens(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return tokens int32, the number of bits beside each, and those bits."""
+    """Return the tokens as int32, the number of remaining bits of each, and those bits."""
     size = np.abs(values.astype(np.int64))
     assert size.max(initial=0) < LIMIT
     if size.max(initial=0) < _DIRECT:
@@ -122,8 +123,8 @@ def _blocks(count: int) -> Iterator[slice]:
         start, stop = stop, 2 * stop
 
 
-def _parts(bits: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """Yield (shift, which) of the low and the high halves of the bits that stand beside the tokens."""
+def _halves(bits: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Yield (shift, indices) of the low and the high halves of the remaining bits."""
     for shift in (0, _LOW):
         some = np.flatnonzero(bits > shift)
         if len(some):
@@ -134,4 +135,4 @@ def _model(counts: np.ndarray) -> Any:
     return _MODEL.Categorical(counts.astype(np.float64), perfect=False)
 
 
-_FIRST = _model(_PRIOR)  # every column begins with it
+_FIRST = _model(_PRIOR)  # of the first block of every column

@@ -1,11 +1,12 @@
-"""Frames <-> packets: a keyframe states all integers of a frame, a residual what changes from the frame before.
+"""Frames <-> packets: a keyframe contains all integers of a frame, a residual the changes since the frame before.
 
-The state of a stream is a `CodedFrame`. Encoder and decoder get it from the same packets by the same integers, so the
-two cannot drift: after making a packet, take `decode` of it as the new state, and fit the next frame to that. Each
+The state of a stream is a `CodedFrame`. Encoder and decoder compute it from the same packets with the same integers, so
+the two cannot drift: after making a packet, take its `decode` as the new state, and fit the next frame to that. Each
 residual also names the state that it continues, and is refused by any other.
 
-`source` [N'] says who is who: the index of the same Gaussian in the frame before, -1 for one that was born. Survivors
-come first in ascending order, births after them. Each keeps its number in `ids` for life, births get the next free.
+`source` [N'] maps a frame to the frame before: the index of the same Gaussian there, -1 for a birth. Survivors come
+first in ascending order, births after them. Each Gaussian has one number in `ids` for life; births get the next free
+ones.
 """
 
 from __future__ import annotations
@@ -14,13 +15,28 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import blake2b
+from math import prod
 
 import numpy as np
 
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import Packet, PacketKind
 from morgs_mi.codec.entropy import LIMIT, ColumnReader, ColumnWriter, column_bits
-from morgs_mi.codec.quantisation import Grid, attributes, bounded, columns_of, new_grid, real_values, step_sizes
+from morgs_mi.codec.quantisation import (
+    KNOWN_OPTIONAL,
+    Grid,
+    bounded,
+    columns_of,
+    finite_fields,
+    new_grid,
+    num_exponents,
+    optional_mask,
+    optional_names,
+    real_values,
+    split_groups,
+    step_sizes,
+    stored_fields,
+)
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.codec.residuals import columns_of_change, take_change
 from morgs_mi.core.camera import Camera
@@ -37,11 +53,11 @@ __all__ = [
     "seek",
 ]
 
-# A packet has at least a word per 16 Gaussians that it brings, so that no damaged number can ask for much memory.
+# A packet has at least one word per 16 Gaussians that it adds, so that a damaged count cannot request much memory.
 _PER_WORD = 16
-# Where no number of a group changes by a step, that is the fit's jitter, but colours show every bit of it. A little
-# less than a step, for a decoded state is rounded to float32, and must give the packet that it came from.
-_LEAST, _LEAST_COLOR = 0.99, 0.5
+# Changes below a step are jitter of the fit, but in the base colour every bit is visible. Slightly less than a step,
+# because a decoded state is rounded to float32 and must give the packet that it was decoded from.
+_THRESHOLD, _THRESHOLD_DC = 0.99, 0.5
 _COARSEST = 80  # quarter octaves: a million times the step
 
 
@@ -52,10 +68,10 @@ class CodedFrame:
     Attributes:
         frame: index of the video frame.
         grid: its N Gaussians as integers.
-        ids: uint32 [N], ascending: which Gaussian each one is, from its birth to its death.
-        next_id: what the next to be born gets.
-        gaussians: the same as numbers; `motion` is the displacement since the frame before, zero where there is none,
-            `offset` its learned part, None if the packet does not tell.
+        ids: uint32 [N], ascending: the number of each Gaussian from its birth to its death.
+        next_id: number of the next birth.
+        gaussians: the Gaussians that the integers stand for; `motion` is the displacement since the frame before, zero
+            where there is none, `offset` its learned part, None if the packet does not contain it.
     """
 
     frame: int
@@ -69,7 +85,7 @@ class CodedFrame:
 
     @cached_property
     def digest(self) -> np.ndarray:
-        """BLAKE2b of all integers, uint8 [8]: what a residual names as its parent."""
+        """BLAKE2b of all integers, uint8 [8], by which a residual names its parent."""
         grid, hashed = self.grid, blake2b(digest_size=8)
         for array, dtype in (
             (self.ids, "<u4"),
@@ -77,35 +93,37 @@ class CodedFrame:
             (grid.exponents, "i1"),
             (grid.values, "<i4"),
         ):
-            hashed.update(np.ascontiguousarray(array, dtype))
-        hashed.update(np.array([self.next_id, grid.degree], "<u4"))
+            hashed.update(np.ascontiguousarray(array, dtype).data)
+        # A mask of the confidence alone follows from the number of exponents.
+        mask = [grid.optional] if grid.optional > 1 else []
+        hashed.update(np.array([self.next_id, grid.degree, *mask], "<u4").data)
         return np.frombuffer(hashed.digest(), np.uint8)
 
 
 def keyframe_packet(
     gaussians: Gaussians, frame: int, cameras: Sequence[Camera] = (), config: CodecConfig | None = None
 ) -> Packet:
-    """Return the packet that states every attribute of `gaussians`, which are new: their numbers count from zero.
+    """Return the packet with every stored attribute of `gaussians`, which are new: their numbers start at zero.
 
     Args:
-        gaussians: N Gaussians; their `motion` and `offset` are not written.
+        gaussians: N Gaussians; their `motion` and `offset` are not stored.
         frame: index of the video frame.
-        cameras: on whose screens errors count.
-        config: what may be off.
+        cameras: cameras on whose screens the error is measured.
+        config: tolerated errors.
 
     Raises:
         ValueError: an attribute is not finite.
     """
-    grid = new_grid(attributes(gaussians), cameras, config or CodecConfig())
+    grid = new_grid(split_groups(finite_fields(gaussians)), cameras, config or CodecConfig())
     return reemitted_keyframe(CodedFrame(frame, grid, np.arange(len(grid), dtype=np.uint32), len(grid), gaussians))
 
 
 def reemitted_keyframe(coded: CodedFrame) -> Packet:
-    """Return the keyframe that leads to the very state `coded`: a place to start from, with nothing lost."""
+    """Return the keyframe that decodes to exactly `coded`: an entry point for readers, without any loss."""
     grid, writer = coded.grid, ColumnWriter()
     writer.put(np.diff(coded.ids.astype(np.int64), prepend=-1) - 1)
     _put_grid(writer, grid)
-    head = np.array([len(grid), grid.degree, grid.has_confidence, coded.next_id], np.uint32)
+    head = np.array([len(grid), grid.degree, grid.optional, coded.next_id], np.uint32)
     return Packet(PacketKind.KEYFRAME, coded.frame, {"head": head, "code": _padded(writer.words(), len(grid))})
 
 
@@ -116,33 +134,28 @@ def residual_packet(
     cameras: Sequence[Camera] = (),
     config: CodecConfig | None = None,
 ) -> Packet:
-    """Return the packet that leads from `previous` to `gaussians` (eq. 3); only those that changed are written.
+    """Return the packet that leads from `previous` to `gaussians` (eq. 3); it contains changed Gaussians only.
 
-    What changed by less than a step, a colour by less than half of one, did not change. With a `target_size`, steps
-    are widened until it is kept.
+    A change counts from one step on, that of a base colour from half a step on. With a `target_size`, the steps of the
+    changes are widened until the packet fits.
 
     Args:
-        previous: state that the decoder has, N Gaussians.
-        gaussians: of the frame after it, N'; their `offset` counts with `config.offset`, where positions change.
-        source: int [N'], see above; None if nobody was born or died.
-        cameras: on whose screens the errors of those born count.
-        config: what may be off.
+        previous: state of the decoder, N Gaussians.
+        gaussians: N' Gaussians of the next frame; with `config.offset`, `offset` is stored where the means change.
+        source: int [N'], see above; None if there are no births and no deaths.
+        cameras: cameras on whose screens the error of births is measured.
+        config: tolerated errors.
 
     Raises:
         ValueError: `source` or the attributes do not fit, or an attribute is not finite.
     """
     config, grid = config or CodecConfig(), previous.grid
-    same = gaussians.sh_degree == grid.degree and (gaussians.logit_confidence is not None) == grid.has_confidence
-    if not same:
-        raise ValueError(
-            f"residual_packet(): frame {previous.frame + 1} must have SH of degree {grid.degree} "
-            f"{'and' if grid.has_confidence else 'but no'} confidence as the frame before; write a keyframe instead."
-        )
+    _check_attributes(previous, gaussians.sh_degree, optional_mask(gaussians.items()))
     source = _checked(np.arange(len(grid)) if source is None else source, len(grid), len(gaussians))
     survivors, births = source[source >= 0], int((source < 0).sum())
-    raw, count = attributes(gaussians), len(survivors)
-    touched = _touched(raw, previous.gaussians.numpy(), survivors)
-    rows = survivors[touched]
+    stored, count = finite_fields(gaussians), len(survivors)
+    touched = _touched(stored, stored_fields(previous.gaussians), survivors)
+    raw, rows = split_groups(stored), survivors[touched]
     change = real_values({name: value[touched] for name, value in raw.items()}, grid.select(rows))
     change -= grid.values[rows].T
     born = new_grid({name: value[count:] for name, value in raw.items()}, cameras, config) if births else None
@@ -152,12 +165,13 @@ def residual_packet(
     def rounded(coarseness: int) -> np.ndarray:
         r, scaled = np.zeros((len(change), len(grid)), np.int32), change / step_sizes(np.array(coarseness))
         for name, at in grid.columns.items():
-            scaled[at][:, np.abs(scaled[at]).max(0) < (_LEAST_COLOR if name == "color" else _LEAST)] = 0
+            largest = np.max(np.abs(scaled[at]), axis=0)
+            scaled[at][:, largest < (_THRESHOLD_DC if name == "sh_dc" else _THRESHOLD)] = 0
         r[:, rows] = np.clip(np.rint(scaled, out=scaled), 1 - LIMIT, LIMIT - 1, out=scaled)
         return r
 
     def offsets(r: np.ndarray, coarseness: int) -> Iterator[np.ndarray]:
-        moved = np.flatnonzero(r[grid.columns["position"]].any(0)[survivors])
+        moved = np.flatnonzero(np.any(r[grid.columns["means"]], axis=0)[survivors])
         offset = np.zeros((len(gaussians), 3)) if gaussians.offset is None else np.asarray(gaussians.offset)
         real = offset[moved] / _offset_steps(grid.select(survivors[moved]), coarseness)
         yield from np.clip(np.rint(real), 1 - LIMIT, LIMIT - 1).astype(np.int32).T
@@ -192,8 +206,8 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
     """Return the state after a packet.
 
     Args:
-        previous: the state before it; a keyframe does not ask for it.
-        packet: of the stream.
+        previous: the state before it; not needed for a keyframe.
+        packet: a packet of the stream.
 
     Raises:
         ValueError: a residual without the state that it continues, or a packet that contradicts itself.
@@ -221,7 +235,7 @@ def coded_frames(packets: Iterable[Packet]) -> Iterator[CodedFrame]:
     """Decode packets in order and yield the state after each frame."""
     coded = None
     for packet in packets:
-        if coded is None or packet.frame != coded.frame:  # a keyframe that restates is for those who start there
+        if coded is None or packet.frame != coded.frame:  # a re-emitted keyframe is for readers that start there
             coded = decode(coded, packet)
             yield coded
 
@@ -232,25 +246,30 @@ def play(packets: Iterable[Packet]) -> Iterator[tuple[int, Gaussians]]:
 
 
 def seek(stream: StreamReader, frame: int) -> CodedFrame:
-    """Return the state at a frame, decoding no more than what lies between it and the keyframe before it.
+    """Return the state at a frame; decoding starts at the last keyframe before it.
 
     Raises:
-        ValueError: the stream has no such frame, is no file, or a packet is broken.
+        ValueError: the stream has no such frame, is not a file, or a packet is broken.
     """
     for coded in coded_frames(stream.near(frame)):
         if coded.frame == frame:
             return coded
-    raise ValueError(f"{stream.path}: expected a frame of the stream, got {frame}; it has none of that number.")
+    raise ValueError(f"{stream.path}: expected a frame of the stream, got {frame}; choose one that it contains.")
 
 
 def _decoded_keyframe(packet: Packet) -> CodedFrame:
     code = packet.arrays["code"]
-    N, degree, has_confidence, next_id = _head(packet, 4)
-    if _PER_WORD * len(code) < N or degree > 3 or has_confidence > 1 or next_id >= LIMIT:
-        raise ValueError(f"its head {[N, degree, has_confidence, next_id]} does not fit its {len(code)} words of code")
+    N, degree, optional, next_id = _head(packet, 4)
+    if unknown := optional & ~KNOWN_OPTIONAL:
+        raise ValueError(
+            f"its mask of optional attributes must have no bits beyond {KNOWN_OPTIONAL:#b}, got {optional:#b} with the "
+            f"unknown {unknown:#b}; read it with the release that wrote it"
+        )
+    if _PER_WORD * len(code) < N or degree > 3 or next_id >= LIMIT:
+        raise ValueError(f"its head {[N, degree, optional, next_id]} does not fit its {len(code)} words of code")
     reader = ColumnReader(code)
     ids = np.cumsum(reader.take(N) + 1) - 1
-    grid = _taken_grid(reader, N, degree, bool(has_confidence))
+    grid = _taken_grid(reader, N, degree, optional)
     if np.any(np.diff(ids, prepend=-1) < 1) or (N and ids[-1] >= next_id):
         raise ValueError("its ids do not ascend")
     return CodedFrame(packet.frame, grid, ids.astype(np.uint32), next_id, grid.gaussians())
@@ -267,23 +286,23 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
     new = replace(grid, values=values).select(survivors)
     motion = np.zeros((len(survivors) + births, 3), np.float32)
     before = np.asarray(previous.gaussians.means)[survivors]
-    motion[: len(survivors)] = new.real("position").astype(np.float32) - before
+    motion[: len(survivors)] = new.real("means").astype(np.float32) - before
     offset = None
     if "offset" in packet.arrays:
-        offset, at, words = np.zeros_like(motion), grid.columns["position"], ColumnReader(packet.arrays["offset"])
-        moved = np.flatnonzero((new.values[:, at] != grid.values[survivors, at]).any(1))
+        offset, at, words = np.zeros_like(motion), grid.columns["means"], ColumnReader(packet.arrays["offset"])
+        moved = np.flatnonzero(np.any(new.values[:, at] != grid.values[survivors, at], axis=1))
         r = np.stack([words.take(len(moved)) for _ in range(3)], axis=1)
         offset[moved] = r * _offset_steps(new.select(moved), coarseness)
     if births:
-        new = new.concatenate(_taken_grid(reader, births, grid.degree, grid.has_confidence))
+        new = new.concatenate(_taken_grid(reader, births, grid.degree, grid.optional))
     ids = np.concatenate([previous.ids[survivors], previous.next_id + np.arange(births, dtype=np.uint32)])
     gaussians = new.gaussians(motion, offset)
     return CodedFrame(packet.frame, new, ids.astype(np.uint32), previous.next_id + births, gaussians)
 
 
 def _offset_steps(grid: Grid, coarseness: int) -> np.ndarray:
-    """Return by how much the integers of an offset count, float64 [N, 1], world units: as those of a displacement."""
-    return grid.steps("position") * step_sizes(np.array(coarseness))
+    """Return the steps of the offsets, float64 [N, 1], world units: those of the changes of the means."""
+    return grid.steps("means") * step_sizes(np.array(coarseness))
 
 
 def _words(columns: Iterable[np.ndarray]) -> np.ndarray:
@@ -296,28 +315,29 @@ def _words(columns: Iterable[np.ndarray]) -> np.ndarray:
 def _put_grid(writer: ColumnWriter, grid: Grid) -> None:
     columns = np.concatenate([grid.largest_components[:, None], grid.exponents, grid.values], axis=1, dtype=np.int64)
     middle = np.sort(columns, axis=0)[len(grid) // 2] if len(grid) else np.zeros(columns.shape[1], np.int64)
-    middle[np.abs(columns - middle).max(0, initial=0) >= LIMIT] = 0  # what is as large as can be is not made larger
+    middle[np.abs(columns - middle).max(0, initial=0) >= LIMIT] = 0  # the difference must not leave the limit
     writer.put(middle)
-    for column in (columns - middle).T:  # small numbers are coded one by one, large ones by their octave
+    for column in (columns - middle).T:  # small integers have a token of their own, large ones one per octave
         writer.put(column)
 
 
-def _taken_grid(reader: ColumnReader, N: int, degree: int, has_confidence: bool) -> Grid:
-    first = 9 + has_confidence  # column of the values
-    middle = reader.take(first + max(at.stop for at in columns_of(degree, has_confidence).values()))
+def _taken_grid(reader: ColumnReader, N: int, degree: int, optional: int) -> Grid:
+    first = 1 + num_exponents(optional)  # column of the values
+    middle = reader.take(first + max(at.stop for at in columns_of(degree, optional).values()))
     columns = np.stack([reader.take(N) + shift for shift in middle], axis=1)
     if np.any((columns[:, 0] < 0) | (columns[:, 0] > 3)):
-        raise ValueError("a quaternion's pivot must be 0 to 3")
+        raise ValueError("the largest component of a quaternion must be 0 to 3")
     exponents = bounded(columns[:, 1:first], 128, "exponent").astype(np.int8)
     values = bounded(columns[:, first:], LIMIT, "value").astype(np.int32)
-    return Grid(values, exponents, columns[:, 0].astype(np.uint8), degree)
+    return Grid(values, exponents, columns[:, 0].astype(np.uint8), degree, optional)
 
 
 def _touched(now: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray], survivors: np.ndarray) -> np.ndarray:
-    """Return who of the survivors has any attribute that differs: the others need not be looked at."""
+    """Return the indices of the survivors with any attribute that differs: the others are skipped."""
     differs = np.zeros(len(survivors), bool)
     for name, value in now.items():
-        differs |= (value[: len(survivors)] != before[name][survivors]).reshape(len(survivors), -1).any(1)
+        different = value[: len(survivors)] != before[name][survivors]
+        differs |= different.reshape(len(survivors), prod(value.shape[1:])).any(1)
     return np.flatnonzero(differs)
 
 
@@ -333,6 +353,16 @@ def _fitting(columns: Callable[[int], Iterator[np.ndarray]], low: int, target: i
     return low
 
 
+def _check_attributes(previous: CodedFrame, degree: int, optional: int) -> None:
+    grid = previous.grid
+    if (degree, optional) != (grid.degree, grid.optional):
+        expected, got = (list(optional_names(mask)) for mask in (grid.optional, optional))
+        raise ValueError(
+            f"residual_packet(): frame {previous.frame + 1} must have SH of degree {grid.degree} and the optional "
+            f"attributes {expected} as the frame before, got degree {degree} and {got}; write a keyframe instead."
+        )
+
+
 def _checked(source: np.ndarray, before: int, now: int) -> np.ndarray:
     source = np.asarray(source)
     born = source < 0
@@ -341,7 +371,7 @@ def _checked(source: np.ndarray, before: int, now: int) -> np.ndarray:
     if not sound or np.any(survivors >= before):
         raise ValueError(
             f"residual_packet(): `source` must be [{now}] with survivors of 0..{before - 1} in ascending order, then "
-            f"-1 for each birth, got {source.shape}; sort the Gaussians so."
+            f"-1 for each birth, got {source.shape}; sort the Gaussians in this order."
         )
     return source
 

@@ -1,50 +1,72 @@
-"""Gaussians <-> integers: every number is a multiple of a step that its Gaussian keeps for life.
+"""Gaussians <-> integers: every number is a multiple of a step, which stays the same for the life of its Gaussian.
 
     value = q * 2^(e / 4)        q int32, e int8: quarter octaves
 
-The columns of `values` [N, C], C = 11 + 3 K (one less without confidence), stand in groups:
+The columns of `values` [N, C] form groups, one per stored row of the attribute table (`core.attributes`), in its order:
 
-    position 3   means, world units
-    size 3       log_scales
-    rotation 3   quats without their largest component, divided by it: (u, v, w) stands for (1, u, v, w) / length
-    opacity 1    logit_opacities
-    color 3      SH of degree 0
-    shine 3 K-3  SH of degree 1 and up
-    confidence 1 logit_confidence
+    means            3       world units
+    log_scales       3
+    quats            3       quats without their largest component, divided by it: (u, v, w) stands for
+                             (1, u, v, w) / length
+    logit_opacities  1
+    sh_dc            3
+    sh_rest          3 K-3
+    any other row            optional attributes, e.g. logit_confidence with 1 column; a bit mask determines which exist
 
-`exponents` [N, 8 or 9] hold one e per axis of the size and one for every other group. Everything a decoder computes
-is element by element in float64, with operations that IEEE 754 rounds in one way only: no machine, library or
-number of threads can change a bit.
+`exponents` [N, E] has one e per axis of log_scales and one for every other group. A decoder computes everything element
+by element in float64, with operations whose rounding IEEE 754 determines: no machine, library or number of threads can
+change a bit.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from math import prod
 
 import numpy as np
 
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.entropy import LIMIT
+from morgs_mi.core.attributes import ATTRIBUTES, BY_NAME, SIGMOID, Attribute
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 
-__all__ = ["GROUPS", "Grid", "attributes", "bounded", "columns_of", "new_grid", "real_values", "step_sizes"]
+__all__ = [
+    "GROUPS",
+    "KNOWN_OPTIONAL",
+    "Grid",
+    "bounded",
+    "columns_of",
+    "finite_fields",
+    "new_grid",
+    "num_exponents",
+    "optional_mask",
+    "optional_names",
+    "real_values",
+    "split_groups",
+    "step_sizes",
+    "stored_fields",
+]
 
-GROUPS = ("position", "size", "rotation", "opacity", "color", "shine", "confidence")
+_STORED: dict[str, Attribute] = {row.name: row for row in ATTRIBUTES if row.error is not None}
+# Every stream has these groups, and `_exponents` has a rule for each; all others are optional.
+_ALWAYS = ("means", "log_scales", "quats", "logit_opacities", "sh_dc", "sh_rest")
+_OPTIONAL = tuple(name for name in _STORED if name not in _ALWAYS)  # by bit of the mask
+GROUPS = (*_ALWAYS, *_OPTIONAL)
+"""Names of the groups of columns, in their order."""
+KNOWN_OPTIONAL = (1 << len(_OPTIONAL)) - 1
+"""Bit mask of all optional attributes that this release can decode."""
 
 _QUARTERS = np.array([1.0, 1.189207115002721, 1.4142135623730951, 1.681792830507429])  # 2^(k/4)
 _STEPS = np.ldexp(_QUARTERS[np.arange(256) & 3], np.arange(256).astype(np.int8) >> 2)  # by e mod 256
-_EXPONENTS = {name: slice(k, k + 1) for k, name in zip((0, 1, 4, 5, 6, 7, 8), GROUPS, strict=True)} | {
-    "size": slice(1, 4)
-}
-_DC = 0.28209479177387814  # basis function of degree 0
-# Beyond these nothing can be seen, and one wild number must not cost the others their steps.
-_MOST_TURN, _MOST_LOGIT, _MOST_CONFIDENCE = 4096.0, 16.0, 6.0
-_SMALLEST_PX = 0.5  # splats below are blurred to about this size when drawn
-_MOST_BITS = 24  # of an integer of who is new
-_FURTHEST = LIMIT - 2**20  # rounded to the coarsest change (see `gaussians`), it still lies within the limit
+# Values beyond these bounds make no visible difference, and one outlier must not cost the others their steps.
+_MAX_RATIO, _MAX_LOGIT, _MAX_OPTIONAL = 4096.0, 16.0, 6.0
+_MIN_SIZE_PX = 0.5  # smaller splats are blurred to about this size when they are drawn
+_MAX_BITS = 24  # of an integer of a new Gaussian
+_MAX_VALUE = LIMIT - 2**20  # stays within the limit when it is rounded to the coarsest change (see `packets`)
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,35 +75,32 @@ class Grid:
 
     Attributes:
         values: int32 [N, C].
-        exponents: int8 [N, 8 or 9].
-        largest_components: uint8 [N], the component of each quaternion that is not written.
+        exponents: int8 [N, E].
+        largest_components: uint8 [N], the component of each quaternion that is not stored.
         degree: of the spherical harmonics, 0 to 3.
+        optional: bit mask of the optional attributes, see `optional_mask`.
     """
 
     values: np.ndarray
     exponents: np.ndarray
     largest_components: np.ndarray
     degree: int
+    optional: int
 
     def __len__(self) -> int:
         return len(self.values)
 
-    @property
-    def has_confidence(self) -> bool:
-        """Whether there is a column of confidences."""
-        return self.exponents.shape[1] == 9
-
     @cached_property
     def columns(self) -> dict[str, slice]:
-        """Where each group stands; those of no width are left out."""
-        return columns_of(self.degree, self.has_confidence)
+        """Columns of each group; groups of no width are left out."""
+        return columns_of(self.degree, self.optional)
 
     def steps(self, name: str) -> np.ndarray:
-        """Return the steps of a group, float64 [N, 3] for the size, [N, 1] for every other."""
-        return step_sizes(self.exponents[:, _EXPONENTS[name]])
+        """Return the steps of a group, float64 [N, 3] for `log_scales`, [N, 1] for every other."""
+        return step_sizes(self.exponents[:, _exponent_columns(self.optional)[name]])
 
     def real(self, name: str) -> np.ndarray:
-        """Return what the integers of a group stand for, float64 [N, its width]."""
+        """Return the numbers that the integers of a group stand for, float64 [N, its width]."""
         return self.values[:, self.columns[name]] * self.steps(name)
 
     def select(self, index: np.ndarray) -> Grid:
@@ -94,7 +113,7 @@ class Grid:
         )
 
     def concatenate(self, other: Grid) -> Grid:
-        """Return these Gaussians and then those of `other`, which have the same columns."""
+        """Return these Gaussians followed by those of `other`, which has the same columns."""
         both = {
             n: np.concatenate([getattr(self, n), getattr(other, n)])
             for n in ("values", "exponents", "largest_components")
@@ -102,41 +121,73 @@ class Grid:
         return replace(self, **both)
 
     def gaussians(self, motion: np.ndarray | None = None, offset: np.ndarray | None = None) -> Gaussians:
-        """Return what the integers stand for, with a displacement and its learned part float32 [N, 3].
+        """Return the Gaussians that the integers stand for.
 
-        Without a displacement nothing has moved; without an offset nothing is known of it.
+        Args:
+            motion: displacement since the frame before, float32 [N, 3]; None for zero.
+            offset: learned part of the displacement, float32 [N, 3]; None if it is unknown.
         """
-        u, v, w = np.ascontiguousarray(self.real("rotation").T)
+        u, v, w = np.ascontiguousarray(self.real("quats").T)
         length = np.sqrt(((1 + u * u) + v * v) + w * w)
         quats = np.empty((len(self), 4), np.float32)
         rows = np.arange(len(self))
         quats[rows, self.largest_components] = 1 / length
-        for k, part in enumerate((u, v, w)):
-            quats[rows, k + (k >= self.largest_components)] = part / length
-        sh = np.concatenate(
-            [self.real(name) for name in ("color", "shine") if name in self.columns], 1, dtype=np.float32
-        )
+        for k, ratio in enumerate((u, v, w)):
+            quats[rows, k + (k >= self.largest_components)] = ratio / length
+        sh = [self.real(name) for name in ("sh_dc", "sh_rest") if name in self.columns]
+        optional = {
+            name: self.real(name).astype(np.float32).reshape(len(self), *_STORED[name].shape)
+            for name in optional_names(self.optional)
+        }
         return Gaussians(
-            means=self.real("position").astype(np.float32),
-            log_scales=self.real("size").astype(np.float32),
+            means=self.real("means").astype(np.float32),
+            log_scales=self.real("log_scales").astype(np.float32),
             quats=quats,
-            logit_opacities=self.real("opacity")[:, 0].astype(np.float32),
-            sh_coeffs=sh.astype(np.float32).reshape(len(self), (self.degree + 1) ** 2, 3),
+            logit_opacities=self.real("logit_opacities")[:, 0].astype(np.float32),
+            sh_coeffs=np.concatenate(sh, 1, dtype=np.float32).reshape(len(self), (self.degree + 1) ** 2, 3),
             motion=np.zeros((len(self), 3), np.float32) if motion is None else motion,
-            logit_confidence=self.real("confidence")[:, 0].astype(np.float32) if self.has_confidence else None,
             offset=offset,
+            **optional,
         )
 
 
-def columns_of(degree: int, has_confidence: bool) -> dict[str, slice]:
-    """Return where each group stands among the columns, in order; those of no width are left out."""
-    widths = (3, 3, 3, 1, 3, 3 * ((degree + 1) ** 2 - 1), int(has_confidence))
-    ends = np.cumsum(widths)
-    return {name: slice(end - width, end) for name, width, end in zip(GROUPS, widths, ends, strict=True) if width}
+def optional_mask(names: Collection[str]) -> int:
+    """Return the bit mask of the optional attributes among `names`: bit k stands for the k-th in the table."""
+    return sum(1 << bit for bit, name in enumerate(_OPTIONAL) if name in names)
+
+
+def optional_names(mask: int) -> tuple[str, ...]:
+    """Return the names of the optional attributes of a bit mask, in the order of the table."""
+    return tuple(name for bit, name in enumerate(_OPTIONAL) if mask >> bit & 1)
+
+
+def columns_of(degree: int, optional: int) -> dict[str, slice]:
+    """Return the columns of each group, in order; groups of no width are left out."""
+    widths = {name: _width(_STORED[name], degree) for name in (*_ALWAYS, *optional_names(optional))}
+    return _slices({name: width for name, width in widths.items() if width})
+
+
+def _width(row: Attribute, degree: int) -> int:
+    """Return the number of columns of a group; -1 in a shape is the number of SH coefficients beyond the first."""
+    return 3 if row.name == "quats" else prod((degree + 1) ** 2 - 1 if n < 0 else n for n in row.shape)
+
+
+def num_exponents(optional: int) -> int:
+    """Return the number E of exponents of a Gaussian."""
+    return max(at.stop for at in _exponent_columns(optional).values())
+
+
+def _exponent_columns(optional: int) -> dict[str, slice]:
+    return _slices({name: 3 if name == "log_scales" else 1 for name in (*_ALWAYS, *optional_names(optional))})
+
+
+def _slices(widths: Mapping[str, int]) -> dict[str, slice]:
+    ends = np.cumsum(list(widths.values())).tolist()
+    return {name: slice(end - width, end) for (name, width), end in zip(widths.items(), ends, strict=True)}
 
 
 def step_sizes(exponents: np.ndarray) -> np.ndarray:
-    """Return 2^(e / 4) as float64 for integers e of -128 to 127: a factor out of four, times a power of two."""
+    """Return 2^(e / 4) as float64 for integers e of -128 to 127: one of four factors, times a power of two."""
     return _STEPS[exponents.astype(np.uint8)]
 
 
@@ -151,86 +202,118 @@ def bounded(values: np.ndarray, limit: int, what: str) -> np.ndarray:
     return values
 
 
-def attributes(gaussians: Gaussians) -> dict[str, np.ndarray]:
-    """Return the raw attributes that a stream holds, by name.
+def stored_fields(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """Return the fields [N, ...] of Gaussians that a stream stores, by name."""
+    return {name: value for name, value in gaussians.numpy().items() if name == "sh_coeffs" or name in GROUPS}
+
+
+def split_groups(stored: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return `stored_fields` by group: the spherical harmonics in two parts."""
+    sh = stored["sh_coeffs"]
+    return {name: value for name, value in stored.items() if name in GROUPS} | {
+        "sh_dc": sh[:, :1],
+        "sh_rest": sh[:, 1:],
+    }
+
+
+def finite_fields(gaussians: Gaussians) -> dict[str, np.ndarray]:
+    """Return the `stored_fields`.
 
     Raises:
         ValueError: one is not finite.
     """
-    raw = {name: value for name, value in gaussians.numpy().items() if name not in ("motion", "offset")}
-    for name, value in raw.items():
+    stored = stored_fields(gaussians)
+    for name, value in stored.items():
         if not np.isfinite(value).all():
             row = np.argwhere(~np.isfinite(value))[0][0]
             raise ValueError(
                 f"the stream: `{name}` must be finite, that of Gaussian {row} is not; lower the learning rates."
             )
-    return raw
+    return stored
 
 
 def new_grid(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> Grid:
-    """Choose the steps of Gaussians that are new, given by their `attributes`, and round them to these."""
+    """Return new Gaussians, given by their raw attributes by group, rounded to steps that are chosen here."""
     raw = {name: np.asarray(value, np.float64) for name, value in raw.items()}
     largest_components = np.abs(raw["quats"]).argmax(1).astype(np.uint8)
-    degree = round(raw["sh_coeffs"].shape[1] ** 0.5) - 1
-    grid = Grid(np.zeros((0, 0), np.int32), _exponents(raw, cameras, config), largest_components, degree)
+    degree = round((1 + raw["sh_rest"].shape[1]) ** 0.5) - 1
+    exponents = _exponents(raw, cameras, config)
+    grid = Grid(np.zeros((0, 0), np.int32), exponents, largest_components, degree, optional_mask(raw))
     values = np.rint(real_values(raw, grid)).astype(np.int32)
     return replace(grid, values=np.ascontiguousarray(values.T))
 
 
+def _bounded_optional(name: str, values: np.ndarray) -> np.ndarray:
+    """Return the values of an optional attribute, clipped where its activation saturates."""
+    return np.clip(values, -_MAX_OPTIONAL, _MAX_OPTIONAL) if BY_NAME[name].activation is SIGMOID else values
+
+
 def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
-    """Return what `Grid.values` of other `attributes` would be without rounding, float64 [C, N]; N as in `grid`."""
+    """Return unrounded `Grid.values` of other raw attributes by group, float64 [C, N], with the steps of `grid`."""
     largest_components, rows = grid.largest_components, np.arange(len(grid.largest_components))
-    quats, sh = np.asarray(raw["quats"], np.float64), raw["sh_coeffs"]
+    quats = np.asarray(raw["quats"], np.float64)
     others = np.stack([quats[rows, k + (k >= largest_components)] for k in range(3)], axis=1)
-    pivot = quats[rows, largest_components][:, None]
-    # A turn by 180 degrees away from where the pivot was chosen divides by zero: then "very far" is what is meant.
-    turn = others / np.where(np.abs(pivot) < 1e-12, 1e-12, pivot)
-    parts = {
-        "position": raw["means"],
-        "size": raw["log_scales"],
-        "rotation": np.clip(turn, -_MOST_TURN, _MOST_TURN),
-        "opacity": np.clip(raw["logit_opacities"], -_MOST_LOGIT, _MOST_LOGIT)[:, None],
-        "color": sh[:, 0],
-        "shine": sh[:, 1:].reshape(len(sh), 3 * sh.shape[1] - 3),
-    }
-    if grid.has_confidence:
-        parts["confidence"] = np.clip(raw["logit_confidence"], -_MOST_CONFIDENCE, _MOST_CONFIDENCE)[:, None]
-    real = np.empty((max(at.stop for at in grid.columns.values()), len(largest_components)))
+    largest = quats[rows, largest_components][:, None]
+    # The component that was the largest at birth is zero after a turn by 180 degrees; the ratio is then very large.
+    ratios = others / np.where(np.abs(largest) < 1e-12, 1e-12, largest)
+    numbers = {name: _bounded_optional(name, raw[name]) for name in optional_names(grid.optional)}
+    numbers |= {name: raw[name] for name in ("means", "log_scales", "sh_dc", "sh_rest")}
+    numbers["quats"] = np.clip(ratios, -_MAX_RATIO, _MAX_RATIO)
+    numbers["logit_opacities"] = np.clip(raw["logit_opacities"], -_MAX_LOGIT, _MAX_LOGIT)
+    real = np.empty((max(at.stop for at in grid.columns.values()), len(rows)))
     for name, at in grid.columns.items():
-        np.divide(parts[name].T, grid.steps(name).T, out=real[at])
-    return np.clip(real, -_FURTHEST, _FURTHEST, out=real)
+        np.divide(numbers[name].reshape(len(rows), at.stop - at.start).T, grid.steps(name).T, out=real[at])
+    return np.clip(real, -_MAX_VALUE, _MAX_VALUE, out=real)
 
 
 def _exponents(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> np.ndarray:
-    """Return quarter octaves int8 [N, 8 or 9]: steps whose half is the error that `config` tolerates."""
+    """Return quarter octaves int8 [N, E]: steps whose half is the error that `config` tolerates."""
     precision = config.quality * config.birth_precision
     error, color = 2 * config.error_px / precision, 2 * config.error_color / precision
     pixel, N = _world_per_pixel(raw["means"], cameras), len(raw["means"])
-    sizes = np.maximum(np.exp(np.minimum(raw["log_scales"], 80.0)) / pixel[:, None], _SMALLEST_PX)  # px
-    needle = np.maximum(np.sqrt(sizes.max(1) ** 2 - sizes.min(1) ** 2), _SMALLEST_PX)  # a ball may turn as it likes
+    sizes = np.maximum(np.exp(np.minimum(raw["log_scales"], 80.0)) / pixel[:, None], _MIN_SIZE_PX)  # px
+    elongation = np.maximum(np.sqrt(sizes.max(1) ** 2 - sizes.min(1) ** 2), _MIN_SIZE_PX)  # a ball tolerates any turn
     one = np.ones(N)
-    # What every Gaussian tolerates, times what this one does.
-    steps = [
-        (error, pixel),
-        *((error, 1 / size) for size in sizes.T),
-        (error / 2, 1 / needle),  # a turn by a changes tan(a / 2)
-        (8 * config.error_opacity / precision, one),  # the sigmoid's slope is 1/4 at most
-        (color / _DC, one),
-        (color, one),
-        (8 * config.error_confidence / precision, one),
-    ]
-    # The latter in whole octaves, which take fewer bits than they save.
-    e = [np.floor(4 * np.log2(shared)) + 4 * np.floor(np.log2(own)) for shared, own in steps]
-    # Before a lens, and where splats are huge, that would be finer than float32 is, and its integers without bound.
-    sh = np.abs(raw["sh_coeffs"])
-    colors = sh[:, 0].max(1), sh[:, 1:].max((1, 2), initial=0)
-    largest = [np.abs(raw["means"]).max(1), *np.abs(raw["log_scales"]).T, one, one, *colors, one]
-    finest = [np.ceil(4 * (np.log2(np.maximum(most, 1e-38)) - _MOST_BITS)) for most in largest]
-    return np.clip(np.maximum(e, finest).T, -128, 127).astype(np.int8)[:, : 8 + ("logit_confidence" in raw)]
+    # (what every Gaussian tolerates, what this one does in these units) for each exponent of a group.
+    steps = {
+        "means": [(error, pixel)],
+        "log_scales": [(error, 1 / size) for size in sizes.T],
+        "quats": [(error / 2, 1 / elongation)],  # a turn by a changes tan(a / 2)
+        "logit_opacities": [(_generic_step("logit_opacities", config), one)],
+        "sh_dc": [(color / SH_C0, one)],
+        "sh_rest": [(color, one)],
+    }
+    # Close to a lens, and for huge splats, such steps would be finer than float32, and the integers without bound.
+    largest = {
+        "means": [np.abs(raw["means"]).max(1)],
+        "log_scales": list(np.abs(raw["log_scales"]).T),
+        "sh_dc": [np.abs(raw["sh_dc"]).max((1, 2))],
+        "sh_rest": [np.abs(raw["sh_rest"]).max((1, 2), initial=0)],
+    }
+    columns = []
+    for name in (*_ALWAYS, *optional_names(optional_mask(raw))):
+        group = steps.get(name) or [(_generic_step(name, config), one)]
+        for (shared, own), most in zip(group, largest.get(name) or [one], strict=True):
+            # The factor of this Gaussian in whole octaves, which take fewer bits than they save.
+            e = np.floor(4 * np.log2(shared)) + 4 * np.floor(np.log2(own))
+            finest = np.ceil(4 * (np.log2(np.maximum(most, 1e-38)) - _MAX_BITS))
+            columns.append(np.maximum(e, finest))
+    return np.clip(np.stack(columns, axis=1), -128, 127).astype(np.int8)
+
+
+def _generic_step(name: str, config: CodecConfig) -> float:
+    """Return the step whose half changes the activated value by the tolerated error where it is most sensitive.
+
+    Where the slope of the activation has no bound, the error is that of the optimised value.
+    """
+    row = _STORED[name]
+    error = getattr(config, row.error) if isinstance(row.error, str) else row.error
+    assert error is not None
+    return 2 * error / (config.quality * config.birth_precision) / (row.activation.largest_slope or 1.0)
 
 
 def _world_per_pixel(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the size of a pixel [N] at each centre, world units, in the camera that sees it largest."""
+    """Return the size of a pixel [N] at each mean, world units, in the camera that magnifies it most."""
     pixel = np.full(len(means), np.inf)
     for camera in cameras:
         view = np.asarray(camera.viewmat, np.float64)
@@ -238,5 +321,5 @@ def _world_per_pixel(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray
         focal = max(camera.K[0, 0], camera.K[1, 1])
         pixel = np.minimum(pixel, np.where(depth > camera.near, depth, np.inf) / focal)
     seen = pixel[np.isfinite(pixel)]
-    # Behind every camera there is nothing to see; it may come into view.
+    # A Gaussian behind every camera is invisible but may come into view.
     return np.where(np.isfinite(pixel), pixel, np.median(seen) if len(seen) else 1e-3)

@@ -1,4 +1,4 @@
-"""Reading a stream: from a file, whole or still growing, or from a pipe; from the start, or from near a frame."""
+"""Reader of a stream: a file, complete or still growing, or a pipe; from the start, or from near a frame."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ _CHUNK = 2**20
 
 
 class StreamReader:
-    """Reads a stream.
+    """Reader of a stream.
 
-    Iterating yields its packets from the first. A file may be read again, e.g. when it has grown; a pipe gives each
-    packet once, as soon as it is there.
+    Iterating yields its packets from the first. A file may be read again, e.g. when it has grown; a pipe yields each
+    packet once, as soon as it arrives.
 
     Args:
-        source: the file, or something binary to read from, such as a pipe or a socket's file.
+        source: path of the file, or a binary file object, such as a pipe or the file of a socket.
 
     Attributes:
         path: the file.
         cameras: the rig.
         fps: frames per second.
-        metadata: what the writer was given.
+        metadata: metadata that was passed to the writer.
 
     Raises:
         FileNotFoundError: there is no such file.
-        TruncatedStreamError: the stream ends inside a packet (while iterating: after the whole ones).
-        ValueError: it is no stream, of another version, or a packet is broken. The message names the
-            file, the packet's number and byte offset and how many packets before it are intact.
+        TruncatedStreamError: the stream ends inside a packet (while iterating: after the complete ones).
+        ValueError: it is not a stream, has another version, or a packet is broken. The message names the
+            file, the packet's number and byte offset and the number of intact packets before it.
     """
 
     def __init__(self, source: str | Path | BinaryIO) -> None:
@@ -82,11 +82,11 @@ class StreamReader:
     def near(self, frame: int) -> Iterator[Packet]:
         """Yield the packets from the last keyframe before `frame` on, or from the first.
 
-        A frame's displacements are told by its residual, so a keyframe of that very frame is not the place.
+        Only the residual of a frame determines its displacements, so a keyframe of `frame` itself does not count.
 
         Raises:
             TruncatedStreamError: as `index`.
-            ValueError: it is a pipe, which cannot be turned back, or a packet is broken.
+            ValueError: it is a pipe, which cannot seek, or a packet is broken.
         """
         if self._pipe is not None:
             raise ValueError(f"{self.path}: expected a file to seek in, got a pipe; save it first.")
@@ -97,7 +97,7 @@ class StreamReader:
         return self._packets(number, at)
 
     def closed(self) -> bool:
-        """Tell whether the file ends with its index; otherwise it is still written, or was cut off.
+        """Return whether the file ends with its index; otherwise it is still being written, or was truncated.
 
         Raises:
             TruncatedStreamError: as `index`.
@@ -106,10 +106,10 @@ class StreamReader:
             return self._last_index(file) is not None
 
     def index(self) -> list[tuple[int, int, int]]:
-        """Return (kind, frame, offset) of every whole packet but the header, from the file's index if it has one.
+        """Return (kind, frame, offset) of every complete packet except the header, from the index if there is one.
 
         Raises:
-            TruncatedStreamError: the file has become shorter than the header that was read from it.
+            TruncatedStreamError: the file is now shorter than the header that was read from it.
         """
         with open(self.path, "rb") as file:
             if (entries := self._last_index(file)) is not None:
@@ -124,10 +124,10 @@ class StreamReader:
             return entries
 
     def _last_index(self, file: BinaryIO) -> list[tuple[int, int, int]] | None:
-        """Return what the index at the file's end says, None if there is none."""
+        """Return the entries of the index at the file's end, None if there is none."""
         size = file.seek(0, 2)
         if size < self._first:
-            problem = f"the header ended at byte {self._first}, now the file has {size} bytes: replaced or cut off"
+            problem = f"the header ended at byte {self._first}, now the file has {size} bytes: replaced or truncated"
             raise TruncatedStreamError(self._sentence(0, PREAMBLE.size, problem))
         file.seek(size - TRAILER.size)
         at, magic = TRAILER.unpack(file.read(TRAILER.size))
@@ -139,10 +139,10 @@ class StreamReader:
                     return list(ENTRY.iter_unpack(payload[: -TRAILER.size]))
         return None
 
-    def whole(self) -> tuple[list[tuple[int, int, int]], int]:
-        """Check every packet and return the (kind, frame, offset) of all but the header, and where the last one ends.
+    def check(self) -> tuple[list[tuple[int, int, int]], int]:
+        """Check every packet and return (kind, frame, offset) of all except the header, and the end of the last one.
 
-        An index at the file's end, and a packet that was cut off there, lie behind that byte.
+        An index at the file's end, and a packet that is truncated there, lie behind that byte.
 
         Raises:
             ValueError: it is a pipe, or a packet is broken.
@@ -169,7 +169,7 @@ class StreamReader:
     def _checked(self, number: int, at: int) -> Iterator[tuple[int, bytes]]:
         """Yield (offset, bytes) of every packet whose CRC is right, from packet `number` at byte `at` on.
 
-        An index may stand between packets, for a stream that was closed may have been continued; it has no number.
+        There may be an index between packets, if a stream was closed and continued; it has no number.
         """
         with self._opened() as file:
             if self._pipe is None:
@@ -182,14 +182,14 @@ class StreamReader:
                 number += kind != PacketKind.INDEX
 
     def _packet(self, file: BinaryIO, number: int, at: int) -> bytes | None:
-        """Return the bytes of the packet that comes next, None at the stream's end."""
+        """Return the bytes of the next packet, None at the stream's end."""
         head = _read(file, PAYLOAD)
         if not head:
             return None
-        need = PAYLOAD + (HEAD.unpack_from(head)[2] if len(head) == PAYLOAD else 0)
-        data = head + _read(file, need - PAYLOAD)
-        if len(head) < PAYLOAD or len(data) < need:
-            problem = f"at least {need} bytes expected, got {len(data)}: truncated or still written"
+        size = PAYLOAD + (HEAD.unpack_from(head)[2] if len(head) == PAYLOAD else 0)
+        data = head + _read(file, size - PAYLOAD)
+        if len(head) < PAYLOAD or len(data) < size:
+            problem = f"at least {size} bytes expected, got {len(data)}: truncated or still written"
             raise TruncatedStreamError(self._sentence(number, at, problem))
         return data
 
@@ -213,9 +213,9 @@ class StreamReader:
 
 
 def _read(file: BinaryIO, count: int) -> bytes:
-    """Return `count` bytes, or what there is. A length is not to be trusted: memory grows with what has come."""
-    parts = []
-    while count > 0 and (part := file.read(min(count, _CHUNK))):
-        parts.append(part)
-        count -= len(part)
-    return b"".join(parts)
+    """Return `count` bytes, or fewer at the end. Read in chunks, because a damaged length must not allocate memory."""
+    chunks = []
+    while count > 0 and (chunk := file.read(min(count, _CHUNK))):
+        chunks.append(chunk)
+        count -= len(chunk)
+    return b"".join(chunks)

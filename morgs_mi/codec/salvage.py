@@ -1,7 +1,7 @@
-"""What can still be played of a damaged stream: all packets are looked for by their CRC, wherever they begin.
+"""Recovery of the playable frames of a damaged stream: packets are found by their CRC, wherever they begin.
 
-Neither lengths nor the index are trusted, so whatever happened to the rest, an intact packet is found. A frame plays if
-its packet is intact and its parent plays, or from a keyframe on.
+Neither lengths nor the index are trusted, so an intact packet is found whatever happened to the rest. A frame plays if
+its packet is intact and is a keyframe or has a parent that plays.
 """
 
 from __future__ import annotations
@@ -27,22 +27,23 @@ from morgs_mi.codec.container import (
 )
 from morgs_mi.codec.packets import CodedFrame, decode
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.files import whole
+from morgs_mi.core.files import atomic_path
 
 __all__ = ["DamagedRange", "salvage", "write_salvaged"]
 
-# A packet begins with its kind, uint32. The header is not looked for: it has its place, and holes are full of zeros.
+# A packet begins with its kind, uint32. Kind 0, the header, is not searched for: its place is fixed, and erased ranges
+# consist of zeros.
 _KIND = re.compile(rb"[\1-\3]\0\0\0")
 
 
 @dataclass(frozen=True)
 class DamagedRange:
-    """Bytes of a stream that give no frame.
+    """Byte range of a stream from which no frame can be decoded.
 
     Attributes:
-        start: the first of them.
-        stop: the first that is none of them.
-        problem: what is wrong with them.
+        start: the first byte.
+        stop: the first byte behind the range.
+        problem: description of the damage.
     """
 
     start: int
@@ -51,10 +52,10 @@ class DamagedRange:
 
 
 def salvage(path: str | Path) -> Iterator[CodedFrame | DamagedRange]:
-    """Yield what a stream file still says, in its order: the states of frames, and what is damaged or lost.
+    """Yield the states of the playable frames of a stream file and its damaged ranges, in the order of the file.
 
-    A file that is cut off behind a whole packet is shorter and no more: `StreamReader.closed` tells. Cameras are not
-    asked for, so frames may be played from under a header that is broken.
+    A file that is truncated behind a complete packet has no damaged range; see `StreamReader.closed`. Cameras are not
+    needed, so the frames behind a broken header play as well.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -69,43 +70,43 @@ def salvage(path: str | Path) -> Iterator[CodedFrame | DamagedRange]:
 
 
 def write_salvaged(stream: StreamReader, output: str | Path) -> tuple[list[int], list[DamagedRange]]:
-    """Write what a damaged stream still says as a new one, which appears whole or not at all.
+    """Write the playable packets of a damaged stream as a new stream, atomically.
 
-    Its packets are those of the damaged one that play, as they are; behind a gap it goes on with a keyframe, whose
-    frame tells no displacements. An undamaged stream becomes a copy.
+    The packets are copied unchanged. Behind a damaged range the new stream continues with a keyframe, whose frame has
+    no displacements. An undamaged stream is copied.
 
     Args:
-        stream: the file; without its header nobody knows the cameras.
-        output: the file to write; an existing one is replaced, but for that of `stream`.
+        stream: the damaged stream; its header, with the cameras, must be intact.
+        output: the file to write; an existing one is replaced, unless it is the file of `stream`.
 
     Returns:
-        The frames that play, and what is damaged or lost.
+        The playable frames and the damaged ranges.
 
     Raises:
-        OSError: the new one cannot be written.
+        OSError: the new file cannot be written.
         ValueError: no frame plays, or `output` is the file of `stream`.
     """
     if Path(output).resolve() == stream.path.resolve():
         raise ValueError(f"{output}: expected a new file, got the damaged stream itself; give another name.")
-    frames, gaps = [], []
+    frames, ranges = [], []
     with (
-        whole(output, "write_salvaged()") as partial,
+        atomic_path(output, "write_salvaged()") as partial,
         StreamWriter(partial, stream.cameras, stream.fps, stream.metadata) as writer,
     ):
         for found in _playable(stream.path):
             if isinstance(found, DamagedRange):
-                gaps.append(found)
+                ranges.append(found)
             else:
                 writer.write(found[0])
                 frames.append(found[1].frame)
         if not frames:
             raise ValueError(f"{stream.path}: expected at least one frame that plays, got none; nothing was written.")
-    return list(dict.fromkeys(frames)), gaps
+    return list(dict.fromkeys(frames)), ranges
 
 
 def _playable(path: Path) -> Iterator[tuple[Packet, CodedFrame] | DamagedRange]:
-    """Yield packets with the states that they lead to or, once more, restate, and what gives neither."""
-    data = path.read_bytes()  # a map of the file would end the process if somebody cut it off meanwhile
+    """Yield each playable packet with the state after it, and the damaged ranges."""
+    data = path.read_bytes()  # a memory map would end the process if the file were truncated meanwhile
     if not data:
         yield DamagedRange(0, 0, "the file is empty")
     coded, at = None, 0
@@ -119,16 +120,16 @@ def _playable(path: Path) -> Iterator[tuple[Packet, CodedFrame] | DamagedRange]:
                 if coded is None or packet.frame != coded.frame:
                     coded = decode(coded, packet)
                 elif not np.array_equal(decode(None, packet).digest, coded.digest):
-                    raise ValueError(f"it restates another state than that of frame {coded.frame}")
+                    raise ValueError(f"the re-emitted keyframe differs from the state of frame {coded.frame}")
                 yield packet, coded
             except ValueError as error:
                 yield DamagedRange(start, stop, str(error))
     if at < len(data):
-        yield DamagedRange(at, len(data), "the bytes are damaged or cut off")
+        yield DamagedRange(at, len(data), "the bytes are damaged or truncated")
 
 
 def _intact(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield (kind, start, stop) of the preamble, as a part of the header, and of every packet whose CRC is right."""
+    """Yield (kind, start, stop) of the preamble, with the header's kind, and of every packet with a correct CRC."""
     at = PREAMBLE.size
     if data[:at] == PREAMBLE.pack(MAGIC, VERSION):
         yield PacketKind.HEADER, 0, at
@@ -144,7 +145,7 @@ def _intact(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 
 def _end(data: bytes, start: int) -> int | None:
-    """Return where the packet ends that begins at `start`, None if none does."""
+    """Return the end of the intact packet that begins at `start`, None if there is none."""
     if start + PAYLOAD > len(data):
         return None
     stop = start + PAYLOAD + HEAD.unpack_from(data, start)[2]

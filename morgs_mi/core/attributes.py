@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import drjit as dr
 
-__all__ = ["ATTRIBUTES", "BY_ACTIVATED_NAME", "BY_NAME", "Activation", "Attribute", "sigmoid"]
+__all__ = ["ATTRIBUTES", "BY_ACTIVATED_NAME", "BY_NAME", "EXP", "IDENTITY", "SIGMOID", "Activation", "Attribute", "sigmoid"]
 
 
 def sigmoid(x: Any) -> Any:

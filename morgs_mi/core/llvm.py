@@ -1,9 +1,9 @@
-"""Find a libLLVM that Dr.Jit can use, before Dr.Jit looks for one itself.
+"""Search for a libLLVM that Dr.Jit can use, before Dr.Jit looks for one itself.
 
-Dr.Jit compiles its CPU kernels with the LLVM it finds when `drjit` is first imported. Version 14 and older
-it refuses; 15 and 16 abort the whole process on recent CPUs (``LLVM ERROR: Cannot select: f32 = fminimum``);
-17 and newer work. This module needs the standard library only, so that set-up can ask it before anything
-is installed: ``python -P morgs_mi/core/llvm.py`` prints the library in use, or a sentence and status 1.
+Dr.Jit compiles its CPU kernels with the LLVM that it finds when `drjit` is first imported. It refuses version 14 and
+older; 15 and 16 abort the whole process on recent CPUs (``LLVM ERROR: Cannot select: f32 = fminimum``); 17 and newer
+work. This module needs the standard library only, so that it can run during set-up before anything is installed:
+``python -P morgs_mi/core/llvm.py`` prints the library in use, or a sentence with exit status 1.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ REMEDY = (
     "install one (Debian: apt-get install libllvm19; Ubuntu: the newest of libllvm17 to libllvm20; "
     f"conda: conda install -c conda-forge libllvm19) or set {VARIABLE} to its path"
 )
-# Dr.Jit turns a path that cannot be opened into an exception; a library that it cannot use ends the process.
+# For a path that cannot be opened Dr.Jit raises an exception; with a library that it cannot use it ends the process.
 _NOWHERE = f"/nonexistent/libLLVM-{SAFE_MAJOR}-or-newer.so"
 _NAME = re.compile(r"libLLVM(?:-(\d+)[\d.]*)?\.so(?:\.(\d+)[\d.]*)?")
 _TRIAL = "import drjit as dr; from drjit.llvm import Float; dr.eval(dr.minimum(dr.arange(Float, 4), 2))"
 
 
 def llvm_major(path: Path) -> int | None:
-    """Return the major version that the file name (links followed) gives, None where it gives none."""
+    """Return the major version in the file name, or in that of the link's target; None if there is none."""
     for name in (path.name, path.resolve().name):
         if (match := _NAME.fullmatch(name)) and (major := match[1] or match[2]):
             return int(major)
@@ -42,7 +42,7 @@ def llvm_major(path: Path) -> int | None:
 
 
 def search_folders() -> list[Path]:
-    """Return the folders where distributions, LLVM's own packages and conda put libLLVM."""
+    """Return the folders where distributions, LLVM's own packages and conda install libLLVM."""
     prefixes = [os.environ.get("CONDA_PREFIX"), sys.prefix, sys.base_prefix]
     folders = [Path(p, "lib") for p in prefixes if p]
     folders += [Path(p) for p in os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep) if p]
@@ -52,7 +52,7 @@ def search_folders() -> list[Path]:
 
 
 def find_llvm(folders: Iterable[Path] | None = None) -> list[Path]:
-    """Return the libLLVM files in `folders` (default: the usual places), newest first, one per file."""
+    """Return the libLLVM files in `folders` (default: `search_folders`), newest first, without duplicates."""
     folders = search_folders() if folders is None else folders
     files = {path.resolve(): path for folder in folders for path in folder.glob("libLLVM*.so*")}
     named = [path for path in files.values() if _NAME.fullmatch(path.name)]
@@ -60,10 +60,10 @@ def find_llvm(folders: Iterable[Path] | None = None) -> list[Path]:
 
 
 def works(path: Path) -> bool:
-    """Return whether Dr.Jit compiles a kernel with this library, tried in a process of its own.
+    """Return whether Dr.Jit compiles a kernel with this library, tested in a separate process.
 
-    A yes is remembered per file and machine under ``~/.cache/morgs_mi``; a no is asked again, since an
-    update of Dr.Jit may change it.
+    Success is cached per file and machine in ``~/.cache/morgs_mi``; failure is not, because an update of Dr.Jit may
+    change it.
     """
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "morgs_mi", "llvm.txt")
     key = f"{os.uname().nodename} {sys.executable} {path.resolve()} {path.stat().st_mtime_ns}"
@@ -82,7 +82,7 @@ def works(path: Path) -> bool:
 
 
 def usable(path: Path) -> bool:
-    """Return whether Dr.Jit can use this libLLVM: by its version, by trial where the version leaves doubt."""
+    """Return whether Dr.Jit can use this libLLVM, from its version, or by a test where that is inconclusive."""
     if not path.is_file():
         return False
     major = llvm_major(path)
@@ -92,11 +92,11 @@ def usable(path: Path) -> bool:
 
 
 def choose_llvm(wanted: str | None = None, folders: Iterable[Path] | None = None) -> tuple[Path | None, str]:
-    """Return the library to use (None if there is none) and a sentence on what is wrong (empty if nothing).
+    """Return the library to use (None if there is none) and a sentence that describes the problem (empty if none).
 
     Args:
-        wanted: the user's own choice; it wins if it is usable.
-        folders: where to look otherwise, default the usual places.
+        wanted: the user's choice, which takes precedence if it is usable.
+        folders: folders to search otherwise, by default `search_folders`.
     """
     if wanted and usable(Path(wanted)):
         return Path(wanted), ""
@@ -132,7 +132,7 @@ def ensure_llvm() -> None:
     if not sys.platform.startswith("linux"):
         return
     wanted = os.environ.get(VARIABLE)
-    if wanted == _NOWHERE:  # a parent process has already said it
+    if wanted == _NOWHERE:  # a parent process has already warned
         return
     path, problem = choose_llvm(wanted)
     if not path and not has_cuda():

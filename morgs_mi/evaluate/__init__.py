@@ -1,1 +1,1 @@
-"""Scores of a stream against its recording and the ground truth."""
+"""Scores of a stream compared with its recording and the ground truth."""

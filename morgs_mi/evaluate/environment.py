@@ -1,4 +1,4 @@
-"""The machine and the versions that every measured figure comes with."""
+"""Machine and versions, reported with every measurement."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["machine", "versions"]
 
 
 def machine() -> dict[str, Any]:
-    """Return what the figures were measured on: processor, its number of threads, system and variant."""
+    """Return the processor, its number of threads, the system and the Mitsuba variant."""
     return {
         "processor": _processor(),
         "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),

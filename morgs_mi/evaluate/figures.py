@@ -1,4 +1,4 @@
-"""What a judged stream looks like: one column over time, motion, confidence and offset, with truth and legends."""
+"""Figures of a stream: one column over time; motion, confidence and offset beside the truth, with legends."""
 
 from __future__ import annotations
 
@@ -45,25 +45,25 @@ def draw_stream(
     capture: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> list[Path]:
-    """Draw a stream's held-out view, or else its first training view, into PNG files.
+    """Draw a stream's held-out view, or without one its first training view, into PNG files.
 
-    ``slice.png`` has one column over time, recorded and rendered: the column in which the recording changes most.
-    ``motion.png`` and, where one was learned, ``confidence.png`` have up to four frames beside the truth, and
-    their legend; so has ``offset.png``, where the stream holds offsets, beside the motion that they are a part of.
+    ``slice.png`` shows one column over time, recorded and rendered: the column in which the recording changes most.
+    ``motion.png`` shows up to four frames beside the truth, with a legend. So do ``confidence.png``, if confidence was
+    learned, and ``offset.png``, if the stream holds offsets; the latter stands beside the whole motion.
 
     Args:
-        out: the stream file or its folder.
-        folder: where to write; made if missing.
-        capture: the recording; default is where it was when it was fitted.
+        out: stream file or its folder.
+        folder: output folder; created if missing.
+        capture: recording; default is the capture that the stream was fitted to.
         progress: called with (frames done, frames in all).
 
     Returns:
-        The files.
+        Paths of the files.
 
     Raises:
         FileNotFoundError: the stream or the capture is missing.
         OSError: a file cannot be written.
-        ValueError: as `open_stream_capture`; or the stream is broken or has no frame.
+        ValueError: as `open_stream_capture`, or the stream is broken or has no frame.
     """
     stream = open_stream(out)
     frames = [packet.frame for packet in stream]
@@ -76,13 +76,13 @@ def draw_stream(
     later = frames[1:] or frames
     chosen = {later[i] for i in np.linspace(0, len(later) - 1, min(_ROWS, len(later))).astype(int)}
     scale = motion_scale(recording, camera)
-    column, sight = _busiest_column(recording, view, frames)
+    column, still = _busiest_column(recording, view, frames)
     shown, recorded, motions, confidences, offsets = [], [], [], [], []
-    trusted, corrected = has_confidence(stream), has_offset(stream)
-    maps = (*(("confidence",) if trusted else ()), *(("offset",) if corrected else ()))
+    with_confidence, with_offset = has_confidence(stream), has_offset(stream)
+    maps = (*(("confidence",) if with_confidence else ()), *(("offset",) if with_offset else ()))
     played = render_stream(stream, camera, ("color", "motion", *maps))
     for (index, images), frame in zip(played, recording.partial_frames(frames[0], frames[-1] + 1), strict=False):
-        # Copies, for the pictures of a long clip do not all fit in memory.
+        # Copies: views would keep all images of a long clip in memory.
         shown.append(to_uint8(images["color"])[:, column].copy())
         seen = frame.images[view]
         recorded.append(np.zeros_like(shown[-1]) if seen is None else seen[:, column].copy())
@@ -91,16 +91,16 @@ def draw_stream(
             true_motion, mask = (None, None) if truth is None else (truth.motion, truth.mask)
             moved = {"true motion": true_motion, "motion": images["motion"]}
             motions.append(_row(index, partial(motion_image, scale_px=scale), moved))
-            if trusted:
+            if with_confidence:
                 found = {"true mask": mask, "confidence": images["confidence"]}
                 confidences.append(_row(index, confidence_image, found))
-            if corrected:
+            if with_offset:
                 whole = channel_image("motion", images["motion"], scale)
-                part = channel_image("offset", images["offset"], scale)
-                offsets.append(_row(index, to_uint8, {"motion": whole, "its offset": part}))
+                offset = channel_image("offset", images["offset"], scale)
+                offsets.append(_row(index, to_uint8, {"motion": whole, "its offset": offset}))
         if progress is not None:
             progress(len(shown), len(frames))
-    sheets = {"slice": _slices(sight, column, recorded, shown), "motion": _with_legend(motions, motion_legend(scale))}
+    sheets = {"slice": _slices(still, column, recorded, shown), "motion": _with_legend(motions, motion_legend(scale))}
     if confidences:
         sheets["confidence"] = _with_legend(confidences, confidence_legend())
     if offsets:
@@ -113,7 +113,7 @@ def draw_stream(
 
 
 def motion_scale(capture: Capture, camera: Camera) -> float:
-    """Return a speed in pixels that few of the camera's pixels exceed; without truth 3 % of its width."""
+    """Return the 95th percentile of the true speed of moving pixels, px; without truth 3 % of the camera's width."""
     truths = [truth_for_camera(capture, camera, frame) for frame in range(capture.num_frames)]
     speeds = [np.linalg.norm(truth.motion[truth.mask], axis=-1) for truth in truths[1:] if truth is not None]
     moving = np.concatenate(speeds) if speeds else np.zeros(0)
@@ -121,22 +121,22 @@ def motion_scale(capture: Capture, camera: Camera) -> float:
 
 
 def _busiest_column(recording: Capture, view: int, frames: Sequence[int]) -> tuple[int, np.ndarray]:
-    """Return the column of a view in which the recording changes most, and the last picture of it."""
+    """Return the column of a view in which the recording changes most, and its last image."""
     change, last = np.zeros(recording.cameras[view].width), None
     for frame in recording.partial_frames(frames[0], frames[-1] + 1):
         if (seen := frame.images[view]) is None:
             continue
-        picture = seen.astype(float)
+        image = seen.astype(float)
         if last is not None:
-            change += np.abs(picture - last).sum((0, 2))
-        last = picture
+            change += np.abs(image - last).sum((0, 2))
+        last = image
     assert last is not None
     return int(change.argmax()), last.astype(np.uint8)
 
 
-def _slices(sight: np.ndarray, column: int, recorded: Sequence[np.ndarray], shown: Sequence[np.ndarray]) -> np.ndarray:
-    """Return where the column is in a picture, and what is recorded and rendered there over time."""
-    marked = sight.copy()
+def _slices(still: np.ndarray, column: int, recorded: Sequence[np.ndarray], shown: Sequence[np.ndarray]) -> np.ndarray:
+    """Return an image with the column marked, beside the recorded and the rendered column over time."""
+    marked = still.copy()
     marked[:, column] = _MARK
     over_time = [(recorded, "recorded, over time"), (shown, "rendered, over time")]
     slices = [label(time_slice(columns), title) for columns, title in over_time]
@@ -146,7 +146,7 @@ def _slices(sight: np.ndarray, column: int, recorded: Sequence[np.ndarray], show
 def _row(
     frame: int, draw: Callable[[np.ndarray], np.ndarray], maps: Mapping[str, np.ndarray | None]
 ) -> list[np.ndarray]:
-    """Draw those of the maps that are known, under their names."""
+    """Draw each map that is not None, labelled with its name."""
     return [label(draw(values), f"{name}, frame {frame}") for name, values in maps.items() if values is not None]
 
 

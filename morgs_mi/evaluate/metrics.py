@@ -1,6 +1,6 @@
-"""How far a picture or a motion is from the truth. NumPy, float64, so that every back-end is judged alike.
+"""Errors of images, motions and masks, in NumPy and float64, so that every backend is evaluated alike.
 
-Pictures are display-referred RGB (or one channel), float in [0, 1] or uint8.
+Images are display-referred RGB (or one channel), float in [0, 1] or uint8.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ C1, C2 = 0.01**2, 0.03**2
 
 
 def psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Return 10 log10(1 / mean squared error) in dB; infinite where the two are equal.
+    """Return 10 log10(1 / mean squared error) in dB; infinite for equal images.
 
     Args:
         image: [H, W, 3] or [H, W].
         truth: likewise.
-        mask: [H, W] bool, the pixels that count; without any, the result is NaN.
+        mask: [H, W] bool, the pixels that count; the result is NaN if there are none.
 
     Raises:
         ValueError: the sizes differ.
@@ -31,20 +31,20 @@ def psnr(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -
 
 
 def psnr_of(error: float) -> float:
-    """Return a mean squared error in dB below 1; infinite for 0."""
+    """Return the PSNR of a mean squared error, dB; infinite for 0."""
     return float(-10 * np.log10(error)) if error != 0 else float("inf")
 
 
 def ssim(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Return the mean structural similarity, in [-1, 1] and 1 for equal pictures (Wang et al. 2004).
+    """Return the mean structural similarity, in [-1, 1] and 1 for equal images (Wang et al. 2004).
 
-    The window is an 11x11 Gaussian of sigma 1.5, moments are the population's, and only windows that lie
-    wholly inside the picture count. Channels are averaged.
+    The window is an 11x11 Gaussian of sigma 1.5, the moments are those of the population, and only windows inside
+    the image count. Channels are averaged.
 
     Args:
         image: [H, W, 3] or [H, W], both sides at least 11 pixels.
         truth: likewise.
-        mask: [H, W] bool, the window centres that count; without any, the result is NaN.
+        mask: [H, W] bool, the window centres that count; the result is NaN if there are none.
 
     Raises:
         ValueError: the sizes differ or are smaller than the window.
@@ -54,14 +54,14 @@ def ssim(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -
 
 
 def ssim_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return the similarity (see `ssim`) of the window about each pixel [H - 10, W - 10] where it fits.
+    """Return the similarity (see `ssim`) of the window around each pixel for which it fits, [H - 10, W - 10].
 
     Raises:
         ValueError: the sizes differ or are smaller than the window.
     """
     image, truth = unit_pair("ssim", image, truth)
     if min(image.shape[:2]) < WINDOW:
-        raise ValueError(f"ssim(): pictures must be at least {WINDOW}x{WINDOW} pixels, got {image.shape[:2]}.")
+        raise ValueError(f"ssim(): images must be at least {WINDOW}x{WINDOW} pixels, got {image.shape[:2]}.")
     x, y = _blur(image), _blur(truth)
     var_x, var_y = _blur(image**2) - x**2, _blur(truth**2) - y**2
     covariance = _blur(image * truth) - x * y
@@ -74,8 +74,8 @@ def endpoint_error(motion: np.ndarray, truth: np.ndarray, mask: np.ndarray | Non
 
     Args:
         motion: [H, W, 2] in pixels.
-        truth: likewise, of the same sign and on the same grid.
-        mask: [H, W] bool, the pixels that count; without any, the result is NaN.
+        truth: likewise, with the same sign and on the same grid.
+        mask: [H, W] bool, the pixels that count; the result is NaN if there are none.
 
     Raises:
         ValueError: the sizes differ or the last axis is not 2.
@@ -88,15 +88,15 @@ def endpoint_error(motion: np.ndarray, truth: np.ndarray, mask: np.ndarray | Non
 
 
 def iou(mask: np.ndarray, truth: np.ndarray) -> float:
-    """Return the intersection of two bool masks [H, W] over their union; NaN where both are empty."""
+    """Return the intersection of two bool masks [H, W] over their union; NaN if both are empty."""
     union = np.count_nonzero(mask | truth)
     return np.count_nonzero(mask & truth) / union if union else float("nan")
 
 
 def mean_over(values: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """Return the mean of a map [h, w, ...] over `mask` [H, W], or over all; NaN is that of nothing.
+    """Return the mean of a map [h, w, ...] over `mask` [H, W], or over all pixels; NaN if there are none.
 
-    A map smaller than the mask lies in its middle, as that of `ssim_map` does.
+    A map that is smaller than the mask is centred in it, like that of `ssim_map`.
     """
     if mask is not None:
         rows, columns = (slice((n - m) // 2, (n - m) // 2 + m) for n, m in zip(mask.shape, values.shape, strict=False))
@@ -105,7 +105,7 @@ def mean_over(values: np.ndarray, mask: np.ndarray | None = None) -> float:
 
 
 def _blur(image: np.ndarray) -> np.ndarray:
-    """Average over the Gaussian window wherever it fits, [H - 10, W - 10, ...]."""
+    """Return the average over the Gaussian window wherever it fits, [H - 10, W - 10, ...]."""
     half = WINDOW // 2
     weights = np.exp(-0.5 * (np.arange(-half, half + 1) / SIGMA) ** 2)
     weights /= weights.sum()
@@ -116,6 +116,11 @@ def _blur(image: np.ndarray) -> np.ndarray:
 def unit_pair(
     name: str, image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Return two images of one size in float64, bytes scaled to [0, 1].
+
+    Raises:
+        ValueError: the sizes differ or the mask does not match; the message begins with `name`.
+    """
     _check(name, image, truth, mask)
     return _unit(image), _unit(truth)
 
@@ -123,7 +128,7 @@ def unit_pair(
 def _check(name: str, image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None) -> None:
     if np.shape(image) != np.shape(truth):
         raise ValueError(
-            f"{name}(): both must have one size, got {np.shape(image)} and {np.shape(truth)}; resize one first."
+            f"{name}(): both images must have one size, got {np.shape(image)} and {np.shape(truth)}; resize one first."
         )
     if mask is not None and (mask.shape != np.shape(image)[:2] or mask.dtype != bool):
         raise ValueError(f"{name}(): `mask` must be bool {np.shape(image)[:2]}, got {mask.dtype} {mask.shape}.")

@@ -1,15 +1,15 @@
-"""How Gaussians on moving objects moved, in 3D, against the objects' true trajectories.
+"""Displacements in 3D of Gaussians on moving objects, compared with the objects' true trajectories.
 
-d_i is a Gaussian's displacement from frame t-1 to frame t, and d*_i that of the surface it lay on at t-1:
+d_i is the displacement of Gaussian i from frame t-1 to frame t, and d*_i that of the surface on which it lay at t-1:
 
-1. It lay on the surface of object k if, in some view, the pixel that its centre fell on at t-1 saw k within 1 % of
-   the centre's depth, and no view says the same of another object.
-2. Objects are rigid. k's motion is the rigid one that best carries its tracked points from t-1 to t, exact up to
-   rounding; an object whose tracks do not fit one is left out.
-3. Judged are those with an opacity of at least 0.1 whose d* is at least a tenth of the longest on their object: the
-   others neither show nor have a direction to speak of.
+1. A Gaussian lies on the surface of object k if, in some view at t-1, the pixel under its centre shows k within 1 % of
+   the centre's depth, and the same holds for no other object in any view.
+2. Objects are rigid. The motion of k is the rigid motion that best maps its tracked points from t-1 to t, exact up to
+   rounding; an object whose tracks do not fit a rigid motion is excluded.
+3. Gaussians are evaluated if their opacity is at least 0.1 and their d* is at least a tenth of the longest on their
+   object: the others are hardly visible or have no meaningful direction.
 
-Where a Gaussian went does not matter for whether it is judged, so that one which left its object counts in full.
+The selection does not depend on d_i, so a Gaussian that left its object counts in full.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.evaluate.results import Motion3DScores
 from morgs_mi.synth.ground_truth import GroundTruth
 
 __all__ = ["compare_motion", "evaluate_motion", "rigid_motions", "surface_ids"]
@@ -26,7 +27,7 @@ __all__ = ["compare_motion", "evaluate_motion", "rigid_motions", "surface_ids"]
 _DEPTH_TOLERANCE = 0.01
 _LEAST_OPACITY = 0.1
 _LEAST_SHARE = 0.1
-# Of an object's size: what tracked points may be off a rigid motion, and from one line.
+# Tolerances relative to an object's size: distance of tracked points from a rigid motion, and from one line.
 _RIGID, _FLAT = 1e-4, 1e-3
 
 
@@ -36,57 +37,46 @@ def evaluate_motion(
     opacities: np.ndarray,
     tracks: tuple[np.ndarray, np.ndarray, np.ndarray],
     views: Sequence[tuple[Camera, GroundTruth]],
-) -> dict[str, float]:
-    """Compare the displacements of one frame with the truth; see the module for who is judged.
+) -> Motion3DScores:
+    """Return the errors of one frame's displacements; the module describes which Gaussians are evaluated.
 
     Args:
         means: centres at t-1 [N, 3], world units.
         displacements: from t-1 to t [N, 3].
         opacities: [N].
         tracks: the tracked points at t-1 and at t [P, 3], and their objects' ids [P].
-        views: cameras and what they truly saw at t-1.
-
-    Returns:
-        As `compare_motion`.
+        views: cameras with their ground truth at t-1.
     """
     ids = surface_ids(means, views)
-    true, judged = np.zeros_like(means, float), np.zeros(len(means), bool)
+    true, evaluated = np.zeros_like(means, float), np.zeros(len(means), bool)
     for index, (rotation, shift) in rigid_motions(*tracks).items():
         own = tracks[2] == index
         longest = np.linalg.norm(tracks[1][own] - tracks[0][own], axis=-1).max()
         on = (ids == index) & (opacities >= _LEAST_OPACITY)
         true[on] = means[on] @ (rotation - np.eye(3)).T + shift
-        judged |= on & (np.linalg.norm(true, axis=-1) >= _LEAST_SHARE * longest)
-    return compare_motion(displacements[judged], true[judged])
+        evaluated |= on & (np.linalg.norm(true, axis=-1) >= _LEAST_SHARE * longest)
+    return compare_motion(displacements[evaluated], true[evaluated])
 
 
-def compare_motion(motion: np.ndarray, truth: np.ndarray) -> dict[str, float]:
-    """Return how displacements [M, 3] differ from the true ones [M, 3], none of which is 0.
-
-    Returns:
-        ``num_gaussians`` M; ``error``, the mean of |d - d*| in world units; ``true_length``, the mean of |d*|;
-        ``relative_error`` and ``length_ratio``, the means of |d - d*| and of |d| over that of |d*|; ``angle``, the
-        mean angle between d and d* in degrees, 90 for what did not move at all. NaN where M is 0.
-    """
+def compare_motion(motion: np.ndarray, truth: np.ndarray) -> Motion3DScores:
+    """Return the errors of displacements [M, 3] for true ones [M, 3], none of which is 0; NaN if M is 0."""
     if not len(truth):
-        return {"num_gaussians": 0} | dict.fromkeys(
-            ("error", "true_length", "relative_error", "length_ratio", "angle"), float("nan")
-        )
+        return Motion3DScores()
     length, true_length = np.linalg.norm(motion, axis=-1), np.linalg.norm(truth, axis=-1)
     error = np.linalg.norm(motion - truth, axis=-1)
     cosine = (motion * truth).sum(-1) / np.where(length > 0, length * true_length, 1)
-    return {
-        "num_gaussians": len(truth),
-        "error": float(error.mean()),
-        "true_length": float(true_length.mean()),
-        "relative_error": float(error.mean() / true_length.mean()),
-        "length_ratio": float(length.mean() / true_length.mean()),
-        "angle": float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))).mean()),
-    }
+    return Motion3DScores(
+        num_gaussians=len(truth),
+        error=float(error.mean()),
+        true_length=float(true_length.mean()),
+        relative_error=float(error.mean() / true_length.mean()),
+        length_ratio=float(length.mean() / true_length.mean()),
+        angle=float(np.rad2deg(np.arccos(np.clip(cosine, -1, 1))).mean()),
+    )
 
 
 def surface_ids(points: np.ndarray, views: Sequence[tuple[Camera, GroundTruth]]) -> np.ndarray:
-    """Return the id of the object on whose visible surface each point [N, 3] lies, -1 for none or for several."""
+    """Return the id of the object on whose visible surface each point [N, 3] lies; -1 for none or several."""
     ids = np.full(len(points), -1, np.int64)
     several = np.zeros(len(points), bool)
     for camera, truth in views:
@@ -107,15 +97,15 @@ def surface_ids(points: np.ndarray, views: Sequence[tuple[Camera, GroundTruth]])
 def rigid_motions(
     before: np.ndarray, after: np.ndarray, ids: np.ndarray
 ) -> Mapping[int, tuple[np.ndarray, np.ndarray]]:
-    """Return rotation [3, 3] and shift [3] of every object that moved, by its id: x -> R x + s.
+    """Return rotation [3, 3] and shift [3] of every moving object by its id: x -> R x + s.
 
-    Least squares over the object's points (Kabsch 1976). Left out are objects that stand still, that have too few
-    points or points on one line, and that are not rigid.
+    Least squares over the object's points (Kabsch 1976). Excluded are objects that are static or not rigid, and those
+    with too few points or with all points on one line.
 
     Args:
         before: tracked points [P, 3].
-        after: the same, a frame later.
-        ids: their objects' [P].
+        after: the same points one frame later.
+        ids: ids of their objects [P].
     """
     found = {}
     for index in np.unique(ids):

@@ -1,9 +1,9 @@
-"""How different two pictures look: maps of FLIP and of the colour difference dE2000, one value per pixel.
+"""Perceived difference of two images: maps of FLIP and of the colour difference dE2000, one value per pixel.
 
-Pictures are display-referred RGB [H, W, 3], sRGB-encoded, float in [0, 1] or uint8. FLIP's numbers are those of
+Images are display-referred RGB [H, W, 3], sRGB-encoded, float in [0, 1] or uint8. FLIP's constants are those of
 Andersson, Nilsson, Akenine-Moller, Oskarsson, Astrom and Fairchild, "FLIP: a difference evaluator for alternating
-images", HPG 2020: the picture is filtered by the eye's contrast sensitivity, colours are compared by HyAB in
-Hunt-adjusted CIELAB, and where edges or points differ the error is raised.
+images", HPG 2020: the image is filtered by the eye's contrast sensitivity, colours are compared by HyAB in
+Hunt-adjusted CIELAB, and differing edges or points increase the error.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from functools import cache
 import cv2
 import numpy as np
 
+from morgs_mi.core.color_space import srgb_to_linear
 from morgs_mi.evaluate.metrics import unit_pair
 
 __all__ = ["PIXELS_PER_DEGREE", "delta_e_map", "flip_map"]
@@ -42,64 +43,63 @@ _ROWS = 32
 
 
 def flip_map(image: np.ndarray, truth: np.ndarray, pixels_per_degree: float = PIXELS_PER_DEGREE) -> np.ndarray:
-    """Return LDR-FLIP per pixel [H, W], in [0, 1]: 0 where nothing can be told apart. Its mean is "the" FLIP.
+    """Return LDR-FLIP per pixel [H, W], in [0, 1]; 0 where no difference is visible. Its mean is the FLIP value.
 
     Args:
         image: [H, W, 3].
         truth: likewise; FLIP is symmetric.
-        pixels_per_degree: pixels in a degree of the observer's view.
+        pixels_per_degree: pixels per degree of the observer's field of view.
 
     Raises:
-        ValueError: the sizes differ, the pictures have no three channels, or the pixels are not positive.
+        ValueError: the sizes differ, an image does not have three channels, or `pixels_per_degree` is not positive.
     """
     _check_rgb("flip_map", image, truth)
     if not (np.isfinite(pixels_per_degree) and pixels_per_degree > 0):
         raise ValueError(f"flip_map(): `pixels_per_degree` must be positive, got {pixels_per_degree}.")
-    pair = [_opponent(_linear(picture)) for picture in unit_pair("flip_map", image, truth)]
-    colour = _colour_error(*(_hunt_lab(_filtered(picture, pixels_per_degree)) for picture in pair))
-    features = [_features((picture[..., 0] + 16) / 116, pixels_per_degree) for picture in pair]
-    # Strengths of edges and of points; the one that differs more counts.
+    pair = [_opponent(srgb_to_linear(np.clip(each, 0, 1))) for each in unit_pair("flip_map", image, truth)]
+    colour = _colour_error(*(_hunt_lab(_filtered(each, pixels_per_degree)) for each in pair))
+    features = [_features((each[..., 0] + 16) / 116, pixels_per_degree) for each in pair]
+    # Strengths of edges and of points; the larger difference counts.
     structure = np.max([np.abs(a - b) for a, b in zip(*features, strict=True)], axis=0)
     return colour ** (1 - (structure / np.sqrt(2)) ** _FEATURE_EXPONENT)
 
 
 def delta_e_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Return the colour difference CIE dE2000 per pixel [H, W], by colour-science; about 1 can just be seen.
+    """Return the colour difference CIE dE2000 per pixel [H, W], by colour-science; a value of about 1 is just visible.
 
-    Colours are decoded from sRGB and compared under its own white, D65. What lies outside [0, 1] is clipped, as a
-    display does.
+    Colours are decoded from sRGB and compared under its white point, D65. Values outside [0, 1] are clipped, as on
+    a display.
 
     Args:
         image: [H, W, 3].
         truth: likewise.
 
     Raises:
-        ValueError: the sizes differ or the pictures have no three channels.
+        ValueError: the sizes differ or an image does not have three channels.
     """
-    # It costs a second, which other commands need not wait for.
+    # The import takes a second, for which other commands should not wait.
     from colour import XYZ_to_Lab
     from colour.difference import delta_E_CIE2000
-    from colour.models import RGB_COLOURSPACE_sRGB, eotf_sRGB
+    from colour.models import RGB_COLOURSPACE_sRGB
 
     _check_rgb("delta_e_map", image, truth)
-    a, b = (np.clip(picture, 0, 1) for picture in unit_pair("delta_e_map", image, truth))
+    a, b = (np.clip(each, 0, 1) for each in unit_pair("delta_e_map", image, truth))
 
     def lab(colours: np.ndarray) -> np.ndarray:
-        return XYZ_to_Lab(
-            eotf_sRGB(colours) @ RGB_COLOURSPACE_sRGB.matrix_RGB_to_XYZ.T, RGB_COLOURSPACE_sRGB.whitepoint
-        )
+        xyz = srgb_to_linear(colours) @ RGB_COLOURSPACE_sRGB.matrix_RGB_to_XYZ.T
+        return XYZ_to_Lab(xyz, RGB_COLOURSPACE_sRGB.whitepoint)
 
     def rows(start: int) -> np.ndarray:
-        part = slice(start, start + _ROWS)
-        return delta_E_CIE2000(lab(a[part]), lab(b[part]))
+        band = slice(start, start + _ROWS)
+        return delta_E_CIE2000(lab(a[band]), lab(b[band]))
 
-    # A whole picture's temporaries would leave the cache, and NumPy alone would use one core.
+    # The temporaries of a whole image exceed the cache, and NumPy alone uses one core.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         return np.concatenate(list(pool.map(rows, range(0, len(a), _ROWS))))
 
 
 def _colour_error(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return HyAB's distance of adjusted colours [H, W], compressed and scaled to [0, 1]."""
+    """Return the HyAB distance of Hunt-adjusted colours [H, W], compressed and scaled to [0, 1]."""
     error, largest = _hyab(a, b) ** _COLOUR_EXPONENT, _largest_error()
     knee = _KNEE * largest
     above = _KNEE_VALUE + (error - knee) / (largest - knee) * (1 - _KNEE_VALUE)
@@ -108,7 +108,7 @@ def _colour_error(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @cache
 def _largest_error() -> float:
-    """Return the error between the colours of the gamut that are farthest apart, green and blue."""
+    """Return the error between green and blue, the colours of the gamut that are farthest apart."""
     green, blue = (_hunt_lab(np.eye(3)[i]) for i in (1, 2))
     return float(_hyab(green, blue) ** _COLOUR_EXPONENT)
 
@@ -119,7 +119,7 @@ def _hyab(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _filtered(opponent: np.ndarray, pixels_per_degree: float) -> np.ndarray:
-    """Blur opponent colours as the eye does; return linear RGB [H, W, 3] in [0, 1]."""
+    """Return opponent colours, blurred by the eye's contrast sensitivity, as linear RGB [H, W, 3] in [0, 1]."""
     widest = max(width for pair in _SENSITIVITY for _, width in pair)
     radius = int(np.ceil(3 * np.sqrt(widest / (2 * np.pi**2)) * pixels_per_degree))
     squared = (np.arange(-radius, radius + 1) / pixels_per_degree) ** 2
@@ -145,7 +145,7 @@ def _features(luminance: np.ndarray, pixels_per_degree: float) -> tuple[np.ndarr
     smooth = gaussian / gaussian.sum()
 
     def strength(kernel: np.ndarray) -> np.ndarray:
-        # Both signs get a weight of one, so that the strength lies in [0, 1].
+        # The weights of each sign sum to one, so that the strength lies in [0, 1].
         kernel = kernel / np.where(kernel > 0, kernel[kernel > 0].sum(), -kernel[kernel < 0].sum())
         return np.hypot(_separable(luminance, kernel, smooth), _separable(luminance, smooth, kernel))
 
@@ -169,7 +169,7 @@ def _linear_of_opponent(opponent: np.ndarray) -> np.ndarray:
 
 
 def _hunt_lab(linear: np.ndarray) -> np.ndarray:
-    """Return linear RGB as CIELAB whose chroma is scaled by lightness: dark colours look less colourful."""
+    """Return linear RGB as CIELAB with chroma scaled by lightness, because dark colours look less colourful."""
     ratio = linear @ (_XYZ / _WHITE[:, None]).T
     limit = 6 / 29
     root = np.where(ratio > limit**3, np.cbrt(ratio), ratio / (3 * limit**2) + 4 / 29)
@@ -178,13 +178,7 @@ def _hunt_lab(linear: np.ndarray) -> np.ndarray:
     return np.stack([lightness, 5 * lightness * (x - y), 2 * lightness * (y - z)], -1)
 
 
-def _linear(encoded: np.ndarray) -> np.ndarray:
-    """Decode sRGB in [0, 1]."""
-    encoded = np.clip(encoded, 0, 1)
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-
-
 def _check_rgb(name: str, image: np.ndarray, truth: np.ndarray) -> None:
-    for picture in (image, truth):
-        if np.ndim(picture) != 3 or np.shape(picture)[2] != 3:
-            raise ValueError(f"{name}(): pictures must be [H, W, 3], got {np.shape(picture)}.")
+    for each in (image, truth):
+        if np.ndim(each) != 3 or np.shape(each)[2] != 3:
+            raise ValueError(f"{name}(): images must be [H, W, 3], got {np.shape(each)}.")

@@ -1,76 +1,76 @@
-"""What `evaluate_stream` has found, as tables of at most 80 columns and sentences."""
+"""An `Evaluation` as tables of at most 80 columns and as sentences."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from morgs_mi.evaluate.evaluate import REGIONS
+from morgs_mi.evaluate.results import Evaluation
 
 __all__ = ["evaluation_summary", "evaluation_tables", "figure"]
 
-_PICTURE = (("PSNR, dB", "psnr", 2), ("SSIM", "ssim", 4), ("FLIP", "flip", 4), ("dE2000", "delta_e", 2))
-_PICTURE += (("LPIPS", "lpips", 4), ("flow error, px", "motion_error", 2))
+_METRICS = (("PSNR, dB", "psnr", 2), ("SSIM", "ssim", 4), ("FLIP", "flip", 4), ("dE2000", "delta_e", 2))
+_METRICS += (("LPIPS", "lpips", 4), ("flow error, px", "motion_error", 2))
 _FRAME = (("PSNR, dB", "psnr", 2), ("moving", "psnr_moving", 2), ("SSIM", "ssim", 4), ("FLIP", "flip", 4))
 _FRAME += (("flow error", "motion_error", 2), ("moving", "motion_error_moving", 2))
 
 
 def figure(value: float | None, digits: int) -> str:
-    """Return a number with so many decimals, "-" where it is unknown."""
+    """Return a number with `digits` decimals, "-" if it is None or NaN."""
     return "-" if value is None or value != value else f"{value:.{digits}f}"
 
 
-def evaluation_tables(result: Mapping[str, Any]) -> Iterator[Table]:
+def evaluation_tables(result: Evaluation) -> Iterator[Table]:
     """Yield a table of the frames and one of the regions."""
     frames = _table("frame by frame", "frame", *(title for title, *_ in _FRAME), "kB", "s")
-    for row in result["frames"]:
-        scores = (figure(row[name], digits) for _, name, digits in _FRAME)
-        size, seconds = figure(row["num_bytes"] / 1e3, 1), figure(row["seconds"], 1)
-        frames.add_row(str(row["frame"]), *scores, size, seconds)
+    for row in result.frames:
+        scores = (figure(getattr(row.scores, name), digits) for _, name, digits in _FRAME)
+        frames.add_row(str(row.frame), *scores, figure(row.num_bytes / 1e3, 1), figure(row.seconds, 1))
     yield frames
-    views = ("held-out view " if result["held_out"] else "training views ") + ", ".join(result["views"])
-    regions = _table(f"{views}: means, regions from {result['regions']}", "", "whole", "moving", "still")
-    for title, name, digits in _PICTURE:
-        values = [result[name + region] for region in REGIONS]
-        values[0] = values[0]["mean"] if isinstance(values[0], Mapping) else values[0]
+    views = ("held-out view " if result.held_out else "training views ") + ", ".join(result.views)
+    regions = _table(f"{views}: means, regions from {result.regions}", "", "whole", "moving", "still")
+    mean = result.scores
+    for title, name, digits in _METRICS:
+        values = [getattr(mean, name + region) for region in REGIONS]
         if any(value == value for value in values):
             regions.add_row(title, *(figure(value, digits) for value in values))
-    if result["mtv"]["render"] == result["mtv"]["render"]:
-        regions.add_row("mTV x100", "", "", figure(result["mtv"]["render"], 3))
-        regions.add_row("mTV x100 of the recording", "", "", figure(result["mtv"]["input"], 3))
+    if result.variation.render == result.variation.render:
+        regions.add_row("mTV x100", "", "", figure(result.variation.render, 3))
+        regions.add_row("mTV x100 of the recording", "", "", figure(result.variation.input, 3))
     yield regions
 
 
-def evaluation_summary(result: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what fits no table: time, space, drift, 3D motion."""
-    size, seconds, play, psnr = result["bytes"], result["seconds"], result["playback"], result["psnr"]
-    if not result["held_out"]:
-        scores = (f"{name} {figure(score['psnr'], 2)}" for name, score in result["views"].items())
+def evaluation_summary(result: Evaluation) -> Iterator[str]:
+    """Yield sentences on time, size, drift and 3D motion."""
+    sizes, seconds, play, mean = result.sizes, result.seconds, result.playback, result.scores
+    if not result.held_out:
+        scores = (f"{name} {figure(score.psnr, 2)}" for name, score in result.views.items())
         yield f"PSNR by view, dB: {', '.join(scores)}"
+    first, last = (result.frames[k].scores.psnr for k in (0, -1))
     yield (
-        f"Drift: PSNR {figure(psnr['first'], 2)} dB in the first frame, {figure(psnr['last'], 2)} dB in the last, "
-        f"{figure(result['psnr_slope'], 4)} dB per frame."
+        f"Drift: PSNR {figure(first, 2)} dB in the first frame, {figure(last, 2)} dB in the last, "
+        f"{figure(result.psnr_slope, 4)} dB per frame."
     )
-    motion = result["motion_3d"]
-    if motion.get("num_gaussians"):
+    motion = result.motion_3d
+    if motion is not None and motion.num_gaussians:
         yield (
-            f"3D motion of {motion['num_gaussians']:.0f} Gaussians on moving objects: error {motion['error']:.4f} of "
-            f"{motion['true_length']:.4f} units ({100 * motion['relative_error']:.0f} %), angle "
-            f"{motion['angle']:.1f} degrees, length ratio {motion['length_ratio']:.2f}."
+            f"3D motion of {motion.num_gaussians:.0f} Gaussians on moving objects: error {motion.error:.4f} of "
+            f"{motion.true_length:.4f} units ({100 * motion.relative_error:.0f} %), angle "
+            f"{motion.angle:.1f} degrees, length ratio {motion.length_ratio:.2f}."
         )
-    if result["confidence_iou"] == result["confidence_iou"]:
-        yield f"Confidence over the true mask: IoU {result['confidence_iou']:.2f}."
+    if mean.confidence_iou == mean.confidence_iou:
+        yield f"Confidence over the true mask: IoU {mean.confidence_iou:.2f}."
     yield (
-        f"Size: {size['file'] / 1e6:.2f} MB, {figure(size['per_keyframe'] / 1e3, 1)} kB per keyframe, "
-        f"{figure(size['per_residual'] / 1e3, 1)} kB per residual."
+        f"Size: {sizes.file / 1e6:.2f} MB, {figure(sizes.per_keyframe / 1e3, 1)} kB per keyframe, "
+        f"{figure(sizes.per_residual / 1e3, 1)} kB per residual."
     )
     yield (
-        f"Time: {figure(seconds['first'], 1)} s for the first frame, {figure(seconds['per_later_frame'], 1)} s per "
-        f"later one, from pictures to packet; played at {figure(play['fps'], 0)} frames per second "
-        f"({figure(play['decode_ms'], 1)} ms to decode, {figure(play['render_ms'], 1)} ms to render)."
+        f"Time: {figure(seconds.first, 1)} s for the first frame, {figure(seconds.per_later_frame, 1)} s per "
+        f"later one, from images to packet; played at {figure(play.fps, 0)} frames per second "
+        f"({figure(play.decode_ms, 1)} ms to decode, {figure(play.render_ms, 1)} ms to render)."
     )
 
 

@@ -1,6 +1,6 @@
-"""What changes over time and should not: pixels that stand still, and a score that ought to hold.
+"""Quality over time: the variation of static pixels and the slope of a score.
 
-I_t is frame t of one fixed view, display-referred in [0, 1]; I'_t is what was recorded.
+I_t is frame t of one fixed view, display-referred in [0, 1]; I'_t is the recorded frame.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.evaluate.metrics import mean_over, unit_pair
+from morgs_mi.evaluate.results import VariationScores
 
 __all__ = ["StillVariation", "recorded_change", "slope"]
 
@@ -20,16 +21,16 @@ _GREY_LEVEL = 1 / 255
 
 
 class StillVariation:
-    """Masked total variation of a view (mTV): 100 mean |I_t - I_{t-1}| over the pixels that stand still.
+    """Masked total variation of a view (mTV): 100 mean |I_t - I_{t-1}| over the static pixels.
 
-    The mask is one for the clip, as in the paper: pixels where nothing moved in any frame. A view that is frozen
-    has a variation of 0, and a recording's own is its noise, so the two are told side by side. A mask that is told from
-    the recording itself favours the recording a little: it is made of what changed least there.
+    One mask serves the whole clip, as in the paper: pixels in which nothing moves in any frame. A frozen view has a
+    variation of 0 and the recording's own variation is its noise, so both are reported. A mask computed from the
+    recording itself favours the recording slightly: it selects the pixels that change least there.
 
     Args:
-        valid: [H, W] bool, pixels that may count; None for all.
-        false_alarms: share of the frames in which a pixel may be said to move and still count as standing still:
-            0 for true masks, more for those told from a noisy recording.
+        valid: valid pixels [H, W], bool; None for all.
+        false_alarms: share of the frames in which a pixel may be marked as moving and still count as static: 0 for
+            true masks, more for masks computed from a noisy recording.
     """
 
     def __init__(self, valid: np.ndarray | None = None, false_alarms: float = 0) -> None:
@@ -39,7 +40,7 @@ class StillVariation:
         self._moved = np.zeros((1, 1), int)
 
     def add(self, image: np.ndarray, recorded: np.ndarray, moving: np.ndarray) -> None:
-        """Take in the next frame: rendered and recorded picture [H, W, 3], and where something moves [H, W] bool."""
+        """Add the next frame: rendered and recorded image [H, W, 3], and the mask of moving pixels [H, W] bool."""
         pair = unit_pair("StillVariation.add", image, recorded, moving)
         self._moved = self._moved + moving
         self._frames += 1
@@ -48,25 +49,27 @@ class StillVariation:
             self._sums = [a + b for a, b in zip(self._sums, changes, strict=True)] if self._sums else changes
         self._last = pair
 
-    def result(self) -> dict[str, float]:
-        """Return ``render`` and ``input``, the mTV of I and of I', and ``still_share``, the mask's share of the view.
-
-        Without two frames or a still pixel they are NaN.
-        """
+    def result(self) -> VariationScores:
+        """Return the mTV of I and of I', and the mask's share of the view; NaN without two frames or a static pixel."""
         if self._frames < 2:
-            return dict.fromkeys(("render", "input", "still_share"), float("nan"))
+            return VariationScores()
         valid = np.ones(self._moved.shape, bool) if self._valid is None else self._valid
         still = (self._moved <= self._false_alarms * self._frames) & valid
         render, recorded = (100 * mean_over(total, still) / (self._frames - 1) for total in self._sums)
-        return {"render": render, "input": recorded, "still_share": float(still.sum() / max(valid.sum(), 1))}
+        return VariationScores(render, recorded, float(still.sum() / max(valid.sum(), 1)))
 
 
+# Not `morgs_mi.method.change.changed`, with which the fit selects its work. The score ignores a change of the whole
+# image's brightness (it subtracts the median), accepts any noise level, and marks changes above four standard
+# deviations; the fit must react to such a brightness change, assumes static noise of at most a grey level, and marks
+# changes above five. Sharing one definition would change the regions of all published scores.
 def recorded_change(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Return where a recording changes by more than its noise [H, W], bool: what stands in for a missing true mask.
+    """Return the mask of pixels [H, W] in which a recording changes by more than its noise; it replaces a true mask.
 
-    Changes of brightness are averaged over 5x5 pixels. Noise is told from their median absolute deviation over the
-    picture, which holds while most of it stands still; what exceeds four of its standard deviations, and one grey
-    level, has changed. The inside of a plain moving surface does not change and is not found; a moving shadow is.
+    Changes of brightness are averaged over 5x5 pixels. The noise is estimated from their median absolute deviation
+    over the image, which is robust as long as most of the image is static. A change above four of its standard
+    deviations, and above one grey level, is marked. The inside of a uniform moving surface does not change and is not
+    marked; a moving shadow is.
 
     Args:
         before: I'_{t-1} [H, W, 3].
@@ -81,7 +84,7 @@ def recorded_change(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 def slope(values: Sequence[float]) -> float:
     """Return the slope per frame of the least-squares line through a score of consecutive frames.
 
-    NaN where fewer than two frames have one, or one is infinite.
+    NaN if fewer than two scores are known or one is infinite.
     """
     scores = np.asarray(values, float)
     known = np.flatnonzero(~np.isnan(scores))

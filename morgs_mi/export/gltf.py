@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.core.color_space import SH_C0, srgb_to_linear
-from morgs_mi.core.files import whole
+from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import rotated, unit_quats
 
@@ -50,7 +50,7 @@ def write_gltf(path: str | Path, gaussians: Gaussians, axes: np.ndarray | None =
         OSError: the file cannot be written.
     """
     data = glb(gaussians, axes)
-    with whole(path, "write_gltf()") as partial:
+    with atomic_path(path, "write_gltf()") as partial:
         partial.write_bytes(data)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.packets import CodedFrame, decode
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.files import whole
+from morgs_mi.core.files import atomic_path
 
 __all__ = ["Tracks", "extract_tracks", "write_tracks"]
 
@@ -72,7 +72,7 @@ def write_tracks(path: str | Path, tracks: Tracks) -> None:
     Raises:
         OSError: the file cannot be written.
     """
-    with whole(path, "write_tracks()") as partial, open(partial, "wb") as file:
+    with atomic_path(path, "write_tracks()") as partial, open(partial, "wb") as file:
         np.savez_compressed(
             file, ids=tracks.ids, frames=tracks.frames, positions=tracks.positions, confidence=tracks.confidence
         )

@@ -109,8 +109,6 @@ class FitConfig:
     """Fraction of the first frame's steps after which another SH band is added, as in 3DGS."""
     confidence_steps: int = 40
     """Steps that learn the confidence of the first frame from the masks of its key views."""
-    confidence_rate_scale: float = 4.0
-    """Factor on the confidence's learning rate in these steps, in which nothing else changes."""
     epochs: int = 8
     """Passes over all training views for every later frame; the paper's small variant takes 5."""
     skip_static: bool = True
@@ -130,9 +128,9 @@ class FitConfig:
     rates_epochs: int = 8
     """Number of epochs that `rates` were chosen for: other parameters get larger rates in fewer epochs."""
     first_frame_rates: LearningRates = field(
-        default_factory=lambda: LearningRates(means=2e-3, scales=0.02, quats=0.02, opacities=0.2)
+        default_factory=lambda: LearningRates(means=2e-3, scales=0.02, quats=0.02, opacities=0.2, confidence=0.2)
     )
-    """Learning rates at the start of the first frame."""
+    """Learning rates at the start of the first frame. That of the confidence is constant: nothing else changes then."""
     final_rate: float = 0.1
     """Learning rates at the end of the first frame, as a fraction of those at its start."""
 

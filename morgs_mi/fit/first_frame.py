@@ -147,7 +147,7 @@ def fit_confidence(
         image = rasterize(posed, cameras[views[k]], ("confidence",), detach_weights=("confidence",), config=render)
         return {"mask": mask_loss(image.confidence, targets[views[k]])}
 
-    rates = {"logit_confidence": config.confidence_rate_scale * config.rates.confidence}
+    rates = {"logit_confidence": config.first_frame_rates.confidence}
     order = view_order(len(views), config.confidence_steps, rng)
     optimizer = adam({"logit_confidence": gaussians.logit_confidence})
     losses = optimise(optimizer, rates, order, losses_at, {})

@@ -1,9 +1,9 @@
-"""Make what an iterator yields in a background thread, a bounded number of items ahead."""
+"""Run an iterator in a background thread, a bounded number of items ahead."""
 
 from __future__ import annotations
 
 import atexit
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable
 from contextlib import suppress
 from queue import Empty, Full, Queue
 from threading import Event, Thread
@@ -12,23 +12,23 @@ from typing import TypeVar
 __all__ = ["prefetched"]
 
 T = TypeVar("T")
-_PATIENCE = 0.1  # seconds after which the thread looks whether it is still wanted
+_POLL_SECONDS = 0.1  # interval at which the thread checks whether the consumer has closed
 
 
 class _End:
-    """The iterator is exhausted, or has raised `error`."""
+    """Marker of the iterator's end, with the `error` that it raised."""
 
     def __init__(self, error: BaseException | None = None) -> None:
         self.error = error
 
 
-def prefetched(items: Iterable[T], ahead: int = 2, newest: bool = False) -> Iterator[T]:
-    """Yield what `items` yields, in order; what it raises is raised here.
+def prefetched(items: Iterable[T], ahead: int = 2, newest: bool = False) -> Generator[T, None, None]:
+    """Yield the items of `items`, in order; an error that it raises is raised here.
 
     Args:
-        items: is iterated in a thread of its own, from the first `next` on until this iterator is closed.
-        ahead: so many wait at most, and one more is being made.
-        newest: whatever waits when a new one is made is dropped: for sources that cannot wait.
+        items: iterated in a separate thread, from the first `next` until this generator is closed.
+        ahead: maximum number of items that wait, while one more is being produced.
+        newest: whether a new item replaces the one that waits, for sources that cannot wait.
     """
     ready: Queue[T | _End] = Queue(1 if newest else ahead)
     closed = Event()
@@ -36,7 +36,7 @@ def prefetched(items: Iterable[T], ahead: int = 2, newest: bool = False) -> Iter
     def put(item: T | _End) -> None:
         while not closed.is_set():
             try:
-                return ready.put(item, timeout=0 if newest else _PATIENCE)
+                return ready.put(item, timeout=0 if newest else _POLL_SECONDS)
             except Full:
                 if newest:
                     with suppress(Empty):
@@ -55,16 +55,16 @@ def prefetched(items: Iterable[T], ahead: int = 2, newest: bool = False) -> Iter
             if (close := getattr(items, "close", None)) is not None:
                 close()
         while newest and not ready.empty() and not closed.wait(0.01):
-            pass  # the last one may still be wanted
+            pass  # the consumer may still take the last item
         put(_End(error))
 
     worker = Thread(target=work, daemon=True, name="prefetch")
 
     def stop() -> None:
         closed.set()
-        worker.join(timeout=10 * _PATIENCE)  # a source may hang
+        worker.join(timeout=10 * _POLL_SECONDS)  # a source may hang
 
-    # A thread that is within a library when the interpreter ends takes the process down with it.
+    # A thread that executes library code when the interpreter ends aborts the process.
     atexit.register(stop)
     worker.start()
     try:

@@ -1,12 +1,12 @@
-"""Frames out of video files and of folders of images.
+"""Readers of video files and of folders of images.
 
-A frame is an RGB uint8 array [H, W, 3]. `VideoReader` and `FolderReader` offer the same members.
+A frame is an RGB uint8 array [H, W, 3]. `VideoReader` and `FolderReader` have the same members.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,7 @@ __all__ = [
     "Clip",
     "FolderReader",
     "FrameReader",
+    "ImageOrError",
     "VideoReader",
     "natural_key",
     "numbering_gap",
@@ -29,9 +30,9 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 def natural_key(name: str) -> list[str | int]:
-    """Return a sorting key that puts cam_2 before cam_10."""
+    """Return a sorting key that places cam_2 before cam_10."""
     # split() with a group alternates text and digits, so keys compare text with text and int with int.
-    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", name))]
+    return [int(piece) if i % 2 else piece for i, piece in enumerate(re.split(r"([0-9]+)", name))]
 
 
 def numbering_gap(names: Sequence[str]) -> int | None:
@@ -45,15 +46,15 @@ def numbering_gap(names: Sequence[str]) -> int | None:
 
 @dataclass(frozen=True)
 class VideoReader:
-    """A video file, decoded from its start by each call of `frames`.
+    """Reader of a video file, which each call of `frames` decodes from the start.
 
     Attributes:
         path: the file.
-        num_frames: what the file's header promises.
-        fps: frames per second.
+        num_frames: number of frames according to the file's header.
+        fps: frames per second, None if unknown.
         width: in pixels.
         height: in pixels.
-        num_held: how many frames the file holds; less than `num_frames` where it was cut off.
+        num_held: number of frames in the file; less than `num_frames` if it was truncated.
     """
 
     path: Path
@@ -65,7 +66,7 @@ class VideoReader:
 
     @classmethod
     def open(cls, path: str | Path) -> VideoReader:
-        """Read a video's header, decode its first frame and count the others.
+        """Return the reader of a video whose first frame can be decoded.
 
         Raises:
             FileNotFoundError: there is no such file.
@@ -88,22 +89,22 @@ class VideoReader:
                 "one frame: the file is truncated or no video; copy or convert it again."
             )
         held = _count_packets(path)
-        # Some containers promise nothing.
-        promised = num_frames if num_frames > 0 else held
-        return cls(path, promised, fps if fps > 0 else None, first.shape[1], first.shape[0], held)
+        # Some containers do not store the number.
+        declared = num_frames if num_frames > 0 else held
+        return cls(path, declared, fps if fps > 0 else None, first.shape[1], first.shape[0], held)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
-        """Yield frames start..stop-1, by default up to the promised end.
+        """Yield frames start..stop-1, by default up to `num_frames`.
 
         Raises:
             ValueError: a frame before `stop` cannot be decoded.
         """
-        return _demanded(self.pick(range(start, self.num_frames if stop is None else min(stop, self.num_frames))))
+        return _raising(self.pick(range(start, self.num_frames if stop is None else min(stop, self.num_frames))))
 
-    def pick(self, indices: Sequence[int]) -> Iterator[Picture]:
-        """Yield the frames of rising `indices`, an error in place of each that cannot be decoded.
+    def pick(self, indices: Sequence[int]) -> Generator[ImageOrError, None, None]:
+        """Yield the frames of ascending `indices`, with an error in place of each that cannot be decoded.
 
-        Those between are decoded too, for seeking is inexact.
+        The frames between are decoded too, because seeking is inexact.
         """
         stream = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
         done, ok = 0, True
@@ -128,9 +129,9 @@ class VideoReader:
 
 @dataclass(frozen=True)
 class FolderReader:
-    """A folder of numbered images, e.g. ``0000.png``; members as in `VideoReader`, but no `fps`.
+    """Reader of a folder of numbered images, e.g. ``0000.png``; the members of `VideoReader`, with `fps` None.
 
-    It may also be a list of images that lie anywhere; `path` is then the folder of the first.
+    The images may also be a list of files in any folders; `path` is then the folder of the first.
     """
 
     path: Path
@@ -141,23 +142,23 @@ class FolderReader:
 
     @classmethod
     def open(cls, path: str | Path) -> FolderReader:
-        """List a folder's images in the order of their numbers and decode the first.
+        """Return the reader of a folder's images in the order of their numbers; the first is decoded.
 
         Raises:
             FileNotFoundError: the folder or the images are missing.
-            ValueError: a number is missing or given twice, or the first image cannot be decoded.
+            ValueError: a number is missing or occurs twice, or the first image cannot be decoded.
         """
         path, files = Path(path), _images(Path(path))
         if gap := numbering_gap([f.stem for f in files]):
             raise ValueError(
                 f"{path}: the images must be numbered without gaps, got {files[gap - 1].name} followed by "
-                f"{files[gap].name}; extract the frames again, or go on without what is missing (--gaps)."
+                f"{files[gap].name}; extract the frames again, or go on without the missing ones (--gaps)."
             )
         return cls.of_files(files)
 
     @classmethod
     def of_files(cls, files: Sequence[Path], gaps: bool = False) -> FolderReader:
-        """Take the images `files` in their order and decode the first, with `gaps` the first that is there and whole.
+        """Return the reader of the images `files`; the first is decoded, with `gaps` the first that is readable.
 
         Raises:
             FileNotFoundError: a file is missing.
@@ -173,10 +174,12 @@ class FolderReader:
 
     @property
     def num_frames(self) -> int:
+        """Number of images."""
         return len(self.files)
 
     @property
     def num_held(self) -> int:
+        """Number of images."""
         return len(self.files)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
@@ -185,10 +188,10 @@ class FolderReader:
         Raises:
             ValueError: an image cannot be decoded or has another size than the first.
         """
-        return _demanded(self.pick(range(self.num_frames)[start:stop]))
+        return _raising(self.pick(range(self.num_frames)[start:stop]))
 
-    def pick(self, indices: Sequence[int]) -> Iterator[Picture]:
-        """Yield the frames `indices`, an error in place of each that is missing, broken or of another size."""
+    def pick(self, indices: Sequence[int]) -> Generator[ImageOrError, None, None]:
+        """Yield the frames `indices`, with an error in place of each that is missing, broken or of another size."""
         for index in indices:
             if index >= self.num_frames:
                 yield ValueError(f"{self.path}: it has ended after {self.num_frames} images; record longer.")
@@ -203,16 +206,17 @@ class FolderReader:
 
 
 FrameReader = VideoReader | FolderReader
-# A video file, a folder of images, or images that lie anywhere.
 Clip = Path | tuple[Path, ...]
-# A frame, or why there is none.
-Picture = np.ndarray | ValueError | FileNotFoundError
+"""A video file, a folder of images, or a list of image files."""
+ImageOrError = np.ndarray | ValueError | FileNotFoundError
+"""A frame, or the reason why it is missing."""
 
 
 def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
-    """Open one clip per camera; with `gaps`, images may be missing or broken.
+    """Return one reader per camera; with `gaps`, images may be missing or broken.
 
-    The images of folders are then aligned by their numbers: one that another camera has is missing, not skipped.
+    Folders are then aligned by the numbers of their images, so that a number that only other cameras have is a missing
+    image.
 
     Raises:
         FileNotFoundError: a clip is missing, or one of its images.
@@ -226,22 +230,22 @@ def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
     step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
     instants = range(numbers[0], numbers[-1] + 1, step)
     return [
-        FolderReader.of_files([numbered[clip].get(n, _unseen(clip, numbered[clip], n)) for n in instants], gaps)
-        if clip in numbered
+        FolderReader.of_files([numbered[clip].get(n, _missing_name(clip, numbered[clip], n)) for n in instants], gaps)
+        if isinstance(clip, Path) and clip in numbered
         else open_clips([clip], gaps)[0]
         for clip in clips
     ]
 
 
 def open_frames(path: str | Path | tuple[Path, ...]) -> FrameReader:
-    """Open a video file, a folder of images or a list of images; raises what their `open` raises."""
+    """Return the reader of a video file, a folder of images or a list of images; raises the errors of their `open`."""
     if isinstance(path, tuple):
         return FolderReader.of_files(path)
     return FolderReader.open(path) if Path(path).is_dir() else VideoReader.open(path)
 
 
 def _count_packets(path: Path) -> int:
-    """Return how many frames a video file holds; they are read but not decoded, 0.2 ms each at 1080x1920."""
+    """Return the number of frames in a video file; they are read but not decoded, 0.2 ms each at 1080x1920."""
     stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
     count = 0
     while stream.grab():
@@ -250,11 +254,11 @@ def _count_packets(path: Path) -> int:
     return count
 
 
-def _demanded(pictures: Iterator[Picture]) -> Iterator[np.ndarray]:
-    for picture in pictures:
-        if isinstance(picture, Exception):
-            raise picture
-        yield picture
+def _raising(images: Iterator[ImageOrError]) -> Iterator[np.ndarray]:
+    for image in images:
+        if isinstance(image, Exception):
+            raise image
+        yield image
 
 
 def _images(path: Path) -> list[Path]:
@@ -277,8 +281,8 @@ def _number(file: Path) -> int:
     return int(numbers[-1])
 
 
-def _unseen(folder: Path, files: dict[int, Path], number: int) -> Path:
-    """Return the name that an image that is missing would have beside the others."""
+def _missing_name(folder: Path, files: dict[int, Path], number: int) -> Path:
+    """Return the path that a missing image would have."""
     other = next(iter(files.values()))
     return folder / re.sub(r"[0-9]+(?=[^0-9]*\.)", lambda old: str(number).zfill(len(old[0])), other.name, count=1)
 
@@ -289,7 +293,7 @@ def _no_image(file: Path) -> FileNotFoundError:
     )
 
 
-def _image_or_error(file: Path) -> Picture:
+def _image_or_error(file: Path) -> ImageOrError:
     try:
         return _read_image(file)
     except (ValueError, FileNotFoundError) as error:
@@ -299,7 +303,7 @@ def _image_or_error(file: Path) -> Picture:
 def _read_image(file: Path) -> np.ndarray:
     if not file.is_file():
         raise _no_image(file)
-    # The stored pixels, not turned by EXIF: calibrations are made on those.
+    # The stored pixels, without EXIF's rotation: calibrations refer to those.
     image = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
         raise ValueError(f"{file}: expected an image, got {file.stat().st_size} bytes that cannot be decoded.")

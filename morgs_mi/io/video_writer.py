@@ -1,4 +1,4 @@
-"""Frames into video files and folders of images, whole or not at all; a frame is an RGB uint8 array [H, W, 3]."""
+"""Atomic writing of video files and folders of images; a frame is an RGB uint8 array [H, W, 3]."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from morgs_mi.core.files import atomic_folder, whole
+from morgs_mi.core.files import atomic_folder, atomic_path
 
 __all__ = ["write_video"]
 
@@ -16,29 +16,29 @@ __all__ = ["write_video"]
 def write_video(path: str | Path, frames: Iterable[np.ndarray], fps: float, codec: str = "FFV1") -> None:
     """Write RGB uint8 frames [H, W, 3] as a video, or as a folder of PNGs where `path` has no suffix.
 
-    The file gets its name only when all of it can be read back, so there is never a half-written one.
+    The file gets its name only after all of it could be read back, so it is never incomplete.
 
     Args:
         path: ``.mp4``, ``.mkv``, ``.avi``, ... or a folder that does not exist yet.
         frames: at least one, all of one even width and height (any size in a folder).
-        fps: frames per second; a folder does not keep it.
-        codec: OpenCV's four letters. ``FFV1`` is lossless, in .mp4 too, but no browser plays it. On a
+        fps: frames per second; not stored in a folder.
+        codec: OpenCV's four-character code. ``FFV1`` is lossless, in .mp4 too, but no browser plays it. On a
             path-traced box at 304x224, 4:2:0 chroma alone allows 42.4 dB; ``vp09`` reaches 39.2 dB and plays
             in browsers at 37 ms a frame, ``mp4v`` 37.6 dB at 0.6 ms. ``avc1`` is not in OpenCV's wheels.
 
     Raises:
         ValueError: there are no frames, or a frame is not as described.
-        OSError: the encoder is missing, the folder exists, or what was written cannot be read back.
+        OSError: the encoder is missing, the folder exists, or the written frames cannot be read back.
     """
     path = Path(path)
     if path.suffix:
-        with whole(path, "write_video()") as partial:
+        with atomic_path(path, "write_video()") as partial:
             partial.parent.mkdir(parents=True, exist_ok=True)
             _write_file(partial, path, frames, fps, codec)
         return
     with atomic_folder(path, "write_video()") as folder:
         for i, frame in enumerate(_checked(path, frames)):
-            # Not cv2.imwrite, which says nothing of why it failed.
+            # Not cv2.imwrite, which does not report why it failed.
             png = cv2.imencode(".png", cv2.cvtColor(frame, cv2.COLOR_RGB2BGR))[1]
             (folder / f"{i:04d}.png").write_bytes(png.tobytes())
 
@@ -51,8 +51,8 @@ def _write_file(partial: Path, path: Path, frames: Iterable[np.ndarray], fps: fl
                 height, width = frame.shape[:2]
                 if width % 2 or height % 2:
                     raise ValueError(
-                        f"write_video({path}): the width and height must be even, for OpenCV drops the last "
-                        f"column or row otherwise, got {width}x{height}; crop, or write a folder of PNGs."
+                        f"write_video({path}): the width and height must be even, because OpenCV drops an odd "
+                        f"column or row, got {width}x{height}; crop, or write a folder of PNGs."
                     )
                 fourcc = cv2.VideoWriter.fourcc(*codec)
                 encoder = cv2.VideoWriter(str(partial), cv2.CAP_FFMPEG, fourcc, fps, (width, height))
@@ -63,7 +63,7 @@ def _write_file(partial: Path, path: Path, frames: Iterable[np.ndarray], fps: fl
     finally:
         if encoder is not None:
             encoder.release()
-    # OpenCV reports no failure of its writer, a full disk included: count what can be decoded.
+    # OpenCV's writer reports no failure, not even a full disk, so the decodable frames are counted.
     stream = cv2.VideoCapture(str(partial), cv2.CAP_FFMPEG)
     readable = 0
     while stream.grab():

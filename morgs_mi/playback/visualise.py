@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from morgs_mi.core.files import whole
+from morgs_mi.core.files import atomic_path
 
 __all__ = [
     "confidence_image",
@@ -188,7 +188,7 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
     if not image.size:
         raise ValueError(f"write_png(): the image for {path} has no pixels: {image.shape}.")
     _, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    with whole(path, "write_png()") as partial:
+    with atomic_path(path, "write_png()") as partial:
         partial.parent.mkdir(parents=True, exist_ok=True)
         partial.write_bytes(data.tobytes())
 

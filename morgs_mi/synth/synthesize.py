@@ -16,7 +16,7 @@ import numpy as np
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.files import whole, write_json
+from morgs_mi.core.files import atomic_path, write_json
 from morgs_mi.io.video import VideoReader
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.synth.ground_truth import Tracks, compute_ground_truth, move_with_objects, save_truth
@@ -100,7 +100,7 @@ def synthesize(
     cameras = scene.rig.cameras(num_cameras, width, height)
     times = np.arange(num_frames) / fps
     _check_folder(Path(out), overwrite)
-    with whole(out, "synthesize()") as folder:
+    with atomic_path(out, "synthesize()") as folder:
         folder.mkdir(parents=True)
         tracer = PathTracer(scene)
         done = 0

@@ -1,4 +1,4 @@
-"""A decoder written from docs/stream-format.md alone: slow, obvious, and without the package's code."""
+"""A reference decoder written from docs/stream-format.md alone: slow, simple, and without the package's code."""
 
 from __future__ import annotations
 
@@ -96,6 +96,7 @@ def groups(state):
 def keyframe(payload):
     found = arrays(payload)
     N, degree, confidence, next_id = (int(x) for x in found["head"])
+    assert confidence <= 1, "unknown optional attributes"
     code = RangeCode(found["code"])
     ids = np.cumsum(code.column(N) + 1) - 1
     state = {"ids": ids, "degree": degree, "confidence": confidence, "next_id": next_id}
@@ -104,9 +105,9 @@ def keyframe(payload):
 
 
 def digest(state):
-    parts = [state["ids"].astype("<u4"), state["largest_components"].astype("u1"), state["exponents"].astype("i1")]
-    parts += [state["values"].astype("<i4"), np.array([state["next_id"], state["degree"]], "<u4")]
-    return hashlib.blake2b(b"".join(part.tobytes() for part in parts), digest_size=8).digest()
+    arrays = [state["ids"].astype("<u4"), state["largest_components"].astype("u1"), state["exponents"].astype("i1")]
+    arrays += [state["values"].astype("<i4"), np.array([state["next_id"], state["degree"]], "<u4")]
+    return hashlib.blake2b(b"".join(array.tobytes() for array in arrays), digest_size=8).digest()
 
 
 def residual(state, payload):
@@ -116,13 +117,13 @@ def residual(state, payload):
     code, values, dead = RangeCode(found["code"]), state["values"].copy(), np.zeros(len(state["ids"]), bool)
     moving = values[:, -1] > 0 if state["confidence"] else np.zeros(len(values), bool)
     for members in (np.flatnonzero(~moving), np.flatnonzero(moving)):
-        geometry, look = code.column(len(members)), np.zeros(len(members), np.int64)
-        look[geometry == 0] = code.column(int((geometry == 0).sum()))
+        geometry, appearance = code.column(len(members)), np.zeros(len(members), np.int64)
+        appearance[geometry == 0] = code.column(int((geometry == 0).sum()))
         other = (geometry > 0) & (geometry < 8)
-        look[other] = code.column(int(other.sum()))
+        appearance[other] = code.column(int(other.sum()))
         dead[members] = geometry == 8
         for g, columns in enumerate(groups(state)):
-            flags = (geometry % 8) >> g & 1 if g < 3 else look >> (g - 3) & 1
+            flags = (geometry % 8) >> g & 1 if g < 3 else appearance >> (g - 3) & 1
             changed = members[flags == 1]
             for column in columns:
                 r = code.column(len(changed))
@@ -143,16 +144,16 @@ def residual(state, payload):
                 step = (F[e % 4] * 2.0 ** (e // 4)) * (F[coarseness % 4] * 2.0 ** (coarseness // 4))
                 new["offset"][i, axis] = int(r) * step
     if births:
-        parts = born(code, births, state["degree"], state["confidence"])
-        for name, part in zip(("largest_components", "exponents", "values"), parts, strict=True):
-            new[name] = np.concatenate([new[name], part])
+        added = born(code, births, state["degree"], state["confidence"])
+        for name, array in zip(("largest_components", "exponents", "values"), added, strict=True):
+            new[name] = np.concatenate([new[name], array])
         new["ids"] = np.concatenate([new["ids"], state["next_id"] + np.arange(births)])
         new["next_id"] = state["next_id"] + births
     return new
 
 
 def numbers(state):
-    """Return what a state stands for, by the names of the package."""
+    """Return the attributes that a state stands for, by the names of the package."""
     e, own = state["exponents"], [0, 0, 0, 1, 2, 3, 4, 4, 4, 5, 6, 6, 6]
     own += [7] * (3 * ((state["degree"] + 1) ** 2 - 1)) + [8] * state["confidence"]
     real = np.zeros(state["values"].shape)
@@ -162,10 +163,10 @@ def numbers(state):
             for q, x in zip(state["values"][:, column], e[:, k], strict=True)
         ]
     quats = np.zeros((len(real), 4))
-    for i, pivot in enumerate(state["largest_components"]):
+    for i, largest in enumerate(state["largest_components"]):
         u, v, w = (float(x) for x in real[i, 6:9])
         length = math.sqrt(((1 + u * u) + v * v) + w * w)
-        quats[i] = np.insert([u / length, v / length, w / length], int(pivot), 1 / length)
+        quats[i] = np.insert([u / length, v / length, w / length], int(largest), 1 / length)
     end = 10 + 3 * (state["degree"] + 1) ** 2
     found = {"means": real[:, :3], "log_scales": real[:, 3:6], "quats": quats, "logit_opacities": real[:, 9]}
     found["sh_coeffs"] = real[:, 10:end].reshape(len(real), -1, 3)

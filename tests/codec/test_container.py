@@ -1,4 +1,4 @@
-"""The stream file: exact round trips, and no damage that goes unnoticed."""
+"""The stream file: exact round trips, and detection of every damage."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def assert_equal(got: Packet, expected: Packet) -> None:
         np.testing.assert_array_equal(got.arrays[name], array)
 
 
-def test_round_trip(tmp_path: Path) -> None:
+def test_stream_reader__round_trips_header_and_packets(tmp_path: Path) -> None:
     write(tmp_path / "s")
     stream = StreamReader(tmp_path / "s")
     assert stream.fps == 29.97
@@ -78,20 +78,34 @@ def test_round_trip(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("packet", PACKETS)
-def test_a_packet_stands_alone(packet: Packet) -> None:
+def test_decode_packet__inverts_encode_packet(packet: Packet) -> None:
     assert_equal(decode_packet(encode_packet(packet)), packet)
 
 
-def test_arrays_in_any_memory_order_arrive_in_theirs() -> None:
+def test_packet__is_encoded_once_and_does_not_change() -> None:
+    array = np.arange(3, dtype=np.uint32)
+    packet = Packet(PacketKind.RESIDUAL, 1, {"a": array})
+    encoded = packet.encoded
+    assert packet.num_bytes == len(encoded)
+    assert encode_packet(packet) is encoded
+    array[:] = 7  # a copy is encoded
+    assert packet.arrays["a"].tolist() == [0, 1, 2]
+    with pytest.raises(ValueError, match="read-only"):
+        packet.arrays["a"][0] = 7
+    with pytest.raises(TypeError, match="does not support item assignment"):
+        packet.arrays["a"] = array  # pyright: ignore[reportIndexIssue]
+
+
+def test_decode_packet__restores_arrays_of_any_memory_order() -> None:
     array = RNG.normal(size=(3, 5)).astype(np.float32)
     arrays = {"fortran": np.asfortranarray(array), "slice": array[::2, 1:], "swapped": array.astype(">f4")}
     got = decode_packet(encode_packet(Packet(PacketKind.RESIDUAL, 0, arrays))).arrays
     for name, expected in arrays.items():
         np.testing.assert_array_equal(got[name], expected)
-        assert got[name].flags.writeable
+        assert not got[name].flags.writeable
 
 
-def test_a_growing_file_can_be_read_up_to_its_last_whole_packet(tmp_path: Path) -> None:
+def test_stream_reader__reads_a_growing_file_up_to_its_last_complete_packet(tmp_path: Path) -> None:
     with StreamWriter(tmp_path / "s", cameras(), 30) as writer:
         reader = StreamReader(tmp_path / "s")
         for i, packet in enumerate(PACKETS):
@@ -100,7 +114,7 @@ def test_a_growing_file_can_be_read_up_to_its_last_whole_packet(tmp_path: Path) 
         assert len(list(reader)) == len(PACKETS)
 
 
-def test_every_truncation_is_noticed_or_leaves_whole_packets(tmp_path: Path) -> None:
+def test_stream_reader__detects_every_truncation_inside_a_packet(tmp_path: Path) -> None:
     path = tmp_path / "s"
     ends = write(path)
     whole = path.read_bytes()
@@ -116,7 +130,7 @@ def test_every_truncation_is_noticed_or_leaves_whole_packets(tmp_path: Path) -> 
         assert len(got) == max(intact - 1, 0)
 
 
-def test_every_flipped_bit_is_noticed(tmp_path: Path) -> None:
+def test_stream_reader__detects_every_flipped_bit(tmp_path: Path) -> None:
     path = tmp_path / "s"
     write(path)
     whole = path.read_bytes()
@@ -149,8 +163,8 @@ def with_table(table: bytes, rest: bytes = b"") -> bytes:
         (with_table(b"no"), "table of arrays is broken"),
         (with_table(b"[" * 100000), "table of arrays is broken"),
         (with_table(b"[1]"), "table of arrays is broken"),
-        (with_table(b'[["a", "object", [1]]]', bytes(8)), "`a` is said to be object"),
-        (with_table(b'[["a", "uint8", [-1]]]', bytes(8)), r"`a` is said to be uint8 \[-1\]"),
+        (with_table(b'[["a", "object", [1]]]', bytes(8)), "`a` is declared as object"),
+        (with_table(b'[["a", "uint8", [-1]]]', bytes(8)), r"`a` is declared as uint8 \[-1\]"),
         (
             with_table(b'[["a", "float32", [1000000000000]]]', bytes(8)),
             "would end at byte 4000000000039 of 47",
@@ -161,7 +175,7 @@ def with_table(table: bytes, rest: bytes = b"") -> bytes:
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_packets_that_lie_are_refused(data: bytes, message: str) -> None:
+def test_decode_packet__refuses_inconsistent_packets(data: bytes, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         decode_packet(data)
 
@@ -175,7 +189,9 @@ def test_packets_that_lie_are_refused(data: bytes, message: str) -> None:
         (Packet(PacketKind.RESIDUAL, 0, {"a": np.array([None])}), "got object"),
     ],
 )
-def test_packets_that_do_not_fit_are_refused_and_leave_no_trace(tmp_path: Path, packet: Packet, message: str) -> None:
+def test_stream_writer__refuses_invalid_packets_and_writes_nothing_of_them(
+    tmp_path: Path, packet: Packet, message: str
+) -> None:
     with StreamWriter(tmp_path / "s", cameras(), 30) as stream:
         with pytest.raises(ValueError, match=message):
             stream.write(packet)
@@ -183,7 +199,7 @@ def test_packets_that_do_not_fit_are_refused_and_leave_no_trace(tmp_path: Path, 
     assert len(list(StreamReader(tmp_path / "s"))) == 1
 
 
-def test_files_that_are_no_stream(tmp_path: Path) -> None:
+def test_stream_reader__refuses_files_that_are_not_streams(tmp_path: Path) -> None:
     path = tmp_path / "s"
     path.write_bytes(b"ply\nformat ascii")
     with pytest.raises(ValueError, match=r"expected a stream that starts with .* got b'ply"):
@@ -206,7 +222,7 @@ def test_files_that_are_no_stream(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("length", [0, 5, 15, 16, 40])
-def test_a_file_that_becomes_shorter_than_its_header_is_named(tmp_path: Path, length: int) -> None:
+def test_stream_reader__reports_a_file_that_became_shorter_than_its_header(tmp_path: Path, length: int) -> None:
     path = tmp_path / "s"
     write(path)
     reader = StreamReader(path)
@@ -217,9 +233,9 @@ def test_a_file_that_becomes_shorter_than_its_header_is_named(tmp_path: Path, le
             call()
 
 
-def test_a_full_disk_leaves_whole_packets_and_the_writer_usable(tmp_path: Path) -> None:
+def test_stream_writer__leaves_complete_packets_on_a_full_disk_and_stays_usable(tmp_path: Path) -> None:
     path = tmp_path / "s"
-    # A limit on the size of files fails a write in its middle, as a full disk does.
+    # A limit on the file size makes a write fail in its middle, as a full disk does.
     program = f"""
 import resource
 import numpy as np
@@ -236,5 +252,5 @@ with StreamWriter({str(path)!r}, [], 30) as stream:
 """
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert f"{path}: 2" in result.stdout
-    assert "bytes of whole packets; free space on the disk" in result.stdout
+    assert "bytes of complete packets; free space on the disk" in result.stdout
     assert [packet.frame for packet in StreamReader(path)] == [0, 2]

@@ -1,4 +1,4 @@
-"""Damaged streams: every damage is named, every undamaged frame plays, and no number of theirs is believed."""
+"""Damaged streams: all damage is reported, every undamaged frame plays, and no damaged number is trusted."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from morgs_mi.codec.packets import (
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.codec.salvage import DamagedRange, salvage, write_salvaged
 from morgs_mi.core.gaussians import Gaussians
-from tests.codec.test_packets import CAMERAS, cloud, jittered
+from tests.codec.clouds import CAMERAS, cloud, jittered
 
 FRAMES, EVERY = 8, 3
-# More than a trial takes with all that is cached, and far less than a damaged length or count may ask for.
-ROOM = 64 * 2**20
+# More than a trial takes with everything that is cached, and far less than a damaged length or count may request.
+MEMORY_BYTES = 64 * 2**20
 
 
-class ActiveSet(NamedTuple):
-    """A piece of the file: the preamble (kind -1) or a packet."""
+class Piece(NamedTuple):
+    """Byte range of the file: the preamble (kind -1) or a packet."""
 
     kind: int
     frame: int
@@ -46,13 +46,13 @@ class ActiveSet(NamedTuple):
 
 class Clip(NamedTuple):
     data: bytes
-    parts: list[ActiveSet]
+    pieces: list[Piece]
     states: dict[int, CodedFrame]
 
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
-    """A stream of a handful of Gaussians that are born and die, with keyframes to start from."""
+    """A stream of a few Gaussians that are born and die, with re-emitted keyframes."""
     path, rng = tmp_path_factory.mktemp("clip") / "s", np.random.default_rng(0)
     config = CodecConfig(quality=0.3, offset=True)
     with StreamWriter(path, CAMERAS[:1], 25, {"num_frames": FRAMES}) as writer:
@@ -70,20 +70,20 @@ def clip(tmp_path_factory: pytest.TempPathFactory) -> Clip:
             if frame % EVERY == 0:
                 writer.write(reemitted_keyframe(states[-1]))
     data = path.read_bytes()
-    parts, at = [ActiveSet(-1, 0, 0, 12)], 12
+    pieces, at = [Piece(-1, 0, 0, 12)], 12
     while at < len(data):
         kind, frame, length = struct.unpack_from("<IIQ", data, at)
-        parts.append(ActiveSet(kind, frame, at, at + PAYLOAD + length))
-        at = parts[-1].stop
-    return Clip(data, parts, {state.frame: state for state in states})
+        pieces.append(Piece(kind, frame, at, at + PAYLOAD + length))
+        at = pieces[-1].stop
+    return Clip(data, pieces, {state.frame: state for state in states})
 
 
 @contextmanager
 def little_memory() -> Iterator[None]:
-    """Let this process have `ROOM` more of address space and no more."""
+    """Limit the address space of this process to `MEMORY_BYTES` more than now."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + ROOM, hard))
+    resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY_BYTES, hard))
     try:
         yield
     finally:
@@ -91,85 +91,85 @@ def little_memory() -> Iterator[None]:
 
 
 def damaged(data: bytes, rng: np.random.Generator) -> bytes:
-    """Truncate, flip one bit or some, or overwrite a stretch."""
+    """Return the data truncated, with one or several flipped bits, or with an overwritten range."""
     spoilt, kind = bytearray(data), rng.integers(4)
     if kind == 0:
         return data[: rng.integers(len(data))]
     if kind == 3:
         start, length = rng.integers(len(data)), rng.integers(1, 200)
-        stretch = spoilt[start : start + length]
-        spoilt[start : start + length] = bytes(len(stretch)) if rng.random() < 0.5 else rng.bytes(len(stretch))
+        size = len(spoilt[start : start + length])
+        spoilt[start : start + length] = bytes(size) if rng.random() < 0.5 else rng.bytes(size)
     for at in rng.choice(8 * len(data), 1 if kind == 1 else rng.integers(2, 9) if kind == 2 else 0, replace=False):
         spoilt[at // 8] ^= 1 << at % 8
     return bytes(spoilt)
 
 
 def playable(clip: Clip, intact: list[bool]) -> list[int]:
-    """Return the frames that play: those whose packets are intact back to a keyframe."""
+    """Return the playable frames: those whose packets are intact back to a keyframe."""
     frames: list[int] = []
-    for part, whole in zip(clip.parts, intact, strict=True):
-        known = bool(frames) and part.frame in (frames[-1], frames[-1] + 1)
-        if whole and part.frame not in frames and (part.kind == 1 or (part.kind == 2 and known)):
-            frames.append(part.frame)
+    for piece, ok in zip(clip.pieces, intact, strict=True):
+        known = bool(frames) and piece.frame in (frames[-1], frames[-1] + 1)
+        if ok and piece.frame not in frames and (piece.kind == 1 or (piece.kind == 2 and known)):
+            frames.append(piece.frame)
     return frames
 
 
 def check(clip: Clip, data: bytes, path: Path) -> None:
     path.write_bytes(data)
-    intact = [data[part.start : part.stop] == clip.data[part.start : part.stop] for part in clip.parts]
-    intact = [same and part.stop <= len(data) for same, part in zip(intact, clip.parts, strict=True)]
-    first = intact.index(False)  # what is damaged first
-    # Playing stops there with a sentence, unless the file simply ends; then it does not claim to be closed.
+    intact = [data[piece.start : piece.stop] == clip.data[piece.start : piece.stop] for piece in clip.pieces]
+    intact = [same and piece.stop <= len(data) for same, piece in zip(intact, clip.pieces, strict=True)]
+    first = intact.index(False)  # the first damaged piece
+    # Playing stops there with an error, unless the file just ends; then it is not closed.
     played: list[CodedFrame] = []
-    if clip.parts[first].start == len(data) and first > 1:
+    if clip.pieces[first].start == len(data) and first > 1:
         reader = StreamReader(path)
         played.extend(coded_frames(reader))
         assert not reader.closed()
     else:
         with pytest.raises(ValueError, match=str(path)) as error:
             played.extend(coded_frames(StreamReader(path)))
-        if first:  # but for the magic, the place is named
-            number, at = max(first - 1, 0), clip.parts[first].start
+        if first:  # the message names the place, except for the preamble
+            number, at = max(first - 1, 0), clip.pieces[first].start
             assert f"packet {number} at byte {at}: " in str(error.value)
-    assert [state.frame for state in played] == sorted({part.frame for part in clip.parts[2:first] if part.kind < 3})
-    # What is intact behind it plays as well, and what is not is named.
+    assert [state.frame for state in played] == sorted({p.frame for p in clip.pieces[2:first] if p.kind < 3})
+    # Intact packets behind it play as well, and damaged ones are reported.
     found = list(salvage(path))
-    states = [one for one in found if isinstance(one, CodedFrame)]
+    states = [entry for entry in found if isinstance(entry, CodedFrame)]
     assert [state.frame for state in states] == playable(clip, intact)
     for state in [*played, *states]:
         assert np.array_equal(state.digest, clip.states[state.frame].digest)
-    gaps = [one for one in found if isinstance(one, DamagedRange)]
-    for part, whole in zip(clip.parts, intact, strict=True):
-        end = min(part.stop, len(data))
-        assert whole or part.start >= end or any(g.start <= part.start and end <= g.stop for g in gaps), part
-    for gap in gaps:
-        assert 0 <= gap.start < gap.stop <= len(data) or not data
-    # All of that can be had as a stream that is whole, if there is anything.
+    ranges = [entry for entry in found if isinstance(entry, DamagedRange)]
+    for piece, ok in zip(clip.pieces, intact, strict=True):
+        end = min(piece.stop, len(data))
+        assert ok or piece.start >= end or any(r.start <= piece.start and end <= r.stop for r in ranges), piece
+    for damage in ranges:
+        assert 0 <= damage.start < damage.stop <= len(data) or not data
+    # All of it can be written as an intact stream, if there is a playable frame.
     if intact[0] and intact[1] and states:
         again = rewritten(path)
-        assert again == ([state.frame for state in states], gaps, [state.digest.tobytes() for state in states])
-    # A reader that trusts an intact index gets to the frames behind the damage, too.
+        assert again == ([state.frame for state in states], ranges, [state.digest.tobytes() for state in states])
+    # A reader that trusts an intact index also reaches the frames behind the damage.
     if intact[0] and intact[1] and intact[-1]:
-        for part in clip.parts[first + 1 : -1]:
-            behind = [p for p in clip.parts[first:] if p.start >= part.start and p.frame <= part.frame + 1]
-            if part.kind == 1 and part.frame + 1 < FRAMES and all(intact[clip.parts.index(p)] for p in behind):
-                state = seek(StreamReader(path), part.frame + 1)
-                assert np.array_equal(state.digest, clip.states[part.frame + 1].digest)
+        for piece in clip.pieces[first + 1 : -1]:
+            behind = [p for p in clip.pieces[first:] if p.start >= piece.start and p.frame <= piece.frame + 1]
+            if piece.kind == 1 and piece.frame + 1 < FRAMES and all(intact[clip.pieces.index(p)] for p in behind):
+                state = seek(StreamReader(path), piece.frame + 1)
+                assert np.array_equal(state.digest, clip.states[piece.frame + 1].digest)
 
 
 def rewritten(path: Path) -> tuple[list[int], list[DamagedRange], list[bytes]]:
-    """Return what `write_salvaged` says, and the digests of the states in the stream that it wrote."""
+    """Return the results of `write_salvaged` and the digests of the states in the stream that it wrote."""
     new = path.with_name("new")
-    frames, gaps = write_salvaged(StreamReader(path), new)
+    frames, ranges = write_salvaged(StreamReader(path), new)
     reader = StreamReader(new)
     assert reader.closed()
     states = list(coded_frames(reader))
     assert [state.frame for state in states] == frames
     assert np.array_equal(seek(reader, frames[-1]).digest, states[-1].digest)
-    return frames, gaps, [state.digest.tobytes() for state in states]
+    return frames, ranges, [state.digest.tobytes() for state in states]
 
 
-def damage(clip: Clip, path: Path, count: int) -> None:
+def check_damage(clip: Clip, path: Path, count: int) -> None:
     rng = np.random.default_rng(0)
     for length in (*range(40), len(clip.data) - 1):
         check(clip, clip.data[:length], path)
@@ -183,62 +183,62 @@ def damage(clip: Clip, path: Path, count: int) -> None:
                     raise AssertionError(f"damage {trial} of seed 0") from error
 
 
-def test_every_damage_is_named_and_all_else_plays(clip: Clip, tmp_path: Path) -> None:
-    damage(clip, tmp_path / "s", 80)
+def test_salvage__reports_all_damage_and_plays_the_rest(clip: Clip, tmp_path: Path) -> None:
+    check_damage(clip, tmp_path / "s", 80)
 
 
 @pytest.mark.slow
-def test_every_damage_of_ten_thousand_is_named_and_all_else_plays(clip: Clip, tmp_path: Path) -> None:
-    damage(clip, tmp_path / "s", 10_000)
+def test_salvage__reports_ten_thousand_damages_and_plays_the_rest(clip: Clip, tmp_path: Path) -> None:
+    check_damage(clip, tmp_path / "s", 10_000)
 
 
-def lie(clip: Clip, path: Path, count: int) -> None:
-    """Change bytes within packets and make their CRC fit."""
+def check_forgery(clip: Clip, path: Path, count: int) -> None:
+    """Change bytes inside packets and adapt their CRC."""
     rng = np.random.default_rng(1)
     with little_memory():
         for _ in range(count):
-            spoilt, part = bytearray(clip.data), clip.parts[rng.integers(1, len(clip.parts))]
-            # Half of them where the numbers stand that say how much there is.
-            stop = part.stop if rng.random() < 0.5 else min(part.start + PAYLOAD + 120, part.stop)
-            for at in rng.integers(part.start + PAYLOAD, stop, rng.integers(1, 4)):
+            spoilt, piece = bytearray(clip.data), clip.pieces[rng.integers(1, len(clip.pieces))]
+            # Half of them among the numbers that determine the sizes of arrays.
+            stop = piece.stop if rng.random() < 0.5 else min(piece.start + PAYLOAD + 120, piece.stop)
+            for at in rng.integers(piece.start + PAYLOAD, stop, rng.integers(1, 4)):
                 spoilt[at] = rng.integers(256)
-            head, payload = spoilt[part.start : part.start + 16], spoilt[part.start + PAYLOAD : part.stop]
-            spoilt[part.start + 16 : part.start + PAYLOAD] = struct.pack("<I", zlib.crc32(head + payload))
+            head, payload = spoilt[piece.start : piece.start + 16], spoilt[piece.start + PAYLOAD : piece.stop]
+            spoilt[piece.start + 16 : piece.start + PAYLOAD] = struct.pack("<I", zlib.crc32(head + payload))
             path.write_bytes(spoilt)
             found = list(salvage(path))
-            if part.kind:
-                assert rewritten(path)[0] == [one.frame for one in found if isinstance(one, CodedFrame)]
+            if piece.kind:
+                assert rewritten(path)[0] == [entry.frame for entry in found if isinstance(entry, CodedFrame)]
             try:
                 played = list(coded_frames(StreamReader(path)))
             except ValueError:
                 played = []
-            # A lie may give another state of that frame; what was to follow refuses it.
+            # A forged packet may result in another state of its frame, which the next residual refuses.
             others = [s.frame for s in found if isinstance(s, CodedFrame) and differs(s, clip)]
             others += [s.frame for s in played if differs(s, clip)]
-            assert set(others) <= {part.frame}, (part, others)
+            assert set(others) <= {piece.frame}, (piece, others)
 
 
 def differs(state: CodedFrame, clip: Clip) -> bool:
     return not np.array_equal(state.digest, clip.states[state.frame].digest)
 
 
-def test_packets_that_lie_deceive_about_their_own_frame_at_most(clip: Clip, tmp_path: Path) -> None:
-    lie(clip, tmp_path / "s", 80)
+def test_salvage__a_forged_packet_affects_its_own_frame_at_most(clip: Clip, tmp_path: Path) -> None:
+    check_forgery(clip, tmp_path / "s", 80)
 
 
 @pytest.mark.slow
-def test_five_thousand_lies_deceive_about_their_own_frame_at_most(clip: Clip, tmp_path: Path) -> None:
-    lie(clip, tmp_path / "s", 5_000)
+def test_salvage__five_thousand_forged_packets_affect_their_own_frame_at_most(clip: Clip, tmp_path: Path) -> None:
+    check_forgery(clip, tmp_path / "s", 5_000)
 
 
-def test_a_stream_that_is_whole_is_salvaged_to_the_same_bytes(clip: Clip, tmp_path: Path) -> None:
+def test_write_salvaged__copies_an_intact_stream(clip: Clip, tmp_path: Path) -> None:
     (tmp_path / "s").write_bytes(clip.data)
     assert write_salvaged(StreamReader(tmp_path / "s"), tmp_path / "new") == (list(range(FRAMES)), [])
     assert (tmp_path / "new").read_bytes() == clip.data
 
 
-def test_what_cannot_be_salvaged_is_said_and_nothing_is_written(clip: Clip, tmp_path: Path) -> None:
-    (tmp_path / "s").write_bytes(clip.data[: clip.parts[2].start + 50])
+def test_write_salvaged__raises_and_writes_nothing_if_no_frame_plays(clip: Clip, tmp_path: Path) -> None:
+    (tmp_path / "s").write_bytes(clip.data[: clip.pieces[2].start + 50])
     reader = StreamReader(tmp_path / "s")
     with pytest.raises(ValueError, match="expected at least one frame that plays, got none"):
         write_salvaged(reader, tmp_path / "new")
@@ -247,8 +247,10 @@ def test_what_cannot_be_salvaged_is_said_and_nothing_is_written(clip: Clip, tmp_
     assert [path.name for path in tmp_path.iterdir()] == ["s"]
 
 
-def test_an_empty_file_and_one_of_something_else_hold_nothing(tmp_path: Path) -> None:
+def test_salvage__reports_an_empty_file_and_a_file_of_zeros(tmp_path: Path) -> None:
     (tmp_path / "s").write_bytes(b"")
-    assert [gap.problem for gap in salvage(tmp_path / "s") if isinstance(gap, DamagedRange)] == ["the file is empty"]
+    assert [entry.problem for entry in salvage(tmp_path / "s") if isinstance(entry, DamagedRange)] == [
+        "the file is empty"
+    ]
     (tmp_path / "s").write_bytes(bytes(10_000))
-    assert list(salvage(tmp_path / "s")) == [DamagedRange(0, 10_000, "the bytes are damaged or cut off")]
+    assert list(salvage(tmp_path / "s")) == [DamagedRange(0, 10_000, "the bytes are damaged or truncated")]

@@ -1,4 +1,4 @@
-"""Entropy coding: exact, near the entropy, and harmless when damaged."""
+"""Entropy coding: exact, close to the entropy, and harmless when damaged."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from morgs_mi.codec.entropy import LIMIT, ColumnReader, ColumnWriter, column_bit
 
 RNG = np.random.default_rng(3)
 COLUMNS = {
-    "nothing": np.zeros(0, np.int64),
+    "empty": np.zeros(0, np.int64),
     "one": np.array([-7]),
-    "still": np.zeros(5000, np.int64),
+    "constant": np.zeros(5000, np.int64),
     "narrow": np.rint(RNG.laplace(0, 0.6, 5000)).astype(np.int64),
     "wide": np.rint(RNG.laplace(3, 400, 5000)).astype(np.int64),
     "limits": np.array([LIMIT - 1, 1 - LIMIT, 15, -15, 16, -16, 2**16 - 1, 2**16, 2**17 - 1, -(2**17)]),
@@ -28,28 +28,28 @@ def coded(*columns: np.ndarray) -> np.ndarray:
     return writer.words()
 
 
-def test_columns_come_back_in_order() -> None:
+def test_column_reader__inverts_the_writer_in_order() -> None:
     reader = ColumnReader(coded(*COLUMNS.values()))
     for name, column in COLUMNS.items():
         np.testing.assert_array_equal(reader.take(len(column)), column, name)
 
 
 @pytest.mark.parametrize("scale", [0.3, 1, 5, 40])
-def test_the_code_is_near_the_entropy(scale: float) -> None:
+def test_column_writer__is_close_to_the_entropy(scale: float) -> None:
     values = np.rint(np.random.default_rng(0).laplace(0, scale, 10_000)).astype(int)
     _, counts = np.unique(values, return_counts=True)
     entropy = -(counts * np.log2(counts / counts.sum())).sum()
     size = 32 * len(coded(values))
-    # Learning the distribution costs some ten bits a token that occurs, and octaves are taken as flat.
+    # Learning the distribution costs about ten bits per distinct token, and octaves are modelled as uniform.
     assert entropy < size < 1.035 * entropy + 300
     assert size == pytest.approx(column_bits(values), rel=0.02, abs=100)
 
 
-def test_what_never_changes_costs_next_to_nothing() -> None:
+def test_column_writer__stores_a_constant_column_in_a_few_bytes() -> None:
     assert coded(np.zeros(100_000, np.int64)).nbytes < 40
 
 
-def test_damage_gives_wrong_numbers_or_a_sentence() -> None:
+def test_column_reader__returns_wrong_numbers_or_raises_on_damage() -> None:
     words = coded(*COLUMNS.values())
     for _ in range(100):
         damaged = words.copy()

@@ -1,4 +1,4 @@
-"""Frames in the stream: bit-exact states, stable numbers, errors within their bounds, damage that is named."""
+"""Frames in the stream: bit-exact states, stable ids, bounded errors, and messages that locate damage."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterable
 from dataclasses import replace
-from hashlib import blake2b
 from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO
@@ -30,60 +28,9 @@ from morgs_mi.codec.packets import (
     seek,
 )
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from tests.codec import plain_decoder
-
-CAMERAS = [Camera.look_at((x, 0, -4), (0, 0, 0), (0, -1, 0), 50, 160, 120, f"cam{x}") for x in (-1, 1)]
-
-
-def cloud(N: int = 60, degree: int = 1, confidence: bool = True, seed: int = 0) -> Gaussians:
-    rng = np.random.default_rng(seed)
-    return Gaussians(
-        means=rng.uniform(-1, 1, (N, 3)),
-        log_scales=rng.normal(-3, 0.5, (N, 3)),
-        quats=rng.normal(size=(N, 4)),
-        logit_opacities=rng.normal(1, 2, N),
-        sh_coeffs=rng.normal(0, 0.5, (N, (degree + 1) ** 2, 3)),
-        logit_confidence=rng.normal(0, 2, N) if confidence else None,
-    )
-
-
-def jittered(gaussians: Gaussians, rng: np.random.Generator, share: float = 0.4) -> Gaussians:
-    """Move some of the Gaussians, in all attributes."""
-    raw = {name: value for name, value in gaussians.numpy().items() if name not in ("motion", "offset")}
-    who = rng.random(len(gaussians)) < share
-    change = {n: 0.05 * rng.normal(size=v.shape) * who.reshape(-1, *[1] * (v.ndim - 1)) for n, v in raw.items()}
-    return Gaussians(**{name: value + change[name] for name, value in raw.items()})
-
-
-def run(
-    frames: int, config: CodecConfig | None = None, seed: int = 0, degree: int = 1
-) -> tuple[list[Packet], list[CodedFrame]]:
-    """Encode a cloud in which Gaussians move, die and are born in every frame."""
-    rng = np.random.default_rng(0)
-    packets = [keyframe_packet(cloud(degree=degree), 0, CAMERAS, config)]
-    states = [decode(None, packets[0])]
-    for frame in range(1, frames):
-        state = states[-1]
-        alive = np.flatnonzero(rng.random(len(state)) > 0.03)
-        births = int(rng.integers(0, 5))
-        moved = jittered(state.gaussians, rng).select(alive)
-        now = Gaussians.concatenate([moved, cloud(births, degree, seed=frame)]) if births else moved
-        if config is not None and config.offset:
-            now = replace(now, offset=np.random.default_rng(frame).normal(0, 0.02, (len(now), 3)))
-        source = np.concatenate([alive, np.full(births, -1)])
-        packets.append(residual_packet(state, now, source, CAMERAS, config))
-        states.append(decode(state, packets[-1]))
-    return packets, states
-
-
-def write(path: Path, packets: list[Packet], states: list[CodedFrame], every: int = 4) -> None:
-    with StreamWriter(path, CAMERAS, 25) as writer:
-        for packet, state in zip(packets, states, strict=True):
-            writer.write(packet)
-            if state.frame and state.frame % every == 0:
-                writer.write(reemitted_keyframe(state))
+from tests.codec.clouds import CAMERAS, cloud, encoded_clip, history, jittered, write
 
 
 def assert_same(got: CodedFrame, expected: CodedFrame) -> None:
@@ -95,8 +42,8 @@ def assert_same(got: CodedFrame, expected: CodedFrame) -> None:
 
 
 @pytest.mark.parametrize("config", [None, CodecConfig(offset=True)], ids=["", "offset"])
-def test_a_decoder_from_the_specification_gets_the_same_bits(tmp_path: Path, config: CodecConfig | None) -> None:
-    packets, states = run(6, config)
+def test_decode__equals_a_decoder_from_the_specification(tmp_path: Path, config: CodecConfig | None) -> None:
+    packets, states = encoded_clip(6, config)
     write(tmp_path / "s", packets, states, every=3)
     plain = list(plain_decoder.states((tmp_path / "s").read_bytes()))
     assert [frame for frame, _ in plain] == [state.frame for state in states]
@@ -108,33 +55,33 @@ def test_a_decoder_from_the_specification_gets_the_same_bits(tmp_path: Path, con
             assert np.array_equal(value, expected[name]), name
 
 
-def test_errors_stay_within_what_is_tolerated() -> None:
-    """A new Gaussian is off by half a step of its birth at most, a moved one by a step, its colour by half."""
+def test_residual_packet__errors_stay_within_the_tolerance() -> None:
+    """The error is at most half a step for a new Gaussian, a step for a moved one, half a step for its base colour."""
     config = CodecConfig(birth_precision=2)
     before = cloud(400)
     state = decode(None, keyframe_packet(before, 0, CAMERAS, config))
     after = jittered(before, np.random.default_rng(1))
     moved = decode(state, residual_packet(state, after, None, CAMERAS, config))
-    for true, found, error, shade in ((before, state, 0.5, 0.5), (after, moved, 2.0, 1.0)):
+    for true, found, error, color_error in ((before, state, 0.5, 0.5), (after, moved, 2.0, 1.0)):
         for camera in CAMERAS:
             view = camera.viewmat
             a, b = (g.numpy()["means"].astype(float) @ view[:3, :3].T + view[:3, 3] for g in (true, found.gaussians))
-            # Three coordinates add up at most.
-            off = camera.K[0, 0] * np.abs(a - b)[:, :2] / a[:, 2:]
-            assert off.max() < error * config.error_px * np.sqrt(3)
+            # At most, the errors of three coordinates add up.
+            pixels = camera.K[0, 0] * np.abs(a - b)[:, :2] / a[:, 2:]
+            assert pixels.max() < error * config.error_px * np.sqrt(3)
         sh = np.abs(true.numpy()["sh_coeffs"] - found.gaussians.numpy()["sh_coeffs"])
-        assert 0.2821 * sh[:, 0].max() < 1.001 * shade * config.error_color
+        assert 0.2821 * sh[:, 0].max() < 1.001 * color_error * config.error_color
         assert sh[:, 1:].max() < 1.001 * error * config.error_color
         opacity = np.abs(np.asarray(true.opacities) - np.asarray(found.gaussians.opacities))
         assert opacity.max() < 1.001 * error * config.error_opacity
         q, p = true.numpy()["quats"], found.gaussians.numpy()["quats"]
         cosine = np.abs((q * p).sum(1)) / np.linalg.norm(q, axis=1)
-        # The steps are meant for some 5 px: far below a tenth of a pixel at the ends of an axis.
+        # The steps are chosen for about 5 px: far below a tenth of a pixel at the ends of an axis.
         assert np.rad2deg(2 * np.arccos(np.minimum(cosine, 1))).max() < 8 * error
         assert opacity.max() > 0.7 * error * config.error_opacity, "the bound is near"
 
 
-def test_more_quality_takes_more_bytes_and_errs_less() -> None:
+def test_codec_config__more_quality_takes_more_bytes_and_has_smaller_errors() -> None:
     before = cloud(400)
     after = jittered(before, np.random.default_rng(1))
     sizes, errors = [], []
@@ -151,38 +98,38 @@ def test_more_quality_takes_more_bytes_and_errs_less() -> None:
 
 
 @pytest.mark.parametrize("target", [2000, 4000, 8000])
-def test_a_frame_keeps_to_its_target_and_comes_near_it(target: int) -> None:
+def test_residual_packet__stays_below_its_target_size_and_comes_near_it(target: int) -> None:
     state = decode(None, keyframe_packet(cloud(1500), 0, CAMERAS))
     after = jittered(state.gaussians, np.random.default_rng(1), share=1)
     packet = residual_packet(state, after, None, CAMERAS, CodecConfig(target_size=target))
-    # The coarseness goes in steps of 2^(1/4), up to a fifth of the bytes where few numbers are left.
+    # The coarseness has steps of 2^(1/4), up to a fifth of the bytes where few numbers are left.
     assert 0.75 * target < packet.arrays["code"].nbytes <= target
     assert len(decode(state, packet)) == 1500
 
 
-def test_nothing_moves_nothing_is_written() -> None:
+def test_residual_packet__of_a_static_frame_is_nearly_empty() -> None:
     state = decode(None, keyframe_packet(cloud(5000), 0, CAMERAS))
     packet = residual_packet(state, state.gaussians)
     assert len(encode_packet(packet)) < 200
     np.testing.assert_array_equal(decode(state, packet).grid.values, state.grid.values)
 
 
-def test_only_what_changes_by_a_step_is_written_and_colours_by_half() -> None:
+def test_residual_packet__stores_changes_of_a_step_and_colours_of_half_a_step() -> None:
     config = CodecConfig(birth_precision=1)
     state = decode(None, keyframe_packet(cloud(), 0, CAMERAS, config))
     raw = {name: value.astype(np.float64) for name, value in state.gaussians.numpy().items()}
-    for who, steps in ((7, 10.0), (8, 1.0), (9, 0.98)):
-        raw["means"][who] += steps * state.grid.steps("position")[who]
-    for who, steps in ((17, 0.51), (18, 0.49)):
-        raw["sh_coeffs"][who, 0] += steps * state.grid.steps("color")[who]
+    for i, steps in ((7, 10.0), (8, 1.0), (9, 0.98)):
+        raw["means"][i] += steps * state.grid.steps("means")[i]
+    for i, steps in ((17, 0.51), (18, 0.49)):
+        raw["sh_coeffs"][i, 0] += steps * state.grid.steps("sh_dc")[i]
     found = decode(state, residual_packet(state, Gaussians(**raw), None, CAMERAS, config))
     assert np.flatnonzero((found.grid.values != state.grid.values).any(1)).tolist() == [7, 8, 17]
     assert np.flatnonzero(found.gaussians.numpy()["motion"].any(1)).tolist() == [7, 8]
 
 
-def test_offsets_are_told_of_those_that_move_and_change_nothing_else() -> None:
-    plain, before = run(4)
-    packets, states = run(4, CodecConfig(offset=True))
+def test_residual_packet__stores_offsets_of_moving_gaussians_and_changes_nothing_else() -> None:
+    plain, before = encoded_clip(4)
+    packets, states = encoded_clip(4, CodecConfig(offset=True))
     assert [state.gaussians.offset is None for state in states] == [True, False, False, False]
     assert all(state.gaussians.offset is None for state in before)
     for without, packet in zip(plain, packets, strict=True):
@@ -194,13 +141,13 @@ def test_offsets_are_told_of_those_that_move_and_change_nothing_else() -> None:
     found = decode(state, residual_packet(state, after, None, CAMERAS, CodecConfig(offset=True))).gaussians.numpy()
     moved = found["motion"].any(1)
     assert 0.2 < moved.mean() < 0.6
-    # A moved centre's step is four times that of its birth.
-    error = np.abs(found["offset"] - after.numpy()["offset"])[moved] / (4 * state.grid.steps("position")[moved])
+    # The step of a moved mean is four times that of its birth.
+    error = np.abs(found["offset"] - after.numpy()["offset"])[moved] / (4 * state.grid.steps("means")[moved])
     assert 0.45 < error.max() <= 0.5 + 1e-4
     assert not found["offset"][~moved].any()
 
 
-def test_offsets_count_towards_the_target() -> None:
+def test_residual_packet__counts_offsets_towards_the_target_size() -> None:
     state = decode(None, keyframe_packet(cloud(1500), 0, CAMERAS))
     rng = np.random.default_rng(1)
     after = replace(jittered(state.gaussians, rng, share=1), offset=rng.normal(0, 0.02, (1500, 3)))
@@ -209,37 +156,37 @@ def test_offsets_count_towards_the_target() -> None:
     assert 0.75 * 8000 < arrays["code"].nbytes + arrays["offset"].nbytes <= 8000
 
 
-def test_a_decoded_state_leads_to_itself() -> None:
-    """Whoever encodes a stream once more, at the same steps, loses nothing more."""
-    _, states = run(5)
+def test_residual_packet__of_a_decoded_state_reproduces_it() -> None:
+    """Encoding a stream again, with the same steps, loses nothing more."""
+    _, states = encoded_clip(5)
     for before, after in pairwise(states):
         source = np.searchsorted(before.ids, after.ids)
-        kept = np.flatnonzero(after.ids < before.next_id)  # those born would choose their steps anew
+        kept = np.flatnonzero(after.ids < before.next_id)  # births would choose new steps
         found = decode(before, residual_packet(before, after.gaussians.select(kept), source[kept], CAMERAS))
         assert np.array_equal(found.grid.values, after.grid.values[kept])
 
 
-def test_numbers_follow_a_gaussian_from_birth_to_death() -> None:
+def test_decode__ids_follow_a_gaussian_from_birth_to_death() -> None:
     first = cloud(6)
     state = decode(None, keyframe_packet(first, 0, CAMERAS))
-    marked = Gaussians.concatenate([state.gaussians.select(np.array([0, 2, 5])), one(7.0)])
+    marked = Gaussians.concatenate([state.gaussians.select(np.array([0, 2, 5])), single_at(7.0)])
     state = decode(state, residual_packet(state, marked, np.array([0, 2, 5, -1]), CAMERAS))
     assert state.ids.tolist() == [0, 2, 5, 6]
-    again = Gaussians.concatenate([state.gaussians.select(np.array([1, 2])), one(8.0), one(9.0)])
+    again = Gaussians.concatenate([state.gaussians.select(np.array([1, 2])), single_at(8.0), single_at(9.0)])
     state = decode(state, residual_packet(state, again, np.array([1, 2, -1, -1]), CAMERAS))
     assert (state.ids.tolist(), state.next_id) == ([2, 5, 7, 8], 9)
     np.testing.assert_allclose(state.gaussians.numpy()["means"][2:, 0], [8, 9], atol=0.01)
-    assert not state.gaussians.numpy()["motion"][2:].any(), "who was born comes from nowhere"
+    assert not state.gaussians.numpy()["motion"][2:].any(), "a birth has no motion"
     assert decode(None, reemitted_keyframe(state)).ids.tolist() == [2, 5, 7, 8]
 
 
-def one(x: float) -> Gaussians:
+def single_at(x: float) -> Gaussians:
     single = decode(None, keyframe_packet(cloud(1), 0)).gaussians
     return replace(single, means=[[x, 0, 0]])
 
 
 @pytest.mark.parametrize(("degree", "confidence"), [(0, False), (0, True), (2, False), (3, True)])
-def test_every_kind_of_gaussian(degree: int, confidence: bool) -> None:
+def test_decode__round_trips_every_degree_with_and_without_confidence(degree: int, confidence: bool) -> None:
     state = decode(None, keyframe_packet(cloud(20, degree, confidence), 3, CAMERAS))
     now = jittered(state.gaussians, np.random.default_rng(0))
     found = decode(state, residual_packet(state, now, None, CAMERAS))
@@ -249,8 +196,22 @@ def test_every_kind_of_gaussian(degree: int, confidence: bool) -> None:
     np.testing.assert_allclose(found.gaussians.numpy()["sh_coeffs"], now.numpy()["sh_coeffs"], atol=0.02)
 
 
-def test_a_turn_of_any_angle_is_followed() -> None:
-    """The component that is left out was the largest at birth; later it may vanish."""
+def test_residual_packet__removes_all_gaussians() -> None:
+    state = decode(None, keyframe_packet(cloud(5), 0, CAMERAS))
+    now = decode(state, residual_packet(state, single_at(7.0), np.array([-1]), CAMERAS))
+    assert (now.ids.tolist(), now.next_id) == ([5], 6)
+
+
+def test_grid__stores_the_attribute_of_a_new_row_of_the_table() -> None:
+    """One more row with an `error` and a field of that name; streams without the attribute stay the same."""
+    command = [sys.executable, "-m", "tests.codec.new_row"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == history(encoded_clip(4)[1])
+
+
+def test_residual_packet__follows_a_turn_of_any_angle() -> None:
+    """The component that is not stored was the largest at birth; later it may vanish."""
     angles = np.linspace(0, 2 * np.pi, 40)
     one_axis = cloud(1)
     state = decode(None, keyframe_packet(replace(one_axis, quats=[[1, 0, 0, 0]]), 0, CAMERAS))
@@ -261,8 +222,8 @@ def test_a_turn_of_any_angle_is_followed() -> None:
         assert abs(state.gaussians.numpy()["quats"][0] @ q) > np.cos(np.deg2rad(2))
 
 
-def test_the_extremes_are_coded_as_exactly_as_float32_is() -> None:
-    """Right before a lens steps are tiny, and what is large, far away or bright would need integers without end."""
+def test_keyframe_packet__codes_extremes_as_exactly_as_float32() -> None:
+    """Close to a lens steps are tiny, and large, distant or bright Gaussians would need unbounded integers."""
     raw = cloud(40).numpy()
     raw["means"][:8] = CAMERAS[0].position + 1.001 * CAMERAS[0].near * CAMERAS[0].viewmat[2, :3]
     raw["log_scales"][:4] = 12, -30, 0
@@ -273,10 +234,10 @@ def test_the_extremes_are_coded_as_exactly_as_float32_is() -> None:
     for name in ("means", "log_scales", "sh_coeffs"):
         before, now = (np.asarray(getattr(g, name)).astype(np.float64) for g in (extreme, first.gaussians))
         largest = np.abs(before).reshape(40, -1).max(1).reshape(40, *[1] * (before.ndim - 1))
-        usual = 2 * np.abs(now[16:] - before[16:]).max()  # others are that exact; twice, as steps are by octaves
+        usual = 2 * np.abs(now[16:] - before[16:]).max()  # of the other Gaussians; twice, because steps come in octaves
         assert np.all(np.abs(now - before) <= np.maximum(2.0**-23 * largest, usual)), name
 
-    # Who was born near and small and flies off stops where its integers end.
+    # A Gaussian that is born close and small and flies off stops at the limit of its integers.
     gone = replace(first.gaussians, means=first.gaussians.means + np.float32(1e30))
     for config in (CodecConfig(), CodecConfig(birth_precision=1), CodecConfig(target_size=1)):
         second = decode(first, residual_packet(first, gone, cameras=CAMERAS, config=config))
@@ -284,8 +245,8 @@ def test_the_extremes_are_coded_as_exactly_as_float32_is() -> None:
         assert np.array_equal(decode(None, reemitted_keyframe(second)).digest, second.digest)
 
 
-def test_seeking_equals_playing_on_an_index_or_without(tmp_path: Path) -> None:
-    packets, states = run(14)
+def test_seek__equals_playing_with_and_without_an_index(tmp_path: Path) -> None:
+    packets, states = encoded_clip(14)
     path = tmp_path / "s"
     write(path, packets, states)
     whole = path.read_bytes()
@@ -295,13 +256,13 @@ def test_seeking_equals_playing_on_an_index_or_without(tmp_path: Path) -> None:
         assert len(reader.index()) == 14 + 3
         for state in states:
             assert_same(seek(reader, state.frame), state)
-        assert len(list(reader.near(9))) == 14 + 3 - 10  # from the keyframe of frame 8 on
+        assert len(list(reader.near(9))) == 14 + 3 - 10  # starting at the keyframe of frame 8
     with pytest.raises(ValueError, match="expected a frame of the stream, got 14"):
         seek(StreamReader(path), 14)
 
 
 def pipe() -> tuple[BinaryIO, BinaryIO]:
-    """Return the ends to read from and to write to."""
+    """Return the ends for reading and for writing."""
     read, write_end = os.pipe()
     return open(read, "rb"), open(write_end, "wb", buffering=0)
 
@@ -315,8 +276,8 @@ def tcp() -> tuple[BinaryIO, BinaryIO]:
 
 
 @pytest.mark.parametrize("channel", [pipe, tcp])
-def test_a_stream_is_received_frame_by_frame_while_it_is_written(channel) -> None:
-    packets, states = run(5)
+def test_stream_reader__receives_frames_while_they_are_written(channel) -> None:
+    packets, states = encoded_clip(5)
     source, sink = channel()
     got: list[CodedFrame] = []
     arrived = threading.Semaphore(0)
@@ -333,15 +294,15 @@ def test_a_stream_is_received_frame_by_frame_while_it_is_written(channel) -> Non
         with StreamWriter(sink, CAMERAS, 25) as writer:
             for packet in packets:
                 writer.write(packet)
-                assert arrived.acquire(timeout=20), "a frame is there as soon as it was written"
+                assert arrived.acquire(timeout=20), "a frame arrives as soon as it was written"
         assert not sink.closed
     receiver.join(20)
     for found, state in zip(got, states, strict=True):
         assert_same(found, state)
 
 
-def test_a_connection_that_is_lost_leaves_whole_frames_and_a_sentence() -> None:
-    packets, states = run(3)
+def test_stream_reader__reports_a_lost_connection_after_complete_frames() -> None:
+    packets, states = encoded_clip(3)
     source, sink = tcp()
     with sink:
         writer = StreamWriter(sink, CAMERAS, 25)
@@ -357,7 +318,7 @@ def test_a_connection_that_is_lost_leaves_whole_frames_and_a_sentence() -> None:
     assert len(got) == 1
 
 
-def test_a_pipe_cannot_be_turned_back() -> None:
+def test_stream_reader__refuses_to_seek_in_a_pipe() -> None:
     data = io.BytesIO()
     with StreamWriter(data, CAMERAS, 25):
         pass
@@ -366,27 +327,18 @@ def test_a_pipe_cannot_be_turned_back() -> None:
     with pytest.raises(ValueError, match="expected a file to seek in, got a pipe"):
         next(reader.near(1))
     with pytest.raises(ValueError, match="expected a file that is read twice, got a pipe"):
-        reader.whole()
+        reader.check()
 
 
-def history(states: Iterable[CodedFrame]) -> str:
-    """Return a digest of all that a decoder ever had."""
-    digest = blake2b()
-    for state in states:
-        for array in (state.digest, state.ids, *state.gaussians.numpy().values()):
-            digest.update(np.ascontiguousarray(array))
-    return digest.hexdigest()
-
-
-def test_300_frames_give_the_encoders_states_on_one_thread_and_on_many(tmp_path: Path) -> None:
-    packets, states = run(300, degree=0)
+def test_coded_frames__equal_the_encoders_states_on_one_thread_and_on_many(tmp_path: Path) -> None:
+    packets, states = encoded_clip(300, degree=0)
     write(tmp_path / "s", packets, states, every=50)
     program = f"""
 import drjit as dr
 import mitsuba as mi; mi.set_variant("llvm_ad_rgb")
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
-from tests.codec.test_packets import history
+from tests.codec.clouds import history
 dr.set_thread_count(1)
 print(history(coded_frames(StreamReader({str(tmp_path / "s")!r}))))
 """
@@ -399,8 +351,8 @@ print(history(coded_frames(StreamReader({str(tmp_path / "s")!r}))))
     assert_same(seek(StreamReader(tmp_path / "s"), 299), states[-1])
 
 
-def test_a_missing_packet_is_named() -> None:
-    packets, states = run(4)
+def test_decode__names_a_missing_packet() -> None:
+    packets, states = encoded_clip(4)
     with pytest.raises(ValueError, match="packet of frame 3: it does not continue the state after frame 1"):
         decode(states[1], packets[3])
     with pytest.raises(ValueError, match="packet of frame 1: a residual needs the frame before it"):
@@ -416,6 +368,7 @@ def with_head(packet: Packet, *head: int) -> Packet:
     [
         (lambda key, _: with_head(key, 2**32 - 1, 1, 1, 60), "does not fit its"),
         (lambda key, _: with_head(key, 60, 4, 1, 60), "does not fit its"),
+        (lambda key, _: with_head(key, 60, 1, 5, 60), "must have no bits beyond 0b1, got 0b101 with the unknown 0b100"),
         (lambda key, _: with_head(key, 60, 1, 1, 5), "its ids do not ascend"),
         (lambda key, _: with_head(key, 60), "its head must have 4 numbers"),
         (lambda _, residual: with_head(residual, 2**31, 8), "does not fit its"),
@@ -428,14 +381,14 @@ def with_head(packet: Packet, *head: int) -> Packet:
         ),
     ],
 )
-def test_packets_that_contradict_themselves_are_refused(change, message: str) -> None:
-    packets, states = run(2)
+def test_decode__refuses_packets_that_contradict_themselves(change, message: str) -> None:
+    packets, states = encoded_clip(2)
     with pytest.raises(ValueError, match=message):
         decode(states[0], change(*packets))
 
 
-def test_scrambled_code_is_refused_or_gives_a_state_that_the_next_packet_refuses() -> None:
-    packets, states = run(3)
+def test_decode__refuses_scrambled_code_or_the_packet_after_it() -> None:
+    packets, states = encoded_clip(3)
     rng = np.random.default_rng(0)
     for _ in range(60):
         code = packets[1].arrays["code"].copy()
@@ -454,11 +407,15 @@ def test_scrambled_code_is_refused_or_gives_a_state_that_the_next_packet_refuses
         (lambda s: residual_packet(s, cloud(3), np.array([1, 0, -1])), "`source` must be"),
         (lambda s: residual_packet(s, cloud(3), np.array([0, 1, 9])), "`source` must be"),
         (lambda s: residual_packet(s, cloud(3, degree=0)), "must have SH of degree 1"),
+        (
+            lambda s: residual_packet(s, cloud(3, confidence=False)),
+            r"\['logit_confidence'\] .* got .* \[\];",
+        ),
         (lambda s: CodecConfig(quality=0), "`quality` must be positive"),
         (lambda s: CodecConfig(target_size=-1), "`target_size` must not be negative"),
     ],
 )
-def test_bad_input_gets_a_sentence(call, message: str) -> None:
+def test_packets__bad_input_raises_a_sentence(call, message: str) -> None:
     state = decode(None, keyframe_packet(cloud(3), 0))
     with pytest.raises(ValueError, match=message):
         call(state)

@@ -1,4 +1,4 @@
-"""Files and folders appear whole or not at all."""
+"""Atomic creation of files and folders."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from morgs_mi.core.files import atomic_folder, whole, write_json
+from morgs_mi.core.files import atomic_folder, atomic_path, write_json
 
 
 def tree(path: Path) -> dict[str, str | None]:
@@ -21,7 +21,7 @@ def tree(path: Path) -> dict[str, str | None]:
 
 
 def write(partial: Path, kind: str, text: str = "new") -> None:
-    """Write what `whole` is asked for: a file, or a folder with one in it."""
+    """Write a file, or a folder with a file in it."""
     if kind == "folder":
         partial.mkdir()
     (partial / "a" if kind == "folder" else partial).write_text(text)
@@ -29,7 +29,7 @@ def write(partial: Path, kind: str, text: str = "new") -> None:
 
 @contextmanager
 def file_size_limit(size: int) -> Iterator[None]:
-    """A limit on the size of files fails writes as a full disk does."""
+    """Limit the file size, so that writes fail as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -40,11 +40,11 @@ def file_size_limit(size: int) -> Iterator[None]:
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
 @pytest.mark.parametrize("old", [False, True])
-def test_it_appears_at_the_end_and_in_place_of_the_old(tmp_path: Path, kind: str, old: bool) -> None:
+def test_atomic_path__appears_at_the_end_and_replaces_the_old(tmp_path: Path, kind: str, old: bool) -> None:
     if old:
         write(tmp_path / "x", kind, "old")
     before = tree(tmp_path)
-    with whole(tmp_path / "x", "test()") as partial:
+    with atomic_path(tmp_path / "x", "test()") as partial:
         write(partial, kind)
         assert {name: text for name, text in tree(tmp_path).items() if not name.startswith(".")} == before
     assert tree(tmp_path) == ({"x": "new"} if kind == "file" else {"x": None, "x/a": "new"})
@@ -53,13 +53,13 @@ def test_it_appears_at_the_end_and_in_place_of_the_old(tmp_path: Path, kind: str
 @pytest.mark.parametrize("kind", ["file", "folder"])
 @pytest.mark.parametrize("old", [False, True])
 @pytest.mark.parametrize("error", [ValueError("bad"), KeyboardInterrupt("stop"), OSError(28, "No space left")])
-def test_a_failing_body_leaves_nothing_and_keeps_the_old(tmp_path: Path, kind: str, old: bool, error) -> None:
+def test_atomic_path__is_unchanged_after_an_error_in_the_body(tmp_path: Path, kind: str, old: bool, error) -> None:
     if old:
         write(tmp_path / "x", kind, "old")
     before = tree(tmp_path)
 
     def fail() -> None:
-        with whole(tmp_path / "x", "test()") as partial:
+        with atomic_path(tmp_path / "x", "test()") as partial:
             write(partial, kind)
             raise error
 
@@ -69,7 +69,7 @@ def test_a_failing_body_leaves_nothing_and_keeps_the_old(tmp_path: Path, kind: s
     assert tree(tmp_path) == before
 
 
-def test_a_full_disk(tmp_path: Path) -> None:
+def test_write_json__leaves_the_old_file_on_a_full_disk(tmp_path: Path) -> None:
     write_json(tmp_path / "x.json", {"a": 1})
     before = tree(tmp_path)
     with file_size_limit(100), pytest.raises(OSError, match=r"x\.json, .*: File too large; check"):
@@ -78,7 +78,7 @@ def test_a_full_disk(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("case", ["a file", "read-only", "a folder", "missing"])
-def test_a_place_that_cannot_be_written(tmp_path: Path, case: str) -> None:
+def test_atomic_path__reports_a_folder_that_is_not_writable(tmp_path: Path, case: str) -> None:
     folder = tmp_path / "folder"
     if case == "a file":
         folder.touch()
@@ -91,13 +91,15 @@ def test_a_place_that_cannot_be_written(tmp_path: Path, case: str) -> None:
     before = tree(tmp_path)
     with (
         pytest.raises(OSError, match=rf"test\(\): cannot write {folder}/x, "),
-        whole(folder / "x", "test()") as partial,
+        atomic_path(folder / "x", "test()") as partial,
     ):
         partial.write_text("new")
     assert tree(tmp_path) == before
 
 
-def test_a_failed_swap_puts_the_old_folder_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_atomic_path__restores_the_old_folder_after_a_failed_swap(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write(tmp_path / "x", "folder", "old")
     before = tree(tmp_path)
 
@@ -105,33 +107,33 @@ def test_a_failed_swap_puts_the_old_folder_back(tmp_path: Path, monkeypatch: pyt
         raise OSError(5, "Input/output error")
 
     monkeypatch.setattr(Path, "replace", failing)
-    with pytest.raises(OSError, match="Input/output error"), whole(tmp_path / "x", "test()") as partial:
+    with pytest.raises(OSError, match="Input/output error"), atomic_path(tmp_path / "x", "test()") as partial:
         write(partial, "folder")
     assert tree(tmp_path) == before
 
 
-def test_what_a_killed_run_left_is_no_hindrance(tmp_path: Path) -> None:
-    """What others are still writing stays: another name's, and that of a process that lives."""
+def test_atomic_folder__removes_partial_output_of_killed_processes(tmp_path: Path) -> None:
+    """Partial output that may still be written stays: that of another name, and that of a running process."""
     gone = subprocess.Popen(["true"])
     gone.wait()
     for number in (os.getpid(), gone.pid):
         write(tmp_path / f".partial-{number}-x", "folder", "half")
-    theirs = {f".partial-{os.getppid()}-x": "", f".partial-{os.getpid()}-y-x": ""}
-    for name in theirs:
+    others = {f".partial-{os.getppid()}-x": "", f".partial-{os.getpid()}-y-x": ""}
+    for name in others:
         (tmp_path / name).touch()
     with atomic_folder(tmp_path / "x", "test()") as partial:
         (partial / "b").touch()
-    assert tree(tmp_path) == theirs | {"x": None, "x/b": ""}
+    assert tree(tmp_path) == others | {"x": None, "x/b": ""}
 
 
-def test_a_link_stays_a_link(tmp_path: Path) -> None:
+def test_write_json__follows_a_link(tmp_path: Path) -> None:
     (tmp_path / "link.json").symlink_to(tmp_path / "x.json")
     write_json(tmp_path / "link.json", {})
     assert (tmp_path / "link.json").is_symlink()
     assert (tmp_path / "x.json").read_text() == "{}\n"
 
 
-def test_a_new_folder_replaces_nothing_not_even_what_came_meanwhile(tmp_path: Path) -> None:
+def test_atomic_folder__replaces_nothing_not_even_a_folder_created_meanwhile(tmp_path: Path) -> None:
     write(tmp_path / "x", "folder", "old")
     with (
         pytest.raises(FileExistsError, match="x: expected a new folder, got one that exists; remove it first"),
@@ -143,7 +145,7 @@ def test_a_new_folder_replaces_nothing_not_even_what_came_meanwhile(tmp_path: Pa
     assert tree(tmp_path) == {"x": None, "x/a": "old", "y": None, "y/a": "theirs"}
 
 
-def test_a_file_in_a_folder_fails_with_one_sentence(tmp_path: Path) -> None:
+def test_atomic_folder__reports_a_failed_file_in_one_sentence(tmp_path: Path) -> None:
     with (
         file_size_limit(10),
         pytest.raises(OSError, match=r"^test\(\): .*/new/x, [^(]*: File too large; [^:]*$"),
@@ -153,7 +155,7 @@ def test_a_file_in_a_folder_fails_with_one_sentence(tmp_path: Path) -> None:
     assert tree(tmp_path) == {"new": None}
 
 
-def test_json_knows_no_infinity(tmp_path: Path) -> None:
+def test_write_json__writes_null_for_infinity_and_nan(tmp_path: Path) -> None:
     write_json(tmp_path / "new" / "a.json", {"psnr": [float("inf"), 1.0], "deep": {"nan": float("nan")}})
     assert json.loads((tmp_path / "new" / "a.json").read_text()) == {"psnr": [None, 1.0], "deep": {"nan": None}}
     (tmp_path / "file").write_text("")

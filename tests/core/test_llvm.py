@@ -1,4 +1,4 @@
-"""The choice of libLLVM: newest usable first, the user's own if it is usable, words instead of a crash."""
+"""The choice of libLLVM: the user's if it is usable, otherwise the newest; an error message instead of a crash."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 from morgs_mi.core import llvm
 
-linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the search is for Linux alone")
+linux = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the search is for Linux only")
 pytestmark = linux
 
 
@@ -44,25 +44,25 @@ def old_fails(monkeypatch):
         ("libLLVMPolly.so", None),
     ],
 )
-def test_major_from_file_name(tmp_path, name, major):
+def test_llvm_major__reads_the_file_name(tmp_path, name, major):
     assert llvm.llvm_major(tmp_path / name) == major
 
 
-def test_major_follows_links(libraries, tmp_path):
+def test_llvm_major__follows_links(libraries, tmp_path):
     libraries("libLLVM.so.20.1")
     (tmp_path / "libLLVM.so").symlink_to(tmp_path / "libLLVM.so.20.1")
     assert llvm.llvm_major(tmp_path / "libLLVM.so") == 20
     assert len(llvm.find_llvm([tmp_path])) == 1
 
 
-def test_newest_first(libraries):
+def test_find_llvm__returns_the_newest_first(libraries):
     folders = libraries("libLLVM-9.so.1", "libLLVM-15.so.1", "libLLVM.so.22.1", "libLLVM.so.19.1", "libLLVMx.so")
     assert [llvm.llvm_major(path) for path in llvm.find_llvm(folders)] == [22, 19, 15, 9]
     assert llvm.choose_llvm(folders=folders) == (folders[0] / "libLLVM.so.22.1", "")
 
 
 @pytest.mark.usefixtures("old_fails")
-def test_users_choice_wins_unless_it_is_bad(libraries):
+def test_choose_llvm__prefers_the_users_choice_if_it_is_usable(libraries):
     folders = libraries("libLLVM.so.19.1", "libLLVM.so.22.1", "libLLVM-15.so.1")
     good, bad = folders[0] / "libLLVM.so.19.1", folders[0] / "libLLVM-15.so.1"
     assert llvm.choose_llvm(str(good), folders) == (good, "")
@@ -73,14 +73,14 @@ def test_users_choice_wins_unless_it_is_bad(libraries):
 
 
 @pytest.mark.usefixtures("old_fails")
-def test_only_old_ones_is_said_in_words(libraries):
+def test_choose_llvm__describes_the_remedy_if_all_are_old(libraries):
     path, problem = llvm.choose_llvm(folders=libraries("libLLVM-15.so.1", "libLLVM-14.so.1"))
     assert path is None
     assert "libLLVM-15.so.1" in problem
     assert "apt-get install libllvm" in problem
 
 
-def test_missing_llvm_raises_without_cuda_and_warns_with_it(monkeypatch):
+def test_ensure_llvm__raises_without_cuda_and_warns_with_it(monkeypatch):
     monkeypatch.setattr(llvm, "find_llvm", lambda folders=None: [])
     monkeypatch.delenv(llvm.VARIABLE, raising=False)
     monkeypatch.setattr(llvm, "has_cuda", lambda: False)
@@ -94,13 +94,13 @@ def test_missing_llvm_raises_without_cuda_and_warns_with_it(monkeypatch):
     assert not Path(llvm.os.environ[llvm.VARIABLE]).exists()
 
 
-def test_search_is_cheap():
+def test_find_llvm__takes_less_than_30_ms():
     start = time.perf_counter()
     llvm.find_llvm()
     assert time.perf_counter() - start < 0.03
 
 
-def test_import_survives_a_bad_choice(tmp_path):
+def test_ensure_llvm__replaces_an_unusable_library_on_import(tmp_path):
     """A library that Dr.Jit cannot use is replaced, with a warning, before Dr.Jit loads it."""
     bad = next((p for p in llvm.find_llvm() if (llvm.llvm_major(p) or 99) < 17), tmp_path / "libLLVM-15.so.1")
     if llvm.usable(bad):

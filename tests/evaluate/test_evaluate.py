@@ -1,4 +1,4 @@
-"""Streams judged: pictures rendered from the stream's own Gaussians are the recording."""
+"""Evaluation of streams whose recording was rendered from the same Gaussians."""
 
 from __future__ import annotations
 
@@ -13,150 +13,186 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, reemitted_keyframe, residual_packet
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.evaluate.evaluate import IMAGE_SCORES, evaluate_stream
+from morgs_mi.evaluate.evaluate import IMAGE_SCORES, REGIONS, evaluate_stream
 from morgs_mi.evaluate.lpips import Lpips
+from morgs_mi.evaluate.results import known_mean
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.render.rasterize import rasterize
 from tests.evaluate.tiny_onnx import squared_difference
 from tests.moving_splats import CAMERAS, EXACT, FRAMES, HEIGHT, PIXELS, STEP, WIDTH, moved, write_stream
 
 
-def test_a_stream_of_the_recording_itself_has_no_error(fitted_clip: Path) -> None:
+def test_evaluate_stream__finds_no_error_in_the_stream_of_the_recording(fitted_clip: Path) -> None:
     result = evaluate_stream(fitted_clip)
-    assert result["held_out"]
-    assert list(result["views"]) == ["cam0"]
-    assert result["psnr"] == {"mean": np.inf, "first": np.inf, "last": np.inf}
-    assert result["ssim"]["mean"] == pytest.approx(1)
-    # Residuals of float32 coordinates near 1 leave a displacement of 0.05 good to 1e-7: 1e-6 px.
-    assert result["motion_error"] == pytest.approx(0, abs=1e-5)
-    assert result["motion_error_still"] == 0
-    assert result["true_motion_moving"] == pytest.approx(PIXELS)
-    assert np.isnan(result["frames"][0]["motion_error"]), "the first frame moves from nowhere"
-    assert (result["seconds"]["first"], result["seconds"]["per_later_frame"]) == (3.0, 1.5)
+    assert result.held_out
+    assert list(result.views) == ["cam0"]
+    assert [row.scores.psnr for row in (result, result.frames[0], result.frames[-1])] == [np.inf] * 3
+    assert result.scores.ssim == pytest.approx(1)
+    # Residuals of float32 coordinates near 1 store a displacement of 0.05 to 1e-7: 1e-6 px.
+    assert result.scores.motion_error == pytest.approx(0, abs=1e-5)
+    assert result.scores.motion_error_still == 0
+    assert result.scores.true_motion_moving == pytest.approx(PIXELS)
+    assert np.isnan(result.frames[0].scores.motion_error), "the first frame has no motion"
+    assert (result.seconds.first, result.seconds.per_later_frame) == (3.0, 1.5)
 
 
-def test_bytes_are_those_of_the_file(fitted_clip: Path) -> None:
+def test_evaluate_stream__reports_the_bytes_of_the_file(fitted_clip: Path) -> None:
     result = evaluate_stream(fitted_clip / "stream.morgs")
-    packets = [row["num_bytes"] for row in result["frames"]]
-    assert [row["kind"] for row in result["frames"]] == ["keyframe", "residual", "residual"]
-    assert result["bytes"]["file"] == (fitted_clip / "stream.morgs").stat().st_size
-    assert result["bytes"]["overhead"] + sum(packets) == result["bytes"]["file"]
-    assert result["bytes"]["per_keyframe"] == packets[0]
-    assert result["bytes"]["per_residual"] == np.mean(packets[1:])
+    packets = [row.num_bytes for row in result.frames]
+    assert [row.kind for row in result.frames] == ["keyframe", "residual", "residual"]
+    assert result.sizes.file == (fitted_clip / "stream.morgs").stat().st_size
+    assert result.sizes.overhead + sum(packets) == result.sizes.file
+    assert result.sizes.per_keyframe == packets[0]
+    assert result.sizes.per_residual == np.mean(packets[1:])
 
 
-def test_without_a_held_out_view_the_training_views_are_judged(fitted_clip: Path, tmp_path: Path) -> None:
+def test_evaluate_stream__uses_all_training_views_without_a_held_out_view(fitted_clip: Path, tmp_path: Path) -> None:
     write_stream(tmp_path / "s.morgs", {"test_view": None})
     with pytest.raises(ValueError, match="its header names no capture"):
         evaluate_stream(tmp_path / "s.morgs")
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
-    assert not result["held_out"]
-    assert {name: score["psnr"] for name, score in result["views"].items()} == {"cam0": np.inf, "cam1": np.inf}
-    assert result["frames"][0]["seconds"] is None
+    assert not result.held_out
+    assert {name: scores.psnr for name, scores in result.views.items()} == {"cam0": np.inf, "cam1": np.inf}
+    assert result.frames[0].seconds is None
 
 
-def test_a_wrong_motion_is_an_error_where_things_move(fitted_clip: Path, tmp_path: Path) -> None:
-    """A stream of keyframes alone carries no motion: none is judged. One that stands still errs by the truth."""
+def test_evaluate_stream__reports_a_wrong_motion_in_the_moving_region(fitted_clip: Path, tmp_path: Path) -> None:
+    """A keyframe has no motion, hence no motion error. The error of zero motion is the true motion."""
     state = decode(None, keyframe_packet(moved(1), 0, CAMERAS, EXACT))
     with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
         writer.write(reemitted_keyframe(state))
         writer.write(residual_packet(state, state.gaussians))
         writer.write(keyframe_packet(moved(1), 2, CAMERAS, EXACT))
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
-    assert result["frames"][1]["motion_error_moving"] == pytest.approx(PIXELS)
-    assert np.isnan(result["frames"][2]["motion_error"])
-    assert result["frames"][0]["psnr"] < result["frames"][1]["psnr"] == np.inf
+    scores = [row.scores for row in result.frames]
+    assert scores[1].motion_error_moving == pytest.approx(PIXELS)
+    assert np.isnan(scores[2].motion_error)
+    assert scores[0].psnr < scores[1].psnr == np.inf
 
 
-def test_only_those_who_live_in_both_frames_are_judged_by_their_motion(fitted_clip: Path, tmp_path: Path) -> None:
-    """The first splat dies, and one that moves in no true way is born: the others' motion is still exact."""
+def test_evaluate_stream__compares_3d_motion_of_gaussians_in_both_frames_only(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
+    """The first splat is removed and one with a wrong motion is added: the motion of the others is still exact."""
     state = decode(None, keyframe_packet(moved(0), 0, CAMERAS, EXACT))
     after = moved(1).select([1, 2, 3, 4, 0])
     with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
         writer.write(reemitted_keyframe(state))
         writer.write(residual_packet(state, after, np.array([1, 2, 3, 4, -1]), CAMERAS, EXACT))
-    result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")["motion_3d"]
-    assert 0 < result["num_gaussians"] <= 4
-    assert result["relative_error"] < 1e-3
+    result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture").motion_3d
+    assert result is not None
+    assert 0 < result.num_gaussians <= 4
+    assert result.relative_error < 1e-3
 
 
-def test_a_downscaled_fit_is_judged_at_its_own_size(fitted_clip: Path, tmp_path: Path) -> None:
+def test_evaluate_stream__uses_the_size_of_a_downscaled_fit(fitted_clip: Path, tmp_path: Path) -> None:
     small = load_capture(fitted_clip / "capture", downscale=1.7)
     with StreamWriter(
         tmp_path / "s.morgs", small.cameras, 25, {"test_view": 0, "downscale": small.downscale}
     ) as writer:
         writer.write(keyframe_packet(moved(0), 0))
-    # The recording was averaged down, the render was not: near, not equal.
-    assert evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")["psnr"]["mean"] > 20
+    # The recording was averaged down, the rendering was not: similar, not equal.
+    assert evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture").scores.psnr > 20
 
 
-def test_every_score_knows_its_regions(fitted_clip: Path) -> None:
+def test_evaluate_stream__reports_every_score_by_region(fitted_clip: Path) -> None:
     result = evaluate_stream(fitted_clip)
-    assert result["regions"] == "true masks"
+    assert result.regions == "true masks"
     for region in ("_moving", "_still"):
-        assert result["psnr" + region] == np.inf
-        assert result["ssim" + region] == pytest.approx(1)
-        assert result["flip" + region] == result["delta_e" + region] == 0
-    assert result["mtv"]["render"] == pytest.approx(result["mtv"]["input"])
-    assert 0 < result["mtv"]["still_share"] < 1
-    assert np.isnan(result["psnr_slope"]), "there is no line through infinite values"
+        scores = {name: getattr(result.scores, name + region) for name in IMAGE_SCORES}
+        assert scores["psnr"] == np.inf
+        assert scores["ssim"] == pytest.approx(1)
+        assert scores["flip"] == scores["delta_e"] == 0
+    assert result.variation.render == pytest.approx(result.variation.input)
+    assert 0 < result.variation.still_share < 1
+    assert np.isnan(result.psnr_slope), "there is no line through infinite values"
 
 
-def test_motion_of_splats_on_a_moving_object_is_judged_in_3d(fitted_clip: Path) -> None:
-    motion = evaluate_stream(fitted_clip)["motion_3d"]
+def test_evaluate_stream__reports_the_3d_motion_of_splats_on_a_moving_object(fitted_clip: Path) -> None:
+    motion = evaluate_stream(fitted_clip).motion_3d
+    assert motion is not None
     # Some of the five may lie behind pixels that none of them covers enough.
-    assert 1 <= motion["num_gaussians"] <= 5
-    assert motion["true_length"] == pytest.approx(STEP)
-    # float32 coordinates near 1 leave 1e-7 of a step of 0.05.
-    assert motion["relative_error"] == pytest.approx(0, abs=1e-5)
-    assert motion["length_ratio"] == pytest.approx(1, abs=1e-5)
-    assert motion["angle"] == pytest.approx(0, abs=1e-2)
+    assert 1 <= motion.num_gaussians <= 5
+    assert motion.true_length == pytest.approx(STEP)
+    # float32 coordinates near 1 resolve 1e-7 of a step of 0.05.
+    assert motion.relative_error == pytest.approx(0, abs=1e-5)
+    assert motion.length_ratio == pytest.approx(1, abs=1e-5)
+    assert motion.angle == pytest.approx(0, abs=1e-2)
 
 
-def test_confidence_overlaps_with_the_true_mask(fitted_clip: Path, tmp_path: Path) -> None:
-    """The clip's own confidence of one half is nowhere above it; that of sure splats is their alpha."""
-    assert evaluate_stream(fitted_clip)["confidence_iou"] == 0
+def test_evaluate_stream__reports_the_overlap_of_confidence_and_true_mask(fitted_clip: Path, tmp_path: Path) -> None:
+    """The clip's confidence of 0.5 is never above the threshold; a confidence of 1 is rendered as the alpha."""
+    assert evaluate_stream(fitted_clip).scores.confidence_iou == 0
     write_stream(tmp_path / "s.morgs", {"test_view": 0}, logit=20)
     alphas = [np.array(rasterize(moved(t), CAMERAS[0]).alpha) for t in range(1, FRAMES)]
     expected = np.mean([(alpha > 0.5).sum() / (alpha > 0).sum() for alpha in alphas])
-    found = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")["confidence_iou"]
+    found = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture").scores.confidence_iou
     assert found == pytest.approx(expected)
     assert found > 0
 
 
-def test_without_truth_the_recorded_change_parts_the_regions(fitted_clip: Path, tmp_path: Path) -> None:
+def test_evaluate_stream__uses_the_recorded_change_as_regions_without_truth(fitted_clip: Path, tmp_path: Path) -> None:
     shutil.copytree(fitted_clip / "capture", tmp_path / "capture", ignore=shutil.ignore_patterns("truth"))
     result = evaluate_stream(fitted_clip, tmp_path / "capture")
-    assert result["regions"] == "recorded change"
-    assert result["psnr_moving"] == result["psnr_still"] == np.inf
-    assert result["frames"][0]["flip_moving"] != result["frames"][0]["flip_moving"], "no frame before it"
-    assert result["motion_3d"] == {}
-    assert np.isnan(result["confidence_iou"])
+    assert result.regions == "recorded change"
+    assert result.scores.psnr_moving == result.scores.psnr_still == np.inf
+    assert np.isnan(result.frames[0].scores.flip_moving), "no frame before it"
+    assert result.motion_3d is None
+    assert result.as_dict()["motion_3d"] == {}
+    assert np.isnan(result.scores.confidence_iou)
 
 
-def test_lpips_is_told_where_a_network_is_given(fitted_clip: Path, tmp_path: Path) -> None:
+def test_evaluate_stream__reports_lpips_if_a_network_is_given(fitted_clip: Path, tmp_path: Path) -> None:
     write_stream(tmp_path / "s.morgs", {"test_view": 0}, shift=1)
     network = squared_difference(tmp_path / "net.onnx", HEIGHT, WIDTH)
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture", lpips=Lpips(network))
     # The network's distance is the squared error on a scale twice as wide; the mean over frames is that of errors.
-    errors = [4 * 10 ** (-row["psnr_moving"] / 10) for row in result["frames"]]
-    assert result["lpips_moving"] == pytest.approx(np.mean(errors), rel=1e-5)
+    errors = [4 * 10 ** (-row.scores.psnr_moving / 10) for row in result.frames]
+    assert result.scores.lpips_moving == pytest.approx(np.mean(errors), rel=1e-5)
     single = squared_difference(tmp_path / "single.onnx", HEIGHT, WIDTH, spatial=False)
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture", lpips=Lpips(single))
-    assert result["lpips"] > 0
-    assert np.isnan(result["lpips_moving"])
+    assert result.scores.lpips > 0
+    assert np.isnan(result.scores.lpips_moving)
 
 
-def test_drift_is_the_slope_of_psnr(fitted_clip: Path, tmp_path: Path) -> None:
+def test_evaluate_stream__reports_drift_as_the_slope_of_psnr(fitted_clip: Path, tmp_path: Path) -> None:
     write_stream(tmp_path / "s.morgs", {"test_view": 0}, shift=1)
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
-    first, _, last = (row["psnr"] for row in result["frames"])
-    assert result["psnr_slope"] == pytest.approx((last - first) / 2)
-    scores = {name + region for name in IMAGE_SCORES for region in ("", "_moving", "_still")}
-    assert scores <= result["frames"][0].keys()
+    first, _, last = (row.scores.psnr for row in result.frames)
+    assert result.psnr_slope == pytest.approx((last - first) / 2)
 
 
-def test_a_stream_that_does_not_fit_the_capture(fitted_clip: Path, tmp_path: Path) -> None:
+def test_evaluation__as_dict_holds_the_scores_under_the_keys_of_the_json(fitted_clip: Path, tmp_path: Path) -> None:
+    write_stream(tmp_path / "s.morgs", {"test_view": 0}, shift=1)
+    result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
+    found, row = result.as_dict(), result.as_dict()["frames"][1]
+    scores = {name + region for name in IMAGE_SCORES for region in REGIONS}
+    assert scores <= row.keys()
+    assert scores <= found.keys()
+    ends = {"mean": result.scores.psnr, "first": found["frames"][0]["psnr"], "last": found["frames"][-1]["psnr"]}
+    assert found["psnr"] == ends
+    assert found["ssim"].keys() == ends.keys()
+    assert (found["num_frames"], found["complete"], found["held_out"]) == (FRAMES, True, True)
+    for name, keys in (
+        ("seconds", {"first", "per_later_frame", "definition"}),
+        ("bytes", {"file", "overhead", "per_frame", "per_keyframe", "per_residual"}),
+        ("mtv", {"render", "input", "still_share"}),
+        ("playback", {"fps", "decode_ms", "render_ms"}),
+        ("motion_3d", {"num_gaussians", "error", "true_length", "relative_error", "length_ratio", "angle"}),
+    ):
+        assert found[name].keys() == keys, name
+    assert {"frame", "kind", "num_bytes", "seconds", "motion_3d", "views"} <= row.keys()
+    assert row["views"]["cam0"]["psnr"] == result.frames[1].views["cam0"].psnr
+    assert found["views"]["cam0"]["flip"] == result.views["cam0"].flip
+
+
+def test_known_mean__ignores_nan() -> None:
+    assert known_mean([1, np.nan, 2]) == 1.5
+    assert np.isnan(known_mean([np.nan]))
+    assert np.isnan(known_mean([]))
+
+
+def test_evaluate_stream__refuses_a_stream_of_another_capture(fitted_clip: Path, tmp_path: Path) -> None:
     write_colmap(tmp_path / "sparse", CAMERAS[:1])
     write_video(tmp_path / "cam0", [np.zeros((HEIGHT, WIDTH, 3), np.uint8)] * FRAMES, 25)
     with pytest.raises(ValueError, match=r"expected the cameras that .* was fitted to"):

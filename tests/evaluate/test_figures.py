@@ -1,4 +1,4 @@
-"""Drawings of a stream: which files, how large, and that they show the stream beside the truth."""
+"""Figures of a stream: names, sizes, and content compared with the truth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.moving_splats import CAMERAS, FRAMES, HEIGHT, PIXELS, WIDTH, write_st
 LEGEND = 96
 
 
-def test_every_picture_of_a_stream(fitted_clip: Path, tmp_path: Path) -> None:
+def test_draw_stream__writes_every_figure(fitted_clip: Path, tmp_path: Path) -> None:
     done = []
     paths = draw_stream(fitted_clip, tmp_path / "new", progress=lambda *count: done.append(count))
     assert [path.name for path in paths] == ["slice.png", "motion.png", "confidence.png"]
@@ -36,13 +36,13 @@ def test_every_picture_of_a_stream(fitted_clip: Path, tmp_path: Path) -> None:
     assert np.abs(true.astype(int) - found).max() <= 2
 
 
-def test_without_truth_the_stream_alone_is_drawn(fitted_clip: Path, tmp_path: Path) -> None:
+def test_draw_stream__draws_the_stream_alone_without_truth(fitted_clip: Path, tmp_path: Path) -> None:
     shutil.copytree(fitted_clip / "capture", tmp_path / "capture", ignore=shutil.ignore_patterns("truth"))
     paths = draw_stream(fitted_clip, tmp_path, tmp_path / "capture")
     assert cv2.imread(str(paths[1])).shape == (LEGEND + GAP + HEIGHT, WIDTH + GAP + LEGEND, 3)
 
 
-def test_offsets_are_drawn_beside_the_motion_that_they_are_a_part_of(fitted_clip: Path, tmp_path: Path) -> None:
+def test_draw_stream__draws_offsets_beside_the_whole_motion(fitted_clip: Path, tmp_path: Path) -> None:
     write_stream(tmp_path / "s.morgs", open_stream(fitted_clip).metadata, offset=0.05)
     path = draw_stream(tmp_path / "s.morgs", tmp_path)[-1]
     assert path.name == "offset.png"
@@ -56,14 +56,14 @@ def test_offsets_are_drawn_beside_the_motion_that_they_are_a_part_of(fitted_clip
     assert np.abs(offset[seen] - (255, 127, 127)).max() <= 3
 
 
-def test_the_scale_of_motion_is_that_of_the_truth(fitted_clip: Path, tmp_path: Path) -> None:
+def test_motion_scale__is_that_of_the_truth(fitted_clip: Path, tmp_path: Path) -> None:
     capture = load_capture(fitted_clip / "capture")
     assert motion_scale(capture, capture.cameras[0]) == pytest.approx(PIXELS)
     shutil.copytree(fitted_clip / "capture", tmp_path / "capture", ignore=shutil.ignore_patterns("truth"))
     assert motion_scale(load_capture(tmp_path / "capture"), capture.cameras[0]) == pytest.approx(0.03 * WIDTH)
 
 
-def test_a_stream_without_a_frame_is_refused(fitted_clip: Path, tmp_path: Path) -> None:
+def test_draw_stream__refuses_a_stream_without_a_frame(fitted_clip: Path, tmp_path: Path) -> None:
     with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25):
         pass
     with pytest.raises(ValueError, match="got a header alone"):

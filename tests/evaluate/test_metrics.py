@@ -1,4 +1,4 @@
-"""Metrics against what they say they are."""
+"""Metrics compared with their definitions."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def ssim_by_windows(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return out
 
 
-def test_psnr_of_a_known_error():
+def test_psnr__of_a_known_error():
     assert psnr(TRUTH + 0.1, TRUTH) == pytest.approx(20)
     assert psnr(TRUTH, TRUTH) == float("inf")
     black = np.zeros((4, 4, 3), np.uint8)
     assert psnr(black + np.uint8(255), black) == pytest.approx(0)
 
 
-def test_psnr_counts_the_mask_alone():
+def test_psnr__counts_the_masked_pixels_only():
     image = TRUTH.copy()
     image[:12] += 0.1
     mask = np.zeros(TRUTH.shape[:2], bool)
@@ -43,7 +43,7 @@ def test_psnr_counts_the_mask_alone():
     assert np.isnan(psnr(image, TRUTH, mask & ~mask))
 
 
-def test_ssim_equals_its_definition():
+def test_ssim__equals_its_definition():
     maps = np.stack([ssim_by_windows(NOISY[..., c], TRUTH[..., c]) for c in range(3)], -1)
     assert ssim(NOISY, TRUTH) == pytest.approx(maps.mean(), abs=1e-12)
     mask = rng.random(TRUTH.shape[:2]) < 0.3
@@ -51,19 +51,19 @@ def test_ssim_equals_its_definition():
     assert ssim(NOISY[..., 0], TRUTH[..., 0]) == pytest.approx(maps[..., 0].mean(), abs=1e-12)
 
 
-def test_ssim_is_symmetric_and_one_only_for_equals():
+def test_ssim__is_symmetric_and_one_for_equal_images_only():
     assert ssim(TRUTH, TRUTH) == pytest.approx(1, abs=1e-12)
     assert ssim(NOISY, TRUTH) == pytest.approx(ssim(TRUTH, NOISY), abs=1e-14)
     assert ssim(1 - TRUTH, TRUTH) < 0 < ssim(NOISY, TRUTH) < 1
 
 
-def test_bytes_and_floats_agree():
+def test_psnr_and_ssim__bytes_and_floats_agree():
     a, b = ((x * 255 + 0.5).astype(np.uint8) for x in (NOISY, TRUTH))
     assert psnr(a, b) == pytest.approx(psnr(a / 255, b / 255))
     assert ssim(a, b) == pytest.approx(ssim(a / 255, b / 255))
 
 
-def test_endpoint_error_is_a_mean_length():
+def test_endpoint_error__is_a_mean_length():
     truth = rng.normal(0, 3, (6, 7, 2))
     assert endpoint_error(truth + np.array([3, 4]), truth) == pytest.approx(5)
     motion = truth.copy()
@@ -73,7 +73,7 @@ def test_endpoint_error_is_a_mean_length():
     assert endpoint_error(motion, truth, mask) == pytest.approx(1)
 
 
-def test_iou_of_known_masks():
+def test_iou__of_known_masks():
     a, b = np.zeros((2, 4, 5), bool)
     a[0], b[:, 0] = True, True
     assert iou(a, b) == pytest.approx(1 / 8)
@@ -82,13 +82,13 @@ def test_iou_of_known_masks():
     assert np.isnan(iou(a & ~a, b & ~b))
 
 
-def test_a_smaller_map_lies_in_the_middle_of_its_mask():
+def test_mean_over__centres_a_smaller_map_in_the_mask():
     mask = np.zeros((6, 7), bool)
     mask[2, 3] = True
     values = np.arange(12.0).reshape(4, 3)  # its pixel (1, 1) is the mask's (2, 3)
     assert mean_over(values, mask) == values[1, 1]
     assert np.isnan(mean_over(values, mask & ~mask))
-    assert np.isnan(mean_over(np.array([1, np.nan]))), "a broken map does not look whole"
+    assert np.isnan(mean_over(np.array([1, np.nan]))), "a map with NaN has no mean"
     assert ssim_map(NOISY, TRUTH).shape == (14, 21)
 
 
@@ -101,6 +101,6 @@ def test_a_smaller_map_lies_in_the_middle_of_its_mask():
         (lambda: endpoint_error(TRUTH, TRUTH), r"\[H, W, 2\]"),
     ],
 )
-def test_bad_input_is_named(call, message):
+def test_metrics__refuse_bad_input(call, message):
     with pytest.raises(ValueError, match=message):
         call()

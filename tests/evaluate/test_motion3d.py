@@ -1,6 +1,8 @@
-"""3D motion: who lies on which object, how objects move, how displacements compare."""
+"""3D motion: assignment to objects, motion of objects, comparison of displacements."""
 
 from __future__ import annotations
+
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -17,27 +19,27 @@ TURN, SHIFT = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0.05
 
 
 def plane(depth: float, left: int, right: int) -> GroundTruth:
-    """What a camera sees of a wall: object `left` in its left half, `right` in its right half."""
+    """Ground truth of a wall: object `left` in the left half of the image, `right` in the right half."""
     ids = np.where(np.arange(WIDTH) < WIDTH // 2, left, right) + np.zeros((HEIGHT, 1), int)
     return GroundTruth(
         np.zeros((HEIGHT, WIDTH, 2)), np.full((HEIGHT, WIDTH), depth), ids, np.zeros((HEIGHT, WIDTH), bool)
     )
 
 
-def test_points_on_a_visible_surface_are_its_objects():
+def test_surface_ids__assigns_points_on_a_visible_surface_to_its_object():
     points = np.array([(-0.5, 0, 0), (0.5, 0, 0.03), (-0.5, 0, -0.1), (0.5, 0, 0.1), (9, 0, 0), (0, 0, -9)])
-    # On, on within 1 % of the depth of 4, in front, behind, beside the picture, behind the camera.
+    # On, on within 1 % of the depth of 4, in front, behind, outside the image, behind the camera.
     assert surface_ids(points, [(FRONT, plane(4, 3, 5))]).tolist() == [3, 5, -1, -1, -1, -1]
     assert surface_ids(points, []).tolist() == [-1] * 6
 
 
-def test_views_that_disagree_leave_a_point_out_and_others_complete_each_other():
+def test_surface_ids__excludes_points_on_which_views_disagree_and_combines_the_others():
     points = np.array([(-0.5, 0, 0.0), (0.5, 0, 0.0)])
     assert surface_ids(points, [(FRONT, plane(4, 3, 5)), (FRONT, plane(4, 3, 6))]).tolist() == [3, -1]
     assert surface_ids(points, [(FRONT, plane(4, -1, 5)), (FRONT, plane(4, 3, 5))]).tolist() == [3, 5]
 
 
-def test_rigid_motions_are_recovered_from_tracks():
+def test_rigid_motions__are_recovered_from_tracks():
     before = rng.normal(size=(40, 3))
     ids = np.repeat([0, 2, 4, 5], 10)
     after = before.copy()
@@ -51,34 +53,34 @@ def test_rigid_motions_are_recovered_from_tracks():
     np.testing.assert_allclose(found[2][1], SHIFT, atol=1e-12)
 
 
-def test_points_in_a_plane_are_enough():
+def test_rigid_motions__are_recovered_from_points_in_a_plane():
     before = rng.normal(size=(5, 3)) * (1, 1, 0)
     rotation, shift = rigid_motions(before, before @ TURN.T + SHIFT, np.zeros(5, int))[0]
     np.testing.assert_allclose(rotation, TURN, atol=1e-12)
     np.testing.assert_allclose(shift, SHIFT, atol=1e-12)
 
 
-def test_comparison_of_known_displacements():
+def test_compare_motion__of_known_displacements():
     truth = np.array([(1.0, 0, 0), (0, 3, 0)])
     score = compare_motion(np.array([(0, 1.0, 0), (0, 0, 0)]), truth)
-    assert score["num_gaussians"] == 2
-    assert score["error"] == pytest.approx((np.sqrt(2) + 3) / 2)
-    assert score["true_length"] == 2
-    assert score["relative_error"] == pytest.approx((np.sqrt(2) + 3) / 4)
-    assert score["length_ratio"] == pytest.approx(0.25)
-    assert score["angle"] == pytest.approx(90)
-    assert compare_motion(-truth, truth)["angle"] == pytest.approx(180)
+    assert score.num_gaussians == 2
+    assert score.error == pytest.approx((np.sqrt(2) + 3) / 2)
+    assert score.true_length == 2
+    assert score.relative_error == pytest.approx((np.sqrt(2) + 3) / 4)
+    assert score.length_ratio == pytest.approx(0.25)
+    assert score.angle == pytest.approx(90)
+    assert compare_motion(-truth, truth).angle == pytest.approx(180)
     half = compare_motion(truth / 2, truth)
-    assert (half["relative_error"], half["length_ratio"], half["angle"]) == pytest.approx((0.5, 0.5, 0))
+    assert (half.relative_error, half.length_ratio, half.angle) == pytest.approx((0.5, 0.5, 0))
 
 
-def test_of_no_gaussian_nothing_is_known():
-    nothing = compare_motion(np.zeros((0, 3)), np.zeros((0, 3)))
+def test_compare_motion__of_no_gaussian_is_nan():
+    nothing = asdict(compare_motion(np.zeros((0, 3)), np.zeros((0, 3))))
     assert nothing.pop("num_gaussians") == 0
     assert np.isnan(list(nothing.values())).all()
 
 
-def test_the_judged_are_opaque_on_a_moving_object_and_not_on_its_axis():
+def test_evaluate_motion__selects_opaque_gaussians_on_a_moving_object_off_its_axis():
     """The left half of the wall turns about the axis through (-1, 0, 0) along the view."""
     turn = Rotation.from_rotvec([0, 0, 0.2]).as_matrix()
     centre = np.array([-1.0, 0, 0])
@@ -89,9 +91,9 @@ def test_the_judged_are_opaque_on_a_moving_object_and_not_on_its_axis():
     true = (means - centre) @ turn.T + centre - means
     opacities = np.array([0.9, 0.9, 0.05, 0.9, 0.9])
     views = [(FRONT, plane(4, 3, 5))]
-    # Judged is the first alone: the axis, too thin, the half that stands still, off the surface.
+    # Only the first is evaluated: on the axis, too transparent, on the static half, off the surface.
     score = evaluate_motion(means, 1.5 * true, opacities, (tracked, after, ids), views)
-    assert score["num_gaussians"] == 1
-    assert score["true_length"] == pytest.approx(2 * 0.4 * np.sin(0.1))
-    assert (score["relative_error"], score["length_ratio"]) == pytest.approx((0.5, 1.5))
-    assert score["angle"] == pytest.approx(0, abs=1e-5)  # an arc cosine near 1 halves the digits
+    assert score.num_gaussians == 1
+    assert score.true_length == pytest.approx(2 * 0.4 * np.sin(0.1))
+    assert (score.relative_error, score.length_ratio) == pytest.approx((0.5, 1.5))
+    assert score.angle == pytest.approx(0, abs=1e-5)  # an arc cosine near 1 halves the digits

@@ -1,4 +1,4 @@
-"""FLIP against its authors' program, dE2000 against known differences."""
+"""FLIP compared with its authors' program, dE2000 with known differences."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ GREEN, BLUE = BLACK + np.eye(3)[1], BLACK + np.eye(3)[2]
     ],
     ids=["waves", "waves from afar", "black and white", "the ends of the gamut"],
 )
-def test_flip_is_that_of_its_authors(image, truth, pixels_per_degree, expected):
-    """Means that the authors' package flip-evaluator 1.7 gives, which works in single precision."""
+def test_flip_map__agrees_with_its_authors_program(image, truth, pixels_per_degree, expected):
+    """Expected are means of the authors' package flip-evaluator 1.7, which works in single precision."""
     assert flip_map(image, truth, pixels_per_degree).mean() == pytest.approx(expected, abs=1e-5)
 
 
-def test_flip_is_a_bounded_symmetric_difference():
+def test_flip_map__is_bounded_and_symmetric():
     error = flip_map(IMAGE, TRUTH)
     assert (flip_map(TRUTH, TRUTH) == 0).all()
     # Sums of the same terms in another order.
@@ -40,7 +40,7 @@ def test_flip_is_a_bounded_symmetric_difference():
     assert flip_map(*noise).max() <= 1
 
 
-def test_flip_lies_where_the_error_is():
+def test_flip_map__lies_where_the_error_is():
     image = TRUTH.copy()
     image[20:24, 30:34] += 0.2
     error = flip_map(image, TRUTH)
@@ -59,13 +59,13 @@ def test_flip_lies_where_the_error_is():
         ((9, 99, 199), (9, 99, 199), 0),
     ],
 )
-def test_colour_differences_of_the_gamuts_corners(a, b, expected):
+def test_delta_e_map__of_the_corners_of_the_gamut(a, b, expected):
     """Values that calculators of CIE dE2000 agree on for sRGB, to their two digits."""
     found = delta_e_map(np.full((1, 1, 3), a, np.uint8), np.full((1, 1, 3), b, np.uint8))
     assert found == pytest.approx(expected, abs=0.005)
 
 
-def test_colour_difference_is_per_pixel():
+def test_delta_e_map__is_per_pixel():
     image = TRUTH.copy()
     image[37, 5] = 1 - image[37, 5]
     error = delta_e_map(image, TRUTH)
@@ -74,7 +74,7 @@ def test_colour_difference_is_per_pixel():
 
 
 @pytest.mark.parametrize("metric", [flip_map, delta_e_map])
-def test_bytes_and_floats_agree(metric):
+def test_flip_map_and_delta_e_map__bytes_and_floats_agree(metric):
     a, b = ((x * 255 + 0.5).astype(np.uint8) for x in (IMAGE, TRUTH))
     np.testing.assert_allclose(metric(a, b), metric(a / 255, b / 255))
 
@@ -89,6 +89,6 @@ def test_bytes_and_floats_agree(metric):
         (lambda: delta_e_map(TRUTH[..., :2], TRUTH[..., :2]), r"must be \[H, W, 3\]"),
     ],
 )
-def test_bad_input_is_named(call, message):
+def test_flip_map_and_delta_e_map__refuse_bad_input(call, message):
     with pytest.raises(ValueError, match=message):
         call()

@@ -1,4 +1,4 @@
-"""Tables of a judgement: they fit a terminal and hold the figures."""
+"""Tables of an evaluation: they fit a terminal and hold the figures."""
 
 from __future__ import annotations
 
@@ -8,18 +8,19 @@ import pytest
 from rich.console import Console
 
 from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.evaluate.tables import evaluation_summary, evaluation_tables, figure
 from tests.moving_splats import write_stream
 
 
 @pytest.fixture(scope="module")
-def result(fitted_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> dict:
+def result(fitted_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Evaluation:
     path = tmp_path_factory.mktemp("tables") / "s.morgs"
     write_stream(path, {"test_view": 0}, shift=1)
     return evaluate_stream(path, fitted_clip / "capture")
 
 
-def test_tables_fit_eighty_columns(result: dict) -> None:
+def test_evaluation_tables__fit_eighty_columns(result: Evaluation) -> None:
     console = Console(width=200, record=True)
     for table in evaluation_tables(result):
         console.print(table)
@@ -27,18 +28,19 @@ def test_tables_fit_eighty_columns(result: dict) -> None:
     assert max(map(len, lines)) <= 80
     rows = {line.split("  ")[0].strip(): line.split()[-3:] for line in lines}
     assert rows["PSNR, dB"] == [
-        figure(v, 2) for v in (result["psnr"]["mean"], result["psnr_moving"], result["psnr_still"])
+        figure(v, 2) for v in (result.scores.psnr, result.scores.psnr_moving, result.scores.psnr_still)
     ]
-    assert rows["FLIP"] == [figure(result["flip" + region], 4) for region in ("", "_moving", "_still")]
+    assert rows["FLIP"] == [figure(getattr(result.scores, "flip" + region), 4) for region in ("", "_moving", "_still")]
     assert "LPIPS" not in rows, "no network was given"
-    assert any(line.endswith(figure(result["mtv"]["input"], 3)) for line in lines)
+    assert any(line.endswith(figure(result.variation.input, 3)) for line in lines)
 
 
-def test_sentences_hold_what_no_table_does(result: dict) -> None:
-    text = " ".join(evaluation_summary(result))
-    for value, digits in ((result["psnr_slope"], 4), (result["playback"]["fps"], 0), (result["motion_3d"]["angle"], 1)):
+def test_evaluation_summary__holds_the_figures_that_no_table_has(result: Evaluation) -> None:
+    text, motion = " ".join(evaluation_summary(result)), result.motion_3d
+    assert motion is not None
+    for value, digits in ((result.psnr_slope, 4), (result.playback.fps, 0), (motion.angle, 1)):
         assert figure(value, digits) in text
 
 
-def test_unknown_figures_are_dashes() -> None:
+def test_figure__of_unknown_values_is_a_dash() -> None:
     assert (figure(None, 2), figure(float("nan"), 2), figure(1 / 3, 2)) == ("-", "-", "0.33")

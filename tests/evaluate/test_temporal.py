@@ -1,4 +1,4 @@
-"""What holds over time: the variation of still pixels, recorded change, drift."""
+"""Quality over time: variation of static pixels, recorded change, slope of a score."""
 
 from __future__ import annotations
 
@@ -13,48 +13,48 @@ GREY = np.full((*SIZE, 3), 0.5)
 NOTHING = np.zeros(SIZE, bool)
 
 
-def test_variation_is_the_mean_change_of_pixels_that_never_moved():
+def test_still_variation__is_the_mean_change_of_pixels_that_never_move():
     left = NOTHING.copy()
     left[:, :8] = True
     variation = StillVariation()
     for step, moving in ((0.0, NOTHING), (0.01, left), (-0.02, NOTHING)):
         image = GREY + step
-        image[:, :8] += 10 * step  # where something moved once, nothing is counted
+        image[:, :8] += 10 * step  # pixels that moved once are not counted
         variation.add(image, GREY + step / 2, moving)
     result = variation.result()
-    assert result["render"] == pytest.approx(100 * (0.01 + 0.03) / 2)
-    assert result["input"] == pytest.approx(100 * (0.01 + 0.03) / 4)
-    assert result["still_share"] == pytest.approx(24 / 32)
+    assert result.render == pytest.approx(100 * (0.01 + 0.03) / 2)
+    assert result.input == pytest.approx(100 * (0.01 + 0.03) / 4)
+    assert result.still_share == pytest.approx(24 / 32)
 
 
-def test_a_frozen_view_has_no_variation_but_its_recording_has():
+def test_still_variation__of_a_frozen_view_is_zero_and_of_its_recording_is_not():
     variation = StillVariation()
     for _ in range(4):
         variation.add(GREY, GREY + rng.normal(0, 0.01, GREY.shape), NOTHING)
     result = variation.result()
-    assert result["render"] == 0
+    assert result.render == 0
     # The mean of |N(0, 2 sigma^2)| is 2 sigma / sqrt(pi).
-    assert result["input"] == pytest.approx(100 * 2 * 0.01 / np.sqrt(np.pi), rel=0.05)
+    assert result.input == pytest.approx(100 * 2 * 0.01 / np.sqrt(np.pi), rel=0.05)
 
 
-def test_false_alarms_are_forgiven():
+def test_still_variation__tolerates_false_alarms():
     once, twice = NOTHING.copy(), NOTHING.copy()
     once[:, :8], twice[:, :4] = True, True
     variation = StillVariation(false_alarms=0.1)
     for moving in (once, twice, *[NOTHING] * 8):
         variation.add(GREY, GREY, moving)
-    assert variation.result()["still_share"] == pytest.approx(28 / 32), "one frame in ten"
+    assert variation.result().still_share == pytest.approx(28 / 32), "one frame in ten"
 
 
-def test_variation_of_too_little_is_unknown():
+def test_still_variation__of_too_few_frames_or_pixels_is_nan():
     variation = StillVariation(valid=NOTHING)
     variation.add(GREY, GREY, NOTHING)
-    assert np.isnan(variation.result()["render"])
+    assert np.isnan(variation.result().render)
     variation.add(GREY, GREY, NOTHING)
-    assert np.isnan(variation.result()["input"]), "no pixel is valid"
+    assert np.isnan(variation.result().input), "no pixel is valid"
 
 
-def test_recorded_change_is_told_from_noise():
+def test_recorded_change__is_distinguished_from_noise():
     scene = rng.random((*SIZE, 3))
     before, after = (scene + rng.normal(0, 0.02, scene.shape) for _ in range(2))
     # Four deviations are exceeded by 6 in 100,000 pixels.
@@ -65,12 +65,12 @@ def test_recorded_change_is_told_from_noise():
     assert not changed[18:].any()
 
 
-def test_nothing_changes_in_equal_pictures_nor_under_a_flicker_of_all():
+def test_recorded_change__is_empty_for_equal_images_and_for_a_global_flicker():
     assert not recorded_change(GREY, GREY).any()
     assert not recorded_change(GREY, GREY + 0.1).any()
 
 
-def test_slope_is_that_of_a_line():
+def test_slope__is_that_of_a_line():
     assert slope([30, 29.5, 29, 28.5]) == pytest.approx(-0.5)
     assert slope([30, np.nan, 29]) == pytest.approx(-0.5), "time goes on where a score is missing"
     noisy = 30 + 0.1 * np.arange(50) + rng.normal(0, 1, 50)

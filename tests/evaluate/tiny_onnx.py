@@ -1,6 +1,6 @@
-"""ONNX files of three nodes, written by hand: a network to load without weights and without the package `onnx`.
+"""ONNX files of three nodes, written without the package `onnx`, as networks without weights for tests.
 
-Field numbers are those of onnx.proto; a message is a run of (number << 3 | wire type, value).
+Field numbers are those of onnx.proto; a message is a sequence of (number << 3 | wire type, value).
 """
 
 from __future__ import annotations

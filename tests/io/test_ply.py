@@ -1,4 +1,4 @@
-"""PLY: what is written comes back, what other tools write is read, what is broken is named."""
+"""PLY: exact round trips, files of other tools, and messages for broken files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from morgs_mi.io.ply import read_ply, write_ply
 LAYOUT = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 
 
-def some(N: int = 20, degree: int = 3) -> Gaussians:
+def random_gaussians(N: int = 20, degree: int = 3) -> Gaussians:
     rng = np.random.default_rng(degree)
     quats = rng.normal(size=(N, 4))
     quats /= np.linalg.norm(quats, axis=1, keepdims=True)
@@ -24,7 +24,7 @@ def some(N: int = 20, degree: int = 3) -> Gaussians:
 
 
 def table(gaussians: Gaussians) -> np.ndarray:
-    """Return one record per Gaussian as other tools hold them."""
+    """Return one record per Gaussian in the layout of other tools."""
     raw = gaussians.numpy()
     columns = {"x": raw["means"][:, 0], "y": raw["means"][:, 1], "z": raw["means"][:, 2]}
     columns |= {f"f_dc_{c}": raw["sh_coeffs"][:, 0, c] for c in range(3)}
@@ -44,15 +44,15 @@ def assert_same(a: Gaussians, b: Gaussians, **tolerance: float) -> None:
 
 
 @pytest.mark.parametrize("degree", range(4))
-def test_what_is_written_comes_back(tmp_path, degree):
-    gaussians = some(degree=degree)
+def test_read_ply__inverts_write_ply(tmp_path, degree):
+    gaussians = random_gaussians(degree=degree)
     write_ply(tmp_path / "g.ply", gaussians)
-    # Quaternions are normalised once more: one rounding.
+    # Quaternions are normalised again: one rounding.
     assert_same(gaussians, read_ply(tmp_path / "g.ply"), rtol=3e-7)
 
 
-def test_bytes_are_those_of_the_layout(tmp_path):
-    gaussians = some(2, degree=1)
+def test_write_ply__has_the_bytes_of_the_layout(tmp_path):
+    gaussians = random_gaussians(2, degree=1)
     write_ply(tmp_path / "g.ply", gaussians)
     head, body = (tmp_path / "g.ply").read_bytes().split(b"end_header\n")
     lines = head.decode().splitlines()
@@ -75,10 +75,10 @@ def test_bytes_are_those_of_the_layout(tmp_path):
 @pytest.mark.parametrize(
     "form", [{"text": True}, {"byte_order": ">"}, {"byte_order": "<"}], ids=["text", "big", "little"]
 )
-def test_reads_what_other_tools_write(tmp_path, degree, form):
-    gaussians = some(degree=degree)
+def test_read_ply__accepts_files_of_other_tools(tmp_path, degree, form):
+    gaussians = random_gaussians(degree=degree)
     records = table(gaussians)
-    # No normals, properties in another order and of other types, and some of another tool's own; a second element too.
+    # No normals, properties in another order and of other types, unknown properties, and a second element.
     extra = [("label", "u1"), *reversed(records.dtype.descr), ("time", "f8")]
     vertices = np.zeros(len(records), extra)
     for name in records.dtype.names:
@@ -90,7 +90,7 @@ def test_reads_what_other_tools_write(tmp_path, degree, form):
     assert_same(gaussians, read_ply(tmp_path / "g.ply"), rtol=1e-6 if "text" in form else 0)  # 9 digits may be fewer
 
 
-def test_a_zero_quaternion_does_not_rotate(tmp_path):
+def test_write_ply__writes_no_rotation_for_a_zero_quaternion(tmp_path):
     write_ply(
         tmp_path / "g.ply", Gaussians(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 4)), [0], np.zeros((1, 1, 3)))
     )
@@ -109,33 +109,33 @@ def with_nan(records):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (without("rot_3", "opacity"), "without opacity, rot_3; points alone"),
+        (without("rot_3", "opacity"), "without opacity, rot_3; a point cloud"),
         (without("f_rest_4"), "expected f_rest_0 to f_rest_8, 23 or 44 .* got 44 of them"),
         (with_nan, "expected finite numbers, got others in scale_1"),
         (lambda _: np.zeros(4, [("packed_position", "u4")]), "SuperSplat's compressed one"),
     ],
 )
-def test_refuses_in_a_sentence(tmp_path, change, message):
-    vertices = change(table(some()))
+def test_read_ply__bad_input_raises_a_sentence(tmp_path, change, message):
+    vertices = change(table(random_gaussians()))
     PlyData([PlyElement.describe(vertices, "vertex")]).write(str(tmp_path / "g.ply"))
     with pytest.raises(ValueError, match=message):
         read_ply(tmp_path / "g.ply")
 
 
 @pytest.mark.parametrize("keep", [0, 3, 60, -5])
-def test_a_file_cut_short_is_named(tmp_path, keep):
+def test_read_ply__names_a_truncated_file(tmp_path, keep):
     path = tmp_path / "g.ply"
-    write_ply(path, some())
+    write_ply(path, random_gaussians())
     path.write_bytes(path.read_bytes()[:keep])
-    with pytest.raises(ValueError, match=r"g\.ply: expected a whole PLY file"):
+    with pytest.raises(ValueError, match=r"g\.ply: expected a complete PLY file"):
         read_ply(path)
 
 
-def test_no_file_is_named(tmp_path):
+def test_read_ply__names_a_missing_file(tmp_path):
     with pytest.raises(FileNotFoundError, match="expected a PLY file, found none"):
         read_ply(tmp_path / "none.ply")
 
 
-def test_no_gaussians_are_a_file_too(tmp_path):
-    write_ply(tmp_path / "g.ply", some(0))
+def test_write_ply__writes_a_file_of_no_gaussians(tmp_path):
+    write_ply(tmp_path / "g.ply", random_gaussians(0))
     assert len(read_ply(tmp_path / "g.ply")) == 0

@@ -1,4 +1,4 @@
-"""Making things ahead in the background: order, bound, errors, and an end that leaves no thread behind."""
+"""Prefetching in the background: order, bound, errors, and no thread that remains."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ import pytest
 from morgs_mi.io.prefetch import prefetched
 
 
-def wait_until(true: Callable[[], bool]) -> None:
+def wait_until(condition: Callable[[], bool]) -> None:
     deadline = time.monotonic() + 10
-    while not true():
+    while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.005)
 
@@ -24,7 +24,7 @@ def workers() -> int:
     return sum(thread.name == "prefetch" for thread in threading.enumerate())
 
 
-def test_the_order_is_kept_and_work_is_done_elsewhere() -> None:
+def test_prefetched__preserves_the_order_and_runs_in_another_thread() -> None:
     made_by = set()
 
     def items():
@@ -37,7 +37,7 @@ def test_the_order_is_kept_and_work_is_done_elsewhere() -> None:
     wait_until(lambda: workers() == 0)
 
 
-def test_no_more_is_made_than_asked_for() -> None:
+def test_prefetched__produces_a_bounded_number_of_items_ahead() -> None:
     made = []
 
     def items():
@@ -54,7 +54,7 @@ def test_no_more_is_made_than_asked_for() -> None:
     wait_until(lambda: workers() == 0)
 
 
-def test_an_error_comes_where_the_item_would_have() -> None:
+def test_prefetched__raises_an_error_in_place_of_the_item() -> None:
     def items():
         yield 1
         raise ValueError("the disk is gone")
@@ -65,7 +65,7 @@ def test_an_error_comes_where_the_item_would_have() -> None:
         next(ahead)
 
 
-def test_closing_closes_the_source() -> None:
+def test_prefetched__closes_the_source() -> None:
     closed = []
 
     def items():
@@ -81,7 +81,7 @@ def test_closing_closes_the_source() -> None:
     wait_until(lambda: closed == [True])
 
 
-def test_the_newest_is_taken_where_the_source_cannot_wait() -> None:
+def test_prefetched__yields_the_newest_item_of_a_source_that_cannot_wait() -> None:
     made, taken = [], threading.Event()
 
     def items():
@@ -98,8 +98,8 @@ def test_the_newest_is_taken_where_the_source_cannot_wait() -> None:
     assert list(ahead) == [49]
 
 
-def test_the_interpreter_may_end_while_something_is_being_made() -> None:
-    """A thread that wakes within a library when the interpreter is gone aborts the process."""
+def test_prefetched__lets_the_interpreter_end_while_an_item_is_produced() -> None:
+    """A thread that resumes in library code after the end of the interpreter aborts the process."""
     script = (
         "import cv2, numpy as np\n"
         "from morgs_mi.io.prefetch import prefetched\n"

@@ -1,4 +1,4 @@
-"""Videos and folders of images: round trips, order, and what happens to broken ones."""
+"""Videos and folders of images: round trips, order, and messages for broken files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def smooth_clip() -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("name", ["cam.mp4", "cam.mkv", "cam"])
-def test_the_default_is_lossless(tmp_path: Path, name: str) -> None:
+def test_write_video__is_lossless_by_default(tmp_path: Path, name: str) -> None:
     write_video(tmp_path / name, clip(), fps=12.5)
     reader = open_frames(tmp_path / name)
     assert (reader.num_frames, reader.width, reader.height) == (COUNT, WIDTH, HEIGHT)
@@ -37,33 +37,33 @@ def test_the_default_is_lossless(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("codec", ["mp4v", "vp09"])
-def test_lossy_codecs_keep_rgb_order_and_most_of_the_picture(tmp_path: Path, codec: str) -> None:
+def test_write_video__lossy_codecs_preserve_the_rgb_order_and_most_of_the_image(tmp_path: Path, codec: str) -> None:
     write_video(tmp_path / "cam.mp4", smooth_clip(), 30, codec)
     got = np.array(list(VideoReader.open(tmp_path / "cam.mp4").frames()), float)
     # 4:2:0 chroma and the encoders' default rates; a swap of red and blue would give 13 dB.
     assert 10 * np.log10(255**2 / np.mean((got - smooth_clip()) ** 2)) > 30
 
 
-def test_names_sort_by_their_numbers() -> None:
+def test_natural_key__sorts_names_by_their_numbers() -> None:
     names = ["cam_10", "cam_2", "cam_0", "2", "b", "10", "cam"]
     assert sorted(names, key=natural_key) == ["2", "10", "b", "cam", "cam_0", "cam_2", "cam_10"]
 
 
-def test_a_folder_is_read_in_numerical_order(tmp_path: Path) -> None:
+def test_folder_reader__reads_in_numerical_order(tmp_path: Path) -> None:
     for i, frame in enumerate(clip(count=12)):
         cv2.imwrite(str(tmp_path / f"{i}.png"), frame[..., ::-1])
     np.testing.assert_array_equal(list(FolderReader.open(tmp_path).frames()), clip(count=12))
 
 
-def cut(path: Path, length: int) -> Path:
+def truncated(path: Path, length: int) -> Path:
     path.write_bytes(path.read_bytes()[:length])
     return path
 
 
-def test_a_truncated_video_gives_what_it_holds_and_then_names_the_frame(tmp_path: Path) -> None:
+def test_video_reader__yields_the_frames_of_a_truncated_video_and_then_names_the_missing_one(tmp_path: Path) -> None:
     path = tmp_path / "cam.mkv"
     write_video(path, clip(), 30)
-    reader = VideoReader.open(cut(path, path.stat().st_size // 2))
+    reader = VideoReader.open(truncated(path, path.stat().st_size // 2))
     frames = []
     with pytest.raises(ValueError, match=rf"cam.mkv: frame \d of {COUNT} cannot be decoded.*max_frames"):
         frames.extend(reader.frames())
@@ -75,9 +75,9 @@ def make_bad(tmp_path: Path, case: str) -> Path:
     path = tmp_path / "cam.mp4"
     write_video(path, clip(), 30)
     if case == "empty":
-        cut(path, 0)
+        truncated(path, 0)
     elif case == "truncated":
-        cut(path, path.stat().st_size // 2)
+        truncated(path, path.stat().st_size // 2)
     elif case == "text":
         path.write_text("no video")
     else:
@@ -86,7 +86,7 @@ def make_bad(tmp_path: Path, case: str) -> Path:
         if case == "gap":
             (path / "0002.png").unlink()
         elif case == "no image":
-            cut(path / "0000.png", 20)
+            truncated(path / "0000.png", 20)
         elif case == "size":
             cv2.imwrite(str(path / "0003.png"), np.zeros((8, 8, 3), np.uint8))
         elif case == "no images":
@@ -109,30 +109,32 @@ def make_bad(tmp_path: Path, case: str) -> Path:
         ("size", ValueError, "0003.png: expected 48x32 as in 0000.png, got 8x8"),
     ],
 )
-def test_bad_input(tmp_path: Path, case: str, error: type[Exception], message: str) -> None:
+def test_open_frames__bad_input_raises_a_sentence(
+    tmp_path: Path, case: str, error: type[Exception], message: str
+) -> None:
     with pytest.raises(error, match=message):
         list(open_frames(make_bad(tmp_path, case)).frames())
 
 
-def test_the_frames_that_a_cut_file_holds_are_counted(tmp_path: Path) -> None:
+def test_video_reader__counts_the_frames_of_a_truncated_file(tmp_path: Path) -> None:
     for name, codec in (("cam.mp4", "FFV1"), ("cam.mkv", "FFV1"), ("cam.avi", "MJPG")):
         write_video(tmp_path / name, clip(), 30, codec)
         reader = open_frames(tmp_path / name)
         assert reader.num_held == reader.num_frames == len(clip())
-    cut(tmp_path / "cam.mkv", (tmp_path / "cam.mkv").stat().st_size * 2 // 3)
+    truncated(tmp_path / "cam.mkv", (tmp_path / "cam.mkv").stat().st_size * 2 // 3)
     reader = open_frames(tmp_path / "cam.mkv")
     assert reader.num_frames == len(clip())
     assert 0 < reader.num_held < len(clip())
     assert len(list(reader.frames(0, reader.num_held))) == reader.num_held
 
 
-def test_images_are_not_turned_by_exif(tmp_path: Path) -> None:
+def test_folder_reader__ignores_the_rotation_of_exif(tmp_path: Path) -> None:
     jpeg = cv2.imencode(".jpg", np.zeros((16, 32, 3), np.uint8))[1].tobytes()
-    # One entry, orientation (0x112) 6: turned by 90 degrees.
+    # One entry, orientation (0x112) 6: rotated by 90 degrees.
     tiff = b"MM\0*\0\0\0\x08\0\x01\x01\x12\0\x03\0\0\0\x01\0\x06\0\0\0\0\0\0"
     exif = b"Exif\0\0" + tiff
     (tmp_path / "0.jpg").write_bytes(jpeg[:2] + b"\xff\xe1" + (len(exif) + 2).to_bytes(2, "big") + exif + jpeg[2:])
-    assert cv2.imread(str(tmp_path / "0.jpg")).shape == (32, 16, 3), "OpenCV turns it by itself"
+    assert cv2.imread(str(tmp_path / "0.jpg")).shape == (32, 16, 3), "OpenCV rotates it by default"
     assert next(open_frames(tmp_path).frames()).shape == (16, 32, 3)
 
 
@@ -159,13 +161,13 @@ def interrupted():
         ("cam.mp4", interrupted(), "FFV1", KeyboardInterrupt, "Ctrl-C"),
     ],
 )
-def test_a_failed_write_leaves_nothing(tmp_path: Path, name, frames, codec, error, message) -> None:
+def test_write_video__leaves_nothing_on_failure(tmp_path: Path, name, frames, codec, error, message) -> None:
     with pytest.raises(error, match=message):
         write_video(tmp_path / name, frames, 30, codec)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
+def test_write_video__leaves_the_old_file_on_failure(tmp_path: Path) -> None:
     write_video(tmp_path / "cam.mp4", clip(), 30)
     with pytest.raises(ValueError, match="at least one frame"):
         write_video(tmp_path / "cam.mp4", [], 30)
@@ -176,8 +178,8 @@ def test_a_failed_write_keeps_the_old_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["cam.mp4", "cam.mkv", "cam"])
-def test_a_full_disk_is_an_error_and_leaves_nothing(tmp_path: Path, name: str) -> None:
-    # A limit on the size of files fails writes as a full disk does.
+def test_write_video__raises_and_leaves_nothing_on_a_full_disk(tmp_path: Path, name: str) -> None:
+    # A limit on the file size makes writes fail as on a full disk.
     limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))"
     program = f"""{limit}
 import numpy as np

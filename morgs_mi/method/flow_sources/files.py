@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.core.files import whole
+from morgs_mi.core.files import atomic_path
 from morgs_mi.io.exr import read_exr, write_exr
 from morgs_mi.method.flow_sources.config import FlowConfig
 from morgs_mi.method.flow_sources.registry import FLOW_SOURCES, FlowSource, FramePair
@@ -138,7 +138,7 @@ def write_flow(path: str | Path, flow: np.ndarray) -> None:
         return
     height, width = flow.shape[:2]
     header = np.array([(_MAGIC, width, height)], _HEADER)
-    with whole(path, "write_flow()") as partial:
+    with atomic_path(path, "write_flow()") as partial:
         partial.write_bytes(header.tobytes() + flow.astype("<f4").tobytes())
 
 

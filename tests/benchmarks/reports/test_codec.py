@@ -1,4 +1,4 @@
-"""The codec's report: every figure from the streams that it leaves behind."""
+"""Report on the codec: figures compared with the streams that it writes."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.reports.codec import CodecReportConfig, markdown_table, plot_codec, report_codec
+from benchmarks.reports.codec import CodecReportConfig, CodecResult, markdown_table, plot_codec, report_codec
 from benchmarks.reports.plots import markdown
+from morgs_mi.core.files import finite
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.stream_loop import StreamConfig
+from tests.benchmarks.reports.pages import ROOT, page
 
-ROOT = Path(__file__).parents[3]
 QUICK = CodecReportConfig(
     qualities=(4, 40),
     stream=StreamConfig(
@@ -24,39 +25,59 @@ QUICK = CodecReportConfig(
 )
 
 
-def test_coarser_streams_are_smaller_and_lzma_is_larger(fitted_clip: Path, tmp_path: Path) -> None:
-    stages = []
-    result = report_codec([fitted_clip / "capture"], tmp_path, QUICK, lambda *stage: stages.append(stage))
-    (found,) = result["clips"]
-    rows = found["rows"]
-    assert [row["quality"] for row in rows] == [4, 40, 1000]
+@pytest.fixture(scope="module")
+def reported(fitted_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[CodecResult, Path, list]:
+    """Return a result, the folder of its streams, and the reported stages."""
+    folder, stages = tmp_path_factory.mktemp("codec"), []
+    result = report_codec([fitted_clip / "capture"], folder, QUICK, lambda *stage: stages.append(stage))
+    return result, folder, stages
+
+
+def test_report_codec__finds_coarser_streams_smaller_and_lzma_larger(reported) -> None:
+    result, folder, stages = reported
+    (found,) = result.clips
+    rows = found.rows
+    assert [row.quality for row in rows] == [4, 40, 1000]
     assert stages[-1] == ("Fitting capture", 3, 3)
     for row in rows:
-        assert row["file"] == (tmp_path / "capture" / f"{row['quality']:g}" / "stream.morgs").stat().st_size
-        assert row["later"] < row["lzma"] < row["raw"]
-        assert row["loss"] == pytest.approx(rows[-1]["psnr"]["later"] - row["psnr"]["later"])
-        # What a packet holds beside its flags; of a handful of numbers, the entropy says little.
-        assert 0 <= sum(row["bytes_by_group"].values()) < 1.1 * row["later"]
-        assert 0 <= row["moved"] < 300
-        assert min(row[name] for name in ("encode_ms", "decode_ms", "lzma_ms")) > 0
+        assert row.file == (folder / "capture" / f"{row.quality:g}" / "stream.morgs").stat().st_size
+        assert row.later < row.lzma < row.raw
+        assert row.loss == pytest.approx(rows[-1].psnr.later - row.psnr.later)
+        # The contents of a packet without its flags; the entropy of a few numbers is only approximate.
+        assert 0 <= sum(row.bytes_by_group.values()) < 1.1 * row.later
+        assert 0 <= row.moved < 300
+        assert min(row.encode_ms, row.decode_ms, row.lzma_ms) > 0
     for name in ("first", "later", "file"):
-        sizes = [row[name] for row in rows]
+        sizes = [getattr(row, name) for row in rows]
         assert sizes == sorted(sizes), name
-    assert np.isfinite(rows[0]["loss"])
-    assert rows[-1]["moved"] > 0
-    assert sum(rows[-1]["bytes_by_group"].values()) > 0.3 * rows[-1]["later"]
-    table = markdown_table(found).splitlines()
-    assert len({line.count("|") for line in table}) == 1
-    assert len(table) == 2 + len(rows)
-    before = {path: path.read_bytes() for path in tmp_path.rglob("stream.morgs")}
-    (again,) = report_codec([fitted_clip / "capture"], tmp_path, replace(QUICK, resume=True))["clips"]
+    assert np.isfinite(rows[0].loss)
+    assert rows[-1].moved > 0
+    assert sum(rows[-1].bytes_by_group.values()) > 0.3 * rows[-1].later
+
+
+def test_report_codec__reuses_complete_streams(reported, fitted_clip: Path) -> None:
+    result, folder, _ = reported
+    before = {path: path.read_bytes() for path in folder.rglob("stream.morgs")}
+    (again,) = report_codec([fitted_clip / "capture"], folder, replace(QUICK, resume=True)).clips
     assert {path: path.read_bytes() for path in before} == before, "nothing was fitted again"
-    assert [row["psnr"] for row in again["rows"]] == [row["psnr"] for row in rows]
+    assert [row.psnr for row in again.rows] == [row.psnr for row in result.clips[0].rows]
+
+
+def test_codec_result__is_read_from_its_json(reported) -> None:
+    result, *_ = reported
+    assert CodecResult.from_dict(json.loads(json.dumps(finite(result.as_dict())))).clips == result.clips
+
+
+def test_markdown_table_and_plot_codec__show_every_row(reported, tmp_path: Path) -> None:
+    result, *_ = reported
+    table = markdown_table(result.clips[0]).splitlines()
+    assert len({line.count("|") for line in table}) == 1
+    assert len(table) == 2 + len(result.clips[0].rows)
     plot_codec(result, tmp_path / "codec.png")
     assert (tmp_path / "codec.png").stat().st_size > 10_000
 
 
-def test_bad_settings_get_a_sentence(fitted_clip: Path, tmp_path: Path) -> None:
+def test_report_codec__refuses_bad_settings(fitted_clip: Path, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="`captures` must name at least one folder"):
         report_codec([], tmp_path, QUICK)
     with pytest.raises(ValueError, match="expected a capture of two frames or more, got 1"):
@@ -65,11 +86,11 @@ def test_bad_settings_get_a_sentence(fitted_clip: Path, tmp_path: Path) -> None:
         CodecReportConfig(qualities=(2000,))
 
 
-def groups_table(result: dict) -> str:
-    rows = [(clip["name"], next(row for row in clip["rows"] if row["quality"] == 1)) for clip in result["clips"]]
-    names = list(rows[0][1]["bytes_by_group"])
+def groups_table(result: CodecResult) -> str:
+    rows = [(clip.name, next(row for row in clip.rows if row.quality == 1)) for clip in result.clips]
+    names = list(rows[0][1].bytes_by_group)
     return markdown(
-        ["", *names], [[name, *(f"{row['bytes_by_group'][key] / 1e3:.1f}" for key in names)] for name, row in rows]
+        ["", *names], [[name, *(f"{row.bytes_by_group[key] / 1e3:.1f}" for key in names)] for name, row in rows]
     )
 
 
@@ -84,13 +105,14 @@ def speed_table(result: dict) -> str:
     return markdown(titles, cells, left=0)
 
 
-def test_documentation_quotes_the_committed_figures() -> None:
-    text = (ROOT / "docs/stream.md").read_text(encoding="utf-8")
+def test_codec_page__quotes_the_committed_figures() -> None:
+    text = page("stream.md", "stream-format.md", "codec.md")
     report, speed = (
         json.loads((ROOT / f"benchmarks/results/{name}.json").read_text(encoding="utf-8"))
         for name in ("codec_report", "codec_speed")
     )
+    report = CodecResult.from_dict(report)
     assert groups_table(report) in text
     assert speed_table(speed) in text
-    for clip in report["clips"]:
+    for clip in report.clips:
         assert markdown_table(clip) in text

@@ -1,16 +1,16 @@
-"""The report on optical flow: its errors are those of the flow, and the documentation quotes what was measured."""
+"""Report on optical flow: errors compared with those of the flow, and the page with the committed figures."""
 
 from __future__ import annotations
 
 import json
 import shutil
-from pathlib import Path
+from dataclasses import asdict
 
 import numpy as np
 import pytest
 
 from benchmarks.reports import __main__ as cli
-from benchmarks.reports.flow import FlowReportConfig, markdown_table, report_flow
+from benchmarks.reports.flow import FlowReportConfig, FlowResult, markdown_table, report_flow
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.evaluate.metrics import endpoint_error
 from morgs_mi.method.flow import observe_flow
@@ -18,8 +18,7 @@ from morgs_mi.method.flow_sources.files import write_flow
 from morgs_mi.method.flow_sources.opencv import FLOW_METHODS
 from morgs_mi.synth.ground_truth import load_truth
 from morgs_mi.synth.synthesize import synthesize
-
-ROOT = Path(__file__).parents[3]
+from tests.benchmarks.reports.pages import ROOT, page
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +31,7 @@ def clip(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def perfect(clip):
-    """The clip's true flow as files, one direction exact and the other the best that it tells."""
+    """The clip's true flow as files: backward exact, forward approximated by the backward motion."""
     flow = clip.parent / "flow"
     for camera in ("cam00", "cam01"):
         motion = load_truth(clip / "truth", camera, 1).motion
@@ -42,49 +41,51 @@ def perfect(clip):
     return flow
 
 
-def test_the_true_flow_has_no_error(clip, perfect):
-    row = report_flow([clip], FlowReportConfig((f"files:{perfect}",)))["clips"][0]["rows"][0]
-    for figures in (row["all"], row["moving"]):
-        assert figures["error"] == figures["reliable_error"] == 0
-        assert figures["within_1px"] == 1
+def test_report_flow__finds_no_error_in_the_true_flow(clip, perfect):
+    row = report_flow([clip], FlowReportConfig((f"files:{perfect}",))).clips[0].rows[0]
+    for errors in (row.all, row.moving):
+        assert errors.error == errors.reliable_error == 0
+        assert errors.within_1px == 1
 
 
-def test_errors_are_those_of_the_cue(clip):
-    found = report_flow([clip], FlowReportConfig(("dis",), views=1))["clips"][0]
-    assert (found["name"], found["width"], found["height"], found["pairs"]) == ("spheres", 96, 72, 1)
+def test_report_flow__errors_are_those_of_the_flow_observation(clip):
+    found = report_flow([clip], FlowReportConfig(("dis",), views=1)).clips[0]
+    assert (found.name, found.width, found.height, found.pairs) == ("spheres", 96, 72, 1)
     capture = load_capture(clip)
     frames, errors = list(capture.frames()), []
     for view, camera in enumerate(capture.cameras):
         truth = load_truth(clip / "truth", camera.name, 1)
-        cue = observe_flow(frames[1].images[view], frames[0].images[view])
+        flow = observe_flow(frames[1].images[view], frames[0].images[view])
         moving = truth.mask
         errors.append(
             {
-                "error": endpoint_error(cue.motion, truth.motion, moving),
-                "within_1px": np.mean(np.linalg.norm(cue.motion - truth.motion, axis=-1)[moving] < 1),
-                "reliable": cue.reliable[moving].mean(),
-                "reliable_error": endpoint_error(cue.motion, truth.motion, moving & cue.reliable),
+                "error": endpoint_error(flow.motion, truth.motion, moving),
+                "within_1px": np.mean(np.linalg.norm(flow.motion - truth.motion, axis=-1)[moving] < 1),
+                "reliable": flow.reliable[moving].mean(),
+                "reliable_error": endpoint_error(flow.motion, truth.motion, moving & flow.reliable),
             }
         )
-    # Figures are rounded to four digits; which of the two cameras is the more central one does not matter.
-    moving = found["rows"][0]["moving"]
+    # Figures are rounded to four digits; the report uses either of the two cameras.
+    moving = asdict(found.rows[0].moving)
     assert any(all(abs(moving[name] - each[name]) < 1e-4 for name in moving) for each in errors)
 
 
-def test_the_command_compares_methods_in_all_three_forms(clip, tmp_path, capsys):
+def test_flow_command__writes_tables_json_and_plot(clip, tmp_path, capsys):
     pytest.importorskip("matplotlib")
     path, plot = tmp_path / "flow.json", tmp_path / "flow.png"
     methods = ["--methods", "dis-ultrafast", "farneback"]
     assert cli.main(["flow", str(clip), str(clip), *methods, "--json", str(path), "--plot", str(plot)]) == 0
-    result = json.loads(path.read_text())
-    assert markdown_table(result["clips"][1]) in capsys.readouterr().out
-    assert [row["method"] for row in result["clips"][0]["rows"]] == methods[1:]
-    assert all(row["ms"] > 0 for row in result["clips"][0]["rows"])
-    assert {"settings", "machine", "versions"} <= result.keys()
+    value = json.loads(path.read_text())
+    result = FlowResult.from_dict(value)
+    assert result.as_dict() == value
+    assert markdown_table(result.clips[1]) in capsys.readouterr().out
+    assert [row.method for row in result.clips[0].rows] == methods[1:]
+    assert all(row.ms > 0 for row in result.clips[0].rows)
+    assert {"settings", "machine", "versions"} <= value.keys()
     assert plot.stat().st_size > 1000
 
 
-def test_a_clip_without_truth_is_refused(clip, tmp_path, capsys):
+def test_report_flow__refuses_a_clip_without_truth(clip, tmp_path, capsys):
     shutil.copytree(clip, tmp_path / "clip", ignore=shutil.ignore_patterns("truth"))
     assert cli.main(["flow", str(tmp_path / "clip")]) == 1
     assert "with ground truth, got 2 frames and no folder truth" in capsys.readouterr().err
@@ -100,14 +101,14 @@ def test_a_clip_without_truth_is_refused(clip, tmp_path, capsys):
         ({"frames": 1}, "`frames` must be at least 2, got 1"),
     ],
 )
-def test_nothing_cannot_be_measured(arguments, message):
+def test_flow_report_config__refuses_empty_settings(arguments, message):
     with pytest.raises(ValueError, match=message):
         FlowReportConfig(**arguments)
 
 
-def test_documentation_quotes_the_committed_figures():
+def test_flow_page__quotes_the_committed_figures():
     result = json.loads((ROOT / "benchmarks/results/flow_report.json").read_text(encoding="utf-8"))
-    text = (ROOT / "docs/flow.md").read_text(encoding="utf-8")
-    for clip in result["clips"]:
+    text = page("flow.md")
+    for clip in FlowResult.from_dict(result).clips:
         assert markdown_table(clip) in text
-        assert [row["method"] for row in clip["rows"]] == list(FLOW_METHODS)
+        assert [row.method for row in clip.rows] == list(FLOW_METHODS)

@@ -1,4 +1,4 @@
-"""The sampled float64 twin against the tests' own, which loops over everything."""
+"""The sampled float64 reference compared with that of the tests, which loops over everything."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from benchmarks.reports import reference64
-from benchmarks.reports.reference64 import ATTRIBUTES, Twin
+from benchmarks.reports.reference64 import ATTRIBUTES, Reference64
 from morgs_mi import Camera, RenderConfig
 from tests import reference
 
-CONFIG = RenderConfig(alpha_min=1 / 255, alpha_max=0.7)  # a cap that is met
+CONFIG = RenderConfig(alpha_min=1 / 255, alpha_max=0.7)  # a cap that some pixels reach
 
 
 def scene(degree: int) -> tuple[dict[str, np.ndarray], Camera]:
@@ -35,18 +35,18 @@ def slow(raw: dict[str, np.ndarray], camera: Camera) -> np.ndarray:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("pairs", [1_000_000, 50], ids=["at once", "in parts"])
-def test_agrees_with_the_tests_twin(degree, pairs, monkeypatch):
+@pytest.mark.parametrize("pairs", [1_000_000, 50], ids=["at once", "in chunks"])
+def test_reference64__renders_like_the_reference_of_the_tests(degree, pairs, monkeypatch):
     monkeypatch.setattr(reference64, "_PAIRS", pairs)
     raw, camera = scene(degree)
     expected = slow(raw, camera)
     pixels = np.random.default_rng(1).permutation(np.argwhere(np.ones((13, 9))))[:80]
-    found = Twin(raw, camera, CONFIG).render(pixels)
+    found = Reference64(raw, camera, CONFIG).render(pixels)
     assert np.abs(found - expected[pixels[:, 1], pixels[:, 0]]).max() < 1e-13
 
 
 @pytest.mark.parametrize("degree", [0, 3])
-def test_gradients_agree_with_complex_steps_through_everything(degree):
+def test_reference64__gradients_agree_with_complex_steps_through_everything(degree):
     raw, camera = scene(degree)
     rng = np.random.default_rng(2)
     pixels = rng.permutation(np.argwhere(np.ones((13, 9))))[:60]
@@ -56,7 +56,7 @@ def test_gradients_agree_with_complex_steps_through_everything(degree):
         return np.sum(slow(values, camera)[pixels[:, 1], pixels[:, 0]] * weight)
 
     expected = reference.complex_step(loss, raw, list(ATTRIBUTES))
-    found = Twin(raw, camera, CONFIG).gradients(pixels, weight)
+    found = Reference64(raw, camera, CONFIG).gradients(pixels, weight)
     for name in ATTRIBUTES:
         assert found[name].shape == raw[name].shape
         assert np.abs(expected[name]).max() > 0

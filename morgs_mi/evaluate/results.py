@@ -1,0 +1,265 @@
+"""Results of an evaluation as frozen dataclasses; `Evaluation.as_dict` is the JSON that `morgs-mi eval` writes.
+
+NaN stands for an unknown score. A name with ``_moving`` or ``_still`` is the score of a region; see `evaluate`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any, Self
+
+import numpy as np
+
+__all__ = [
+    "Evaluation",
+    "FrameScores",
+    "Motion3DScores",
+    "PlaybackTimes",
+    "Sizes",
+    "Timings",
+    "VariationScores",
+    "ViewScores",
+    "known_mean",
+]
+
+_NAN = float("nan")
+_SECONDS = (
+    "wall time of a frame from the images in memory to its packet: flow, masks, optimisation, residual and its "
+    "decoding; without reading the recording and without writing the packet"
+)
+
+
+def known_mean(values: Sequence[float]) -> float:
+    """Return the mean of the values that are not NaN; NaN if there are none."""
+    known = [value for value in values if not np.isnan(value)]
+    return float(np.mean(known)) if known else _NAN
+
+
+@dataclass(frozen=True)
+class _Scores:
+    """Base of scores that are averaged field by field."""
+
+    @classmethod
+    def mean(cls, scores: Sequence[Self]) -> Self:
+        """Return the mean of each field over its known values."""
+        return cls(**{name: known_mean([getattr(each, name) for each in scores]) for name in cls.names()})
+
+    @classmethod
+    def names(cls) -> tuple[str, ...]:
+        """Return the names of the fields."""
+        return tuple(field.name for field in fields(cls))
+
+
+@dataclass(frozen=True)
+class ViewScores(_Scores):
+    """Scores of one view of one frame, or means of several."""
+
+    psnr: float = _NAN
+    """PSNR, dB."""
+    psnr_moving: float = _NAN
+    psnr_still: float = _NAN
+    ssim: float = _NAN
+    """SSIM, at most 1."""
+    ssim_moving: float = _NAN
+    ssim_still: float = _NAN
+    flip: float = _NAN
+    """FLIP, in [0, 1]."""
+    flip_moving: float = _NAN
+    flip_still: float = _NAN
+    delta_e: float = _NAN
+    """Colour difference CIE dE2000."""
+    delta_e_moving: float = _NAN
+    delta_e_still: float = _NAN
+    lpips: float = _NAN
+    """LPIPS, if a network is given."""
+    lpips_moving: float = _NAN
+    lpips_still: float = _NAN
+    motion_error: float = _NAN
+    """Endpoint error of the rendered motion, px."""
+    motion_error_moving: float = _NAN
+    motion_error_still: float = _NAN
+    true_motion_moving: float = _NAN
+    """Mean length of the true motion where the surface moves, px."""
+    confidence_iou: float = _NAN
+    """IoU of the rendered confidence above 0.5 and the true mask."""
+
+
+@dataclass(frozen=True)
+class Motion3DScores(_Scores):
+    """Error of the 3D displacements of Gaussians on moving objects (see `motion3d`)."""
+
+    num_gaussians: float = 0
+    """Number of Gaussians that are compared."""
+    error: float = _NAN
+    """Mean of |d - d*|, world units."""
+    true_length: float = _NAN
+    """Mean of |d*|, world units."""
+    relative_error: float = _NAN
+    """`error` divided by `true_length`."""
+    length_ratio: float = _NAN
+    """Mean of |d| divided by `true_length`."""
+    angle: float = _NAN
+    """Mean angle between d and d*, degrees; 90 for a Gaussian that does not move."""
+
+
+@dataclass(frozen=True)
+class VariationScores(_Scores):
+    """Masked total variation (mTV, x100) of the static pixels of a view (see `StillVariation`)."""
+
+    render: float = _NAN
+    """mTV of the rendered view."""
+    input: float = _NAN
+    """mTV of the recording."""
+    still_share: float = _NAN
+    """Share of the view's pixels that count as static."""
+
+
+@dataclass(frozen=True)
+class FrameScores:
+    """Scores of one frame."""
+
+    frame: int
+    """Index of the frame."""
+    kind: str
+    """Kind of its packet, ``keyframe`` or ``residual``."""
+    num_bytes: int
+    """Size of its packet."""
+    seconds: float | None
+    """Wall time of its fit; None without a report of the fit."""
+    scores: ViewScores
+    """Means over the views."""
+    motion_3d: Motion3DScores | None
+    """Errors in 3D; None without tracks or a previous frame."""
+    views: Mapping[str, ViewScores]
+    """Scores by camera name."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the frame's row of the JSON."""
+        return {
+            "frame": self.frame,
+            "kind": self.kind,
+            "num_bytes": self.num_bytes,
+            "seconds": self.seconds,
+            **asdict(self.scores),
+            "motion_3d": _optional(self.motion_3d),
+            "views": {name: asdict(scores) for name, scores in self.views.items()},
+        }
+
+
+@dataclass(frozen=True)
+class Timings:
+    """Wall times of a fit, from the images in memory to the packet."""
+
+    first: float | None
+    """Seconds of the first frame; None without a report of the fit."""
+    per_later_frame: float
+    """Mean seconds of a later frame."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of a stream, bytes."""
+
+    file: int
+    """Size of the file."""
+    overhead: int
+    """Header, index and re-emitted keyframes."""
+    per_frame: float
+    """`file` divided by the number of frames."""
+    per_keyframe: float
+    """Mean size of a keyframe's packet."""
+    per_residual: float
+    """Mean size of a residual's packet."""
+
+
+@dataclass(frozen=True)
+class PlaybackTimes:
+    """Speed of decoding and rendering a stream on this machine (see `playback_speed`)."""
+
+    fps: float
+    """Frames per second."""
+    decode_ms: float
+    """Median time to decode a frame, ms."""
+    render_ms: float
+    """Median time to render a frame, ms."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores of a stream."""
+
+    stream: str
+    """Path of the stream file."""
+    capture: str
+    """Path of the capture."""
+    held_out: bool
+    """Whether the scores are those of the held-out view; otherwise of all training views."""
+    complete: bool
+    """Whether the stream holds all frames that were to be fitted."""
+    regions: str
+    """Source of the regions, ``true masks`` or ``recorded change``."""
+    sizes: Sizes
+    variation: VariationScores
+    """Mean over the views."""
+    playback: PlaybackTimes
+    psnr_slope: float
+    """Slope of the PSNR, dB per frame."""
+    frames: tuple[FrameScores, ...]
+
+    @property
+    def num_frames(self) -> int:
+        """Number of frames in the stream."""
+        return len(self.frames)
+
+    @property
+    def scores(self) -> ViewScores:
+        """Means over the frames."""
+        return ViewScores.mean([frame.scores for frame in self.frames])
+
+    @property
+    def views(self) -> dict[str, ViewScores]:
+        """Means over the frames by camera name."""
+        names = self.frames[0].views
+        return {name: ViewScores.mean([frame.views[name] for frame in self.frames]) for name in names}
+
+    @property
+    def motion_3d(self) -> Motion3DScores | None:
+        """Mean over the frames; None if no frame has any."""
+        found = [frame.motion_3d for frame in self.frames if frame.motion_3d is not None]
+        return Motion3DScores.mean(found) if found else None
+
+    @property
+    def seconds(self) -> Timings:
+        """Times of the fit."""
+        later = [frame.seconds for frame in self.frames[1:] if frame.seconds is not None]
+        return Timings(self.frames[0].seconds, known_mean(later))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the evaluation as JSON can hold it, apart from scores that are infinite or NaN."""
+        means, ends = asdict(self.scores), (self.frames[0].scores, self.frames[-1].scores)
+        for name in ("psnr", "ssim"):
+            first, last = (getattr(scores, name) for scores in ends)
+            means[name] = {"mean": means[name], "first": first, "last": last}
+        return {
+            "stream": self.stream,
+            "capture": self.capture,
+            "held_out": self.held_out,
+            "num_frames": self.num_frames,
+            "complete": self.complete,
+            "regions": self.regions,
+            **means,
+            "psnr_slope": self.psnr_slope,
+            "motion_3d": _optional(self.motion_3d),
+            "seconds": {**asdict(self.seconds), "definition": _SECONDS},
+            "bytes": asdict(self.sizes),
+            "mtv": asdict(self.variation),
+            "playback": asdict(self.playback),
+            "views": {name: asdict(scores) for name, scores in self.views.items()},
+            "frames": [frame.as_dict() for frame in self.frames],
+        }
+
+
+def _optional(scores: Motion3DScores | None) -> dict[str, float]:
+    """Return the scores as a dict, empty without any."""
+    return {} if scores is None else asdict(scores)

@@ -1,0 +1,78 @@
+"""Clouds of Gaussians and streams of them, shared by the tests of the codec."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from hashlib import blake2b
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.codec.config import CodecConfig
+from morgs_mi.codec.container import Packet, StreamWriter
+from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, reemitted_keyframe, residual_packet
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
+
+CAMERAS = [Camera.look_at((x, 0, -4), (0, 0, 0), (0, -1, 0), 50, 160, 120, f"cam{x}") for x in (-1, 1)]
+
+
+def cloud(N: int = 60, degree: int = 1, confidence: bool = True, seed: int = 0) -> Gaussians:
+    """Return random Gaussians in front of `CAMERAS`."""
+    rng = np.random.default_rng(seed)
+    return Gaussians(
+        means=rng.uniform(-1, 1, (N, 3)),
+        log_scales=rng.normal(-3, 0.5, (N, 3)),
+        quats=rng.normal(size=(N, 4)),
+        logit_opacities=rng.normal(1, 2, N),
+        sh_coeffs=rng.normal(0, 0.5, (N, (degree + 1) ** 2, 3)),
+        logit_confidence=rng.normal(0, 2, N) if confidence else None,
+    )
+
+
+def jittered(gaussians: Gaussians, rng: np.random.Generator, share: float = 0.4) -> Gaussians:
+    """Return the Gaussians with a share of them changed in all attributes."""
+    raw = {name: value for name, value in gaussians.numpy().items() if name not in ("motion", "offset")}
+    active = rng.random(len(gaussians)) < share
+    change = {n: 0.05 * rng.normal(size=v.shape) * active.reshape(-1, *[1] * (v.ndim - 1)) for n, v in raw.items()}
+    return Gaussians(**{name: value + change[name] for name, value in raw.items()})
+
+
+def encoded_clip(
+    frames: int, config: CodecConfig | None = None, degree: int = 1
+) -> tuple[list[Packet], list[CodedFrame]]:
+    """Return the packets and states of a cloud in which Gaussians move, die and are born in every frame."""
+    rng = np.random.default_rng(0)
+    packets = [keyframe_packet(cloud(degree=degree), 0, CAMERAS, config)]
+    states = [decode(None, packets[0])]
+    for frame in range(1, frames):
+        state = states[-1]
+        alive = np.flatnonzero(rng.random(len(state)) > 0.03)
+        births = int(rng.integers(0, 5))
+        moved = jittered(state.gaussians, rng).select(alive)
+        now = Gaussians.concatenate([moved, cloud(births, degree, seed=frame)]) if births else moved
+        if config is not None and config.offset:
+            now = replace(now, offset=np.random.default_rng(frame).normal(0, 0.02, (len(now), 3)))
+        source = np.concatenate([alive, np.full(births, -1)])
+        packets.append(residual_packet(state, now, source, CAMERAS, config))
+        states.append(decode(state, packets[-1]))
+    return packets, states
+
+
+def write(path: Path, packets: list[Packet], states: list[CodedFrame], every: int = 4) -> None:
+    """Write a stream with a re-emitted keyframe after every `every`-th frame."""
+    with StreamWriter(path, CAMERAS, 25) as writer:
+        for packet, state in zip(packets, states, strict=True):
+            writer.write(packet)
+            if state.frame and state.frame % every == 0:
+                writer.write(reemitted_keyframe(state))
+
+
+def history(states: Iterable[CodedFrame]) -> str:
+    """Return a digest of all states of a decoder."""
+    digest = blake2b()
+    for state in states:
+        for array in (state.digest, state.ids, *state.gaussians.numpy().values()):
+            digest.update(np.ascontiguousarray(array))
+    return digest.hexdigest()

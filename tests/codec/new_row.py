@@ -1,0 +1,85 @@
+"""Program that adds an attribute to the table and streams it; `test_packets` runs it in a process of its own."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+import morgs_mi  # noqa: F401  (finds a usable LLVM before the variant is set)
+from morgs_mi.core import attributes, gaussians
+
+ROW = attributes.Attribute("logit_labels", (2,), "labels", attributes.SIGMOID, error=0.01)
+
+
+@dataclass(frozen=True)
+class LabelledGaussians(gaussians.Gaussians):
+    """Gaussians with the field of the new row."""
+
+    logit_labels: Any = None
+
+
+def add_row() -> None:
+    """Add the row and the field, and forget the modules that were imported without them."""
+    attributes.ATTRIBUTES = gaussians.ATTRIBUTES = (*attributes.ATTRIBUTES, ROW)
+    attributes.BY_NAME[ROW.name] = attributes.BY_ACTIVATED_NAME[ROW.activated_name] = ROW
+    gaussians.Gaussians = LabelledGaussians
+    for name in [name for name in sys.modules if name.startswith("morgs_mi.codec")]:
+        del sys.modules[name]
+
+
+def check_round_trip(confidence: bool) -> None:
+    """Check the decoded attributes of labelled Gaussians of which some change, die and are born."""
+    from morgs_mi.codec.packets import decode, keyframe_packet, reemitted_keyframe, residual_packet
+    from tests.codec.clouds import CAMERAS, cloud, jittered
+
+    rng = np.random.default_rng(0)
+
+    def labelled(N: int, seed: int) -> Any:
+        base = cloud(N, confidence=confidence, seed=seed)
+        return LabelledGaussians(**base.items(), logit_labels=rng.normal(0, 1, (N, 2)))
+
+    def error(found: Any, true: Any) -> float:
+        return float(np.abs(np.asarray(found.labels) - np.asarray(true.labels)).max())
+
+    first = labelled(50, 1)
+    packet = keyframe_packet(first, 0, CAMERAS)
+    assert packet.arrays["head"].tolist() == [50, 1, 2 + confidence, 50]
+    state = decode(None, packet)
+    assert state.grid.values.shape == (50, 10 + 12 + confidence + 2)
+    assert state.grid.exponents.shape == (50, 8 + confidence + 1)
+    # Twice the error, over four times the precision of a birth and the largest slope, rounded down to quarter octaves.
+    steps = state.grid.steps(ROW.name)
+    assert np.all(steps == 2.0 ** (np.floor(4 * np.log2(2 * 0.01 / 4 / 0.25)) / 4))
+    assert error(state.gaussians, first) <= 0.01 / 4
+    assert np.array_equal(decode(None, reemitted_keyframe(state)).digest, state.digest)
+
+    alive, relabelled = np.arange(2, 50), rng.random(48) < 0.5
+    moved = jittered(state.gaussians, rng).select(alive)
+    labels = state.gaussians.numpy()[ROW.name][alive] + 0.5 * relabelled[:, None]
+    now = gaussians.Gaussians.concatenate([replace(moved, logit_labels=labels), labelled(3, 2)])
+    after = decode(state, residual_packet(state, now, np.r_[alive, -1, -1, -1], CAMERAS))
+    assert after.ids.tolist() == list(range(2, 53))
+    integers = (after.grid.values[:48], state.grid.values[alive])
+    changed = np.not_equal(*(values[:, state.grid.columns[ROW.name]] for values in integers)).any(1)
+    assert np.array_equal(changed, relabelled)
+    assert error(after.gaussians, now) <= 0.02
+    assert (after.gaussians.logit_confidence is None) == (not confidence)
+
+
+def main() -> None:
+    """Check the new row and print the digest of a stream without labels."""
+    mi.set_variant("llvm_ad_rgb")
+    add_row()
+    from tests.codec.clouds import encoded_clip, history
+
+    for confidence in (False, True):
+        check_round_trip(confidence)
+    print(history(encoded_clip(4)[1]))
+
+
+if __name__ == "__main__":
+    main()
