@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pkgutil
 import re
+import sys
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -76,7 +77,8 @@ def link_notebooks(app: Sphinx, name: str, source: list[str]) -> None:
 
 
 def leave_internal_names(app: Sphinx, env: BuildEnvironment, node: Element, content: Element) -> Element | None:
-    """Leave a type in a signature without a link if its module does not export it: it has no description."""
-    module, _, name = node.get("reftarget", "").rpartition(".")
-    internal = module.startswith("morgs_mi.") and name not in getattr(import_module(module), "__all__", ())
-    return content if internal else None
+    """Leave a type in a signature without a link if no module exports it: it has no description."""
+    target = node.get("reftarget", "")
+    module, _, name = target.rpartition(".")
+    exported = name in getattr(sys.modules.get(module), "__all__", ())
+    return content if target.startswith("morgs_mi.") and not exported else None
