@@ -1,10 +1,10 @@
-# Every target is enough by itself on a bare Debian 12 or Ubuntu machine.
+# Every target sets up what it needs on a bare Debian 12 or Ubuntu machine.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-slow lint setup clean
+.PHONY: demo test test-slow lint docs setup clean
 
 demo: setup
 	$(BIN)/morgs-mi demo out/demo
@@ -20,7 +20,11 @@ lint: setup
 	$(BIN)/ruff format --check
 	$(BIN)/pyright
 
-# LLVM is asked for every time: it lives outside the environment and costs 50 ms to find.
+docs: setup
+	$(BIN)/sphinx-build -q -W --keep-going docs docs/_build/html
+	@echo "Documentation: docs/_build/html/index.html"
+
+# LLVM is checked every time: it is outside the environment, and finding it takes 50 ms.
 setup: $(STAMP)
 	@tools/setup_llvm.sh $(BIN)/python
 
@@ -29,5 +33,5 @@ $(STAMP): pyproject.toml constraints.txt tools/setup_venv.sh
 	@touch $@
 
 clean:
-	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .ruff_cache
+	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .ruff_cache docs/_build docs/notebooks docs/api/morgs_mi*.md
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,13 +1,13 @@
 #!/usr/bin/env bash
-# setup_venv.sh PYTHON FOLDER: create the environment and install the package into it, versions pinned.
+# setup_venv.sh PYTHON FOLDER: create the environment and install the package with pinned versions.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=$1 venv=$2
 
-say() { echo "setup: $*" >&2; }
+log() { echo "setup: $*" >&2; }
 
 if ! command -v "$python" >/dev/null; then
-    tools/apt_install.sh python3 || { say "no $python found: install Python 3.11 or newer."; exit 1; }
+    tools/apt_install.sh python3 || { log "no $python found: install Python 3.11 or newer."; exit 1; }
 fi
 recent() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; }
 if ! recent "$python"; then
@@ -18,7 +18,7 @@ if ! recent "$python"; then
     if ! recent "$candidate"; then
         candidate=python3.11
         tools/apt_install.sh python3.11 && recent $candidate || {
-            say "$("$python" --version) is too old: install Python 3.11 or newer and run make PYTHON=/path/to/it."
+            log "$("$python" --version) is too old: install Python 3.11 or newer and run make PYTHON=/path/to/it."
             exit 1
         }
     fi
@@ -29,10 +29,10 @@ if [ ! -x "$venv/bin/python" ] || ! "$venv/bin/python" -c 'import pip' 2>/dev/nu
     if ! "$python" -c 'import venv, ensurepip' 2>/dev/null; then
         version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
         tools/apt_install.sh "python$version-venv" python3-venv || {
-            say "$python cannot create environments: install the package python$version-venv (apt-get install python$version-venv)."
+            log "$python cannot create environments: install the package python$version-venv (apt-get install python$version-venv)."
             exit 1
         }
     fi
     "$python" -m venv --clear "$venv"
 fi
-"$venv/bin/python" -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev,notebooks,viewer,viewer-test]'
+"$venv/bin/python" -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev,docs,notebooks,viewer,viewer-test]'

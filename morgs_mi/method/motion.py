@@ -25,7 +25,7 @@ def initial_motion(
     config: MotionConfig,
     rng: np.random.Generator,
 ) -> Lift | None:
-    """Return the start of motion and confidence of the active Gaussians; None: no motion, confidence as before.
+    """Return the start of motion (eq. 5) and confidence of the active Gaussians; None: no motion, confidence as before.
 
     Args:
         previous: N Gaussians of the previous frame, detached.

@@ -60,7 +60,7 @@ def apply_residual(previous: Gaussians, parameters: Mapping[str, Tensor], config
 
     Args:
         previous: N Gaussians of the previous frame.
-        parameters: as from `residual_parameters`; without a confidence the gate is 1.
+        parameters: as from `residual_parameters`; without a confidence the gate is 1 (eq. 3).
         config: one gate or two.
     """
     logit = parameters.get("logit_confidence")

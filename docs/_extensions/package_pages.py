@@ -1,0 +1,84 @@
+"""Writes the pages that follow from the repository: api/ from the package, notebooks/ from the notebooks."""
+
+from __future__ import annotations
+
+import pkgutil
+import re
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from docutils.nodes import Element
+from sphinx.application import Sphinx
+from sphinx.environment import BuildEnvironment
+
+import morgs_mi
+
+NOTEBOOK = re.compile(r"\]\((?:\.\./)+notebooks/(\w+)\.ipynb\)")
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    app.connect("config-inited", lambda app, config: write_pages(Path(app.srcdir)))
+    app.connect("source-read", link_notebooks)
+    app.connect("missing-reference", leave_internal_names)
+    return {"parallel_read_safe": True}
+
+
+def write_pages(docs: Path) -> None:
+    """Write a page per module or subpackage of `morgs_mi` to api/, and copy the notebooks."""
+    pages = {"morgs_mi": front_door()}
+    for child in pkgutil.iter_modules(morgs_mi.__path__):
+        if child.name != "__main__":
+            name = f"morgs_mi.{child.name}"
+            pages[name] = "\n".join([f"# {name}\n", *(chapter(module, name) for module in modules_of(name))])
+    for old in (docs / "api").glob("morgs_mi*.md"):
+        if old.stem not in pages:
+            old.unlink()
+    for name, text in pages.items():
+        write_if_changed(docs / "api" / f"{name}.md", text.encode())
+    for notebook in (docs.parent / "notebooks").glob("*.ipynb"):
+        # From the copy, docs/ is one level up, as in the repository: its pages are found without the folder's name.
+        write_if_changed(docs / "notebooks" / notebook.name, notebook.read_bytes().replace(b"](../docs/", b"](../"))
+
+
+def modules_of(name: str) -> list[str]:
+    """Return a module and, of a subpackage, all modules in it, by name."""
+    package = import_module(name)
+    inside = pkgutil.walk_packages(getattr(package, "__path__", []), f"{name}.")
+    return [name, *sorted(module.name for module in inside)]
+
+
+def chapter(module: str, page: str) -> str:
+    heading = "" if module == page else f"## {module.removeprefix(page + '.')}\n\n"
+    return f"{heading}```{{eval-rst}}\n.. automodule:: {module}\n```\n"
+
+
+def front_door() -> str:
+    """Return the page of the names that `import morgs_mi` brings, each linked to its description."""
+    lines = ["# morgs_mi", "", "The names that `import morgs_mi` provides:", ""]
+    for name in sorted(morgs_mi.__all__):
+        target = getattr(morgs_mi, name)
+        first = (target.__doc__ or "").strip().split("\n\n")[0].split()
+        lines.append(f"- {{py:obj}}`morgs_mi.{name} <{target.__module__}.{target.__qualname__}>`: {' '.join(first)}")
+    return "\n".join(lines) + "\n"
+
+
+def write_if_changed(path: Path, content: bytes) -> None:
+    """Write a file unless it has this content already, so that Sphinx rereads only what has changed."""
+    path.parent.mkdir(exist_ok=True)
+    if not path.exists() or path.read_bytes() != content:
+        path.write_bytes(content)
+
+
+def link_notebooks(app: Sphinx, name: str, source: list[str]) -> None:
+    """Let links to notebooks/, which lies beside docs/, lead to the copies."""
+    source[0] = NOTEBOOK.sub(r"](/notebooks/\1.ipynb)", source[0])
+
+
+def leave_internal_names(app: Sphinx, env: BuildEnvironment, node: Element, content: Element) -> Element | None:
+    """Leave a type in a signature without a link if no module exports it: it has no description."""
+    target = node.get("reftarget", "")
+    module, _, name = target.rpartition(".")
+    exported = name in getattr(sys.modules.get(module), "__all__", ())
+    return content if target.startswith("morgs_mi.") and not exported else None
