@@ -1,4 +1,4 @@
-"""A module imports only from its own room and from rooms to its left."""
+"""The layers of the package: a module imports only from its own subpackage and from those before it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 import morgs_mi
 
 ROOT = Path(morgs_mi.__file__).parent
-ROOMS = (
+SUBPACKAGES = (
     "core",
     "io",
     "render",
@@ -32,12 +32,12 @@ ROOMS = (
     "demo",
     "cli",
 )
-# The package's front door gathers what the rooms offer, `python -m morgs_mi` opens the command line.
-DOORS = {ROOT / "__init__.py", ROOT / "__main__.py"}
-MODULES = sorted(path for path in ROOT.rglob("*.py") if path not in DOORS)
+# `import morgs_mi` collects names of all subpackages, and `python -m morgs_mi` runs the command line.
+ENTRY_POINTS = {ROOT / "__init__.py", ROOT / "__main__.py"}
+MODULES = sorted(path for path in ROOT.rglob("*.py") if path not in ENTRY_POINTS)
 
 
-def room_of(path: Path) -> str:
+def subpackage_of(path: Path) -> str:
     return path.relative_to(ROOT).parts[0].removesuffix(".py")
 
 
@@ -55,14 +55,16 @@ def imported_names(tree: ast.AST, package: list[str]) -> list[list[str]]:
 
 
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_imports_go_left(path):
-    room = room_of(path)
-    assert room in ROOMS, f"{room} is not a room: add it to ROOMS in the order of the data's flow"
+def test_layers__imports_go_down(path):
+    own = subpackage_of(path)
+    assert own in SUBPACKAGES, f"add {own} to SUBPACKAGES, after all that it imports"
     package = ["morgs_mi", *path.relative_to(ROOT).parent.parts]
-    allowed = ROOMS[: ROOMS.index(room) + 1]
+    allowed = SUBPACKAGES[: SUBPACKAGES.index(own) + 1]
     names = imported_names(ast.parse(path.read_text(encoding="utf-8")), package)
     inside = [name[1] for name in names if name[0] == "morgs_mi" and len(name) > 1]
-    wrong = [target for target in inside if target in ROOMS and target not in allowed]
-    assert not wrong, f"{path.relative_to(ROOT)} imports from {wrong}, right of `{room}`"
-    # Names that the front door gathers would hide which room they come from.
-    assert set(inside) <= set(ROOMS), f"{path.relative_to(ROOT)} imports {set(inside) - set(ROOMS)} from morgs_mi"
+    wrong = [target for target in inside if target in SUBPACKAGES and target not in allowed]
+    assert not wrong, f"{path.relative_to(ROOT)} imports from {wrong}, which come after `{own}`"
+    # A name imported from `morgs_mi` itself would hide its subpackage.
+    assert set(inside) <= set(SUBPACKAGES), (
+        f"{path.relative_to(ROOT)} imports {set(inside) - set(SUBPACKAGES)} from morgs_mi"
+    )

@@ -289,7 +289,7 @@ def test_synthesize__removes_its_output_after_a_failure(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("morgs_mi.synth.synthesize.write_colmap", full)
-    with pytest.raises(OSError, match=r"cannot write .*nothing is left.*No space left"):
+    with pytest.raises(OSError, match=r"cannot write .*the partial output was removed.*No space left"):
         synthesize("spheres", tmp_path / "clip", num_cameras=2, num_frames=1, width=16, height=16, spp=1)
     assert list(tmp_path.iterdir()) == []
 
