@@ -60,6 +60,11 @@ _MOST_TIMED_FRAMES = 30
 def open_stream(out: str | Path) -> StreamReader:
     """Open a stream file, or the ``stream.morgs`` in the folder of a fit.
 
+    Example:
+        >>> stream = morgs_mi.open_stream("out/arm_fit")
+        >>> for frame, images in morgs_mi.render_stream(stream, stream.cameras[0]):
+        ...     print(frame, images["color"].shape)
+
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: the file is not a stream, or its header is broken or missing.
