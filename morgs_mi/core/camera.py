@@ -10,6 +10,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from morgs_mi.core.types import Tensor
 
 __all__ = ["Camera", "rigid"]
 
@@ -35,7 +38,7 @@ class Camera:
     """
 
     K: np.ndarray
-    viewmat: Any
+    viewmat: np.ndarray | Tensor
     width: int
     height: int
     name: str = ""
@@ -65,9 +68,9 @@ class Camera:
     @classmethod
     def look_at(
         cls,
-        origin: Any,
-        target: Any,
-        up: Any,
+        origin: ArrayLike,
+        target: ArrayLike,
+        up: ArrayLike,
         fov_x: float,
         width: int,
         height: int,
