@@ -7,30 +7,52 @@ ensure_llvm()
 
 from morgs_mi.capture.capture import Capture, load_capture  # noqa: E402
 from morgs_mi.capture.live import live_frames  # noqa: E402
+from morgs_mi.codec.config import CodecConfig  # noqa: E402
 from morgs_mi.config import StreamConfig  # noqa: E402
 from morgs_mi.core.camera import Camera  # noqa: E402
+from morgs_mi.core.color_space import SH_C0  # noqa: E402
 from morgs_mi.core.gaussians import Gaussians  # noqa: E402
+from morgs_mi.evaluate.evaluate import evaluate_stream  # noqa: E402
+from morgs_mi.export.tracks import extract_tracks  # noqa: E402
+from morgs_mi.fit.config import FitConfig  # noqa: E402
 from morgs_mi.gaussian_integrator import ellipsoids  # noqa: E402  (registers the integrator `gaussian_splat`)
-from morgs_mi.playback.player import open_stream, render_stream  # noqa: E402
+from morgs_mi.method.config import MotionConfig  # noqa: E402
+from morgs_mi.playback.player import channel_image, open_stream, render_stream  # noqa: E402
+from morgs_mi.playback.visualise import confidence_image, depth_image, motion_image  # noqa: E402
 from morgs_mi.recorder import stream_capture  # noqa: E402
 from morgs_mi.render.config import RenderConfig  # noqa: E402
 from morgs_mi.render.rasterize import Image, rasterize  # noqa: E402
 from morgs_mi.stream_loop import FrameReport, StreamLoop  # noqa: E402
+from morgs_mi.synth.ground_truth import load_tracks, load_truth  # noqa: E402
+from morgs_mi.synth.synthesize import synthesize  # noqa: E402
 
 __all__ = [
+    "SH_C0",
     "Camera",
     "Capture",
+    "CodecConfig",
+    "FitConfig",
     "FrameReport",
     "Gaussians",
     "Image",
+    "MotionConfig",
     "RenderConfig",
     "StreamConfig",
     "StreamLoop",
+    "channel_image",
+    "confidence_image",
+    "depth_image",
     "ellipsoids",
+    "evaluate_stream",
+    "extract_tracks",
     "live_frames",
     "load_capture",
+    "load_tracks",
+    "load_truth",
+    "motion_image",
     "open_stream",
     "rasterize",
     "render_stream",
     "stream_capture",
+    "synthesize",
 ]

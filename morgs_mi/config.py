@@ -56,7 +56,11 @@ _COMMENT_WIDTH = 110
 
 @dataclass(frozen=True)
 class StreamConfig:
-    """Settings of the streaming loop."""
+    """Settings of the streaming loop.
+
+    Example:
+        >>> config = morgs_mi.StreamConfig(fit=morgs_mi.FitConfig(epochs=4), seed=1)
+    """
 
     fit: FitConfig = field(default_factory=FitConfig)
     """Optimisation of the Gaussians."""

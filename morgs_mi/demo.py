@@ -26,7 +26,7 @@ from morgs_mi.playback.visualise import contact_sheet, label, motion_legend, sid
 from morgs_mi.recorder import stream_capture
 from morgs_mi.synth.synthesize import synthesize
 
-__all__ = ["ClipConfig", "DemoConfig", "run_demo"]
+__all__ = ["ClipConfig", "DemoConfig", "DemoReport", "run_demo"]
 
 Progress = Callable[[str, float, float], None]
 _COMPARED = ("psnr", "ssim", "motion_error", "motion_error_moving", "motion_error_still", "true_motion_moving")
@@ -68,7 +68,45 @@ class DemoConfig:
     """The fit, with a shortened first frame so that it takes minutes; its seed is also the clip's."""
 
 
-def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Progress | None = None) -> dict[str, Any]:
+@dataclass(frozen=True)
+class DemoReport:
+    """Results of the demonstration.
+
+    Attributes:
+        config: the settings.
+        full: evaluation of the fit with motion, offset and confidence.
+        plain: evaluation of the fit without.
+        compared_frames: indices of the frames that both fits have, without the first.
+        comparison: mean scores over these frames, by fit (``full``, ``plain``) and by name.
+        seconds: wall time by step, and ``total``.
+        machine: the machine, see `evaluate.environment`.
+        versions: of the libraries, likewise.
+    """
+
+    config: DemoConfig
+    full: Evaluation
+    plain: Evaluation
+    compared_frames: list[int]
+    comparison: dict[str, dict[str, float | None]]
+    seconds: dict[str, float]
+    machine: dict[str, Any]
+    versions: dict[str, str]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the content of ``report.json``."""
+        return {
+            "config": asdict(self.config),
+            "seed": self.config.stream.seed,
+            "comparison": {"frames": self.compared_frames, **self.comparison},
+            "seconds": self.seconds,
+            "machine": self.machine,
+            "versions": self.versions,
+            "full": self.full.as_dict(),
+            "plain": self.plain.as_dict(),
+        }
+
+
+def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Progress | None = None) -> DemoReport:
     """Synthesise a clip, fit it, and write images and results of its held-out view into `out`.
 
     The folder contains ``capture/`` (reused if it has the same settings), ``stream/``, ``stream_plain/``,
@@ -78,10 +116,6 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Progre
         out: the folder.
         config: the settings.
         progress: called with (step, done, total).
-
-    Returns:
-        The content of ``report.json``: `Evaluation.as_dict` of both fits as ``full`` and ``plain``, ``comparison`` with
-        their means over the same frames after the first, seconds per step, machine, versions and seed.
 
     Raises:
         ValueError: a setting is out of range.
@@ -116,16 +150,11 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Progre
         for name, folder in (("full", "stream"), ("plain", "stream_plain"))
     }
     run_step("Drawing", lambda report: _draw(root, load_capture(root / "capture"), report))
-    report = {
-        "config": asdict(config),
-        "seed": config.stream.seed,
-        "comparison": _comparison(results),
-        "seconds": {**seconds, "total": sum(seconds.values())},
-        "machine": machine(),
-        "versions": versions(),
-        **{name: result.as_dict() for name, result in results.items()},
-    }
-    write_json(root / "report.json", report)
+    frames, comparison = _compare(results)
+    seconds["total"] = sum(seconds.values())
+    full, plain_result = results["full"], results["plain"]
+    report = DemoReport(config, full, plain_result, frames, comparison, seconds, machine(), versions())
+    write_json(root / "report.json", report.as_dict())
     return report
 
 
@@ -143,16 +172,16 @@ def _synthesize_clip(folder: Path, config: DemoConfig, report: Callable[[float, 
     synthesize(config.scene, folder, **settings, overwrite=True, progress=report)
 
 
-def _comparison(results: Mapping[str, Evaluation]) -> dict[str, Any]:
-    """Return both fits' means over their common frames, without the first one, which has no motion."""
+def _compare(results: Mapping[str, Evaluation]) -> tuple[list[int], dict[str, dict[str, float | None]]]:
+    """Return the frames that both fits have, without the first, which has no motion, and mean scores over them."""
     count = min(result.num_frames for result in results.values())
     rows = {name: result.frames[1:count] for name, result in results.items()}
-    return {"frames": [row.frame for row in rows["full"]]} | {
-        name: {
-            score: float(np.mean([getattr(row.scores, score) for row in own])) if own else None for score in _COMPARED
-        }
-        for name, own in rows.items()
-    }
+
+    def mean(name: str, score: str) -> float | None:
+        return float(np.mean([getattr(row.scores, score) for row in rows[name]])) if rows[name] else None
+
+    means = {name: {score: mean(name, score) for score in _COMPARED} for name in rows}
+    return [row.frame for row in rows["full"]], means
 
 
 def _draw(out: Path, capture: Capture, report: Callable[[float, float], None]) -> None:

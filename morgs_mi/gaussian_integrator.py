@@ -60,6 +60,11 @@ def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
     """Return the dictionary of an `ellipsoids` shape with a copy of N Gaussians' activated attributes.
 
     The parameters to optimise are then those of the scene: gradients do not reach `gaussians`.
+
+    Example:
+        >>> scene = mi.load_dict({"type": "scene", "gaussians": morgs_mi.ellipsoids(gaussians),
+        ...                       "sensor": camera.sensor(), "integrator": {"type": "gaussian_splat"}})
+        >>> image = mi.render(scene)
     """
     names = ("means", "scales", "quats", *_attribute_widths())
     values = {name: getattr(gaussians, name, None) for name in names}

@@ -196,6 +196,11 @@ def load_capture(
         max_frames: number of frames to use at most, from the start.
         reading: how clips that do not match are read.
 
+    Example:
+        >>> capture = morgs_mi.load_capture("out/demo/capture")
+        >>> for frame in capture.frames():
+        ...     print(frame.index, frame.images[0].shape)
+
     Raises:
         FileNotFoundError: the folder, the calibration or a camera's clip is missing.
         ValueError: calibration and clips disagree (number, size, length, frame rate), a file is broken, or

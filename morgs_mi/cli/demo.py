@@ -61,21 +61,21 @@ class Demo:
         )
         with progress() as report:
             result = run_demo(self.out, replace(_DEFAULT, scene=self.scene, clip=clip, stream=stream), report)
-        full, compared = result["full"], result["comparison"]
-        table = Table(title=f"held-out view, frames {_span(compared['frames'])}")
+        full = result.full
+        table = Table(title=f"held-out view, frames {_span(result.compared_frames)}")
         for column in ("", "PSNR, dB", "SSIM", "flow error, px", "moving, px", "still, px"):
             table.add_column(column, justify="right" if column else "left")
         for name, title in (("full", "with motion"), ("plain", "without")):
-            row = compared[name]
+            row = result.comparison[name]
             motion = (figure(row[key], 2) for key in ("motion_error", "motion_error_moving", "motion_error_still"))
             table.add_row(title, figure(row["psnr"], 2), figure(row["ssim"], 4), *motion)
         OUT.print(table)
         print_result(
-            f"Held-out PSNR {figure(full['psnr']['first'], 2)} dB in the first frame, "
-            f"{figure(full['psnr']['last'], 2)} dB in the last of {full['num_frames']}; "
-            f"{figure(full['seconds']['per_later_frame'], 1)} s and "
-            f"{figure(full['bytes']['per_residual'] / 1e6, 2)} MB per later frame; "
-            f"{result['seconds']['total']:.0f} s in all."
+            f"Held-out PSNR {figure(full.frames[0].scores.psnr, 2)} dB in the first frame, "
+            f"{figure(full.frames[-1].scores.psnr, 2)} dB in the last of {full.num_frames}; "
+            f"{figure(full.seconds.per_later_frame, 1)} s and "
+            f"{figure(full.sizes.per_residual / 1e6, 2)} MB per later frame; "
+            f"{result.seconds['total']:.0f} s in all."
         )
         print_result(f"Video and contact sheet: {self.out / 'side_by_side.mp4'}, {self.out / 'contact_sheet.png'}")
         print_result(f"All results: {self.out / 'report.json'}")

@@ -1,1 +1,1 @@
-"""The values that every subpackage speaks: cameras and Gaussians; files that appear whole or not at all."""
+"""What all subpackages share: cameras, Gaussians, the attribute table, colour spaces, atomic files."""

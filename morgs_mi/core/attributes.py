@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import drjit as dr
+
+from morgs_mi.core.types import Jit
 
 __all__ = [
     "ATTRIBUTES",
@@ -25,7 +27,7 @@ __all__ = [
 ]
 
 
-def sigmoid(x: Any) -> Any:
+def sigmoid(x: Jit) -> Jit:
     """Return 1 / (1 + exp(-x)); finite with a finite gradient for every finite x."""
     return 0.5 + 0.5 * dr.tanh(0.5 * x)
 
@@ -40,7 +42,7 @@ class Activation:
             optimised value; None where there is no bound.
     """
 
-    function: Callable[[Any], Any]
+    function: Callable[[Jit], Jit]
     largest_slope: float | None
 
 

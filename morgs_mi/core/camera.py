@@ -10,6 +10,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
+
+from morgs_mi.core.types import Tensor
 
 __all__ = ["Camera", "rigid"]
 
@@ -23,16 +26,19 @@ class Camera:
 
     Attributes:
         K: intrinsics [3, 3] in pixels; an off-centre principal point is honoured.
-        viewmat: extrinsics [4, 4], world -> camera. NumPy as a rule; a Dr.Jit tensor [4, 4] where the
-            gradient of the pose is wanted.
+        viewmat: extrinsics [4, 4], world -> camera: a NumPy array, or a Dr.Jit tensor for gradients of the pose.
         width: image width in pixels.
         height: image height in pixels.
-        name: what the capture calls it, e.g. ``cam00``.
-        near: Gaussians whose centre has a depth below this (world units) are not drawn.
+        name: in the capture, e.g. ``cam00``.
+        near: depth in world units below which Gaussians are not rendered.
+
+    Example:
+        >>> camera = morgs_mi.Camera.look_at((0, -4, 1), (0, 0, 0), up=(0, 0, 1), fov_x=40, width=320, height=240)
+        >>> pixels, depths = camera.project(points)
     """
 
     K: np.ndarray
-    viewmat: Any
+    viewmat: np.ndarray | Tensor
     width: int
     height: int
     name: str = ""
@@ -62,9 +68,9 @@ class Camera:
     @classmethod
     def look_at(
         cls,
-        origin: Any,
-        target: Any,
-        up: Any,
+        origin: ArrayLike,
+        target: ArrayLike,
+        up: ArrayLike,
         fov_x: float,
         width: int,
         height: int,

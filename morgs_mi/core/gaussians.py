@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, Protocol
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import ArrayLike
 
 from morgs_mi.core.attributes import ATTRIBUTES, BY_ACTIVATED_NAME, sigmoid
+from morgs_mi.core.types import Float, Tensor, UInt32
 
 __all__ = ["ActivatedGaussians", "Gaussians", "join_sh", "repeat_each", "split_sh", "tensor_rows"]
 
@@ -24,46 +26,46 @@ class ActivatedGaussians(Protocol):
     """Activated attributes as Dr.Jit tensors, which the renderer reads."""
 
     @property
-    def means(self) -> Any:
+    def means(self) -> Tensor:
         """Centres [N, 3], world units."""
         ...
 
     @property
-    def scales(self) -> Any:
+    def scales(self) -> Tensor:
         """Standard deviations [N, 3], world units."""
         ...
 
     @property
-    def quats(self) -> Any:
+    def quats(self) -> Tensor:
         """Rotations [N, 4], wxyz, not necessarily unit."""
         ...
 
     @property
-    def opacities(self) -> Any:
+    def opacities(self) -> Tensor:
         """Opacities [N] in [0, 1]."""
         ...
 
     @property
-    def sh_coeffs(self) -> Any:
+    def sh_coeffs(self) -> Tensor:
         """Spherical harmonics [N, K, 3] of the display-referred colour."""
         ...
 
     @property
-    def motion(self) -> Any:
+    def motion(self) -> Tensor:
         """Displacement [N, 3] since the last frame, world units, or None."""
         ...
 
     @property
-    def confidence(self) -> Any:
+    def confidence(self) -> Tensor:
         """Motion confidence [N] in [0, 1], or None."""
         ...
 
-    def rows(self, name: str, index: Any) -> list[Any]:
+    def rows(self, name: str, index: UInt32) -> list[Float]:
         """Return an attribute of the Gaussians at `index`, as `tensor_rows` does."""
         ...
 
 
-def tensor_rows(tensor: Any, index: Any) -> list[Any]:
+def tensor_rows(tensor: Tensor, index: UInt32) -> list[Float]:
     """Return rows of a tensor [N, ...], one Dr.Jit float [M] per number of a row, differentiable.
 
     Args:
@@ -76,7 +78,7 @@ def tensor_rows(tensor: Any, index: Any) -> list[Any]:
     return [dr.gather(mi.Float, tensor.array, index * size + k, mode=mode) for k in range(size)]
 
 
-def repeat_each(x: Any, count: int) -> Any:
+def repeat_each(x: Float, count: int) -> Float:
     """Return every element of a float [N] `count` times in a row, [N * count].
 
     The adjoint of Dr.Jit's own `repeat` adds atomically, in no fixed order; this one sums blocks.
@@ -85,7 +87,7 @@ def repeat_each(x: Any, count: int) -> Any:
 
 
 class _RepeatEach(dr.CustomOp):
-    def eval(self, x: Any, count: int) -> Any:
+    def eval(self, x: Float, count: int) -> Float:
         self.count = count
         return dr.repeat(x, count)
 
@@ -99,7 +101,7 @@ class _RepeatEach(dr.CustomOp):
         return "morgs_mi.repeat_each"
 
 
-def _aligned_tensor(value: Any) -> Any:
+def _aligned_tensor(value: ArrayLike) -> Tensor:
     """Return a NumPy array as a float tensor in memory that Dr.Jit owns.
 
     Dr.Jit borrows NumPy's memory where it can. Packets of floats can be read from it only if it happens to be aligned,
@@ -136,14 +138,14 @@ class Gaussians:
         ValueError: a shape that does not agree with `means`, or a K that is not 1, 4, 9 or 16.
     """
 
-    means: Any
-    log_scales: Any
-    quats: Any
-    logit_opacities: Any
-    sh_coeffs: Any
-    motion: Any = None
-    logit_confidence: Any = None
-    offset: Any = None
+    means: Tensor
+    log_scales: Tensor
+    quats: Tensor
+    logit_opacities: Tensor
+    sh_coeffs: Tensor
+    motion: Tensor | None = None
+    logit_confidence: Tensor | None = None
+    offset: Tensor | None = None
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -173,7 +175,13 @@ class Gaussians:
 
     @classmethod
     def from_activated(
-        cls, means: Any, scales: Any, quats: Any, opacities: Any, sh_coeffs: Any, **more: Any
+        cls,
+        means: ArrayLike,
+        scales: ArrayLike,
+        quats: ArrayLike,
+        opacities: ArrayLike,
+        sh_coeffs: ArrayLike,
+        **more: ArrayLike,
     ) -> Gaussians:
         """Return Gaussians with activated NumPy arrays: `scales` [N, 3] > 0 and `opacities` [N] in [0, 1].
 
@@ -185,21 +193,21 @@ class Gaussians:
         return cls(means, log_scales, quats, logits, sh_coeffs, **more)
 
     @property
-    def scales(self) -> Any:
+    def scales(self) -> Tensor:
         """Standard deviations [N, 3]."""
         return dr.exp(self.log_scales)
 
     @property
-    def opacities(self) -> Any:
+    def opacities(self) -> Tensor:
         """Opacities [N] in (0, 1)."""
         return sigmoid(self.logit_opacities)
 
     @property
-    def confidence(self) -> Any:
+    def confidence(self) -> Tensor:
         """Motion confidence [N] in (0, 1), or None."""
         return None if self.logit_confidence is None else sigmoid(self.logit_confidence)
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> Tensor | None:
         """Return the activated value of an attribute of the table that has no property of its own, or None."""
         attribute = BY_ACTIVATED_NAME.get(name)
         if attribute is None or attribute.name == name:
@@ -214,13 +222,13 @@ class Gaussians:
         """Degree of the spherical harmonics, 0 to 3."""
         return round(int(self.sh_coeffs.shape[1]) ** 0.5) - 1
 
-    def parameters(self) -> dict[str, Any]:
+    def parameters(self) -> dict[str, Tensor]:
         """Return the raw attributes that are present, by the names of the attribute table (SH in two parts)."""
         sh_dc, sh_rest = split_sh(self.sh_coeffs)
         values = {**self.items(), "sh_dc": sh_dc, "sh_rest": sh_rest}
         return {a.name: values[a.name] for a in ATTRIBUTES if values.get(a.name) is not None}
 
-    def with_parameters(self, parameters: Mapping[str, Any]) -> Gaussians:
+    def with_parameters(self, parameters: Mapping[str, Tensor]) -> Gaussians:
         """Return these Gaussians with some of their `parameters` replaced.
 
         Where `sh_dc` is given, `sh_rest` is taken from `parameters` too; without it the degree becomes 0.
@@ -230,7 +238,7 @@ class Gaussians:
             values["sh_coeffs"] = join_sh(values.pop("sh_dc"), values.pop("sh_rest", None))
         return replace(self, **values)
 
-    def items(self) -> dict[str, Any]:
+    def items(self) -> dict[str, Tensor]:
         """Return the raw attributes that are present, by the names of the fields."""
         return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
 
@@ -242,14 +250,14 @@ class Gaussians:
         """Return the same values, detached from the gradient graph."""
         return replace(self, **{name: dr.detach(value) for name, value in self.items().items()})
 
-    def rows(self, name: str, index: Any) -> list[Any]:
+    def rows(self, name: str, index: UInt32) -> list[Float]:
         """Return an activated attribute of the Gaussians at `index` (see `tensor_rows`): read first, then activated."""
         if name == "sh_coeffs":
             return tensor_rows(self.sh_coeffs, index)
         attribute = BY_ACTIVATED_NAME[name]
         return [attribute.activation.function(column) for column in tensor_rows(getattr(self, attribute.name), index)]
 
-    def select(self, index: Any) -> Gaussians:
+    def select(self, index: np.ndarray) -> Gaussians:
         """Return the Gaussians at `index` [M] (integers, or a mask [N]); gradients are not carried."""
         return Gaussians(**{name: value[index] for name, value in self.numpy().items()})
 
@@ -269,13 +277,13 @@ class Gaussians:
         return Gaussians(**{k: np.concatenate([column[k] for column in columns]) for k in columns[0]})
 
 
-def split_sh(sh_coeffs: Any) -> tuple[Any, Any]:
+def split_sh(sh_coeffs: Tensor) -> tuple[Tensor, Tensor | None]:
     """Return the constant coefficient [N, 1, 3] and the others [N, K - 1, 3], or None where there are none."""
     K = int(sh_coeffs.shape[1])
     return (sh_coeffs, None) if K == 1 else (sh_coeffs[:, :1], sh_coeffs[:, 1:])
 
 
-def join_sh(sh_dc: Any, sh_rest: Any) -> Any:
+def join_sh(sh_dc: Tensor, sh_rest: Tensor | None) -> Tensor:
     """Return the coefficients [N, K, 3] of the two results of `split_sh`."""
     if sh_rest is None:
         return sh_dc

@@ -36,21 +36,28 @@ def residual_parameters(previous: Gaussians, config: MotionConfig, start: Lift |
         previous: N Gaussians of the previous frame.
         config: which modules are on.
         start: start of motion and confidence; None: no motion, and the confidence of the previous frame.
+
+    Raises:
+        ValueError: the confidence is learned, and the Gaussians have none.
     """
     shapes = {**previous.parameters(), "motion": previous.means, "offset": previous.means}
     names = [n for n in _RESIDUALS if n in shapes and (n != "offset" or config.learn_offset)]
-    parameters = {name: dr.zeros(mi.TensorXf, tuple(shapes[name].shape)) for name in names}
+    parameters: dict[str, Tensor] = {name: dr.zeros(mi.TensorXf, tuple(shapes[name].shape)) for name in names}
+    displacement = None if start is None else start.displacement
     if config.learn_confidence:
-        parameters["logit_confidence"] = previous.logit_confidence
-    if start is not None:
-        displacement = start.displacement
-        if config.learn_confidence:
-            if config.lift_confidence:
-                carried = np.asarray(previous.logit_confidence) - config.confidence_decay
-                parameters["logit_confidence"] = mi.TensorXf(np.maximum(start.logit_confidence, carried))
+        logit = previous.logit_confidence
+        if logit is None:
+            raise ValueError(
+                "residual_parameters(): `previous` must have a confidence with `learn_confidence`, got none; set "
+                "`logit_confidence`, or switch the module off."
+            )
+        if start is not None and config.lift_confidence:
+            logit = mi.TensorXf(np.maximum(start.logit_confidence, np.asarray(logit) - config.confidence_decay))
+        if displacement is not None:
             # The gate would shrink the displacement; a Gaussian that hardly moves may stay shrunk.
-            gate = np.asarray(sigmoid(parameters["logit_confidence"].array))
-            displacement = displacement / np.maximum(gate, config.min_gate)[:, None]
+            displacement = displacement / np.maximum(np.asarray(sigmoid(logit.array)), config.min_gate)[:, None]
+        parameters["logit_confidence"] = logit
+    if displacement is not None:
         parameters["motion"] = mi.TensorXf(displacement.astype(np.float32))
     return parameters
 

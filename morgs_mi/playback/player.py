@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.types import Tensor
 from morgs_mi.playback.visualise import confidence_image, depth_image, grey_image, motion_image, to_uint8
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
@@ -59,6 +59,11 @@ _MOST_TIMED_FRAMES = 30
 
 def open_stream(out: str | Path) -> StreamReader:
     """Open a stream file, or the ``stream.morgs`` in the folder of a fit.
+
+    Example:
+        >>> stream = morgs_mi.open_stream("out/arm_fit")
+        >>> for frame, images in morgs_mi.render_stream(stream, stream.cameras[0]):
+        ...     print(frame, images["color"].shape)
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -193,10 +198,10 @@ def render(
 ) -> dict[str, np.ndarray]:
     """Return rendered channels as float32 arrays [H, W, C] by name; the offset is zero where none is stored."""
     rendered = [name for name in channels if name != "offset"]
-    images: dict[str, Any] = {}
+    images: dict[str, Tensor] = {}
     if rendered:
-        image = vars(rasterize(gaussians, camera, rendered, config=config))
-        images = image | image.get("others", {})  # the channels of attributes without a field of their own
+        image = rasterize(gaussians, camera, rendered, config=config)
+        images = {name: image[name] for name in rendered}
     if "offset" in channels:
         offset = np.zeros((len(gaussians), 3)) if gaussians.offset is None else gaussians.offset
         images["offset"] = rasterize(replace(gaussians, motion=offset), camera, ("motion",), config=config).motion

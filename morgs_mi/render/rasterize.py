@@ -106,6 +106,10 @@ def rasterize(
         static_splats: further splats of this view that are drawn and get no gradients; they must have the channels.
         config: cut-offs and block shape.
 
+    Example:
+        >>> image = morgs_mi.rasterize(gaussians, camera, channels=("color", "depth"))
+        >>> dr.backward(dr.mean(dr.square(image.color - target), axis=None))
+
     Returns:
         An `Image` with one tensor per requested channel. On a region, and with `active`, the pixels that are drawn and
         the gradients that remain are those of the full computation.

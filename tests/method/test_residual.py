@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -85,3 +87,9 @@ def test_apply_residual__gradient_of_the_gate_follows_the_product_rule():
     assert np.asarray(dr.grad(parameters["motion"])) == pytest.approx(np.repeat(m[:, None], 3, 1), rel=1e-5)
     expected = m * (1 - m) * R.sum(1)
     assert np.asarray(dr.grad(parameters["logit_confidence"])) == pytest.approx(expected, abs=1e-6)
+
+
+def test_residual_parameters__refuse_gaussians_without_confidence():
+    previous = replace(to_gaussians(make_scene()), logit_confidence=None)
+    with pytest.raises(ValueError, match="`previous` must have a confidence with `learn_confidence`, got none"):
+        residual_parameters(previous, MotionConfig())

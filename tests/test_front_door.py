@@ -1,0 +1,50 @@
+"""The front door: what `import morgs_mi` provides."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+import morgs_mi
+
+ROOT = Path(__file__).parents[1]
+WITH_EXAMPLE = (
+    "Camera",
+    "Gaussians",
+    "StreamConfig",
+    "StreamLoop",
+    "ellipsoids",
+    "load_capture",
+    "open_stream",
+    "rasterize",
+)
+
+
+def test_front_door__names_are_documented():
+    for name in morgs_mi.__all__:
+        if name != "SH_C0":
+            assert inspect.getdoc(getattr(morgs_mi, name)), name
+
+
+@pytest.mark.parametrize("name", WITH_EXAMPLE)
+def test_front_door__examples_compile(name):
+    lines = re.findall(r"^\s*(?:>>>|\.\.\.) ?(.*)$", inspect.getdoc(getattr(morgs_mi, name)) or "", re.MULTILINE)
+    assert lines
+    assert any("morgs_mi." in line for line in lines)
+    ast.parse("\n".join(lines))
+
+
+def test_front_door__has_what_readme_and_notebooks_import():
+    code = "\n".join(re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL))
+    for path in ("01_render", "02_stream"):
+        cells = json.loads((ROOT / f"notebooks/{path}.ipynb").read_text(encoding="utf-8"))["cells"]
+        code += "\n" + "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code")
+    lines = [line for line in code.splitlines() if not line.startswith("%")]
+    imports = [node for node in ast.walk(ast.parse("\n".join(lines))) if isinstance(node, ast.ImportFrom)]
+    inner = [node.module for node in imports if (node.module or "").startswith("morgs_mi.")]
+    assert inner == []
