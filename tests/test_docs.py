@@ -21,7 +21,8 @@ PAGES = {
     for path in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"))
     if not (name := path.relative_to(ROOT).as_posix()).startswith(GENERATED)
 }
-EQUATIONS = re.findall(r"^\| (\d+) \| [^|]+ \| `([\w.]+)` \|$", PAGES["docs/architecture.md"], re.MULTILINE)
+ROWS = re.findall(r"^\| (\d+) \| [^|]+ \| (`[\w.]+`(?:, `[\w.]+`)*) \|$", PAGES["docs/architecture.md"], re.MULTILINE)
+EQUATIONS = [(number, name) for number, names in ROWS for name in re.findall(r"`([\w.]+)`", names)]
 RESULTS = ROOT / "benchmarks/results"
 
 
@@ -57,15 +58,15 @@ def committed(name: str) -> Any:
 
 
 def test_equation_table__has_every_equation():
-    assert [int(number) for number, _ in EQUATIONS] == list(range(1, 14))
+    assert [int(number) for number, _ in ROWS] == list(range(1, 14))
 
 
-@pytest.mark.parametrize(("number", "function"), EQUATIONS)
-def test_equation_table__functions_name_their_equation(number, function):
-    source = inspect.getsource(resolve(function))
+@pytest.mark.parametrize(("number", "name"), EQUATIONS)
+def test_equation_table__functions_name_their_equation(number, name):
+    source = inspect.getsource(resolve(name))
     # "eq. 12", or a list such as "eqs. 3, 8 and 12".
     lists = re.findall(r"\beqs?\. ((?:\d+(?:, | and |-)?)+)", source)
-    assert number in {n for found in lists for n in re.findall(r"\d+", found)}, f"{function} does not name eq. {number}"
+    assert number in {n for found in lists for n in re.findall(r"\d+", found)}, f"{name} does not name eq. {number}"
 
 
 def test_architecture__lists_every_subpackage():
@@ -104,6 +105,17 @@ def test_experiments__begin_with_date_commit_and_command(page):
         text.strip()[:500],
         re.DOTALL,
     )
+
+
+def test_experiments__index_lists_every_page():
+    listed = re.findall(r"^\| \[[^]]+\]\(([\w-]+\.md)\)", PAGES["docs/experiments/index.md"], re.MULTILINE)
+    pages = {path.name for path in (ROOT / "docs/experiments").glob("*.md")}
+    assert sorted(listed) == sorted(pages - {"index.md"})
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if re.fullmatch(r"docs/[\w-]+\.md", page)])
+def test_user_pages__hold_no_measurements(page):
+    assert re.findall(r"[^.\n]*\d (?:dB|ms|kB)\b[^.\n]*", PAGES[page]) == []
 
 
 def test_experiments__quote_the_committed_demo():

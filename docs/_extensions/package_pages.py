@@ -12,6 +12,7 @@ from typing import Any
 from docutils.nodes import Element
 from sphinx.application import Sphinx
 from sphinx.environment import BuildEnvironment
+from sphinx.pycode import ModuleAnalyzer
 
 import morgs_mi
 
@@ -58,10 +59,21 @@ def front_door() -> str:
     """Return the page of the names that `import morgs_mi` brings, each linked to its description."""
     lines = ["# morgs_mi", "", "The names that `import morgs_mi` provides:", ""]
     for name in sorted(morgs_mi.__all__):
-        target = getattr(morgs_mi, name)
-        first = (target.__doc__ or "").strip().split("\n\n")[0].split()
-        lines.append(f"- {{py:obj}}`morgs_mi.{name} <{target.__module__}.{target.__qualname__}>`: {' '.join(first)}")
+        path, doc = description(name)
+        first = " ".join(doc.strip().split("\n\n")[0].split())
+        lines.append(f"- {{py:obj}}`morgs_mi.{name} <{path}>`: {first}")
     return "\n".join(lines) + "\n"
+
+
+def description(name: str) -> tuple[str, str]:
+    """Return the dotted path at which a name of `morgs_mi` is defined, and its docstring."""
+    target = getattr(morgs_mi, name)
+    if hasattr(target, "__qualname__"):
+        return f"{target.__module__}.{target.__qualname__}", target.__doc__ or ""
+    # A constant does not name its module: it is the one that exports it.
+    packages = (module for module in sorted(sys.modules) if module.startswith("morgs_mi."))
+    module = next(m for m in packages if name in getattr(sys.modules[m], "__all__", ()))
+    return f"{module}.{name}", "\n".join(ModuleAnalyzer.for_module(module).find_attr_docs()["", name])
 
 
 def write_if_changed(path: Path, content: bytes) -> None:

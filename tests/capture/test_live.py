@@ -109,11 +109,11 @@ def test_captures_page__live_example_runs(rig: Capture, monkeypatch: pytest.Monk
 
         def push(self, images):
             pushed.append(images)
-            return None, type("Report", (), {"frame": len(pushed) - 1, "left_out": (), "seconds": 0.0})
+            return None, type("Report", (), {"frame": len(pushed) - 1, "missing_views": (), "seconds": 0.0})
 
     monkeypatch.setattr("subprocess.Popen", popen)
-    monkeypatch.setattr("morgs_mi.stream_loop.StreamLoop", Loop)
-    monkeypatch.setattr("morgs_mi.capture.capture.load_capture", lambda path, downscale: rig)
+    monkeypatch.setattr("morgs_mi.StreamLoop", Loop)
+    monkeypatch.setattr("morgs_mi.load_capture", lambda path, downscale: rig)
     monkeypatch.setattr("mitsuba.set_variant", lambda name: None)
     exec(compile(example, "captures.md", "exec"), {})
     assert len(pushed) == 3

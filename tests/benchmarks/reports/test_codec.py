@@ -106,7 +106,7 @@ def speed_table(result: dict) -> str:
 
 
 def test_codec_page__quotes_the_committed_figures() -> None:
-    text = page("stream.md", "stream-format.md", "codec.md")
+    text = page("codec.md")
     report, speed = (
         json.loads((ROOT / f"benchmarks/results/{name}.json").read_text(encoding="utf-8"))
         for name in ("codec_report", "codec_speed")

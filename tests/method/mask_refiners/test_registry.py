@@ -40,9 +40,9 @@ def test_masks_page__lists_every_refiner():
     assert [usage for usage in MASK_REFINERS.usages if f"- `{usage}`: " not in text] == []
 
 
-def test_masks_page__quotes_the_committed_figures():
+def test_masks_experiment__quotes_the_committed_figures():
     clips = json.loads((ROOT / "benchmarks/results/masks.json").read_text(encoding="utf-8"))["clips"]
-    text = (ROOT / "docs/masks.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs/experiments/masks.md").read_text(encoding="utf-8")
 
     def cell(row: dict) -> str:
         return f"{row['iou']:.2f} ({row['found']:.2f}, {row['true']:.2f})"
