@@ -104,7 +104,7 @@ def _tvl1(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
 
 
 # OpenCV's other methods (sparse-to-dense, SimpleFlow, RLOF with other interpolations) crash or return NaN on images
-# with too little to match: see docs/flow.md. All take RGB as bytes.
+# with too little to match: see docs/experiments/flow.md. All take RGB as bytes.
 FLOW_METHODS: dict[str, _Method] = {
     # The presets stop at half or quarter resolution, where patches of 8 pixels miss small objects in small images.
     "dis": _dis(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM, lambda width, config: int(width > config.fine_width)),
