@@ -108,7 +108,10 @@ def _matches(a: Features, b: Features) -> np.ndarray:
     if len(pairs) < _MIN_MATCHES:
         return none
     points = a.points[pairs[:, 0]], b.points[pairs[:, 1]]
-    _, inliers = cv2.findFundamentalMat(*points, cv2.USAC_MAGSAC, 2.0, 0.999, 5000)
+    try:
+        _, inliers = cv2.findFundamentalMat(*points, cv2.USAC_MAGSAC, 2.0, 0.999, 5000)
+    except cv2.error:  # raised for some matches that fit no geometry
+        return none
     kept = pairs[inliers.ravel() > 0] if inliers is not None else none
     return kept if len(kept) >= _MIN_MATCHES else none
 
