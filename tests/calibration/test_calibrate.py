@@ -15,7 +15,7 @@ from morgs_mi.calibration.rig_check import check_rig, match_capture
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
-from tests.capture import textured
+from tests.scenes import textured
 
 
 def film(path: Path, cameras: list[Camera], suffix: str = ".mkv") -> Path:

@@ -22,7 +22,8 @@ from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds, write_poses
 from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
-from tests.capture import textured
+from tests.scenes import textured
+from tests.scenes.cameras import circle, look_at_cameras
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -319,7 +320,6 @@ def test_draw_rig__draws_cameras_at_their_positions() -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 8])
 def test_draw_rig__draws_any_rig(count: int) -> None:
-    angles = 2 * np.pi * np.arange(count) / count
-    cameras = [Camera.look_at((np.cos(a), np.sin(a), 0), (0, 0, 0), (0, 0, 1), 60, 64, 48, "c") for a in angles]
+    cameras = look_at_cameras(circle(2 * np.pi * np.arange(count) / count, z=0), 60, up=(0, 0, 1))
     image = draw_rig(cameras, np.zeros((0, 3)), np.zeros((0, 3)))
     assert (image < 200).any()

@@ -15,7 +15,7 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
 from morgs_mi.io.video_writer import write_video
-from tests.capture import textured
+from tests.scenes import textured
 
 # Sensors with different cross-talk, white balance and exposure. The first is the reference.
 SENSORS = np.array(

@@ -28,7 +28,7 @@ from morgs_mi.codec.packets import (
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.codec.salvage import DamagedRange, salvage, write_salvaged
 from morgs_mi.core.gaussians import Gaussians
-from tests.codec.clouds import CAMERAS, cloud, jittered
+from tests.scenes.coded_clip import CAMERAS, cloud, jittered
 
 FRAMES, EVERY = 8, 3
 # More than a trial takes with everything that is cached, and far less than a damaged length or count may request.

@@ -30,7 +30,7 @@ from morgs_mi.codec.packets import (
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.gaussians import Gaussians
 from tests.codec import plain_decoder
-from tests.codec.clouds import CAMERAS, cloud, encoded_clip, history, jittered, write
+from tests.scenes.coded_clip import CAMERAS, cloud, encoded_clip, history, jittered, write
 
 
 def assert_same(got: CodedFrame, expected: CodedFrame) -> None:
@@ -338,7 +338,7 @@ import drjit as dr
 import mitsuba as mi; mi.set_variant("llvm_ad_rgb")
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
-from tests.codec.clouds import history
+from tests.scenes.coded_clip import history
 dr.set_thread_count(1)
 print(history(coded_frames(StreamReader({str(tmp_path / "s")!r}))))
 """

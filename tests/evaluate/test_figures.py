@@ -14,7 +14,7 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.evaluate.figures import draw_stream, motion_scale
 from morgs_mi.playback.player import open_stream
 from morgs_mi.playback.visualise import GAP
-from tests.moving_splats import CAMERAS, FRAMES, HEIGHT, PIXELS, WIDTH, write_stream
+from tests.scenes.moving_splats import CAMERAS, FRAMES, HEIGHT, PIXELS, WIDTH, write_stream
 
 LEGEND = 96
 

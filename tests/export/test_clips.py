@@ -16,7 +16,7 @@ from morgs_mi.export.clips import select_frames
 from morgs_mi.export.frames import exr_channels, pad_to_even
 from morgs_mi.io.ply import read_ply
 from morgs_mi.render.rasterize import rasterize
-from tests.export.streams import rig, write_stream
+from tests.scenes.changing_splats import rig, write_stream
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.export.axes import gltf_axes
 from morgs_mi.export.gltf import glb, write_gltf
 from morgs_mi.render.rasterize import rasterize
-from tests.export.streams import rig, splats
+from tests.scenes.changing_splats import rig, splats
 
 KHR = "KHR_gaussian_splatting"
 SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}

@@ -11,15 +11,15 @@ import pytest
 from morgs_mi.core.camera import Camera
 from morgs_mi.export.axes import up_direction
 from morgs_mi.export.paths import CameraPath, focus, load_path, orbit, through_cameras
-from tests.export.streams import rig
+from tests.scenes.cameras import circle, look_at_cameras
+from tests.scenes.changing_splats import rig
 
 TARGET = np.array([0, 0, 0.2])
 
 
 def ring(count: int) -> tuple[Camera, ...]:
-    angles = 2 * np.pi * np.arange(count) / count
-    positions = np.stack([3 * np.cos(angles), 3 * np.sin(angles), np.full(count, 1.0)], 1)
-    return tuple(Camera.look_at(p, TARGET, (0, 0, 1), 45, 64, 48, f"c{i}") for i, p in enumerate(positions))
+    origins = circle(2 * np.pi * np.arange(count) / count, 3, 1)
+    return tuple(look_at_cameras(origins, 45, target=(0, 0, 0.2), up=(0, 0, 1)))
 
 
 def test_camera_path__interpolates_its_keys_smoothly():

@@ -9,7 +9,7 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.export.tracks import extract_tracks, write_tracks
-from tests.export.streams import rig, splats, write_stream
+from tests.scenes.changing_splats import rig, splats, write_stream
 
 
 def test_extract_tracks__positions_are_those_of_the_gaussians(tmp_path):

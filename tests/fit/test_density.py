@@ -16,6 +16,7 @@ from morgs_mi.fit.optimise import adam, values_of
 from morgs_mi.losses.attribution import DensificationScores, densification_scores
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.active_view import ActiveView
+from tests.scenes.gaussians import isotropic
 
 CONFIG = DensityConfig(max_gaussians=100, split_scale=0.1, min_opacity=0.005, births=1.0)
 
@@ -163,13 +164,7 @@ def test_resize_optimizer__applies_edits_to_the_parameters():
 def test_densification_scores__attribute_the_error_to_the_wrong_gaussian():
     camera = Camera.look_at((0, 0, -4), (0, 0, 0), (0, -1, 0), 40, 64, 48)
     x = np.linspace(-1, 1, 6)
-    truth = Gaussians.from_activated(
-        np.stack([x, 0 * x, 0 * x], 1),
-        np.full((6, 3), 0.1),
-        np.tile([1.0, 0, 0, 0], (6, 1)),
-        np.full(6, 0.9),
-        np.full((6, 1, 3), 0.5),
-    )
+    truth = isotropic(np.stack([x, 0 * x, 0 * x], 1), 0.1, 0.9, 0.5)
     image = np.asarray(rasterize(truth, camera, ("color",)).color)
     sh = np.full((6, 1, 3), 0.5, np.float32)
     sh[4] = -1.0

@@ -13,6 +13,8 @@ from morgs_mi.fit.later_frame import FrameProblem, LaterFrame, fit_later_frame
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
 from morgs_mi.method.config import MotionConfig
+from tests.scenes.cameras import arc, look_at_cameras
+from tests.scenes.gaussians import isotropic, random_sheet
 
 RENDER, EXTENT, V = RenderConfig(), 3.0, 5
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
@@ -21,24 +23,18 @@ HIDDEN = 300  # the wall's Gaussians come first
 
 
 def cameras() -> dict[int, Camera]:
-    angles = np.linspace(-0.6, 0.6, V)
-    origins = [(4 * np.sin(a), -0.3, -4 * np.cos(a)) for a in angles]
-    return {view: Camera.look_at(o, (0, 0, 0), (0, -1, 0), 40, 128, 96) for view, o in enumerate(origins)}
+    return dict(enumerate(look_at_cameras(arc(np.linspace(-0.6, 0.6, V), 4, y=-0.3), 40, 128, 96)))
 
 
 def scene(shift=0.0, colors=None) -> Gaussians:
-    """A wall, and before it a ball of 60 Gaussians that may be shifted."""
+    """Return a wall, and in front of it a ball of 60 Gaussians that is shifted along x."""
     rng = np.random.default_rng(0)
-    wall = np.stack([*rng.uniform(-2, 2, (2, HIDDEN)), np.full(HIDDEN, 1.0)], axis=1)
+    wall = random_sheet(rng, HIDDEN, 2, 1.0)
     ball = rng.normal(size=(60, 3)) * 0.12 + (shift, 0, 0)
     means = np.concatenate([wall, ball])
     sh = 0.6 * np.sin(3 * means[:, None, :] + (0, 1, 2)) if colors is None else colors
     sizes = np.where(np.arange(len(means)) < HIDDEN, 0.15, 0.06)
-    quats = np.tile([1.0, 0, 0, 0], (len(means), 1))
-    opacities = np.full(len(means), 0.95)
-    return Gaussians.from_activated(
-        means, np.repeat(sizes[:, None], 3, 1), quats, opacities, sh, logit_confidence=np.zeros(len(means))
-    )
+    return isotropic(means, sizes, 0.95, sh, logit_confidence=np.zeros(len(means)))
 
 
 def images_of(gaussians: Gaussians) -> list[np.ndarray]:

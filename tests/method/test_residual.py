@@ -10,7 +10,7 @@ import pytest
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.lift import Lift
 from morgs_mi.method.residual import apply_residual, residual_parameters
-from tests.scenes import RAW, make_scene, to_gaussians
+from tests.scenes.gaussians import RAW, make_scene, to_gaussians
 
 OFF = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
 

@@ -23,7 +23,7 @@ from morgs_mi.playback.player import (
     render_stream,
     truth_for_camera,
 )
-from tests.moving_splats import CAMERAS, FRAMES, HEIGHT, WIDTH, moved, write_stream
+from tests.scenes.moving_splats import CAMERAS, FRAMES, HEIGHT, WIDTH, moved, write_stream
 
 
 def test_truth_for_camera__resamples_to_a_coarser_grid(fitted_clip: Path) -> None:

@@ -8,7 +8,8 @@ import pytest
 from morgs_mi import rasterize
 from morgs_mi.render.backproject import backproject
 from tests import tolerances as tol
-from tests.scenes import as_float32, make_camera, make_scene, to_gaussians
+from tests.scenes.cameras import make_camera
+from tests.scenes.gaussians import as_float32, make_scene, to_gaussians
 
 
 def test_backproject__is_the_transpose_of_blending():

@@ -22,7 +22,7 @@ from morgs_mi.core.gaussians import tensor_rows
 from tests import reference
 from tests import tolerances as tol
 from tests.assertions import assert_close
-from tests.scenes import CHANNELS, Values
+from tests.scenes.gaussians import CHANNELS, Values
 
 SIZES = {"color": 3, "motion": 2}
 ATTRIBUTES = ("means", "scales", "quats", "opacities", "sh_coeffs", "motion", "confidence")

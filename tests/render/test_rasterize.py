@@ -16,13 +16,13 @@ from tests import reference
 from tests import tolerances as tol
 from tests.assertions import assert_close
 from tests.reference import rasterize_view
-from tests.scenes import (
+from tests.scenes.cameras import make_camera
+from tests.scenes.gaussians import (
     CHANNELS,
     NEW_ATTRIBUTES,
     RAW,
     ExtendedGaussians,
     as_float32,
-    make_camera,
     make_scene,
     to_gaussians,
 )

@@ -8,7 +8,7 @@ import pytest
 from morgs_mi.codec.packets import CodedFrame
 from morgs_mi.playback.player import open_stream
 from morgs_mi.viewer.frame_cache import FrameCache
-from tests.export.streams import splats, write_stream
+from tests.scenes.changing_splats import splats, write_stream
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from morgs_mi.playback.visualise import confidence_image, motion_image
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.viewer.modes import MODES, available_modes, splat_colors
-from tests.export.streams import rig, write_stream
+from tests.scenes.changing_splats import rig, write_stream
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.export.axes import up_direction
 from morgs_mi.playback.player import channel_image, open_stream, render, render_config
-from tests.export.streams import write_stream
+from tests.scenes.changing_splats import write_stream
 
 pytest.importorskip("viser", reason="install it with pip install 'morgs-mi[viewer]'")
 playwright = pytest.importorskip("playwright.sync_api", reason="install it with pip install 'morgs-mi[viewer-test]'")

@@ -17,8 +17,8 @@ from morgs_mi.capture.layouts.calibration import Calibration, Layout, required_c
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import MODELS, Lens
 from morgs_mi.io.video_writer import write_video
-from tests.capture import small_captures as layouts
-from tests.capture.small_captures import COUNT, FPS, HEIGHT, WIDTH, folder_per_camera, folder_per_frame, rig
+from tests.scenes import captures as layouts
+from tests.scenes.captures import COUNT, FPS, HEIGHT, WIDTH, folder_per_camera, folder_per_frame, rig
 
 # Files store poses in text or float64; the focal length of a rig is near 50 px.
 POSE_ABS, PIXEL_ABS = 1e-9, 1e-6
