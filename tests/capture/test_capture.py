@@ -15,6 +15,7 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import Lens
 from morgs_mi.io.video_writer import write_video
+from tests.assertions import assert_close
 from tests.scenes.captures import COUNT, FPS, HEIGHT, WIDTH, frames, make_camera, rig, videos
 
 
@@ -36,7 +37,7 @@ def test_load_capture__reads_n3dv(tmp_path: Path) -> None:
     assert (capture.num_frames, capture.fps, capture.test_view, capture.truth) == (COUNT, FPS, None, None)
     assert capture.points.shape == capture.point_colors.shape == (0, 3)
     assert capture.masks == (None,) * 3
-    np.testing.assert_allclose(capture.cameras[1].viewmat, make_camera(1, "cam01").viewmat, atol=1e-12)
+    assert_close(capture.cameras[1].viewmat, make_camera(1, "cam01").viewmat, atol=1e-12)
     for t, frame in enumerate(capture.frames()):
         assert frame.index == t
         assert [tuple(image[5, 5]) for image in frame.images] == [(0, t, 0), (1, t, 0), (2, t, 0)]
@@ -58,10 +59,10 @@ def test_load_capture__prefers_the_colmap_model_and_orders_it_by_number(tmp_path
     capture = load_capture(tmp_path)
     assert capture.names == ("cam1", "cam2", "cam10")
     assert [image[0, 0, 0] for image in next(capture.frames()).images] == [2, 1, 0]
-    np.testing.assert_allclose(capture.cameras[0].viewmat, make_camera(2, "cam1").viewmat, atol=1e-12)
+    assert_close(capture.cameras[0].viewmat, make_camera(2, "cam1").viewmat, atol=1e-12)
     assert capture.cameras[0].K[0, 2] == WIDTH / 2 + 3
     np.testing.assert_allclose(capture.points, points)
-    np.testing.assert_allclose(capture.point_colors, points / 5, atol=1 / 255)
+    assert_close(capture.point_colors, points / 5, atol=1 / 255)
 
 
 @pytest.mark.parametrize("downscale", [2, 3, 4.5])
@@ -81,7 +82,7 @@ def test_load_capture__downscaling_moves_projections_with_the_pixels(tmp_path: P
     assert image.shape == (small.height, small.width)
     rows, columns = np.mgrid[: small.height, : small.width] + 0.5
     centre = np.array([(image * columns).sum(), (image * rows).sum()]) / image.sum()
-    np.testing.assert_allclose(centre, small.project(point)[0], atol=0.05)
+    assert_close(centre, small.project(point)[0], atol=0.05)
 
 
 def test_load_capture__undistorts_and_masks(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import pytest
 from morgs_mi.capture.layouts.colmap import find_colmap, read_colmap, write_colmap
 from morgs_mi.capture.lens import MODELS, Lens
 from morgs_mi.core.camera import Camera
+from tests.assertions import assert_close
 from tests.scenes.captures import HEIGHT, WIDTH, rig
 
 RNG = np.random.default_rng(1)
@@ -43,13 +44,13 @@ def test_read_colmap__reads_what_write_colmap_writes(tmp_path: Path, kind: str) 
         assert camera.name == f"{expected.name}.png"
         assert (camera.width, camera.height) == (WIDTH, HEIGHT)
         np.testing.assert_allclose(camera.K, expected.K, rtol=1e-12)
-        np.testing.assert_allclose(camera.viewmat, expected.viewmat, atol=1e-12)
+        assert_close(camera.viewmat, expected.viewmat, atol=1e-12)
     assert [model.lenses[i].model for i in order] == ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"]
     assert model.lenses[order[1]].distortion == (0.1, -0.02, 0.003, 0.004)
     assert model.points.dtype == np.float32
     rows = np.lexsort(model.points.T), np.lexsort(POINTS.T)
     np.testing.assert_allclose(model.points[rows[0]], POINTS[rows[1]], rtol=1e-6)
-    np.testing.assert_allclose(model.point_colors[rows[0]], COLORS[rows[1]], atol=1e-6)
+    assert_close(model.point_colors[rows[0]], COLORS[rows[1]], atol=1e-6)
 
 
 def test_read_colmap__projection_agrees_with_pycolmap(tmp_path: Path) -> None:
@@ -58,7 +59,7 @@ def test_read_colmap__projection_agrees_with_pycolmap(tmp_path: Path) -> None:
     camera = model.cameras[0]
     image = next(i for i in reference.images.values() if i.name == camera.name)
     for point in POINTS * 0.2:
-        np.testing.assert_allclose(camera.project(point)[0], image.project_point(point), atol=1e-9)
+        assert_close(camera.project(point)[0], image.project_point(point), atol=1e-9)
 
 
 def test_models__are_numbered_as_in_colmap() -> None:
