@@ -117,7 +117,7 @@ def cuts(whole: Path) -> list[int]:
     index = StreamReader(whole / "stream.morgs").index()
     size, ends = len(stream_of(whole)), [offset for _, _, offset in index]
     index_at = size - PAYLOAD - 16 * len(index) - TRAILER.size
-    # A keyframe that restates, the fourth of all, may be missing behind its residual.
+    # A re-emitted keyframe, the fourth packet, may be missing after its residual.
     return [0, ends[0] - 1, ends[0], ends[3] - 1, ends[3], ends[4], index_at, size - 1, size]
 
 

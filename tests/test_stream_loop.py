@@ -288,7 +288,7 @@ def test_stream_capture__writes_a_file(clip, tmp_path):
         (lambda clip: MotionConfig(key_views=0), "`key_views` must be at least 1, got 0"),
     ],
 )
-def test_bad_input__gets_a_sentence(clip, call, message):
+def test_stream_loop__refuses_bad_input(clip, call, message):
     with pytest.raises(ValueError, match=message):
         call(clip)
 

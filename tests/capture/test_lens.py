@@ -97,6 +97,6 @@ def test_undistortion__mask_ends_where_the_polynomial_folds(model: str, fold: fl
         ("OPENCV", (1, 2, 3, 4), "OPENCV takes 8 parameters, got 4"),
     ],
 )
-def test_lens_and_intrinsics__refuses_bad_input(model: str, params: tuple[float, ...], message: str) -> None:
+def test_lens_and_intrinsics__refuse_bad_input(model: str, params: tuple[float, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         lens_and_intrinsics(model, params)

@@ -188,7 +188,7 @@ def test_salvage__reports_all_damage_and_plays_the_rest(clip: Clip, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_salvage__reports_ten_thousand_damages_and_plays_the_rest(clip: Clip, tmp_path: Path) -> None:
+def test_salvage__reports_all_damage_of_ten_thousand_files(clip: Clip, tmp_path: Path) -> None:
     check_damage(clip, tmp_path / "s", 10_000)
 
 

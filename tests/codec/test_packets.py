@@ -162,9 +162,9 @@ def test_residual_packet__of_a_decoded_state_reproduces_it() -> None:
     _, states = encoded_clip(5)
     for before, after in pairwise(states):
         source = np.searchsorted(before.ids, after.ids)
-        kept = np.flatnonzero(after.ids < before.next_id)  # births would choose new steps
-        found = decode(before, residual_packet(before, after.gaussians.select(kept), source[kept], CAMERAS))
-        assert np.array_equal(found.grid.values, after.grid.values[kept])
+        survivors = np.flatnonzero(after.ids < before.next_id)  # births would choose new steps
+        found = decode(before, residual_packet(before, after.gaussians.select(survivors), source[survivors], CAMERAS))
+        assert np.array_equal(found.grid.values, after.grid.values[survivors])
 
 
 def test_decode__ids_follow_a_gaussian_from_birth_to_death() -> None:
@@ -417,7 +417,7 @@ def test_decode__refuses_scrambled_code_or_the_packet_after_it() -> None:
         (lambda s: CodecConfig(target_size=-1), "`target_size` must not be negative"),
     ],
 )
-def test_packets__bad_input_raises_a_sentence(call, message: str) -> None:
+def test_packets__refuse_bad_input(call, message: str) -> None:
     state = decode(None, keyframe_packet(cloud(3), 0))
     with pytest.raises(ValueError, match=message):
         call(state)

@@ -114,18 +114,18 @@ def with_nan(records):
         (lambda _: np.zeros(4, [("packed_position", "u4")]), "SuperSplat's compressed one"),
     ],
 )
-def test_read_ply__bad_input_raises_a_sentence(tmp_path, change, message):
+def test_read_ply__refuses_files_that_it_cannot_read(tmp_path, change, message):
     vertices = change(table(random_gaussians()))
     PlyData([PlyElement.describe(vertices, "vertex")]).write(str(tmp_path / "g.ply"))
     with pytest.raises(ValueError, match=message):
         read_ply(tmp_path / "g.ply")
 
 
-@pytest.mark.parametrize("keep", [0, 3, 60, -5])
-def test_read_ply__names_a_truncated_file(tmp_path, keep):
+@pytest.mark.parametrize("size", [0, 3, 60, -5])
+def test_read_ply__names_a_truncated_file(tmp_path, size):
     path = tmp_path / "g.ply"
     write_ply(path, random_gaussians())
-    path.write_bytes(path.read_bytes()[:keep])
+    path.write_bytes(path.read_bytes()[:size])
     with pytest.raises(ValueError, match=r"g\.ply: expected a complete PLY file"):
         read_ply(path)
 

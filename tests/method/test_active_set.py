@@ -62,7 +62,7 @@ def changes(before, after) -> dict[int, np.ndarray]:
     return {view: np.abs(b - a).max(-1) > 0.02 for view, (a, b) in enumerate(pairs)}
 
 
-def test_find_active_set__selects_what_moves_and_not_what_is_occluded(before, after):
+def test_find_active_set__selects_moving_but_not_occluded_gaussians(before, after):
     active = find_active_set(before, cameras(), changes(before, after), CHANNELS, RENDER)
     chosen = np.isin(np.arange(len(before)), active.indices)
     assert chosen[HIDDEN:].mean() > 0.9
@@ -83,7 +83,7 @@ def test_find_active_set__is_empty_without_changes(before):
     assert not np.asarray(fitted.gaussians.motion).any()
 
 
-def test_find_active_set__covers_what_appears_before_a_static_wall(before):
+def test_find_active_set__covers_what_appears_in_front_of_a_static_wall(before):
     """The ball is new: no Gaussian is there, and every view sees it before another active of the wall."""
     wall = before.select(np.arange(HIDDEN))
     active = find_active_set(wall, cameras(), changes(wall, before), CHANNELS, RENDER)
@@ -116,8 +116,8 @@ def test_fit_later_frame__with_the_active_set_equals_the_full_fit(before, after,
     assert not np.asarray(fitted.gaussians.motion)[where].any()
     assert not np.asarray(fitted.gaussians.offset)[where].any()
     for attribute in ("means", "quats", "log_scales", "sh_coeffs", "logit_opacities"):
-        kept = np.asarray(getattr(fitted.gaussians, attribute))[where]
-        assert np.array_equal(kept, np.asarray(getattr(before, attribute))[still]), attribute
+        found = np.asarray(getattr(fitted.gaussians, attribute))[where]
+        assert np.array_equal(found, np.asarray(getattr(before, attribute))[still]), attribute
 
 
 @pytest.mark.parametrize("density", [DensityConfig(births=0.0), DensityConfig(later_frames=False)])

@@ -63,7 +63,7 @@ def test_propagate_motion__continues_motion_without_flow(scene):
     assert (lift.logit_confidence[~moves] < 0).mean() > 0.99
 
 
-def test_propagate_motion__stops_what_stopped(scene):
+def test_propagate_motion__ends_motion_that_has_stopped(scene):
     """The images are those of `before`: nothing moves any more."""
     before, moves, views, _ = scene
     targets = {v: Target(np.asarray(view.render(before).color)) for v, view in views.items()}

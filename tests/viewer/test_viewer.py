@@ -109,6 +109,16 @@ def select_mode(page, mode: str) -> None:
     page.get_by_role("option", name=mode).click()
 
 
+def test_viewer__shows_the_first_frame_and_follows_the_fit(page, tmp_path):
+    page, states, grow = page
+    page.get_by_text("Frame 0 of 2, 40 Gaussians").wait_for()
+    wait_for(page, rendered(open_stream(tmp_path), states[0], "color"), 40)  # see below
+    grow()
+    page.get_by_label("Follow the fit").check()
+    page.get_by_text("Frame 3 of 3, 41 Gaussians").wait_for()
+
+
+@pytest.mark.slow
 def test_viewer__shows_the_images_of_the_renderer(page, tmp_path):
     page, states, grow = page
     stream = open_stream(tmp_path)
