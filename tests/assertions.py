@@ -17,7 +17,7 @@ def assert_close(
 
     Args:
         found: NumPy array, or Dr.Jit array or tensor.
-        expected: array of the same shape.
+        expected: array of the same shape, or one number for all entries.
         atol: absolute tolerance.
         rtol: tolerance relative to the largest expected entry that is compared, not to each entry.
         where: mask of the entries that are compared, broadcast to their shape.
@@ -28,6 +28,7 @@ def assert_close(
     """
     found, expected = (np.asarray(dr.detach(v) if dr.is_array_v(v) else v) for v in (found, expected))
     label = f"{name}: " if name else ""
+    expected = expected if expected.ndim else np.broadcast_to(expected, found.shape)
     assert found.shape == expected.shape, f"{label}shape {list(found.shape)}, expected {list(expected.shape)}"
     if found.dtype != np.longdouble and expected.dtype != np.longdouble:
         found, expected = np.asarray(found, np.float64), np.asarray(expected, np.float64)

@@ -15,7 +15,7 @@ from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.visualise import to_uint8
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.synth.ground_truth import GroundTruth, save_truth
-from tests.moving_splats import CAMERAS, DISTANCE, FRAMES, PIXELS, STEP, moved, write_stream
+from tests.scenes.moving_splats import CAMERAS, DISTANCE, FRAMES, PIXELS, STEP, moved, write_stream
 
 mi.set_variant("llvm_ad_rgb")  # one for all tests, which then share its kernels
 

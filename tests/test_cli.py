@@ -32,7 +32,9 @@ from morgs_mi.demo import DemoConfig
 from morgs_mi.io.exr import read_exr
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.stream_loop import StreamLoop
-from tests.export.streams import write_stream
+from tests.scenes.cameras import look_at_cameras
+from tests.scenes.changing_splats import write_stream
+from tests.scenes.gaussians import isotropic
 
 WIDTH, HEIGHT, FRAMES = 48, 32, 3
 NAMES = ("cam0", "cam1", "cam2")
@@ -47,8 +49,7 @@ def run(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str, st
 
 
 def rig() -> list[Camera]:
-    places = [(-0.4, 0, -3), (0, 0, -3), (0.4, 0, -3)]
-    return [Camera.look_at(p, (0, 0, 0), (0, -1, 0), 60, WIDTH, HEIGHT, n) for p, n in zip(places, NAMES, strict=True)]
+    return look_at_cameras([(x, 0, -3) for x in (-0.4, 0, 0.4)], 60, WIDTH, HEIGHT)
 
 
 def clip(count: int = FRAMES) -> list[np.ndarray]:
@@ -72,7 +73,7 @@ def capture(tmp_path: Path) -> Path:
 def stream(tmp_path: Path) -> Path:
     """A stream of one splat in two frames."""
     path = tmp_path / "good.morgs"
-    splat = Gaussians.from_activated([[0, 0, 0]], [[0.3] * 3], [[1, 0, 0, 0]], [0.9], [[[1.0, 0, 0]]])
+    splat = isotropic([[0, 0, 0]], 0.3, 0.9, (1.0, 0, 0))
     with StreamWriter(path, rig(), 25) as writer:
         writer.write(keyframe_packet(splat, 0))
         writer.write(keyframe_packet(splat, 1))

@@ -16,7 +16,7 @@ from morgs_mi.fit.config import FitConfig
 SMALL = DemoConfig(
     clip=ClipConfig(num_cameras=6, num_frames=4, width=64, height=48, spp=4),
     plain_frames=3,
-    stream=StreamConfig(fit=FitConfig(sh_degree=0, num_gaussians=500, first_frame_steps=40, epochs=1)),
+    stream=StreamConfig(fit=FitConfig(sh_degree=0, num_gaussians=500, first_frame_steps=20, epochs=1)),
 )
 
 

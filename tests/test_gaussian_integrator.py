@@ -18,15 +18,9 @@ from tests import reference
 from tests import tolerances as tol
 from tests.assertions import assert_close
 from tests.reference import rasterize_view
-from tests.scenes import (
-    AOVS,
-    NEW_ATTRIBUTES,
-    ExtendedGaussians,
-    make_mitsuba_scene,
-    make_sensor_camera,
-    make_unit_scene,
-    to_gaussians,
-)
+from tests.scenes.cameras import make_sensor_camera
+from tests.scenes.gaussians import NEW_ATTRIBUTES, ExtendedGaussians, make_unit_scene, to_gaussians
+from tests.scenes.plugin import AOVS, make_mitsuba_scene
 
 # Raw attributes, and their derivatives with respect to the activated parameters of a Mitsuba scene.
 ACTIVATED = {

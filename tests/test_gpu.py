@@ -10,16 +10,9 @@ import pytest
 from morgs_mi import rasterize
 from tests import tolerances as tol
 from tests.assertions import assert_close
-from tests.scenes import (
-    AOVS,
-    CHANNELS,
-    RAW,
-    make_camera,
-    make_mitsuba_scene,
-    make_scene,
-    make_unit_scene,
-    to_gaussians,
-)
+from tests.scenes.cameras import make_camera
+from tests.scenes.gaussians import CHANNELS, RAW, make_scene, make_unit_scene, to_gaussians
+from tests.scenes.plugin import AOVS, make_mitsuba_scene
 
 pytestmark = [
     pytest.mark.gpu,

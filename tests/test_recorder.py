@@ -21,8 +21,8 @@ from morgs_mi.codec.packets import CodedFrame, coded_frames, play, reemitted_key
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.recorder import stream_capture
 from morgs_mi.stream_loop import StreamLoop
-from tests.codec.test_packets import history
-from tests.recording import CONFIG, FRAMES, Recording, recording
+from tests.scenes.coded_clip import history
+from tests.scenes.recording import CONFIG, FRAMES, Recording, recording
 
 # About what the fit takes here; on a slower machine all kills come early.
 SECONDS = 0.8
@@ -54,7 +54,7 @@ def assert_same(out: Path, whole: Path) -> None:
 
 
 def process(out: Path, *left: int) -> subprocess.Popen:
-    args = [sys.executable, "-m", "tests.recording", str(out), *map(str, left)]
+    args = [sys.executable, "-m", "tests.scenes.recording", str(out), *map(str, left)]
     started = subprocess.Popen(args, stdout=subprocess.PIPE, cwd=Path(__file__).parent.parent)
     assert started.stdout is not None
     assert started.stdout.readline() == b"ready\n"
@@ -117,7 +117,7 @@ def cuts(whole: Path) -> list[int]:
     index = StreamReader(whole / "stream.morgs").index()
     size, ends = len(stream_of(whole)), [offset for _, _, offset in index]
     index_at = size - PAYLOAD - 16 * len(index) - TRAILER.size
-    # A keyframe that restates, the fourth of all, may be missing behind its residual.
+    # A re-emitted keyframe, the fourth packet, may be missing after its residual.
     return [0, ends[0] - 1, ends[0], ends[3] - 1, ends[3], ends[4], index_at, size - 1, size]
 
 

@@ -15,6 +15,8 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.fit.config import DensityConfig, FitConfig
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.stream_loop import StreamLoop
+from tests.scenes.cameras import look_at_cameras
+from tests.scenes.gaussians import random_sheet
 
 BASE = StreamConfig(
     fit=FitConfig(
@@ -94,12 +96,11 @@ def other(name: str) -> Any:
 
 @pytest.fixture(scope="module")
 def clip() -> tuple[list[Camera], np.ndarray, np.ndarray, list[list[np.ndarray]]]:
-    """Five views of a bright textured square before a textured wall; it moves, and the light grows slowly."""
+    """Five views of a bright textured square in front of a textured wall; it moves, and the light grows slowly."""
     rng = np.random.default_rng(0)
     origins = [(x, y, -3) for x, y in ((-1, 0), (1, 0), (0, 0.8), (0, -0.8), (0.4, 0.4))]
-    views = [Camera.look_at(o, (0, 0, 0), (0, -1, 0), 50, 64, 48, f"cam{i}") for i, o in enumerate(origins)]
-    wall = np.stack([*rng.uniform(-1.5, 1.5, (2, 260)), np.full(260, 0.5)], axis=1)
-    square = np.stack([*rng.uniform(-0.35, 0.35, (2, 80)), np.full(80, -0.4)], axis=1)
+    views = look_at_cameras(origins)
+    wall, square = random_sheet(rng, 260, 1.5, 0.5), random_sheet(rng, 80, 0.35, -0.4)
     points = np.concatenate([wall, square])
     colors = np.concatenate([rng.uniform(0.1, 0.6, (260, 3)), rng.uniform(0.5, 1.0, (80, 3))])
     frames = [

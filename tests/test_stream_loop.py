@@ -21,6 +21,8 @@ from morgs_mi.fit.config import DensityConfig, FitConfig, LearningRates
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.recorder import stream_capture
 from morgs_mi.stream_loop import StreamLoop
+from tests.scenes.cameras import QUAD, look_at_cameras
+from tests.scenes.gaussians import isotropic
 
 SHIFT = np.array([0.06, 0.02, 0.0])  # about 3 px a frame
 QUICK = StreamConfig(  # from all points, as the images were made of them
@@ -45,15 +47,13 @@ def scene(frame: int) -> tuple[Gaussians, np.ndarray]:
     wall = rng.uniform((-2.4, -2.0, 0.6), (2.4, 2.0, 2.0), (500, 3))
     direction = rng.normal(size=(120, 3))
     ball = 0.5 * direction / np.linalg.norm(direction, axis=1, keepdims=True) + (-0.2, 0, -0.4) + frame * SHIFT
-    n, moves = len(wall) + len(ball), np.r_[np.zeros(len(wall), bool), np.ones(len(ball), bool)]
-    scales, quats = np.where(moves, 0.09, 0.16)[:, None].repeat(3, 1), np.tile([1.0, 0, 0, 0], (n, 1))
-    sh = rng.uniform(-1.6, 1.6, (n, 1, 3))
-    return Gaussians.from_activated(np.concatenate([wall, ball]), scales, quats, np.full(n, 0.95), sh), moves
+    moves = np.r_[np.zeros(len(wall), bool), np.ones(len(ball), bool)]
+    sh = rng.uniform(-1.6, 1.6, (len(moves), 1, 3))
+    return isotropic(np.concatenate([wall, ball]), np.where(moves, 0.09, 0.16), 0.95, sh), moves
 
 
 def cameras() -> list[Camera]:
-    origins = [(x, y, -3.5) for x in (-0.9, 0.9) for y in (-0.6, 0.6)] + [(0, 0, -3.5)]
-    return [Camera.look_at(o, (0, 0, 0), (0, -1, 0), 50, 96, 72, name=f"cam{i:02d}") for i, o in enumerate(origins)]
+    return look_at_cameras([*QUAD, (0, 0, -3.5)], 50, 96, 72, [f"cam{i:02d}" for i in range(5)])
 
 
 @pytest.fixture(scope="module")
@@ -288,7 +288,7 @@ def test_stream_capture__writes_a_file(clip, tmp_path):
         (lambda clip: MotionConfig(key_views=0), "`key_views` must be at least 1, got 0"),
     ],
 )
-def test_bad_input__gets_a_sentence(clip, call, message):
+def test_stream_loop__refuses_bad_input(clip, call, message):
     with pytest.raises(ValueError, match=message):
         call(clip)
 

@@ -15,7 +15,8 @@ from morgs_mi.calibration.rig_check import check_rig, match_capture
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
-from tests.capture import textured
+from tests.assertions import assert_close
+from tests.scenes import textured
 
 
 def film(path: Path, cameras: list[Camera], suffix: str = ".mkv") -> Path:
@@ -44,9 +45,9 @@ def test_calibrate__recovers_a_rig(tmp_path: Path, capsys) -> None:
     true = np.array([camera.position for camera in cameras])
     found, R = aligned(np.array([camera.position for camera in capture.cameras]), true)
     # Features are accurate to 0.1 px of 208 px focal length; the rig is 2.8 wide and 4 from the scene.
-    np.testing.assert_allclose(found, true, atol=5e-3)
+    assert_close(found, true, atol=5e-3)
     for camera, expected in zip(capture.cameras, cameras, strict=True):
-        np.testing.assert_allclose(camera.viewmat[:3, :3] @ R.T, expected.viewmat[:3, :3], atol=3e-3)
+        assert_close(camera.viewmat[:3, :3] @ R.T, expected.viewmat[:3, :3], atol=3e-3)
         np.testing.assert_allclose(camera.K[0, 0], expected.K[0, 0], rtol=5e-3)
     assert check_rig(capture, match_capture(capture)).fits
     status = cli.main(["calibrate", str(tmp_path)])

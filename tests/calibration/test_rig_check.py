@@ -22,7 +22,9 @@ from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds, write_poses
 from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
-from tests.capture import textured
+from tests.assertions import assert_close
+from tests.scenes import textured
+from tests.scenes.cameras import circle, look_at_cameras
 
 FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -211,7 +213,7 @@ def test_detect__finds_a_blob_at_its_position() -> None:
         blob = 120 + 120 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * (4 * scale) ** 2))
         found = detect(np.repeat(blob[..., None], 3, -1).astype(np.uint8)).points
         nearest = found[np.argmin(np.linalg.norm(found - (u, v), axis=1))]
-        np.testing.assert_allclose(nearest, (u, v), atol=0.1 * scale)
+        assert_close(nearest, (u, v), atol=0.1 * scale)
 
 
 def test_detect__respects_the_mask(capture: Capture) -> None:
@@ -319,7 +321,6 @@ def test_draw_rig__draws_cameras_at_their_positions() -> None:
 
 @pytest.mark.parametrize("count", [1, 2, 8])
 def test_draw_rig__draws_any_rig(count: int) -> None:
-    angles = 2 * np.pi * np.arange(count) / count
-    cameras = [Camera.look_at((np.cos(a), np.sin(a), 0), (0, 0, 0), (0, 0, 1), 60, 64, 48, "c") for a in angles]
+    cameras = look_at_cameras(circle(2 * np.pi * np.arange(count) / count, z=0), 60, up=(0, 0, 1))
     image = draw_rig(cameras, np.zeros((0, 3)), np.zeros((0, 3)))
     assert (image < 200).any()

@@ -12,7 +12,7 @@ import pytest
 
 from morgs_mi import cli
 from morgs_mi.io.video_writer import write_video
-from tests.capture import small_captures as layouts
+from tests.scenes import captures as layouts
 
 Damage = Callable[[Path], object]
 

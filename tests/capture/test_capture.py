@@ -14,44 +14,30 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import Lens
-from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
-
-WIDTH, HEIGHT, COUNT = 62, 46, 3
-
-
-def camera(i: int, name: str, width: int = WIDTH, shift: float = 0.0) -> Camera:
-    view = Camera.look_at((np.cos(i), np.sin(i), 0.5), (0, 0, 0), (0, 0, 1), 60, width, HEIGHT, name)
-    return Camera(view.K + np.array([[0, 0, shift], [0, 0, -shift], [0, 0, 0]]), view.viewmat, width, HEIGHT, name)
-
-
-def clip(value: int, count: int = COUNT, width: int = WIDTH) -> list[np.ndarray]:
-    """Return a clip whose frame t is filled with (value, t, 0)."""
-    return [np.full((HEIGHT, width, 3), (value, t, 0), np.uint8) for t in range(count)]
+from tests.assertions import assert_close
+from tests.scenes.captures import COUNT, FPS, HEIGHT, WIDTH, frames, make_camera, rig, videos
 
 
 def n3dv(path: Path, names: tuple[str, ...] = ("cam00", "cam01", "cam02")) -> Path:
-    for i, name in enumerate(names):
-        write_video(path / f"{name}.mp4", clip(i), 30)
-    write_poses_bounds(path / "poses_bounds.npy", [camera(i, n) for i, n in enumerate(names)], [[1, 9]] * len(names))
+    videos(path, names, ".mp4")
+    write_poses_bounds(path / "poses_bounds.npy", rig(names), [[1, 9]] * len(names))
     return path
 
 
 def colmap(path: Path, names: tuple[str, ...] = ("cam01", "cam02"), **kwargs) -> Path:
-    cameras = [camera(i, n, shift=3.0) for i, n in enumerate(names)]
-    write_colmap(path / "sparse" / "0", cameras, **kwargs)
-    for i, name in enumerate(names):
-        write_video(path / f"{name}.mp4", clip(i), 30)
+    write_colmap(path / "sparse" / "0", rig(names, shift=3.0), **kwargs)
+    videos(path, names, ".mp4")
     return path
 
 
 def test_load_capture__reads_n3dv(tmp_path: Path) -> None:
     capture = load_capture(n3dv(tmp_path))
     assert capture.names == ("cam00", "cam01", "cam02")
-    assert (capture.num_frames, capture.fps, capture.test_view, capture.truth) == (COUNT, 30, None, None)
+    assert (capture.num_frames, capture.fps, capture.test_view, capture.truth) == (COUNT, FPS, None, None)
     assert capture.points.shape == capture.point_colors.shape == (0, 3)
     assert capture.masks == (None,) * 3
-    np.testing.assert_allclose(capture.cameras[1].viewmat, camera(1, "cam01").viewmat, atol=1e-12)
+    assert_close(capture.cameras[1].viewmat, make_camera(1, "cam01").viewmat, atol=1e-12)
     for t, frame in enumerate(capture.frames()):
         assert frame.index == t
         assert [tuple(image[5, 5]) for image in frame.images] == [(0, t, 0), (1, t, 0), (2, t, 0)]
@@ -69,25 +55,25 @@ def test_load_capture__prefers_the_colmap_model_and_orders_it_by_number(tmp_path
     points = np.arange(6.0).reshape(2, 3)
     names = ("cam10", "cam2", "cam1")  # a model lists its images in any order
     colmap(tmp_path, names, points=points, point_colors=points / 5)
-    write_poses_bounds(tmp_path / "poses_bounds.npy", [camera(7, n) for n in names], [[1, 9]] * 3)
+    write_poses_bounds(tmp_path / "poses_bounds.npy", [make_camera(7, n) for n in names], [[1, 9]] * 3)
     capture = load_capture(tmp_path)
     assert capture.names == ("cam1", "cam2", "cam10")
     assert [image[0, 0, 0] for image in next(capture.frames()).images] == [2, 1, 0]
-    np.testing.assert_allclose(capture.cameras[0].viewmat, camera(2, "cam1").viewmat, atol=1e-12)
+    assert_close(capture.cameras[0].viewmat, make_camera(2, "cam1").viewmat, atol=1e-12)
     assert capture.cameras[0].K[0, 2] == WIDTH / 2 + 3
     np.testing.assert_allclose(capture.points, points)
-    np.testing.assert_allclose(capture.point_colors, points / 5, atol=1 / 255)
+    assert_close(capture.point_colors, points / 5, atol=1 / 255)
 
 
 @pytest.mark.parametrize("downscale", [2, 3, 4.5])
 def test_load_capture__downscaling_moves_projections_with_the_pixels(tmp_path: Path, downscale: float) -> None:
-    full = camera(0, "cam01", shift=3.0)
+    full = make_camera(0, "cam01", shift=3.0)
     write_colmap(tmp_path / "sparse", [full])
     point = np.array([0.03, 0.05, 0.02])
     u, v = full.project(point)[0]
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     blob = 250 * np.exp(-((columns - u) ** 2 + (rows - v) ** 2) / 50)
-    write_video(tmp_path / "cam01", [np.repeat(blob[..., None], 3, -1).astype(np.uint8)], 30)
+    write_video(tmp_path / "cam01", [np.repeat(blob[..., None], 3, -1).astype(np.uint8)], FPS)
 
     capture = load_capture(tmp_path, downscale)
     small = capture.cameras[0]
@@ -96,7 +82,7 @@ def test_load_capture__downscaling_moves_projections_with_the_pixels(tmp_path: P
     assert image.shape == (small.height, small.width)
     rows, columns = np.mgrid[: small.height, : small.width] + 0.5
     centre = np.array([(image * columns).sum(), (image * rows).sum()]) / image.sum()
-    np.testing.assert_allclose(centre, small.project(point)[0], atol=0.05)
+    assert_close(centre, small.project(point)[0], atol=0.05)
 
 
 def test_load_capture__undistorts_and_masks(tmp_path: Path) -> None:
@@ -115,16 +101,16 @@ def test_load_capture__undistorts_and_masks(tmp_path: Path) -> None:
 
 def test_load_capture__prefers_lossless_frames(tmp_path: Path) -> None:
     n3dv(tmp_path)
-    write_video(tmp_path / "frames" / "cam01", clip(77), 30)
+    write_video(tmp_path / "frames" / "cam01", frames(77), FPS)
     images = next(load_capture(tmp_path).frames()).images
     assert [image[0, 0, 0] for image in images] == [0, 77, 2]
 
 
 def test_load_capture__reads_frame_folders_named_in_the_model(tmp_path: Path) -> None:
     names = ("cam01", "cam02")
-    write_colmap(tmp_path / "sparse", [camera(i, f"{n}/0000.png") for i, n in enumerate(names)])
+    write_colmap(tmp_path / "sparse", [make_camera(i, f"{n}/0000.png") for i, n in enumerate(names)])
     for i, name in enumerate(names):
-        write_video(tmp_path / name, clip(i), 30)
+        write_video(tmp_path / name, frames(i), FPS)
     (tmp_path / "capture.json").write_text('{"fps": 24}')
     capture = load_capture(tmp_path)
     assert (capture.names, capture.fps) == (names, 24)
@@ -153,7 +139,7 @@ def test_load_capture__finds_truth_and_limits_frames(tmp_path: Path) -> None:
 def test_load_capture__leaves_out_uncalibrated_clips_with_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    write_video(colmap(tmp_path) / "cam03.mp4", clip(3), 30)
+    write_video(colmap(tmp_path) / "cam03.mp4", frames(3), FPS)
     with caplog.at_level(logging.WARNING):
         assert load_capture(tmp_path).names == ("cam01", "cam02")
     assert "does not calibrate cam03" in caplog.text
@@ -176,15 +162,15 @@ def no_clip(path: Path) -> None:
 
 
 def other_size(path: Path) -> None:
-    write_video(path / "cam02.mp4", clip(1, width=WIDTH - 2), 30)
+    write_video(path / "cam02.mp4", frames(1, width=WIDTH - 2), FPS)
 
 
 def other_length(path: Path) -> None:
-    write_video(path / "cam02.mp4", clip(1, count=COUNT + 2), 30)
+    write_video(path / "cam02.mp4", frames(1, count=COUNT + 2), FPS)
 
 
 def other_rate(path: Path) -> None:
-    write_video(path / "cam02.mp4", clip(1), 60)
+    write_video(path / "cam02.mp4", frames(1), 60)
 
 
 def empty_clip(path: Path) -> None:
@@ -192,12 +178,12 @@ def empty_clip(path: Path) -> None:
 
 
 def two_images_of_a_camera(path: Path) -> None:
-    write_colmap(path / "sparse/0", [camera(0, "cam01"), camera(1, "cam01/0001.png")])
+    write_colmap(path / "sparse/0", [make_camera(0, "cam01"), make_camera(1, "cam01/0001.png")])
 
 
 def missing_video_of_a_row(path: Path) -> None:
     no_calibration(path)
-    write_poses_bounds(path / "poses_bounds.npy", [camera(i, "") for i in range(3)], [[1, 9]] * 3)
+    write_poses_bounds(path / "poses_bounds.npy", [make_camera(i, "") for i in range(3)], [[1, 9]] * 3)
 
 
 def bad_settings(path: Path) -> None:
@@ -224,8 +210,8 @@ def broken_settings(path: Path) -> None:
             ValueError,
             "cam02.mp4: expected 62x46, the calibrated size of cam02, or a scaled version of it, got 60x46",
         ),
-        (other_length, ValueError, "got cam01.mp4 3, cam02.mp4 5; .*max_frames=3"),
-        (other_rate, ValueError, "the same frame rate, got cam01.mp4 30, cam02.mp4 60; .*--trim"),
+        (other_length, ValueError, "got cam01.mp4 4, cam02.mp4 6; .*max_frames=4"),
+        (other_rate, ValueError, "the same frame rate, got cam01.mp4 25, cam02.mp4 60; .*--trim"),
         (empty_clip, ValueError, "cam02.mp4: expected a video, got an empty file"),
         (
             two_images_of_a_camera,

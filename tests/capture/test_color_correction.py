@@ -15,7 +15,8 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
 from morgs_mi.io.video_writer import write_video
-from tests.capture import textured
+from tests.assertions import assert_close
+from tests.scenes import textured
 
 # Sensors with different cross-talk, white balance and exposure. The first is the reference.
 SENSORS = np.array(
@@ -74,7 +75,7 @@ def test_fit_colors__removes_differences_between_sensors(views, method: str, lef
         assert after < left, (view, before, after)
     if method == "linear":
         found = np.array([matrix for matrix in fit.matrices[1:]])
-        np.testing.assert_allclose(found @ SENSORS[1:], np.tile(np.eye(3), (3, 1, 1)), atol=0.03)
+        assert_close(found @ SENSORS[1:], np.tile(np.eye(3), (3, 1, 1)), atol=0.03)
 
 
 def test_fit_colors__leaves_matching_cameras_unchanged(views) -> None:

@@ -8,6 +8,7 @@ import pytest
 
 from morgs_mi.capture.lens import Lens, lens_and_intrinsics, undistortion
 from morgs_mi.core.camera import Camera
+from tests.assertions import assert_close
 
 WIDTH, HEIGHT = 160, 120
 LENSES = {
@@ -53,7 +54,7 @@ def test_undistortion__moves_points_to_their_pinhole_projections(model: str) -> 
         near = image * ((np.abs(x - u) < 7) & (np.abs(y - v) < 7))
         centre = np.array([(near * x).sum(), (near * y).sum()]) / near.sum()
         # 1/32 px of the maps, and the distortion of the blob itself.
-        np.testing.assert_allclose(centre, (u, v), atol=0.15)
+        assert_close(centre, (u, v), atol=0.15)
 
 
 def test_undistortion__is_none_without_distortion() -> None:
@@ -96,6 +97,6 @@ def test_undistortion__mask_ends_where_the_polynomial_folds(model: str, fold: fl
         ("OPENCV", (1, 2, 3, 4), "OPENCV takes 8 parameters, got 4"),
     ],
 )
-def test_lens_and_intrinsics__refuses_bad_input(model: str, params: tuple[float, ...], message: str) -> None:
+def test_lens_and_intrinsics__refuse_bad_input(model: str, params: tuple[float, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         lens_and_intrinsics(model, params)

@@ -18,7 +18,7 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
 from morgs_mi.capture.live import live_frames
 from morgs_mi.io.video_writer import write_video
-from tests.capture import small_captures as layouts
+from tests.scenes import captures as layouts
 
 NAMES = ("cam1", "cam2", "cam3")
 

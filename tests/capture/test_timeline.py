@@ -12,7 +12,7 @@ import pytest
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.io.video_writer import write_video
-from tests.capture import small_captures as layouts
+from tests.scenes import captures as layouts
 
 
 def capture_of(path: Path, clips: dict[str, tuple[int, float]]) -> Path:

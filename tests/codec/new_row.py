@@ -34,7 +34,7 @@ def add_row() -> None:
 def check_round_trip(confidence: bool) -> None:
     """Check the decoded attributes of labelled Gaussians of which some change, die and are born."""
     from morgs_mi.codec.packets import decode, keyframe_packet, reemitted_keyframe, residual_packet
-    from tests.codec.clouds import CAMERAS, cloud, jittered
+    from tests.scenes.coded_clip import CAMERAS, cloud, jittered
 
     rng = np.random.default_rng(0)
 
@@ -74,7 +74,7 @@ def main() -> None:
     """Check the new row and print the digest of a stream without labels."""
     mi.set_variant("llvm_ad_rgb")
     add_row()
-    from tests.codec.clouds import encoded_clip, history
+    from tests.scenes.coded_clip import encoded_clip, history
 
     for confidence in (False, True):
         check_round_trip(confidence)

@@ -153,7 +153,7 @@ def residual(state, payload):
 
 
 def numbers(state):
-    """Return the attributes that a state stands for, by the names of the package."""
+    """Return the attributes of a state, by the names of the package."""
     e, own = state["exponents"], [0, 0, 0, 1, 2, 3, 4, 4, 4, 5, 6, 6, 6]
     own += [7] * (3 * ((state["degree"] + 1) ** 2 - 1)) + [8] * state["confidence"]
     real = np.zeros(state["values"].shape)

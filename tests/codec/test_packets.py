@@ -29,8 +29,9 @@ from morgs_mi.codec.packets import (
 )
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.gaussians import Gaussians
+from tests.assertions import assert_close
 from tests.codec import plain_decoder
-from tests.codec.clouds import CAMERAS, cloud, encoded_clip, history, jittered, write
+from tests.scenes.coded_clip import CAMERAS, cloud, encoded_clip, history, jittered, write
 
 
 def assert_same(got: CodedFrame, expected: CodedFrame) -> None:
@@ -161,9 +162,9 @@ def test_residual_packet__of_a_decoded_state_reproduces_it() -> None:
     _, states = encoded_clip(5)
     for before, after in pairwise(states):
         source = np.searchsorted(before.ids, after.ids)
-        kept = np.flatnonzero(after.ids < before.next_id)  # births would choose new steps
-        found = decode(before, residual_packet(before, after.gaussians.select(kept), source[kept], CAMERAS))
-        assert np.array_equal(found.grid.values, after.grid.values[kept])
+        survivors = np.flatnonzero(after.ids < before.next_id)  # births would choose new steps
+        found = decode(before, residual_packet(before, after.gaussians.select(survivors), source[survivors], CAMERAS))
+        assert np.array_equal(found.grid.values, after.grid.values[survivors])
 
 
 def test_decode__ids_follow_a_gaussian_from_birth_to_death() -> None:
@@ -175,7 +176,7 @@ def test_decode__ids_follow_a_gaussian_from_birth_to_death() -> None:
     again = Gaussians.concatenate([state.gaussians.select(np.array([1, 2])), single_at(8.0), single_at(9.0)])
     state = decode(state, residual_packet(state, again, np.array([1, 2, -1, -1]), CAMERAS))
     assert (state.ids.tolist(), state.next_id) == ([2, 5, 7, 8], 9)
-    np.testing.assert_allclose(state.gaussians.numpy()["means"][2:, 0], [8, 9], atol=0.01)
+    assert_close(state.gaussians.numpy()["means"][2:, 0], [8, 9], atol=0.01)
     assert not state.gaussians.numpy()["motion"][2:].any(), "a birth has no motion"
     assert decode(None, reemitted_keyframe(state)).ids.tolist() == [2, 5, 7, 8]
 
@@ -193,7 +194,7 @@ def test_decode__round_trips_every_degree_with_and_without_confidence(degree: in
     assert found.frame == 4
     assert found.gaussians.sh_degree == degree
     assert (found.gaussians.logit_confidence is not None) == confidence
-    np.testing.assert_allclose(found.gaussians.numpy()["sh_coeffs"], now.numpy()["sh_coeffs"], atol=0.02)
+    assert_close(found.gaussians.numpy()["sh_coeffs"], now.numpy()["sh_coeffs"], atol=0.02)
 
 
 def test_residual_packet__removes_all_gaussians() -> None:
@@ -330,15 +331,16 @@ def test_stream_reader__refuses_to_seek_in_a_pipe() -> None:
         reader.check()
 
 
-def test_coded_frames__equal_the_encoders_states_on_one_thread_and_on_many(tmp_path: Path) -> None:
-    packets, states = encoded_clip(300, degree=0)
+@pytest.mark.parametrize("frames", [60, pytest.param(300, marks=pytest.mark.slow)])
+def test_coded_frames__equal_the_encoders_states_on_one_thread_and_on_many(tmp_path: Path, frames: int) -> None:
+    packets, states = encoded_clip(frames, degree=0)
     write(tmp_path / "s", packets, states, every=50)
     program = f"""
 import drjit as dr
 import mitsuba as mi; mi.set_variant("llvm_ad_rgb")
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
-from tests.codec.clouds import history
+from tests.scenes.coded_clip import history
 dr.set_thread_count(1)
 print(history(coded_frames(StreamReader({str(tmp_path / "s")!r}))))
 """
@@ -348,7 +350,7 @@ print(history(coded_frames(StreamReader({str(tmp_path / "s")!r}))))
     expected = history(states)
     assert result.stdout.strip() == expected
     assert history(coded_frames(StreamReader(tmp_path / "s"))) == expected
-    assert_same(seek(StreamReader(tmp_path / "s"), 299), states[-1])
+    assert_same(seek(StreamReader(tmp_path / "s"), frames - 1), states[-1])
 
 
 def test_decode__names_a_missing_packet() -> None:
@@ -415,7 +417,7 @@ def test_decode__refuses_scrambled_code_or_the_packet_after_it() -> None:
         (lambda s: CodecConfig(target_size=-1), "`target_size` must not be negative"),
     ],
 )
-def test_packets__bad_input_raises_a_sentence(call, message: str) -> None:
+def test_packets__refuse_bad_input(call, message: str) -> None:
     state = decode(None, keyframe_packet(cloud(3), 0))
     with pytest.raises(ValueError, match=message):
         call(state)

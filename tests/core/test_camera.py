@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.core.camera import Camera
+from tests.assertions import assert_close
 
 
 @pytest.fixture(params=[(0.0, 0.0), (9.0, -6.0), (-5.5, 7.25)], ids=["centred", "right_up", "left_down"])
@@ -32,21 +33,21 @@ def test_project__agrees_with_the_mitsuba_sensor(camera):
     y, x = np.mgrid[:48, :64] + 0.5
     seen = np.array([(image * x).sum(), (image * y).sum()]) / image.sum()
     # A ball's image is an ellipse whose middle is not quite the image of its centre; noise is 0.02 px.
-    np.testing.assert_allclose(seen, camera.project(point)[0], atol=0.1)
+    assert_close(seen, camera.project(point)[0], atol=0.1)
 
 
 def test_project__inverts_the_rays_of_the_mitsuba_sensor(camera):
     y, x = np.mgrid[:48, :64].reshape(2, -1) + 0.5
     rays, _ = mi.load_dict(camera.sensor()).sample_ray(0, 0, mi.Point2f(x / 64, y / 48), 0)
     points = np.array(rays.o + 3 * rays.d).T
-    np.testing.assert_allclose(camera.project(points)[0], np.stack([x, y], axis=1), atol=2e-3)
+    assert_close(camera.project(points)[0], np.stack([x, y], axis=1), atol=2e-3)
 
 
 def test_unproject__inverts_project(camera):
     points = np.random.default_rng(0).uniform(-1, 1, (4, 5, 3))
     pixels, depths = camera.project(points)
     assert pixels.shape == (4, 5, 2)
-    np.testing.assert_allclose(camera.unproject(pixels, depths), points, atol=1e-12)
+    assert_close(camera.unproject(pixels, depths), points, atol=1e-12)
 
 
 def test_rays__start_at_the_camera_and_pass_through_their_pixels(camera):
@@ -54,7 +55,7 @@ def test_rays__start_at_the_camera_and_pass_through_their_pixels(camera):
     origin, directions = camera.rays(pixels)
     np.testing.assert_allclose(origin, camera.position)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1)
-    np.testing.assert_allclose(camera.project(origin + 2.5 * directions)[0], pixels, atol=1e-9)
+    assert_close(camera.project(origin + 2.5 * directions)[0], pixels, atol=1e-9)
 
 
 def test_projection_jacobian__agrees_with_central_differences(camera):

@@ -8,19 +8,11 @@ import pytest
 
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.gaussians import Gaussians, join_sh, split_sh
+from tests.scenes.gaussians import make_scene, to_gaussians
 
 
 def cloud(degree: int) -> Gaussians:
-    rng = np.random.default_rng(degree)
-    return Gaussians(
-        rng.normal(size=(5, 3)),
-        rng.normal(size=(5, 3)),
-        rng.normal(size=(5, 4)),
-        rng.normal(size=5),
-        rng.normal(size=(5, (degree + 1) ** 2, 3)),
-        motion=rng.normal(size=(5, 3)),
-        logit_confidence=rng.normal(size=5),
-    )
+    return to_gaussians(make_scene(degree, n=5))
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -13,6 +13,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import colors_seen_from, covariances, rotated, sh_basis
 from morgs_mi.render.rasterize import rasterize
 from tests import reference
+from tests.assertions import assert_close
 
 R = Rotation.from_rotvec([0.3, -1.1, 0.7]).as_matrix()
 
@@ -44,9 +45,9 @@ def test_colors_seen_from__agree_with_the_reference(degree):
     directions = raw["means"] - eye
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     expected = np.stack([np.stack(reference.sh_basis(d, degree)) for d in directions])
-    np.testing.assert_allclose(sh_basis(directions, degree), expected, atol=2e-6)  # float32 polynomials
+    assert_close(sh_basis(directions, degree), expected, atol=2e-6)  # float32 polynomials
     colors = np.maximum(0.5 + np.einsum("nk,nkc->nc", expected, raw["sh_coeffs"]), 0)
-    np.testing.assert_allclose(colors_seen_from(gaussians, eye), colors, atol=1e-5)
+    assert_close(colors_seen_from(gaussians, eye), colors, atol=1e-5)
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -61,4 +62,4 @@ def test_rotated__looks_the_same_to_a_rotated_camera(degree):
     np.testing.assert_array_equal(rotated(vectors, R).offset, rotated(vectors, R).motion)
     for name in channels:
         # A rotation rounds every attribute once in float32; nearly equal depths do not swap on these seeds.
-        np.testing.assert_allclose(np.array(getattr(b, name)), np.array(getattr(a, name)), atol=2e-4, err_msg=name)
+        assert_close(getattr(b, name), getattr(a, name), atol=2e-4, name=name)

@@ -19,7 +19,7 @@ from morgs_mi.evaluate.results import known_mean
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.render.rasterize import rasterize
 from tests.evaluate.tiny_onnx import squared_difference
-from tests.moving_splats import CAMERAS, EXACT, FRAMES, HEIGHT, PIXELS, STEP, WIDTH, moved, write_stream
+from tests.scenes.moving_splats import CAMERAS, EXACT, FRAMES, HEIGHT, PIXELS, STEP, WIDTH, moved, write_stream
 
 
 def test_evaluate_stream__finds_no_error_in_the_stream_of_the_recording(fitted_clip: Path) -> None:

@@ -14,7 +14,8 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.evaluate.figures import draw_stream, motion_scale
 from morgs_mi.playback.player import open_stream
 from morgs_mi.playback.visualise import GAP
-from tests.moving_splats import CAMERAS, FRAMES, HEIGHT, PIXELS, WIDTH, write_stream
+from tests.assertions import assert_close
+from tests.scenes.moving_splats import CAMERAS, FRAMES, HEIGHT, PIXELS, WIDTH, write_stream
 
 LEGEND = 96
 
@@ -33,7 +34,7 @@ def test_draw_stream__writes_every_figure(fitted_clip: Path, tmp_path: Path) -> 
     assert motion.shape == confidence.shape == (LEGEND + GAP + HEIGHT, 2 * (WIDTH + GAP) + LEGEND, 3)
     seen = confidence[LEGEND + GAP + 15 :, :WIDTH].max(-1) > 128
     true, found = (motion[LEGEND + GAP + 15 :, x : x + WIDTH][seen[: HEIGHT - 15]] for x in (0, WIDTH + GAP))
-    assert np.abs(true.astype(int) - found).max() <= 2
+    assert_close(found, true, atol=2)
 
 
 def test_draw_stream__draws_the_stream_alone_without_truth(fitted_clip: Path, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.evaluate.lpips import Lpips
+from tests.assertions import assert_close
 from tests.evaluate.tiny_onnx import squared_difference
 
 H, W = 12, 17
@@ -16,12 +17,12 @@ EXPECTED = (4 * (IMAGE - TRUTH) ** 2).mean(-1)
 
 def test_lpips__spatial_network_gives_a_map(tmp_path):
     distance = Lpips(squared_difference(tmp_path / "net.onnx", H, W)).distance_map(IMAGE, TRUTH)
-    np.testing.assert_allclose(distance, EXPECTED, atol=1e-6)
+    assert_close(distance, EXPECTED, atol=1e-6)
 
 
 def test_lpips__other_network_gives_one_number(tmp_path):
     net = Lpips(squared_difference(tmp_path / "net.onnx", H, W, spatial=False))
-    np.testing.assert_allclose(net.distance_map(IMAGE, TRUTH), [[EXPECTED.mean()]], atol=1e-6)
+    assert_close(net.distance_map(IMAGE, TRUTH), [[EXPECTED.mean()]], atol=1e-6)
     assert net.distance_map(IMAGE, IMAGE) == 0
 
 

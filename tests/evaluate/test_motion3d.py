@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.motion3d import compare_motion, evaluate_motion, rigid_motions, surface_ids
 from morgs_mi.synth.ground_truth import GroundTruth
+from tests.assertions import assert_close
 
 rng = np.random.default_rng(0)
 WIDTH, HEIGHT = 40, 30
@@ -49,15 +50,15 @@ def test_rigid_motions__are_recovered_from_tracks():
     after[ids == 5] = before[ids == 5] + SHIFT  # on a line: a turn about it would not show
     found = rigid_motions(before, after, ids)
     assert list(found) == [2]
-    np.testing.assert_allclose(found[2][0], TURN, atol=1e-12)
-    np.testing.assert_allclose(found[2][1], SHIFT, atol=1e-12)
+    assert_close(found[2][0], TURN, atol=1e-12)
+    assert_close(found[2][1], SHIFT, atol=1e-12)
 
 
 def test_rigid_motions__are_recovered_from_points_in_a_plane():
     before = rng.normal(size=(5, 3)) * (1, 1, 0)
     rotation, shift = rigid_motions(before, before @ TURN.T + SHIFT, np.zeros(5, int))[0]
-    np.testing.assert_allclose(rotation, TURN, atol=1e-12)
-    np.testing.assert_allclose(shift, SHIFT, atol=1e-12)
+    assert_close(rotation, TURN, atol=1e-12)
+    assert_close(shift, SHIFT, atol=1e-12)
 
 
 def test_compare_motion__of_known_displacements():

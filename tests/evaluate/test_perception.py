@@ -7,6 +7,7 @@ import pytest
 
 from morgs_mi.evaluate import perception
 from morgs_mi.evaluate.perception import delta_e_map, flip_map
+from tests.assertions import assert_close
 
 ROWS, COLUMNS = np.mgrid[:48, :64]
 TRUTH = np.stack([0.5 + 0.4 * np.sin(COLUMNS / 5 + k) * np.cos(ROWS / 7 - k) for k in range(3)], -1)
@@ -34,7 +35,7 @@ def test_flip_map__is_bounded_and_symmetric():
     error = flip_map(IMAGE, TRUTH)
     assert (flip_map(TRUTH, TRUTH) == 0).all()
     # Sums of the same terms in another order.
-    np.testing.assert_allclose(error, flip_map(TRUTH, IMAGE), atol=1e-12)
+    assert_close(error, flip_map(TRUTH, IMAGE), atol=1e-12)
     noise = np.random.default_rng(0).integers(0, 2, (2, 40, 40, 3)).astype(float)
     assert 0 <= error.min() < error.max() <= 1
     assert flip_map(*noise).max() <= 1

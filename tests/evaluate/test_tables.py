@@ -10,7 +10,7 @@ from rich.console import Console
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.evaluate.tables import evaluation_summary, evaluation_tables, figure
-from tests.moving_splats import write_stream
+from tests.scenes.moving_splats import write_stream
 
 
 @pytest.fixture(scope="module")

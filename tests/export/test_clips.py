@@ -16,7 +16,8 @@ from morgs_mi.export.clips import select_frames
 from morgs_mi.export.frames import exr_channels, pad_to_even
 from morgs_mi.io.ply import read_ply
 from morgs_mi.render.rasterize import rasterize
-from tests.export.streams import rig, write_stream
+from tests.assertions import assert_close
+from tests.scenes.changing_splats import rig, write_stream
 
 
 @pytest.fixture
@@ -101,11 +102,11 @@ def test_exr_channels__are_read_by_mitsuba(stream, tmp_path):
     assert sorted(names) == sorted(["R", "G", "B", "motion.X", "motion.Y", "confidence.Y", "depth.Y"])
     planes = dict(zip(names, np.moveaxis(np.array(image), -1, 0), strict=True))
     rendered = rasterize(stream[1].gaussians, rig()[1], ("color", "motion", "confidence", "depth"))
-    np.testing.assert_allclose(planes["motion.X"], np.array(rendered.motion)[..., 0], atol=1e-5)
-    np.testing.assert_allclose(planes["confidence.Y"], np.array(rendered.confidence)[..., 0], atol=1e-6)
-    np.testing.assert_allclose(planes["depth.Y"], np.array(rendered.depth)[..., 0], atol=1e-5)
+    assert_close(planes["motion.X"], np.array(rendered.motion)[..., 0], atol=1e-5)
+    assert_close(planes["confidence.Y"], np.array(rendered.confidence)[..., 0], atol=1e-6)
+    assert_close(planes["depth.Y"], np.array(rendered.depth)[..., 0], atol=1e-5)
     linear = srgb_to_linear(np.array(rendered.color))
-    np.testing.assert_allclose(np.stack([planes[c] for c in "RGB"], -1), linear, atol=1e-6)
+    assert_close(np.stack([planes[c] for c in "RGB"], -1), linear, atol=1e-6)
 
 
 def test_exr_channels__names_follow_the_number_of_components():

@@ -13,7 +13,8 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.export.axes import gltf_axes
 from morgs_mi.export.gltf import glb, write_gltf
 from morgs_mi.render.rasterize import rasterize
-from tests.export.streams import rig, splats
+from tests.assertions import assert_close
+from tests.scenes.changing_splats import rig, splats
 
 KHR = "KHR_gaussian_splatting"
 SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
@@ -84,7 +85,7 @@ def test_glb__conforms_to_the_extension(degree):
     position = document["accessors"][primitive["attributes"]["POSITION"]]
     np.testing.assert_array_equal(position["min"], arrays["POSITION"].min(0))
     np.testing.assert_array_equal(position["max"], arrays["POSITION"].max(0))
-    np.testing.assert_allclose(np.linalg.norm(arrays[f"{KHR}:ROTATION"], axis=1), 1, atol=1e-6)
+    assert_close(np.linalg.norm(arrays[f"{KHR}:ROTATION"], axis=1), 1, atol=1e-6)
     assert arrays[f"{KHR}:SCALE"].min() >= 0
     for name in ("COLOR_0", f"{KHR}:OPACITY"):
         assert arrays[name].min() >= 0
@@ -108,12 +109,12 @@ def test_write_gltf__renders_the_same_image_in_gltf_axes(tmp_path, degree):
     exported = gaussians_of(attributes(document, binary))
     image = rasterize(exported, replace(camera, viewmat=camera.viewmat @ rotation)).color
     # The rotation rounds the float32 attributes once more.
-    np.testing.assert_allclose(np.array(image), np.array(rasterize(gaussians, camera).color), atol=2e-4)
+    assert_close(image, rasterize(gaussians, camera).color, atol=2e-4)
 
 
 def test_gltf_axes__have_y_up_and_the_cameras_at_positive_z():
     axes = gltf_axes(rig())
-    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert_close(axes @ axes.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(axes) == pytest.approx(1)
     assert (axes @ [0, 0, 1])[1] > 0.95  # the world's up is nearly y, since the cameras look down a little
     assert (axes @ rig()[1].position)[2] > 3  # the cameras are at positive z

@@ -11,34 +11,35 @@ import pytest
 from morgs_mi.core.camera import Camera
 from morgs_mi.export.axes import up_direction
 from morgs_mi.export.paths import CameraPath, focus, load_path, orbit, through_cameras
-from tests.export.streams import rig
+from tests.assertions import assert_close
+from tests.scenes.cameras import circle, look_at_cameras
+from tests.scenes.changing_splats import rig
 
 TARGET = np.array([0, 0, 0.2])
 
 
 def ring(count: int) -> tuple[Camera, ...]:
-    angles = 2 * np.pi * np.arange(count) / count
-    positions = np.stack([3 * np.cos(angles), 3 * np.sin(angles), np.full(count, 1.0)], 1)
-    return tuple(Camera.look_at(p, TARGET, (0, 0, 1), 45, 64, 48, f"c{i}") for i, p in enumerate(positions))
+    origins = circle(2 * np.pi * np.arange(count) / count, 3, 1)
+    return tuple(look_at_cameras(origins, 45, target=(0, 0, 0.2), up=(0, 0, 1)))
 
 
 def test_camera_path__interpolates_its_keys_smoothly():
     wide = replace(rig()[2], K=np.array([[30.0, 0, 31], [0, 33, 25], [0, 0, 1]]))
     path = CameraPath(np.array([0, 1, 2.5]), (*rig()[:2], wide))
     for time, key in zip(path.times, path.keys, strict=True):
-        np.testing.assert_allclose(path.at(time).viewmat, key.viewmat, atol=1e-9)
-        np.testing.assert_allclose(path.at(time).K, key.K, atol=1e-9)
+        assert_close(path.at(time).viewmat, key.viewmat, atol=1e-9)
+        assert_close(path.at(time).K, key.K, atol=1e-9)
     np.testing.assert_array_equal(path.at(9).viewmat, path.at(2.5).viewmat)
     # No kinks: the steps to both sides of a key differ by the acceleration times their square.
     before, at, after = (path.at(1 + h).position for h in (-1e-4, 0, 1e-4))
-    np.testing.assert_allclose(after - at, at - before, atol=1e-7)
+    assert_close(after - at, at - before, atol=1e-7)
 
 
 def test_camera_path__rotations_are_orthonormal():
     path = through_cameras(ring(7), 3)
     for time in np.linspace(0, 3, 40):
         R = path.at(time).viewmat[:3, :3]
-        np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+        assert_close(R @ R.T, np.eye(3), atol=1e-12)
         assert np.linalg.det(R) > 0
 
 
@@ -51,7 +52,7 @@ def test_through_cameras__visits_the_nearest_next_at_constant_speed():
 
 def test_orbit__has_a_constant_distance_and_looks_at_the_centre():
     path = orbit(ring(8), TARGET, seconds=4)
-    np.testing.assert_allclose(path.at(0).position, path.at(4).position, atol=1e-9)  # no gap of 90 degrees: a full turn
+    assert_close(path.at(0).position, path.at(4).position, atol=1e-9)  # no gap of 90 degrees: a full turn
     for time in np.linspace(0, 4, 30):
         camera = path.at(time)
         pixel, depth = camera.project(TARGET)
@@ -71,7 +72,7 @@ def test_orbit__of_a_frontal_rig_is_as_wide_as_the_rig():
 
 def test_focus__is_the_intersection_of_the_axes_or_the_median_of_the_gaussians():
     means = np.random.default_rng(0).normal(size=(99, 3))
-    np.testing.assert_allclose(focus(ring(8), means), TARGET, atol=0.02)
+    assert_close(focus(ring(8), means), TARGET, atol=0.02)
     parallel = [Camera.look_at((x, -4, 0), (x, 0, 0), (0, 0, 1), 45, 64, 48) for x in (-1, 1)]
     assert focus(parallel, means + np.array([0, 2, 0]))[1] == pytest.approx(np.median(means[:, 1]) + 2)
 
@@ -85,8 +86,8 @@ def test_load_path__accepts_cameras_matrices_and_positions(tmp_path):
     (tmp_path / "path.json").write_text(json.dumps({"width": 128, "height": 96, "up": [0, 0, 1], "keys": keys}))
     path = load_path(tmp_path / "path.json", rig())
     for key, camera in zip(path.keys, rig()[::-1], strict=True):
-        np.testing.assert_allclose(key.viewmat, camera.viewmat, atol=1e-12)
-        np.testing.assert_allclose(key.K, camera.resized(128, 96).K, atol=1e-9)
+        assert_close(key.viewmat, camera.viewmat, atol=1e-12)
+        assert_close(key.K, camera.resized(128, 96).K, atol=1e-9)
 
 
 @pytest.mark.parametrize(

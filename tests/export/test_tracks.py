@@ -9,7 +9,8 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.export.tracks import extract_tracks, write_tracks
-from tests.export.streams import rig, splats, write_stream
+from tests.assertions import assert_close
+from tests.scenes.changing_splats import rig, splats, write_stream
 
 
 def test_extract_tracks__positions_are_those_of_the_gaussians(tmp_path):
@@ -28,7 +29,7 @@ def test_extract_tracks__positions_are_those_of_the_gaussians(tmp_path):
     assert np.isnan(tracks["positions"][:, 0, 0]).tolist() == [False, False, True, True]
     assert np.isnan(tracks["positions"][:, -1, 0]).tolist() == [True, True, False, False]
     # The second moved by 0.1 per frame, up to the codec's quantisation steps of a tenth of a pixel, or 0.007.
-    np.testing.assert_allclose(np.diff(tracks["positions"][:, 1, 0]), 0.1, atol=0.007)
+    assert_close(np.diff(tracks["positions"][:, 1, 0]), 0.1, atol=0.007)
 
 
 def test_extract_tracks__new_sets_of_gaussians_get_new_ids(tmp_path):

@@ -10,7 +10,7 @@ from morgs_mi import RenderConfig
 from morgs_mi.fit.config import DensityConfig, FitConfig
 from morgs_mi.fit.first_frame import density_rounds, fit_first_frame
 from morgs_mi.losses.ssim import Target
-from tests.fit.ball import ball, images_of, mean_psnr, opaque_ball, views
+from tests.scenes.ball import ball, images_of, mean_psnr, opaque_ball, views
 
 RENDER, EXTENT = RenderConfig(), 3.0
 

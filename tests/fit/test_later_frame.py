@@ -11,7 +11,7 @@ from morgs_mi.fit.later_frame import FrameProblem, LaterFrame, fit_later_frame
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.config import MotionConfig
-from tests.fit.ball import images_of, mean_psnr, opaque_ball, views
+from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
 
 RENDER, EXTENT = RenderConfig(), 3.0
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)

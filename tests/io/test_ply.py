@@ -11,16 +11,15 @@ from plyfile import PlyData, PlyElement
 
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.ply import read_ply, write_ply
+from tests.scenes.gaussians import RAW, make_unit_scene, to_gaussians
 
 LAYOUT = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
 
 
-def random_gaussians(N: int = 20, degree: int = 3) -> Gaussians:
-    rng = np.random.default_rng(degree)
-    quats = rng.normal(size=(N, 4))
-    quats /= np.linalg.norm(quats, axis=1, keepdims=True)
-    sh = rng.normal(size=(N, (degree + 1) ** 2, 3))
-    return Gaussians(rng.normal(size=(N, 3)), rng.normal(size=(N, 3)), quats, rng.normal(size=N), sh)
+def random_gaussians(n: int = 20, degree: int = 3) -> Gaussians:
+    """Return Gaussians with the attributes of a PLY file."""
+    raw = make_unit_scene(degree, n)
+    return to_gaussians({name: raw[name] for name in RAW if name not in ("motion", "logit_confidence")})
 
 
 def table(gaussians: Gaussians) -> np.ndarray:
@@ -115,18 +114,18 @@ def with_nan(records):
         (lambda _: np.zeros(4, [("packed_position", "u4")]), "SuperSplat's compressed one"),
     ],
 )
-def test_read_ply__bad_input_raises_a_sentence(tmp_path, change, message):
+def test_read_ply__refuses_files_that_it_cannot_read(tmp_path, change, message):
     vertices = change(table(random_gaussians()))
     PlyData([PlyElement.describe(vertices, "vertex")]).write(str(tmp_path / "g.ply"))
     with pytest.raises(ValueError, match=message):
         read_ply(tmp_path / "g.ply")
 
 
-@pytest.mark.parametrize("keep", [0, 3, 60, -5])
-def test_read_ply__names_a_truncated_file(tmp_path, keep):
+@pytest.mark.parametrize("size", [0, 3, 60, -5])
+def test_read_ply__names_a_truncated_file(tmp_path, size):
     path = tmp_path / "g.ply"
     write_ply(path, random_gaussians())
-    path.write_bytes(path.read_bytes()[:keep])
+    path.write_bytes(path.read_bytes()[:size])
     with pytest.raises(ValueError, match=r"g\.ply: expected a complete PLY file"):
         read_ply(path)
 

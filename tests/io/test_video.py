@@ -109,9 +109,7 @@ def make_bad(tmp_path: Path, case: str) -> Path:
         ("size", ValueError, "0003.png: expected 48x32 as in 0000.png, got 8x8"),
     ],
 )
-def test_open_frames__bad_input_raises_a_sentence(
-    tmp_path: Path, case: str, error: type[Exception], message: str
-) -> None:
+def test_open_frames__refuses_bad_input(tmp_path: Path, case: str, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         list(open_frames(make_bad(tmp_path, case)).frames())
 

@@ -11,8 +11,10 @@ from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.fit.config import DensityConfig, FitConfig
 from morgs_mi.fit.later_frame import FrameProblem, LaterFrame, fit_later_frame
 from morgs_mi.losses.ssim import Target
-from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
+from morgs_mi.method.active_set import ActiveSet, ActiveSetConfig, find_active_set, full_active_set
 from morgs_mi.method.config import MotionConfig
+from tests.scenes.cameras import arc, look_at_cameras
+from tests.scenes.gaussians import isotropic, random_sheet
 
 RENDER, EXTENT, V = RenderConfig(), 3.0, 5
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
@@ -21,24 +23,18 @@ HIDDEN = 300  # the wall's Gaussians come first
 
 
 def cameras() -> dict[int, Camera]:
-    angles = np.linspace(-0.6, 0.6, V)
-    origins = [(4 * np.sin(a), -0.3, -4 * np.cos(a)) for a in angles]
-    return {view: Camera.look_at(o, (0, 0, 0), (0, -1, 0), 40, 128, 96) for view, o in enumerate(origins)}
+    return dict(enumerate(look_at_cameras(arc(np.linspace(-0.6, 0.6, V), 4, y=-0.3), 40, 128, 96)))
 
 
 def scene(shift=0.0, colors=None) -> Gaussians:
-    """A wall, and before it a ball of 60 Gaussians that may be shifted."""
+    """Return a wall, and in front of it a ball of 60 Gaussians that is shifted along x."""
     rng = np.random.default_rng(0)
-    wall = np.stack([*rng.uniform(-2, 2, (2, HIDDEN)), np.full(HIDDEN, 1.0)], axis=1)
+    wall = random_sheet(rng, HIDDEN, 2, 1.0)
     ball = rng.normal(size=(60, 3)) * 0.12 + (shift, 0, 0)
     means = np.concatenate([wall, ball])
     sh = 0.6 * np.sin(3 * means[:, None, :] + (0, 1, 2)) if colors is None else colors
     sizes = np.where(np.arange(len(means)) < HIDDEN, 0.15, 0.06)
-    quats = np.tile([1.0, 0, 0, 0], (len(means), 1))
-    opacities = np.full(len(means), 0.95)
-    return Gaussians.from_activated(
-        means, np.repeat(sizes[:, None], 3, 1), quats, opacities, sh, logit_confidence=np.zeros(len(means))
-    )
+    return isotropic(means, sizes, 0.95, sh, logit_confidence=np.zeros(len(means)))
 
 
 def images_of(gaussians: Gaussians) -> list[np.ndarray]:
@@ -66,7 +62,7 @@ def changes(before, after) -> dict[int, np.ndarray]:
     return {view: np.abs(b - a).max(-1) > 0.02 for view, (a, b) in enumerate(pairs)}
 
 
-def test_find_active_set__selects_what_moves_and_not_what_is_occluded(before, after):
+def test_find_active_set__selects_moving_but_not_occluded_gaussians(before, after):
     active = find_active_set(before, cameras(), changes(before, after), CHANNELS, RENDER)
     chosen = np.isin(np.arange(len(before)), active.indices)
     assert chosen[HIDDEN:].mean() > 0.9
@@ -87,8 +83,8 @@ def test_find_active_set__is_empty_without_changes(before):
     assert not np.asarray(fitted.gaussians.motion).any()
 
 
-def test_find_active_set__covers_what_appears_before_a_static_wall(before):
-    """The ball is new: no Gaussian is there, and every view sees it before another active of the wall."""
+def test_find_active_set__covers_what_appears_in_front_of_a_static_wall(before):
+    """The ball is new: no Gaussian is there, and every view sees it before another part of the wall."""
     wall = before.select(np.arange(HIDDEN))
     active = find_active_set(wall, cameras(), changes(wall, before), CHANNELS, RENDER)
     covered = []
@@ -97,6 +93,9 @@ def test_find_active_set__covers_what_appears_before_a_static_wall(before):
         covered.append(region.paste(np.ones(region.shape(1)[:3]), np.zeros((96, 128))))
     for change, drawn in zip(changes(wall, before).values(), covered, strict=True):
         assert drawn[change].mean() > 0.9
+    strict = ActiveSetConfig(min_unexplained=1.5)
+    without = find_active_set(wall, cameras(), changes(wall, before), CHANNELS, RENDER, strict)
+    assert len(without.indices) < len(active.indices)
 
 
 @pytest.mark.parametrize("grows", [False, True])
@@ -120,8 +119,8 @@ def test_fit_later_frame__with_the_active_set_equals_the_full_fit(before, after,
     assert not np.asarray(fitted.gaussians.motion)[where].any()
     assert not np.asarray(fitted.gaussians.offset)[where].any()
     for attribute in ("means", "quats", "log_scales", "sh_coeffs", "logit_opacities"):
-        kept = np.asarray(getattr(fitted.gaussians, attribute))[where]
-        assert np.array_equal(kept, np.asarray(getattr(before, attribute))[still]), attribute
+        found = np.asarray(getattr(fitted.gaussians, attribute))[where]
+        assert np.array_equal(found, np.asarray(getattr(before, attribute))[still]), attribute
 
 
 @pytest.mark.parametrize("density", [DensityConfig(births=0.0), DensityConfig(later_frames=False)])

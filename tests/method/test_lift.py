@@ -7,26 +7,26 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from morgs_mi import Camera, Gaussians
 from morgs_mi.method.flow import FlowObservation, choose_key_views
 from morgs_mi.method.lift import lift_flow
 from morgs_mi.render.active_view import ActiveView
+from tests.scenes.cameras import arc, look_at_cameras
+from tests.scenes.gaussians import isotropic
 
 SHIFT = np.array([0.03, -0.02, 0.015])
 
 
 def rig(count=4):
     angles = np.linspace(-0.6, 0.6, count)
-    origins = [(3 * np.sin(a), 0.5 * (-1) ** i, -3 * np.cos(a)) for i, a in enumerate(angles)]
-    return [Camera.look_at(o, (0, 0, 0), (0, -1, 0), 40, 64, 48) for o in origins]
+    origins = [(x, 0.5 * (-1) ** i, z) for i, (x, _, z) in enumerate(arc(angles, 3))]
+    return look_at_cameras(origins, 40)
 
 
 def cloud(n=200, seed=0):
     """A sheet through the origin, so that the flow of one plane is the flow of all."""
     rng = np.random.default_rng(seed)
     means = rng.uniform((-0.5, -0.5, -0.03), (0.5, 0.5, 0.03), (n, 3))
-    scales, quats = np.full((n, 3), 0.06), np.tile([1.0, 0, 0, 0], (n, 1))
-    return Gaussians.from_activated(means, scales, quats, np.full(n, 0.8), np.zeros((n, 1, 3)))
+    return isotropic(means, 0.06, 0.8)
 
 
 def uniform_flow(camera, shift):

@@ -8,31 +8,28 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, Gaussians
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.lift import Lift
 from morgs_mi.method.propagation import propagate_motion
 from morgs_mi.render.active_view import ActiveView
+from tests.scenes.cameras import look_at_cameras
+from tests.scenes.gaussians import isotropic, random_sheet
 
 SHIFT = np.float32([0.25, -0.1, 0.0])
-
-
-def cameras():
-    return [Camera.look_at((x, 0.3, -3), (0, 0, 0), (0, -1, 0), 45, 64, 48) for x in (-0.8, 0.8)]
 
 
 @pytest.fixture(scope="module")
 def scene():
     """A bright clump of 60 in front of a dark wall; the clump moves by SHIFT, the wall is static."""
     rng = np.random.default_rng(0)
-    wall = np.stack([*rng.uniform(-1.2, 1.2, (2, 400)), np.full(400, 0.6)], axis=1)
+    wall = random_sheet(rng, 400, 1.2, 0.6)
     means = np.concatenate([rng.normal(0, 0.12, (60, 3)), wall])
     colors = np.concatenate([rng.uniform(0.5, 1.5, (60, 1, 3)), rng.uniform(-1.5, -1, (400, 1, 3))])
-    scales, quats = np.full((460, 3), 0.05), np.tile([1.0, 0, 0, 0], (460, 1))
-    before = Gaussians.from_activated(means, scales, quats, np.full(460, 0.9), colors)
+    before = isotropic(means, 0.05, 0.9, colors)
     moves = np.arange(460) < 60
     after = replace(before, means=mi.TensorXf(np.asarray(before.means) + SHIFT * moves[:, None]))
-    views = {view: ActiveView(camera) for view, camera in enumerate(cameras())}
+    cameras = look_at_cameras([(x, 0.3, -3) for x in (-0.8, 0.8)], 45)
+    views = {view: ActiveView(camera) for view, camera in enumerate(cameras)}
     targets = {v: Target(np.asarray(view.render(after).color)) for v, view in views.items()}
     return before, moves, views, targets
 
@@ -66,7 +63,7 @@ def test_propagate_motion__continues_motion_without_flow(scene):
     assert (lift.logit_confidence[~moves] < 0).mean() > 0.99
 
 
-def test_propagate_motion__stops_what_stopped(scene):
+def test_propagate_motion__ends_motion_that_has_stopped(scene):
     """The images are those of `before`: nothing moves any more."""
     before, moves, views, _ = scene
     targets = {v: Target(np.asarray(view.render(before).color)) for v, view in views.items()}

@@ -12,7 +12,8 @@ import pytest
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.lift import Lift
 from morgs_mi.method.residual import apply_residual, residual_parameters
-from tests.scenes import RAW, make_scene, to_gaussians
+from tests.assertions import assert_close
+from tests.scenes.gaussians import RAW, make_scene, to_gaussians
 
 OFF = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
 
@@ -44,16 +45,16 @@ def test_apply_residual__gate_scales_every_attribute(degree, two_gates):
     current, before = apply_residual(previous, parameters, config).numpy(), previous.numpy()
     R = {name: np.asarray(value) for name, value in parameters.items()}
     for name in ("motion", "offset"):
-        assert current[name] == pytest.approx(m[:, None] * R[name], abs=1e-6)
-    assert current["means"] - before["means"] == pytest.approx(m[:, None] * (R["motion"] + R["offset"]), abs=1e-6)
-    assert current["quats"] - before["quats"] == pytest.approx(m[:, None] * R["quats"], abs=1e-6)
+        assert_close(current[name], m[:, None] * R[name], atol=1e-6)
+    assert_close(current["means"] - before["means"], m[:, None] * (R["motion"] + R["offset"]), atol=1e-6)
+    assert_close(current["quats"] - before["quats"], m[:, None] * R["quats"], atol=1e-6)
     change = current["sh_coeffs"] - before["sh_coeffs"]
     m = np.ones_like(m) if two_gates else m
-    assert current["log_scales"] - before["log_scales"] == pytest.approx(m[:, None] * R["log_scales"], abs=1e-6)
-    assert current["logit_opacities"] - before["logit_opacities"] == pytest.approx(m * R["logit_opacities"], abs=1e-6)
-    assert change[:, :1] == pytest.approx(m[:, None, None] * R["sh_dc"], abs=1e-6)
+    assert_close(current["log_scales"] - before["log_scales"], m[:, None] * R["log_scales"], atol=1e-6)
+    assert_close(current["logit_opacities"] - before["logit_opacities"], m * R["logit_opacities"], atol=1e-6)
+    assert_close(change[:, :1], m[:, None, None] * R["sh_dc"], atol=1e-6)
     if degree:
-        assert change[:, 1:] == pytest.approx(m[:, None, None] * R["sh_rest"], abs=1e-6)
+        assert_close(change[:, 1:], m[:, None, None] * R["sh_rest"], atol=1e-6)
 
 
 def test_residual_parameters__follow_the_modules():
@@ -86,7 +87,7 @@ def test_apply_residual__gradient_of_the_gate_follows_the_product_rule():
     R = sum(np.asarray(parameters[name], np.float64) for name in ("motion", "offset"))
     assert np.asarray(dr.grad(parameters["motion"])) == pytest.approx(np.repeat(m[:, None], 3, 1), rel=1e-5)
     expected = m * (1 - m) * R.sum(1)
-    assert np.asarray(dr.grad(parameters["logit_confidence"])) == pytest.approx(expected, abs=1e-6)
+    assert_close(dr.grad(parameters["logit_confidence"]), expected, atol=1e-6)
 
 
 def test_residual_parameters__refuse_gaussians_without_confidence():

@@ -23,7 +23,8 @@ from morgs_mi.playback.player import (
     render_stream,
     truth_for_camera,
 )
-from tests.moving_splats import CAMERAS, FRAMES, HEIGHT, WIDTH, moved, write_stream
+from tests.assertions import assert_close
+from tests.scenes.moving_splats import CAMERAS, FRAMES, HEIGHT, WIDTH, moved, write_stream
 
 
 def test_truth_for_camera__resamples_to_a_coarser_grid(fitted_clip: Path) -> None:
@@ -75,7 +76,7 @@ def test_render_stream__offset_is_its_share_of_the_motion(fitted_clip: Path, tmp
     assert not played[0][1]["offset"].any(), "the first frame stores no offset"
     for _, images in played[1:]:
         assert np.abs(images["motion"]).max() > 0.4
-        np.testing.assert_allclose(images["offset"], 0.25 * images["motion"], atol=1e-4)
+        assert_close(images["offset"], 0.25 * images["motion"], atol=1e-4)
     for _, images in render_stream(open_stream(fitted_clip), CAMERAS[0], ("offset",)):
         assert not images["offset"].any()
     tenth = channel_image("offset", 0.1 * images["offset"] + 0.05)

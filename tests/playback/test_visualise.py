@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.playback import visualise
+from tests.assertions import assert_close
 
 
 def test_motion_image__colours_are_as_documented():
@@ -27,7 +28,7 @@ def test_motion_image__saturation_increases_with_speed():
 def test_motion_legend__agrees_with_the_image():
     legend = visualise.motion_legend(8.0, size=101)
     expected = visualise.motion_image(np.array([[[0.0, 6.4]]]), 8.0)[0, 0]
-    np.testing.assert_allclose(legend[90, 50].astype(int), expected, atol=2)
+    assert_close(legend[90, 50].astype(int), expected, atol=2)
     assert (legend[-1, -1] == 255).all()
 
 

@@ -12,7 +12,8 @@ from morgs_mi.render.active_view import ActiveView, make_active_view
 from morgs_mi.render.backproject import backproject
 from tests import tolerances as tol
 from tests.assertions import assert_close
-from tests.scenes import CHANNELS, make_wide_camera, make_wide_scene
+from tests.scenes.cameras import make_wide_camera
+from tests.scenes.gaussians import CHANNELS, make_wide_scene
 
 N, ACTIVE = 120, np.arange(0, 120, 5)
 

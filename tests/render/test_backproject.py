@@ -8,7 +8,9 @@ import pytest
 from morgs_mi import rasterize
 from morgs_mi.render.backproject import backproject
 from tests import tolerances as tol
-from tests.scenes import as_float32, make_camera, make_scene, to_gaussians
+from tests.assertions import assert_close
+from tests.scenes.cameras import make_camera
+from tests.scenes.gaussians import as_float32, make_scene, to_gaussians
 
 
 def test_backproject__is_the_transpose_of_blending():
@@ -27,7 +29,7 @@ def test_backproject__of_ones_sums_to_alpha():
     ones = np.ones((camera.height, camera.width, 3), np.float32)
     sums = backproject(to_gaussians(raw), camera, ones)
     alpha = np.asarray(rasterize(to_gaussians(raw), camera, ("alpha",)).alpha, np.float64)
-    assert sums.sum(0) == pytest.approx(np.full(3, alpha.sum()), rel=tol.DUALITY_REL)
+    assert_close(sums.sum(0), np.full(3, alpha.sum()), rtol=tol.DUALITY_REL)
 
 
 def test_backproject__refuses_an_image_of_another_size():

@@ -22,7 +22,7 @@ from morgs_mi.core.gaussians import tensor_rows
 from tests import reference
 from tests import tolerances as tol
 from tests.assertions import assert_close
-from tests.scenes import CHANNELS, Values
+from tests.scenes.gaussians import CHANNELS, Values
 
 SIZES = {"color": 3, "motion": 2}
 ATTRIBUTES = ("means", "scales", "quats", "opacities", "sh_coeffs", "motion", "confidence")
@@ -469,10 +469,10 @@ def test_rasterize__two_million_gaussians_in_view():
 
 
 def test_rasterize__refuses_lists_that_exceed_32_bits():
-    """2^14 x 2^14 pixels are 2^18 tiles, and entries are counted in 32 bits."""
-    camera = Camera(np.array([[1e4, 0, 8192], [0, 1e4, 8192], [0, 0, 1]]), np.eye(4), 2**14, 2**14)
-    values = stack(2**14 + 1, 0.5) | {"scales": np.full((2**14 + 1, 3), 1e3)}
-    with pytest.raises(ValueError, match=r"fewer than 2\^32 entries, got 4\.3e\+09 for 16385 Gaussians"):
+    """2^12 x 2^12 pixels are 2^14 tiles, and entries are counted in 32 bits."""
+    camera = Camera(np.array([[1e4, 0, 2048], [0, 1e4, 2048], [0, 0, 1]]), np.eye(4), 2**12, 2**12)
+    values = stack(2**18 + 1, 0.5) | {"scales": np.full((2**18 + 1, 3), 1e3)}
+    with pytest.raises(ValueError, match=r"fewer than 2\^32 entries, got 4\.29e\+09 for 262145 Gaussians"):
         rasterize(Activated(values), camera, CHANNELS, BACKGROUND, config=CONFIG)
 
 

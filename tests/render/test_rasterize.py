@@ -16,13 +16,13 @@ from tests import reference
 from tests import tolerances as tol
 from tests.assertions import assert_close
 from tests.reference import rasterize_view
-from tests.scenes import (
+from tests.scenes.cameras import make_camera
+from tests.scenes.gaussians import (
     CHANNELS,
     NEW_ATTRIBUTES,
     RAW,
     ExtendedGaussians,
     as_float32,
-    make_camera,
     make_scene,
     to_gaussians,
 )
@@ -218,9 +218,9 @@ def test_rasterize__stops_early_within_its_bound_in_a_dense_opaque_scene():
 
 
 def test_rasterize__backward_agrees_with_the_reference_in_a_dense_scene():
-    raw = as_float32(make_scene(0, 60, seed=7))
-    camera = make_camera(40, 33)
-    weight = np.random.default_rng(8).normal(size=(33, 40, 3))
+    raw = as_float32(make_scene(0, 40, seed=7))
+    camera = make_camera(30, 25)
+    weight = np.random.default_rng(8).normal(size=(25, 30, 3))
     gaussians = to_gaussians(raw, grad=True)
     dr.backward(dr.sum(rasterize(gaussians, camera, ("color",)).color * mi.TensorXf(np.float32(weight)), axis=None))
     names = ["means", "log_scales", "logit_opacities"]

@@ -11,7 +11,8 @@ from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.render.region import Region, owned_copy
 from tests import tolerances as tol
 from tests.assertions import assert_close
-from tests.scenes import CHANNELS, RAW, make_wide_camera, make_wide_scene
+from tests.scenes.cameras import make_wide_camera
+from tests.scenes.gaussians import CHANNELS, RAW, make_wide_scene
 
 BACKGROUND = (0.2, 0.5, 0.9)
 

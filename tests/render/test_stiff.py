@@ -10,7 +10,7 @@ from drjit.opt import Adam
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from tests import reference
-from tests.scenes import CHANNELS, Values
+from tests.scenes.gaussians import CHANNELS, Values
 
 # The settings of test_extremes, so that both share their kernels.
 BACKGROUND = (0.2, 0.5, 0.9)

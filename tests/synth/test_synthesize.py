@@ -18,6 +18,7 @@ from morgs_mi.synth.ground_truth import compute_ground_truth, load_tracks, load_
 from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import Light, Object, Scene, load_scene, translate
 from morgs_mi.synth.synthesize import synthesize
+from tests.assertions import assert_close
 
 FPS = 30.0
 
@@ -50,8 +51,8 @@ def test_synthesize__writes_the_layout_of_n3dv_with_a_colmap_model(clip):
     model = read_colmap(clip / "sparse" / "0")
     expected = load_scene("arm").rig.cameras(3, 64, 48)
     for ours, theirs, colmaps in zip(expected, cameras, model.cameras, strict=True):
-        np.testing.assert_allclose(theirs.viewmat, ours.viewmat, atol=1e-6)
-        np.testing.assert_allclose(colmaps.viewmat, ours.viewmat, atol=1e-6)
+        assert_close(theirs.viewmat, ours.viewmat, atol=1e-6)
+        assert_close(colmaps.viewmat, ours.viewmat, atol=1e-6)
         np.testing.assert_allclose(colmaps.K, ours.K)
         assert colmaps.name == f"{ours.name}.png"
     assert (bounds[:, 0] > 0).all()
@@ -130,7 +131,7 @@ def test_load_tracks__tracks_reproject_to_the_motion_map(clip):
             col, row = np.clip(col, 0, 63), np.clip(row, 0, 47)
             at_centre &= np.abs(depth - truth.depth[row, col]) < 1e-4
             np.testing.assert_array_equal(truth.ids[row, col][at_centre], tracks.ids[at_centre])
-            np.testing.assert_allclose((now - before)[at_centre], truth.motion[row, col][at_centre], atol=2e-3)
+            assert_close((now - before)[at_centre], truth.motion[row, col][at_centre], atol=2e-3)
             compared += int((truth.mask[row, col] & at_centre).sum())
     assert compared > 100
 
@@ -144,9 +145,9 @@ def test_surface_points__agree_with_rays_of_the_mitsuba_sensor(tracer):
     y, x = np.mgrid[:48, :64].reshape(2, -1) + 0.5
     rays, _ = mi.load_dict(camera.sensor()).sample_ray(0, 0, mi.Point2f(x / 64, y / 48), 0)
     hit = tracer._scene.ray_intersect(mi.Ray3f(rays.o, rays.d))
-    np.testing.assert_allclose(np.array(hit.p).T.reshape(48, 64, 3)[5:-5, 5:-5], points[5:-5, 5:-5], atol=2e-3)
+    assert_close(np.array(hit.p).T.reshape(48, 64, 3)[5:-5, 5:-5], points[5:-5, 5:-5], atol=2e-3)
     pixels, depth = camera.project(points)
-    np.testing.assert_allclose(pixels, np.stack([x, y], axis=-1).reshape(48, 64, 2), atol=1e-3)
+    assert_close(pixels, np.stack([x, y], axis=-1).reshape(48, 64, 2), atol=1e-3)
     poses = tracer.poses(0)
     np.testing.assert_allclose(compute_ground_truth(camera, points, ids, poses, None, poses).depth, depth, rtol=1e-6)
 
@@ -203,7 +204,7 @@ def test_load_scene__poses_are_rigid_and_repeatable(name):
         if item.pose is not None:
             for time in (0.0, 0.31, 7.7):
                 pose = item.pose(time)
-                np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+                assert_close(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
                 assert np.linalg.det(pose[:3, :3]) > 0
                 np.testing.assert_array_equal(pose, item.pose(time))
 
@@ -265,7 +266,7 @@ def test_rig__test_view_is_at_the_centre():
     others = np.mean([camera.position for camera in cameras[1:]], axis=0)
     assert np.linalg.norm(cameras[0].position - others) < 0.5
     for camera in cameras:
-        np.testing.assert_allclose(camera.project(np.array([0, 0.8, 0]))[0], [160, 120], atol=1e-9)
+        assert_close(camera.project(np.array([0, 0.8, 0]))[0], [160, 120], atol=1e-9)
 
 
 def test_synthesize__rejects_a_non_empty_folder_and_replaces_a_capture_with_overwrite(tmp_path, clip):

@@ -8,7 +8,8 @@ import pytest
 from morgs_mi.codec.packets import CodedFrame
 from morgs_mi.playback.player import open_stream
 from morgs_mi.viewer.frame_cache import FrameCache
-from tests.export.streams import splats, write_stream
+from tests.assertions import assert_close
+from tests.scenes.changing_splats import splats, write_stream
 
 
 @pytest.fixture
@@ -67,6 +68,6 @@ def test_trails__are_the_displacements_of_the_moving_gaussians(tmp_path, states)
     np.testing.assert_array_equal(np.sort(newest[:, 1], 0), np.sort(means[3][moved], 0))
     assert sorted(set(ages)) == [0, 0.5]
     # A step of 0.1, quantised to a tenth of a pixel or 0.007.
-    np.testing.assert_allclose(lines[:, 1] - lines[:, 0], np.broadcast_to([0.1, 0, 0], (len(lines), 3)), atol=0.01)
+    assert_close(lines[:, 1] - lines[:, 0], np.broadcast_to([0.1, 0, 0], (len(lines), 3)), atol=0.01)
     assert len(cache.trails(3, length=2, count=5)[0]) <= 10
     assert cache.trails(0, length=2)[0].shape == (0, 2, 3)

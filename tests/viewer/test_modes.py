@@ -19,7 +19,8 @@ from morgs_mi.playback.visualise import confidence_image, motion_image
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.viewer.modes import MODES, available_modes, splat_colors
-from tests.export.streams import rig, write_stream
+from tests.assertions import assert_close
+from tests.scenes.changing_splats import rig, write_stream
 
 
 @pytest.fixture
@@ -36,14 +37,14 @@ def test_splat_colors__of_one_splat_equal_those_of_the_renderer(states):
         rendered = rasterize(one, facing, ("color", "alpha", "motion", "confidence"))
         alpha = np.array(rendered.alpha)[24, 32]
         color = np.clip(np.array(rendered.color)[24, 32] / alpha, 0, 1)
-        np.testing.assert_allclose(splat_colors(one, facing, "color")[0] / 255, color, atol=0.01)
+        assert_close(splat_colors(one, facing, "color")[0] / 255, color, atol=0.01)
         motion = motion_image(np.array(rendered.motion)[24:25, 32:33], MOTION_SCALE * 65)[0, 0].astype(int)
-        np.testing.assert_allclose(splat_colors(one, facing, "motion")[0], motion, atol=2)
+        assert_close(splat_colors(one, facing, "motion")[0], motion, atol=2)
         offset = channel_image("offset", render(one, facing, ("offset",), RenderConfig())["offset"])[24, 32]
-        np.testing.assert_allclose(splat_colors(one, facing, "offset")[0].astype(int), offset, atol=2)
+        assert_close(splat_colors(one, facing, "offset")[0].astype(int), offset, atol=2)
         assert offset.astype(int).min() < 200, "the first half of the splats moves"
         confidence = confidence_image(np.array(rendered.confidence)[24:25, 32:33] / alpha)[0, 0].astype(int)
-        np.testing.assert_allclose(splat_colors(one, facing, "confidence")[0], confidence, atol=3)
+        assert_close(splat_colors(one, facing, "confidence")[0], confidence, atol=3)
 
 
 def test_splat_colors__every_mode_colours_every_splat(states):

@@ -18,7 +18,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.export.axes import up_direction
 from morgs_mi.playback.player import channel_image, open_stream, render, render_config
-from tests.export.streams import write_stream
+from tests.scenes.changing_splats import write_stream
 
 pytest.importorskip("viser", reason="install it with pip install 'morgs-mi[viewer]'")
 playwright = pytest.importorskip("playwright.sync_api", reason="install it with pip install 'morgs-mi[viewer-test]'")
@@ -109,6 +109,16 @@ def select_mode(page, mode: str) -> None:
     page.get_by_role("option", name=mode).click()
 
 
+def test_viewer__shows_the_first_frame_and_follows_the_fit(page, tmp_path):
+    page, states, grow = page
+    page.get_by_text("Frame 0 of 2, 40 Gaussians").wait_for()
+    wait_for(page, rendered(open_stream(tmp_path), states[0], "color"), 40)  # see below
+    grow()
+    page.get_by_label("Follow the fit").check()
+    page.get_by_text("Frame 3 of 3, 41 Gaussians").wait_for()
+
+
+@pytest.mark.slow
 def test_viewer__shows_the_images_of_the_renderer(page, tmp_path):
     page, states, grow = page
     stream = open_stream(tmp_path)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 
 from morgs_mi import cli
-from tests.export.streams import write_stream
+from tests.scenes.changing_splats import write_stream
 
 
 def test_viewer__without_viser_explains_how_to_install_it(tmp_path, monkeypatch, capsys):

@@ -18,6 +18,7 @@ from benchmarks import workloads
 from benchmarks.speed import plain, render_speed, timing
 from benchmarks.workloads import ball
 from morgs_mi import RenderConfig, rasterize
+from tests.assertions import assert_close
 
 ROOT = Path(__file__).parents[3]
 # Output of a yardstick, from a program that checks its input: 60 Gaussians on 40x24 pixels.
@@ -123,10 +124,10 @@ def test_plain__renders_the_same_image_and_gradients():
     )  # above any colour: signs are certain
     dr.enable_grad(*gaussians.items().values())
     image = rasterize(gaussians, camera, ("color",), config=config).color
-    assert np.abs(np.asarray(plain.render(gaussians, camera, config)) - np.asarray(dr.detach(image))).max() < 2e-5
+    assert_close(plain.render(gaussians, camera, config), image, atol=2e-5)
     found = [np.asarray(grad) for grad in plain.step(gaussians, camera, target, config)]
     dr.backward(dr.mean(dr.abs(image - mi.TensorXf(np.tile(np.float32(target), (38, 50, 1)))), axis=None))
     for (name, value), grad in zip(gaussians.items().items(), found, strict=True):
         expected = np.asarray(dr.grad(value))
         assert np.abs(expected).max() > 0
-        assert np.abs(grad - expected).max() < 1e-3 * np.abs(expected).max(), name
+        assert_close(grad, expected, rtol=1e-3, name=name)

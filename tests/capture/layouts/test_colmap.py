@@ -12,6 +12,8 @@ import pytest
 from morgs_mi.capture.layouts.colmap import find_colmap, read_colmap, write_colmap
 from morgs_mi.capture.lens import MODELS, Lens
 from morgs_mi.core.camera import Camera
+from tests.assertions import assert_close
+from tests.scenes.captures import HEIGHT, WIDTH, rig
 
 RNG = np.random.default_rng(1)
 POINTS = RNG.normal(size=(7, 3))
@@ -19,11 +21,7 @@ COLORS = RNG.integers(0, 256, (7, 3)) / 255
 
 
 def cameras() -> list[Camera]:
-    views = [
-        Camera.look_at((np.cos(a), np.sin(a), 0.5), (0, 0, 0), (0, 0, 1), 60 + a, 64, 48, f"cam0{i}")
-        for i, a in enumerate((0.0, 0.7, 2.0))
-    ]
-    return [Camera(v.K + np.array([[0, 0, 3], [0, 0, -2], [0, 0, 0]]), v.viewmat, 64, 48, v.name) for v in views]
+    return rig(("cam00", "cam01", "cam02"), shift=3)
 
 
 def write(folder: Path, kind: str = "txt") -> Path:
@@ -44,15 +42,15 @@ def test_read_colmap__reads_what_write_colmap_writes(tmp_path: Path, kind: str) 
     for i, expected in zip(order, cameras(), strict=True):
         camera = model.cameras[i]
         assert camera.name == f"{expected.name}.png"
-        assert (camera.width, camera.height) == (64, 48)
+        assert (camera.width, camera.height) == (WIDTH, HEIGHT)
         np.testing.assert_allclose(camera.K, expected.K, rtol=1e-12)
-        np.testing.assert_allclose(camera.viewmat, expected.viewmat, atol=1e-12)
+        assert_close(camera.viewmat, expected.viewmat, atol=1e-12)
     assert [model.lenses[i].model for i in order] == ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"]
     assert model.lenses[order[1]].distortion == (0.1, -0.02, 0.003, 0.004)
     assert model.points.dtype == np.float32
     rows = np.lexsort(model.points.T), np.lexsort(POINTS.T)
     np.testing.assert_allclose(model.points[rows[0]], POINTS[rows[1]], rtol=1e-6)
-    np.testing.assert_allclose(model.point_colors[rows[0]], COLORS[rows[1]], atol=1e-6)
+    assert_close(model.point_colors[rows[0]], COLORS[rows[1]], atol=1e-6)
 
 
 def test_read_colmap__projection_agrees_with_pycolmap(tmp_path: Path) -> None:
@@ -61,7 +59,7 @@ def test_read_colmap__projection_agrees_with_pycolmap(tmp_path: Path) -> None:
     camera = model.cameras[0]
     image = next(i for i in reference.images.values() if i.name == camera.name)
     for point in POINTS * 0.2:
-        np.testing.assert_allclose(camera.project(point)[0], image.project_point(point), atol=1e-9)
+        assert_close(camera.project(point)[0], image.project_point(point), atol=1e-9)
 
 
 def test_models__are_numbered_as_in_colmap() -> None:
@@ -99,7 +97,7 @@ def test_read_colmap__refuses_every_truncation_of_a_binary_file(tmp_path: Path, 
             " PINHOLE ",
             "camera 2: the camera model PINHOLE takes 4 parameters, got 8",
         ),
-        ("cameras.txt", " 64 ", " wide ", "cameras.txt, line 4: expected `CAMERA_ID MODEL"),
+        ("cameras.txt", f" {WIDTH} ", " wide ", "cameras.txt, line 4: expected `CAMERA_ID MODEL"),
         (
             "images.txt",
             " 2 cam01",

@@ -17,8 +17,9 @@ from morgs_mi.capture.layouts.calibration import Calibration, Layout, required_c
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import MODELS, Lens
 from morgs_mi.io.video_writer import write_video
-from tests.capture import small_captures as layouts
-from tests.capture.small_captures import COUNT, FPS, HEIGHT, WIDTH, folder_per_camera, folder_per_frame, rig
+from tests.assertions import assert_close
+from tests.scenes import captures as layouts
+from tests.scenes.captures import COUNT, FPS, HEIGHT, WIDTH, folder_per_camera, folder_per_frame, rig
 
 # Files store poses in text or float64; the focal length of a rig is near 50 px.
 POSE_ABS, PIXEL_ABS = 1e-9, 1e-6
@@ -30,8 +31,8 @@ def assert_holds(capture: Capture, names: tuple[str, ...], order: tuple[int, ...
     assert capture.names == tuple(names[i] for i in order)
     assert capture.num_frames == COUNT
     for camera, i in zip(capture.cameras, order, strict=True):
-        np.testing.assert_allclose(camera.viewmat, cameras[i].viewmat, atol=POSE_ABS)
-        np.testing.assert_allclose(camera.K, cameras[i].K, atol=PIXEL_ABS)
+        assert_close(camera.viewmat, cameras[i].viewmat, atol=POSE_ABS)
+        assert_close(camera.K, cameras[i].K, atol=PIXEL_ABS)
     for t, frame in enumerate(capture.frames()):
         assert [tuple(image[20, 30, :2]) for image in frame.images] == [(i, t) for i in order]
 
@@ -93,14 +94,14 @@ def test_colmap__reads_all_models(tmp_path: Path, model: str, shared: bool, kind
     capture = load_capture(tmp_path)
     assert (capture.layout, capture.names) == ("COLMAP", ("cam1", "cam2", "cam10"))
     for camera, i in zip(capture.cameras, (2, 1, 0), strict=True):
-        np.testing.assert_allclose(camera.viewmat, cameras[i].viewmat, atol=POSE_ABS)
+        assert_close(camera.viewmat, cameras[i].viewmat, atol=POSE_ABS)
         own = 0 if shared else i
         np.testing.assert_allclose(camera.K, [[50 + own, 0, 33], [0, 50 + own, 20 + own], [0, 0, 1]])
     metadata = capture.metadata()
     assert [view["lens"] for view in metadata["cameras"]] == [model] * 3
     np.testing.assert_allclose(metadata["cameras"][0]["distortion"], lens)
     np.testing.assert_allclose(capture.points, [[0.1, 0.2, 0.3]], rtol=1e-6)
-    np.testing.assert_allclose(capture.point_colors, [[1, 0, 0.2]], atol=1e-6)
+    assert_close(capture.point_colors, [[1, 0, 0.2]], atol=1e-6)
 
 
 @pytest.mark.parametrize("place", ["sparse", "colmap/sparse/0", "."])
@@ -191,8 +192,8 @@ def test_nerfstudio__has_opengl_axes(tmp_path: Path) -> None:
     pose = [[1, 0, 0, 5], [0, 0, -1, 6], [0, 1, 0, 7], [0, 0, 0, 1]]
     edit(path, lambda meta: meta["frames"][0].update(transform_matrix=pose))
     camera = load_capture(path).cameras[0]
-    np.testing.assert_allclose(camera.position, (5, 6, 7), atol=1e-12)
-    np.testing.assert_allclose((camera.viewmat @ [5 + 1, 6 + 10, 7 + 2, 1])[:3], (1, -2, 10), atol=1e-12)
+    assert_close(camera.position, (5, 6, 7), atol=1e-12)
+    assert_close((camera.viewmat @ [5 + 1, 6 + 10, 7 + 2, 1])[:3], (1, -2, 10), atol=1e-12)
 
 
 def edit(path: Path, change, name: str = "transforms.json") -> None:
@@ -285,7 +286,7 @@ def test_at_clip_size__scales_the_intrinsics_of_smaller_clips(tmp_path: Path, ca
         capture = load_capture(path)
     assert "the clips of cam2 do not have the calibrated size (the first has 31x23); the intrinsics" in caplog.text
     assert [(c.width, c.height) for c in capture.cameras] == [(62, 46), (31, 23), (62, 46)]
-    np.testing.assert_allclose(capture.cameras[1].K[:2], rig(("a", "b"), shift=3)[1].K[:2] / 2, atol=PIXEL_ABS)
+    assert_close(capture.cameras[1].K[:2], rig(("a", "b"), shift=3)[1].K[:2] / 2, atol=PIXEL_ABS)
 
 
 def test_metadata__describes_how_frames_were_read(tmp_path: Path) -> None:

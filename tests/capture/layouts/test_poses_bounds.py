@@ -9,6 +9,7 @@ import pytest
 
 from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds, write_poses_bounds
 from morgs_mi.core.camera import Camera
+from tests.assertions import assert_close
 
 BOUNDS = np.array([[1.0, 9.0], [2.0, 8.0]])
 
@@ -29,7 +30,7 @@ def test_read_poses_bounds__reads_what_write_poses_bounds_writes(tmp_path: Path)
     for got, expected in zip(read, cameras(), strict=True):
         assert (got.name, got.width, got.height) == (expected.name, expected.width, expected.height)
         np.testing.assert_allclose(got.K, expected.K, rtol=1e-12)
-        np.testing.assert_allclose(got.viewmat, expected.viewmat, atol=1e-12)
+        assert_close(got.viewmat, expected.viewmat, atol=1e-12)
 
 
 def test_read_poses_bounds__columns_are_down_right_back(tmp_path: Path) -> None:
@@ -39,7 +40,7 @@ def test_read_poses_bounds__columns_are_down_right_back(tmp_path: Path) -> None:
     (camera,), _ = read_poses_bounds(tmp_path / "p.npy", ["cam"])
     np.testing.assert_allclose(camera.position, (5, 6, 7))
     local = camera.viewmat @ [5 + 1, 6 + 10, 7 + 2, 1]
-    np.testing.assert_allclose(local[:3], (1, -2, 10), atol=1e-12)
+    assert_close(local[:3], (1, -2, 10), atol=1e-12)
     assert (camera.width, camera.height, camera.K[0, 0]) == (64, 48, 100)
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from morgs_mi.method.flow_sources.network import FlowNetwork, read_signature
 from morgs_mi.method.flow_sources.registry import FramePair, flow_source
+from tests.assertions import assert_close
 from tests.method.flow_sources.tiny_network import export, export_lookup, known_flow
 
 # Float32 sums of six products of up to 255 each.
@@ -29,7 +30,7 @@ def test_flow_network__returns_the_known_flow_at_any_size(network, size):
     flow = FlowNetwork(network)(image, other)
     assert flow.shape == (*size, 2)
     assert flow.dtype == np.float32
-    np.testing.assert_allclose(flow, known_flow(image, other), atol=TOLERANCE)
+    assert_close(flow, known_flow(image, other), atol=TOLERANCE)
 
 
 @pytest.mark.parametrize(("kind", "low", "high"), [("onnx", 0, 255), ("onnx-unit", 0, 1), ("onnx-signed", -1, 1)])
@@ -37,10 +38,10 @@ def test_flow_source__runs_a_network_both_ways_in_its_value_range(network, kind,
     image, previous = image_pair(24, 40)
     back, forward_flow = flow_source(f"{kind}:{network}")(FramePair(image, previous))
     a, b = (low + (high - low) / 255 * each.astype(float) for each in (image, previous))
-    np.testing.assert_allclose(back, known_flow(a, b), atol=TOLERANCE)
-    np.testing.assert_allclose(forward_flow, known_flow(b, a), atol=TOLERANCE)
+    assert_close(back, known_flow(a, b), atol=TOLERANCE)
+    assert_close(forward_flow, known_flow(b, a), atol=TOLERANCE)
     floats = flow_source(f"{kind}:{network}")(FramePair(image / 255, previous / 255))
-    np.testing.assert_allclose(floats[0], back, atol=TOLERANCE)
+    assert_close(floats[0], back, atol=TOLERANCE)
 
 
 def test_flow_network__of_fixed_size_resizes_images_and_flow(tmp_path):
@@ -50,7 +51,7 @@ def test_flow_network__of_fixed_size_resizes_images_and_flow(tmp_path):
     flow = FlowNetwork(export(tmp_path / "fixed.onnx", 32, 40), 0, 1)(image, other)
     expected = known_flow(image, other) * (100 / 40, 60 / 32)
     assert flow.shape == (60, 100, 2)
-    np.testing.assert_allclose(flow[5:-5, 5:-5], expected[5:-5, 5:-5], atol=0.01)
+    assert_close(flow[5:-5, 5:-5], expected[5:-5, 5:-5], atol=0.01)
 
 
 def test_read_signature__returns_names_and_shapes(tmp_path, network):
@@ -116,4 +117,4 @@ def test_flow_network__runs_the_lookup_of_raft_or_names_it(tmp_path):
         return
     expected = 0.5 * (other[::-1, ::-1, :2].astype(float) - image[..., :2])
     # With grid coordinates in float32, a lookup is up to 1e-5 px off its pixel.
-    np.testing.assert_allclose(FlowNetwork(path)(image, other), expected, atol=0.01)
+    assert_close(FlowNetwork(path)(image, other), expected, atol=0.01)

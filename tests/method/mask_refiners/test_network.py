@@ -7,6 +7,7 @@ import sys
 import numpy as np
 import pytest
 
+from morgs_mi.evaluate.metrics import iou
 from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.mask_refiners.config import MaskConfig, PromptConfig
 from morgs_mi.method.mask_refiners.network import SegmentNetwork, prompts
@@ -39,17 +40,13 @@ def discs(height, width, *centres, radius=20, color=RED):
     return image, masks
 
 
-def overlap(a, b):
-    return (a & b).sum() / (a | b).sum()
-
-
 @pytest.mark.parametrize("size", [(120, 160), (160, 120), (480, 640), (1100, 1400)])
 def test_segment_network__segments_an_object_to_the_pixel_at_any_size(network, size):
     height, width = size
     image, (disc,) = discs(height, width, (0.4 * width, 0.55 * height), radius=0.2 * height)
     # A cell of the network's mask is width / 256 pixels wide; half a cell may be wrong around the disc.
     off = np.pi * 0.4 * height * (max(size) / 256) / 2
-    assert overlap(network(image, disc), disc) > 1 - off / disc.sum()
+    assert iou(network(image, disc), disc) > 1 - off / disc.sum()
 
 
 def test_segment_network__returns_an_empty_mask_for_an_empty_mask(network):
@@ -60,7 +57,7 @@ def test_segment_network__returns_an_empty_mask_for_an_empty_mask(network):
 def test_segment_network__prompts_with_each_connected_component(network):
     image, (one, other, still) = discs(240, 320, (60, 60), (220, 60), (140, 180))
     found = network(image, one | other)
-    assert overlap(found, one | other) > 0.9
+    assert iou(found, one | other) > 0.9
     assert not found[still].any()
 
 
@@ -126,7 +123,7 @@ def test_motion_mask__is_the_union_of_flow_mask_and_sam2_objects(files):
 def test_segment_network__accepts_an_encoder_of_open_size(tmp_path, files):
     image, (disc,) = discs(120, 160, (80, 60))
     found = SegmentNetwork(export_encoder(tmp_path / "open.onnx", open_size=True), files[1])(image, disc)
-    assert overlap(found, disc) > 0.9
+    assert iou(found, disc) > 0.9
 
 
 def bad(folder, files, name):

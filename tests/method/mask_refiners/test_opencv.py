@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from morgs_mi.evaluate.metrics import iou
 from morgs_mi.method.mask_refiners.config import MaskConfig
 from morgs_mi.method.mask_refiners.opencv import clean_mask, refine_mask, vote_superpixels
 from tests.method.moving_disc import moving_disc
@@ -13,22 +14,18 @@ from tests.method.moving_disc import moving_disc
 CAMERA_NOISE = 2 / 255  # standard deviation of a video camera in room light
 
 
-def overlap(a: np.ndarray, b: np.ndarray) -> float:
-    return (a & b).sum() / (a | b).sum()
-
-
 def test_refine_mask__recovers_an_object_from_a_part_of_it():
     _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
     partial = disc.copy()
     partial[120:140] = False
-    assert overlap(refine_mask(image, partial), disc) > 0.95 > overlap(partial, disc)
+    assert iou(refine_mask(image, partial), disc) > 0.95 > iou(partial, disc)
 
 
 def test_vote_superpixels__removes_flow_that_bleeds_over_an_edge():
     _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
     bleeding = cv2.dilate(disc.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
     voted = vote_superpixels(image, bleeding)
-    assert overlap(voted, disc) > 0.9 > overlap(bleeding, disc)
+    assert iou(voted, disc) > 0.9 > iou(bleeding, disc)
     assert voted[disc].mean() > 0.98
 
 

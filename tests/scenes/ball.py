@@ -1,4 +1,4 @@
-"""A ball of Gaussians in four views: what the tests of the fitting stages share."""
+"""A ball of Gaussians and its images in four views, which a fit reconstructs."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.fit.initialise import from_points
+from tests.scenes.cameras import QUAD, look_at_cameras
 
 
 def ball(n: int, sh_degree: int = 0) -> Gaussians:
@@ -24,13 +25,15 @@ def opaque_ball() -> Gaussians:
 
 
 def views() -> list[Camera]:
-    origins = [(x, y, -3.5) for x in (-0.9, 0.9) for y in (-0.6, 0.6)]
-    return [Camera.look_at(o, (0, 0, 0), (0, -1, 0), 40, 64, 48, name=f"cam{i}") for i, o in enumerate(origins)]
+    """Return four cameras in front of the ball."""
+    return look_at_cameras(QUAD, 40)
 
 
 def images_of(gaussians: Gaussians) -> list[np.ndarray]:
+    """Return the images [H, W, 3] of the Gaussians in `views`."""
     return [np.clip(np.asarray(rasterize(gaussians, c, ("color",)).color), 0, 1) for c in views()]
 
 
 def mean_psnr(gaussians: Gaussians, images: list[np.ndarray]) -> float:
+    """Return the mean PSNR of the Gaussians in `views`, dB."""
     return float(np.mean([psnr(a, b) for a, b in zip(images_of(gaussians), images, strict=True)]))

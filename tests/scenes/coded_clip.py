@@ -1,4 +1,4 @@
-"""Clouds of Gaussians and streams of them, shared by the tests of the codec."""
+"""Random clouds whose attributes cover the range of the codec, and encoded clips of them."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import Packet, StreamWriter
 from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, reemitted_keyframe, residual_packet
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from tests.scenes.cameras import look_at_cameras
 
-CAMERAS = [Camera.look_at((x, 0, -4), (0, 0, 0), (0, -1, 0), 50, 160, 120, f"cam{x}") for x in (-1, 1)]
+CAMERAS = look_at_cameras([(x, 0, -4) for x in (-1, 1)], 50, 160, 120)
 
 
 def cloud(N: int = 60, degree: int = 1, confidence: bool = True, seed: int = 0) -> Gaussians:

@@ -1,4 +1,4 @@
-"""A small stream for the tests of export and viewer, with splats that move, are born and die."""
+"""Splats that move, are born and die, seen by three cameras with z up, and their stream with learned offsets."""
 
 from __future__ import annotations
 
@@ -12,19 +12,22 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, residual_packet
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from tests.scenes.cameras import look_at_cameras
 
 NAMES = ("left", "middle", "right")
+TARGET = (0, 0, 0.2)
 # Learned part of a displacement of 0.1 along x: two steps of its quantisation grid.
 OFFSET = (0, 0, 0.008)
 
 
 def rig(width: int = 64, height: int = 48) -> tuple[Camera, ...]:
-    positions = ((-1, -4, 1), (0, -4, 1), (1, -4, 1))
-    named = zip(positions, NAMES, strict=True)
-    return tuple(Camera.look_at(p, (0, 0, 0.2), (0, 0, 1), 45, width, height, name) for p, name in named)
+    """Return three cameras side by side that look along +y."""
+    origins = [(x, -4, 1) for x in (-1, 0, 1)]
+    return tuple(look_at_cameras(origins, 45, width, height, NAMES, target=TARGET, up=(0, 0, 1)))
 
 
 def splats(N: int = 40, degree: int = 1, seed: int = 0) -> Gaussians:
+    """Return random splats; the first half has a high confidence."""
     rng = np.random.default_rng(seed)
     return Gaussians.from_activated(
         means=rng.uniform(-0.8, 0.8, (N, 3)),

@@ -1,4 +1,4 @@
-"""Five splats that move along x in equal steps, their stream, and cameras: shared by several test modules."""
+"""Five splats that move along x in equal steps, seen by two cameras, and their stream."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from morgs_mi.codec.container import Packet, StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from tests.scenes.gaussians import isotropic
 
 WIDTH, HEIGHT, DISTANCE, STEP, FRAMES = 40, 30, 4.0, 0.05, 3
+# Both look along +z.
 CAMERAS = [
-    Camera.look_at((0, 0, -DISTANCE), (0, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT, "cam0"),
-    Camera.look_at((0.5, 0, -DISTANCE), (0.5, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT, "cam1"),
+    Camera.look_at((x, 0, -DISTANCE), (x, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT, f"cam{i}")
+    for i, x in enumerate((0, 0.5))
 ]
 # As exact as float32, so that only the code under test contributes errors.
 EXACT = CodecConfig(quality=1e5)
@@ -30,7 +32,7 @@ def moved(frame: float, logit: float | None = 0.0) -> Gaussians:
     means = np.float32(rng.uniform(-1, 1, (5, 3)) * (1, 1, 0) + (frame * STEP, 0, 0))
     sh = np.float32(rng.uniform(-1, 1.5, (5, 1, 3)))
     more = {} if logit is None else {"logit_confidence": np.full(5, logit, np.float32)}
-    return Gaussians.from_activated(means, np.full((5, 3), 0.2), np.tile([1, 0, 0, 0], (5, 1)), [0.9] * 5, sh, **more)
+    return isotropic(means, 0.2, 0.9, sh, **more)
 
 
 def write_stream(

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from tests.scenes.cameras import shift_principal_point
 
 _TEXTURE = 512
 # Corner, and the edges that span it; far planes first, as near ones occlude them.
@@ -25,8 +26,7 @@ def rig(count: int = 6, width: int = 320, height: int = 240, shift: float = 0.0)
     for i, angle in enumerate(np.linspace(-0.35, 0.35, count)):
         place = (4.0 * np.sin(angle), -0.5 + 0.5 * np.cos(5 * i), 4.2 - 4.0 * np.cos(angle))
         view = Camera.look_at(place, (0, 0, 4.2), (0, -1, 0), 60, width, height, f"cam{i}")
-        K = view.K + np.array([[0, 0, shift], [0, 0, -0.5 * shift], [0, 0, 0]])
-        cameras.append(Camera(K, view.viewmat, width, height, view.name))
+        cameras.append(shift_principal_point(view, shift, -0.5 * shift))
     return cameras
 
 

@@ -1,7 +1,7 @@
 """A recording of three tiny views, and a process that fits it until it is killed.
 
-`python -m tests.recording OUT` says "ready" when it begins; with a number it kills itself within the write that
-brings the bytes written to that many.
+`python -m tests.scenes.recording OUT` prints "ready" when it begins; with a further number it kills itself within the
+write that brings the bytes written to that many.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi import Camera, RenderConfig
+from morgs_mi import RenderConfig
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.codec import container
 from morgs_mi.codec.config import CodecConfig
@@ -21,6 +21,7 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.fit.config import DensityConfig, FitConfig
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.recorder import stream_capture
+from tests.scenes.cameras import look_at_cameras
 
 FRAMES = 6
 # As little as a fit can do with all that it does: births, deaths, masks, keyframes, offsets.
@@ -40,7 +41,7 @@ CONFIG = StreamConfig(
 
 
 class Recording(Capture):
-    """A bright square that wanders over a dull wall: something moves, something stands, something is missed."""
+    """A bright square that moves over a dull wall."""
 
     def partial_frames(self, start=0, stop=None):
         rng = np.random.default_rng(0)
@@ -55,8 +56,9 @@ class Recording(Capture):
 
 
 def recording(**changes) -> Recording:
+    """Return the recording, with some fields replaced."""
     rng = np.random.default_rng(1)
-    views = [Camera.look_at((x, 0, -3), (0, 0, 0), (0, -1, 0), 60, 32, 24, f"cam{x}") for x in (-1, 0, 1)]
+    views = look_at_cameras([(x, 0, -3) for x in (-1, 0, 1)], 60, 32, 24)
     fields = {
         "path": Path("noise"),
         "cameras": tuple(views),
@@ -73,7 +75,7 @@ def recording(**changes) -> Recording:
 
 
 class Dying:
-    """A file whose process is killed after so many bytes."""
+    """A file that kills its process after `left` more bytes."""
 
     def __init__(self, file, left: int) -> None:
         self.file, self.left = file, left

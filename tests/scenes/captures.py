@@ -13,22 +13,25 @@ from scipy.spatial.transform import Rotation
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
+from tests.scenes.cameras import circle, look_at_cameras, shift_principal_point
 
 WIDTH, HEIGHT, COUNT, FPS = 62, 46, 4, 25
 
 
+def make_camera(i: int, name: str, shift: float = 0.0) -> Camera:
+    """Return the camera at i radians on a circle, with its own focal length and a shifted principal point."""
+    (view,) = look_at_cameras(circle([i]), 60 + i, WIDTH, HEIGHT, [name], up=(0, 0, 1))
+    return shift_principal_point(view, shift, -shift)
+
+
 def rig(names: tuple[str, ...], shift: float = 0.0) -> list[Camera]:
     """Return cameras on a circle with different focal lengths and principal points `shift` px off the centre."""
-    views = [
-        Camera.look_at((np.cos(i), np.sin(i), 0.5), (0, 0, 0), (0, 0, 1), 60 + i, WIDTH, HEIGHT, name)
-        for i, name in enumerate(names)
-    ]
-    moved = np.array([[0, 0, shift], [0, 0, -shift], [0, 0, 0]])
-    return [Camera(view.K + moved, view.viewmat, WIDTH, HEIGHT, view.name) for view in views]
+    return [make_camera(i, name, shift) for i, name in enumerate(names)]
 
 
-def frames(i: int, count: int = COUNT) -> list[np.ndarray]:
-    return [np.full((HEIGHT, WIDTH, 3), (i, t, 0), np.uint8) for t in range(count)]
+def frames(i: int, count: int = COUNT, width: int = WIDTH) -> list[np.ndarray]:
+    """Return the clip of camera i."""
+    return [np.full((HEIGHT, width, 3), (i, t, 0), np.uint8) for t in range(count)]
 
 
 def write_image(file: Path, i: int, t: int) -> None:

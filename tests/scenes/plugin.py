@@ -1,0 +1,24 @@
+"""A Mitsuba scene of Gaussians with the integrator `gaussian_splat`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+
+from morgs_mi import ellipsoids
+from tests.scenes.cameras import make_sensor_camera
+
+AOVS = "motion,confidence,depth"
+
+
+def make_mitsuba_scene(gaussians: Any, film: dict | None = None, sensor: dict | None = None, **props: Any) -> Any:
+    """Return a Mitsuba scene of one shape, `make_sensor_camera` and the integrator `gaussian_splat` with `props`."""
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "gaussians": ellipsoids(gaussians),
+            "sensor": {**make_sensor_camera().sensor(**(film or {})), **(sensor or {})},
+            "integrator": {"type": "gaussian_splat", **props},
+        }
+    )

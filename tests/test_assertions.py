@@ -1,0 +1,29 @@
+"""The assertion that the tests share: what passes, and what its message reports."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tests.assertions import assert_close
+
+
+def test_assert_close__accepts_errors_up_to_the_tolerances():
+    assert_close(mi.TensorXf([1.0, 2.5]), np.array([1.0, 2.0]), atol=0.5)
+    assert_close([1.0, 2.5], [1.0, 2.0], rtol=0.25)
+    assert_close([1.0, np.nan], [1.0, 2.0], where=[True, False])
+    assert_close([1.0, 1.5], 1, atol=0.5)
+
+
+@pytest.mark.parametrize(
+    ("found", "expected", "message"),
+    [
+        ([[1, 2], [3, 5]], [[1, 2], [3, 4]], r"x: off by 1 at \[1, 1\] \(found 5, expected 4\), bound 0.5; 1 of 4"),
+        ([1, np.nan], [1, 2], r"off by nan at \[1\]"),
+        ([1, 2], [1, 2, 3], r"x: shape \[2\], expected \[3\]"),
+    ],
+)
+def test_assert_close__reports_the_worst_entry(found, expected, message):
+    with pytest.raises(AssertionError, match=message):
+        assert_close(found, expected, atol=0.5, name="x")
