@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import webbrowser
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
@@ -35,4 +38,28 @@ class View:
         print_result(f"{viewer.url} (Ctrl-C to stop)")
         if self.open_browser:
             webbrowser.open(viewer.url)
-        viewer.run()
+        with _stopped_by_interrupt(viewer.stop):
+            viewer.run()
+
+
+@contextmanager
+def _stopped_by_interrupt(stop: Callable[[], None]) -> Iterator[None]:
+    """Call `stop` on Ctrl-C, and raise KeyboardInterrupt only at the end, or at the second Ctrl-C.
+
+    Raised at once, it can end up in a callback of a library, which ignores it: the viewer would run on.
+    """
+    interrupted = []
+
+    def handle(*_: object) -> None:
+        if interrupted:
+            raise KeyboardInterrupt
+        interrupted.append(True)
+        stop()
+
+    previous = signal.signal(signal.SIGINT, handle)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
+    if interrupted:
+        raise KeyboardInterrupt

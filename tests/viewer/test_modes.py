@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.playback.player import MOTION_SCALE, channel_image, render
 from morgs_mi.playback.visualise import confidence_image, motion_image
 from morgs_mi.render.config import RenderConfig
-from morgs_mi.render.rasterize import rasterize
+from morgs_mi.render.rasterize import Image, rasterize
 from morgs_mi.viewer.modes import MODES, available_modes, splat_colors
 from tests.assertions import assert_close
 from tests.scenes.changing_splats import rig, write_stream
@@ -88,7 +88,7 @@ def test_modes__include_a_new_row_of_the_attribute_table(states, monkeypatch):
     assert "wetness" in player.CHANNELS
     assert player.available_channels(wet) == (*player.available_channels(dry), "wetness")
     assert set(modes.available_modes(wet)) - set(modes.available_modes(dry)) == {"wetness"}
-    image = SimpleNamespace(color=np.zeros((2, 3, 3)), others={"wetness": np.ones((2, 3, 1))})
+    image = Image(color=np.zeros((2, 3, 3)), others={"wetness": np.ones((2, 3, 1))})
     monkeypatch.setattr(player, "rasterize", lambda *_, **__: image)
     assert player.render(wet, rig()[0], ("color", "wetness"), RenderConfig())["wetness"].all()
     grey = np.rint(255 * wet.wetness)
