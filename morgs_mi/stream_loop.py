@@ -191,14 +191,15 @@ def _first_gaussians(
     setup: Setup, cameras: Sequence[Camera], images: Sequence[np.ndarray], rng: np.random.Generator
 ) -> tuple[Gaussians, str]:
     """Return the initial Gaussians, and a status about where they lie."""
-    count, status = setup.config.fit.first_count, "ok"
+    config, status = setup.config.fit, "ok"
+    count = config.first_count
     points, colors = setup.points, setup.point_colors
     if len(points) < MIN_POINTS:
         status = f"the capture has {len(points)} points, too few: seeded {count} random ones inside the views"
         _LOG.warning("frame 0: %s", status)
         points, colors = seed_points(cameras, images, count, rng)
     points, colors = resample_points(points, colors, count, rng)
-    return from_points(points, colors, setup.config.fit.sh_degree), status
+    return from_points(points, colors, config.sh_degree, config.initial_opacity), status
 
 
 def _changes(setup: Setup, references: Images, images: Images) -> dict[int, np.ndarray] | None:

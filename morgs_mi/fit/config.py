@@ -103,6 +103,8 @@ class FitConfig:
     """Degree of the spherical harmonics, 0 to 3; 0 is enough where no surface is glossy."""
     num_gaussians: int = 20_000
     """Number of Gaussians of the first frame; see `first_count` for the number that it starts from."""
+    initial_opacity: float = 0.3
+    """Opacity of the Gaussians at the start of the first frame."""
     first_frame_steps: int = 1500
     """Steps of the first frame, one view each."""
     sh_band_fraction: float = 1 / 30
@@ -142,6 +144,8 @@ class FitConfig:
                 raise ValueError(f"FitConfig(): `{name}` must be at least {low}, got {getattr(self, name)}.")
         if self.sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"FitConfig(): `sh_degree` must be 0 to 3, got {self.sh_degree}.")
+        if not 0 < self.initial_opacity < 1:
+            raise ValueError(f"FitConfig(): `initial_opacity` must lie between 0 and 1, got {self.initial_opacity}.")
         if not 0 < self.final_rate <= 1:
             raise ValueError(f"FitConfig(): `final_rate` must be above 0 and at most 1, got {self.final_rate}.")
 

@@ -14,8 +14,6 @@ from morgs_mi.core.gaussians import Gaussians
 
 __all__ = ["focus_point", "from_points", "resample_points", "scene_extent", "seed_points"]
 
-_INITIAL_OPACITY = 0.3
-
 
 def scene_extent(cameras: Sequence[Camera]) -> float:
     """Return the scene extent in world units: 1.1 times the radius of the cameras around their mean, as in 3DGS.
@@ -27,13 +25,14 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
     return float(1.1 * radius) if radius > 0 else 1.0
 
 
-def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int) -> Gaussians:
+def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int, opacity: float = 0.3) -> Gaussians:
     """Return a round Gaussian on every point, as large as the distance to its three nearest neighbours (as in 3DGS).
 
     Args:
         points: [P, 3], world units.
         colors: [P, 3] in [0, 1], display-referred.
         sh_degree: 0 to 3; all but the constant coefficient start at 0.
+        opacity: of every Gaussian.
 
     Raises:
         ValueError: no points, points that are not finite, or colours of another shape.
@@ -59,7 +58,7 @@ def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int) -> Gauss
         points,
         np.repeat(spacing[:, None], 3, axis=1),
         np.tile([1.0, 0, 0, 0], (n, 1)),
-        np.full(n, _INITIAL_OPACITY),
+        np.full(n, opacity),
         sh,
         **{a.name: np.full((n, *a.shape), a.initial) for a in ATTRIBUTES if a.initial is not None},
     )

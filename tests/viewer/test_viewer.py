@@ -118,7 +118,6 @@ def test_viewer__shows_the_first_frame_and_follows_the_fit(page, tmp_path):
     page.get_by_text("Frame 3 of 3, 41 Gaussians").wait_for()
 
 
-@pytest.mark.slow
 def test_viewer__shows_the_images_of_the_renderer(page, tmp_path):
     page, states, grow = page
     stream = open_stream(tmp_path)
