@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.reports.plots import blank_figure, label_points, markdown, save_figure
-from benchmarks.reports.records import from_json, to_json
+from benchmarks.reports.records import Record
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.codec.entropy import column_bits
 from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, residual_packet
@@ -117,22 +117,13 @@ class CodecClip:
 
 
 @dataclass(frozen=True)
-class CodecResult:
+class CodecResult(Record):
     """Results of the report on the codec."""
 
     clips: tuple[CodecClip, ...]
     settings: Mapping[str, Any]
     machine: Mapping[str, Any]
     versions: Mapping[str, str]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the result as JSON."""
-        return to_json(self)
-
-    @classmethod
-    def from_dict(cls, value: Mapping[str, Any]) -> CodecResult:
-        """Return the result that is stored as JSON in `value`."""
-        return from_json(cls, value)
 
 
 def report_codec(

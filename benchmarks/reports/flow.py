@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.reports.plots import blank_figure, markdown, save_figure
-from benchmarks.reports.records import from_json, to_json
+from benchmarks.reports.records import Record
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.method.flow import choose_key_views
@@ -103,22 +103,13 @@ class FlowClip:
 
 
 @dataclass(frozen=True)
-class FlowResult:
+class FlowResult(Record):
     """Results of the report on optical flow."""
 
     clips: tuple[FlowClip, ...]
     settings: Mapping[str, Any]
     machine: Mapping[str, Any]
     versions: Mapping[str, str]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the result as JSON."""
-        return to_json(self)
-
-    @classmethod
-    def from_dict(cls, value: Mapping[str, Any]) -> FlowResult:
-        """Return the result that is stored as JSON in `value`."""
-        return from_json(cls, value)
 
 
 def report_flow(

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from benchmarks.reports.records import from_json, to_json
+from benchmarks.reports.records import Record
 
 __all__ = ["FlowError", "MethodClip", "MethodResult", "ScratchRow", "SettingRow"]
 
@@ -83,7 +83,7 @@ class MethodClip:
 
 
 @dataclass(frozen=True)
-class MethodResult:
+class MethodResult(Record):
     """Results of a report on the method."""
 
     clips: tuple[MethodClip, ...]
@@ -94,12 +94,3 @@ class MethodResult:
     settings: Mapping[str, Any]
     machine: Mapping[str, Any]
     versions: Mapping[str, str]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the contents of ``method.json``."""
-        return to_json(self)
-
-    @classmethod
-    def from_dict(cls, value: Mapping[str, Any]) -> MethodResult:
-        """Return the result that is stored as JSON in `value`."""
-        return from_json(cls, value)

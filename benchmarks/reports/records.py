@@ -9,11 +9,24 @@ from __future__ import annotations
 import types
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Self, TypeVar, get_args, get_origin, get_type_hints
 
-__all__ = ["from_json", "to_json"]
+__all__ = ["Record", "from_json", "to_json"]
 
 T = TypeVar("T")
+
+
+class Record:
+    """Base of a report's result, a frozen dataclass that is stored as JSON."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the result as JSON."""
+        return to_json(self)
+
+    @classmethod
+    def from_dict(cls, value: Mapping[str, Any]) -> Self:
+        """Return the result that is stored as JSON in `value`."""
+        return from_json(cls, value)
 
 
 def to_json(value: Any) -> Any:

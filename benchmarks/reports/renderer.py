@@ -20,7 +20,7 @@ import mitsuba as mi
 import numpy as np
 
 from benchmarks.reports.plots import blank_figure, label_points, markdown, save_figure
-from benchmarks.reports.records import from_json, to_json
+from benchmarks.reports.records import Record
 from benchmarks.reports.reference64 import ATTRIBUTES, Reference64
 from benchmarks.workloads import ball
 from morgs_mi.core.camera import Camera
@@ -144,7 +144,7 @@ class RendererRow:
 
 
 @dataclass(frozen=True)
-class RendererResult:
+class RendererResult(Record):
     """Results of the renderer's report."""
 
     scene: Mapping[str, Any]
@@ -152,15 +152,6 @@ class RendererResult:
     rows: tuple[RendererRow, ...]
     machine: Mapping[str, Any]
     versions: Mapping[str, str]
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the result as JSON."""
-        return to_json(self)
-
-    @classmethod
-    def from_dict(cls, value: Mapping[str, Any]) -> RendererResult:
-        """Return the result that is stored as JSON in `value`."""
-        return from_json(cls, value)
 
 
 def ladder() -> list[Setting]:
