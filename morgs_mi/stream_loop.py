@@ -24,7 +24,7 @@ from morgs_mi.fit.initialise import from_points, resample_points, scene_extent, 
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
-from morgs_mi.method.change import box_around, change_mask, update_reference
+from morgs_mi.method.change import box_around, change_mask, moving_region, update_reference
 from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.flow import FlowObservation, choose_key_views, observe_key_views
 from morgs_mi.method.flow_sources.registry import FramePair
@@ -236,7 +236,9 @@ def _observe(
     for v in _frame_key_views(setup, state, images):
         box = None if changes is None else box_around(changes[v], motion.change)
         if changes is None or box is not None:
-            pairs[v] = FramePair(images[v], state.images[v], setup.cameras[v].name, state.frame, setup.masks[v], box)
+            region = None if changes is None else moving_region(changes[v], motion.change)
+            name, valid = setup.cameras[v].name, setup.masks[v]
+            pairs[v] = FramePair(images[v], state.images[v], name, state.frame, valid, box, region)
     masks = motion.mask_method if with_masks else None
     flows = observe_key_views(pairs, motion.flow_method, masks, motion.flow, motion.masks)
     return flows, {v: KeyView(pairs[v], flow) for v, flow in flows.items()}

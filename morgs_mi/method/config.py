@@ -50,6 +50,10 @@ class MotionConfig:
     """Frames from one supervision of the confidence by masks to the next."""
     min_gate: float = 0.1
     """Gate below which a lifted motion is no longer scaled up to pass the gate at full length."""
+    min_changed: float = 0.4
+    """Responsibility of a Gaussian and its neighbours up to which it has not moved."""
+    changed_neighbours: int = 48
+    """Number of these neighbours."""
     confidence_decay: float = 0.3
     """Logit that a confidence loses per frame without evidence of motion: where something moved, more is to correct."""
     flow: FlowConfig = field(default_factory=FlowConfig)

@@ -97,6 +97,11 @@ def observe_key_views(
     for view, pair in pairs.items():
         backward, forward = source(pair)  # eq. 4
         reliable, forward_reliable = _reliable(pair, backward, forward, flow)
+        if pair.region is not None:
+            # Flow bleeds over the edges of what moves; what has not changed has not moved.
+            backward, forward = (np.where(pair.region[..., None], f, 0) for f in (backward, forward))
+            still = ~pair.region if pair.valid is None else ~pair.region & pair.valid
+            reliable, forward_reliable = reliable | still, forward_reliable | still
         mask = motion_mask(pair.image, -backward, reliable, mask_method, masks) if mask_method else None  # eqs. 9, 10
         observations[view] = FlowObservation(-backward, reliable, forward, forward_reliable, mask)
     return observations

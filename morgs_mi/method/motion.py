@@ -39,7 +39,17 @@ def initial_motion(
         return None
     gaussians = active.select(previous)
     lifted = lift_flow(gaussians, active.views, flows, config.lift, config.masks)
-    if not config.propagate_motion:
+    if config.propagate_motion:
+        views = {v: active.views[v] for v in sorted(flows.keys() & active.views.keys())}
+        lifted = propagate_motion(gaussians, lifted, views, targets, rng, config.propagation)
+    return _only_changed(lifted, active, previous, config)
+
+
+def _only_changed(lifted: Lift, active: ActiveSet, previous: Gaussians, config: MotionConfig) -> Lift:
+    """Return the start in which Gaussians do not move where the surface around them has hardly changed."""
+    if active.responsibility is None:
         return lifted
-    views = {v: active.views[v] for v in sorted(flows.keys() & active.views.keys())}
-    return propagate_motion(gaussians, lifted, views, targets, rng, config.propagation)
+    pooled = active.responsibility.pooled(np.asarray(previous.means), active.indices, config.changed_neighbours)
+    moves = pooled > config.min_changed
+    logit = np.where(moves, lifted.logit_confidence, -np.inf)
+    return Lift(lifted.displacement, logit.astype(np.float32))

@@ -52,7 +52,9 @@ def residual_parameters(previous: Gaussians, config: MotionConfig, start: Lift |
                 "`logit_confidence`, or switch the module off."
             )
         if start is not None and config.lift_confidence:
-            logit = mi.TensorXf(np.maximum(start.logit_confidence, np.asarray(logit) - config.confidence_decay))
+            carried = np.maximum(start.logit_confidence, np.asarray(logit) - config.confidence_decay)
+            still = np.minimum(np.asarray(logit), -config.lift.max_logit)
+            logit = mi.TensorXf(np.where(np.isneginf(start.logit_confidence), still, carried))
         if displacement is not None:
             # The gate would shrink the displacement; a Gaussian that hardly moves may stay shrunk.
             displacement = displacement / np.maximum(np.asarray(sigmoid(logit.array)), config.min_gate)[:, None]

@@ -32,6 +32,7 @@ class FramePair:
         frame: t; flow from files needs it.
         valid: [H, W] bool, False where undistortion left nothing; None: valid everywhere.
         box: rows and columns outside which nothing has changed; None: any pixel may have changed.
+        region: [H, W] bool, pixels outside which nothing has moved, all of them in the box; None: any may have.
     """
 
     image: np.ndarray
@@ -40,6 +41,7 @@ class FramePair:
     frame: int = 1
     valid: np.ndarray | None = None
     box: tuple[slice, slice] | None = None
+    region: np.ndarray | None = None
 
 
 FlowSource = Callable[[FramePair], tuple[np.ndarray, np.ndarray]]
