@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.camera import Camera
 
-__all__ = ["Light", "Object", "Rig", "Scene", "load_scene", "rotate", "translate"]
+__all__ = ["Light", "Object", "Recording", "Rig", "Scene", "load_scene", "rotate", "translate"]
 
 Pose = Callable[[float], np.ndarray]
 
@@ -83,6 +83,21 @@ class Rig:
 
 
 @dataclass(frozen=True)
+class Recording:
+    """How a scene is recorded unless `synthesize` is given other values.
+
+    Attributes:
+        num_cameras: including the held-out view.
+        spp: samples per pixel.
+        noise: standard deviation of the sensor noise, relative to white.
+    """
+
+    num_cameras: int = 10
+    spp: int = 16
+    noise: float = 0.0
+
+
+@dataclass(frozen=True)
 class Scene:
     """A moving scene.
 
@@ -92,6 +107,7 @@ class Scene:
         lights: lamps by name.
         rig: positions of the cameras.
         exposure: seconds -> exposure factor of all cameras; None for 1.
+        recording: number of cameras and noise.
     """
 
     name: str
@@ -99,6 +115,7 @@ class Scene:
     lights: Mapping[str, Light]
     rig: Rig = field(default_factory=Rig)
     exposure: Callable[[float], float] | None = None
+    recording: Recording = field(default_factory=Recording)
 
 
 def load_scene(scene: str | Path, seed: int = 0) -> Scene:

@@ -33,12 +33,12 @@ def synthesize(
     scene: str | Path | Scene,
     out: str | Path,
     *,
-    num_cameras: int = 10,
+    num_cameras: int | None = None,
     num_frames: int = 12,
     width: int = 320,
     height: int = 240,
-    spp: int = 16,
-    noise: float = 0.0,
+    spp: int | None = None,
+    noise: float | None = None,
     fps: float = 30.0,
     lossless: bool = False,
     seed: int = 0,
@@ -54,13 +54,14 @@ def synthesize(
     Args:
         scene: a scene, its name, or the path of its Python file.
         out: the folder to write.
-        num_cameras: including the test view, at least 2.
+        num_cameras: including the test view, at least 2; None for the scene's own number, usually 10.
         num_frames: at least 1.
         width: in pixels, even.
         height: in pixels, even.
-        spp: samples per pixel; the noise of 16 is at 42 dB, below that of a good camera.
+        spp: samples per pixel; the noise of 16 is at 42 dB, below that of a good camera. None for the scene's own
+            number, usually 16.
         noise: standard deviation of the sensor noise, relative to white; 0.01 (2.5 grey levels) is typical of a camera
-            indoors.
+            indoors. None for the scene's own, usually 0.
         fps: frames per second.
         lossless: also write ``frames/cam00/0000.png`` ....
         seed: of the textures, the sampling noise and the choice of points.
@@ -87,16 +88,19 @@ def synthesize(
         "seed": (seed, 0),
     }
     for name, (value, least) in lowest.items():
-        if value < least:
+        if value is not None and value < least:
             raise ValueError(f"synthesize(): `{name}` must be at least {least}, got {value}.")
     if min(width, height) < 2 or width % 2 or height % 2:
         raise ValueError(f"synthesize(): `width` and `height` must be even, got {width}x{height}.")
     if not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"synthesize(): `fps` must be positive, got {fps}.")
-    if not 0 <= noise < 1:
+    if noise is not None and not 0 <= noise < 1:
         raise ValueError(f"synthesize(): `noise` must be at least 0 and below 1, got {noise}.")
 
     scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
+    num_cameras = scene.recording.num_cameras if num_cameras is None else num_cameras
+    spp = scene.recording.spp if spp is None else spp
+    noise = scene.recording.noise if noise is None else noise
     cameras = scene.rig.cameras(num_cameras, width, height)
     times = np.arange(num_frames) / fps
     _check_folder(Path(out), overwrite)
