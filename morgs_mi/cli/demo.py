@@ -27,7 +27,7 @@ class Demo:
     out: Positional[Path]
     """Folder for all results."""
     scene: str = _DEFAULT.scene
-    """Name of a scene (spheres, arm, thin, flicker) or its Python file."""
+    """Name of a scene (spheres, arm, thin, flicker, random) or its Python file."""
     cameras: int = _DEFAULT.clip.num_cameras
     """Number of cameras, the held-out cam00 included."""
     frames: int = _DEFAULT.clip.num_frames

@@ -198,7 +198,7 @@ def test_synthesize__colmap_points_lie_on_the_surface_within_their_noise(clip):
     assert np.percentile(best, 95) < 4
 
 
-@pytest.mark.parametrize("name", ["spheres", "arm", "thin", "flicker"])
+@pytest.mark.parametrize("name", ["spheres", "arm", "thin", "flicker", "random"])
 def test_load_scene__poses_are_rigid_and_repeatable(name):
     for item in load_scene(name).objects.values():
         if item.pose is not None:
@@ -305,7 +305,7 @@ def test_synthesize__removes_its_output_after_a_failure(tmp_path, monkeypatch):
         ({"width": 63}, "must be even, got 63x240"),
         ({"fps": 0}, "`fps` must be positive"),
         ({"noise": -0.1}, "`noise` must be at least 0 and below 1, got -0.1"),
-        ({"scene": "nowhere"}, "no scene 'nowhere'; name one of .*'arm', 'flicker', 'spheres', 'thin'"),
+        ({"scene": "nowhere"}, "no scene 'nowhere'; name one of .*'arm', 'flicker', 'random', 'spheres', 'thin'"),
     ],
 )
 def test_synthesize__rejects_invalid_arguments(tmp_path, arguments, message):
