@@ -21,6 +21,7 @@ from morgs_mi.core.geometry import covariances
 from morgs_mi.export.axes import up_direction
 from morgs_mi.export.paths import focus
 from morgs_mi.playback.player import channel_image, render, render_config
+from morgs_mi.viewer.access import checked_connections
 from morgs_mi.viewer.frame_cache import FrameCache
 from morgs_mi.viewer.modes import BACKGROUNDS, available_modes, splat_colors
 
@@ -31,6 +32,7 @@ __all__ = ["Viewer", "ViewerConfig"]
 _DISTANCE = 10.0
 _HALF_MAX = 6e4
 _NO_OFFSET = ". This frame stores no offset: set codec.offset in --config to store it in every frame but the first."
+_ANY, _LOCAL = ("0.0.0.0", "::", ""), ("127.0.0.1", "::1", "localhost")
 # In seconds: period of the loop, period of reading the file again, time without motion after which the camera rests.
 _TICK, _REFRESH, _REST = 0.01, 1.0, 0.2
 
@@ -43,6 +45,8 @@ class ViewerConfig:
     """Address of the server; the default serves this machine only, 0.0.0.0 all machines that can reach it."""
     port: int = 8080
     """Port of the server; the next free one if it is taken."""
+    allowed_names: tuple[str, ...] = ()
+    """Names under which browsers may open the page, besides localhost, HOST and addresses in digits."""
     trail: int = 10
     """Length of the trajectories, in frames."""
 
@@ -55,7 +59,8 @@ class Viewer:
         config: address and initial settings.
 
     Attributes:
-        url: address of the page.
+        url: address of the page on this machine.
+        is_public: whether other machines can reach it.
 
     Raises:
         ImportError: viser is not installed.
@@ -84,8 +89,11 @@ class Viewer:
         self._shown: tuple[Any, ...] | None = None
         self._splats: Any = None
         self._frame_time = time.monotonic()
-        self._server = viser.ViserServer(config.host, config.port, label="morgs_mi", verbose=False)
-        self.url = f"http://{config.host}:{self._server.get_port()}"
+        with checked_connections((config.host, *config.allowed_names)):
+            self._server = viser.ViserServer(config.host, config.port, label="morgs_mi", verbose=False)
+        host = "localhost" if config.host in _ANY else config.host
+        self.is_public = config.host not in _LOCAL
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
         self._modes = available_modes(first)
         self._build(center)
 
