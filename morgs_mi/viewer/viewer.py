@@ -207,7 +207,7 @@ class Viewer:
 
     def _move_frame(self, change: Callable[[int], int]) -> None:
         self._controls.playing.value = self._controls.follow.value = False
-        self._controls.frame.value = change(int(self._controls.frame.value)) % len(self._cache.frames)
+        self._controls.frame.value = change(int(self._controls.frame.value)) % max(len(self._cache.frames), 1)
 
     def _go_to(self, client: Any, index: int) -> None:
         move_page(client, self._cameras[index], self._center, self._up, self._scale)

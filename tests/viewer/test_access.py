@@ -9,6 +9,7 @@ from threading import Thread
 
 import pytest
 
+from morgs_mi import cli
 from morgs_mi.viewer.access import checked_connections, refusal
 from morgs_mi.viewer.viewer import Viewer, ViewerConfig
 from tests.scenes.changing_splats import write_stream
@@ -108,3 +109,15 @@ def test_viewer__refuses_other_pages_and_rebound_names(address, headers, message
     assert refused.startswith("HTTP/1.1 403 ")
     assert message in refused
     assert answer(address, *headers).startswith("HTTP/1.1 403 ")
+
+
+@pytest.mark.parametrize(("host", "is_public"), [("0.0.0.0", True), ("127.0.0.1", False)])
+def test_view__reports_that_other_machines_can_open_the_page(tmp_path, monkeypatch, capsys, host, is_public):
+    pytest.importorskip("viser", reason="install it with pip install 'morgs-mi[viewer]'")
+    write_stream(tmp_path / "stream.morgs", 1)
+    run = Viewer.run
+    monkeypatch.setattr(Viewer, "run", lambda viewer: (viewer.stop(), run(viewer)))
+    assert cli.main(["view", str(tmp_path), "--host", host, "--port", "0", "--no-open-browser"]) == 0
+    output = capsys.readouterr().out
+    assert ("without a password" in output) == is_public
+    assert f"http://{'localhost' if is_public else host}:" in output
