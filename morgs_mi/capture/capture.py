@@ -22,7 +22,7 @@ from morgs_mi.capture.lens import undistortion
 from morgs_mi.capture.timeline import ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.prefetch import prefetched
-from morgs_mi.io.video import open_clips
+from morgs_mi.io.video import ImageOrError, open_clips
 
 __all__ = ["Capture", "Frame", "PartialFrame", "load_capture"]
 
@@ -157,6 +157,11 @@ class Capture:
         """Yield frames start..stop-1 as `frames` does, with None for a missing image, which is logged."""
         for frame in prefetched(self._decoded(start, stop, False)):
             yield PartialFrame(*frame)
+
+    def images(self, view: int, start: int = 0, stop: int | None = None) -> Iterator[ImageOrError]:
+        """Yield the images of one camera at the frames start..stop-1, with an error in place of a missing image."""
+        stop = self.num_frames if stop is None else min(stop, self.num_frames)
+        return self._sources[view].images(self.cameras[view], start, stop)
 
     def _decoded(
         self, start: int, stop: int | None, strict: bool

@@ -80,11 +80,15 @@ class Flight:
     output: Path | None = None
     """FILE.mp4; by default OUT/PATH.mp4."""
     seconds: float | None = None
-    """Duration in seconds; by default that of the clip or the JSON file."""
+    """Duration in seconds; by default that of the JSON file, or that of the clip, repeated to LEAST_SECONDS."""
+    least_seconds: float = 5.0
+    """Least duration without SECONDS; a shorter clip is played several times, as a whole. 0: once."""
+    back_and_forth: bool = False
+    """Play every second time backwards, instead of restarting at the first frame."""
     degrees: float | None = None
     """Angle of an orbit; below 360 the camera swings to both sides. By default the extent of the rig."""
     freeze: int | None = None
-    """Frame to freeze time at; by default the clip plays and repeats."""
+    """Frame to freeze time at; by default the clip plays."""
     width: int | None = None
     """Width of the video; by default that of the first camera or the JSON file."""
     channels: tuple[Literal["color", "motion", "confidence", "depth", "alpha"], ...] = ("color",)
@@ -92,12 +96,12 @@ class Flight:
 
     def run(self) -> None:
         from morgs_mi.codec.packets import play
-        from morgs_mi.export.clips import frame_numbers, write_flight
+        from morgs_mi.export.clips import frame_numbers, repeated_seconds, write_flight
         from morgs_mi.export.paths import focus, load_path, orbit, through_cameras
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
-        clip = len(frame_numbers(stream)) / stream.fps
+        clip = repeated_seconds(len(frame_numbers(stream)) / stream.fps, self.least_seconds)
         if self.path == "between":
             path = through_cameras(stream.cameras, clip)
         elif self.path == "orbit":
@@ -118,6 +122,7 @@ class Flight:
                 self.channels,
                 self.freeze,
                 lambda done, of: report("Rendering", done, of),
+                self.back_and_forth,
             )
         print_result(f"{output}: {path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}.")
 

@@ -36,6 +36,11 @@ class View:
         except ImportError as error:
             raise ValueError(str(error)) from error
         print_result(f"{viewer.url} (Ctrl-C to stop)")
+        if viewer.is_public:
+            print_result(
+                "Every machine that can reach this one can open the page, without a password: by the address of this "
+                "machine in digits, or by a name passed with --allowed-names."
+            )
         if self.open_browser:
             webbrowser.open(viewer.url)
         with _stopped_by_interrupt(viewer.stop):
