@@ -13,6 +13,7 @@ from tyro.conf import Positional, arg
 from morgs_mi.calibration.calibrate import CalibrateConfig
 from morgs_mi.cli.console import print_result, print_table, print_warning, progress
 from morgs_mi.cli.info import advice_lines, check_cells
+from morgs_mi.cli.settings import Flag
 
 __all__ = ["Calibrate"]
 
@@ -24,7 +25,7 @@ class Calibrate:
     folder: Positional[Path]
     """Folder of videos, or of one folder of images per camera."""
     config: Annotated[CalibrateConfig, arg(name="")] = field(default_factory=CalibrateConfig)
-    overwrite: bool = False
+    overwrite: Flag = False
     """Replace an earlier model."""
 
     def run(self) -> None:

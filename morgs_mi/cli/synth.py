@@ -10,6 +10,7 @@ from typing import ClassVar
 from tyro.conf import Positional
 
 from morgs_mi.cli.console import print_result, progress
+from morgs_mi.cli.settings import Flag
 
 __all__ = ["Synth"]
 
@@ -19,9 +20,9 @@ class Synth:
     """Path-trace a moving scene into a multi-view capture with exact ground truth."""
 
     scene: Positional[str]
-    """Name of a scene (spheres, arm, thin, flicker) or the path of its Python file."""
+    """Name of a scene (spheres, arm, thin, flicker) or the path of a Python file with a function build(seed)."""
     out: Positional[Path]
-    """New folder."""
+    """New folder of the capture."""
     cameras: int = 10
     """Number of cameras, the held-out cam00 included."""
     frames: int = 12
@@ -36,11 +37,11 @@ class Synth:
     """Standard deviation of sensor noise as a share of white; an indoor camera has 0.01, 2.5 grey levels."""
     fps: float = 30.0
     """Frames per second."""
-    lossless: bool = False
-    """Also write the frames as PNG files."""
+    lossless: bool = True
+    """Also write the frames as PNG files, which are read in place of the compressed videos."""
     seed: int = 0
     """Seed of textures, sampling noise and the choice of points."""
-    overwrite: bool = False
+    overwrite: Flag = False
     """Replace an earlier capture."""
 
     arguments: ClassVar[Mapping[str, str]] = {"num_cameras": "--cameras", "num_frames": "--frames"}
@@ -64,4 +65,8 @@ class Synth:
                 overwrite=self.overwrite,
                 progress=lambda done, total: report("Path-tracing", done, total),
             )
-        print_result(f"{self.out}: {self.cameras} cameras, {self.frames} frames of {self.width}x{self.height}.")
+        images = "PNG files and videos" if self.lossless else "videos"
+        print_result(
+            f"{self.out}: {self.cameras} cameras, {self.frames} frames of {self.width}x{self.height} as {images}, with "
+            "ground truth."
+        )
