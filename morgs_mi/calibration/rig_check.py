@@ -39,8 +39,8 @@ _LEAST_FACTOR = 0.1
 # Matches of a pair, and pairs, with which candidates are compared: more are slow, and not more accurate.
 _SAMPLE, _FACTOR_PAIRS = 40, 8
 _NO_OVERLAP = (
-    "check that its clip is of this scene and not mirrored, compare its place in the plot of the rig (--plot) with the "
-    "real one, or add cameras in between and textured objects"
+    "check that the clip is of this scene and not mirrored, compare the camera's place in the plot of the rig (--plot) "
+    "with the real one, or add cameras in between and textured objects"
 )
 
 

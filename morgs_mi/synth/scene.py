@@ -141,7 +141,9 @@ def _failures_in(path: Path) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == str(path)]
+        # The file name of a frame is absolute.
+        frames = extract_tb(error.__traceback__)
+        lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == path.resolve()]
         # A syntax error has no frame in the file.
         line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
         reason = error.msg if isinstance(error, SyntaxError) else str(error)

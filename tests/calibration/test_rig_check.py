@@ -240,7 +240,7 @@ def test_check_rig__does_not_check_a_camera_without_matches(capture: Capture, sh
     assert check.advice == "the poses of 5 of 6 cameras fit the images; not checked: cam3."
     assert (check.cameras[3].fits, check.cameras[3].matches) == (None, 0)
     assert np.isnan(check.cameras[3].error)
-    assert "no matches with any other camera: check that its clip is of this scene" in check.cameras[3].advice
+    assert "no matches with any other camera: check that the clip is of this scene" in check.cameras[3].advice
 
 
 def test_check_rig__does_not_check_a_camera_that_matches_only_a_wrong_one(

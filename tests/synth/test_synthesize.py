@@ -344,11 +344,13 @@ def test_load_scene__accepts_any_file_path(tmp_path):
         ),
     ],
 )
-def test_load_scene__names_the_file_and_line_of_a_mistake(tmp_path, code, message):
+def test_load_scene__names_the_file_and_line_of_a_mistake(tmp_path, monkeypatch, code, message):
     (tmp_path / "scene.py").write_text(code)
-    with pytest.raises(ValueError, match=message) as error:
-        load_scene(tmp_path / "scene.py")
-    assert str(tmp_path) in str(error.value)
+    monkeypatch.chdir(tmp_path)
+    for path in (tmp_path / "scene.py", Path("scene.py")):
+        with pytest.raises(ValueError, match=message) as error:
+            load_scene(path)
+        assert str(path) in str(error.value)
 
 
 def sphere(**entries):
