@@ -8,8 +8,9 @@ from contextlib import contextmanager
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
 
-__all__ = ["ERR", "OUT", "Report", "print_result", "print_warning", "progress", "with_option_names"]
+__all__ = ["ERR", "OUT", "Report", "print_result", "print_table", "print_warning", "progress", "with_option_names"]
 
 # Rich would wrap paths and sentences at 80 columns without a terminal, and turn `:100:` into an emoji.
 OUT = Console(soft_wrap=True, highlight=False, emoji=False)
@@ -20,6 +21,12 @@ Report = Callable[[str, float, float], None]
 def print_result(text: str) -> None:
     """Print to standard output."""
     OUT.print(text, markup=False)
+
+
+def print_table(table: Table) -> None:
+    """Print to standard output with complete columns, even where the terminal is narrower than the table."""
+    needed = OUT.measure(table, options=OUT.options.update(max_width=1000)).maximum
+    Console(width=max(OUT.width, needed), highlight=False, emoji=False).print(table)
 
 
 def print_warning(text: str) -> None:

@@ -10,6 +10,7 @@ from typing import Annotated, ClassVar
 from tyro.conf import DisallowNone, Positional
 
 from morgs_mi.cli.console import print_result, progress
+from morgs_mi.cli.settings import Flag
 
 __all__ = ["Synth"]
 
@@ -19,9 +20,9 @@ class Synth:
     """Path-trace a moving scene into a multi-view capture with exact ground truth."""
 
     scene: Positional[str]
-    """Name of a scene (spheres, arm, thin, flicker, random) or the path of its Python file."""
+    """Name of a scene (spheres, arm, thin, flicker, random), or path of a Python file with a function build(seed)."""
     out: Positional[Path]
-    """New folder."""
+    """New folder of the capture."""
     cameras: Annotated[int | None, DisallowNone] = None
     """Number of cameras, the held-out cam00 included; the scene's own, usually 10, if not given."""
     frames: int = 12
@@ -37,11 +38,11 @@ class Synth:
     own, usually 0, if not given."""
     fps: float = 30.0
     """Frames per second."""
-    lossless: bool = False
-    """Also write the frames as PNG files."""
+    lossless: bool = True
+    """Also write the frames as PNG files, which are read in place of the compressed videos."""
     seed: int = 0
     """Seed of textures, sampling noise and the choice of points; of everything in the scene random."""
-    overwrite: bool = False
+    overwrite: Flag = False
     """Replace an earlier capture."""
 
     arguments: ClassVar[Mapping[str, str]] = {"num_cameras": "--cameras", "num_frames": "--frames"}
@@ -65,5 +66,9 @@ class Synth:
                 overwrite=self.overwrite,
                 progress=lambda done, total: report("Path-tracing", done, total),
             )
-        cameras = len(list(self.out.glob("cam*.mp4")))
-        print_result(f"{self.out}: {cameras} cameras, {self.frames} frames of {self.width}x{self.height}.")
+        images = "PNG files and videos" if self.lossless else "videos"
+        cameras = len(list((self.out / "truth").glob("cam*")))
+        print_result(
+            f"{self.out}: {cameras} cameras, {self.frames} frames of {self.width}x{self.height} as {images}, with "
+            "ground truth."
+        )
