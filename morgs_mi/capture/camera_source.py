@@ -24,7 +24,7 @@ class CameraSource:
         reader: reader of the clip.
         lens: the lens that the clip was recorded through.
         undistortion: the pixel maps that remove the lens distortion, or None.
-        frame_indices: the clip's frames that show the instants 0, 1, ... of the recording, int [T].
+        frame_indices: the clip's frames that show the instants 0, 1, ... of the recording, -1 for none, int [T].
         color_correction: the colour correction, or None.
     """
 
@@ -36,7 +36,10 @@ class CameraSource:
 
     def images(self, camera: Camera, start: int, stop: int) -> Generator[ImageOrError, None, None]:
         """Yield the processed images of the instants start..stop-1, with an error in place of a missing image."""
-        for image in self.reader.pick(self.frame_indices[start:stop].tolist()):
+        indices = self.frame_indices[start:stop]
+        frames = self.reader.pick(indices[indices >= 0].tolist())
+        for instant, index in enumerate(indices, start):
+            image = next(frames) if index >= 0 else ValueError(f"{self.reader.path}: no frame at instant {instant}.")
             yield self.process(image, camera) if isinstance(image, np.ndarray) else image
 
     def process(self, image: np.ndarray, camera: Camera) -> np.ndarray:

@@ -75,6 +75,7 @@ class Capture:
         layout: name of the folder's layout, e.g. ``COLMAP``.
         reading: how clips that do not match are read.
         colors: the colour correction of the cameras, or None.
+        notes: a sentence for everything about the clips that was not as expected, e.g. a variable frame rate.
     """
 
     path: Path
@@ -91,6 +92,7 @@ class Capture:
     layout: str = ""
     reading: ReadConfig = field(default_factory=ReadConfig)
     colors: ColorFit | None = None
+    notes: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -127,6 +129,7 @@ class Capture:
             "points": len(self.points),
             "reading": asdict(self.reading),
             "colors": colors,
+            "notes": list(self.notes),
             "cameras": [
                 {
                     "name": camera.name,
@@ -247,6 +250,7 @@ def load_capture(
         downscale=downscale,
         layout=layout.name,
         reading=reading,
+        notes=common.notes,
     )
     return _color_corrected(capture, reading) if reading.color != "none" or reading.exposure else capture
 
