@@ -63,9 +63,9 @@ def at_clip_size(camera: Camera, reader: FrameReader) -> Camera:
     """
     if (reader.width, reader.height) == (camera.width, camera.height):
         return camera
-    x, y = reader.width / camera.width, reader.height / camera.height
     # Both sides were rounded to whole pixels.
-    if abs(camera.width * y - reader.width) > 1 or abs(camera.height * x - reader.height) > 1:
+    difference = abs(camera.width * reader.height - camera.height * reader.width)
+    if difference > min(camera.width, camera.height):
         raise ValueError(
             f"{reader.path}: expected {camera.width}x{camera.height}, the calibrated size of {camera.name}, or a "
             f"scaled version of it, got {reader.width}x{reader.height}; calibrate at the recorded size."

@@ -9,7 +9,6 @@ In a clip of variable frame rate k is a position on its regular clock, and the f
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from morgs_mi.io.bounded import read_json
 from morgs_mi.io.video import FrameReader
 
 __all__ = ["ReadConfig", "Timeline", "read_settings", "timeline"]
@@ -255,10 +255,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     """
     if not path.exists():
         return {}
-    try:
-        settings = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: expected JSON, got a broken file ({error}); correct it.") from None
+    settings = read_json(path)
     if not isinstance(settings, dict):
         raise ValueError(f"{path}: expected a JSON object, got {type(settings).__name__}; correct it.")
     fps, view = settings.get("fps"), settings.get("test_view")

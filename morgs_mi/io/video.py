@@ -9,12 +9,15 @@ stores the time of each frame, so the reader knows where on a regular clock the 
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
+
+from morgs_mi.io.bounded import check_claim
 
 __all__ = [
     "Clip",
@@ -35,6 +38,8 @@ _WITHOUT_TIMES = (".avi",)
 _JITTER, _ROUNDING_SECONDS = 0.1, 1e-3
 # Difference up to which the header's frame rate, which may be a mean over pauses, is that of the clip's clock.
 _SAME_RATE = 0.01
+# Bytes of an image file in which its size is searched, and of memory that a pixel takes, in BGR and RGB.
+_MAX_HEADER, _BYTES_PER_PIXEL = 1_000_000, 6
 # Frames that a clip may pause; the instants of the pause are listed.
 _MAX_PAUSE = 1_000_000
 
@@ -257,6 +262,13 @@ def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
     numbered = {folder: {_number(file): file for file in _images(folder)} for folder in folders}
     numbers = sorted(set().union(*numbered.values()))
     step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
+    if (numbers[-1] - numbers[0]) // step > 10 * len(numbers) + 1000:
+        after = int(np.argmax(np.diff(numbers)))
+        file = next(files[numbers[after + 1]] for files in numbered.values() if numbers[after + 1] in files)
+        raise ValueError(
+            f"{file}: expected images numbered without large gaps, got this after "
+            f"number {numbers[after]} among {len(numbers)} images; rename or remove it."
+        )
     instants = range(numbers[0], numbers[-1] + 1, step)
     return [
         FolderReader.of_files([numbered[clip].get(n, _missing_name(clip, numbered[clip], n)) for n in instants], gaps)
@@ -351,7 +363,31 @@ def _read_image(file: Path) -> np.ndarray:
     if not file.is_file():
         raise _no_image(file)
     # The stored pixels, without EXIF's rotation: calibrations refer to those.
-    image = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise ValueError(f"{file}: expected an image, got {file.stat().st_size} bytes that cannot be decoded.")
+    image = _decoded(file, cv2.IMREAD_COLOR)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _decoded(file: Path, mode: int) -> np.ndarray:
+    data = np.fromfile(file, np.uint8)
+    width, height = _claimed_size(data[:_MAX_HEADER].tobytes())
+    check_claim(file, _BYTES_PER_PIXEL * width * height, f"{width}x{height} pixels")
+    image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+    if image is None:
+        raise ValueError(f"{file}: expected an image, got {len(data)} bytes that cannot be decoded.")
+    return image
+
+
+def _claimed_size(data: bytes) -> tuple[int, int]:
+    """Return the width and height in the header of a PNG or JPEG file, 0 of another."""
+    if data.startswith(b"\x89PNG") and len(data) >= 24:
+        width, height = struct.unpack(">II", data[16:24])
+        return width, height
+    at = 2
+    while data.startswith(b"\xff\xd8") and at + 9 <= len(data):
+        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+        # Start of a frame, by its kind of compression; the other three numbers mark tables.
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
+            return width, height
+        at += 1 if marker == 0xFF else 2 + length
+    return 0, 0

@@ -220,6 +220,14 @@ def test_partial_frames__leave_out_missing_images_in_frame_folders(tmp_path: Pat
         load_capture(path)
 
 
+@pytest.mark.parametrize("number", ["9000000000", "9" * 60])
+def test_open_clips__refuses_numbers_that_span_more_than_the_images(tmp_path: Path, number: str) -> None:
+    path = images(tmp_path / "c")
+    (path / "cam_2" / "0003.png").rename(path / "cam_2" / f"{number}.png")
+    with pytest.raises(ValueError, match=rf"cam_2/{number}.png: expected images numbered without .* after number 3"):
+        load_capture(path, reading=ReadConfig(gaps=True))
+
+
 def test_frames__stop_at_a_broken_image(tmp_path: Path) -> None:
     path = images(tmp_path / "c")
     (path / "cam_2" / "0002.png").write_bytes(b"")

@@ -5,12 +5,11 @@ A reader module exposes a `Layout`, which `registry.py` lists.
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video import VIDEO_SUFFIXES, Clip, natural_key
 
-__all__ = ["NO_POINTS", "Calibration", "Layout", "PoseConvention", "match_clips", "read_json", "required_clips"]
+__all__ = ["NO_POINTS", "Calibration", "Layout", "PoseConvention", "match_clips", "required_clips"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -93,18 +92,6 @@ def required_clips(path: Path) -> dict[str, Path]:
     raise FileNotFoundError(
         f"{path}: expected videos ({', '.join(VIDEO_SUFFIXES)}) or folders of frames, found none; check the path."
     )
-
-
-def read_json(path: Path) -> Any:
-    """Return the content of a JSON file.
-
-    Raises:
-        ValueError: the file is broken.
-    """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: expected JSON, got a broken file ({error}); export it again.") from None
 
 
 def match_clips(

@@ -67,7 +67,7 @@ def view_of_image(views: Collection[str], image: str) -> str | None:
     It is cam01 for ``cam01.png``, ``cam01.mp4``, ``cam01/0000.png`` and ``cam01/images/0000.png``.
     """
     place = PurePosixPath(image.replace("\\", "/"))
-    names = (place.stem, *(parent.name for parent in place.parents))
+    names = (place.stem, *reversed(place.parts[:-1]))
     return next((name for name in names if name in views), None)
 
 
