@@ -15,7 +15,7 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from morgs_mi.capture.layouts.clips import clips_by_camera
+from morgs_mi.capture.layouts.clips import EXAMPLE, clips_by_camera, photos
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.video import open_frames
 
@@ -73,7 +73,7 @@ def calibrate(
     """Calibrate a folder of clips, one per camera, and write ``sparse/0`` there; nothing is written on failure.
 
     Args:
-        path: the folder: videos, or a folder of images per camera.
+        path: the folder: videos, a folder of images per camera, or one photo per camera.
         config: settings.
         overwrite: whether to replace an existing model.
         progress: called with (stage, done, total).
@@ -116,10 +116,12 @@ def calibrate(
 
 def _frames(path: Path, config: CalibrateConfig) -> dict[str, np.ndarray]:
     """Return one image of each camera by its name."""
-    clips = clips_by_camera(path)
+    clips = clips_by_camera(path) or photos(path)
     if len(clips) < 2:
         found = ", ".join(clips) or "none"
-        raise ValueError(f"{path}: expected the clips of at least two cameras, found {found}; check the path.")
+        raise ValueError(
+            f"{path}: expected the clips of at least two cameras, found {found}; check the path, or make {EXAMPLE}"
+        )
     readers = {name: open_frames(clip) for name, clip in clips.items()}
     short = [name for name, reader in readers.items() if not 0 <= config.frame < reader.num_held]
     if short:

@@ -26,6 +26,7 @@ class CameraSource:
         undistortion: the pixel maps that remove the lens distortion, or None.
         frame_indices: the clip's frames that show the instants 0, 1, ... of the recording, -1 for none, int [T].
         color_correction: the colour correction, or None.
+        opaque: the mask of the recorded pixels that are not transparent [H, W], or None if all are opaque.
     """
 
     reader: FrameReader
@@ -33,6 +34,7 @@ class CameraSource:
     undistortion: Undistortion | None
     frame_indices: np.ndarray
     color_correction: ColorCorrection | None = None
+    opaque: np.ndarray | None = None
 
     def images(self, camera: Camera, start: int, stop: int) -> Generator[ImageOrError, None, None]:
         """Yield the processed images of the instants start..stop-1, with an error in place of a missing image."""
@@ -49,10 +51,16 @@ class CameraSource:
 
     def mask(self, camera: Camera) -> np.ndarray | None:
         """Return the mask of the valid pixels of `camera` [H, W] bool, or None if all are valid."""
-        if self.undistortion is None or self.undistortion.mask.all():
+        valid = self.opaque
+        if self.undistortion is not None:
+            valid = self.undistortion.mask
+            if self.opaque is not None:
+                # No transparent pixel may contribute; cubic weights are negative too.
+                valid = valid & (np.abs(self.undistortion(self.opaque.astype(np.float32)) - 1) < 1e-3)
+        if valid is None or valid.all():
             return None
         # A downscaled pixel is valid if all pixels that it averages are.
-        return _downscaled(self.undistortion.mask.astype(np.float32), camera) > 1 - 1e-4
+        return _downscaled(valid.astype(np.float32), camera) > 1 - 1e-4
 
 
 def at_clip_size(camera: Camera, reader: FrameReader) -> Camera:

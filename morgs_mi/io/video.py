@@ -206,6 +206,19 @@ class FolderReader:
         first = _read_image(next(readable, files[0]))
         return cls(files[0].parent, tuple(files), first.shape[1], first.shape[0])
 
+    def opaque(self) -> tuple[np.ndarray | None, bool]:
+        """Return the mask of the pixels that no alpha channel makes transparent, and whether it is constant.
+
+        The first, the middle and the last image are compared. The mask [H, W] is that of the first one, None if it has
+        no transparent pixels.
+        """
+        chosen = {0, self.num_frames // 2, self.num_frames - 1}
+        masks = [_opaque(self.files[i]) for i in sorted(chosen)]
+        full = np.ones((self.height, self.width), bool)
+        masks = [full if mask is None or mask.shape != full.shape else mask for mask in masks]
+        constant = all(np.array_equal(mask, masks[0]) for mask in masks)
+        return None if masks[0].all() else masks[0], constant
+
     @property
     def num_frames(self) -> int:
         """Number of images."""
@@ -375,6 +388,20 @@ def _decoded(file: Path, mode: int) -> np.ndarray:
     if image is None:
         raise ValueError(f"{file}: expected an image, got {len(data)} bytes that cannot be decoded.")
     return image
+
+
+def _opaque(file: Path) -> np.ndarray | None:
+    """Return the mask of an image's opaque pixels [H, W], None if it has no alpha channel or is not readable."""
+    try:
+        with file.open("rb") as opened:
+            header = opened.read(26)
+        # Its type of colours: with a palette, grey and alpha, or RGB and alpha.
+        if not header.startswith(b"\x89PNG") or header[25:] not in (b"\3", b"\4", b"\6"):
+            return None
+        image = _decoded(file, cv2.IMREAD_UNCHANGED)
+    except (ValueError, OSError):
+        return None
+    return image[..., 3] == np.iinfo(image.dtype).max if image.ndim == 3 and image.shape[2] == 4 else None
 
 
 def _claimed_size(data: bytes) -> tuple[int, int]:
