@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from morgs_mi import cli
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.io.video_writer import write_video
@@ -180,6 +181,12 @@ def test_timeline__reports_how_irregular_a_clip_is_and_what_was_done(tmp_path: P
     assert problems == [(f"b: {path / 'b.mp4'}: no frame at instant 3.",)]
     regular = timed(tmp_path / "d", a=REGULAR, b=[50 * t + t % 2 for t in range(7)])  # rounded, as in Matroska
     assert load_capture(regular).notes == ()
+
+
+def test_info_command__reports_a_variable_frame_rate(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    path = timed(tmp_path / "c", a=REGULAR, b=LATE)
+    assert cli.main(["info", str(path), "--no-check", "--trim"]) == 0
+    assert "b.mp4: variable frame rate, 5 frames in 7 periods" in capsys.readouterr().out
 
 
 def test_timeline__does_not_use_truth_at_other_times(tmp_path: Path) -> None:
