@@ -17,7 +17,7 @@ import numpy as np
 
 from morgs_mi.calibration.mistakes import same_poses
 from morgs_mi.calibration.rig_check import MAX_ERROR, CameraCheck
-from morgs_mi.capture.layouts.clips import clips_by_camera
+from morgs_mi.capture.layouts.clips import EXAMPLE, clips_by_camera, photos
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.video import open_frames
@@ -80,7 +80,7 @@ def calibrate(
     """Calibrate a folder of clips, one per camera, and write ``sparse/0`` there; nothing is written on failure.
 
     Args:
-        path: the folder: videos, or a folder of images per camera.
+        path: the folder: videos, a folder of images per camera, or one photo per camera.
         config: settings.
         overwrite: whether to replace an existing model.
         progress: called with (stage, done, total).
@@ -150,10 +150,12 @@ def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
 
 def _frames(path: Path, config: CalibrateConfig) -> dict[str, np.ndarray]:
     """Return one image of each camera by its name."""
-    clips = clips_by_camera(path)
+    clips = clips_by_camera(path) or photos(path)
     if len(clips) < 2:
         found = ", ".join(clips) or "none"
-        raise ValueError(f"{path}: expected the clips of at least two cameras, found {found}; check the path.")
+        raise ValueError(
+            f"{path}: expected the clips of at least two cameras, found {found}; check the path, or make {EXAMPLE}"
+        )
     readers = {name: open_frames(clip) for name, clip in clips.items()}
     short = [name for name, reader in readers.items() if not 0 <= config.frame < reader.num_held]
     if short:

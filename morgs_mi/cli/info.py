@@ -46,6 +46,8 @@ class Info:
         points = origin or f"{len(capture.points)} points"
         truth = "with ground truth" if capture.truth else "without ground truth"
         print_result(f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.")
+        for note in capture.notes:
+            print_result(note)
         if found:
             error = f"median {found.error:.2f} px over " if found.matches else ""
             print_result(f"Reprojection check: {error}{found.matches} matches in {found.pairs} pairs; {found.advice}")

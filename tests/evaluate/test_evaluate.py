@@ -85,6 +85,7 @@ def test_evaluate_stream__compares_3d_motion_of_gaussians_in_both_frames_only(
     assert result.relative_error < 1e-3
 
 
+@pytest.mark.usefixtures("small_images")
 def test_evaluate_stream__uses_the_size_of_a_downscaled_fit(fitted_clip: Path, tmp_path: Path) -> None:
     small = load_capture(fitted_clip / "capture", downscale=1.7)
     with StreamWriter(

@@ -12,6 +12,7 @@ import pytest
 
 from morgs_mi.io.video import FolderReader, VideoReader, natural_key, open_frames
 from morgs_mi.io.video_writer import playable_format, write_video
+from tests.scenes.captures import write_timed_video
 
 HEIGHT, WIDTH, COUNT = 32, 48, 6
 
@@ -131,6 +132,32 @@ def test_video_reader__counts_the_frames_of_a_truncated_file(tmp_path: Path) -> 
     assert reader.num_frames == len(clip())
     assert 0 < reader.num_held < len(clip())
     assert len(list(reader.frames(0, reader.num_held))) == reader.num_held
+
+
+def test_video_reader__has_the_positions_of_a_variable_frame_rate(tmp_path: Path) -> None:
+    path = tmp_path / "cam.mp4"
+    write_timed_video(path, clip(), [0, 33, 67, 200, 233, 267])
+    reader = VideoReader.open(path)
+    assert (reader.num_frames, reader.num_held) == (6, 6)
+    assert reader.fps == pytest.approx(30, rel=0.01)
+    assert reader.positions is not None
+    np.testing.assert_allclose(reader.positions, [0, 1, 2, 6, 7, 8], atol=0.05)
+    np.testing.assert_array_equal(list(reader.frames()), clip())
+
+
+@pytest.mark.parametrize(("name", "codec"), [("cam.mp4", "mp4v"), ("cam.mkv", "FFV1"), ("cam.avi", "MJPG")])
+@pytest.mark.parametrize("fps", [24000 / 1001, 29.97, 240])
+def test_video_reader__recognises_a_constant_frame_rate(tmp_path: Path, name: str, codec: str, fps: float) -> None:
+    write_video(tmp_path / name, clip(count=30), fps, codec)
+    reader = VideoReader.open(tmp_path / name)
+    assert (reader.num_frames, reader.positions) == (30, None)
+    assert reader.fps == pytest.approx(fps, rel=1e-3)
+
+
+def test_video_reader__refuses_time_stamps_of_years(tmp_path: Path) -> None:
+    write_timed_video(tmp_path / "cam.mp4", clip(), [0, 33, 67, 100, 133, 200_000_000])
+    with pytest.raises(ValueError, match=r"cam.mp4: expected 6 frames at about 30.* that span 2e\+05 s; .*convert"):
+        VideoReader.open(tmp_path / "cam.mp4")
 
 
 def test_folder_reader__ignores_the_rotation_of_exif(tmp_path: Path) -> None:

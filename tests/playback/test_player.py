@@ -27,6 +27,7 @@ from tests.assertions import assert_close
 from tests.scenes.moving_splats import CAMERAS, FRAMES, HEIGHT, WIDTH, moved, write_stream
 
 
+@pytest.mark.usefixtures("small_images")
 def test_truth_for_camera__resamples_to_a_coarser_grid(fitted_clip: Path) -> None:
     small = load_capture(fitted_clip / "capture", downscale=2)
     full, half = (truth_for_camera(small, c, 1) for c in (CAMERAS[0], small.cameras[0]))
