@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from morgs_mi.calibration.calibrate import CalibrateConfig
 from morgs_mi.cli.console import print_result, print_warning, progress
+from morgs_mi.cli.settings import Flag
 
 __all__ = ["Calibrate"]
 
@@ -20,9 +21,9 @@ class Calibrate:
 
     folder: Positional[Path]
     """Folder of videos, or of one folder of images per camera."""
-    config: Annotated[CalibrateConfig, arg(name="")] = field(default_factory=CalibrateConfig)
-    overwrite: bool = False
-    """Replace an earlier model."""
+    config: Annotated[CalibrateConfig, arg(name=""), FlagCreatePairsOff] = field(default_factory=CalibrateConfig)
+    overwrite: Flag = False
+    """Replace an earlier model in FOLDER/sparse."""
 
     def run(self) -> None:
         from morgs_mi.calibration.calibrate import calibrate

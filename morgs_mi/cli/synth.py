@@ -10,6 +10,7 @@ from typing import ClassVar
 from tyro.conf import Positional
 
 from morgs_mi.cli.console import print_result, progress
+from morgs_mi.cli.settings import Flag
 
 __all__ = ["Synth"]
 
@@ -21,7 +22,7 @@ class Synth:
     scene: Positional[str]
     """Name of a scene (spheres, arm, thin, flicker) or the path of its Python file."""
     out: Positional[Path]
-    """New folder."""
+    """New folder for the capture."""
     cameras: int = 10
     """Number of cameras, the held-out cam00 included."""
     frames: int = 12
@@ -36,12 +37,12 @@ class Synth:
     """Standard deviation of sensor noise as a share of white; an indoor camera has 0.01, 2.5 grey levels."""
     fps: float = 30.0
     """Frames per second."""
-    lossless: bool = False
+    lossless: Flag = False
     """Also write the frames as PNG files."""
     seed: int = 0
     """Seed of textures, sampling noise and the choice of points."""
-    overwrite: bool = False
-    """Replace an earlier capture."""
+    overwrite: Flag = False
+    """Replace an earlier synthetic capture in OUT."""
 
     arguments: ClassVar[Mapping[str, str]] = {"num_cameras": "--cameras", "num_frames": "--frames"}
 
