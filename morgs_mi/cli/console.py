@@ -36,7 +36,7 @@ _PERIOD = 30.0  # seconds between two lines of progress without a terminal
 
 def print_result(text: str) -> None:
     """Print to standard output."""
-    OUT.print(text, markup=False)
+    print(text)
 
 
 def print_warning(text: str) -> None:
