@@ -10,7 +10,7 @@ import logging
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -202,7 +202,7 @@ class Capture:
 def load_capture(
     path: str | Path,
     downscale: float = 1,
-    test_view: int | Literal["auto"] | None = "auto",
+    test_view: int | str | None = "auto",
     max_frames: int | None = None,
     reading: ReadConfig | None = None,
 ) -> Capture:
@@ -211,8 +211,8 @@ def load_capture(
     Args:
         path: the folder; `layouts/registry.py` lists the supported layouts.
         downscale: factor by which images are downscaled (area averages, rounded to the nearest whole size).
-        test_view: index of the held-out camera, None for none; "auto" uses the value in `capture.json`, then the
-            layout's own, then 0 as N3DV does, or none with fewer than six cameras.
+        test_view: index or name of the held-out camera, None for none; "auto" uses the value in `capture.json`, then
+            the layout's own, then 0 as N3DV does, or none with fewer than six cameras.
         max_frames: number of frames to use at most, from the start.
         reading: how clips that do not match are read.
 
@@ -232,7 +232,7 @@ def load_capture(
     if not downscale >= 1:
         raise ValueError(f"load_capture(): `downscale` must be at least 1, got {downscale}.")
     if max_frames is not None and max_frames < 1:
-        raise ValueError(f"load_capture(): `max_frames` must be at least 1 or None, got {max_frames}.")
+        raise ValueError(f"load_capture(): `max_frames` must be at least 1, got {max_frames}.")
     reading, settings = reading or ReadConfig(), read_settings(path / "capture.json")
     layout = find_layout(path)
     calibration = layout.read(path)
@@ -330,15 +330,20 @@ def _resized(camera: Camera, downscale: float) -> Camera:
 
 
 def _test_view(
-    path: Path, requested: int | Literal["auto"] | None, settings: dict[str, Any], calibration: Calibration
+    path: Path, requested: int | str | None, settings: dict[str, Any], calibration: Calibration
 ) -> int | None:
-    num_cameras = len(calibration.cameras)
+    names = [camera.name for camera in calibration.cameras]
     view = requested
     if view == "auto":
-        default = 0 if num_cameras >= 6 else None
+        default = 0 if len(names) >= 6 else None
         view = settings.get("test_view", default if calibration.test_view is None else calibration.test_view)
-    if view is not None and not 0 <= view < num_cameras:
-        raise ValueError(
-            f"{path}: `test_view` must be in 0..{num_cameras - 1}, or None for no held-out view, got {view}."
-        )
-    return view
+    if view is None:
+        return None
+    index = names.index(view) if view in names else view
+    if str(index).isdecimal() and int(index) < len(names):
+        return int(index)
+    place = path / "capture.json" if requested == "auto" else path
+    raise ValueError(
+        f"{place}: `test_view` must be an index in 0..{len(names) - 1}, one of {', '.join(names)}, or none for no "
+        f"held-out camera, got {view}."
+    )

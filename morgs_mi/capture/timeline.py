@@ -192,7 +192,7 @@ def _check_complete(reader: FrameReader, required: int) -> None:
     if required > reader.num_held:
         raise ValueError(
             f"{reader.path}: frame {reader.num_held} of {reader.num_frames} cannot be read: the file is truncated or "
-            f"broken; copy it again, use the first {reader.num_held} frames (max_frames), or leave its camera out of "
+            f"broken; copy it again, use the first {reader.num_held} frames (`max_frames`), or leave its camera out of "
             "the later ones (--gaps)."
         )
 
@@ -228,7 +228,7 @@ def _num_frames(path: Path, readers: Sequence[FrameReader], max_frames: int | No
         table = ", ".join(f"{r.path.name} {n}" for r, n in zip(readers, lengths, strict=True))
         raise ValueError(
             f"{path}: all cameras must have the same number of frames, got {table}; use the first frames with "
-            f"max_frames={shortest} (--frames), the instants that all clips cover with --trim, or align the clips with "
+            f"`max_frames={shortest}`, the instants that all clips cover with --trim, or align the clips with "
             "--offset."
         )
     return shortest

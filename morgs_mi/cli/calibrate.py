@@ -8,7 +8,7 @@ from typing import Annotated
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
-from tyro.conf import Positional, arg
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from morgs_mi.calibration.calibrate import CalibrateConfig
 from morgs_mi.cli.console import print_result, print_table, print_warning, progress
@@ -24,9 +24,9 @@ class Calibrate:
 
     folder: Positional[Path]
     """Folder of videos, or of one folder of images per camera."""
-    config: Annotated[CalibrateConfig, arg(name="")] = field(default_factory=CalibrateConfig)
+    config: Annotated[CalibrateConfig, arg(name=""), FlagCreatePairsOff] = field(default_factory=CalibrateConfig)
     overwrite: Flag = False
-    """Replace an earlier model."""
+    """Replace an earlier model in FOLDER/sparse."""
 
     def run(self) -> None:
         from morgs_mi.calibration.calibrate import calibrate

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated, ClassVar
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
-from tyro.conf import Positional
+from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.calibration.rig_check import CameraCheck, RigCheck, check_rig, match_capture, triangulate_points
 from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, print_table, progress
-from morgs_mi.cli.settings import GivenReading, Reading
+from morgs_mi.cli.settings import GivenReading, Reading, optional
 
 __all__ = ["Info"]
 
@@ -24,15 +26,19 @@ class Info:
 
     capture: Positional[Path]
     """Folder of the capture."""
-    plot: Path | None = None
+    plot: Annotated[Path | None, DisallowNone, optional("FILE")] = None
     """File for a plot of the rig, .png or .jpg."""
-    check: bool = True
+    check: Annotated[bool, arg(help_behavior_hint="(default: --check)")] = True
     """Check the poses against feature matches between the views of the first frame."""
     reading: GivenReading = field(default_factory=Reading)
+
+    arguments: ClassVar[Mapping[str, str]] = {"max_frames": "--frames of morgs-mi fit"}
 
     def run(self) -> None:
         from morgs_mi.calibration.rig_plot import write_rig
 
+        if self.plot is not None:
+            check_output(self.plot)
         capture, found = load_capture(self.capture, reading=self.reading.read_config()), None
         origin = "" if len(capture.points) else "without points"
         if self.check:

@@ -22,7 +22,7 @@ class Synth:
     scene: Positional[str]
     """Name of a scene (spheres, arm, thin, flicker, random), or path of a Python file with a function build(seed)."""
     out: Positional[Path]
-    """New folder of the capture."""
+    """New folder for the capture."""
     cameras: Annotated[int | None, DisallowNone] = None
     """Number of cameras, the held-out cam00 included; the scene's own, usually 10, if not given."""
     frames: int = 12
@@ -43,7 +43,7 @@ class Synth:
     seed: int = 0
     """Seed of textures, sampling noise and the choice of points; of everything in the scene random."""
     overwrite: Flag = False
-    """Replace an earlier capture."""
+    """Replace an earlier synthetic capture in OUT."""
 
     arguments: ClassVar[Mapping[str, str]] = {"num_cameras": "--cameras", "num_frames": "--frames"}
 

@@ -25,7 +25,7 @@ class View:
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
     open_browser: bool = True
-    """Open the page in this machine's browser."""
+    """Open the page in the browser of this machine."""
     config: Annotated[ViewerConfig, arg(name="")] = field(default_factory=ViewerConfig)
 
     def run(self) -> None:
@@ -49,7 +49,7 @@ class View:
 
 @contextmanager
 def _stopped_by_interrupt(stop: Callable[[], None]) -> Iterator[None]:
-    """Call `stop` on Ctrl-C, and raise KeyboardInterrupt only at the end, or at the second Ctrl-C.
+    """Call `stop` on Ctrl-C or SIGTERM, and raise KeyboardInterrupt only at the end, or at the second signal.
 
     Raised at once, it can end up in a callback of a library, which ignores it: the viewer would run on.
     """
@@ -61,10 +61,11 @@ def _stopped_by_interrupt(stop: Callable[[], None]) -> Iterator[None]:
         interrupted.append(True)
         stop()
 
-    previous = signal.signal(signal.SIGINT, handle)
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
     if interrupted:
         raise KeyboardInterrupt

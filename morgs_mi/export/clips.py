@@ -49,13 +49,15 @@ def select_frames(stream: StreamReader, span: str | None) -> list[int]:
         if span.count(":") > 2 or (step is not None and step < 1):
             raise ValueError
     except ValueError:
-        raise ValueError(f"the frames must be given as 12, 10:20 or 0:100:5, got {span!r}.") from None
+        raise ValueError(f"select_frames(): `span` must be like 12, 10:20 or 0:100:5, got {span!r}.") from None
     if ":" not in span:
         start, stop = start, None if start is None else start + 1
     low, high = numbers[0] if start is None else start, numbers[-1] + 1 if stop is None else stop
     wanted = set(range(low, high, step or 1))
     if not (selected := [number for number in numbers if number in wanted]):
-        raise ValueError(f"{stream.path}: the frames must lie in {numbers[0]}..{numbers[-1]}, got {span!r}.")
+        raise ValueError(
+            f"select_frames(): `span` must select frames of {stream.path}, {numbers[0]} to {numbers[-1]}, got {span!r}."
+        )
     return selected
 
 

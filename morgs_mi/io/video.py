@@ -155,7 +155,7 @@ class VideoReader:
             return ValueError(f"{self.path}: it has ended after {self.num_frames} frames; record longer.")
         return ValueError(
             f"{self.path}: frame {index} of {self.num_frames} cannot be decoded: the file is truncated or broken; copy "
-            f"it again or use the first {index} frames (max_frames)."
+            f"it again or use the first {index} frames (`max_frames`)."
         )
 
 

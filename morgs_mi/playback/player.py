@@ -6,8 +6,10 @@ pixel grid and holds x_t - x_{t-1}, like the ground truth. Keyframes store no di
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -218,17 +220,14 @@ def open_stream_capture(stream: StreamReader, capture: str | Path | None, frames
 
     Args:
         stream: the file.
-        capture: folder of the capture; default: the path at the time of the fit.
+        capture: folder of the capture; default: that of the fit, which the ``capture.json`` beside the stream names.
         frames: indices of the stream's frames.
 
     Raises:
         FileNotFoundError: the capture is missing.
-        ValueError: the stream's header does not name a capture, or the capture is not the one that was fitted.
+        ValueError: no capture is named, or the capture is not the one that was fitted.
     """
-    about = stream.metadata
-    if capture is None and "capture" not in about:
-        raise ValueError(f"{stream.path}: its header names no capture to compare with; pass one (--capture).")
-    path = capture or about["capture"]
+    about, path = stream.metadata, capture or _fitted_capture(stream)
     reading = ReadConfig(**about.get("reading", {}))
     recording = load_capture(path, about.get("downscale", 1), about.get("test_view", "auto"), frames[-1] + 1, reading)
     expected, found = _sizes(stream.cameras), _sizes(recording.cameras)
@@ -243,6 +242,29 @@ def open_stream_capture(stream: StreamReader, capture: str | Path | None, frames
             "pass the capture that was fitted (--capture)."
         )
     return recording
+
+
+def _fitted_capture(stream: StreamReader) -> str:
+    """Return the path of a stream's capture, which is in the `capture.json` beside it; in the header of older streams.
+
+    Raises:
+        FileNotFoundError: it is not there any more.
+        ValueError: no path is stored.
+    """
+    beside = None
+    with suppress(OSError, ValueError):
+        beside = json.loads(stream.path.with_name("capture.json").read_text(encoding="utf-8"))
+    stored = [about.get("capture") for about in (stream.metadata, beside) if isinstance(about, dict)]
+    paths, remedy = [path for path in stored if isinstance(path, str)], "name its folder with --capture"
+    if not paths:
+        raise ValueError(
+            f"{stream.path}: expected the path of its capture in the capture.json beside it, found none; {remedy}."
+        )
+    if found := next((path for path in paths if Path(path).is_dir()), None):
+        return found
+    raise FileNotFoundError(
+        f"{paths[0]}: expected the capture of {stream.path}, found none; if it has moved, {remedy}."
+    )
 
 
 def _sizes(cameras: Sequence[Camera]) -> dict[str, tuple[int, int]]:

@@ -6,6 +6,7 @@ centres, so it has no noise and does not mix foreground and background.
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
@@ -16,6 +17,7 @@ import numpy as np
 
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
+from morgs_mi.capture.outputs import check_output
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path, write_json
 from morgs_mi.io.video import open_frames
@@ -76,9 +78,9 @@ def synthesize(
         The folder `out`.
 
     Raises:
-        ValueError: an argument is out of range, there is no such scene, it is not as `check_scene` requires, a camera
-            sees none of its objects, or Mitsuba's variant is not vectorised.
-        FileExistsError: `out` is not empty and `overwrite` is not set, or `out` is not a capture.
+        ValueError: an argument is out of range, there is no such scene, `out` lies in a capture, the scene is not as
+            `check_scene` requires, a camera sees none of its objects, or Mitsuba's variant is not vectorised.
+        FileExistsError: `out` is not empty and `overwrite` is not set, or `out` is not a synthetic capture.
         OSError: a file cannot be written, or a mesh or texture of the scene does not exist.
     """
     if not str(mi.variant()).startswith(("llvm", "cuda")):
@@ -110,6 +112,7 @@ def synthesize(
     times = np.arange(num_frames) / fps
     check_scene(scene, [*times, times[-1] + 1 / fps])
     _check_folder(Path(out), overwrite)
+    check_output(Path(out).resolve().parent)
     with atomic_path(out, "synthesize()") as folder:
         folder.mkdir(parents=True)
         tracer = PathTracer(scene)
@@ -247,6 +250,17 @@ def _check_folder(out: Path, overwrite: bool) -> None:
         raise FileExistsError(f"synthesize(): {out} is a file; choose another folder.")
     occupied = out.is_dir() and any(out.iterdir())
     if occupied and not overwrite:
-        raise FileExistsError(f"synthesize(): {out} is not empty; choose another folder or set overwrite.")
-    if occupied and not (out / "capture.json").is_file():
-        raise FileExistsError(f"synthesize(): {out} is not a capture, so it is not replaced; choose another folder.")
+        raise FileExistsError(f"synthesize(): {out} is not empty; choose another folder, or set `overwrite`.")
+    if occupied and not _is_synthetic(out):
+        raise FileExistsError(
+            f"synthesize(): {out} is not a synthetic capture, so it is not replaced; choose another folder."
+        )
+
+
+def _is_synthetic(folder: Path) -> bool:
+    """Return whether a folder is a capture written by `synthesize`: recordings and fits have a `capture.json` too."""
+    try:
+        about = json.loads((folder / "capture.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(about, dict) and {"scene", "spp"} <= set(about)

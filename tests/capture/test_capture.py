@@ -245,9 +245,9 @@ def test_load_capture__refuses_broken_captures(tmp_path: Path, damage, error: ty
         ({"downscale": 1e300}, r"on each side, got 1e\+300; use at most 1.43"),
         ({"downscale": 0.5}, "`downscale` must be at least 1, got 0.5"),
         ({"downscale": float("nan")}, "`downscale` must be at least 1, got nan"),
-        ({"max_frames": 0}, "`max_frames` must be at least 1 or None, got 0"),
-        ({"test_view": 2}, r"`test_view` must be in 0..1, or None .* got 2"),
-        ({"test_view": -1}, r"`test_view` must be in 0..1, or None .* got -1"),
+        ({"max_frames": 0}, "`max_frames` must be at least 1, got 0"),
+        ({"test_view": 2}, r"`test_view` must be an index in 0..1, one of .*, or none .* got 2"),
+        ({"test_view": -1}, r"`test_view` must be an index in 0..1, one of .*, or none .* got -1"),
     ],
 )
 def test_load_capture__refuses_bad_arguments(tmp_path: Path, arguments: dict, message: str) -> None:

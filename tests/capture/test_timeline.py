@@ -88,7 +88,7 @@ def test_timeline__keeps_truth_only_for_unshifted_clips(tmp_path: Path) -> None:
         (
             {"a": (4, 25), "b": (6, 25)},
             ReadConfig(),
-            r"same number of frames, got a.mkv 4, b.mkv 6; .*max_frames=4 \(--frames\), .* --trim, .* --offset",
+            r"same number of frames, got a.mkv 4, b.mkv 6; .*`max_frames=4`, .* --trim, .* --offset",
         ),
         ({"a": (4, 25), "b": (4, 50)}, ReadConfig(), "same frame rate, got a.mkv 25, b.mkv 50; .* --trim"),
         ({"a": (4, 25), "b": (4, 25)}, ReadConfig(offset={"c": 1}), "`offset` must name cameras of a, b, got c"),

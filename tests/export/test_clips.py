@@ -108,10 +108,12 @@ def test_write_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (("ply", "--frames", "9"), "the frames must lie in 0..3, got '9'"),
-        (("ply", "--frames", "a:b"), "the frames must be given as 12, 10:20 or 0:100:5, got 'a:b'"),
+        (("ply", "--frames", "9"), "stream.morgs, 0 to 3, got '9'"),
+        (("ply", "--frames", "a:b"), "--frames must be like 12, 10:20 or 0:100:5, got 'a:b'"),
         (("video", "--output", "x.avi"), "the output must be FILE.mp4"),
-        (("video", "--freeze", "7"), "expected a frame of the stream, got 7"),
+        (("tracks", "--output", "stream.morgs"), "stream.morgs: the output must be FILE.npz, got '.morgs'"),
+        (("video", "--freeze", "7"), "--freeze must be in 0 to 3, got 7"),
+        (("video", "--width", "0"), "--width must be at least 1, got 0"),
         (("video", "--seconds", "-1"), "--seconds must be positive"),
         (("video", "--least-seconds", "-1"), "--least-seconds must not be negative"),
         (("video", "--path", "none.json"), "expected a camera path, found none"),

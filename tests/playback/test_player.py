@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +21,7 @@ from morgs_mi.playback.player import (
     has_confidence,
     has_offset,
     open_stream,
+    open_stream_capture,
     playback_speed,
     render_stream,
     truth_for_camera,
@@ -108,3 +111,28 @@ def test_channel_image__draws_other_channels_as_grey_values() -> None:
     image = channel_image("wetness", ramp)
     assert (image == image[..., :1]).all()
     np.testing.assert_array_equal(image, channel_image("alpha", ramp))
+
+
+@pytest.mark.parametrize("stored", ["beside", "header", "header, then moved and resumed"])
+def test_open_stream_capture__finds_the_capture_of_the_fit(fitted_clip: Path, tmp_path: Path, stored: str) -> None:
+    capture, header = str(fitted_clip / "capture"), {"test_view": 0}
+    if stored != "beside":
+        header |= {"capture": capture if stored == "header" else str(tmp_path / "moved")}
+    write_stream(tmp_path / "stream.morgs", header)
+    # Earlier versions stored the path beside the stream as it was given, relative to an unknown folder.
+    beside = "capture" if stored == "header" else capture
+    (tmp_path / "capture.json").write_text(json.dumps({"capture": beside}))
+    assert str(open_stream_capture(open_stream(tmp_path), None, [0, 1, 2]).path) == capture
+
+
+def test_open_stream_capture__asks_for_a_capture_that_has_moved(fitted_clip: Path, tmp_path: Path) -> None:
+    write_stream(tmp_path / "stream.morgs", {"test_view": 0})
+    for content in ("{", "[]", '{"capture": 3}', "{}"):
+        (tmp_path / "capture.json").write_text(content)
+        with pytest.raises(ValueError, match=r"stream\.morgs: expected the path of its capture .* --capture\.$"):
+            open_stream_capture(open_stream(tmp_path), None, [0, 1, 2])
+    (tmp_path / "capture.json").write_text(json.dumps({"capture": str(tmp_path / "old")}))
+    with pytest.raises(FileNotFoundError, match=rf"{tmp_path}/old: expected the capture of .* moved, .* --capture\.$"):
+        open_stream_capture(open_stream(tmp_path), None, [0, 1, 2])
+    shutil.copytree(fitted_clip / "capture", tmp_path / "new")
+    assert open_stream_capture(open_stream(tmp_path), tmp_path / "new", [0, 1, 2]).path == tmp_path / "new"

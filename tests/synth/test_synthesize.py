@@ -277,14 +277,20 @@ def test_synthesize__rejects_a_non_empty_folder_and_replaces_a_capture_with_over
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(FileExistsError, match="not empty; choose another folder"):
         synthesize("spheres", tmp_path, **small)
-    with pytest.raises(FileExistsError, match="is not a capture"):
-        synthesize("spheres", tmp_path, **small, overwrite=True)
+    for content in (None, "{", '{"layout": "COLMAP"}'):  # the last is that of a fit; a recording may have one too
+        if content is not None:
+            (tmp_path / "capture.json").write_text(content)
+        with pytest.raises(FileExistsError, match="is not a synthetic capture"):
+            synthesize("spheres", tmp_path, **small, overwrite=True)
+    (tmp_path / "capture.json").unlink()
     out = shutil.copytree(clip, tmp_path / "clip")
     seen = []
     synthesize("spheres", out, **small, overwrite=True, progress=lambda done, total: seen.append((done, total)))
     assert json.loads((out / "capture.json").read_text())["scene"] == "spheres"
     assert not (out / "cam02.mp4").exists()
     assert seen == [(1, 2), (2, 2)]
+    with pytest.raises(ValueError, match=f"expected an output outside of captures, .* in the capture {out}"):
+        synthesize("spheres", out / "clip", **small)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["clip", "notes.txt"]
 
 
