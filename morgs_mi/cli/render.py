@@ -29,12 +29,12 @@ class Render:
 
     def run(self) -> None:
         from morgs_mi.export.frames import write_frames
-        from morgs_mi.playback.player import find_camera, open_stream
+        from morgs_mi.playback.player import find_camera, num_frames, open_stream
 
         stream = open_stream(self.out)
         camera = find_camera(stream, self.camera)
         output = self.output or stream.path.with_name(f"{camera.name}.mp4")
-        total = stream.metadata.get("num_frames", 0)
+        total = num_frames(stream)
         with progress() as report:
             write_frames(
                 stream, camera, output, self.channels, lambda done: report("Rendering", done, max(total, done))
