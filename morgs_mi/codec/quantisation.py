@@ -204,7 +204,7 @@ def bounded(values: np.ndarray, limit: int, what: str) -> np.ndarray:
         ValueError: they do not.
     """
     if np.any((values >= limit) | (values < -limit)):
-        raise ValueError(f"an {what} must lie between -{limit} and {limit}")
+        raise ValueError(f"each {what} must lie between -{limit} and {limit}")
     return values
 
 
