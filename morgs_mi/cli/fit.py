@@ -6,16 +6,13 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import Annotated, ClassVar
 
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.settings import Flag, GivenReading, GivenSettings, Reading, Settings, optional
 from morgs_mi.config import config_toml
-
-if TYPE_CHECKING:
-    pass
 
 __all__ = ["Fit"]
 

@@ -21,7 +21,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.export.axes import up_direction
 from morgs_mi.export.paths import focus
-from morgs_mi.playback.player import MOTION_SCALE, channel_image, open_stream_capture, render, render_config
+from morgs_mi.playback.player import MOTION_SCALE, channel_image, num_frames, open_stream_capture, render, render_config
 from morgs_mi.viewer.access import checked_connections
 from morgs_mi.viewer.controls import FREE, Controls
 from morgs_mi.viewer.crop import crop_limits, is_in_box, is_shown
@@ -335,7 +335,7 @@ class Viewer:
 
     def _open_capture(self) -> Capture:
         stream = self._cache.stream
-        count = max(stream.metadata.get("num_frames", 0), self._cache.frames[-1] + 1)
+        count = max(num_frames(stream), self._cache.frames[-1] + 1)
         return open_stream_capture(stream, self._capture, list(range(count)))
 
     def _missing_capture(self) -> str | None:
