@@ -178,7 +178,7 @@ def relocated(error: ValueError, source: str, prefix: str, names: list[str]) -> 
     """
     text = re.sub(r"^[\w.]+\(\): ", "", str(error))
     keyed = re.sub(r"`(\w+)`", lambda m: f"`{prefix}{m[1]}`" if m[1] in names else m[0], text)
-    return ValueError(f"{source}: {keyed}") if keyed != text else error
+    return ValueError(f"{source}: {keyed}") if any(f"`{name}`" in text for name in names) else error
 
 
 def _replaced(config: Any, values: Mapping[str, Any], source: str, prefix: str) -> Any:
@@ -236,6 +236,9 @@ def _converted(value: Any, kind: Any) -> Any:
             kinds = kinds[:1] * len(value) if kinds[1:] == (...,) else kinds
             if len(kinds) == len(value):
                 return tuple(_converted(*pair) for pair in zip(value, kinds, strict=True))
+        if origin is dict and isinstance(value, dict):
+            names, values = get_args(arm)
+            return {_converted(k, names): _converted(v, values) for k, v in value.items()}
     raise TypeError
 
 

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.outputs import check_output
 from morgs_mi.config import StreamConfig
-from morgs_mi.core.files import write_json
+from morgs_mi.core.files import locked_folder, write_json
 from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.figures import motion_scale
@@ -118,10 +119,17 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Progre
         progress: called with (step, done, total).
 
     Raises:
-        ValueError: a setting is out of range.
-        OSError: a file cannot be written, or ``capture`` exists and is not a capture.
+        ValueError: a setting is out of range, or `out` lies in a capture.
+        OSError: a file cannot be written, another process writes into the folder, or ``capture`` exists and is not a
+            synthetic capture.
     """
-    root, config, report_progress = Path(out), config or DemoConfig(), progress or (lambda step, done, total: None)
+    root = check_output(Path(out))
+    with locked_folder(root, "run_demo()"):
+        return _run(root, config or DemoConfig(), progress or (lambda step, done, total: None))
+
+
+def _run(root: Path, config: DemoConfig, report_progress: Progress) -> DemoReport:
+    """Run the demonstration in a folder that nobody else writes into."""
     seconds: dict[str, float] = {}
 
     def run_step(name: str, work: Callable[[Callable[[float, float], None]], Any]) -> Any:

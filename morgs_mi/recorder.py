@@ -3,12 +3,16 @@
 A fit may be killed at any instruction. The file then holds complete packets and perhaps a part of the next one. A
 frame's row is written to the report before its packet is written to the stream, so that every packet has a row. Nothing
 else is stored, because the state of the loop follows from the stream and the recording (see `StreamState`).
+
+A stream is made to be shared, so its header has no paths; where the capture is stands in the `capture.json` beside it.
 """
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from hashlib import blake2b
 from itertools import chain, islice
@@ -21,15 +25,19 @@ import numpy as np
 
 from morgs_mi.calibration.rig_check import match_capture, triangulate_points
 from morgs_mi.capture.capture import Capture, PartialFrame
+from morgs_mi.capture.outputs import check_output
 from morgs_mi.codec.container import PacketKind, StreamWriter, TruncatedStreamError, header_json
 from morgs_mi.codec.packets import CodedFrame, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
-from morgs_mi.core.files import write_json
+from morgs_mi.core.files import is_same_file, locked_folder, write_json
 from morgs_mi.method.flow import choose_key_views
 from morgs_mi.stream_loop import MIN_POINTS, FrameReport, StreamLoop
 
-__all__ = ["stream_capture"]
+__all__ = ["FILES", "stream_capture"]
+
+FILES = ("stream.morgs", "capture.json", "report.json")
+"""Names of the files that a fit writes into its folder."""
 
 
 def stream_capture(
@@ -41,7 +49,8 @@ def stream_capture(
 ) -> list[FrameReport]:
     """Fit a whole capture and write OUT/stream.morgs packet by packet, and OUT/report.json with every frame.
 
-    OUT/capture.json describes how the capture was read. Points are triangulated where a capture has too few.
+    OUT/capture.json has the capture's path and describes how it was read. Points are triangulated where a capture has
+    too few. OUT is locked meanwhile.
 
     Args:
         capture: cameras and frames; the test view is not trained on, but is part of the stream's header.
@@ -55,11 +64,27 @@ def stream_capture(
         The reports of all frames, including those before an interruption.
 
     Raises:
-        OSError: the disk is full or not writable; the stream is complete up to the last frame. ValueError: as
-        `StreamLoop`; or the stream to resume is damaged, or belongs to another capture or other settings.
+        OSError: the disk is full or not writable, another fit writes into OUT, or the stream was removed, moved or
+        replaced meanwhile; the stream is complete up to the last frame.
+        ValueError: as `StreamLoop`; OUT lies in a capture; or the stream to resume is damaged, or belongs to another
+        capture or other settings.
     """
-    config, out, train = config or StreamConfig(), Path(out), capture.train_views
-    frames = capture.partial_frames()
+    out = Path(out)
+    for name in FILES:
+        check_output(out / name)
+    with locked_folder(out, "stream_capture()"):
+        return _stream(capture, out, config or StreamConfig(), on_step, resume)
+
+
+def _stream(
+    capture: Capture,
+    out: Path,
+    config: StreamConfig,
+    on_step: Callable[[int, int, int], None] | None,
+    resume: bool,
+) -> list[FrameReport]:
+    """Fit a capture into a folder that nobody else writes into."""
+    path, train, frames = out / "stream.morgs", capture.train_views, capture.partial_frames()
     first = next(frames)
     metadata = _metadata(capture, first, config)
     interrupted = _interrupted(out, capture, metadata) if resume else None
@@ -72,10 +97,10 @@ def stream_capture(
         config,
         [capture.masks[v] for v in train],
     )
+    about = _about(capture, None if interrupted is None else out / "capture.json")
     if interrupted is None:
-        out.mkdir(parents=True, exist_ok=True)
-        write_json(out / "capture.json", capture.metadata())
-        writer, reports = StreamWriter(out / "stream.morgs", capture.cameras, capture.fps, metadata), []
+        write_json(out / "capture.json", about)
+        writer, reports = StreamWriter(path, capture.cameras, capture.fps, metadata), []
         frames = chain((first,), frames)
     else:
         # Changes are detected against references that depend on all images so far.
@@ -83,9 +108,10 @@ def stream_capture(
         frames = capture.partial_frames(start)
         past = islice(frames, now + 1 - start)
         loop.resume(interrupted.coded, ([frame.images[v] for v in train] for frame in past))
-        writer = StreamWriter.continued(out / "stream.morgs", interrupted.index, interrupted.end)
+        write_json(out / "capture.json", about)
+        writer = StreamWriter.continued(path, interrupted.index, interrupted.end)
         reports = interrupted.reports
-    interval = config.codec.keyframe_interval
+    interval, written = config.codec.keyframe_interval, os.stat(path)
     with writer:
         if interrupted is not None and interrupted.index[-1][0] == PacketKind.RESIDUAL:
             _reemit_keyframe(writer, interrupted.coded, interval)
@@ -94,10 +120,22 @@ def stream_capture(
             packet, report = loop.push([frame.images[v] for v in train], tick)
             status = "; ".join([*([report.status] if report.status != "ok" else []), *frame.problems]) or "ok"
             reports.append(replace(report, status=status))
+            _check_in_place(path, written)
             write_json(out / "report.json", {**metadata, "frames": [asdict(r) for r in reports]})
             writer.write(packet)
             _reemit_keyframe(writer, loop.state.coded, interval)
+    _check_in_place(path, written)
     return reports
+
+
+def _check_in_place(path: Path, written: os.stat_result) -> None:
+    """Raise `FileNotFoundError` if the stream that is being written has been removed, moved or replaced."""
+    if not is_same_file(path, written):
+        found = "another file" if path.exists() else "none"
+        raise FileNotFoundError(
+            f"{path}: expected the stream that is being written, found {found}: it was removed, moved or replaced; "
+            "start again, or resume it where it is now."
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,12 +166,11 @@ def _interrupted(out: Path, capture: Capture, metadata: Mapping[str, Any]) -> _I
         stream = StreamReader(path)
     except (FileNotFoundError, TruncatedStreamError):
         return None
+    # Streams of earlier versions have paths in their headers.
+    recorded = _without_folders({name: value for name, value in stream.metadata.items() if name != "capture"})
     old, new = (
         json.loads(header_json(*parts))
-        for parts in (
-            (stream.cameras, stream.fps, stream.metadata),
-            (capture.cameras, capture.fps, metadata),
-        )
+        for parts in ((stream.cameras, stream.fps, recorded), (capture.cameras, capture.fps, metadata))
     )
     if difference := _difference(old, new):
         name, before, now = difference
@@ -152,8 +189,7 @@ def _metadata(capture: Capture, first: PartialFrame, config: StreamConfig) -> di
     """Return the entries of the stream's header about the fit; they must agree for a fit to be resumed."""
     train = capture.train_views
     key_views = choose_key_views([capture.cameras[v] for v in train], config.motion.key_views)
-    return {
-        "capture": str(Path(capture.path).resolve()),
+    metadata = {
         "fingerprint": _fingerprint([*first.images, capture.points, capture.point_colors]),
         "downscale": capture.downscale,
         "test_view": capture.test_view,
@@ -165,6 +201,30 @@ def _metadata(capture: Capture, first: PartialFrame, config: StreamConfig) -> di
         "versions": {"mitsuba": mi.__version__},
         "variant": mi.variant(),
     }
+    return _without_folders(metadata)
+
+
+def _without_folders(metadata: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a header's metadata with methods such as ``onnx:FILE`` that have the names of their files alone."""
+    match metadata:
+        case {"config": {"motion": {"flow_method": str(flow), "mask_method": str(masks)} as motion} as config}:
+            motion = {**motion, "flow_method": _without_folder(flow), "mask_method": _without_folder(masks)}
+            return {**metadata, "config": {**config, "motion": motion}}
+    return dict(metadata)
+
+
+def _without_folder(method: str) -> str:
+    kind, colon, files = method.partition(":")
+    return kind + colon + ",".join(Path(file).name for file in files.split(","))
+
+
+def _about(capture: Capture, earlier: Path | None) -> dict[str, Any]:
+    """Return the content of `capture.json`: that of an earlier fit if there is one, with the capture's present path."""
+    about = capture.metadata()
+    if earlier is not None:
+        with suppress(OSError, ValueError):
+            about = json.loads(earlier.read_text(encoding="utf-8"))
+    return {**about, "capture": str(Path(capture.path).resolve())}
 
 
 def _fingerprint(arrays: Iterable[np.ndarray | None]) -> str:

@@ -28,6 +28,12 @@ def llvm_variant():
     mi.set_variant("llvm_ad_rgb")
 
 
+@pytest.fixture
+def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Accept downscaled images that are too small for a fit, so that tests are fast."""
+    monkeypatch.setattr("morgs_mi.capture.capture._MIN_SIDE", 1)
+
+
 @pytest.fixture(scope="session")
 def fitted_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a capture, its ground truth and its stream; all images are rendered from the stream."""

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import resource
+import shlex
+import signal
 import subprocess
 import sys
 import tomllib
@@ -18,9 +21,9 @@ import numpy as np
 import pytest
 
 from morgs_mi import cli
+from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.cli.console import with_option_names
 from morgs_mi.cli.settings import SETTINGS, Reading
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet, play, reemitted_keyframe
@@ -33,6 +36,7 @@ from morgs_mi.io.exr import read_exr
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.cameras import look_at_cameras
+from tests.scenes.captures import colmap
 from tests.scenes.changing_splats import write_stream
 from tests.scenes.gaussians import isotropic
 
@@ -147,7 +151,7 @@ def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
     capture: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     truncated_clip(capture)
-    monkeypatch.setattr("morgs_mi.io.video._count_packets", lambda path: FRAMES)
+    monkeypatch.setattr("morgs_mi.io.video._frame_times", lambda path: np.arange(FRAMES) / 25)
     assert run(capsys, "fit", capture, tmp_path / "out", *QUICK)[0] == 0
     frames = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
     assert [frame["missing_views"] for frame in frames] == [[], ["cam1"], ["cam1"]]
@@ -192,9 +196,9 @@ def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
 @pytest.mark.parametrize(
     ("args", "parts"),
     [
-        (["--frames", "0"], ("--frames must be at least 1 or None, got 0",)),
+        (["--frames", "0"], ("--frames must be at least 1, got 0",)),
         (["--downscale", "0.5"], ("--downscale must be at least 1, got 0.5",)),
-        (["--test-view", "3"], ("--test-view must be in 0..2", "got 3")),
+        (["--test-view", "3"], ("--test-view must be an index in 0..2, one of cam0, cam1, cam2, or none", "got 3")),
         (["--offset", "cam9", "1"], ("--offset must name cameras of cam0, cam1, cam2, got cam9",)),
         (["--num-gaussians", "0"], ("--num-gaussians must be at least 1, got 0",)),
         (["--epochs", "0", "--preset", "s"], ("--epochs must be at least 1, got 0",)),
@@ -401,34 +405,146 @@ def test_main__runs_as_a_module() -> None:
     assert_one_sentence(result.stderr, "expected the folders CAPTURE and OUT")
 
 
-@pytest.mark.parametrize(
-    ("sentence", "expected"),
-    [
-        ("f(): `a` must be 1, got 2.", "--a must be 1, got 2."),
-        ("A.f(): `b` must be below `a`.", "`b` must be below --a."),
-        ("f(): `b` must be 1.", "f(): `b` must be 1."),
-        ("clip: `a` must be 1.", "clip: --a must be 1."),
-        ("clip/file.json: `a` must be 1.", "clip/file.json: `a` must be 1."),
-        ("f(): `x.a` must be 1.", "--x-a must be 1."),
-        ("Something about `a`.", "Something about `a`."),
-    ],
-)
-def test_with_option_names__changes_only_arguments(sentence: str, expected: str) -> None:
-    assert with_option_names(sentence, {"a": "--a", "x.a": "--x-a"}, "clip") == expected
-
-
 def test_main__names_an_output_that_cannot_be_written(capture: Path, stream: Path, tmp_path: Path, capsys) -> None:
     (tmp_path / "file").write_text("")
+    size = ("--cameras", 2, "--frames", 1, "--width", 16, "--height", 16)
+    for folder in (tmp_path / "file", Path("/sys")):  # nobody, not even root, may create files in /sys
+        for args in (
+            ("fit", capture, folder / "out", *QUICK),
+            ("synth", "spheres", folder / "out", *size),
+            ("render", stream, "--camera", 0, "--output", folder / "a.mp4"),
+            ("render", stream, "--camera", 0, "--output", folder / "exr"),
+            ("export", "ply", stream, "--output", folder / "ply"),
+            ("export", "tracks", stream, "--output", folder / "a.npz"),
+            ("salvage", stream, folder / "a.morgs"),
+            ("info", capture, "--no-check", "--plot", folder / "rig.png"),
+            ("demo", folder / "out"),
+        ):
+            status, _, error = run(capsys, *args)
+            assert status == 1
+            assert_one_sentence(
+                error.splitlines()[-1], "Cannot write ", str(folder), "check that its folder is writable"
+            )
+            assert "Errno" not in error
+    for args in (("fit", capture, tmp_path / "file", *QUICK), ("demo", tmp_path / "file")):
+        status, _, error = run(capsys, *args)
+        assert status == 1
+        assert_one_sentence(error, f"{tmp_path / 'file'} is a file; name a folder")
+
+
+def test_main__writes_nothing_into_a_capture(capture: Path, stream: Path, tmp_path: Path, capsys) -> None:
+    (capture / "capture.json").write_text('{"fps": 25}')
+    place = tmp_path / "link"
+    place.symlink_to(capture)
+    before = tree(capture)
     for args in (
-        ("fit", capture, tmp_path / "file" / "out", *QUICK),
-        ("synth", "spheres", tmp_path / "file" / "out", "--cameras", 2, "--frames", 1, "--width", 16, "--height", 16),
-        ("render", stream, "--camera", 0, "--output", tmp_path / "file" / "a.mp4"),
-        ("render", stream, "--camera", 0, "--output", tmp_path / "file" / "exr"),
-        ("demo", tmp_path / "file" / "out"),
+        ("fit", capture, capture, *QUICK),
+        ("fit", capture, place, *QUICK, "--resume"),
+        ("fit", capture, capture / "new" / "out", *QUICK),
+        ("demo", place),
+        ("synth", "spheres", place / "clip"),
+        ("render", stream, "--camera", 0, "--output", place / "cam0.mkv.mp4"),
+        ("render", stream, "--camera", 0, "--output", place / "cam0"),
+        ("export", "ply", stream, "--output", place / "ply"),
+        ("export", "gltf", stream, "--output", place / "gltf"),
+        ("export", "video", stream, "--output", place / "cam0.mp4"),
+        ("export", "tracks", stream, "--output", place / "a.npz"),
+        ("eval", stream, "--capture", capture, "--json", place / "capture.json"),
+        ("eval", stream, "--capture", capture, "--figures", place / "figures"),
+        ("info", capture, "--plot", place / "cam0.png"),
+        ("salvage", stream, place / "capture.json"),
     ):
         status, _, error = run(capsys, *args)
         assert status == 1
-        assert_one_sentence(error, str(tmp_path / "file"))
+        assert_one_sentence(
+            error, "expected an output outside of captures, which stay as they were recorded, got one in"
+        )
+    status, _, error = run(capsys, "synth", "spheres", capture, "--overwrite")
+    assert status == 1
+    assert_one_sentence(error, f"{capture} is not a synthetic capture")
+    assert tree(capture) == before
+
+
+def tree(path: Path) -> dict[str, bytes | None]:
+    """Return the content of every file below `path` by its name, None for folders."""
+    return {str(p.relative_to(path)): p.read_bytes() if p.is_file() else None for p in sorted(path.rglob("*"))}
+
+
+def test_eval__replaces_no_file_of_the_fit(stream: Path, tmp_path: Path, capsys) -> None:
+    for name in ("good.morgs", "report.json", "capture.json"):
+        status, _, error = run(capsys, "eval", stream, "--json", tmp_path / name)
+        assert status == 1
+        assert_one_sentence(error, f"{name}: expected a new file, got one that the fit has written")
+
+
+@pytest.mark.parametrize(("view", "test_view"), [("cam1", 1), ("2", 2), ("none", None), ("None", None), ("auto", None)])
+def test_fit__takes_the_held_out_camera_by_index_or_name(
+    capture: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch, view: str, test_view: int | None
+) -> None:
+    assert fitted_capture(monkeypatch, capsys, capture, tmp_path, "--test-view", view).test_view == test_view
+
+
+def fitted_capture(monkeypatch: pytest.MonkeyPatch, capsys, capture: Path, out: Path, *args: object) -> Capture:
+    """Return the capture that `morgs-mi fit` passes on."""
+    passed: list[Capture] = []
+
+    def stop(capture: Capture, *_: object) -> None:
+        passed.append(capture)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("morgs_mi.recorder.stream_capture", stop)
+    assert run(capsys, "fit", capture, out, *args)[0] == 130
+    return passed[0]
+
+
+def test_fit__refuses_to_leave_fewer_than_32_pixels(tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    clip = colmap(tmp_path / "clip")  # 62x46
+    status, _, error = run(capsys, "fit", clip, tmp_path / "out", "--downscale", 1.5)
+    assert status == 1
+    assert_one_sentence(
+        error, "--downscale must leave images of at least 32 pixels on each side, got 1.5; use at most 1.43."
+    )
+    assert fitted_capture(monkeypatch, capsys, clip, tmp_path / "out", "--downscale", 1.43).cameras[0].height == 32
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
+    capture: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    push = StreamLoop.push
+
+    def interrupted(loop: StreamLoop, *args: Any):
+        if loop.state.frame == 2:
+            os.kill(os.getpid(), number)
+        return push(loop, *args)
+
+    monkeypatch.setattr(StreamLoop, "push", interrupted)
+    args = ["fit", str(capture), str(tmp_path / "my out"), *QUICK]
+    status, _, error = run(capsys, *args)
+    again = shlex.join(["morgs-mi", *args, "--resume"])
+    stands = f"Interrupted. {tmp_path / 'my out'}/stream.morgs holds frames 0 to 1 of 3; continue with `{again}`."
+    assert (status, error) == (130, f"{stands}\n")
+
+
+def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
+    capture: Path, stream: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "out").mkdir()
+    stream.rename(tmp_path / "out" / "stream.morgs")
+    monkeypatch.setattr("morgs_mi.recorder.StreamLoop", interrupt)
+    status, _, error = run(capsys, "fit", capture, tmp_path / "out", *QUICK)
+    assert (status, error) == (130, "Interrupted.\n")
+    assert len(StreamReader(tmp_path / "out" / "stream.morgs").index()) == 2
+
+
+def interrupt(*_: object, **__: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_main__reports_a_full_standard_output_in_one_sentence(capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert run(capsys, "fit", "--print-config")[::2] == (1, "No space left on device.\n")
 
 
 @pytest.mark.parametrize(
@@ -476,7 +592,7 @@ def test_main__names_a_missing_or_empty_stream(stream: Path, tmp_path: Path, cap
     assert_one_sentence(error, "stream.morgs: expected a stream, found none")
     status, _, error = run(capsys, "eval", stream)
     assert status == 1
-    assert_one_sentence(error, "its header names no capture", "--capture")
+    assert_one_sentence(error, "expected the path of its capture", "--capture")
     with StreamWriter(stream, rig(), 25):
         pass
     for output in (tmp_path / "a.mp4", tmp_path / "exr"):
@@ -500,7 +616,7 @@ def test_salvage__writes_the_intact_frames_and_lists_the_lost_ones(tmp_path: Pat
     assert status == 0
     damaged, after, *_, result, lost = output.splitlines()
     assert damaged == f"{path}: bytes {index[2][2]} to {index[3][2]}: the bytes are damaged."
-    assert f"bytes {index[3][2]} to {index[4][2]}: packet of frame 3: it does not continue the state after" in after
+    assert f"bytes {index[3][2]} to {index[4][2]}: intact packet 3, frame 3: it does not continue" in after
     assert result == f"{new}: 2 frames, 0 to 1."
     assert lost.startswith("3 frames cannot be played, 2 to 4: their packets are damaged, missing, or continue one")
     assert [frame for frame, _ in play(StreamReader(new))] == [0, 1]
@@ -513,8 +629,8 @@ def test_salvage__writes_the_intact_frames_and_lists_the_lost_ones(tmp_path: Pat
     assert (status, output.splitlines()[0]) == (0, f"{new}: 3 frames, 0, 3 to 4.")
     assert "3 frames cannot be played, 1 to 2, 5: " in output
 
-    # The metadata is not checked: any type, any size.
-    for total, named in ((10**30, f", 5 to {10**30 - 1}: "), ("many", ", 1 to 2: "), (2, ", 1 to 2: ")):
+    # Metadata may have any type and size.
+    for total, named in ((10**18, f", 5 to {10**18 - 1}: "), ("many", ", 1 to 2: "), (2, ", 1 to 2: ")):
         with StreamWriter(path, rig(), 25, {"num_frames": total}) as writer:
             for state in (states[0], states[3], states[4]):
                 writer.write(reemitted_keyframe(state))
@@ -550,7 +666,8 @@ def test_fit__ends_with_a_whole_packet_on_a_full_disk(capture: Path, tmp_path: P
     args = [sys.executable, "-c", script, "fit", str(capture), str(tmp_path / "out"), *QUICK]
     result = subprocess.run(args, capture_output=True, text=True, check=False)
     assert result.returncode == 1
-    assert_one_sentence(result.stderr, "stream.morgs", "could not be written", "free space on the disk")
+    assert_one_sentence(result.stderr, "stream.morgs", "could not be written", "free space on the disk. ", "--resume`.")
+    assert "Errno" not in result.stderr
     reader = StreamReader(tmp_path / "out" / "stream.morgs")
     assert len(list(reader)) == 1
     assert reader.metadata["num_frames"] == FRAMES
@@ -575,9 +692,6 @@ def test_render__removes_its_output_on_a_full_disk(stream: Path, tmp_path: Path,
 def test_render__removes_its_output_when_interrupted(
     stream: Path, tmp_path: Path, capsys, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def interrupt(*args: object, **more: object) -> None:
-        raise KeyboardInterrupt
-
     monkeypatch.setattr("morgs_mi.playback.player.rasterize", interrupt)
     status, _, error = run(capsys, "render", stream, "--camera", 0)
     assert status == 130

@@ -10,6 +10,7 @@ import cv2
 import pytest
 
 from morgs_mi.config import StreamConfig
+from morgs_mi.core.files import locked_folder
 from morgs_mi.demo import ClipConfig, DemoConfig, _synthesize_clip, run_demo
 from morgs_mi.fit.config import FitConfig
 
@@ -56,3 +57,12 @@ def test_run_demo__reuses_a_clip_with_the_same_settings(out: Path) -> None:
     assert marker.exists()
     _synthesize_clip(out / "capture", replace(SMALL, clip=replace(SMALL.clip, num_frames=1)), lambda done, total: None)
     assert not marker.exists()
+
+
+def test_run_demo__refuses_a_folder_into_which_another_demo_writes(tmp_path: Path) -> None:
+    with (
+        locked_folder(tmp_path, "test()"),
+        pytest.raises(BlockingIOError, match="expected a folder into which nothing else is written"),
+    ):
+        run_demo(tmp_path, SMALL)
+    assert list(tmp_path.iterdir()) == []

@@ -19,8 +19,9 @@ from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import PAYLOAD, TRAILER, StreamWriter
 from morgs_mi.codec.packets import CodedFrame, coded_frames, play, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.recorder import stream_capture
+from morgs_mi.recorder import _metadata, _without_folder, stream_capture
 from morgs_mi.stream_loop import StreamLoop
+from tests.scenes.captures import colmap
 from tests.scenes.coded_clip import history
 from tests.scenes.recording import CONFIG, FRAMES, Recording, recording
 
@@ -208,3 +209,91 @@ def test_stream_capture__does_not_resume_a_damaged_fit(whole: Path, tmp_path: Pa
     with pytest.raises(ValueError, match="the bytes are damaged"):
         stream_capture(recording(), out, CONFIG, resume=True)
     assert stream_of(out) == damaged
+
+
+def test_stream_capture__refuses_a_folder_into_which_another_fit_writes(whole: Path, tmp_path: Path) -> None:
+    """The other one goes on, and its files are whole."""
+    refused = []
+
+    def fit_too(frame: int, step: int, steps: int) -> None:
+        if step == 1 and frame in (1, 3):
+            with pytest.raises(BlockingIOError, match="out: expected a folder into which nothing else is written") as e:
+                stream_capture(recording(), tmp_path / "out", CONFIG, resume=frame == 3)
+            refused.append(e)
+
+    stream_capture(recording(), tmp_path / "out", CONFIG, fit_too)
+    assert len(refused) == 2
+    assert_same(tmp_path / "out", whole)
+
+
+@pytest.mark.parametrize("change", ["removed", "removed folder", "moved", "replaced"])
+def test_stream_capture__ends_when_its_stream_is_taken_away(whole: Path, tmp_path: Path, change: str) -> None:
+    out, seen = tmp_path / "out", []
+
+    def take_away(frame: int, step: int, steps: int) -> None:
+        seen.append(frame)
+        if frame != 2 or step != 1:
+            return
+        if change == "removed":
+            (out / "stream.morgs").unlink()
+        elif change == "replaced":
+            shutil.copy(whole / "stream.morgs", tmp_path / "other")
+            (tmp_path / "other").replace(out / "stream.morgs")
+        else:
+            out.rename(tmp_path / "moved")
+
+    found = "another file" if change == "replaced" else "none"
+    with pytest.raises(FileNotFoundError, match=rf"stream\.morgs: expected the stream that is being .*, found {found}"):
+        stream_capture(recording(), out, CONFIG, take_away)
+    assert max(seen) == 2
+    if change == "replaced":
+        assert stream_of(out) == stream_of(whole)
+    elif change == "moved":
+        assert not out.exists()
+        stream_capture(recording(), tmp_path / "moved", CONFIG, resume=True)
+        assert_same(tmp_path / "moved", whole)
+
+
+def test_stream_capture__writes_no_path_into_the_stream(tmp_path: Path) -> None:
+    """A stream is shared; its capture is named in the file beside it."""
+    secret = tmp_path / "home" / "jane"
+    methods = replace(CONFIG.motion, flow_method=f"files:{secret}/flow", mask_method="none")
+    capture = recording(path=secret / "clip")
+    header = _metadata(capture, next(capture.partial_frames()), replace(CONFIG, motion=methods))
+    assert "jane" not in json.dumps(header)
+    assert header["config"]["motion"]["flow_method"] == "files:flow"
+    assert _without_folder("sam2:/a/encoder.onnx,/b/decoder.onnx") == "sam2:encoder.onnx,decoder.onnx"
+    stream_capture(capture, tmp_path / "out", CONFIG)
+    assert b"jane" not in stream_of(tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "capture.json").read_text())["capture"] == str(secret / "clip")
+
+
+def test_stream_capture__resumes_a_stream_whose_header_has_a_path(whole: Path, tmp_path: Path) -> None:
+    """As the headers of earlier versions have; the recording may have moved."""
+    reader, out = StreamReader(whole / "stream.morgs"), tmp_path / "out"
+    shutil.copytree(whole, out)
+    about = {**reader.metadata, "capture": "/elsewhere"}
+    with StreamWriter(out / "stream.morgs", reader.cameras, reader.fps, about) as writer:
+        for packet in list(reader)[:3]:
+            writer.write(packet)
+    stream_capture(recording(), out, CONFIG, resume=True)
+    assert history(coded_frames(StreamReader(out / "stream.morgs"))) == history(coded_frames(reader))
+    assert json.loads((out / "capture.json").read_text())["capture"] == str(Path("noise").resolve())
+
+
+@pytest.mark.parametrize("link", ["", "folder", "file"])
+def test_stream_capture__does_not_write_into_a_capture(tmp_path: Path, link: str) -> None:
+    capture, out = colmap(tmp_path / "clip"), tmp_path / "clip"
+    (capture / "capture.json").write_text("{}")
+    before = sorted(capture.rglob("*"))
+    if link == "folder":
+        out = tmp_path / "out"
+        out.symlink_to(capture / "videos")
+    elif link == "file":
+        out = tmp_path / "out"
+        out.mkdir()
+        (out / "capture.json").symlink_to(capture / "capture.json")
+    with pytest.raises(ValueError, match=rf"an output outside of captures, .* in the capture {capture}; choose"):
+        stream_capture(recording(), out, CONFIG)
+    assert sorted(capture.rglob("*")) == before
+    assert (capture / "capture.json").read_text() == "{}"

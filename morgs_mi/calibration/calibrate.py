@@ -6,16 +6,19 @@ The scale and the up direction of the model's world are arbitrary: images do not
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import cv2
 import numpy as np
 
-from morgs_mi.capture.layouts.clips import clips_by_camera
+from morgs_mi.calibration.mistakes import same_poses
+from morgs_mi.calibration.rig_check import MAX_ERROR, CameraCheck
+from morgs_mi.capture.layouts.clips import EXAMPLE, clips_by_camera, photos
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.video import open_frames
 
@@ -24,6 +27,8 @@ __all__ = ["CalibrateConfig", "CalibrationResult", "calibrate"]
 # With fewer features in a view COLMAP cannot register it.
 _MIN_FEATURES = 100
 _TRIES = 3
+# COLMAP registers a camera with fewer points, but its pose then rests on a few of them.
+_MIN_POINTS = 50
 _MORE_TEXTURE = "light the scene evenly, add textured objects, or record a frame with such objects before the take"
 
 
@@ -55,6 +60,7 @@ class CalibrationResult:
         left_out: names of the cameras that could not be calibrated.
         points: number of points.
         error: mean reprojection error of the points, px.
+        checks: result of every camera, those that are left out included; `matches` is the number of its points.
     """
 
     model: Path
@@ -62,6 +68,7 @@ class CalibrationResult:
     left_out: tuple[str, ...]
     points: int
     error: float
+    checks: tuple[CameraCheck, ...]
 
 
 def calibrate(
@@ -73,7 +80,7 @@ def calibrate(
     """Calibrate a folder of clips, one per camera, and write ``sparse/0`` there; nothing is written on failure.
 
     Args:
-        path: the folder: videos, or a folder of images per camera.
+        path: the folder: videos, a folder of images per camera, or one photo per camera.
         config: settings.
         overwrite: whether to replace an existing model.
         progress: called with (stage, done, total).
@@ -110,16 +117,45 @@ def calibrate(
         with atomic_path(path / "sparse", "calibrate()") as folder:
             (folder / "0").mkdir(parents=True)
             model.write_text(str(folder / "0"))
-    error = float(model.compute_mean_reprojection_error())
-    return CalibrationResult(path / "sparse" / "0", names, left_out, model.num_points3D(), error)
+    error, checks = float(model.compute_mean_reprojection_error()), _checks(model, list(images))
+    return CalibrationResult(path / "sparse" / "0", names, left_out, model.num_points3D(), error, checks)
+
+
+def _checks(model: Any, names: Sequence[str]) -> tuple[CameraCheck, ...]:
+    """Return the result of each camera from its points in COLMAP's model."""
+    images = {Path(model.image(i).name).stem: model.image(i) for i in model.reg_image_ids()}
+    checks = {name: _check(name, images.get(name), model) for name in names}
+    poses = {name: np.vstack([image.cam_from_world().matrix(), [0, 0, 0, 1]]) for name, image in images.items()}
+    cameras = [Camera(np.eye(3), pose, 1, 1, name) for name, pose in poses.items()]
+    for i, j in same_poses(cameras):
+        for own, other in ((cameras[i].name, cameras[j].name), (cameras[j].name, cameras[i].name)):
+            advice = f"it has the same pose as {other}: one clip seems to be a copy of the other; replace it"
+            checks[own] = replace(checks[own], fits=False, advice=advice)
+    return tuple(checks.values())
+
+
+def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
+    if image is None:
+        return CameraCheck(name, 0, float("nan"), None, f"it could not be registered and has no pose: {_MORE_TEXTURE}")
+    seen = [p for p in image.points2D if p.has_point3D()]
+    projected = (image.project_point(model.point3D(p.point3D_id).xyz) for p in seen)
+    errors = [np.inf if q is None else float(np.linalg.norm(q - p.xy)) for p, q in zip(seen, projected, strict=True)]
+    error, advice = float(np.median(errors)), ""
+    if len(seen) < _MIN_POINTS:
+        advice = f"only {len(seen)} points, {_MIN_POINTS} are needed for a reliable pose: {_MORE_TEXTURE}"
+    elif error > MAX_ERROR:
+        advice = "its points do not fit: try a camera model with more parameters (--camera-model)"
+    return CameraCheck(name, len(seen), error, not advice, advice)
 
 
 def _frames(path: Path, config: CalibrateConfig) -> dict[str, np.ndarray]:
     """Return one image of each camera by its name."""
-    clips = clips_by_camera(path)
+    clips = clips_by_camera(path) or photos(path)
     if len(clips) < 2:
         found = ", ".join(clips) or "none"
-        raise ValueError(f"{path}: expected the clips of at least two cameras, found {found}; check the path.")
+        raise ValueError(
+            f"{path}: expected the clips of at least two cameras, found {found}; check the path, or make {EXAMPLE}"
+        )
     readers = {name: open_frames(clip) for name, clip in clips.items()}
     short = [name for name, reader in readers.items() if not 0 <= config.frame < reader.num_held]
     if short:

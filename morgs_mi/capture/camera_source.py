@@ -24,8 +24,9 @@ class CameraSource:
         reader: reader of the clip.
         lens: the lens that the clip was recorded through.
         undistortion: the pixel maps that remove the lens distortion, or None.
-        frame_indices: the clip's frames that show the instants 0, 1, ... of the recording, int [T].
+        frame_indices: the clip's frames that show the instants 0, 1, ... of the recording, -1 for none, int [T].
         color_correction: the colour correction, or None.
+        opaque: the mask of the recorded pixels that are not transparent [H, W], or None if all are opaque.
     """
 
     reader: FrameReader
@@ -33,10 +34,14 @@ class CameraSource:
     undistortion: Undistortion | None
     frame_indices: np.ndarray
     color_correction: ColorCorrection | None = None
+    opaque: np.ndarray | None = None
 
     def images(self, camera: Camera, start: int, stop: int) -> Generator[ImageOrError, None, None]:
         """Yield the processed images of the instants start..stop-1, with an error in place of a missing image."""
-        for image in self.reader.pick(self.frame_indices[start:stop].tolist()):
+        indices = self.frame_indices[start:stop]
+        frames = self.reader.pick(indices[indices >= 0].tolist())
+        for instant, index in enumerate(indices, start):
+            image = next(frames) if index >= 0 else ValueError(f"{self.reader.path}: no frame at instant {instant}.")
             yield self.process(image, camera) if isinstance(image, np.ndarray) else image
 
     def process(self, image: np.ndarray, camera: Camera) -> np.ndarray:
@@ -46,10 +51,16 @@ class CameraSource:
 
     def mask(self, camera: Camera) -> np.ndarray | None:
         """Return the mask of the valid pixels of `camera` [H, W] bool, or None if all are valid."""
-        if self.undistortion is None or self.undistortion.mask.all():
+        valid = self.opaque
+        if self.undistortion is not None:
+            valid = self.undistortion.mask
+            if self.opaque is not None:
+                # No transparent pixel may contribute; cubic weights are negative too.
+                valid = valid & (np.abs(self.undistortion(self.opaque.astype(np.float32)) - 1) < 1e-3)
+        if valid is None or valid.all():
             return None
         # A downscaled pixel is valid if all pixels that it averages are.
-        return _downscaled(self.undistortion.mask.astype(np.float32), camera) > 1 - 1e-4
+        return _downscaled(valid.astype(np.float32), camera) > 1 - 1e-4
 
 
 def at_clip_size(camera: Camera, reader: FrameReader) -> Camera:
@@ -60,9 +71,9 @@ def at_clip_size(camera: Camera, reader: FrameReader) -> Camera:
     """
     if (reader.width, reader.height) == (camera.width, camera.height):
         return camera
-    x, y = reader.width / camera.width, reader.height / camera.height
     # Both sides were rounded to whole pixels.
-    if abs(camera.width * y - reader.width) > 1 or abs(camera.height * x - reader.height) > 1:
+    difference = abs(camera.width * reader.height - camera.height * reader.width)
+    if difference > min(camera.width, camera.height):
         raise ValueError(
             f"{reader.path}: expected {camera.width}x{camera.height}, the calibrated size of {camera.name}, or a "
             f"scaled version of it, got {reader.width}x{reader.height}; calibrate at the recorded size."

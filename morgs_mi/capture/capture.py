@@ -7,26 +7,29 @@ optional ``capture.json`` sets ``test_view`` (index or null) and ``fps``; ``trut
 from __future__ import annotations
 
 import logging
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from morgs_mi.capture.camera_source import CameraSource, at_clip_size
 from morgs_mi.capture.color_correction import ColorCorrection, ColorFit, fit_colors
 from morgs_mi.capture.layouts.calibration import Calibration
+from morgs_mi.capture.layouts.clips import EXAMPLE
 from morgs_mi.capture.layouts.registry import find_layout
 from morgs_mi.capture.lens import undistortion
 from morgs_mi.capture.timeline import ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.prefetch import prefetched
-from morgs_mi.io.video import open_clips
+from morgs_mi.io.video import Clip, FolderReader, FrameReader, ImageOrError, open_clips
 
 __all__ = ["Capture", "Frame", "PartialFrame", "load_capture"]
 
 _LOG = logging.getLogger(__name__)
+# Pixels of the shorter side that a downscaled image needs.
+_MIN_SIDE = 32
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,7 @@ class Capture:
         layout: name of the folder's layout, e.g. ``COLMAP``.
         reading: how clips that do not match are read.
         colors: the colour correction of the cameras, or None.
+        notes: a sentence for everything about the clips that was not as expected, e.g. a variable frame rate.
     """
 
     path: Path
@@ -91,6 +95,16 @@ class Capture:
     layout: str = ""
     reading: ReadConfig = field(default_factory=ReadConfig)
     colors: ColorFit | None = None
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        colors = self.point_colors
+        if colors.shape != self.points.shape or not ((colors >= 0) & (colors <= 1)).all():
+            span = f"{colors.min():g} to {colors.max():g}" if colors.size else "none"
+            raise ValueError(
+                f"{self.path}: the colours of the points must be {list(self.points.shape)} in [0, 1], got "
+                f"{list(colors.shape)}, {span}; divide by 255 if they are bytes, and export the points again."
+            )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -127,6 +141,7 @@ class Capture:
             "points": len(self.points),
             "reading": asdict(self.reading),
             "colors": colors,
+            "notes": list(self.notes),
             "cameras": [
                 {
                     "name": camera.name,
@@ -158,6 +173,11 @@ class Capture:
         for frame in prefetched(self._decoded(start, stop, False)):
             yield PartialFrame(*frame)
 
+    def images(self, view: int, start: int = 0, stop: int | None = None) -> Iterator[ImageOrError]:
+        """Yield the images of one camera at the frames start..stop-1, with an error in place of a missing image."""
+        stop = self.num_frames if stop is None else min(stop, self.num_frames)
+        return self._sources[view].images(self.cameras[view], start, stop)
+
     def _decoded(
         self, start: int, stop: int | None, strict: bool
     ) -> Generator[tuple[int, tuple, tuple[str, ...]], None, None]:
@@ -182,7 +202,7 @@ class Capture:
 def load_capture(
     path: str | Path,
     downscale: float = 1,
-    test_view: int | Literal["auto"] | None = "auto",
+    test_view: int | str | None = "auto",
     max_frames: int | None = None,
     reading: ReadConfig | None = None,
 ) -> Capture:
@@ -191,8 +211,8 @@ def load_capture(
     Args:
         path: the folder; `layouts/registry.py` lists the supported layouts.
         downscale: factor by which images are downscaled (area averages, rounded to the nearest whole size).
-        test_view: index of the held-out camera, None for none; "auto" uses the value in `capture.json`, then the
-            layout's own, then 0 as N3DV does, or none with fewer than six cameras.
+        test_view: index or name of the held-out camera, None for none; "auto" uses the value in `capture.json`, then
+            the layout's own, then 0 as N3DV does, or none with fewer than six cameras.
         max_frames: number of frames to use at most, from the start.
         reading: how clips that do not match are read.
 
@@ -212,7 +232,7 @@ def load_capture(
     if not downscale >= 1:
         raise ValueError(f"load_capture(): `downscale` must be at least 1, got {downscale}.")
     if max_frames is not None and max_frames < 1:
-        raise ValueError(f"load_capture(): `max_frames` must be at least 1 or None, got {max_frames}.")
+        raise ValueError(f"load_capture(): `max_frames` must be at least 1, got {max_frames}.")
     reading, settings = reading or ReadConfig(), read_settings(path / "capture.json")
     layout = find_layout(path)
     calibration = layout.read(path)
@@ -225,13 +245,15 @@ def load_capture(
         )
     names = [camera.name for camera in recorded]
     common = timeline(path, names, readers, reading, max_frames, settings.get("fps"))
+    opaque = [_opaque(reader, camera.name) for reader, camera in zip(readers, recorded, strict=True)]
     sources = tuple(
-        CameraSource(reader, lens, undistortion(camera, lens), indices)
-        for reader, lens, camera, indices in zip(
-            readers, calibration.lenses, recorded, common.frame_indices, strict=True
+        CameraSource(reader, lens, undistortion(camera, lens), indices, opaque=mask)
+        for reader, lens, camera, indices, (mask, _) in zip(
+            readers, calibration.lenses, recorded, common.frame_indices, opaque, strict=True
         )
     )
     cameras = tuple(_resized(camera, downscale) for camera in recorded)
+    _check_downscale(downscale, cameras, recorded)
     capture = Capture(
         path=path,
         cameras=cameras,
@@ -247,8 +269,41 @@ def load_capture(
         downscale=downscale,
         layout=layout.name,
         reading=reading,
+        notes=(*common.notes, *(note for _, note in opaque if note), *_photos(calibration.clips)),
     )
     return _color_corrected(capture, reading) if reading.color != "none" or reading.exposure else capture
+
+
+def _opaque(reader: FrameReader, name: str) -> tuple[np.ndarray | None, str]:
+    """Return the mask of the pixels that are not transparent, None if all are opaque or it varies, and a note."""
+    if not isinstance(reader, FolderReader):
+        return None, ""
+    mask, constant = reader.opaque()
+    if not constant:
+        return None, f"{name}: the alpha channel of its images changes over time and is ignored."
+    if mask is None:
+        return None, ""
+    if not mask.any():
+        raise ValueError(f"{reader.path}: expected opaque pixels, got an alpha channel without any; remove it.")
+    return mask, f"{name}: {100 * (1 - mask.mean()):.1f} % of its pixels are transparent and masked out."
+
+
+def _photos(clips: Sequence[Clip]) -> tuple[str, ...]:
+    """Return a note if the clips are the photos in one folder."""
+    files = [clip[0] for clip in clips if isinstance(clip, tuple) and len(clip) == 1]
+    if len(files) < len(clips) or len({file.parent for file in files}) > 1:
+        return ()
+    return (f"{len(files)} photos of a static scene, one per camera; a recording has {EXAMPLE}",)
+
+
+def _check_downscale(downscale: float, cameras: Sequence[Camera], recorded: Sequence[Camera]) -> None:
+    if downscale > 1 and min(min(camera.width, camera.height) for camera in cameras) < _MIN_SIDE:
+        largest = min(min(camera.width, camera.height) for camera in recorded) / _MIN_SIDE
+        remedy = f"use at most {np.floor(100 * largest) / 100:g}" if largest >= 1 else "use 1"
+        raise ValueError(
+            f"load_capture(): `downscale` must leave images of at least {_MIN_SIDE} pixels on each side, got "
+            f"{downscale:g}; {remedy}."
+        )
 
 
 def _color_corrected(capture: Capture, reading: ReadConfig) -> Capture:
@@ -275,15 +330,20 @@ def _resized(camera: Camera, downscale: float) -> Camera:
 
 
 def _test_view(
-    path: Path, requested: int | Literal["auto"] | None, settings: dict[str, Any], calibration: Calibration
+    path: Path, requested: int | str | None, settings: dict[str, Any], calibration: Calibration
 ) -> int | None:
-    num_cameras = len(calibration.cameras)
+    names = [camera.name for camera in calibration.cameras]
     view = requested
     if view == "auto":
-        default = 0 if num_cameras >= 6 else None
+        default = 0 if len(names) >= 6 else None
         view = settings.get("test_view", default if calibration.test_view is None else calibration.test_view)
-    if view is not None and not 0 <= view < num_cameras:
-        raise ValueError(
-            f"{path}: `test_view` must be in 0..{num_cameras - 1}, or None for no held-out view, got {view}."
-        )
-    return view
+    if view is None:
+        return None
+    index = names.index(view) if view in names else view
+    if str(index).isdecimal() and int(index) < len(names):
+        return int(index)
+    place = path / "capture.json" if requested == "auto" else path
+    raise ValueError(
+        f"{place}: `test_view` must be an index in 0..{len(names) - 1}, one of {', '.join(names)}, or none for no "
+        f"held-out camera, got {view}."
+    )

@@ -64,6 +64,8 @@ def lens_and_intrinsics(model: str, params: Sequence[float]) -> tuple[Lens, np.n
             f"the camera model {model} takes {focals + 2 + coefficients} parameters, "
             f"got {len(params)}; write the model again."
         )
+    if not np.isfinite(params).all():
+        raise ValueError(f"its parameters must be finite, got {[*params]}; calibrate again.")
     fx, fy, (cx, cy) = params[0], params[focals - 1], params[focals : focals + 2]
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
     return Lens(model, tuple(map(float, params[focals + 2 :]))), K

@@ -3,11 +3,12 @@
 An instant t = 0, 1, ... is a frame of the recording. It is shown by frame k of a clip if
 
     k = o + r t,    with o the clip's offset and r its frame rate divided by the lowest frame rate.
+
+In a clip of variable frame rate k is a position on its regular clock, and the frame nearest to it shows the instant.
 """
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -16,6 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from morgs_mi.io.bounded import read_json
 from morgs_mi.io.video import FrameReader
 
 __all__ = ["ReadConfig", "Timeline", "read_settings", "timeline"]
@@ -24,6 +26,8 @@ _LOG = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0
 # 29.97 and 30 fps count as the same rate: programs write either for the same camera.
 _SAME_RATE = 1.01
+# Distance in frames up to which a frame shows an instant.
+_NEAR = 0.5
 
 
 @dataclass(frozen=True)
@@ -56,14 +60,16 @@ class Timeline:
     """Frames of each clip that show the instants of the recording.
 
     Attributes:
-        frame_indices: per camera the clip's frames in increasing order, int [T].
+        frame_indices: per camera the clip's frames in ascending order, -1 for none, int [T].
         fps: instants per second.
         unchanged: whether instant t is frame t of every clip.
+        notes: a sentence for each clip of variable frame rate.
     """
 
     frame_indices: tuple[np.ndarray, ...]
     fps: float
     unchanged: bool
+    notes: tuple[str, ...] = ()
 
 
 def timeline(
@@ -85,55 +91,136 @@ def timeline(
         fps: true frame rate of all clips, or None for the rates in their headers.
 
     Raises:
-        ValueError: lengths or rates differ and `config` does not resolve it, a clip is cut off, the clips have no
-            instant in common, or `config` names an unknown camera.
+        ValueError: lengths or rates differ or a rate varies and `config` does not resolve it, a clip is cut off, the
+            clips have no instant in common, or `config` names an unknown camera.
     """
     if unknown := [name for name in config.offset if name not in names]:
         raise ValueError(f"{path}: `offset` must name cameras of {', '.join(names)}, got {', '.join(unknown)}.")
+    rates, offsets = np.ones(len(readers)), np.zeros(len(readers))
     if not config.aligns_clips:
-        count, rate = _num_frames(path, readers, max_frames, config.gaps), _fps(path, readers, fps)
-        return Timeline((np.arange(count),) * len(readers), rate, True)
-    clip_fps = [fps or reader.fps for reader in readers]
-    lowest = min((rate for rate in clip_fps if rate), default=_DEFAULT_FPS)
-    rates = np.array([1.0 if not rate or rate < _SAME_RATE * lowest else rate / lowest for rate in clip_fps])
-    offsets = np.array([config.offset.get(name, 0) for name in names], float)
-    lengths = np.array([reader.num_frames if config.gaps else _usable_frames(reader, config) for reader in readers])
+        instants = np.arange(_num_frames(path, readers, max_frames, config.gaps), dtype=float)
+        lowest = _fps(path, readers, fps)
+    else:
+        clip_fps = [fps or reader.fps for reader in readers]
+        lowest = min((rate for rate in clip_fps if rate), default=_DEFAULT_FPS)
+        rates = np.array([1.0 if not rate or rate < _SAME_RATE * lowest else rate / lowest for rate in clip_fps])
+        shifts = (_position(r, config.offset.get(name, 0)) for name, r in zip(names, readers, strict=True))
+        offsets = np.array([*shifts], float)
+        instants = _common_instants(path, names, readers, config, rates, offsets, lowest)[:max_frames]
+    indices, apart = zip(
+        *(_nearest(reader, o + r * instants) for reader, o, r in zip(readers, offsets, rates, strict=True)),
+        strict=True,
+    )
+    if config.gaps:
+        indices = [np.where(distance > _NEAR, -1, index) for index, distance in zip(indices, apart, strict=True)]
+    used = [distance[index >= 0].max(initial=0) for index, distance in zip(indices, apart, strict=True)]
+    if (largest := float(np.max(used / (rates * lowest)))) > 1e-3:
+        _LOG.warning("%s: images of one instant are up to %.1f ms apart.", path, 1e3 * largest)
+    unchanged = all(np.array_equal(index, np.arange(len(instants))) for index in indices)
+    notes = tuple(_note(r, k) for r, k in zip(readers, indices, strict=True) if r.positions is not None)
+    return Timeline(tuple(indices), lowest, unchanged, notes)
+
+
+def _common_instants(
+    path: Path,
+    names: Sequence[str],
+    readers: Sequence[FrameReader],
+    config: ReadConfig,
+    rates: np.ndarray,
+    offsets: np.ndarray,
+    lowest: float,
+) -> np.ndarray:
+    """Return the instants that all clips cover [T]."""
+    lengths = np.array([_usable_periods(reader, config) for reader in readers])
     first, last = np.ceil(np.max(-offsets / rates)), np.floor(np.min((lengths - 1 - offsets) / rates))
-    instants = np.arange(first, last + 1)[:max_frames]
-    if not len(instants):
-        spans = zip(names, (0 - offsets) / rates / lowest, (lengths - offsets) / rates / lowest, strict=True)
-        table = ", ".join(f"{name} {start:.2f} to {stop:.2f} s" for name, start, stop in spans)
-        raise ValueError(f"{path}: the clips have no instant in common, {table}; check `offset`.")
-    exact = offsets[:, None] + rates[:, None] * instants
-    indices = np.rint(exact).astype(int)
-    apart = float(np.max(np.abs(indices - exact) / (rates[:, None] * lowest)))
-    if apart > 1e-3:
-        _LOG.warning("%s: the frame rates differ; images of one instant are up to %.1f ms apart.", path, 1e3 * apart)
-    return Timeline(tuple(indices), lowest, bool((offsets + rates * first == 0).all() and (rates == 1).all()))
+    if last >= first:
+        return np.arange(first, last + 1)
+    spans = zip(names, (0 - offsets) / rates / lowest, (lengths - offsets) / rates / lowest, strict=True)
+    table = ", ".join(f"{name} {start:.2f} to {stop:.2f} s" for name, start, stop in spans)
+    raise ValueError(f"{path}: the clips have no instant in common, {table}; check `offset`.")
 
 
-def _usable_frames(reader: FrameReader, config: ReadConfig) -> int:
-    """Return the number of frames that can be read; a truncated clip can be trimmed but not shifted."""
-    return reader.num_held if config.trim else _check_complete(reader, reader.num_frames)
+def _position(reader: FrameReader, index: int) -> int:
+    """Return the position of a frame of a clip, which may lie before its first or after its last."""
+    if reader.positions is None:
+        return index
+    held = min(max(index, 0), len(reader.positions) - 1)
+    return round(reader.positions[held]) + index - held
 
 
-def _check_complete(reader: FrameReader, required: int) -> int:
-    """Return the clip's number of frames after checking that the first `required` ones can be read."""
+def _nearest(reader: FrameReader, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the frames nearest to ascending positions, int [T], and their distances in frames [T]."""
+    if reader.positions is None:
+        indices = np.rint(positions).astype(int)
+        return indices, np.abs(indices - positions)
+    between = (reader.positions[1:] + reader.positions[:-1]) / 2
+    indices = np.searchsorted(between, positions)
+    return indices, np.abs(reader.positions[indices] - positions)
+
+
+def _note(reader: FrameReader, indices: np.ndarray) -> str:
+    """Return how irregular the times of a clip are, and how its instants are shown."""
+    assert reader.positions is not None
+    assert reader.fps
+    late = np.abs(reader.positions - np.rint(reader.positions)).max() / reader.fps
+    missing, shown = int(np.sum(indices < 0)), indices[indices >= 0]
+    repeated = len(shown) - len(np.unique(shown))
+    return (
+        f"{reader.path.name}: variable frame rate, {len(reader.positions)} frames in {_periods(reader)} periods "
+        f"of {1e3 / reader.fps:.1f} ms, up to {1e3 * late:.1f} ms off; each instant has the frame nearest in time: "
+        f"{repeated} repeat one, {missing} have none."
+    )
+
+
+def _periods(reader: FrameReader) -> int:
+    """Return the number of positions that a clip covers: that of its frames, if their rate is constant."""
+    return reader.num_frames if reader.positions is None else round(reader.positions[-1]) + 1
+
+
+def _usable_periods(reader: FrameReader, config: ReadConfig) -> int:
+    """Return the number of positions that can be read; a truncated clip can be trimmed but not shifted."""
+    if not config.gaps:
+        if not config.trim:
+            _check_complete(reader, reader.num_frames)
+        elif reader.positions is None:
+            return reader.num_held
+    return _periods(reader)
+
+
+def _check_complete(reader: FrameReader, required: int) -> None:
+    """Check that the first `required` frames of a clip can be read."""
     if required > reader.num_held:
         raise ValueError(
             f"{reader.path}: frame {reader.num_held} of {reader.num_frames} cannot be read: the file is truncated or "
-            f"broken; copy it again, use the first {reader.num_held} frames (max_frames), or leave its camera out of "
+            f"broken; copy it again, use the first {reader.num_held} frames (`max_frames`), or leave its camera out of "
             "the later ones (--gaps)."
         )
-    return reader.num_frames
+
+
+def _check_even(reader: FrameReader, required: int) -> None:
+    """Check that each of the first `required` frames of a clip shows the instant of its number."""
+    if reader.positions is None:
+        return
+    late = reader.positions[:required] - np.arange(len(reader.positions[:required]))
+    if np.abs(late).max() > _NEAR:
+        frame = int(np.argmax(np.abs(late) > _NEAR))
+        assert reader.fps
+        raise ValueError(
+            f"{reader.path}: expected a constant frame rate, got a variable one: frame {frame} is "
+            f"{1e3 * abs(late[frame]) / reader.fps:.0f} ms {'late' if late[frame] > 0 else 'early'}; use the frames "
+            "nearest in time (--trim), leave the camera out where it has none (--gaps), or convert the clip."
+        )
 
 
 def _num_frames(path: Path, readers: Sequence[FrameReader], max_frames: int | None, gaps: bool) -> int:
-    lengths = [reader.num_frames for reader in readers]
     if gaps:
-        return min(max(lengths), max_frames or max(lengths))
+        longest = max(_periods(reader) for reader in readers)
+        return min(longest, max_frames or longest)
+    lengths = [reader.num_frames for reader in readers]
     for reader in readers:
-        _check_complete(reader, min(reader.num_frames, max_frames or reader.num_frames))
+        required = min(reader.num_frames, max_frames or reader.num_frames)
+        _check_complete(reader, required)
+        _check_even(reader, required)
     shortest = min(lengths)
     if max_frames is not None and max_frames <= shortest:
         return max_frames
@@ -141,7 +228,7 @@ def _num_frames(path: Path, readers: Sequence[FrameReader], max_frames: int | No
         table = ", ".join(f"{r.path.name} {n}" for r, n in zip(readers, lengths, strict=True))
         raise ValueError(
             f"{path}: all cameras must have the same number of frames, got {table}; use the first frames with "
-            f"max_frames={shortest} (--frames), the instants that all clips cover with --trim, or align the clips with "
+            f"`max_frames={shortest}`, the instants that all clips cover with --trim, or align the clips with "
             "--offset."
         )
     return shortest
@@ -168,10 +255,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     """
     if not path.exists():
         return {}
-    try:
-        settings = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: expected JSON, got a broken file ({error}); correct it.") from None
+    settings = read_json(path)
     if not isinstance(settings, dict):
         raise ValueError(f"{path}: expected a JSON object, got {type(settings).__name__}; correct it.")
     fps, view = settings.get("fps"), settings.get("test_view")

@@ -3,24 +3,27 @@
 `morgs-mi synth`, `info`, `calibrate`, `fit`, `render`, `export`, `view`, `eval`, `salvage` and `demo`.
 
 Results go to standard output; progress, warnings and errors to standard error. An error that the user can correct is
-one sentence and exit status 1, an interruption is status 130; `--debug` adds the traceback. Arguments that the parser
-rejects give status 2.
+one sentence and exit status 1, an interruption by Ctrl-C or SIGTERM is status 130; `--debug` adds the traceback.
+Arguments that the parser rejects give status 2.
 """
 
 from __future__ import annotations
 
 import logging
+import os
+import shlex
+import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Annotated, Any, Literal
 
 import tyro
-from rich.logging import RichHandler
 from tyro.conf import arg
 
 from morgs_mi.cli.calibrate import Calibrate
-from morgs_mi.cli.console import ERR, print_warning, with_option_names
+from morgs_mi.cli.console import ERR, LogHandler, print_warning, sentence_of
 from morgs_mi.cli.demo import Demo
 from morgs_mi.cli.evaluate import Eval
 from morgs_mi.cli.export import Export
@@ -86,18 +89,50 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
             ),
         )
         command = options.command
-        _set_up(options)
-        command.run()
+        with _terminable():
+            _set_up(options)
+            command.run()
+            sys.stdout.flush()
         return 0
     except (KeyboardInterrupt, ValueError, OSError, MemoryError, ArithmeticError) as error:
         interrupted = isinstance(error, KeyboardInterrupt)
-        sentence = "Interrupted; a stream file is whole up to its last frame." if interrupted else str(error)
-        sentence = with_option_names(sentence, _option_names(command), str(getattr(command, "capture", "")))
-        print_warning(" ".join(sentence.split()) or f"{type(error).__name__}.")
+        place = str(getattr(command, "capture", None) or "")
+        sentence = "Interrupted." if interrupted else sentence_of(error, _option_names(command), place)
+        again = shlex.join([prog, *args, *([] if "--resume" in args else ["--resume"])])
+        notes = [note.replace("`--resume`", f"`{again}`") for note in getattr(error, "__notes__", [])]
+        print_warning(" ".join([sentence, *notes]))
         # The error may come from parsing, before `options` exist.
         if "--debug" in args:
             ERR.print_exception()
+        _drop_output()
         return 130 if interrupted else 1
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Treat SIGTERM like Ctrl-C, where signals can be handled: in the main thread."""
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    try:
+        previous = signal.signal(signal.SIGTERM, interrupt)
+    except ValueError:
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, previous)
+
+
+def _drop_output() -> None:
+    """Discard what could not be written to a full or closed standard output; Python would fail again at its end."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        with suppress(OSError, ValueError):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _option_names(command: Any) -> dict[str, str]:
@@ -118,9 +153,7 @@ def _set_up(options: Common) -> None:
     import mitsuba as mi
 
     level = logging.DEBUG if options.debug else logging.WARNING
-    logging.basicConfig(
-        level=level, format="%(message)s", handlers=[RichHandler(console=ERR, show_time=False, show_path=False)]
-    )
+    logging.basicConfig(level=level, handlers=[LogHandler()])
     try:
         mi.set_variant(options.variant)
     except ImportError as error:

@@ -6,10 +6,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import Positional, arg
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+from tyro.conf import FlagCreatePairsOff, Positional, arg
 
 from morgs_mi.calibration.calibrate import CalibrateConfig
-from morgs_mi.cli.console import print_result, print_warning, progress
+from morgs_mi.cli.console import print_result, print_table, print_warning, progress
+from morgs_mi.cli.info import advice_lines, check_cells
+from morgs_mi.cli.settings import Flag
 
 __all__ = ["Calibrate"]
 
@@ -20,9 +24,9 @@ class Calibrate:
 
     folder: Positional[Path]
     """Folder of videos, or of one folder of images per camera."""
-    config: Annotated[CalibrateConfig, arg(name="")] = field(default_factory=CalibrateConfig)
-    overwrite: bool = False
-    """Replace an earlier model."""
+    config: Annotated[CalibrateConfig, arg(name=""), FlagCreatePairsOff] = field(default_factory=CalibrateConfig)
+    overwrite: Flag = False
+    """Replace an earlier model in FOLDER/sparse."""
 
     def run(self) -> None:
         from morgs_mi.calibration.calibrate import calibrate
@@ -31,8 +35,14 @@ class Calibrate:
             found = calibrate(
                 self.folder, self.config, self.overwrite, lambda stage, done, total: report(stage, done, total)
             )
-        if found.left_out:
-            print_warning(f"{found.model}: {', '.join(found.left_out)} could not be registered and have no camera.")
+        table = Table(title=str(found.model), box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for column in ("camera", "points", "error, px", "pose"):
+            table.add_column(column, no_wrap=True)
+        for check in found.checks:
+            table.add_row(check.name, *check_cells(check))
+        print_table(table)
+        for line in advice_lines(found.checks):
+            print_warning(line)
         print_result(
             f"{found.model}: {len(found.cameras)} cameras, {found.points} points, mean reprojection error "
             f"{found.error:.2f} px; scale and up direction of its world are arbitrary."

@@ -2,24 +2,47 @@
 
 from __future__ import annotations
 
+import logging
 import re
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from datetime import timedelta
 
 from rich.console import Console
+from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
 
-__all__ = ["ERR", "OUT", "Report", "print_result", "print_warning", "progress", "with_option_names"]
+__all__ = [
+    "ERR",
+    "OUT",
+    "LogHandler",
+    "Report",
+    "print_result",
+    "print_table",
+    "print_warning",
+    "progress",
+    "sentence_of",
+    "with_option_names",
+]
 
 # Rich would wrap paths and sentences at 80 columns without a terminal, and turn `:100:` into an emoji.
 OUT = Console(soft_wrap=True, highlight=False, emoji=False)
 ERR = Console(stderr=True, soft_wrap=True, highlight=False, emoji=False)
 Report = Callable[[str, float, float], None]
+_PERIOD = 30.0  # seconds between two lines of progress without a terminal
 
 
 def print_result(text: str) -> None:
     """Print to standard output."""
-    OUT.print(text, markup=False)
+    print(text)
+
+
+def print_table(table: Table) -> None:
+    """Print to standard output with complete columns, even where the terminal is narrower than the table."""
+    needed = Measurement.get(OUT, OUT.options.update(max_width=10_000), table).maximum
+    Console(width=max(OUT.width, needed), highlight=False, emoji=False).print(table)
 
 
 def print_warning(text: str) -> None:
@@ -27,11 +50,34 @@ def print_warning(text: str) -> None:
     ERR.print(text, markup=False)
 
 
+class LogHandler(logging.Handler):
+    """Handler that prints log messages to standard error, one line each."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a message behind its level."""
+        print_warning(f"{record.levelname.capitalize()}: {record.getMessage()}")
+
+
+def sentence_of(error: BaseException, names: Mapping[str, str], place: str = "") -> str:
+    """Return the message of an error in one line, with the options `names`, and without the number of a system error.
+
+    Arguments are those of `with_option_names`.
+    """
+    text = str(error)
+    if isinstance(error, OSError) and error.errno is not None and error.strerror:
+        text = f"{f'{error.filename}: ' if error.filename else ''}{error.strerror.rstrip('.')}."
+    text = with_option_names(" ".join(text.split()), names, place)
+    if isinstance(error, OSError):  # it is about a file; the function is of no use to a user
+        text = re.sub(r"^cannot", "Cannot", re.sub(r"^[\w.]+\(\): ", "", text))
+    return text or f"{type(error).__name__}."
+
+
 def with_option_names(sentence: str, names: Mapping[str, str], place: str = "") -> str:
     """Return an error message with command-line options in place of Python arguments.
 
-    ``load_capture(): `downscale` must be ...`` becomes ``--downscale must be ...``. A message is changed only if it
-    starts with a function or `place` and names one of the arguments, for in a file the same name is a key.
+    ``load_capture(): `downscale` must be ...`` becomes ``--downscale must be ...``, and ```max_frames=3``` becomes
+    ``--frames 3``. A message is changed only if it starts with a function or with a file of `place` and names one of
+    the arguments; in a JSON or TOML file the same name is a key.
 
     Args:
         sentence: the message.
@@ -39,19 +85,30 @@ def with_option_names(sentence: str, names: Mapping[str, str], place: str = "") 
         place: a path from the command line that a message may start with; it stays.
     """
     function = re.match(r"[\w.]+\(\): ", sentence)
-    start = function[0] if function else f"{place}: "
-    if not (function or place) or not sentence.startswith(start):
+    start = function or (re.match(rf"{re.escape(place)}(?:/.*?)?(?<!\.json)(?<!\.toml): ", sentence) if place else None)
+    if start is None:
         return sentence
-    text = sentence[len(start) :]
-    named = re.sub(r"`([\w.]+)`", lambda m: names.get(m[1], m[0]), text)
+    text = sentence[start.end() :]
+    named = re.sub(r"`([\w.]+)(?:=(\w+))?`", lambda m: _option(names, *m.groups()) or m[0], text)
     if named == text:
         return sentence
-    return named if function else start + named
+    return named if function else start[0] + named
+
+
+def _option(names: Mapping[str, str], name: str, value: str | None) -> str | None:
+    """Return the option that sets an argument, with its value if there is one."""
+    return " ".join([names[name], *([value] if value else [])]) if name in names else None
 
 
 @contextmanager
 def progress() -> Iterator[Report]:
-    """Show a progress bar per stage; the context is a function to call with (stage, done, total)."""
+    """Show a progress bar per stage, or without a terminal a line every 30 s.
+
+    The context is a function to call with (stage, done, total).
+    """
+    if not ERR.is_terminal:
+        yield _line_report()
+        return
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -68,3 +125,25 @@ def progress() -> Iterator[Report]:
             bars.update(tasks[stage], completed=done, total=total, count=int(done))
 
         yield report
+
+
+def _line_report() -> Report:
+    """Return a function that prints the progress of a stage if no line was printed for 30 s."""
+    begin: dict[str, float] = {}
+    last = time.monotonic()
+
+    def report(stage: str, done: float, total: float) -> None:
+        nonlocal last
+        now = time.monotonic()
+        begin.setdefault(stage, now)
+        if now - last < _PERIOD:
+            return
+        last, seconds = now, now - begin[stage]
+        left = f", about {_clock(seconds * (total - done) / done)} left" if done > 0 else ""
+        print_warning(f"{stage}: {int(done)}/{total:.0f}, {_clock(seconds)} elapsed{left}.")
+
+    return report
+
+
+def _clock(seconds: float) -> str:
+    return str(timedelta(seconds=round(seconds)))

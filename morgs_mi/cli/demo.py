@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Annotated, ClassVar
 
 from rich.table import Table
-from tyro.conf import DisallowNone, Positional, arg
+from tyro.conf import DisallowNone, Positional
 
-from morgs_mi.cli.console import OUT, print_result, progress
-from morgs_mi.cli.settings import Settings, setting
+from morgs_mi.cli.console import print_result, print_table, progress
+from morgs_mi.cli.settings import Settings, optional, setting
 from morgs_mi.demo import DemoConfig
 from morgs_mi.evaluate.tables import figure
 
@@ -22,12 +22,15 @@ _DEFAULT = DemoConfig()
 
 @dataclass(frozen=True)
 class Demo:
-    """Synthesise a clip, reconstruct it with and without learned motion, and write figures and a report to OUT."""
+    """Synthesise a clip, reconstruct it with and without learned motion, and write figures and a report to OUT.
+
+    It takes a few minutes. A clip that is in OUT already is used again if its settings are the same.
+    """
 
     out: Positional[Path]
-    """Folder for all results."""
+    """Folder for all results; those of an earlier demo are replaced."""
     scene: str = _DEFAULT.scene
-    """Name of a scene (spheres, arm, thin, flicker) or its Python file."""
+    """Name of a scene (spheres, arm, thin, flicker, random) or its Python file."""
     cameras: int = _DEFAULT.clip.num_cameras
     """Number of cameras, the held-out cam00 included."""
     frames: int = _DEFAULT.clip.num_frames
@@ -40,7 +43,7 @@ class Demo:
     """Samples per pixel."""
     seed: Annotated[int | None, DisallowNone, setting("seed", _DEFAULT.stream)] = None
     """Seed of the clip and the fit."""
-    config: Annotated[Path | None, DisallowNone, arg(metavar="FILE.toml", help_behavior_hint="")] = None
+    config: Annotated[Path | None, DisallowNone, optional("FILE.toml")] = None
     """File with settings of the fit, as `morgs-mi fit --print-config` writes it."""
 
     arguments: ClassVar[Mapping[str, str]] = {"num_cameras": "--cameras", "num_frames": "--frames"}
@@ -69,7 +72,7 @@ class Demo:
             row = result.comparison[name]
             motion = (figure(row[key], 2) for key in ("motion_error", "motion_error_moving", "motion_error_still"))
             table.add_row(title, figure(row["psnr"], 2), figure(row["ssim"], 4), *motion)
-        OUT.print(table)
+        print_table(table)
         print_result(
             f"Held-out PSNR {figure(full.frames[0].scores.psnr, 2)} dB in the first frame, "
             f"{figure(full.frames[-1].scores.psnr, 2)} dB in the last of {full.num_frames}; "

@@ -6,12 +6,16 @@ import json
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Annotated
 
-from tyro.conf import Positional
+from tyro.conf import DisallowNone, Positional
 
-from morgs_mi.cli.console import OUT, print_result, print_warning, progress
+from morgs_mi.capture.outputs import check_output
+from morgs_mi.cli.console import print_result, print_table, print_warning, progress
+from morgs_mi.cli.settings import optional
 from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.evaluate.tables import evaluation_summary, evaluation_tables
+from morgs_mi.recorder import FILES
 
 __all__ = ["Eval"]
 
@@ -22,14 +26,13 @@ class Eval:
 
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
-    capture: Path | None = None
-    """Folder of the capture, if it has moved since the fit."""
-    json: Path | None = None
+    capture: Annotated[Path | None, DisallowNone, optional("FOLDER")] = None
+    """Capture that was fitted, if it has moved since the fit."""
+    json: Annotated[Path | None, DisallowNone, optional("FILE.json")] = None
     """File for all results; - prints them instead of the tables."""
-    figures: Path | None = None
-    """Folder for slice.png (one column over time), motion.png, confidence.png and, if the stream holds offsets,
-    offset.png."""
-    lpips: Path | None = None
+    figures: Annotated[Path | None, DisallowNone, optional("FOLDER")] = None
+    """Folder for slice.png (one column over time), motion.png, confidence.png, and offset.png if it is stored."""
+    lpips: Annotated[Path | None, DisallowNone, optional("FILE.onnx")] = None
     """LPIPS network as ONNX with inputs in0 and in1, RGB [1, 3, H, W] from -1 to 1; the package includes none."""
 
     def run(self) -> None:
@@ -39,6 +42,9 @@ class Eval:
         from morgs_mi.evaluate.figures import draw_stream
         from morgs_mi.evaluate.lpips import Lpips
 
+        for output in (self.figures, self.json):
+            if output not in (None, Path("-")):
+                _check_not_of_fit(self.out, check_output(output))
         network = None if self.lpips is None else Lpips(self.lpips)
         with progress() as report:
             result = evaluate_stream(self.out, self.capture, partial(report, "Evaluating frames"), network)
@@ -56,10 +62,17 @@ class Eval:
             print_result(f"Figures: {self.figures}")
 
 
+def _check_not_of_fit(out: Path, output: Path) -> None:
+    """Raise `ValueError` if an output would replace a file that a fit has written and still needs."""
+    folder = out if out.is_dir() else out.parent
+    if output.resolve() in [path.resolve() for path in (out, *(folder / name for name in FILES))]:
+        raise ValueError(f"{output}: expected a new file, got one that the fit has written; choose another name.")
+
+
 def _print_evaluation(result: Evaluation) -> None:
     """Print an evaluation."""
     for table in evaluation_tables(result):
-        OUT.print(table)
+        print_table(table)
     for sentence in evaluation_summary(result):
         print_result(sentence)
     if not result.complete:

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import tyro
-from tyro.conf import Positional, arg
+from tyro.conf import DisallowNone, Positional, arg
 
+from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, progress
+from morgs_mi.cli.settings import Flag, optional
 
 __all__ = ["Export"]
 
@@ -20,10 +23,12 @@ class Ply:
 
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
-    output: Path | None = None
+    output: Annotated[Path | None, DisallowNone, optional("FOLDER")] = None
     """New folder for 0000.ply, ...; by default OUT/ply."""
-    frames: str | None = None
+    frames: Annotated[str | None, DisallowNone, optional("FRAMES")] = None
     """Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."""
+
+    arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
 
     def run(self) -> None:
         from morgs_mi.export.clips import select_frames, write_each
@@ -31,7 +36,8 @@ class Ply:
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
-        frames, output = select_frames(stream, self.frames), self.output or stream.path.with_name("ply")
+        frames = select_frames(stream, self.frames)
+        output = check_output(self.output or stream.path.with_name("ply"))
         with progress() as report:
             write_each(stream, output, ".ply", write_ply, frames, lambda done, of: report("Writing", done, of))
         print_result(f"{output}: {len(frames)} PLY files.")
@@ -43,10 +49,12 @@ class Gltf:
 
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
-    output: Path | None = None
+    output: Annotated[Path | None, DisallowNone, optional("FOLDER")] = None
     """New folder for 0000.glb, ...; by default OUT/gltf."""
-    frames: str | None = None
+    frames: Annotated[str | None, DisallowNone, optional("FRAMES")] = None
     """Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."""
+
+    arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
 
     def run(self) -> None:
         from morgs_mi.export.axes import gltf_axes
@@ -55,7 +63,8 @@ class Gltf:
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
-        frames, output = select_frames(stream, self.frames), self.output or stream.path.with_name("gltf")
+        frames = select_frames(stream, self.frames)
+        output = check_output(self.output or stream.path.with_name("gltf"))
         axes = gltf_axes(stream.cameras)
         with progress() as report:
             write_each(
@@ -77,27 +86,36 @@ class Flight:
     """Folder of a fit, or a stream file."""
     path: str = "between"
     """Camera path: between (through the rig's cameras), orbit (around the scene), or a JSON file (docs/exports.md)."""
-    output: Path | None = None
-    """FILE.mp4; by default OUT/PATH.mp4."""
-    seconds: float | None = None
-    """Duration in seconds; by default that of the clip or the JSON file."""
-    degrees: float | None = None
-    """Angle of an orbit; below 360 the camera swings to both sides. By default the extent of the rig."""
-    freeze: int | None = None
-    """Frame to freeze time at; by default the clip plays and repeats."""
-    width: int | None = None
+    output: Annotated[Path | None, DisallowNone, optional("FILE.mp4")] = None
+    """File for the video; by default OUT/PATH.mp4, e.g. OUT/orbit.mp4."""
+    seconds: Annotated[float | None, DisallowNone, optional("FLOAT")] = None
+    """Duration in seconds; by default that of the JSON file, or that of the clip, repeated to LEAST_SECONDS."""
+    least_seconds: float = 5.0
+    """Least duration without SECONDS; a shorter clip is played several times, as a whole. 0: once."""
+    back_and_forth: Flag = False
+    """Play every second time backwards, instead of restarting at the first frame."""
+    degrees: Annotated[float | None, DisallowNone, optional("FLOAT")] = None
+    """Angle of an orbit, 1 to 360; below 360 the camera swings to both sides. By default the extent of the rig."""
+    freeze: Annotated[int | None, DisallowNone, optional("FRAME")] = None
+    """Frame at which time stands still; by default the clip plays and repeats."""
+    width: Annotated[int | None, DisallowNone, optional("INT")] = None
     """Width of the video; by default that of the first camera or the JSON file."""
     channels: tuple[Literal["color", "motion", "confidence", "depth", "alpha"], ...] = ("color",)
     """Channels to render, side by side."""
 
     def run(self) -> None:
         from morgs_mi.codec.packets import play
-        from morgs_mi.export.clips import frame_numbers, write_flight
+        from morgs_mi.export.clips import frame_numbers, repeated_seconds, write_flight
         from morgs_mi.export.paths import focus, load_path, orbit, through_cameras
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
-        clip = len(frame_numbers(stream)) / stream.fps
+        frames = frame_numbers(stream)
+        if self.freeze is not None and self.freeze not in frames:
+            raise ValueError(f"--freeze must be in {frames[0]} to {frames[-1]}, got {self.freeze}.")
+        if self.width is not None and self.width < 1:
+            raise ValueError(f"--width must be at least 1, got {self.width}.")
+        clip = repeated_seconds(len(frames) / stream.fps, self.least_seconds)
         if self.path == "between":
             path = through_cameras(stream.cameras, clip)
         elif self.path == "orbit":
@@ -107,9 +125,9 @@ class Flight:
             path = load_path(self.path, stream.cameras)
         path = path if self.seconds is None else path.with_duration(self.seconds)
         if self.width is not None:
-            height = round(self.width * path.keys[0].height / path.keys[0].width)
+            height = max(1, round(self.width * path.keys[0].height / path.keys[0].width))
             path = replace(path, keys=tuple(key.resized(self.width, height) for key in path.keys))
-        output = self.output or stream.path.with_name(f"{Path(self.path).stem}.mp4")
+        output = check_output(self.output or stream.path.with_name(f"{Path(self.path).stem}.mp4"))
         with progress() as report:
             write_flight(
                 stream,
@@ -118,6 +136,7 @@ class Flight:
                 self.channels,
                 self.freeze,
                 lambda done, of: report("Rendering", done, of),
+                self.back_and_forth,
             )
         print_result(f"{output}: {path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}.")
 
@@ -128,8 +147,8 @@ class Tracks:
 
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
-    output: Path | None = None
-    """FILE.npz; by default OUT/tracks.npz."""
+    output: Annotated[Path | None, DisallowNone, optional("FILE.npz")] = None
+    """File for the tracks; by default OUT/tracks.npz."""
 
     def run(self) -> None:
         from morgs_mi.export.clips import frame_numbers
@@ -137,7 +156,8 @@ class Tracks:
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
-        output, total = self.output or stream.path.with_name("tracks.npz"), len(frame_numbers(stream))
+        output = check_output(self.output or stream.path.with_name("tracks.npz"))
+        total = len(frame_numbers(stream))
         with progress() as report:
             tracks = extract_tracks(stream, lambda done: report("Following", done, total))
         write_tracks(output, tracks)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
-from morgs_mi.cli.settings import Flag, GivenReading, GivenSettings, Reading, Settings
+from morgs_mi.cli.settings import Flag, GivenReading, GivenSettings, Reading, Settings, optional
 from morgs_mi.config import config_toml
 
 __all__ = ["Fit"]
@@ -20,23 +21,24 @@ __all__ = ["Fit"]
 class Fit:
     """Reconstruct a capture, frame after frame, into OUT/stream.morgs.
 
-    All other settings are in a file, see --print-config and --config. It overrides the preset; options override both.
+    All other settings are in a file, see --print-config and --config. The file overrides the preset; options override
+    both.
     """
 
     capture: Annotated[Positional[Path | None], arg(help_behavior_hint="")] = None
     """Folder of the capture."""
     out: Annotated[Positional[Path | None], arg(help_behavior_hint="")] = None
-    """Folder for stream.morgs and report.json; an earlier stream is replaced unless resumed."""
-    frames: Annotated[int | None, DisallowNone, arg(metavar="INT", help_behavior_hint="(default: all)")] = None
-    """Number of frames from the start."""
+    """Folder for stream.morgs, capture.json and report.json; an earlier stream there is replaced without --resume."""
+    frames: Annotated[int | None, DisallowNone, optional("INT", "(default: all)")] = None
+    """Number of frames to fit, from the first one."""
     downscale: float = 1
-    """Factor by which the images are averaged down."""
-    test_view: Annotated[int | Literal["auto"] | None, arg(metavar="INT|None")] = "auto"
-    """Index of the held-out camera; auto: the capture's own, or 0 of six or more."""
+    """Factor by which the images are reduced; 2 halves width and height."""
+    test_view: Annotated[str, arg(metavar="CAMERA")] = "auto"
+    """Held-out camera, by index or name; none: all are fitted; auto: the capture's own, or camera 0 of six or more."""
     reading: GivenReading = field(default_factory=Reading)
     settings: GivenSettings = field(default_factory=Settings)
     resume: Flag = False
-    """Continue the stream in OUT, with the same capture and settings; with --reproducible to the same bytes."""
+    """Continue an interrupted fit in OUT; capture and settings must be the same."""
     print_config: Flag = False
     """Print all settings as TOML and exit."""
 
@@ -53,20 +55,35 @@ class Fit:
         if self.capture is None or self.out is None:
             raise ValueError("morgs-mi fit: expected the folders CAPTURE and OUT, got fewer; see morgs-mi fit --help.")
         self.settings.check_methods(config)
-        capture = load_capture(self.capture, self.downscale, self.test_view, self.frames, self.reading.read_config())
-        count = capture.num_frames
-        with progress() as report:
-            reports = stream_capture(
-                capture,
-                self.out,
-                config,
-                lambda frame, step, steps: report("Fitting frames", frame + step / steps, count),
-                self.resume,
-            )
+        view = None if self.test_view.lower() == "none" else self.test_view
+        capture = load_capture(self.capture, self.downscale, view, self.frames, self.reading.read_config())
+        count, stream, started = capture.num_frames, self.out / "stream.morgs", []
+        with progress() as report, _noting_frames(stream, count, started):
+
+            def on_step(frame: int, step: int, steps: int) -> None:
+                started.append(frame)
+                report("Fitting frames", frame + step / steps, count)
+
+            reports = stream_capture(capture, self.out, config, on_step, self.resume)
         seconds = [row.seconds for row in reports[1:]]
         later = f", {sum(seconds) / len(seconds):.1f} s for each later one" if seconds else ""
-        stream = self.out / "stream.morgs"
         print_result(
             f"{stream}: {len(reports)} frames, {stream.stat().st_size / 1e6:.1f} MB, "
             f"{reports[0].seconds:.1f} s for the first frame{later}."
         )
+
+
+@contextmanager
+def _noting_frames(stream: Path, count: int, started: list[int]) -> Iterator[None]:
+    """Add to an interruption or a failed write which frames the stream holds, if the fit has `started` to write it."""
+    from morgs_mi.codec.reader import StreamReader
+
+    try:
+        yield
+    except (KeyboardInterrupt, OSError) as error:
+        with suppress(OSError, ValueError):
+            if started and (index := StreamReader(stream).index()):
+                error.add_note(f"{stream} holds frames 0 to {index[-1][1]} of {count}; continue with `--resume`.")
+            elif started:
+                error.add_note(f"{stream} holds no frame yet.")
+        raise

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated, ClassVar
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
-from tyro.conf import Positional
+from tyro.conf import DisallowNone, Positional, arg
 
-from morgs_mi.calibration.rig_check import RigCheck, check_rig, match_capture, triangulate_points
+from morgs_mi.calibration.rig_check import CameraCheck, RigCheck, check_rig, match_capture, triangulate_points
 from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.cli.console import OUT, print_result, progress
-from morgs_mi.cli.settings import GivenReading, Reading
+from morgs_mi.capture.outputs import check_output
+from morgs_mi.cli.console import print_result, print_table, progress
+from morgs_mi.cli.settings import GivenReading, Reading, optional
 
 __all__ = ["Info"]
 
@@ -23,15 +26,19 @@ class Info:
 
     capture: Positional[Path]
     """Folder of the capture."""
-    plot: Path | None = None
+    plot: Annotated[Path | None, DisallowNone, optional("FILE")] = None
     """File for a plot of the rig, .png or .jpg."""
-    check: bool = True
+    check: Annotated[bool, arg(help_behavior_hint="(default: --check)")] = True
     """Check the poses against feature matches between the views of the first frame."""
     reading: GivenReading = field(default_factory=Reading)
+
+    arguments: ClassVar[Mapping[str, str]] = {"max_frames": "--frames of morgs-mi fit"}
 
     def run(self) -> None:
         from morgs_mi.calibration.rig_plot import write_rig
 
+        if self.plot is not None:
+            check_output(self.plot)
         capture, found = load_capture(self.capture, reading=self.reading.read_config()), None
         origin = "" if len(capture.points) else "without points"
         if self.check:
@@ -41,13 +48,17 @@ class Info:
             if origin:
                 capture = triangulate_points(capture, common)
                 origin += f" ({len(capture.points)} can be triangulated)"
-        OUT.print(_camera_table(capture, found))
+        print_table(_camera_table(capture, found))
         points = origin or f"{len(capture.points)} points"
         truth = "with ground truth" if capture.truth else "without ground truth"
         print_result(f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.")
+        for note in capture.notes:
+            print_result(note)
         if found:
             error = f"median {found.error:.2f} px over " if found.matches else ""
             print_result(f"Reprojection check: {error}{found.matches} matches in {found.pairs} pairs; {found.advice}")
+            for line in advice_lines(found.cameras):
+                print_result(line)
         if fit := capture.colors:
             changes = zip(capture.names, fit.before, fit.after, fit.samples, strict=True)
             errors = ", ".join(
@@ -62,7 +73,7 @@ class Info:
 def _camera_table(capture: Capture, found: RigCheck | None) -> Table:
     """Return a row per camera: size, intrinsics, use, and how well its pose fits the matches."""
     table = Table(title=f"{capture.path}: {capture.layout}", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for column in ("", "camera", "size", "focal, px", "centre, px", "seen", "use", "matches", "error, px"):
+    for column in ("", "camera", "size", "focal, px", "centre, px", "seen", "use", "matches", "error, px", "pose"):
         table.add_column(column, no_wrap=True)
     for index, (camera, mask) in enumerate(zip(capture.cameras, capture.masks, strict=True)):
         K = camera.K
@@ -74,7 +85,22 @@ def _camera_table(capture: Capture, found: RigCheck | None) -> Table:
             f"{K[0, 2]:.1f} {K[1, 2]:.1f}",
             "100 %" if mask is None else f"{100 * mask.mean():.0f} %",
             "test" if index == capture.test_view else "train",
-            str(found.camera_matches[index]) if found else "-",
-            f"{found.camera_errors[index]:.2f}" if found and found.camera_matches[index] else "-",
+            *check_cells(found.cameras[index] if found else None),
         )
     return table
+
+
+def check_cells(check: CameraCheck | None) -> tuple[str, str, str]:
+    """Return the number of matches, the error and the verdict of a camera as text."""
+    if check is None:
+        return "-", "-", "not checked"
+    return str(check.matches), f"{check.error:.2f}" if check.matches else "-", check.verdict
+
+
+def advice_lines(checks: Sequence[CameraCheck]) -> list[str]:
+    """Return a sentence per advice, with the names of the cameras that it concerns."""
+    names: dict[str, list[str]] = {}
+    for check in checks:
+        if check.advice:
+            names.setdefault(f"{check.verdict}: {check.advice}.", []).append(check.name)
+    return [f"{', '.join(cameras)} {text}" for text, cameras in names.items()]

@@ -10,6 +10,7 @@ from typing import Any
 
 from tyro.conf import Positional
 
+from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result
 
 __all__ = ["Salvage"]
@@ -29,7 +30,7 @@ class Salvage:
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.stream)
-        frames, damaged = write_salvaged(stream, self.out)
+        frames, damaged = write_salvaged(stream, check_output(self.out))
         for span in damaged:
             print_result(f"{stream.path}: bytes {span.start} to {span.stop}: {span.problem.rstrip('.')}.")
         print_result(f"{self.out}: {len(frames)} frames, {_in_words(_runs(frames))}.")

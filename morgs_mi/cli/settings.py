@@ -13,7 +13,7 @@ from tyro.conf import DisallowNone, FlagCreatePairsOff, arg
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.config import PresetName, StreamConfig, apply_preset, apply_values, read_config, relocated
 
-__all__ = ["SETTINGS", "Flag", "GivenReading", "GivenSettings", "Reading", "Settings", "setting"]
+__all__ = ["SETTINGS", "Flag", "GivenReading", "GivenSettings", "Reading", "Settings", "optional", "setting"]
 
 # The setting of every option. All others are set in a file.
 SETTINGS = {
@@ -33,6 +33,17 @@ SETTINGS = {
 
 # A switch that is off by default.
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
+
+
+def optional(metavar: str, hint: str = "", text: str | None = None) -> Any:
+    """Return the help of an option that is None where it is not given, without the word None.
+
+    Args:
+        metavar: name of the value.
+        hint: text behind the help.
+        text: the help, if it is longer than the one line that tyro reads from a field's docstring unbroken.
+    """
+    return arg(metavar=metavar, help_behavior_hint=hint, help=text)
 
 
 def setting(option: str, config: StreamConfig | None = None) -> Any:
@@ -69,9 +80,9 @@ class Reading:
 class Settings:
     """Settings of a fit. Later ones override: defaults, --preset, --config, the other options."""
 
-    preset: Annotated[PresetName | None, arg(metavar="NAME", help_behavior_hint="")] = None
+    preset: Annotated[PresetName | None, optional("NAME")] = None
     """Preset: l, s (the paper's variants, 8 and 5 epochs), baseline, ml, ml-mo, ml-mo-mc (its ablation), or paper."""
-    config: Annotated[Path | None, arg(metavar="FILE.toml", help_behavior_hint="")] = None
+    config: Annotated[Path | None, optional("FILE.toml")] = None
     """File with any settings, as --print-config writes it."""
     seed: Annotated[int | None, setting("seed")] = None
     """Seed of every random choice."""

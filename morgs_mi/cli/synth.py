@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from tyro.conf import Positional
+from tyro.conf import DisallowNone, Positional
 
 from morgs_mi.cli.console import print_result, progress
+from morgs_mi.cli.settings import Flag
 
 __all__ = ["Synth"]
 
@@ -19,29 +20,30 @@ class Synth:
     """Path-trace a moving scene into a multi-view capture with exact ground truth."""
 
     scene: Positional[str]
-    """Name of a scene (spheres, arm, thin, flicker) or the path of its Python file."""
+    """Name of a scene (spheres, arm, thin, flicker, random), or path of a Python file with a function build(seed)."""
     out: Positional[Path]
-    """New folder."""
-    cameras: int = 10
-    """Number of cameras, the held-out cam00 included."""
+    """New folder for the capture."""
+    cameras: Annotated[int | None, DisallowNone] = None
+    """Number of cameras, the held-out cam00 included; the scene's own, usually 10, if not given."""
     frames: int = 12
     """Number of frames per camera."""
     width: int = 320
     """Width of the images in pixels, even."""
     height: int = 240
     """Height of the images in pixels, even."""
-    spp: int = 16
-    """Samples per pixel; 16 gives noise at 42 dB."""
-    noise: float = 0.0
-    """Standard deviation of sensor noise as a share of white; an indoor camera has 0.01, 2.5 grey levels."""
+    spp: Annotated[int | None, DisallowNone] = None
+    """Samples per pixel; 16 gives noise at 42 dB. The scene's own, usually 16, if not given."""
+    noise: Annotated[float | None, DisallowNone] = None
+    """Standard deviation of sensor noise as a share of white; an indoor camera has 0.01, 2.5 grey levels. The scene's
+    own, usually 0, if not given."""
     fps: float = 30.0
     """Frames per second."""
-    lossless: bool = False
-    """Also write the frames as PNG files."""
+    lossless: bool = True
+    """Also write the frames as PNG files, which are read in place of the compressed videos."""
     seed: int = 0
-    """Seed of textures, sampling noise and the choice of points."""
-    overwrite: bool = False
-    """Replace an earlier capture."""
+    """Seed of textures, sampling noise and the choice of points; of everything in the scene random."""
+    overwrite: Flag = False
+    """Replace an earlier synthetic capture in OUT."""
 
     arguments: ClassVar[Mapping[str, str]] = {"num_cameras": "--cameras", "num_frames": "--frames"}
 
@@ -64,4 +66,9 @@ class Synth:
                 overwrite=self.overwrite,
                 progress=lambda done, total: report("Path-tracing", done, total),
             )
-        print_result(f"{self.out}: {self.cameras} cameras, {self.frames} frames of {self.width}x{self.height}.")
+        images = "PNG files and videos" if self.lossless else "videos"
+        cameras = len(list((self.out / "truth").glob("cam*")))
+        print_result(
+            f"{self.out}: {cameras} cameras, {self.frames} frames of {self.width}x{self.height} as {images}, with "
+            "ground truth."
+        )

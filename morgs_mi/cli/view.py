@@ -25,7 +25,7 @@ class View:
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
     open_browser: bool = True
-    """Open the page in this machine's browser."""
+    """Open the page in the browser of this machine."""
     config: Annotated[ViewerConfig, arg(name="")] = field(default_factory=ViewerConfig)
 
     def run(self) -> None:
@@ -36,6 +36,11 @@ class View:
         except ImportError as error:
             raise ValueError(str(error)) from error
         print_result(f"{viewer.url} (Ctrl-C to stop)")
+        if viewer.is_public:
+            print_result(
+                "Every machine that can reach this one can open the page, without a password: by the address of this "
+                "machine in digits, or by a name passed with --allowed-names."
+            )
         if self.open_browser:
             webbrowser.open(viewer.url)
         with _stopped_by_interrupt(viewer.stop):
@@ -44,7 +49,7 @@ class View:
 
 @contextmanager
 def _stopped_by_interrupt(stop: Callable[[], None]) -> Iterator[None]:
-    """Call `stop` on Ctrl-C, and raise KeyboardInterrupt only at the end, or at the second Ctrl-C.
+    """Call `stop` on Ctrl-C or SIGTERM, and raise KeyboardInterrupt only at the end, or at the second signal.
 
     Raised at once, it can end up in a callback of a library, which ignores it: the viewer would run on.
     """
@@ -56,10 +61,11 @@ def _stopped_by_interrupt(stop: Callable[[], None]) -> Iterator[None]:
         interrupted.append(True)
         stop()
 
-    previous = signal.signal(signal.SIGINT, handle)
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, handler in previous.items():
+            signal.signal(number, handler)
     if interrupted:
         raise KeyboardInterrupt

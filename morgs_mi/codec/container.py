@@ -27,6 +27,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from morgs_mi.codec.header import header_json, load_json
 from morgs_mi.core.camera import Camera
 
 __all__ = [
@@ -44,7 +45,6 @@ __all__ = [
     "TruncatedStreamError",
     "decode_packet",
     "encode_packet",
-    "header_fields",
     "header_json",
     "open_packet",
 ]
@@ -58,6 +58,8 @@ TRAILER = struct.Struct("<Q8s")
 _U32 = struct.Struct("<I")
 PAYLOAD = HEAD.size + _U32.size  # offset of the payload in a packet
 _DTYPES = ("float32", "uint32", "uint8")
+_MAX_TABLE = 2**16  # bytes
+_MAX_AXES = 8
 
 
 class PacketKind(IntEnum):
@@ -81,11 +83,13 @@ class Packet:
         kind: `KEYFRAME` (self-contained) or `RESIDUAL` (changes since the frame before).
         frame: index of the video frame.
         arrays: float32, uint32 or uint8 arrays of any shape, by name; read-only copies of those that are passed.
+        place: description of where the packet was read, for messages; empty for a new one.
     """
 
     kind: PacketKind
     frame: int
     arrays: Mapping[str, np.ndarray] = field(default_factory=dict)
+    place: str = ""
 
     def __post_init__(self) -> None:
         arrays = {name: np.array(array) for name, array in self.arrays.items()}
@@ -129,8 +133,8 @@ def encode_packet(packet: Packet) -> bytes:
     return packet.encoded
 
 
-def decode_packet(data: bytes) -> Packet:
-    """Return the packet with the encoding `data`.
+def decode_packet(data: bytes, place: str = "") -> Packet:
+    """Return the packet with the encoding `data`; `place` describes where it was read, for messages.
 
     Raises:
         ValueError: the bytes are not exactly one intact keyframe or residual packet.
@@ -139,8 +143,8 @@ def decode_packet(data: bytes) -> Packet:
     if kind not in (PacketKind.KEYFRAME, PacketKind.RESIDUAL):
         raise ValueError(f"the kind must be 1 (keyframe) or 2 (residual), got {kind}")
     try:
-        return Packet(PacketKind(kind), frame, _arrays(payload))
-    except (struct.error, TypeError, ValueError, OverflowError, RecursionError) as error:
+        return Packet(PacketKind(kind), frame, _arrays(payload), place)
+    except (struct.error, ValueError) as error:
         raise ValueError(f"its table of arrays is broken ({error})") from None
 
 
@@ -282,10 +286,7 @@ def _arrays(payload: memoryview) -> dict[str, np.ndarray]:
     (length,) = _U32.unpack_from(payload)
     at = _U32.size + length
     arrays: dict[str, np.ndarray] = {}
-    for name, dtype, shape in json.loads(bytes(payload[_U32.size : at])):
-        sound = isinstance(name, str) and all(type(n) is int and n >= 0 for n in shape)
-        if not sound or dtype not in _DTYPES:
-            raise ValueError(f"`{name}` is declared as {dtype} {shape}")
+    for name, dtype, shape in _table(load_json(payload[_U32.size : at], _MAX_TABLE)):
         stored = np.dtype(dtype).newbyteorder("<")
         end = at + math.prod(shape) * stored.itemsize
         if end > len(payload):
@@ -297,42 +298,18 @@ def _arrays(payload: memoryview) -> dict[str, np.ndarray]:
     return arrays
 
 
-def header_json(cameras: Sequence[Camera], fps: float, metadata: Mapping[str, Any]) -> str:
-    """Return a header's payload as JSON.
+def _table(rows: Any) -> list[tuple[str, str, list[int]]]:
+    """Return the rows of a table of arrays.
 
     Raises:
-        ValueError: JSON cannot represent it.
+        ValueError: one of them is not the name, dtype and shape of an array, or two have one name.
     """
-    fields = {"cameras": [_camera_fields(camera) for camera in cameras], "fps": float(fps), "metadata": dict(metadata)}
-    try:
-        return json.dumps(fields, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"StreamWriter(): `metadata` and `fps` must fit into JSON ({error}).") from None
-
-
-def _camera_fields(camera: Camera) -> dict[str, Any]:
-    return {
-        "name": camera.name,
-        "K": camera.K.tolist(),
-        "viewmat": np.asarray(camera.viewmat, dtype=np.float64).tolist(),
-        "width": camera.width,
-        "height": camera.height,
-        "near": camera.near,
-    }
-
-
-def header_fields(payload: memoryview) -> tuple[tuple[Camera, ...], float, dict[str, Any]]:
-    """Return cameras, frame rate and metadata of a header's payload.
-
-    Raises:
-        ValueError: it is broken.
-    """
-    try:
-        header = json.loads(bytes(payload))
-        cameras = tuple(
-            Camera(**{**fields, "K": np.array(fields["K"]), "viewmat": np.array(fields["viewmat"])})
-            for fields in header["cameras"]
-        )
-        return cameras, float(header["fps"]), dict(header["metadata"])
-    except (KeyError, TypeError, ValueError, RecursionError) as error:
-        raise ValueError(f"the header's JSON is broken ({error!r})") from None
+    if not isinstance(rows, list) or any(not isinstance(row, list) or len(row) != 3 for row in rows):
+        raise ValueError("it must be a list of [name, dtype, shape]")
+    for name, dtype, shape in rows:
+        sound = isinstance(name, str) and dtype in _DTYPES and isinstance(shape, list) and len(shape) <= _MAX_AXES
+        if not sound or any(type(n) is not int or not 0 <= n < 2**63 for n in shape):
+            raise ValueError(f"`{name!s:.60}` is declared as {dtype!s:.60} {shape!s:.60}")
+    if len({name for name, *_ in rows}) < len(rows):
+        raise ValueError("two arrays have one name")
+    return [tuple(row) for row in rows]

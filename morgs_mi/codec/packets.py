@@ -12,6 +12,7 @@ ones.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import blake2b
@@ -26,10 +27,10 @@ from morgs_mi.codec.quantisation import (
     KNOWN_OPTIONAL,
     Grid,
     bounded,
-    columns_of,
     finite_fields,
     new_grid,
     num_exponents,
+    num_integers,
     optional_mask,
     optional_names,
     real_values,
@@ -53,8 +54,12 @@ __all__ = [
     "seek",
 ]
 
-# A packet has at least one word per 16 Gaussians that it adds, so that a damaged count cannot request much memory.
+# An entropy code stores a column of one value in almost no bytes. So that a small packet cannot request much memory, it
+# has a word for each 16 Gaussians that it adds, or for each 16 of their integers if the state has more than 2^22. The
+# integers of a fit take about four bits each, twice as much.
 _PER_WORD = 16
+_FREE_INTEGERS = 2**22
+_DTYPES = {"head": "uint32", "code": "uint32", "parent": "uint8", "offset": "uint32"}
 # Changes below a step are jitter of the fit, but in the base colour every bit is visible. Slightly less than a step,
 # because a decoded state is rounded to float32 and must give the packet that it was decoded from.
 _THRESHOLD, _THRESHOLD_DC = 0.99, 0.5
@@ -124,7 +129,9 @@ def reemitted_keyframe(coded: CodedFrame) -> Packet:
     writer.put(np.diff(coded.ids.astype(np.int64), prepend=-1) - 1)
     _put_grid(writer, grid)
     head = np.array([len(grid), grid.degree, grid.optional, coded.next_id], np.uint32)
-    return Packet(PacketKind.KEYFRAME, coded.frame, {"head": head, "code": _padded(writer.words(), len(grid))})
+    return Packet(
+        PacketKind.KEYFRAME, coded.frame, {"head": head, "code": _padded(writer.words(), len(grid), len(grid), grid)}
+    )
 
 
 def residual_packet(
@@ -191,7 +198,7 @@ def residual_packet(
             writer.put(column)
         if born is not None:
             _put_grid(writer, born)
-        codes = {"code": _padded(writer.words(), births)}
+        codes = {"code": _padded(writer.words(), births, len(gaussians), grid)}
         if config.offset:
             codes["offset"] = _words(offsets(r, coarseness))
         size = sum(code.nbytes for code in codes.values())
@@ -210,16 +217,20 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
         packet: a packet of the stream.
 
     Raises:
-        ValueError: a residual without the state that it continues, or a packet that contradicts itself.
+        ValueError: a residual without the state that it continues, a packet that contradicts itself, or one whose frame
+            is not behind that of `previous`.
     """
-    where = f"packet of frame {packet.frame}"
+    where = packet.place or f"packet of frame {packet.frame}"
     names = {"head", "code"} | ({"parent"} if packet.kind == PacketKind.RESIDUAL else set())
     optional = {"offset"} if packet.kind == PacketKind.RESIDUAL else set()
     if packet.arrays.keys() - optional != names:
         raise ValueError(f"{where}: expected the arrays {sorted(names)}, got {sorted(packet.arrays)}.")
-    if any(array.ndim != 1 for array in packet.arrays.values()):
-        raise ValueError(f"{where}: its arrays must have one axis each.")
+    for name, array in packet.arrays.items():
+        if array.ndim != 1 or array.dtype != _DTYPES[name]:
+            raise ValueError(f"{where}: `{name}` must be {_DTYPES[name]} [n], got {array.dtype} {list(array.shape)}.")
     try:
+        if previous is not None and packet.frame <= previous.frame:
+            raise ValueError(f"its frame must be above {previous.frame}, that of the state before, got {packet.frame}")
         if packet.kind == PacketKind.KEYFRAME:
             return _decoded_keyframe(packet)
         if previous is None:
@@ -235,9 +246,9 @@ def coded_frames(packets: Iterable[Packet]) -> Iterator[CodedFrame]:
     """Decode packets in order and yield the state after each frame."""
     coded = None
     for packet in packets:
-        if coded is None or packet.frame != coded.frame:  # a re-emitted keyframe is for readers that start there
+        if coded is None or (packet.kind, packet.frame) != (PacketKind.KEYFRAME, coded.frame):
             coded = decode(coded, packet)
-            yield coded
+            yield coded  # a re-emitted keyframe is for readers that start there
 
 
 def play(packets: Iterable[Packet]) -> Iterator[tuple[int, Gaussians]]:
@@ -248,13 +259,24 @@ def play(packets: Iterable[Packet]) -> Iterator[tuple[int, Gaussians]]:
 def seek(stream: StreamReader, frame: int) -> CodedFrame:
     """Return the state at a frame; decoding starts at the last keyframe before it.
 
+    Where the frame cannot be reached from there, because that keyframe or the index is forged, the stream is played.
+
     Raises:
         ValueError: the stream has no such frame, is not a file, or a packet is broken.
     """
-    for coded in coded_frames(stream.near(frame)):
-        if coded.frame == frame:
-            return coded
+    near = stream.near(frame)
+    with suppress(ValueError):
+        if (found := _state_at(near, frame)) is not None:
+            return found
+    if (found := _state_at(stream, frame)) is not None:
+        return found
     raise ValueError(f"{stream.path}: expected a frame of the stream, got {frame}; choose one that it contains.")
+
+
+def _state_at(packets: Iterable[Packet], frame: int) -> CodedFrame | None:
+    """Return the state at a frame, None if the packets have none."""
+    last = next((coded for coded in coded_frames(packets) if coded.frame >= frame), None)
+    return last if last is not None and last.frame == frame else None
 
 
 def _decoded_keyframe(packet: Packet) -> CodedFrame:
@@ -265,8 +287,9 @@ def _decoded_keyframe(packet: Packet) -> CodedFrame:
             f"its mask of optional attributes must have no bits beyond {KNOWN_OPTIONAL:#b}, got {optional:#b} with the "
             f"unknown {unknown:#b}; read it with the release that wrote it"
         )
-    if _PER_WORD * len(code) < N or degree > 3 or next_id >= LIMIT:
-        raise ValueError(f"its head {[N, degree, optional, next_id]} does not fit its {len(code)} words of code")
+    _check_most(degree, 3, "its degree")
+    _check_most(next_id, LIMIT - 1, "its next id")
+    _check_words(code, N, N, degree, optional)
     reader = ColumnReader(code)
     ids = np.cumsum(reader.take(N) + 1) - 1
     grid = _taken_grid(reader, N, degree, optional)
@@ -278,11 +301,12 @@ def _decoded_keyframe(packet: Packet) -> CodedFrame:
 def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
     births, coarseness = _head(packet, 2)
     code, grid = packet.arrays["code"], previous.grid
-    if _PER_WORD * len(code) < births or coarseness > _COARSEST or previous.next_id + births >= LIMIT:
-        raise ValueError(f"its head {[births, coarseness]} does not fit its {len(code)} words of code")
+    _check_most(coarseness, _COARSEST, "its coarseness")
+    _check_most(previous.next_id + births, LIMIT - 1, "its next id")
     reader = ColumnReader(code)
     values, dead = take_change(reader, grid, float(step_sizes(np.array(coarseness))))
     survivors = np.flatnonzero(~dead)
+    _check_words(code, births, len(survivors) + births, grid.degree, grid.optional)
     new = replace(grid, values=values).select(survivors)
     motion = np.zeros((len(survivors) + births, 3), np.float32)
     before = np.asarray(previous.gaussians.means)[survivors]
@@ -323,13 +347,16 @@ def _put_grid(writer: ColumnWriter, grid: Grid) -> None:
 
 def _taken_grid(reader: ColumnReader, N: int, degree: int, optional: int) -> Grid:
     first = 1 + num_exponents(optional)  # column of the values
-    middle = reader.take(first + max(at.stop for at in columns_of(degree, optional).values()))
-    columns = np.stack([reader.take(N) + shift for shift in middle], axis=1)
-    if np.any((columns[:, 0] < 0) | (columns[:, 0] > 3)):
+    middle = reader.take(num_integers(degree, optional))
+    largest = reader.take(N) + middle[0]
+    if np.any((largest < 0) | (largest > 3)):
         raise ValueError("the largest component of a quaternion must be 0 to 3")
-    exponents = bounded(columns[:, 1:first], 128, "exponent").astype(np.int8)
-    values = bounded(columns[:, first:], LIMIT, "value").astype(np.int32)
-    return Grid(values, exponents, columns[:, 0].astype(np.uint8), degree, optional)
+    exponents, values = np.empty((N, first - 1), np.int8), np.empty((N, len(middle) - first), np.int32)
+    for column, shift in zip(exponents.T, middle[1:first], strict=True):
+        column[:] = bounded(reader.take(N) + shift, 128, "exponent")
+    for column, shift in zip(values.T, middle[first:], strict=True):
+        column[:] = bounded(reader.take(N) + shift, LIMIT, "value")
+    return Grid(values, exponents, largest.astype(np.uint8), degree, optional)
 
 
 def _touched(now: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray], survivors: np.ndarray) -> np.ndarray:
@@ -383,5 +410,22 @@ def _head(packet: Packet, count: int) -> list[int]:
     return [int(number) for number in head]
 
 
-def _padded(words: np.ndarray, count: int) -> np.ndarray:
-    return np.pad(words, (0, max(0, -(-count // _PER_WORD) - len(words))))
+def _check_most(number: int, most: int, what: str) -> None:
+    if number > most:
+        raise ValueError(f"{what} must be at most {most}, got {number}")
+
+
+def _padded(words: np.ndarray, added: int, total: int, grid: Grid) -> np.ndarray:
+    return np.pad(words, (0, max(0, _least_words(added, total, grid.degree, grid.optional) - len(words))))
+
+
+def _check_words(code: np.ndarray, added: int, total: int, degree: int, optional: int) -> None:
+    least = _least_words(added, total, degree, optional)
+    if len(code) < least:
+        raise ValueError(f"{added} new of {total} Gaussians take at least {least} words of code, got {len(code)}")
+
+
+def _least_words(added: int, total: int, degree: int, optional: int) -> int:
+    """Return the number of words that a packet has at least if it adds some Gaussians to a state with a new total."""
+    integers = num_integers(degree, optional)
+    return -(-added * (integers if total * integers > _FREE_INTEGERS else 1) // _PER_WORD)

@@ -43,6 +43,7 @@ __all__ = [
     "finite_fields",
     "new_grid",
     "num_exponents",
+    "num_integers",
     "optional_mask",
     "optional_names",
     "real_values",
@@ -134,7 +135,7 @@ class Grid:
         quats[rows, self.largest_components] = 1 / length
         for k, ratio in enumerate((u, v, w)):
             quats[rows, k + (k >= self.largest_components)] = ratio / length
-        sh = [self.real(name) for name in ("sh_dc", "sh_rest") if name in self.columns]
+        sh = [self.real(name).astype(np.float32) for name in ("sh_dc", "sh_rest") if name in self.columns]
         optional = {
             name: self.real(name).astype(np.float32).reshape(len(self), *_STORED[name].shape)
             for name in optional_names(self.optional)
@@ -144,7 +145,7 @@ class Grid:
             log_scales=self.real("log_scales").astype(np.float32),
             quats=quats,
             logit_opacities=self.real("logit_opacities")[:, 0].astype(np.float32),
-            sh_coeffs=np.concatenate(sh, 1, dtype=np.float32).reshape(len(self), (self.degree + 1) ** 2, 3),
+            sh_coeffs=np.concatenate(sh, 1).reshape(len(self), (self.degree + 1) ** 2, 3),
             motion=np.zeros((len(self), 3), np.float32) if motion is None else motion,
             offset=offset,
             **optional,
@@ -177,6 +178,11 @@ def num_exponents(optional: int) -> int:
     return max(at.stop for at in _exponent_columns(optional).values())
 
 
+def num_integers(degree: int, optional: int) -> int:
+    """Return the number of integers of a Gaussian: the largest component, E exponents and C values."""
+    return 1 + num_exponents(optional) + max(at.stop for at in columns_of(degree, optional).values())
+
+
 def _exponent_columns(optional: int) -> dict[str, slice]:
     return _slices({name: 3 if name == "log_scales" else 1 for name in (*_ALWAYS, *optional_names(optional))})
 
@@ -198,7 +204,7 @@ def bounded(values: np.ndarray, limit: int, what: str) -> np.ndarray:
         ValueError: they do not.
     """
     if np.any((values >= limit) | (values < -limit)):
-        raise ValueError(f"an {what} must lie between -{limit} and {limit}")
+        raise ValueError(f"each {what} must lie between -{limit} and {limit}")
     return values
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import struct
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import BinaryIO
 
@@ -21,9 +22,9 @@ from morgs_mi.codec.container import (
     PacketKind,
     TruncatedStreamError,
     decode_packet,
-    header_fields,
     open_packet,
 )
+from morgs_mi.codec.header import header_fields
 
 __all__ = ["StreamReader"]
 
@@ -135,9 +136,16 @@ class StreamReader:
             file.seek(at)
             with contextlib.suppress(ValueError, struct.error):  # a payload that looks like an index by chance
                 kind, _, payload = open_packet(file.read(size - at))
-                if kind == PacketKind.INDEX:
-                    return list(ENTRY.iter_unpack(payload[: -TRAILER.size]))
+                entries = list(ENTRY.iter_unpack(payload[: -TRAILER.size]))
+                if kind == PacketKind.INDEX and self._plausible(entries, at):
+                    return entries
         return None
+
+    def _plausible(self, entries: list[tuple[int, int, int]], end: int) -> bool:
+        """Return whether entries name keyframes and residuals at ascending offsets of the packets before byte `end`."""
+        offsets = [self._first - 1, *(offset for *_, offset in entries), end]
+        kinds = {kind for kind, *_ in entries}
+        return kinds <= {PacketKind.KEYFRAME, PacketKind.RESIDUAL} and all(a < b for a, b in pairwise(offsets))
 
     def check(self) -> tuple[list[tuple[int, int, int]], int]:
         """Check every packet and return (kind, frame, offset) of all except the header, and the end of the last one.
@@ -162,7 +170,7 @@ class StreamReader:
         for offset, data in self._checked(number, at):
             if HEAD.unpack_from(data)[0] != PacketKind.INDEX:
                 with self._located(number, offset):
-                    packet = decode_packet(data)
+                    packet = decode_packet(data, self._place(number, offset))
                 yield packet
                 number += 1
 
@@ -209,7 +217,10 @@ class StreamReader:
             raise ValueError(self._sentence(number, at, str(error))) from None
 
     def _sentence(self, number: int, at: int, problem: str) -> str:
-        return f"{self.path}: packet {number} at byte {at}: {problem}; {number} packets before it are intact."
+        return f"{self._place(number, at)}: {problem}; {number} packets before it are intact."
+
+    def _place(self, number: int, at: int) -> str:
+        return f"{self.path}: packet {number} at byte {at}"
 
 
 def _read(file: BinaryIO, count: int) -> bytes:

@@ -1,15 +1,20 @@
 """Recovery of the playable frames of a damaged stream: packets are found by their CRC, wherever they begin.
 
-Neither lengths nor the index are trusted, so an intact packet is found whatever happened to the rest. A frame plays if
-its packet is intact and is a keyframe or has a parent that plays.
+Lengths, order and index are not trusted, so an intact packet is found whatever happened to the rest. A frame plays if
+it has an intact packet that is a keyframe or has a parent that plays. Of several packets of a frame, the one whose
+state is the parent of a residual plays, otherwise a residual before a keyframe.
 """
 
 from __future__ import annotations
 
 import re
+import struct
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import chain, groupby
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,8 +28,8 @@ from morgs_mi.codec.container import (
     PacketKind,
     StreamWriter,
     decode_packet,
-    open_packet,
 )
+from morgs_mi.codec.crc import range_crcs
 from morgs_mi.codec.packets import CodedFrame, decode
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import atomic_path
@@ -34,6 +39,8 @@ __all__ = ["DamagedRange", "salvage", "write_salvaged"]
 # A packet begins with its kind, uint32. Kind 0, the header, is not searched for: its place is fixed, and erased ranges
 # consist of zeros.
 _KIND = re.compile(rb"[\1-\3]\0\0\0")
+_HEAD_WITH_CRC = struct.Struct("<IIQI")
+_SHORTEST = 16  # bytes of a payload: an index without entries; a frame has more
 
 
 @dataclass(frozen=True)
@@ -52,7 +59,7 @@ class DamagedRange:
 
 
 def salvage(path: str | Path) -> Iterator[CodedFrame | DamagedRange]:
-    """Yield the states of the playable frames of a stream file and its damaged ranges, in the order of the file.
+    """Yield the damaged ranges of a stream file and the states of its playable frames, once each, by ascending frame.
 
     A file that is truncated behind a complete packet has no damaged range; see `StreamReader.closed`. Cameras are not
     needed, so the frames behind a broken header play as well.
@@ -64,23 +71,23 @@ def salvage(path: str | Path) -> Iterator[CodedFrame | DamagedRange]:
     for found in _playable(Path(path)):
         if isinstance(found, DamagedRange):
             yield found
-        elif found[1].frame != last:
-            last = found[1].frame
-            yield found[1]
+        elif found[1] is not last:
+            last = found[1]
+            yield last
 
 
 def write_salvaged(stream: StreamReader, output: str | Path) -> tuple[list[int], list[DamagedRange]]:
     """Write the playable packets of a damaged stream as a new stream, atomically.
 
-    The packets are copied unchanged. Behind a damaged range the new stream continues with a keyframe, whose frame has
-    no displacements. An undamaged stream is copied.
+    The packets are copied unchanged, by ascending frame. Behind a damaged range the new stream continues with a
+    keyframe, whose frame has no displacements. An undamaged stream is copied.
 
     Args:
         stream: the damaged stream; its header, with the cameras, must be intact.
         output: the file to write; an existing one is replaced, unless it is the file of `stream`.
 
     Returns:
-        The playable frames and the damaged ranges.
+        The playable frames and the damaged ranges, both in ascending order.
 
     Raises:
         OSError: the new file cannot be written.
@@ -88,7 +95,8 @@ def write_salvaged(stream: StreamReader, output: str | Path) -> tuple[list[int],
     """
     if Path(output).resolve() == stream.path.resolve():
         raise ValueError(f"{output}: expected a new file, got the damaged stream itself; give another name.")
-    frames, ranges = [], []
+    frames: list[int] = []
+    ranges: list[DamagedRange] = []
     with (
         atomic_path(output, "write_salvaged()") as partial,
         StreamWriter(partial, stream.cameras, stream.fps, stream.metadata) as writer,
@@ -101,58 +109,106 @@ def write_salvaged(stream: StreamReader, output: str | Path) -> tuple[list[int],
                 frames.append(found[1].frame)
         if not frames:
             raise ValueError(f"{stream.path}: expected at least one frame that plays, got none; nothing was written.")
-    return list(dict.fromkeys(frames)), ranges
+    return list(dict.fromkeys(frames)), sorted(ranges, key=lambda found: found.start)
 
 
 def _playable(path: Path) -> Iterator[tuple[Packet, CodedFrame] | DamagedRange]:
-    """Yield each playable packet with the state after it, and the damaged ranges."""
+    """Yield the damaged ranges, and each playable packet with the state after it, by ascending frame."""
     data = path.read_bytes()  # a memory map would end the process if the file were truncated meanwhile
     if not data:
         yield DamagedRange(0, 0, "the file is empty")
-    coded, at = None, 0
-    for kind, start, stop in _intact(data):
+    found: list[_Found] = []
+    parents: set[bytes] = set()
+    at = PREAMBLE.size if data.startswith(PREAMBLE.pack(MAGIC, VERSION)) else 0
+    for number, (start, stop) in enumerate(_intact(data)):
         if start > at:
             yield DamagedRange(at, start, "the bytes are damaged")
         at = stop
+        kind, frame, _ = HEAD.unpack_from(data, start)
         if kind in (PacketKind.KEYFRAME, PacketKind.RESIDUAL):
+            entry = _Found(frame, -kind, number, start, stop)
             try:
-                packet = decode_packet(data[start:stop])
-                if coded is None or packet.frame != coded.frame:
-                    coded = decode(coded, packet)
-                elif not np.array_equal(decode(None, packet).digest, coded.digest):
-                    raise ValueError(f"the re-emitted keyframe differs from the state of frame {coded.frame}")
-                yield packet, coded
+                arrays = entry.packet(data).arrays
             except ValueError as error:
-                yield DamagedRange(start, stop, str(error))
+                yield entry.damaged(f"{entry.place}: {error}")
+                continue
+            found.append(entry)
+            if "parent" in arrays:
+                parents.add(arrays["parent"].tobytes())
     if at < len(data):
         yield DamagedRange(at, len(data), "the bytes are damaged or truncated")
+    coded = None
+    for _, entries in groupby(sorted(found), lambda entry: entry.frame):
+        best, states = None, []
+        for entry in entries:
+            try:
+                state = decode(coded, entry.packet(data))
+            except (ValueError, MemoryError) as error:
+                yield entry.damaged(str(error) or f"{entry.place}: its state does not fit into memory")
+                continue
+            states.append((entry, state.digest.tobytes()))
+            if best is None or (best.digest.tobytes() not in parents and states[-1][1] in parents):
+                best = state
+        if best is not None:
+            coded = best
+            yield from _once(data, coded, states)
 
 
-def _intact(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield (kind, start, stop) of the preamble, with the header's kind, and of every packet with a correct CRC."""
-    at = PREAMBLE.size
-    if data[:at] == PREAMBLE.pack(MAGIC, VERSION):
-        yield PacketKind.HEADER, 0, at
-    if (stop := _end(data, at)) is not None:
-        yield data[at], at, stop
-        at = stop
-    while (found := _KIND.search(data, at)) is not None:
-        start = found.start()
-        stop = _end(data, start)
-        if stop is not None:
-            yield data[start], start, stop
-        at = stop or start + 1
+def _once(
+    data: bytes, coded: CodedFrame, states: list[tuple[_Found, bytes]]
+) -> Iterator[tuple[Packet, CodedFrame] | DamagedRange]:
+    """Yield the first packet of a state and its re-emitted keyframe; the other packets of the frame are damaged."""
+    last = None
+    for entry, digest in states:
+        if digest != coded.digest.tobytes():
+            yield entry.damaged(f"{entry.place}: another packet of frame {coded.frame} leads to another state")
+        elif entry.kind == last or last == PacketKind.KEYFRAME:
+            yield entry.damaged(f"{entry.place}: frame {coded.frame} is there already")
+        else:
+            last = entry.kind
+            yield entry.packet(data), coded
 
 
-def _end(data: bytes, start: int) -> int | None:
-    """Return the end of the intact packet that begins at `start`, None if there is none."""
-    if start + PAYLOAD > len(data):
-        return None
-    stop = start + PAYLOAD + HEAD.unpack_from(data, start)[2]
-    if stop > len(data):
-        return None
-    try:
-        open_packet(data[start:stop])
-    except ValueError:
-        return None
-    return stop
+class _Found(NamedTuple):
+    """An intact packet. In their order, frames ascend and residuals precede keyframes."""
+
+    frame: int
+    minus_kind: int
+    number: int
+    start: int
+    stop: int
+
+    @property
+    def kind(self) -> int:
+        return -self.minus_kind
+
+    @property
+    def place(self) -> str:
+        return f"intact packet {self.number}, frame {self.frame}"
+
+    def packet(self, data: bytes) -> Packet:
+        return decode_packet(data[self.start : self.stop], self.place)
+
+    def damaged(self, problem: str) -> DamagedRange:
+        return DamagedRange(self.start, self.stop, problem)
+
+
+def _intact(data: bytes) -> Iterator[tuple[int, int]]:
+    """Yield (start, stop) of every packet with a correct CRC; of packets that overlap, the first."""
+    starts, stops, heads, expected = np.fromiter(_candidates(data), np.dtype((np.int64, 4))).T
+    right = range_crcs(data, starts + PAYLOAD, stops, heads.astype(np.uint32)) == expected
+    at = 0
+    for start, stop in zip(starts[right].tolist(), stops[right].tolist(), strict=True):
+        if start >= at:
+            yield start, stop
+            at = stop
+
+
+def _candidates(data: bytes) -> Iterator[tuple[int, int, int, int]]:
+    """Yield (start, stop, CRC of the head, CRC stored) of all that begins as a packet and ends within the data."""
+    starts = (found.start() for found in _KIND.finditer(data, PREAMBLE.size))
+    for start in chain((PREAMBLE.size,), starts):
+        if start + PAYLOAD <= len(data):
+            *_, length, crc = _HEAD_WITH_CRC.unpack_from(data, start)
+            if _SHORTEST <= length <= len(data) - start - PAYLOAD:
+                yield start, start + PAYLOAD + length, zlib.crc32(data[start : start + HEAD.size]), crc

@@ -1,18 +1,21 @@
-"""Atomic creation of files and folders, and JSON that every reader accepts."""
+"""Atomic creation of files and folders, locked folders, and JSON that every reader accepts."""
 
 from __future__ import annotations
 
+import fcntl
 import json
 import math
 import os
 import re
 import shutil
-from collections.abc import Generator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Generator, Iterable, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-__all__ = ["atomic_folder", "atomic_path", "json_finite", "write_json"]
+__all__ = ["atomic_folder", "atomic_path", "is_same_file", "json_finite", "locked_folder", "write_json"]
+
+_LOCK = ".morgs-lock"
 
 
 @contextmanager
@@ -23,11 +26,14 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
     that existed from the start. Parent folders are not created.
 
     Raises:
+        FileExistsError: `path` is a device or a pipe.
         OSError: raised by the body or the renaming; its sentence begins with `place`, e.g. ``write_json()``.
     """
     final = Path(path).resolve()  # a rename would replace a link, and `.` has no name
     partial, old = (final.with_name(f".{what}-{os.getpid()}-{final.name}") for what in ("partial", "old"))
     replaces_folder = os.path.isdir(final)  # unlike Path's, never raises
+    if os.path.exists(final) and not (replaces_folder or os.path.isfile(final)):
+        raise FileExistsError(f"{place}: {path} is a device or a pipe, which would be replaced; name a file.")
     for left in _left_behind(final):
         _remove(left)
     try:
@@ -36,13 +42,7 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
             final.rename(old)  # deleting takes time, and a half-deleted folder would look complete
         partial.replace(final)
     except OSError as error:
-        reason = (error.strerror or str(error)).rstrip(".")
-        if error.filename and str(error.filename) != str(partial):
-            reason += f": {error.filename}"
-        remedy = "check that its folder is writable and the disk has room"
-        failure = OSError(f"{place}: cannot write {path}, the partial output was removed: {reason}; {remedy}.")
-        failure.strerror = reason  # so that a folder's sentence does not contain that of a file in it
-        raise failure from error
+        raise _write_error(f"{place}: cannot write {path}, the partial output was removed", error, partial) from error
     finally:
         if os.path.exists(old) and not os.path.exists(final):
             old.rename(final)
@@ -65,6 +65,47 @@ def atomic_folder(path: str | os.PathLike[str], place: str) -> Generator[Path, N
         yield partial
 
 
+@contextmanager
+def locked_folder(path: str | os.PathLike[str], place: str) -> Generator[None, None, None]:
+    """Create a folder with its parents if it is missing, and lock it against other writers while the body runs.
+
+    The lock is an empty file in the folder, which is removed at the end, as are the created folders that are still
+    empty. A killed process leaves the file, but not the lock. A file system without locks is not locked.
+
+    Raises:
+        BlockingIOError: another writer has locked the folder.
+        OSError: the folder cannot be created or written; the sentence begins with `place`.
+    """
+    folder, file = Path(path), Path(path) / _LOCK
+    created = [parent for parent in (folder, *folder.parents) if not os.path.lexists(parent)]
+    with ExitStack() as undo:
+        undo.callback(_remove_empty, created)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock = os.open(file, os.O_RDWR | os.O_CREAT, 0o666)
+        except FileExistsError:
+            raise FileExistsError(f"{place}: {path} is a file; name a folder.") from None
+        except OSError as error:
+            raise _write_error(f"{place}: cannot write into {path}", error, folder) from error
+        undo.callback(os.close, lock)
+        # A writer that has just ended may have removed the file between its opening and its locking.
+        if not _locked(lock) or not is_same_file(file, os.fstat(lock)):
+            raise BlockingIOError(
+                f"{path}: expected a folder into which nothing else is written, got one into which another process is "
+                "writing; wait until it has ended, or choose another folder."
+            )
+        undo.callback(_remove_own, file, lock)
+        yield
+
+
+def is_same_file(path: str | os.PathLike[str], opened: os.stat_result) -> bool:
+    """Return whether `path` still is the file that was opened: it was not removed, moved or replaced since."""
+    try:
+        return os.path.samestat(os.stat(path), opened)
+    except OSError:
+        return False
+
+
 def write_json(path: str | os.PathLike[str], value: Mapping[str, Any]) -> None:
     """Write `value` as JSON atomically, with null for floats that are not finite; missing folders are created.
 
@@ -84,6 +125,39 @@ def json_finite(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [json_finite(entry) for entry in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _write_error(start: str, error: OSError, own: Path) -> OSError:
+    """Return an error with the reason of another one, and its file unless that is `own`."""
+    reason = (error.strerror or str(error)).rstrip(".")
+    if error.filename and str(error.filename) != str(own):
+        reason += f": {error.filename}"
+    failure = OSError(f"{start}: {reason}; check that its folder is writable and the disk has room.")
+    failure.strerror = reason  # so that a folder's sentence does not contain that of a file in it
+    return failure
+
+
+def _locked(file: int) -> bool:
+    """Lock an open file and return whether nobody else has locked it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a file system without locks
+        pass
+    return True
+
+
+def _remove_own(file: Path, lock: int) -> None:
+    """Remove a lock file unless it was replaced by that of another writer."""
+    if is_same_file(file, os.fstat(lock)):
+        _remove(file)
+
+
+def _remove_empty(folders: Iterable[Path]) -> None:
+    for folder in folders:
+        with suppress(OSError):
+            folder.rmdir()
 
 
 def _left_behind(final: Path) -> list[Path]:

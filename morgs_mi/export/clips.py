@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.codec.packets import play, seek
+from morgs_mi.codec.packets import coded_frames, play, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import atomic_folder
 from morgs_mi.core.gaussians import Gaussians
@@ -17,7 +18,7 @@ from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.player import channel_image, render, render_config
 from morgs_mi.playback.visualise import side_by_side
 
-__all__ = ["frame_numbers", "select_frames", "write_each", "write_flight"]
+__all__ = ["frame_numbers", "repeated_seconds", "select_frames", "write_each", "write_flight"]
 
 Progress = Callable[[int, int], None] | None
 
@@ -48,13 +49,15 @@ def select_frames(stream: StreamReader, span: str | None) -> list[int]:
         if span.count(":") > 2 or (step is not None and step < 1):
             raise ValueError
     except ValueError:
-        raise ValueError(f"the frames must be given as 12, 10:20 or 0:100:5, got {span!r}.") from None
+        raise ValueError(f"select_frames(): `span` must be like 12, 10:20 or 0:100:5, got {span!r}.") from None
     if ":" not in span:
         start, stop = start, None if start is None else start + 1
     low, high = numbers[0] if start is None else start, numbers[-1] + 1 if stop is None else stop
     wanted = set(range(low, high, step or 1))
     if not (selected := [number for number in numbers if number in wanted]):
-        raise ValueError(f"{stream.path}: the frames must lie in {numbers[0]}..{numbers[-1]}, got {span!r}.")
+        raise ValueError(
+            f"select_frames(): `span` must select frames of {stream.path}, {numbers[0]} to {numbers[-1]}, got {span!r}."
+        )
     return selected
 
 
@@ -99,10 +102,11 @@ def write_flight(
     channels: Sequence[str] = ("color",),
     freeze: int | None = None,
     progress: Progress = None,
+    back_and_forth: bool = False,
 ) -> None:
     """Render a stream along a camera path into a video at the stream's frame rate; the file is written atomically.
 
-    The clip plays while the camera moves, and restarts after its last frame.
+    The clip plays while the camera moves, and restarts after its last frame or plays backwards from there.
 
     Args:
         stream: the file.
@@ -111,6 +115,8 @@ def write_flight(
         channels: out of `CHANNELS`, drawn side by side.
         freeze: index of a single frame to show; None plays the clip.
         progress: called with (images done, total number of images).
+        back_and_forth: play the clip backwards after its last frame. Motion is then that of the clip, so it points
+            opposite to the motion in the video.
 
     Raises:
         ValueError: another type of file, an unknown channel or frame, or a broken packet.
@@ -122,7 +128,7 @@ def write_flight(
     count, config = max(1, round(path.seconds * stream.fps)), render_config(stream)
 
     def images() -> Iterator[np.ndarray]:
-        for i, gaussians in zip(range(count), _repeated_frames(stream, freeze), strict=False):
+        for i, gaussians in zip(range(count), _repeated_frames(stream, freeze, back_and_forth), strict=False):
             rendered = render(gaussians, path.at(i / stream.fps), channels, config)
             yield pad_to_even(side_by_side([channel_image(name, values) for name, values in rendered.items()]))
             if progress is not None:
@@ -131,8 +137,35 @@ def write_flight(
     write_video(output, images(), stream.fps, PLAYABLE)
 
 
-def _repeated_frames(stream: StreamReader, freeze: int | None) -> Iterator[Gaussians]:
+def repeated_seconds(clip: float, least: float) -> float:
+    """Return the duration of as many plays of a clip as last at least `least` seconds, at least one.
+
+    Raises:
+        ValueError: `least` is negative or not finite.
+    """
+    if not 0 <= least < math.inf:
+        raise ValueError(f"--least-seconds must not be negative and must be finite, got {least}.")
+    return clip * max(1, math.ceil(least / clip - 1e-9))
+
+
+def _repeated_frames(stream: StreamReader, freeze: int | None, back_and_forth: bool) -> Iterator[Gaussians]:
     """Yield the frames of a stream, or the one frame `freeze`, without end."""
     frozen = None if freeze is None else seek(stream, freeze).gaussians
     while True:
         yield from (frozen,) if frozen is not None else (gaussians for _, gaussians in play(stream))
+        if frozen is None and back_and_forth:
+            yield from _frames_backwards(stream)
+
+
+def _frames_backwards(stream: StreamReader) -> Iterator[Gaussians]:
+    """Yield the frames between the first and the last one backwards, decoded from one keyframe to the next."""
+    between = frame_numbers(stream)[1:-1]
+    while between:
+        block = []
+        for coded in coded_frames(stream.near(between[-1])):
+            block.append(coded)
+            if coded.frame == between[-1]:
+                break
+        # A keyframe has no motion of its own: it follows from the residual, in the block before.
+        yield from (coded.gaussians for coded in block[:0:-1])
+        between = [frame for frame in between if frame <= block[0].frame]

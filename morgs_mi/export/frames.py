@@ -51,6 +51,8 @@ def write_frames(
         raise ValueError(
             f"{output}: the output must be FILE.mp4, or a folder ending in png or exr, got {output.suffix!r}."
         )
+    if not stream.index():
+        raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has only a header.")
     rendered = render_stream(stream, camera, channels or (("color",) if video or png else None))
 
     def frames() -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
@@ -68,8 +70,6 @@ def write_frames(
                 write_png(folder / f"{frame:04d}.png", _combined_image(images))
             else:
                 write_exr(folder / f"{frame:04d}.exr", exr_channels(images))
-        if not any(folder.iterdir()):
-            raise ValueError(f"{output}: at least one frame was expected, got none; the stream has only a header.")
 
 
 def exr_channels(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

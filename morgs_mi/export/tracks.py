@@ -70,8 +70,11 @@ def write_tracks(path: str | Path, tracks: Tracks) -> None:
     """Write tracks as .npz with the arrays `ids`, `frames`, `positions`, `confidence`; the file is written atomically.
 
     Raises:
+        ValueError: `path` does not end in .npz.
         OSError: the file cannot be written.
     """
+    if Path(path).suffix.lower() != ".npz":
+        raise ValueError(f"{path}: the output must be FILE.npz, got {Path(path).suffix!r}.")
     with atomic_path(path, "write_tracks()") as partial, open(partial, "wb") as file:
         np.savez_compressed(
             file, ids=tracks.ids, frames=tracks.frames, positions=tracks.positions, confidence=tracks.confidence

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import OpenEXR
 
 from morgs_mi.core.files import atomic_path
+from morgs_mi.io.bounded import check_claim
 
 __all__ = ["read_exr", "write_exr"]
+
+_MAGIC, _MULTIPART = 20000630, 1 << 12
 
 
 def write_exr(path: str | Path, channels: Mapping[str, np.ndarray]) -> None:
@@ -37,12 +42,55 @@ def read_exr(path: str | Path) -> dict[str, np.ndarray]:
 
     Raises:
         FileNotFoundError: there is no such file.
-        OSError: it is not a readable EXR file.
+        OSError: it is not a readable EXR file, or claims more pixels than fit its size.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"read_exr(): there is no file {path}; check the path.")
     try:
+        _check_size(path)
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            return {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
-    except (RuntimeError, ValueError) as error:
+            return {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
+    except (RuntimeError, ValueError, KeyError, struct.error) as error:
         raise OSError(f"read_exr(): cannot read {path}: {error}; the file may be truncated.") from error
+
+
+def _check_size(path: str | Path) -> None:
+    """Check the sizes in the headers of all parts, which OpenEXR allocates even where it reads the headers alone."""
+    with Path(path).open("rb") as file:
+        magic, version = struct.unpack("<II", file.read(8).ljust(8, b"\0"))
+        if magic != _MAGIC:
+            raise ValueError("it does not begin with the number of an EXR file")
+        parts = [_header(file)]
+        # Headers of several parts end with an empty one.
+        while version & _MULTIPART and (header := _header(file)):
+            parts.append(header)
+    sizes = []
+    for part in parts:
+        left, top, right, bottom = struct.unpack("<4i", part[b"dataWindow"])
+        sizes.append((max(0, right - left + 1), max(0, bottom - top + 1), _count_channels(part[b"channels"])))
+        if part.get(b"type", b"").startswith(b"deep"):
+            raise ValueError("it has deep pixels, which are not supported")
+    numbers = sum(width * height * channels for width, height, channels in sizes)
+    check_claim(path, 4 * numbers, " and ".join(f"{w}x{h} pixels of {n} channels" for w, h, n in sizes))
+
+
+def _header(file: BinaryIO) -> dict[bytes, bytes]:
+    """Return the attributes of one part."""
+    attributes = {}
+    while name := _string(file):
+        _string(file)
+        (size,) = struct.unpack("<I", file.read(4).ljust(4, b"\0"))
+        attributes[name] = file.read(size)
+    return attributes
+
+
+def _count_channels(data: bytes) -> int:
+    count = at = 0
+    while at < len(data) - 1:
+        at = data.index(b"\0", at) + 17  # a name that ends in 0, and 16 bytes
+        count += 1
+    return count
+
+
+def _string(file: BinaryIO) -> bytes:
+    return b"".join(iter(lambda: file.read(1).strip(b"\0"), b""))

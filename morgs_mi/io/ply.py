@@ -7,18 +7,36 @@ standard deviations), ``rot_0..3`` (w, x, y, z). World axes stay as they are; th
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
-from typing import cast
+from typing import BinaryIO
 
 import numpy as np
-from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
+from plyfile import PlyData, PlyElement
 
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 
-__all__ = ["read_ply", "write_ply"]
+__all__ = ["read_ply", "read_vertices", "write_ply"]
 
 _MEAN, _SCALE, _ROTATION = ("x", "y", "z"), ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
+# Type names of the format and of its older writers.
+_TYPES = {
+    name: dtype
+    for dtype, names in {
+        "i1": ("char", "int8"),
+        "u1": ("uchar", "uint8"),
+        "i2": ("short", "int16"),
+        "u2": ("ushort", "uint16"),
+        "i4": ("int", "int32"),
+        "u4": ("uint", "uint32"),
+        "f4": ("float", "float32"),
+        "f8": ("double", "float64"),
+    }.items()
+    for name in names
+}
+_BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _NORMAL, _DC = ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
 
 
@@ -58,15 +76,8 @@ def read_ply(path: str | Path) -> Gaussians:
         FileNotFoundError: there is no such file.
         ValueError: it is not a PLY file, is truncated, lacks a property, or has a number that is not finite.
     """
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"{path}: expected a PLY file, found none; check the path.")
-    try:
-        ply = PlyData.read(str(path), mmap=cast(str, False))  # a bool is allowed, but the annotation lacks it
-        elements = {element.name: element for element in ply}
-    except (PlyParseError, ValueError, IndexError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: expected a complete PLY file, got one that cannot be read: {error}.") from error
-    properties = elements["vertex"].properties if "vertex" in elements else ()
-    names = {p.name for p in properties if not isinstance(p, PlyListProperty)}
+    vertices = read_vertices(path)
+    names = set(vertices)
     if "packed_position" in names:
         raise ValueError(
             f"{path}: expected an uncompressed PLY, got SuperSplat's compressed one; export it uncompressed."
@@ -83,18 +94,102 @@ def read_ply(path: str | Path) -> Gaussians:
         raise ValueError(
             f"{path}: expected f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) or none, got {found} of them."
         )
-    vertices, K = elements["vertex"], (degree + 1) ** 2
+    N, K = len(vertices["x"]), (degree + 1) ** 2
 
     def columns(wanted: tuple[str, ...]) -> np.ndarray:
-        values = [np.asarray(vertices[name], np.float32) for name in wanted]
-        bad = [name for name, value in zip(wanted, values, strict=True) if not np.isfinite(value).all()]
-        if bad:
+        values = np.empty((N, len(wanted)), np.float32)
+        for i, name in enumerate(wanted):
+            values[:, i] = vertices[name]
+        if bad := [name for i, name in enumerate(wanted) if not np.isfinite(values[:, i]).all()]:
             raise ValueError(f"{path}: expected finite numbers, got others in {', '.join(bad)}; clean the Gaussians.")
-        return np.stack(values, axis=1) if values else np.zeros((len(vertices.data), 0), np.float32)
+        return values
 
-    rest = columns(_rest(K)).reshape(len(vertices.data), 3, K - 1).transpose(0, 2, 1)
-    coeffs = np.concatenate([columns(_DC)[:, None], rest], axis=1)
+    coeffs = np.empty((N, K, 3), np.float32)
+    coeffs[:, 0] = columns(_DC)
+    coeffs[:, 1:] = columns(_rest(K)).reshape(N, 3, K - 1).transpose(0, 2, 1)
     return Gaussians(columns(_MEAN), columns(_SCALE), columns(_ROTATION), columns(("opacity",))[:, 0], coeffs)
+
+
+def read_vertices(path: str | Path) -> dict[str, np.ndarray]:
+    """Return the properties of the vertices in a PLY file, binary or text, by name, each [N] in its stored type.
+
+    Written by hand because plyfile allocates what the header claims, and Python objects for lists. Elements after the
+    vertices are not read; those before them and the vertices themselves must have no lists.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is not a PLY file, has no vertices, or has fewer of them than its header claims.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a PLY file, found none; check the path.")
+    try:
+        with path.open("rb") as file:
+            order, elements = _read_header(file)
+            for element in elements:
+                dtype = element.dtype(order)
+                held = path.stat().st_size - file.tell()
+                # A number in a text takes a digit and a separator.
+                required = element.count * (dtype.itemsize if order else 2 * len(element.properties)) - (not order)
+                if element.count < 0 or required > held:
+                    raise ValueError(f"{element.count} {element.name} need at least {required} bytes, {held} follow")
+                if element.name == "vertex":
+                    return _read_rows(file, element.count, dtype, text=not order)
+                if order:
+                    file.seek(element.count * dtype.itemsize, 1)
+                else:
+                    next(islice(file, element.count, element.count), None)
+        raise ValueError("it has no vertices")
+    except (ValueError, KeyError, IndexError, OverflowError) as error:
+        raise ValueError(f"{path}: expected a complete PLY file, got one that cannot be read: {error}.") from error
+
+
+@dataclass
+class _Element:
+    """An element of a PLY file: its name, its number of rows, and the lines of its properties, split into words."""
+
+    name: str
+    count: int
+    properties: list[list[str]]
+
+    def dtype(self, order: str) -> np.dtype:
+        """Return the type of a row in the byte order `order`."""
+        if any(words[1] == "list" for words in self.properties):
+            raise ValueError(f"the element {self.name} has lists before the end of the vertices, write it without them")
+        return np.dtype([(words[2], order + _TYPES[words[1]]) for words in self.properties])
+
+
+def _read_header(file: BinaryIO) -> tuple[str, list[_Element]]:
+    """Return the byte order, empty for text, and the elements."""
+    if file.readline(8).strip() != b"ply":
+        raise ValueError("it does not begin with `ply`")
+    order, elements = None, []
+    # Beyond any header: a file without line ends would be read as one line.
+    while line := file.readline(4096):
+        words = line.decode("ascii", errors="replace").split()
+        if words == ["end_header"]:
+            if order is None:
+                raise ValueError("its header has no format")
+            return order, elements
+        if words[:1] == ["format"]:
+            order = _BYTE_ORDERS[words[1]]
+        elif words[:1] == ["element"]:
+            elements.append(_Element(words[1], int(words[2]), []))
+        elif words[:1] == ["property"]:
+            elements[-1].properties.append(words)
+    raise ValueError("its header does not end")
+
+
+def _read_rows(file: BinaryIO, count: int, dtype: np.dtype, text: bool) -> dict[str, np.ndarray]:
+    if not text:
+        table = np.fromfile(file, dtype, count)
+    elif count == 0:
+        table = np.empty(0, dtype)
+    else:
+        table = np.loadtxt(islice(file, count), dtype, ndmin=1)
+    if len(table) < count:
+        raise ValueError(f"expected {count} vertices, got {len(table)}")
+    return {name: table[name] for name in table.dtype.names or ()}
 
 
 def _rest(K: int) -> tuple[str, ...]:

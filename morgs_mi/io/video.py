@@ -1,17 +1,23 @@
 """Readers of video files and of folders of images.
 
 A frame is an RGB uint8 array [H, W, 3]. `VideoReader` and `FolderReader` have the same members.
+
+Many cameras, above all those of phones, record at a variable frame rate: they delay or leave out frames. The container
+stores the time of each frame, so the reader knows where on a regular clock the frames lie.
 """
 
 from __future__ import annotations
 
 import re
+import struct
 from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import cv2
 import numpy as np
+
+from morgs_mi.io.bounded import check_claim
 
 __all__ = [
     "Clip",
@@ -27,6 +33,15 @@ __all__ = [
 
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+_WITHOUT_TIMES = (".avi",)
+# Deviation from a constant rate that does not count: the exposure's, in frames, and the rounding of Matroska's times.
+_JITTER, _ROUNDING_SECONDS = 0.1, 1e-3
+# Difference up to which the header's frame rate, which may be a mean over pauses, is that of the clip's clock.
+_SAME_RATE = 0.01
+# Bytes of an image file in which its size is searched, and of memory that a pixel takes, in BGR and RGB.
+_MAX_HEADER, _BYTES_PER_PIXEL = 1_000_000, 6
+# Frames that a clip may pause; the instants of the pause are listed.
+_MAX_PAUSE = 1_000_000
 
 
 def natural_key(name: str) -> list[str | int]:
@@ -55,6 +70,8 @@ class VideoReader:
         width: in pixels.
         height: in pixels.
         num_held: number of frames in the file; less than `num_frames` if it was truncated.
+        positions: times of the frames in the file, in frames of a regular clock of rate `fps`, which shows position k
+            at the time of frame k of a clip of constant rate [num_held]; None at a constant rate.
     """
 
     path: Path
@@ -63,6 +80,7 @@ class VideoReader:
     width: int
     height: int
     num_held: int
+    positions: np.ndarray | None = field(default=None, compare=False)
 
     @classmethod
     def open(cls, path: str | Path) -> VideoReader:
@@ -70,7 +88,7 @@ class VideoReader:
 
         Raises:
             FileNotFoundError: there is no such file.
-            ValueError: it is empty or OpenCV cannot decode it.
+            ValueError: it is empty, OpenCV cannot decode it, or its time stamps are broken.
         """
         path = Path(path)
         if not path.is_file():
@@ -88,10 +106,24 @@ class VideoReader:
                 f"{path}: expected a video, got {path.stat().st_size} bytes of which OpenCV cannot decode "
                 "one frame: the file is truncated or no video; copy or convert it again."
             )
-        held = _count_packets(path)
-        # Some containers do not store the number.
-        declared = num_frames if num_frames > 0 else held
-        return cls(path, declared, fps if fps > 0 else None, first.shape[1], first.shape[0], held)
+        times = _frame_times(path)
+        held, clock = len(times), None if path.suffix.lower() in _WITHOUT_TIMES else _clock(times)
+        # Some containers do not store the number, and a frame takes more than a byte.
+        declared = num_frames if 0 < num_frames <= path.stat().st_size else held
+        if clock is None:
+            return cls(path, declared, fps if fps > 0 else None, first.shape[1], first.shape[0], held)
+        positions, rate = clock
+        if positions[-1] > 10 * held + _MAX_PAUSE:
+            raise ValueError(
+                f"{path}: expected {held} frames at about {rate:.3g} per second, got time stamps that span "
+                f"{times[-1]:.3g} s; they are broken, convert the clip."
+            )
+        # Where the number is not stored, it is the duration times the mean rate: what counts is that the time is full.
+        if fps > 0 and declared / fps <= times[-1] + 1.5 / rate:
+            declared = held
+        if abs(fps / rate - 1) < _SAME_RATE:
+            rate = fps
+        return cls(path, declared, rate, first.shape[1], first.shape[0], held, positions)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
         """Yield frames start..stop-1, by default up to `num_frames`.
@@ -123,13 +155,14 @@ class VideoReader:
             return ValueError(f"{self.path}: it has ended after {self.num_frames} frames; record longer.")
         return ValueError(
             f"{self.path}: frame {index} of {self.num_frames} cannot be decoded: the file is truncated or broken; copy "
-            f"it again or use the first {index} frames (max_frames)."
+            f"it again or use the first {index} frames (`max_frames`)."
         )
 
 
 @dataclass(frozen=True)
 class FolderReader:
-    """Reader of a folder of numbered images, e.g. ``0000.png``; the members of `VideoReader`, with `fps` None.
+    """Reader of a folder of numbered images, e.g. ``0000.png``, with the members of `VideoReader`, `fps` and
+    `positions` being None.
 
     The images may also be a list of files in any folders; `path` is then the folder of the first.
     """
@@ -139,6 +172,7 @@ class FolderReader:
     width: int
     height: int
     fps: float | None = None
+    positions: np.ndarray | None = None
 
     @classmethod
     def open(cls, path: str | Path) -> FolderReader:
@@ -171,6 +205,19 @@ class FolderReader:
         readable = (f for f in files if not isinstance(_image_or_error(f), Exception)) if gaps else iter(files)
         first = _read_image(next(readable, files[0]))
         return cls(files[0].parent, tuple(files), first.shape[1], first.shape[0])
+
+    def opaque(self) -> tuple[np.ndarray | None, bool]:
+        """Return the mask of the pixels that no alpha channel makes transparent, and whether it is constant.
+
+        The first, the middle and the last image are compared. The mask [H, W] is that of the first one, None if it has
+        no transparent pixels.
+        """
+        chosen = {0, self.num_frames // 2, self.num_frames - 1}
+        masks = [_opaque(self.files[i]) for i in sorted(chosen)]
+        full = np.ones((self.height, self.width), bool)
+        masks = [full if mask is None or mask.shape != full.shape else mask for mask in masks]
+        constant = all(np.array_equal(mask, masks[0]) for mask in masks)
+        return None if masks[0].all() else masks[0], constant
 
     @property
     def num_frames(self) -> int:
@@ -228,6 +275,13 @@ def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
     numbered = {folder: {_number(file): file for file in _images(folder)} for folder in folders}
     numbers = sorted(set().union(*numbered.values()))
     step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
+    if (numbers[-1] - numbers[0]) // step > 10 * len(numbers) + 1000:
+        after = int(np.argmax(np.diff(numbers)))
+        file = next(files[numbers[after + 1]] for files in numbered.values() if numbers[after + 1] in files)
+        raise ValueError(
+            f"{file}: expected images numbered without large gaps, got this after "
+            f"number {numbers[after]} among {len(numbers)} images; rename or remove it."
+        )
     instants = range(numbers[0], numbers[-1] + 1, step)
     return [
         FolderReader.of_files([numbered[clip].get(n, _missing_name(clip, numbered[clip], n)) for n in instants], gaps)
@@ -244,14 +298,32 @@ def open_frames(path: str | Path | tuple[Path, ...]) -> FrameReader:
     return FolderReader.open(path) if Path(path).is_dir() else VideoReader.open(path)
 
 
-def _count_packets(path: Path) -> int:
-    """Return the number of frames in a video file; they are read but not decoded, 0.2 ms each at 1080x1920."""
+def _frame_times(path: Path) -> np.ndarray:
+    """Return the times of the frames in a video file in seconds, from the first, ascending.
+
+    The packets are read but not decoded, 0.2 ms each at 1080x1920. They are in the order of decoding, which differs
+    from that of presentation where frames are predicted from later ones.
+    """
     stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
-    count = 0
+    times = []
     while stream.grab():
-        count += 1
+        times.append(stream.get(cv2.CAP_PROP_POS_MSEC) / 1000)
     stream.release()
-    return count
+    return np.sort(times)
+
+
+def _clock(times: np.ndarray) -> tuple[np.ndarray, float] | None:
+    """Return the `positions` of frames and their rate, or None if the rate is constant or the times are not known."""
+    steps = np.diff(times)
+    if len(steps) < 2 or steps.min() <= 0:
+        return None
+    # Most frames are one period apart, and in step with the clock.
+    period = float(steps[steps < 1.5 * np.median(steps)].mean())
+    ticks = np.append(0, np.cumsum(np.maximum(1, np.rint(steps / period))))
+    positions = (times - np.median(times - period * ticks)) / period
+    if np.abs(positions - np.arange(len(times))).max() <= _JITTER + _ROUNDING_SECONDS / period:
+        return None
+    return positions, 1 / period
 
 
 def _raising(images: Iterator[ImageOrError]) -> Iterator[np.ndarray]:
@@ -304,7 +376,45 @@ def _read_image(file: Path) -> np.ndarray:
     if not file.is_file():
         raise _no_image(file)
     # The stored pixels, without EXIF's rotation: calibrations refer to those.
-    image = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise ValueError(f"{file}: expected an image, got {file.stat().st_size} bytes that cannot be decoded.")
+    image = _decoded(file, cv2.IMREAD_COLOR)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+
+
+def _decoded(file: Path, mode: int) -> np.ndarray:
+    data = np.fromfile(file, np.uint8)
+    width, height = _claimed_size(data[:_MAX_HEADER].tobytes())
+    check_claim(file, _BYTES_PER_PIXEL * width * height, f"{width}x{height} pixels")
+    image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
+    if image is None:
+        raise ValueError(f"{file}: expected an image, got {len(data)} bytes that cannot be decoded.")
+    return image
+
+
+def _opaque(file: Path) -> np.ndarray | None:
+    """Return the mask of an image's opaque pixels [H, W], None if it has no alpha channel or is not readable."""
+    try:
+        with file.open("rb") as opened:
+            header = opened.read(26)
+        # Its type of colours: with a palette, grey and alpha, or RGB and alpha.
+        if not header.startswith(b"\x89PNG") or header[25:] not in (b"\3", b"\4", b"\6"):
+            return None
+        image = _decoded(file, cv2.IMREAD_UNCHANGED)
+    except (ValueError, OSError):
+        return None
+    return image[..., 3] == np.iinfo(image.dtype).max if image.ndim == 3 and image.shape[2] == 4 else None
+
+
+def _claimed_size(data: bytes) -> tuple[int, int]:
+    """Return the width and height in the header of a PNG or JPEG file, 0 of another."""
+    if data.startswith(b"\x89PNG") and len(data) >= 24:
+        width, height = struct.unpack(">II", data[16:24])
+        return width, height
+    at = 2
+    while data.startswith(b"\xff\xd8") and at + 9 <= len(data):
+        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
+        # Start of a frame, by its kind of compression; the other three numbers mark tables.
+        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
+            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
+            return width, height
+        at += 1 if marker == 0xFF else 2 + length
+    return 0, 0

@@ -6,11 +6,16 @@ pixel grid and holds x_t - x_{t-1}, like the ground truth. Keyframes store no di
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from reprlib import repr as shortened
+from types import NoneType
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +24,7 @@ from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.packets import play
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.config import apply_values
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
@@ -37,6 +43,7 @@ __all__ = [
     "find_camera",
     "has_confidence",
     "has_offset",
+    "num_frames",
     "open_stream",
     "open_stream_capture",
     "playback_speed",
@@ -55,6 +62,14 @@ MOTION_SCALE = 0.03
 OFFSET_SCALE = 0.1
 """The same for the learned offset, as a fraction of that speed: the offset is the smaller part of the motion."""
 _MOST_TIMED_FRAMES = 30
+_JSON_TYPES = {
+    dict: "an object",
+    bool: "true or false",
+    int: "an integer",
+    float: "a number",
+    str: "a string",
+    NoneType: "null",
+}
 
 
 def open_stream(out: str | Path) -> StreamReader:
@@ -115,8 +130,12 @@ def render_stream(
 
 
 def has_confidence(stream: StreamReader) -> bool:
-    """Return whether a stream stores a confidence, and the fit has learned it."""
-    learned = stream.metadata.get("config", {}).get("motion", {}).get("learn_confidence", True)
+    """Return whether a stream stores a confidence, and the fit has learned it.
+
+    Raises:
+        ValueError: the header's metadata or the first packet is broken.
+    """
+    learned = _metadata(stream, "config.motion.learn_confidence", True, bool)
     return learned and any(gaussians.logit_confidence is not None for _, gaussians in islice(play(stream), 1))
 
 
@@ -209,8 +228,51 @@ def render(
 
 
 def render_config(stream: StreamReader) -> RenderConfig:
-    """Return the renderer settings of the fit."""
-    return RenderConfig(**stream.metadata.get("config", {}).get("render", {}))
+    """Return the renderer settings of the fit.
+
+    Raises:
+        ValueError: the stream's header has settings of other names, types or ranges.
+    """
+    values = _metadata(stream, "config.render", {}, dict)
+    return apply_values(RenderConfig(), values, _place(stream, "config.render"))
+
+
+def num_frames(stream: StreamReader) -> int:
+    """Return the number of frames of the capture that was fitted, zero if the stream's header does not state it.
+
+    Raises:
+        ValueError: the header states something else.
+    """
+    return _metadata(stream, "num_frames", 0, int)
+
+
+def _metadata(stream: StreamReader, key: str, default: Any, *kinds: type) -> Any:
+    """Return an entry of a stream's metadata, `default` where there is none.
+
+    A stream may come from anybody, and its metadata may be any JSON object.
+
+    Args:
+        stream: the file.
+        key: names of the nested objects and of the entry, with dots between them.
+        default: value of a missing entry.
+        kinds: types that the entry may have.
+
+    Raises:
+        ValueError: it has another type.
+    """
+    value: Any = stream.metadata
+    for name in key.split("."):
+        if isinstance(value, dict) and name not in value:
+            return default
+        value = value[name] if isinstance(value, dict) else None
+    if type(value) not in kinds:
+        expected = " or ".join(_JSON_TYPES[kind] for kind in kinds)
+        raise ValueError(f"{_place(stream, key)} must be {expected}, got {shortened(value)}; fit the capture again.")
+    return value
+
+
+def _place(stream: StreamReader, key: str) -> str:
+    return f"{stream.path}: packet 0: `{key}` of the header's metadata"
 
 
 def open_stream_capture(stream: StreamReader, capture: str | Path | None, frames: Sequence[int]) -> Capture:
@@ -218,19 +280,21 @@ def open_stream_capture(stream: StreamReader, capture: str | Path | None, frames
 
     Args:
         stream: the file.
-        capture: folder of the capture; default: the path at the time of the fit.
+        capture: folder of the capture; default: that of the fit, which the ``capture.json`` beside the stream names.
         frames: indices of the stream's frames.
 
     Raises:
         FileNotFoundError: the capture is missing.
-        ValueError: the stream's header does not name a capture, or the capture is not the one that was fitted.
+        ValueError: no capture is named, the header's metadata do not state how it was read, the capture is not the one
+            that was fitted, or there are no frames.
     """
-    about = stream.metadata
-    if capture is None and "capture" not in about:
-        raise ValueError(f"{stream.path}: its header names no capture to compare with; pass one (--capture).")
-    path = capture or about["capture"]
-    reading = ReadConfig(**about.get("reading", {}))
-    recording = load_capture(path, about.get("downscale", 1), about.get("test_view", "auto"), frames[-1] + 1, reading)
+    path = capture or _fitted_capture(stream)
+    reading = apply_values(ReadConfig(), _metadata(stream, "reading", {}, dict), _place(stream, "reading"))
+    downscale = _metadata(stream, "downscale", 1, int, float)
+    test_view = _metadata(stream, "test_view", "auto", int, str, NoneType)
+    if not frames:
+        raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
+    recording = load_capture(path, downscale, test_view, frames[-1] + 1, reading)
     expected, found = _sizes(stream.cameras), _sizes(recording.cameras)
     if found != expected:
         raise ValueError(
@@ -243,6 +307,29 @@ def open_stream_capture(stream: StreamReader, capture: str | Path | None, frames
             "pass the capture that was fitted (--capture)."
         )
     return recording
+
+
+def _fitted_capture(stream: StreamReader) -> str:
+    """Return the path of a stream's capture, which is in the `capture.json` beside it; in the header of older streams.
+
+    Raises:
+        FileNotFoundError: it is not there any more.
+        ValueError: no path is stored.
+    """
+    beside = None
+    with suppress(OSError, ValueError):
+        beside = json.loads(stream.path.with_name("capture.json").read_text(encoding="utf-8"))
+    stored = [about.get("capture") for about in (stream.metadata, beside) if isinstance(about, dict)]
+    paths, remedy = [path for path in stored if isinstance(path, str)], "name its folder with --capture"
+    if not paths:
+        raise ValueError(
+            f"{stream.path}: expected the path of its capture in the capture.json beside it, found none; {remedy}."
+        )
+    if found := next((path for path in paths if Path(path).is_dir()), None):
+        return found
+    raise FileNotFoundError(
+        f"{paths[0]}: expected the capture of {stream.path}, found none; if it has moved, {remedy}."
+    )
 
 
 def _sizes(cameras: Sequence[Camera]) -> dict[str, tuple[int, int]]:

@@ -18,10 +18,12 @@ __all__ = [
     "confidence_legend",
     "contact_sheet",
     "depth_image",
+    "depth_range",
     "grey_image",
     "label",
     "motion_image",
     "motion_legend",
+    "motion_wheel",
     "side_by_side",
     "time_slice",
     "to_uint8",
@@ -88,12 +90,17 @@ def motion_image(motion: np.ndarray, scale_px: float) -> np.ndarray:
     return image
 
 
-def motion_legend(scale_px: float, size: int = 96) -> np.ndarray:
-    """Return the legend [size, size, 3] of `motion_image`: a disc whose rim is `scale_px`, labelled with that speed."""
+def motion_wheel(scale_px: float, size: int = 96) -> np.ndarray:
+    """Return the colours of `motion_image` as a disc [size, size, 3] whose rim is `scale_px`."""
     axis = np.linspace(-scale_px, scale_px, size, dtype=np.float32)
     motion = np.stack(np.meshgrid(axis, axis), -1)
     motion[np.hypot(*np.moveaxis(motion, -1, 0)) > scale_px] = 0
-    return label(motion_image(motion, scale_px), f"{scale_px:.3g} px")
+    return motion_image(motion, scale_px)
+
+
+def motion_legend(scale_px: float, size: int = 96) -> np.ndarray:
+    """Return the legend [size, size, 3] of `motion_image`: `motion_wheel`, labelled with the speed at its rim."""
+    return label(motion_wheel(scale_px, size), f"{scale_px:.3g} px")
 
 
 def confidence_image(confidence: np.ndarray) -> np.ndarray:
@@ -131,20 +138,27 @@ def depth_image(depth: np.ndarray, near: float | None = None, far: float | None 
 
     Args:
         depth: world units; values that are not positive and finite are grey.
-        near: depth of the red end; default: the 1st percentile.
-        far: depth of the blue end; default: the 99th percentile.
+        near: depth of the red end; default: that of `depth_range`.
+        far: depth of the blue end; default: that of `depth_range`.
     """
     depth = np.asarray(depth, np.float64).reshape(np.shape(depth)[:2])
     known = np.isfinite(depth) & (depth > 0)
     if not known.any():
         return np.full((*depth.shape, 3), UNDEFINED, np.uint8)
-    low, high = (float(value) for value in np.percentile(depth[known], (1, 99)))
+    low, high = depth_range(depth)
     near, far = near or low, far or high
     inverse = 1 / np.where(known, depth, far)
     span = max(1 / near - 1 / far, 1e-12)
     image = _apply_colour_map((inverse - 1 / far) / span, cv2.COLORMAP_TURBO)
     image[~known] = UNDEFINED
     return image
+
+
+def depth_range(depth: np.ndarray) -> tuple[float, float]:
+    """Return the 1st and the 99th percentile of the depths that are positive and finite; (1, 1) if there is none."""
+    known = depth[np.isfinite(depth) & (depth > 0)]
+    low, high = np.percentile(known, (1, 99)) if known.size else (1.0, 1.0)
+    return float(low), float(high)
 
 
 def label(image: np.ndarray, text: str) -> np.ndarray:

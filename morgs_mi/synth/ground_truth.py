@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.io.bounded import read_array
 from morgs_mi.io.exr import read_exr, write_exr
 
 __all__ = [
@@ -161,8 +162,7 @@ def load_tracks(folder: str | Path) -> Tracks:
         raise FileNotFoundError(
             f"load_tracks(): there is no file {path}; pass the truth folder of a synthetic capture."
         )
-    with np.load(path) as arrays:
-        return Tracks(arrays["points"], arrays["ids"])
+    return Tracks(read_array(path, "points"), read_array(path, "ids"))
 
 
 def _path(folder: str | Path, camera: str, frame: int) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import mitsuba as mi
@@ -23,6 +24,15 @@ def srgb_bytes(linear: np.ndarray, noise: np.ndarray | float = 0.0) -> np.ndarra
     return np.rint(255 * np.clip(encoded + noise, 0, 1)).astype(np.uint8)
 
 
+def _load(name: str, content: dict[str, Any]) -> Any:
+    try:
+        return mi.load_dict(content, optimize=False)
+    except RuntimeError as error:
+        # Mitsuba's sentence begins with a line of its own source.
+        reason = re.sub(r"^\[\w+\.cpp:\d+\] ", "", str(error)).rstrip(".! ")
+        raise ValueError(f"scene {name!r}: Mitsuba cannot load it: {reason}; correct the dictionary.") from error
+
+
 class PathTracer:
     """Path tracer of a scene at one time.
 
@@ -31,6 +41,11 @@ class PathTracer:
     """
 
     def __init__(self, scene: Scene) -> None:
+        """Load the scene into Mitsuba.
+
+        Raises:
+            ValueError: Mitsuba cannot load it.
+        """
         self.scene = scene
         content: dict[str, Any] = {"type": "scene", **{name: light.shape for name, light in scene.lights.items()}}
         owners: dict[str, int] = {}
@@ -43,7 +58,7 @@ class PathTracer:
             content |= shapes
             owners |= dict.fromkeys(shapes, index)
         # The optimisation would merge meshes that share a material, even those of different objects.
-        self._scene: Any = mi.load_dict(content, optimize=False)
+        self._scene: Any = _load(scene.name, content)
         self._owners = [(mi.ShapePtr(s), owners[s.id()]) for s in self._scene.shapes() if s.id() in owners]
         self._params: Any = mi.traverse(self._scene)
         moving = {name: light.pose for name, light in scene.lights.items() if light.pose is not None}
@@ -53,8 +68,18 @@ class PathTracer:
         self._integrator: Any = mi.load_dict({"type": "direct", "emitter_samples": 1, "bsdf_samples": 0})
         self.set_time(0.0)
 
+    @property
+    def has_emitters(self) -> bool:
+        """Whether anything emits light."""
+        return bool(self._scene.emitters())
+
     def _lamp_transform(self, light: str) -> np.ndarray:
         """Return the transform [4, 4] of a lamp's shape within the lamp's space."""
+        if f"{light}.to_world" not in self._params:
+            raise ValueError(
+                f"scene {self.scene.name!r}, light {light!r}: a lamp with a pose must be a shape with an "
+                "emitter, e.g. a rectangle; use one, or leave out the pose."
+            )
         return np.array(self._params[f"{light}.to_world"].matrix, float).reshape(4, 4)
 
     def poses(self, time: float) -> list[np.ndarray]:

@@ -7,18 +7,32 @@ seconds, so a clip may have any frame rate and length. World space has y up; len
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Mapping
+import inspect
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
+from traceback import extract_tb
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from morgs_mi.core.camera import Camera
+from morgs_mi.core.camera import Camera, rigid
 
-__all__ = ["Light", "Object", "Rig", "Scene", "load_scene", "rotate", "translate"]
+__all__ = [
+    "Light",
+    "Object",
+    "Recording",
+    "Rig",
+    "Scene",
+    "check_scene",
+    "item_ids",
+    "load_scene",
+    "rotate",
+    "translate",
+]
 
 Pose = Callable[[float], np.ndarray]
 
@@ -83,6 +97,21 @@ class Rig:
 
 
 @dataclass(frozen=True)
+class Recording:
+    """How a scene is recorded unless `synthesize` is given other values.
+
+    Attributes:
+        num_cameras: including the held-out view.
+        spp: samples per pixel.
+        noise: standard deviation of the sensor noise, relative to white.
+    """
+
+    num_cameras: int = 10
+    spp: int = 16
+    noise: float = 0.0
+
+
+@dataclass(frozen=True)
 class Scene:
     """A moving scene.
 
@@ -92,6 +121,7 @@ class Scene:
         lights: lamps by name.
         rig: positions of the cameras.
         exposure: seconds -> exposure factor of all cameras; None for 1.
+        recording: number of cameras and noise.
     """
 
     name: str
@@ -99,13 +129,15 @@ class Scene:
     lights: Mapping[str, Light]
     rig: Rig = field(default_factory=Rig)
     exposure: Callable[[float], float] | None = None
+    recording: Recording = field(default_factory=Recording)
 
 
 def load_scene(scene: str | Path, seed: int = 0) -> Scene:
     """Build the scene of a Python file, given by its path or by its name in ``scenes/``.
 
     Raises:
-        ValueError: there is no such scene, or its file has no ``build``.
+        ValueError: there is no such scene, its file has no ``build(seed) -> Scene``, or running the file fails; the
+            message names the file and its line.
     """
     known = _scene_files()
     path = Path(scene) if Path(scene).suffix == ".py" else known.get(str(scene))
@@ -117,10 +149,112 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
     assert spec
     assert spec.loader
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    if not hasattr(module, "build"):
+    with _failures_in(path):
+        spec.loader.exec_module(module)
+    build = getattr(module, "build", None)
+    if not callable(build):
         raise ValueError(f"load_scene(): {path} must define `build(seed) -> Scene`; add that function.")
-    return module.build(seed)
+    _check_signature(path, build)
+    with _failures_in(path):
+        built = build(seed)
+    if not isinstance(built, Scene):
+        got = "None" if built is None else f"a {type(built).__name__}"
+        raise ValueError(f"load_scene(): `build` in {path} must return a Scene, got {got}; return Scene(...).")
+    return built
+
+
+@contextmanager
+def _failures_in(path: Path) -> Iterator[None]:
+    """Raise `ValueError` with the line of the file at `path` for any error of the code in it."""
+    try:
+        yield
+    except Exception as error:
+        # The file name of a frame is absolute.
+        frames = extract_tb(error.__traceback__)
+        lines = [frame.lineno for frame in frames if Path(frame.filename).resolve() == path.resolve()]
+        # A syntax error has no frame in the file.
+        line = error.lineno if isinstance(error, SyntaxError) else lines[-1] if lines else None
+        reason = error.msg if isinstance(error, SyntaxError) else str(error)
+        place = f"{path}, line {line}" if line else str(path)
+        raise ValueError(f"{place}: {type(error).__name__}: {reason.rstrip('.')}; correct the scene file.") from error
+
+
+def _check_signature(path: Path, build: Callable[..., Any]) -> None:
+    """Raise `ValueError` if `build` cannot be called with a seed alone."""
+    signature = inspect.signature(build)
+    try:
+        signature.bind(0)
+    except TypeError:
+        raise ValueError(
+            f"load_scene(): `build` in {path} must take the seed alone, `build(seed) -> Scene`, got "
+            f"`build{signature}`; give further parameters a default."
+        ) from None
+
+
+def check_scene(scene: Scene, times: Sequence[float]) -> None:
+    """Check the contents of a scene, and its poses at `times` in seconds.
+
+    Raises:
+        ValueError: an object, a lamp or a pose is not as described, or a name is used twice.
+        FileNotFoundError: the file of a mesh or a texture does not exist.
+    """
+    place = f"scene {scene.name!r}"
+    names: set[str] = set()
+    for kind, type_, items in (("object", Object, scene.objects), ("light", Light, scene.lights)):
+        for name, item in items.items():
+            where = f"{place}, {kind} {name!r}"
+            if not isinstance(item, type_):
+                expected, found = f"{type_.__name__}(...)", type(item).__name__
+                raise ValueError(f"{where}: expected {expected}, got a value of type {found}; see docs/scenes.md.")
+            for used in item_ids(name, item):
+                if used in names:
+                    raise ValueError(f"{where}: the name {used!r} is used twice; rename one of the two.")
+                names.add(used)
+            for shape_name, shape in item.shapes.items() if isinstance(item, Object) else (("", item.shape),):
+                _check_node(f"{where}, shape {shape_name!r}" if shape_name else where, shape)
+            if item.pose is not None:
+                for time in times:
+                    _check_pose(where, item.pose, time)
+
+
+def item_ids(name: str, item: Object | Light) -> list[str]:
+    """Return the names by which Mitsuba knows the shapes of an object or a lamp."""
+    if isinstance(item, Object):
+        return [f"{name}_{part}" for part in item.shapes] if item.pose is None else [name, f"{name}_group"]
+    return [name]
+
+
+def _check_node(where: str, node: Any) -> None:
+    """Check a Mitsuba dictionary, whose errors would not name the object, or end the process."""
+    if not isinstance(node, Mapping) or "type" not in node:
+        raise ValueError(f"{where}: expected a Mitsuba dictionary with a `type`, got {node!r:.60}; see docs/scenes.md.")
+    for key, value in node.items():
+        if value is None:
+            raise ValueError(f"{where}: `{key}` must have a value, got None; leave it out.")
+        if key == "filename" and not Path(value).is_file():
+            raise FileNotFoundError(
+                f"{where}: its file {value} does not exist; for a file beside the scene, write "
+                f"str(Path(__file__).parent / {Path(value).name!r})."
+            )
+        if key == "filename" and not isinstance(value, str):
+            raise ValueError(f"{where}: `filename` must be text, got a {type(value).__name__}; wrap it in str().")
+        if isinstance(value, Mapping):
+            _check_node(f"{where}, {key}", value)
+
+
+def _check_pose(where: str, pose: Pose, time: float) -> None:
+    try:
+        matrix = np.asarray(pose(time), np.float64)
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}".rstrip(".")
+        raise ValueError(f"{where}: its pose at {time:.4g} s fails with {reason}; correct the function.") from error
+    if matrix.shape != (4, 4) or not np.isfinite(matrix).all():
+        got = f"the shape {matrix.shape}" if matrix.shape != (4, 4) else "NaN or infinity"
+        raise ValueError(
+            f"{where}: its pose at {time:.4g} s must be a finite matrix [4, 4], got {got}; multiply translate() and "
+            "rotate()."
+        )
+    rigid(f"{where}: its pose at {time:.4g} s is not rigid", matrix)
 
 
 def translate(x: float, y: float, z: float) -> np.ndarray:

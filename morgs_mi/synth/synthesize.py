@@ -6,6 +6,8 @@ centres, so it has no noise and does not mix foreground and background.
 
 from __future__ import annotations
 
+import json
+import logging
 from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
 from pathlib import Path
@@ -15,16 +17,18 @@ import numpy as np
 
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
+from morgs_mi.capture.outputs import check_output
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path, write_json
-from morgs_mi.io.video import VideoReader
-from morgs_mi.io.video_writer import write_video
+from morgs_mi.io.video import open_frames
+from morgs_mi.io.video_writer import playable_format, write_video
 from morgs_mi.synth.ground_truth import Tracks, compute_ground_truth, move_with_objects, save_truth
 from morgs_mi.synth.path_tracer import PathTracer
-from morgs_mi.synth.scene import Scene, load_scene
+from morgs_mi.synth.scene import Scene, check_scene, load_scene
 
 __all__ = ["synthesize"]
 
+_LOG = logging.getLogger(__name__)
 _NUM_SFM_POINTS = 8000
 _NUM_TRACKS = 2000
 
@@ -33,36 +37,39 @@ def synthesize(
     scene: str | Path | Scene,
     out: str | Path,
     *,
-    num_cameras: int = 10,
+    num_cameras: int | None = None,
     num_frames: int = 12,
     width: int = 320,
     height: int = 240,
-    spp: int = 16,
-    noise: float = 0.0,
+    spp: int | None = None,
+    noise: float | None = None,
     fps: float = 30.0,
-    lossless: bool = False,
+    lossless: bool = True,
     seed: int = 0,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
     """Path-trace a moving scene into a multi-view capture in N3DV's layout, with exact ground truth.
 
-    Writes ``cam00.mp4`` ..., ``poses_bounds.npy``, a COLMAP text model ``sparse/0`` with points like those of structure
-    from motion, ``capture.json`` and ``truth/`` (see `ground_truth`). ``cam00`` is the central camera of the rig and
-    the held-out test view, as in N3DV. The folder is written atomically.
+    Writes ``frames/cam00/0000.png`` ..., ``cam00.mp4`` ... for players (see `playable_format`), ``poses_bounds.npy``, a
+    COLMAP text model ``sparse/0`` with points like those of structure from motion, ``capture.json`` and ``truth/`` (see
+    `ground_truth`). ``cam00`` is the central camera of the rig and the held-out test view, as in N3DV. The folder is
+    written atomically.
 
     Args:
         scene: a scene, its name, or the path of its Python file.
         out: the folder to write.
-        num_cameras: including the test view, at least 2.
+        num_cameras: including the test view, at least 2; None for the scene's own number, usually 10.
         num_frames: at least 1.
         width: in pixels, even.
         height: in pixels, even.
-        spp: samples per pixel; the noise of 16 is at 42 dB, below that of a good camera.
+        spp: samples per pixel; the noise of 16 is at 42 dB, below that of a good camera. None for the scene's own
+            number, usually 16.
         noise: standard deviation of the sensor noise, relative to white; 0.01 (2.5 grey levels) is typical of a camera
-            indoors.
+            indoors. None for the scene's own, usually 0.
         fps: frames per second.
-        lossless: also write ``frames/cam00/0000.png`` ....
+        lossless: write the frames also as PNG files, which `load_capture` reads in place of the videos; without them
+            the images and the colours of the points are those of the compressed videos.
         seed: of the textures, the sampling noise and the choice of points.
         overwrite: replace an earlier capture in `out`.
         progress: called with (images done, total number of images).
@@ -71,9 +78,10 @@ def synthesize(
         The folder `out`.
 
     Raises:
-        ValueError: an argument is out of range, there is no such scene, or Mitsuba's variant is not vectorised.
-        FileExistsError: `out` is not empty and `overwrite` is not set, or `out` is not a capture.
-        OSError: a file cannot be written.
+        ValueError: an argument is out of range, there is no such scene, `out` lies in a capture, the scene is not as
+            `check_scene` requires, a camera sees none of its objects, or Mitsuba's variant is not vectorised.
+        FileExistsError: `out` is not empty and `overwrite` is not set, or `out` is not a synthetic capture.
+        OSError: a file cannot be written, or a mesh or texture of the scene does not exist.
     """
     if not str(mi.variant()).startswith(("llvm", "cuda")):
         raise ValueError(
@@ -87,22 +95,28 @@ def synthesize(
         "seed": (seed, 0),
     }
     for name, (value, least) in lowest.items():
-        if value < least:
+        if value is not None and value < least:
             raise ValueError(f"synthesize(): `{name}` must be at least {least}, got {value}.")
     if min(width, height) < 2 or width % 2 or height % 2:
         raise ValueError(f"synthesize(): `width` and `height` must be even, got {width}x{height}.")
     if not (np.isfinite(fps) and fps > 0):
         raise ValueError(f"synthesize(): `fps` must be positive, got {fps}.")
-    if not 0 <= noise < 1:
+    if noise is not None and not 0 <= noise < 1:
         raise ValueError(f"synthesize(): `noise` must be at least 0 and below 1, got {noise}.")
 
     scene = scene if isinstance(scene, Scene) else load_scene(scene, seed)
+    num_cameras = scene.recording.num_cameras if num_cameras is None else num_cameras
+    spp = scene.recording.spp if spp is None else spp
+    noise = scene.recording.noise if noise is None else noise
     cameras = scene.rig.cameras(num_cameras, width, height)
     times = np.arange(num_frames) / fps
+    check_scene(scene, [*times, times[-1] + 1 / fps])
     _check_folder(Path(out), overwrite)
+    check_output(Path(out).resolve().parent)
     with atomic_path(out, "synthesize()") as folder:
         folder.mkdir(parents=True)
         tracer = PathTracer(scene)
+        _check_views(tracer, cameras)
         done = 0
 
         def render_view(index: int) -> Iterator[np.ndarray]:
@@ -116,15 +130,19 @@ def synthesize(
                 if progress is not None:
                     progress(done, num_cameras * num_frames)
 
+        suffix, codec = playable_format()
+        clips = []
         for index, camera in enumerate(cameras):
-            video = folder / f"{camera.name}.mp4"
-            write_video(video, render_view(index), fps)
+            video, png = folder / f"{camera.name}{suffix}", folder / "frames" / camera.name
             if lossless:
-                write_video(folder / "frames" / camera.name, VideoReader.open(video).frames(), fps)
+                write_video(png, render_view(index), fps)
+            images = open_frames(png).frames() if lossless else render_view(index)
+            write_video(video, images, fps, codec)
+            clips.append(png if lossless else video)
             _write_truth(tracer, camera, times, fps, folder / "truth")
         tracks = _sample_tracks(tracer, cameras, times, np.random.default_rng([seed, 1]))
         np.savez_compressed(folder / "truth" / "tracks.npz", points=tracks.points, ids=tracks.ids)
-        _write_calibration(tracer, cameras, folder, np.random.default_rng([seed, 2]))
+        _write_calibration(tracer, cameras, clips, folder, np.random.default_rng([seed, 2]))
         about = {
             "scene": scene.name,
             "test_view": 0,
@@ -141,6 +159,28 @@ def synthesize(
         }
         write_json(folder / "capture.json", about)
     return Path(out)
+
+
+def _check_views(tracer: PathTracer, cameras: Sequence[Camera]) -> None:
+    """Raise `ValueError` without light or if a camera sees no object in the first frame; warn of black images."""
+    if not tracer.has_emitters:
+        raise ValueError(
+            f"scene {tracer.scene.name!r}: it has no emitter, so its images would be black; give it lights, e.g. "
+            "`lights()` of morgs_mi.synth.textures."
+        )
+    for camera in cameras:
+        if not (tracer.surface_points(camera)[1] >= 0).any():
+            raise ValueError(
+                f"scene {tracer.scene.name!r}: {camera.name} sees no object at 0 s; move the objects, or "
+                "the centre and distance of the rig."
+            )
+    if not tracer.render(cameras[0], 1, 0).any():
+        _LOG.warning(
+            "scene %r: %s is black at 0 s: no lamp reaches the objects that it sees; check the sides to which lamps "
+            "and surfaces face (a rectangle emits along its +z).",
+            tracer.scene.name,
+            cameras[0].name,
+        )
 
 
 def _write_truth(tracer: PathTracer, camera: Camera, times: np.ndarray, fps: float, folder: Path) -> None:
@@ -177,8 +217,13 @@ def _sample_tracks(
     return Tracks(np.concatenate(points), np.concatenate(owners))
 
 
-def _write_calibration(tracer: PathTracer, cameras: Sequence[Camera], folder: Path, rng: np.random.Generator) -> None:
-    """Write the cameras as `poses_bounds.npy` and as a COLMAP model with points from the training views."""
+def _write_calibration(
+    tracer: PathTracer, cameras: Sequence[Camera], clips: Sequence[Path], folder: Path, rng: np.random.Generator
+) -> None:
+    """Write the cameras as `poses_bounds.npy` and as a COLMAP model with points from the training views.
+
+    The colours of the points are those of the `clips`, one per camera.
+    """
     tracer.set_time(0.0)
     points, colors, bounds = [], [], []
     for index, camera in enumerate(cameras):
@@ -193,7 +238,7 @@ def _write_calibration(tracer: PathTracer, cameras: Sequence[Camera], folder: Pa
         # Structure from motion has an error of about half a pixel; here it is the same along the ray.
         noise = rng.normal(size=(len(chosen), 3)) * (0.5 * depths[chosen, None] / camera.K[0, 0])
         points.append(visible[pixels[chosen]] + noise)
-        image = next(VideoReader.open(folder / f"{camera.name}.mp4").frames(0, 1))
+        image = next(open_frames(clips[index]).frames(0, 1))
         colors.append(image.reshape(-1, 3)[pixels[chosen]] / 255)
     write_poses_bounds(folder / "poses_bounds.npy", cameras, np.array(bounds))
     write_colmap(folder / "sparse" / "0", cameras, np.concatenate(points), np.concatenate(colors))
@@ -205,6 +250,17 @@ def _check_folder(out: Path, overwrite: bool) -> None:
         raise FileExistsError(f"synthesize(): {out} is a file; choose another folder.")
     occupied = out.is_dir() and any(out.iterdir())
     if occupied and not overwrite:
-        raise FileExistsError(f"synthesize(): {out} is not empty; choose another folder or set overwrite.")
-    if occupied and not (out / "capture.json").is_file():
-        raise FileExistsError(f"synthesize(): {out} is not a capture, so it is not replaced; choose another folder.")
+        raise FileExistsError(f"synthesize(): {out} is not empty; choose another folder, or set `overwrite`.")
+    if occupied and not _is_synthetic(out):
+        raise FileExistsError(
+            f"synthesize(): {out} is not a synthetic capture, so it is not replaced; choose another folder."
+        )
+
+
+def _is_synthetic(folder: Path) -> bool:
+    """Return whether a folder is a capture written by `synthesize`: recordings and fits have a `capture.json` too."""
+    try:
+        about = json.loads((folder / "capture.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(about, dict) and {"scene", "spp"} <= set(about)

@@ -13,13 +13,16 @@ from morgs_mi.codec.container import PacketKind, TruncatedStreamError
 from morgs_mi.codec.packets import CodedFrame, coded_frames
 from morgs_mi.playback.player import open_stream
 
-__all__ = ["FrameCache", "Trails"]
+__all__ = ["NO_TRAILS", "FrameCache", "Trails"]
 
 # Frames whose centres are cached: 3 MB each for 200,000 Gaussians.
 _CACHED_FRAMES = 64
+# Frames that are decoded in search of motion.
+_SEARCHED_FRAMES = 32
 
 Trails = tuple[np.ndarray, np.ndarray]
 """Trails of Gaussians as line segments: end points [S, 2, 3] and ages [S], from 0 (the current frame) to 1."""
+NO_TRAILS: Trails = (np.zeros((0, 2, 3), np.float32), np.zeros(0))
 
 
 class FrameCache:
@@ -85,6 +88,15 @@ class FrameCache:
             raise ValueError(f"{self.stream.path}: expected a frame of the stream, got {frame}.")
         return self._current
 
+    def first_moving(self, frame: int) -> int:
+        """Return the first frame from `frame` on in which Gaussians move, out of the next 32; `frame` if none does."""
+        start = self.frames.index(frame)
+        for index in self.frames[start : start + _SEARCHED_FRAMES]:
+            motion = self.at(index).gaussians.motion
+            if motion is not None and np.asarray(motion).any():
+                return index
+        return frame
+
     def trails(self, frame: int, length: int, count: int = 2000) -> Trails:
         """Return the trails over at most `length` frames of the `count` Gaussians with the longest paths."""
         end = self.frames.index(frame)
@@ -104,7 +116,7 @@ class FrameCache:
             np.add.at(path_lengths, owner, np.linalg.norm(after[a] - before[b], axis=1))
             after_ids, after = before_ids, before
         if not segments or not path_lengths.any():
-            return np.zeros((0, 2, 3), np.float32), np.zeros(0)
+            return NO_TRAILS
         selected = np.zeros(len(ids), bool)
         selected[np.argsort(path_lengths)[-count:]] = True
         shown = (selected & (path_lengths > 0))[np.concatenate(owners)]

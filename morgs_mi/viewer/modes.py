@@ -10,7 +10,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import colors_seen_from
 from morgs_mi.playback.player import CHANNELS, MOTION_SCALE, channel_image
 
-__all__ = ["BACKGROUNDS", "MODES", "available_modes", "splat_colors"]
+__all__ = ["BACKGROUNDS", "MODES", "available_modes", "splat_colors", "splat_values"]
 
 _ATTRIBUTE_MODES = {row.channel: row for row in ATTRIBUTES if row.channel is not None}
 
@@ -34,16 +34,15 @@ def splat_colors(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray:
     Raises:
         ValueError: `mode` is not one of `MODES`, or the Gaussians do not have its attribute.
     """
-    values = _mode_values(gaussians, camera, mode)
-    if values is None:
-        raise ValueError(
-            f"splat_colors(): the mode must be one of {', '.join(MODES)} that the stream stores, got {mode!r}."
-        )
-    return channel_image(mode, values[:, None], MOTION_SCALE * camera.width)[:, 0]
+    return channel_image(mode, splat_values(gaussians, camera, mode)[:, None], MOTION_SCALE * camera.width)[:, 0]
 
 
-def _mode_values(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray | None:
-    """Return the values [N, C] that a mode shows, in the channel's units; None where there are none."""
+def splat_values(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray:
+    """Return the values [N, C] that a mode shows, in the channel's units.
+
+    Raises:
+        ValueError: `mode` is not one of `MODES`, or the Gaussians do not have its attribute.
+    """
     if mode == "color":
         return colors_seen_from(gaussians, camera.position)
     raw = gaussians.numpy()
@@ -54,5 +53,7 @@ def _mode_values(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray 
         return np.einsum("nij,nj->ni", camera.projection_jacobian(raw["means"]), displacements)
     row = _ATTRIBUTE_MODES.get(mode)
     if row is None or getattr(gaussians, row.name) is None:
-        return None
+        raise ValueError(
+            f"splat_values(): the mode must be one of {', '.join(MODES)} that the stream stores, got {mode!r}."
+        )
     return np.asarray(getattr(gaussians, row.activated_name)).reshape(len(gaussians), -1)

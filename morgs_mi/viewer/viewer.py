@@ -1,4 +1,4 @@
-"""A stream in the browser: play, scrub, orbit, show motion, follow a running fit.
+"""A stream in the browser: play, scrub, orbit, show motion, compare with the recording, follow a running fit.
 
 The page is viser's. It draws the Gaussians itself from their centres, covariances in half precision, and one colour and
 opacity each, so that orbiting is smooth. "Exact image" shows the image of this package's renderer instead, which is
@@ -8,29 +8,43 @@ rendered whenever the camera comes to rest. All decoding and rendering happens i
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Event
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from morgs_mi.capture.capture import Capture
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.geometry import covariances
+from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.export.axes import up_direction
 from morgs_mi.export.paths import focus
-from morgs_mi.playback.player import channel_image, render, render_config
-from morgs_mi.viewer.frame_cache import FrameCache
-from morgs_mi.viewer.modes import BACKGROUNDS, available_modes, splat_colors
+from morgs_mi.playback.player import MOTION_SCALE, channel_image, num_frames, open_stream_capture, render, render_config
+from morgs_mi.viewer.access import checked_connections
+from morgs_mi.viewer.controls import FREE, Controls
+from morgs_mi.viewer.crop import crop_limits, is_in_box, is_shown
+from morgs_mi.viewer.frame_cache import NO_TRAILS, FrameCache
+from morgs_mi.viewer.legend import legend_html
+from morgs_mi.viewer.modes import available_modes, splat_values
+from morgs_mi.viewer.page_scene import PageScene
+from morgs_mi.viewer.page_view import camera_at, move_page, page_view, point_ahead
+from morgs_mi.viewer.recorded import RecordedImages, seen_from, wipe
 
 __all__ = ["Viewer", "ViewerConfig"]
 
 # Distance on the page between the first camera and the point that it looks at: half-precision covariances have three
 # digits for splats down to 1/1000 of it, and it fits the page's near and far planes.
 _DISTANCE = 10.0
-_HALF_MAX = 6e4
+# Distance on the page up to which it is at a camera: an error of a pixel or two at the distance of the scene.
+_AT_CAMERA = 0.01
+_MOVING_MODES = ("motion", "confidence", "offset")
 _NO_OFFSET = ". This frame stores no offset: set codec.offset in --config to store it in every frame but the first."
+_NO_MOTION = ". The first frame has no motion."
+_NOT_AT_CAMERA = ". Go to a camera to see its recorded image."
+_NOT_RECORDED = ". There is no recorded image of this camera at this frame."
+_ANY, _LOCAL = ("0.0.0.0", "::", ""), ("127.0.0.1", "::1", "localhost")
 # In seconds: period of the loop, period of reading the file again, time without motion after which the camera rests.
 _TICK, _REFRESH, _REST = 0.01, 1.0, 0.2
 
@@ -43,8 +57,12 @@ class ViewerConfig:
     """Address of the server; the default serves this machine only, 0.0.0.0 all machines that can reach it."""
     port: int = 8080
     """Port of the server; the next free one if it is taken."""
+    allowed_names: tuple[str, ...] = ()
+    """Names under which browsers may open the page, besides localhost, HOST and addresses in digits."""
     trail: int = 10
     """Length of the trajectories, in frames."""
+    capture: Path | None = None
+    """Folder of the capture with the recorded images; by default the one that was fitted."""
 
 
 class Viewer:
@@ -55,7 +73,8 @@ class Viewer:
         config: address and initial settings.
 
     Attributes:
-        url: address of the page.
+        url: address of the page on this machine.
+        is_public: whether other machines can reach it.
 
     Raises:
         ImportError: viser is not installed.
@@ -76,18 +95,36 @@ class Viewer:
                 f"{self._cache.stream.path}: at least one frame was expected, got none; wait for the first."
             )
         first = self._cache.at(self._cache.frames[0]).gaussians
-        cameras = self._cache.stream.cameras
-        self._view = (0, 0.0, cameras[0])  # number of the view, time of the last change, camera
-        center = focus(cameras, first.numpy()["means"])
-        self._scale = _DISTANCE / max(float(np.linalg.norm(cameras[0].position - center)), 1e-12)
+        means = first.numpy()["means"]
+        self._cameras = self._cache.stream.cameras
+        self._view = (0, 0.0, self._cameras[0])  # number of the view, time of the last change, camera
+        self._center, self._up = focus(self._cameras, means), up_direction(self._cameras)
+        distance = float(np.linalg.norm(self._cameras[0].position - self._center))
+        self._scale = _DISTANCE / max(distance, 1e-12)
         self._config = render_config(self._cache.stream)
+        self._capture = config.capture
+        self._recording: RecordedImages | None = None
         self._shown: tuple[Any, ...] | None = None
-        self._splats: Any = None
+        self._rendered: tuple[Any, np.ndarray] | None = None
         self._frame_time = time.monotonic()
-        self._server = viser.ViserServer(config.host, config.port, label="morgs_mi", verbose=False)
-        self.url = f"http://{config.host}:{self._server.get_port()}"
-        self._modes = available_modes(first)
-        self._build(center)
+        with checked_connections((config.host, *config.allowed_names)):
+            self._server = viser.ViserServer(config.host, config.port, label="morgs_mi", verbose=False)
+        host = "localhost" if config.host in _ANY else config.host
+        self.is_public = config.host not in _LOCAL
+        self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
+        self._set_up_page()
+        self._scene = PageScene(self._server.scene, self._scale)
+        self._scene.add_cameras(self._cameras, self._cache.stream.metadata.get("test_view"), self._go_to)
+        self._controls = Controls(
+            self._server.gui,
+            len(self._cache.frames),
+            available_modes(first),
+            [camera.name for camera in self._cameras],
+            crop_limits(means),
+            self._missing_capture(),
+        )
+        self._mode = self._controls.mode.value
+        self._connect()
 
     def run(self) -> None:
         """Serve the page until `stop` is called, from the only thread that uses Dr.Jit."""
@@ -99,12 +136,13 @@ class Viewer:
                     if now - refreshed > _REFRESH:
                         refreshed = now
                         if self._cache.refresh():
-                            self._update_slider()
+                            self._controls.set_count(len(self._cache.frames))
+                            self._shown = None  # the number of frames is shown, and a replaced file has other frames
                     if self._cache.frames:  # empty while the file is being replaced
                         self._play(now)
                         self._show(now)
                 except (ValueError, OSError) as error:  # damaged or being replaced: show the message and try again
-                    self._status.content, self._shown = str(error), None
+                    self._controls.status.content, self._shown = str(error), None
                     self._stopped.wait(_REFRESH)
         finally:
             self._server.stop()
@@ -113,118 +151,198 @@ class Viewer:
         """End `run`, from any thread."""
         self._stopped.set()
 
-    def _build(self, center: np.ndarray) -> None:
-        server, camera, count = self._server, self._view[2], len(self._cache.frames)
-        up = up_direction(self._cache.stream.cameras)
+    def _set_up_page(self) -> None:
+        """Set the look of the page and its initial view: the first camera, upright to the mean up."""
+        server, first = self._server, self._cameras[0]
         server.gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False)
-        server.scene.set_up_direction(up)
+        server.scene.set_up_direction(self._up)
         start = server.initial_camera
-        start.up = up
-        start.position, start.look_at = self._scale * camera.position, self._scale * self._look_at(camera, center)
-        start.fov = 2 * float(np.arctan(0.5 * camera.height / camera.K[1, 1]))
-        gui = server.gui
-        self._playing = gui.add_checkbox("Play", False)
-        # A slider needs two ends; for a stream of one frame both show the same image.
-        self._slider = gui.add_slider("Frame", 0, max(count - 1, 1), 1, 0)
-        self._speed = gui.add_slider("Speed", 0.1, 4.0, 0.1, 1.0)
-        self._mode = gui.add_dropdown("Mode", self._modes)
-        self._trails = gui.add_checkbox("Trajectories", False)
-        self._exact = gui.add_checkbox("Exact image", False)
-        self._follow = gui.add_checkbox("Follow the fit", False)
-        self._status = gui.add_markdown("")
-        server.on_client_connect(self._watch)
+        start.up, start.position = self._up, self._scale * first.position
+        start.look_at = self._scale * point_ahead(first, self._center)
+        start.fov = 2 * float(np.arctan(0.5 * first.height / first.K[1, 1]))
+
+    def _connect(self) -> None:
+        """Connect the page's cameras, its buttons and its keys."""
+        controls, gui = self._controls, self._server.gui
+        self._server.on_client_connect(self._watch)
+        controls.reset.on_click(lambda event: self._reset(event.client))
+
+        @controls.camera.on_update
+        def _(event: Any) -> None:
+            if event.client is not None and controls.camera.value != FREE:
+                self._go_to(event.client, [camera.name for camera in self._cameras].index(controls.camera.value))
+
+        def next_camera(client: Any) -> None:
+            at = self._camera_index()
+            self._go_to(client, 0 if at is None else (at + 1) % len(self._cameras))
+
+        def next_mode(_: Any) -> None:
+            options = controls.mode.options
+            controls.mode.value = options[(options.index(controls.mode.value) + 1) % len(options)]
+
+        def flip(box: Any) -> Callable[[Any], None]:
+            return lambda _: setattr(box, "value", not box.value)
+
+        def move(change: Callable[[int], int]) -> Callable[[Any], None]:
+            return lambda _: self._move_frame(change)
+
+        # The arrows and W, A, S, D, Q, E are viser's own keys for moving the camera.
+        keys: list[tuple[str, Any, Callable[[Any], None]]] = [
+            ("Play or pause", "space", flip(controls.playing)),
+            ("Previous frame", "J", move(lambda index: index - 1)),
+            ("Next frame", "L", move(lambda index: index + 1)),
+            ("First frame", "home", move(lambda _: 0)),
+            ("Last frame", "end", move(lambda _: len(self._cache.frames) - 1)),
+            ("Next camera", "C", next_camera),
+            ("Next mode", "M", next_mode),
+            ("Exact image", "X", flip(controls.exact)),
+            ("Trajectories", "T", flip(controls.trails)),
+            ("Reset view", "R", self._reset),
+        ]
+        for label, key, act in keys:
+            gui.add_command(label, hotkey=key).on_trigger(lambda event, act=act: act(event.client))
 
     def _watch(self, client: Any) -> None:
         client.camera.on_update(lambda _: self._set_view(client))
 
-    @staticmethod
-    def _look_at(camera: Camera, center: np.ndarray) -> np.ndarray:
-        """Return the point on the camera's axis at the depth of the scene, so that the page starts with its view."""
-        axis = np.asarray(camera.viewmat, np.float64)[2, :3]
-        return camera.position + axis * max((center - camera.position) @ axis, 1e-6)
+    def _move_frame(self, change: Callable[[int], int]) -> None:
+        self._controls.playing.value = self._controls.follow.value = False
+        self._controls.frame.value = change(int(self._controls.frame.value)) % max(len(self._cache.frames), 1)
+
+    def _go_to(self, client: Any, index: int) -> None:
+        move_page(client, self._cameras[index], self._center, self._up, self._scale)
+
+    def _reset(self, client: Any) -> None:
+        start, page = self._server.initial_camera, client.camera
+        with client.atomic():
+            page.up_direction, page.position, page.look_at, page.fov = (
+                start.up,
+                start.position,
+                start.look_at,
+                start.fov,
+            )
 
     def _set_view(self, client: Any) -> None:
         """Store the camera of a client; with several clients, the one that moved last determines the view."""
-        page = client.camera
-        height = max(int(page.image_height), 1)
-        width = max(round(height * page.aspect), 1)
-        f = 0.5 * height / np.tan(0.5 * page.fov)
-        R = Rotation.from_quat(page.wxyz, scalar_first=True).as_matrix().T
-        viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = R, -R @ (np.asarray(page.position) / self._scale)
-        K = np.array([[f, 0, 0.5 * width], [0, f, 0.5 * height], [0, 0, 1.0]])
-        self._view = (self._view[0] + 1, time.monotonic(), Camera(K, viewmat, width, height, "page"))
+        self._view = (self._view[0] + 1, time.monotonic(), page_view(client.camera, self._scale))
 
-    def _update_slider(self) -> None:
-        last = max(len(self._cache.frames) - 1, 1)
-        self._slider.value = min(int(self._slider.value), last)
-        self._slider.max = last
-        self._shown = None  # the number of frames is shown too, and a replaced file has other frames
+    def _camera_index(self) -> int | None:
+        """Return the index of the camera at which the page is."""
+        return camera_at(self._view[2], self._cameras, _AT_CAMERA / self._scale)
 
     def _play(self, now: float) -> None:
-        step = 1 / (self._cache.stream.fps * self._speed.value)
-        if not self._playing.value:
+        controls = self._controls
+        step = 1 / (self._cache.stream.fps * controls.speed.value)
+        if not controls.playing.value:
             self._frame_time = now
             last = len(self._cache.frames) - 1
-            if self._follow.value and self._slider.value != last:
-                self._slider.value = last
+            if controls.follow.value and controls.frame.value != last:
+                controls.frame.value = last
         elif now - self._frame_time >= step:
             # Delays are not caught up: every frame is shown.
             self._frame_time = max(self._frame_time + step, now - step)
-            self._slider.value = (int(self._slider.value) + 1) % len(self._cache.frames)
+            controls.frame.value = (int(controls.frame.value) + 1) % len(self._cache.frames)
 
     def _show(self, now: float) -> None:
         """Send the frame to the page if the frame, a setting or the view has changed."""
-        frame = self._cache.frames[min(int(self._slider.value), len(self._cache.frames) - 1)]
+        self._choose_moving_frame()
+        controls = self._controls
+        frame = self._frame_at(int(controls.frame.value))
         number, since, camera = self._view
         if self._shown is not None and now - since < _REST:
             number = self._shown[-1]  # the camera still moves
-        wanted = (frame, self._mode.value, self._trails.value, self._exact.value, number)
+        wanted = (frame, *controls.settings, number)
         if wanted == self._shown:
             return
-        coded = self._cache.at(frame)
-        if self._exact.value:
-            self._show_exact(coded.gaussians, camera)
+        at = self._camera_index()
+        if self._shown is None or number != self._shown[-1]:
+            controls.camera.value = FREE if at is None else self._cameras[at].name
+        coded, share = self._cache.at(frame), 0.01 * controls.recorded.value
+        gaussians = self._cropped(coded.gaussians)
+        recorded = None if at is None or not share else self._recorded_image(at, frame, camera)
+        if controls.exact.value or recorded is not None:
+            self._show_image(gaussians, camera, recorded, (frame, *controls.render_settings, number))
         else:
-            self._show_splats(coded.gaussians, camera)
-        if self._splats is not None:
-            self._splats.visible = not self._exact.value
-        self._show_trails(frame)
-        missing = self._mode.value == "offset" and coded.gaussians.offset is None
-        self._status.content = (
-            f"Frame {frame} of {self._cache.frames[-1]}, {len(coded)} Gaussians{_NO_OFFSET * missing}"
+            self._show_splats(gaussians, camera)
+        lines, ages = self._cache.trails(frame, self._trail) if controls.trails.value else NO_TRAILS
+        inside = is_in_box(lines[:, 1], controls.open_crop_box)
+        self._scene.show_trails(lines[inside], ages[inside])
+        self._scene.show_cameras(controls.cameras.value, at)
+        self._scene.show_box(controls.crop_box if controls.is_cropped else None)
+        mode, own = controls.mode.value, coded.gaussians
+        notes = (
+            (mode == "offset" and own.offset is None, _NO_OFFSET),
+            (mode == "motion" and own.motion is None, _NO_MOTION),
+            (share > 0 and at is None, _NOT_AT_CAMERA),
+            (share > 0 and at is not None and recorded is None, _NOT_RECORDED),
+        )
+        count = f"{len(own)}" if len(gaussians) == len(own) else f"{len(gaussians)} of {len(own)}"
+        controls.status.content = f"Frame {frame} of {self._cache.frames[-1]}, {count} Gaussians" + "".join(
+            note for applies, note in notes if applies
         )
         self._server.flush()
         self._shown = wanted
 
-    def _show_splats(self, gaussians: Any, camera: Camera) -> None:
-        background = np.full((2, 2, 3), BACKGROUNDS[self._mode.value], np.uint8)
-        self._server.scene.set_background_image(background, format="png")
-        splats = (
-            self._scale * gaussians.numpy()["means"],
-            np.clip(self._scale**2 * covariances(gaussians), -_HALF_MAX, _HALF_MAX),
-            splat_colors(gaussians, camera, self._mode.value),
-            np.asarray(gaussians.opacities)[:, None],
-        )
-        if self._splats is None:
-            self._splats = self._server.scene.add_gaussian_splats("/splats", *splats)
-        else:
-            self._splats.set_gaussians(*splats)
+    def _frame_at(self, index: int) -> int:
+        return self._cache.frames[min(index, len(self._cache.frames) - 1)]
 
-    def _show_exact(self, gaussians: Any, camera: Camera) -> None:
-        mode = self._mode.value
-        image = render(gaussians, camera, (mode,), self._config)[mode]
-        self._server.scene.set_background_image(channel_image(mode, image), format="png")
-
-    def _show_trails(self, frame: int) -> None:
-        if not self._trails.value:
-            self._server.scene.remove_by_name("/trails")
+    def _choose_moving_frame(self) -> None:
+        """Go to a frame with motion if a mode that shows motion has just been chosen: the first frame has none."""
+        controls = self._controls
+        if controls.mode.value == self._mode:
             return
-        lines, ages = self._cache.trails(frame, self._trail)
-        if not len(lines):
-            lines, ages = np.zeros((1, 2, 3)), np.ones(1)
-        level = (255 * (1 - 0.8 * ages)).astype(np.uint8)
-        colors = np.broadcast_to(np.stack([level, level, np.full_like(level, 40)], axis=-1)[:, None], lines.shape)
-        self._server.scene.add_line_segments(
-            "/trails", self._scale * lines, colors, thickness=1.5, thickness_units="screen"
+        self._mode = controls.mode.value
+        if self._mode in _MOVING_MODES:
+            moving = self._cache.first_moving(self._frame_at(int(controls.frame.value)))
+            controls.frame.value = self._cache.frames.index(moving)
+
+    def _cropped(self, gaussians: Gaussians) -> Gaussians:
+        controls = self._controls
+        if not controls.is_cropped and controls.opacity.value == 0:
+            return gaussians
+        return gaussians.select(is_shown(gaussians, controls.opacity.value, controls.open_crop_box))
+
+    def _show_splats(self, gaussians: Gaussians, camera: Camera) -> None:
+        mode = self._controls.mode.value
+        self._scene.show_splats(gaussians, camera, mode)
+        values = splat_values(gaussians, camera, mode)
+        self._controls.show_legend(legend_html(mode, values, MOTION_SCALE * camera.width))
+
+    def _show_image(
+        self, gaussians: Gaussians, camera: Camera, recorded: np.ndarray | None, key: tuple[Any, ...]
+    ) -> None:
+        """Show the image of the renderer, and the recorded image beside it; `key` determines the render."""
+        mode = self._controls.mode.value
+        if self._rendered is None or self._rendered[0] != key:
+            self._rendered = (key, render(gaussians, camera, (mode,), self._config)[mode])
+        values = self._rendered[1]
+        image = channel_image(mode, values)
+        self._scene.show_image(
+            image if recorded is None else wipe(recorded, image, 0.01 * self._controls.recorded.value)
         )
+        self._controls.show_legend(legend_html(mode, values, MOTION_SCALE * camera.width))
+
+    def _recorded_image(self, view: int, frame: int, camera: Camera) -> np.ndarray | None:
+        """Return the recorded image of a camera of the rig as the page sees it; None if there is none."""
+        try:
+            if self._recording is None:
+                self._recording = RecordedImages(self._open_capture())
+            image = self._recording.at(view, frame)
+        except (OSError, ValueError) as error:
+            self._controls.disable_recorded(str(error))
+            return None
+        return None if image is None else seen_from(camera, self._cameras[view], image)
+
+    def _open_capture(self) -> Capture:
+        stream = self._cache.stream
+        count = max(num_frames(stream), self._cache.frames[-1] + 1)
+        return open_stream_capture(stream, self._capture, list(range(count)))
+
+    def _missing_capture(self) -> str | None:
+        """Return why there are no recorded images, without opening them; None if there are."""
+        path = self._capture or self._cache.stream.metadata.get("capture")
+        if path is None:
+            return f"{self._cache.stream.path} does not name its capture; pass one (--capture)."
+        if not Path(path).is_dir():
+            return f"{path}: expected the capture, found none; pass its folder (--capture)."
+        return None

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+import shutil
 from pathlib import Path
 
 import cv2
@@ -68,6 +70,23 @@ def test_calibrate__names_a_camera_with_another_scene(tmp_path: Path) -> None:
     assert (found.cameras, found.left_out) == (("cam1", "cam2", "cam3", "cam4"), ("other",))
     assert found.error < 0.5
     assert load_capture(tmp_path).names == found.cameras
+
+
+def test_calibrate__prints_a_verdict_per_camera(tmp_path: Path, capsys) -> None:
+    cameras = [camera.resized(240, 180) for camera in textured.rig(4)]
+    film(tmp_path, cameras)
+    shutil.copy(tmp_path / "cam1.mkv", tmp_path / "cam9.mkv")
+    noise = np.random.default_rng(1).integers(0, 255, (90, 120, 3), np.uint8)
+    write_video(tmp_path / "other.mkv", [cv2.resize(noise, (240, 180), interpolation=cv2.INTER_CUBIC)] * 2, 30)
+    assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics", "--partial"]) == 0
+    printed = capsys.readouterr()
+    rows = {name: rest for name, rest in re.findall(r"^ (\w+)  +(.*)$", printed.out, re.MULTILINE)}
+    for name in ("cam0", "cam2", "cam3"):
+        assert re.match(r"\d{3} +0\.\d\d +fits", rows[name])
+    assert re.match(r"\d{3} +0\.\d\d +does not fit", rows["cam9"])
+    assert re.match(r"0 +- +not checked", rows["other"])
+    assert "cam9 does not fit: it has the same pose as cam1: one clip seems to be a copy" in printed.err
+    assert "other not checked: it could not be registered and has no pose" in printed.err
 
 
 def noise_clips(path: Path) -> None:

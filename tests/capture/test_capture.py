@@ -7,15 +7,18 @@ import logging
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
+from morgs_mi.calibration.calibrate import calibrate
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import Lens
 from morgs_mi.io.video_writer import write_video
 from tests.assertions import assert_close
+from tests.scenes import captures as layouts
 from tests.scenes.captures import COUNT, FPS, HEIGHT, WIDTH, frames, make_camera, rig, videos
 
 
@@ -65,6 +68,7 @@ def test_load_capture__prefers_the_colmap_model_and_orders_it_by_number(tmp_path
     assert_close(capture.point_colors, points / 5, atol=1 / 255)
 
 
+@pytest.mark.usefixtures("small_images")
 @pytest.mark.parametrize("downscale", [2, 3, 4.5])
 def test_load_capture__downscaling_moves_projections_with_the_pixels(tmp_path: Path, downscale: float) -> None:
     full = make_camera(0, "cam01", shift=3.0)
@@ -85,6 +89,7 @@ def test_load_capture__downscaling_moves_projections_with_the_pixels(tmp_path: P
     assert_close(centre, small.project(point)[0], atol=0.05)
 
 
+@pytest.mark.usefixtures("small_images")
 def test_load_capture__undistorts_and_masks(tmp_path: Path) -> None:
     colmap(tmp_path, lenses=[Lens("SIMPLE_RADIAL", (0.3,)), Lens()])
     full, small = load_capture(tmp_path), load_capture(tmp_path, 2)
@@ -233,14 +238,138 @@ def test_load_capture__refuses_broken_captures(tmp_path: Path, damage, error: ty
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (
+            {"downscale": 2},
+            r"`downscale` must leave .* at least 32 pixels on each side, got 2; use at most 1.43",
+        ),
+        ({"downscale": 1e300}, r"on each side, got 1e\+300; use at most 1.43"),
         ({"downscale": 0.5}, "`downscale` must be at least 1, got 0.5"),
         ({"downscale": float("nan")}, "`downscale` must be at least 1, got nan"),
-        ({"max_frames": 0}, "`max_frames` must be at least 1 or None, got 0"),
-        ({"test_view": 2}, r"`test_view` must be in 0..1, or None .* got 2"),
-        ({"test_view": -1}, r"`test_view` must be in 0..1, or None .* got -1"),
+        ({"max_frames": 0}, "`max_frames` must be at least 1, got 0"),
+        ({"test_view": 2}, r"`test_view` must be an index in 0..1, one of .*, or none .* got 2"),
+        ({"test_view": -1}, r"`test_view` must be an index in 0..1, one of .*, or none .* got -1"),
     ],
 )
 def test_load_capture__refuses_bad_arguments(tmp_path: Path, arguments: dict, message: str) -> None:
     path = colmap(tmp_path)
     with pytest.raises(ValueError, match=message):
         load_capture(path, **arguments)
+
+
+def test_load_capture__accepts_the_largest_downscale(tmp_path: Path) -> None:
+    camera = load_capture(colmap(tmp_path), 1.43).cameras[0]
+    assert min(camera.width, camera.height) == 32
+
+
+@pytest.mark.parametrize("colors", [[[0, 0, 300]], [[-1, 0, 0]]])
+def test_load_capture__refuses_point_colours_out_of_range(tmp_path: Path, colors: list) -> None:
+    path = colmap(tmp_path, points=np.zeros((1, 3)))
+    (row,) = (line for line in (path / "sparse/0/points3D.txt").read_text().splitlines() if line[0] != "#")
+    fields = [*row.split()[:4], *map(str, colors[0]), "0.5"]
+    (path / "sparse/0/points3D.txt").write_text(" ".join(fields) + "\n")
+    with pytest.raises(ValueError, match=r"the colours of the points must be .* in \[0, 1\], got .*; divide by 255"):
+        load_capture(path)
+
+
+def test_load_capture__does_not_clip_the_colours_of_a_point_cloud(tmp_path: Path) -> None:
+    path = layouts.dynamic3dgs(tmp_path / "a")
+    np.savez(path / "init_pt_cld.npz", data=[[1, 2, 3, 128, 255, 0, 1]])
+    with pytest.raises(ValueError, match=r"in \[0, 1\], got \[1, 3\], 0 to 255; divide by 255"):
+        load_capture(path)
+
+
+# ---- images with other channels --------------------------------------------------------------------------
+
+
+def transparent(t: int = 0, kind: type = np.uint8) -> np.ndarray:
+    """Return an image [H, W, 4] whose left 10 columns and column 20 + t are transparent."""
+    image = np.full((HEIGHT, WIDTH, 4), np.iinfo(kind).max, kind)
+    image[:, :10, 3] = 0
+    image[:, 20 + t, 3] = np.iinfo(kind).max // 2
+    return image
+
+
+def with_images(path: Path, images: list[np.ndarray], **kwargs) -> Path:
+    """Write a capture of one camera whose images have any channels and type."""
+    write_colmap(path / "sparse", [make_camera(0, "cam01")], **kwargs)
+    (path / "cam01").mkdir()
+    for t, image in enumerate(images):
+        cv2.imwrite(str(path / "cam01" / f"{t}.png"), image)
+    return path
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_load_capture__masks_transparent_pixels(tmp_path: Path, kind: type) -> None:
+    capture = load_capture(with_images(tmp_path, [transparent(kind=kind)] * 3))
+    assert capture.masks[0] is not None
+    np.testing.assert_array_equal(capture.masks[0], transparent()[..., 3] == 255)
+    assert capture.notes == (f"cam01: {1100 / WIDTH:.1f} % of its pixels are transparent and masked out.",)
+    assert capture.metadata()["cameras"][0]["valid_share"] == pytest.approx(1 - 11 / WIDTH)
+
+
+def test_load_capture__masks_what_transparent_pixels_contribute_to(tmp_path: Path, small_images: None) -> None:
+    lens = Lens("SIMPLE_RADIAL", (0.05,))
+    images = [transparent()] * 2
+    images[0][images[0][..., 3] < 255, :3] = 0
+    capture = load_capture(with_images(tmp_path, images, lenses=[lens]), 2)
+    (image,) = next(capture.frames()).images
+    assert capture.masks[0] is not None
+    assert 0.5 < capture.masks[0].mean() < 1
+    assert (image[capture.masks[0]] == 255).all(), "no black has leaked into a valid pixel"
+    assert (image[~capture.masks[0]] < 255).any()
+
+
+def test_load_capture__ignores_an_alpha_channel_that_changes(tmp_path: Path) -> None:
+    capture = load_capture(with_images(tmp_path, [transparent(t) for t in range(3)]))
+    assert capture.masks == (None,)
+    assert capture.notes == ("cam01: the alpha channel of its images changes over time and is ignored.",)
+
+
+def test_load_capture__does_not_mask_opaque_images(tmp_path: Path) -> None:
+    opaque = np.full((HEIGHT, WIDTH, 4), 255, np.uint8)
+    capture = load_capture(with_images(tmp_path, [opaque] * 2))
+    assert (capture.masks, capture.notes) == ((None,), ())
+
+
+def test_load_capture__refuses_images_without_opaque_pixels(tmp_path: Path) -> None:
+    path = with_images(tmp_path, [np.zeros((HEIGHT, WIDTH, 4), np.uint8)])
+    with pytest.raises(ValueError, match=r"cam01: expected opaque pixels, got an alpha channel without any; remove it"):
+        load_capture(path)
+
+
+@pytest.mark.parametrize(
+    "image",
+    [np.full((HEIGHT, WIDTH), 200, np.uint8), np.full((HEIGHT, WIDTH, 3), 200 * 257, np.uint16)],
+    ids=["grey", "16 bits"],
+)
+def test_load_capture__reads_grey_and_16_bit_images(tmp_path: Path, image: np.ndarray) -> None:
+    capture = load_capture(with_images(tmp_path, [image]))
+    assert (next(capture.frames()).images[0] == 200).all()
+
+
+# ---- photos ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("place", ["", "images", "photos"])
+def test_load_capture__reads_photos_as_cameras_of_one_frame(tmp_path: Path, place: str) -> None:
+    names = ("IMG_2", "IMG_3", "IMG_10")
+    write_colmap(tmp_path / "sparse/0", rig(names))
+    for i, name in enumerate(names):
+        for folder in (tmp_path / place, tmp_path / "images_2"):  # the latter as Nerfstudio's downscaled copies
+            folder.mkdir(exist_ok=True)
+            cv2.imwrite(str(folder / f"{name}.png"), frames(i)[0][..., ::-1])
+    capture = load_capture(tmp_path)
+    assert (capture.names, capture.num_frames) == (names, 1)
+    assert [image[0, 0, 0] for image in next(capture.frames()).images] == [0, 1, 2]
+    (note,) = capture.notes
+    assert "3 photos of a static scene, one per camera; a recording has one folder per camera: cam01/0000.png" in note
+
+
+def test_load_capture__describes_the_folders_that_photos_lack(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"found none; .*, or make one folder per camera: cam01/0000"):
+        load_capture(tmp_path)
+    cv2.imwrite(str(tmp_path / "IMG_1.png"), frames(0)[0])
+    with pytest.raises(FileNotFoundError, match=r"run `morgs-mi calibrate`.* The 1 photos .* one folder per camera: c"):
+        load_capture(tmp_path)
+    with pytest.raises(ValueError, match=r"at least two cameras, found IMG_1; .* one folder per camera: cam01/"):
+        calibrate(tmp_path)

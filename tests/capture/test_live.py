@@ -24,7 +24,7 @@ NAMES = ("cam1", "cam2", "cam3")
 
 
 @pytest.fixture
-def rig(tmp_path: Path) -> Capture:
+def rig(tmp_path: Path, small_images: None) -> Capture:
     """Three cameras at half size, the second with lens distortion."""
     lenses = [Lens(), Lens("SIMPLE_RADIAL", (0.2,)), Lens()]
     write_colmap(tmp_path / "rig/sparse/0", layouts.rig(NAMES), lenses=lenses)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from morgs_mi import cli
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.io.video_writer import write_video
@@ -87,7 +88,7 @@ def test_timeline__keeps_truth_only_for_unshifted_clips(tmp_path: Path) -> None:
         (
             {"a": (4, 25), "b": (6, 25)},
             ReadConfig(),
-            r"same number of frames, got a.mkv 4, b.mkv 6; .*max_frames=4 \(--frames\), .* --trim, .* --offset",
+            r"same number of frames, got a.mkv 4, b.mkv 6; .*`max_frames=4`, .* --trim, .* --offset",
         ),
         ({"a": (4, 25), "b": (4, 50)}, ReadConfig(), "same frame rate, got a.mkv 25, b.mkv 50; .* --trim"),
         ({"a": (4, 25), "b": (4, 25)}, ReadConfig(offset={"c": 1}), "`offset` must name cameras of a, b, got c"),
@@ -116,6 +117,82 @@ def test_timeline__truncated_clip_can_be_trimmed_or_left_out_but_not_shifted(tmp
     assert frame_numbers(load_capture(path, reading=ReadConfig(trim=True))) == [[t, t] for t in range(held)]
     expected = [[t, t if t < held else None] for t in range(6)]
     assert frame_numbers(load_capture(path, reading=ReadConfig(gaps=True))) == expected
+
+
+# Clips at 20 fps, the second with two frames that come 0.1 s late, the third with jitter within half a frame.
+REGULAR, LATE, JITTER = [50 * t for t in range(7)], [0, 50, 100, 250, 300], [0, 60, 95, 140, 200, 255, 300]
+
+
+def timed(path: Path, **times: list[int]) -> Path:
+    """Write clips given by the times of their frames in milliseconds; frame t of camera i is filled with (i, t, 0)."""
+    layouts.n3dv(path, tuple(times), lambda *_: None)
+    for i, (name, milliseconds) in enumerate(times.items()):
+        layouts.write_timed_video(path / f"{name}.mp4", layouts.frames(i, len(milliseconds)), milliseconds)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("times", "config", "instants"),
+    [
+        # The nearest frame is shown at each instant.
+        ({"a": REGULAR, "b": LATE}, ReadConfig(trim=True), [[0, 0], [1, 1], [2, 2], [3, 2], [4, 3], [5, 3], [6, 4]]),
+        # Its camera is left out where the nearest frame is more than half a frame away.
+        (
+            {"a": REGULAR, "b": LATE},
+            ReadConfig(gaps=True),
+            [[0, 0], [1, 1], [2, 2], [3, None], [4, None], [5, 3], [6, 4]],
+        ),
+        # Frame 1 of b is simultaneous with frame 0 of a; then frame 3 of b.
+        ({"a": REGULAR, "b": LATE}, ReadConfig(offset={"b": 1}), [[0, 1], [1, 2], [2, 2], [3, 3], [4, 3], [5, 4]]),
+        ({"a": REGULAR[:2], "b": LATE}, ReadConfig(offset={"b": 3}), [[0, 3], [1, 4]]),
+        # a has twice the rate: the instants are those of b.
+        (
+            {"a": [25 * t for t in range(9)], "b": LATE},
+            ReadConfig(trim=True),
+            [[0, 0], [2, 1], [4, 2], [6, 2], [8, 3]],
+        ),
+        ({"a": REGULAR, "b": JITTER}, ReadConfig(), [[t, t] for t in range(7)]),
+        ({"a": REGULAR, "b": JITTER}, ReadConfig(trim=True), [[t, t] for t in range(7)]),
+    ],
+)
+def test_timeline__synchronises_variable_frame_rates_by_time(tmp_path: Path, times, config, instants) -> None:
+    capture = load_capture(timed(tmp_path / "c", **times), reading=config)
+    assert capture.fps == pytest.approx(20, rel=0.01)
+    assert frame_numbers(capture) == instants
+    assert [frame.index for frame in capture.partial_frames(1)] == list(range(1, len(instants)))
+
+
+def test_timeline__refuses_a_variable_frame_rate_by_default(tmp_path: Path) -> None:
+    path = timed(tmp_path / "c", a=REGULAR[:5], b=LATE)
+    with pytest.raises(ValueError, match=r"b.mp4: expected a constant frame rate, .* frame 3 is 100 ms late; .*--trim"):
+        load_capture(path)
+    assert load_capture(path, max_frames=3).num_frames == 3
+
+
+def test_timeline__reports_how_irregular_a_clip_is_and_what_was_done(tmp_path: Path) -> None:
+    path = timed(tmp_path / "c", a=REGULAR, b=LATE)
+    assert load_capture(path, reading=ReadConfig(trim=True)).notes == (
+        "b.mp4: variable frame rate, 5 frames in 7 periods of 50.0 ms, up to 0.0 ms off; each instant has the frame "
+        "nearest in time: 2 repeat one, 0 have none.",
+    )
+    capture = load_capture(path, reading=ReadConfig(gaps=True))
+    assert "0 repeat one, 2 have none" in capture.metadata()["notes"][0]
+    problems = [frame.problems for frame in capture.partial_frames(3, 4)]
+    assert problems == [(f"b: {path / 'b.mp4'}: no frame at instant 3.",)]
+    regular = timed(tmp_path / "d", a=REGULAR, b=[50 * t + t % 2 for t in range(7)])  # rounded, as in Matroska
+    assert load_capture(regular).notes == ()
+
+
+def test_info_command__reports_a_variable_frame_rate(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    path = timed(tmp_path / "c", a=REGULAR, b=LATE)
+    assert cli.main(["info", str(path), "--no-check", "--trim"]) == 0
+    assert "b.mp4: variable frame rate, 5 frames in 7 periods" in capsys.readouterr().out
+
+
+def test_timeline__does_not_use_truth_at_other_times(tmp_path: Path) -> None:
+    path = timed(tmp_path / "c", a=REGULAR, b=LATE)
+    (path / "truth").mkdir()
+    assert load_capture(path, reading=ReadConfig(trim=True)).truth is None
 
 
 def images(path: Path, names: Sequence[str] = ("cam_0", "cam_2", "cam_10")) -> Path:
@@ -148,6 +225,14 @@ def test_partial_frames__leave_out_missing_images_in_frame_folders(tmp_path: Pat
     assert frame_numbers(capture) == [[0, 0, 0], [1, 1, 1], [2, None, 2], [3, 3, 3]]
     with pytest.raises(FileNotFoundError, match=r"frame000002/cam_2.png: expected an image, found none; .* \(--gaps\)"):
         load_capture(path)
+
+
+@pytest.mark.parametrize("number", ["9000000000", "9" * 60])
+def test_open_clips__refuses_numbers_that_span_more_than_the_images(tmp_path: Path, number: str) -> None:
+    path = images(tmp_path / "c")
+    (path / "cam_2" / "0003.png").rename(path / "cam_2" / f"{number}.png")
+    with pytest.raises(ValueError, match=rf"cam_2/{number}.png: expected images numbered without .* after number 3"):
+        load_capture(path, reading=ReadConfig(gaps=True))
 
 
 def test_frames__stop_at_a_broken_image(tmp_path: Path) -> None:

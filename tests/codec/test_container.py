@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 import subprocess
 import sys
-import zlib
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +20,7 @@ from morgs_mi.codec.container import (
 )
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
+from tests.scenes.short_clip import sealed
 
 RNG = np.random.default_rng(5)
 PACKETS = [
@@ -142,11 +142,6 @@ def test_stream_reader__detects_every_flipped_bit(tmp_path: Path) -> None:
             list(StreamReader(path))
 
 
-def sealed(payload: bytes, kind: int = 2) -> bytes:
-    head = struct.pack("<IIQ", kind, 0, len(payload))
-    return head + struct.pack("<I", zlib.crc32(head + payload)) + payload
-
-
 def with_table(table: bytes, rest: bytes = b"") -> bytes:
     return sealed(struct.pack("<I", len(table)) + table + rest)
 
@@ -161,16 +156,28 @@ def with_table(table: bytes, rest: bytes = b"") -> bytes:
         (sealed(b"", kind=0), r"1 \(keyframe\) or 2 \(residual\), got 0"),
         (sealed(b"\xff\xff\xff\xff"), "table of arrays is broken"),
         (with_table(b"no"), "table of arrays is broken"),
-        (with_table(b"[" * 100000), "table of arrays is broken"),
-        (with_table(b"[1]"), "table of arrays is broken"),
+        (with_table(b"[" * 60_000), "must be nested at most 32 levels deep"),
+        (with_table(b"[1]"), r"it must be a list of \[name, dtype, shape\]"),
+        (with_table(b'{"a": 1}'), r"it must be a list of \[name, dtype, shape\]"),
+        (with_table(b'[["a", "uint8"]]'), r"it must be a list of \[name, dtype, shape\]"),
+        (with_table(b'[[["a"], "uint8", [1]]]', bytes(1)), r"is declared as uint8 \[1\]"),
+        (with_table(b'[["a", {"x": 1}, [1]]]', bytes(1)), r"`a` is declared as \{'x': 1\} \[1\]"),
+        (with_table(b'[["a", "f4,f4", [1]]]', bytes(8)), "`a` is declared as f4,f4"),
+        (with_table(b'[["a", "uint8", 1]]', bytes(1)), "`a` is declared as uint8 1"),
+        (with_table(b'[["a", "uint8", [true]]]', bytes(1)), r"`a` is declared as uint8 \[True\]"),
+        (with_table(b'[["a", "uint8", [1.0]]]', bytes(1)), r"`a` is declared as uint8 \[1.0\]"),
+        (with_table(b'[["a", "uint8", [1,1,1,1,1,1,1,1,1]]]', bytes(1)), r"`a` is declared as uint8 \[1, 1"),
+        (with_table(b'[["a", "uint8", [1]], ["a", "uint8", [1]]]', bytes(2)), "two arrays have one name"),
+        (with_table(b'[["a", "uint8", [NaN]]]'), "numbers must be finite, got NaN"),
+        (with_table(b'[["a", "uint8", [' + b"1," * 33_000 + b"1]]]"), "must have at most 65536 bytes, got 66021"),
         (with_table(b'[["a", "object", [1]]]', bytes(8)), "`a` is declared as object"),
         (with_table(b'[["a", "uint8", [-1]]]', bytes(8)), r"`a` is declared as uint8 \[-1\]"),
         (
             with_table(b'[["a", "float32", [1000000000000]]]', bytes(8)),
             "would end at byte 4000000000039 of 47",
         ),
-        (with_table(b'[["a", "uint8", [0, 10000000000000000000000]]]'), "table of arrays is broken"),
-        (with_table(b'[["a", "uint8", [10000000000000000000000]]]'), "table of arrays is broken"),
+        (with_table(b'[["a", "uint8", [0, 10000000000000000000000]]]'), "integers must have at most 64 bits"),
+        (with_table(b'[["a", "uint8", [10000000000000000000000]]]'), "integers must have at most 64 bits"),
         (with_table(b'[["a", "uint8", [7]]]', bytes(8)), "describes 32 bytes of 33"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
@@ -212,13 +219,30 @@ def test_stream_reader__refuses_files_that_are_not_streams(tmp_path: Path) -> No
     with pytest.raises(ValueError, match="packet 0 at byte 12: the first packet must be the header, got kind 1"):
         StreamReader(path)
     path.write_bytes(preamble + sealed(b"{}", kind=0))
-    with pytest.raises(ValueError, match="packet 0 at byte 12: the header's JSON is broken"):
+    with pytest.raises(ValueError, match="packet 0 at byte 12: `cameras` is missing; 0 packets before it are intact"):
         StreamReader(path)
     with pytest.raises(FileNotFoundError):
         StreamReader(tmp_path / "none")
     with pytest.raises(ValueError, match="`metadata` and `fps` must fit into JSON"):
         StreamWriter(tmp_path / "t", cameras(), 30, {"a": object()})
     assert not (tmp_path / "t").exists()
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [[(0, 0, 700)], [(1, 0, 12)], [(1, 0, 2**63)], [(1, 0, 2**64 - 1)], [(2, 1, 900), (1, 0, 800)]],
+    ids=["kind", "inside the header", "large", "largest", "descending"],
+)
+def test_stream_reader__walks_from_packet_to_packet_where_the_index_is_implausible(
+    tmp_path: Path, entries: list[tuple[int, int, int]]
+) -> None:
+    ends = write(tmp_path / "s")
+    packed = b"".join(struct.pack("<IIQ", *entry) for entry in entries)
+    data = (tmp_path / "s").read_bytes()[: ends[-1]]
+    (tmp_path / "s").write_bytes(data + sealed(packed + struct.pack("<Q8s", len(data), b"MORGSIDX"), 3))
+    reader = StreamReader(tmp_path / "s")
+    assert [at for *_, at in reader.index()] == ends[:-1]
+    assert len(list(reader.near(3))) == len(PACKETS)
 
 
 @pytest.mark.parametrize("length", [0, 5, 15, 16, 40])
@@ -240,7 +264,8 @@ def test_stream_writer__leaves_complete_packets_on_a_full_disk_and_stays_usable(
 import resource
 import numpy as np
 from morgs_mi.codec.container import Packet, PacketKind, StreamWriter
-with StreamWriter({str(path)!r}, [], 30) as stream:
+from tests.scenes.coded_clip import CAMERAS
+with StreamWriter({str(path)!r}, CAMERAS, 30) as stream:
     stream.write(Packet(PacketKind.KEYFRAME, 0, {{"a": np.zeros(50, np.float32)}}))
     resource.setrlimit(resource.RLIMIT_FSIZE, (stream.num_bytes + 100, resource.RLIM_INFINITY))
     try:

@@ -362,31 +362,56 @@ def test_decode__names_a_missing_packet() -> None:
 
 
 def with_head(packet: Packet, *head: int) -> Packet:
-    return Packet(packet.kind, packet.frame, {**packet.arrays, "head": np.array(head, np.uint32)})
+    return with_array(packet, "head", np.array(head, np.uint32))
+
+
+def with_array(packet: Packet, name: str, array: np.ndarray) -> Packet:
+    return Packet(packet.kind, packet.frame, {**packet.arrays, name: array})
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda key, _: with_head(key, 2**32 - 1, 1, 1, 60), "does not fit its"),
-        (lambda key, _: with_head(key, 60, 4, 1, 60), "does not fit its"),
+        (lambda key, _: with_head(key, 2**32 - 1, 1, 1, 60), r"take at least \d+ words of code, got"),
+        (lambda key, _: with_head(key, 60, 4, 1, 60), "its degree must be at most 3, got 4"),
         (lambda key, _: with_head(key, 60, 1, 5, 60), "must have no bits beyond 0b1, got 0b101 with the unknown 0b100"),
         (lambda key, _: with_head(key, 60, 1, 1, 5), "its ids do not ascend"),
+        (lambda key, _: with_head(key, 60, 1, 1, 2**30), "its next id must be at most 1073741823, got 1073741824"),
         (lambda key, _: with_head(key, 60), "its head must have 4 numbers"),
-        (lambda _, residual: with_head(residual, 2**31, 8), "does not fit its"),
-        (lambda _, residual: with_head(residual, 0, 81), "does not fit its"),
+        (lambda _, residual: with_head(residual, 2**29, 8), r"take at least \d+ words of code, got"),
+        (lambda _, residual: with_head(residual, 2**31, 8), "its next id must be at most 1073741823"),
+        (lambda _, residual: with_head(residual, 0, 81), "its coarseness must be at most 80, got 81"),
         (lambda key, _: Packet(key.kind, 0, {"head": key.arrays["head"]}), "expected the arrays"),
-        (lambda key, _: Packet(key.kind, 0, {**key.arrays, "offset": key.arrays["code"]}), "expected the arrays"),
-        (
-            lambda _, residual: Packet(residual.kind, 1, {**residual.arrays, "offset": np.full(60, 2**32 - 1, "u4")}),
-            "its code is broken",
-        ),
+        (lambda key, _: with_array(key, "offset", key.arrays["code"]), "expected the arrays"),
+        (lambda key, _: with_array(key, "head", np.full(4, np.inf, np.float32)), r"`head` must be uint32 \[n\], got f"),
+        (lambda key, _: with_array(key, "code", np.zeros(99, np.float32)), r"`code` must be uint32 \[n\], got float32"),
+        (lambda key, _: with_array(key, "code", key.arrays["code"][None]), r"`code` must be uint32 \[n\], got uint32"),
+        (lambda _, residual: with_array(residual, "parent", np.zeros(8, np.uint32)), r"`parent` must be uint8 \[n\]"),
+        (lambda _, residual: with_array(residual, "offset", np.zeros(8, np.uint8)), r"`offset` must be uint32 \[n\]"),
+        (lambda _, residual: with_array(residual, "offset", np.full(60, 2**32 - 1, "u4")), "its code is broken"),
+        (lambda _, residual: replace(residual, frame=0), "its frame must be above 0, that of the state before, got 0"),
     ],
 )
 def test_decode__refuses_packets_that_contradict_themselves(change, message: str) -> None:
     packets, states = encoded_clip(2)
+    packet = change(*packets)
     with pytest.raises(ValueError, match=message):
-        decode(states[0], change(*packets))
+        decode(states[0] if packet.kind == PacketKind.RESIDUAL else None, packet)
+
+
+def test_coded_frames__name_file_packet_and_byte(tmp_path: Path) -> None:
+    packets, states = encoded_clip(4)
+    write(tmp_path / "s", [packets[0], packets[2], packets[3]], [states[0], states[2], states[3]])
+    at = StreamReader(tmp_path / "s").index()[1][2]
+    with pytest.raises(ValueError, match=f"s: packet 2 at byte {at}: it does not continue the state after frame 0; "):
+        list(coded_frames(StreamReader(tmp_path / "s")))
+
+
+def test_coded_frames__refuse_frames_that_do_not_ascend(tmp_path: Path) -> None:
+    packets, states = encoded_clip(4)
+    write(tmp_path / "s", [*packets, packets[0]], [*states, states[0]])
+    with pytest.raises(ValueError, match=r"s: packet 5 at byte \d+: its frame must be above 3, .* got 0"):
+        list(coded_frames(StreamReader(tmp_path / "s")))
 
 
 def test_decode__refuses_scrambled_code_or_the_packet_after_it() -> None:

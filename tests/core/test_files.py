@@ -1,4 +1,4 @@
-"""Atomic creation of files and folders."""
+"""Atomic creation of files and folders, and locked folders."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import json
 import os
 import resource
 import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from morgs_mi.core.files import atomic_folder, atomic_path, write_json
+from morgs_mi.core.files import atomic_folder, atomic_path, locked_folder, write_json
 
 
 def tree(path: Path) -> dict[str, str | None]:
@@ -97,6 +98,13 @@ def test_atomic_path__reports_a_folder_that_is_not_writable(tmp_path: Path, case
     assert tree(tmp_path) == before
 
 
+def test_atomic_path__replaces_no_device_and_no_pipe(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(FileExistsError, match=r"test\(\): .*/pipe is a device or a pipe"):
+        atomic_path(tmp_path / "pipe", "test()").__enter__()
+    assert (tmp_path / "pipe").is_fifo()
+
+
 def test_atomic_path__restores_the_old_folder_after_a_failed_swap(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -161,3 +169,54 @@ def test_write_json__writes_null_for_infinity_and_nan(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match=r"cannot write .*b.json"):
         write_json(tmp_path / "file" / "b.json", {})
+
+
+def test_locked_folder__refuses_a_second_writer_until_the_first_has_ended(tmp_path: Path) -> None:
+    out = tmp_path / "new" / "out"
+    (tmp_path / "link").symlink_to(out)
+    with locked_folder(out, "test()"):
+        for same in (out, tmp_path / "link"):
+            with pytest.raises(BlockingIOError, match=f"{same}: .* another process is writing; wait"):
+                locked_folder(same, "test()").__enter__()
+        (out / "a").write_text("whole")
+    with locked_folder(out, "test()"):
+        pass
+    assert tree(tmp_path / "new") == {"out": None, "out/a": "whole"}
+
+
+def test_locked_folder__is_free_after_its_writer_was_killed(tmp_path: Path) -> None:
+    script = (
+        "import os, sys; from morgs_mi.core.files import locked_folder\n"
+        "with locked_folder(sys.argv[1], 'test()'): os.kill(os.getpid(), 9)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", script, str(tmp_path)], check=False).returncode == -9
+    assert len(tree(tmp_path)) == 1
+    with locked_folder(tmp_path, "test()"):
+        pass
+    assert not tree(tmp_path)
+
+
+def test_locked_folder__leaves_no_empty_folder_and_no_foreign_lock(tmp_path: Path) -> None:
+    with locked_folder(tmp_path / "new" / "out", "test()"):
+        pass
+    assert not tree(tmp_path)
+    with locked_folder(tmp_path / "out", "test()"):
+        (tmp_path / "out").rename(tmp_path / "moved")
+        with locked_folder(tmp_path / "out", "test()"):
+            pass
+
+
+@pytest.mark.parametrize(
+    ("folder", "sentence"),
+    [
+        ("file", "/file is a file; name a folder"),
+        ("file/out", r"^test\(\): cannot write into .*/file/out: Not a directory; check"),
+        ("/sys/out", r"^test\(\): cannot write into /sys/out: [^:\[]*; check"),
+    ],
+)
+def test_locked_folder__reports_a_folder_that_cannot_be_written(tmp_path: Path, folder: str, sentence: str) -> None:
+    """Nobody, not even root, may create files in /sys."""
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match=sentence):
+        locked_folder(tmp_path / folder, "test()").__enter__()
+    assert tree(tmp_path) == {"file": ""}

@@ -12,7 +12,7 @@ import pytest
 from morgs_mi import cli
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import srgb_to_linear
-from morgs_mi.export.clips import select_frames
+from morgs_mi.export.clips import _frames_backwards, repeated_seconds, select_frames
 from morgs_mi.export.frames import exr_channels, pad_to_even
 from morgs_mi.io.ply import read_ply
 from morgs_mi.render.rasterize import rasterize
@@ -67,6 +67,38 @@ def test_write_flight__shows_rendered_images_and_restarts_the_clip(stream, tmp_p
         assert errors[t % 4] < 0.03  # the error of the lossy codec on such a small image
 
 
+def test_write_flight__plays_back_and_forth(stream, tmp_path):
+    keys = [{"time": 0, "camera": "middle"}, {"time": 0.9, "camera": "middle"}]
+    (tmp_path / "still.json").write_text(json.dumps({"keys": keys}))
+    assert run("export", "video", tmp_path, "--path", tmp_path / "still.json", "--back-and-forth") == 0
+    expected = [np.clip(np.array(rasterize(state.gaussians, rig()[1]).color), 0, 1) for state in stream]
+    shown = [
+        np.argmin([np.abs(frame / 255 - image).mean() for image in expected]) for frame in video(tmp_path / "still.mp4")
+    ]
+    assert shown == [0, 1, 2, 3, 2, 1, 0, 1, 2]
+
+
+def test_frames_backwards__are_those_of_the_clip_with_their_motion(tmp_path):
+    states = write_stream(tmp_path / "stream.morgs", 7, keyframe_interval=2)
+    backwards = list(_frames_backwards(StreamReader(tmp_path / "stream.morgs")))
+    assert len(backwards) == 5
+    for gaussians, state in zip(backwards, states[-2:0:-1], strict=True):
+        for name, values in state.gaussians.numpy().items():
+            np.testing.assert_array_equal(gaussians.numpy()[name], values)
+
+
+def test_repeated_seconds__plays_whole_clips():
+    seconds = [repeated_seconds(clip, least) for clip, least in ((0.4, 5), (2.0, 5), (5.0, 5), (7.0, 5), (0.4, 0))]
+    assert_close(np.array(seconds), np.array([5.2, 6, 5, 7, 0.4]), atol=1e-9)
+
+
+def test_export_video__repeats_a_short_clip(stream, tmp_path):
+    assert run("export", "video", tmp_path, "--least-seconds", 1, "--width", 32) == 0
+    assert len(video(tmp_path / "between.mp4")) == 12  # three plays of 4 frames at 10 frames per second
+    assert run("export", "video", tmp_path, "--least-seconds", 0, "--width", 32) == 0
+    assert len(video(tmp_path / "between.mp4")) == 4
+
+
 def test_write_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
     more = ("--freeze", 2, "--seconds", 0.5, "--width", 32, "--channels", "color", "depth")
     assert run("export", "video", tmp_path, "--path", "orbit", *more) == 0
@@ -76,11 +108,14 @@ def test_write_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (("ply", "--frames", "9"), "the frames must lie in 0..3, got '9'"),
-        (("ply", "--frames", "a:b"), "the frames must be given as 12, 10:20 or 0:100:5, got 'a:b'"),
+        (("ply", "--frames", "9"), "stream.morgs, 0 to 3, got '9'"),
+        (("ply", "--frames", "a:b"), "--frames must be like 12, 10:20 or 0:100:5, got 'a:b'"),
         (("video", "--output", "x.avi"), "the output must be FILE.mp4"),
-        (("video", "--freeze", "7"), "expected a frame of the stream, got 7"),
+        (("tracks", "--output", "stream.morgs"), "stream.morgs: the output must be FILE.npz, got '.morgs'"),
+        (("video", "--freeze", "7"), "--freeze must be in 0 to 3, got 7"),
+        (("video", "--width", "0"), "--width must be at least 1, got 0"),
         (("video", "--seconds", "-1"), "--seconds must be positive"),
+        (("video", "--least-seconds", "-1"), "--least-seconds must not be negative"),
         (("video", "--path", "none.json"), "expected a camera path, found none"),
     ],
 )

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from morgs_mi.io.video import FolderReader, VideoReader, natural_key, open_frames
-from morgs_mi.io.video_writer import write_video
+from morgs_mi.io.video_writer import playable_format, write_video
+from tests.scenes.captures import write_timed_video
 
 HEIGHT, WIDTH, COUNT = 32, 48, 6
 
@@ -42,6 +43,13 @@ def test_write_video__lossy_codecs_preserve_the_rgb_order_and_most_of_the_image(
     got = np.array(list(VideoReader.open(tmp_path / "cam.mp4").frames()), float)
     # 4:2:0 chroma and the encoders' default rates; a swap of red and blue would give 13 dB.
     assert 10 * np.log10(255**2 / np.mean((got - smooth_clip()) ** 2)) > 30
+
+
+def test_playable_format__is_vp9_and_otherwise_lossless(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert playable_format() == (".mp4", "vp09")
+    missing = cv2.VideoWriter()
+    monkeypatch.setattr("morgs_mi.io.video_writer._encoder", lambda *_: missing)
+    assert playable_format.__wrapped__() == (".mkv", "FFV1")
 
 
 def test_natural_key__sorts_names_by_their_numbers() -> None:
@@ -126,6 +134,32 @@ def test_video_reader__counts_the_frames_of_a_truncated_file(tmp_path: Path) -> 
     assert len(list(reader.frames(0, reader.num_held))) == reader.num_held
 
 
+def test_video_reader__has_the_positions_of_a_variable_frame_rate(tmp_path: Path) -> None:
+    path = tmp_path / "cam.mp4"
+    write_timed_video(path, clip(), [0, 33, 67, 200, 233, 267])
+    reader = VideoReader.open(path)
+    assert (reader.num_frames, reader.num_held) == (6, 6)
+    assert reader.fps == pytest.approx(30, rel=0.01)
+    assert reader.positions is not None
+    np.testing.assert_allclose(reader.positions, [0, 1, 2, 6, 7, 8], atol=0.05)
+    np.testing.assert_array_equal(list(reader.frames()), clip())
+
+
+@pytest.mark.parametrize(("name", "codec"), [("cam.mp4", "mp4v"), ("cam.mkv", "FFV1"), ("cam.avi", "MJPG")])
+@pytest.mark.parametrize("fps", [24000 / 1001, 29.97, 240])
+def test_video_reader__recognises_a_constant_frame_rate(tmp_path: Path, name: str, codec: str, fps: float) -> None:
+    write_video(tmp_path / name, clip(count=30), fps, codec)
+    reader = VideoReader.open(tmp_path / name)
+    assert (reader.num_frames, reader.positions) == (30, None)
+    assert reader.fps == pytest.approx(fps, rel=1e-3)
+
+
+def test_video_reader__refuses_time_stamps_of_years(tmp_path: Path) -> None:
+    write_timed_video(tmp_path / "cam.mp4", clip(), [0, 33, 67, 100, 133, 200_000_000])
+    with pytest.raises(ValueError, match=r"cam.mp4: expected 6 frames at about 30.* that span 2e\+05 s; .*convert"):
+        VideoReader.open(tmp_path / "cam.mp4")
+
+
 def test_folder_reader__ignores_the_rotation_of_exif(tmp_path: Path) -> None:
     jpeg = cv2.imencode(".jpg", np.zeros((16, 32, 3), np.uint8))[1].tobytes()
     # One entry, orientation (0x112) 6: rotated by 90 degrees.
@@ -181,7 +215,7 @@ def test_write_video__raises_and_leaves_nothing_on_a_full_disk(tmp_path: Path, n
     limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000))"
     program = f"""{limit}
 import numpy as np
-from morgs_mi.io.video_writer import write_video
+from morgs_mi.io.video_writer import playable_format, write_video
 noise = np.random.default_rng(0).integers(0, 256, (6, 32, 48, 3), dtype=np.uint8)
 try:
     write_video({str(tmp_path / name)!r}, noise, 30)

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import json
+import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
+from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.playback.player import (
     CHANNELS,
@@ -18,8 +23,11 @@ from morgs_mi.playback.player import (
     find_camera,
     has_confidence,
     has_offset,
+    num_frames,
     open_stream,
+    open_stream_capture,
     playback_speed,
+    render_config,
     render_stream,
     truth_for_camera,
 )
@@ -27,6 +35,11 @@ from tests.assertions import assert_close
 from tests.scenes.moving_splats import CAMERAS, FRAMES, HEIGHT, WIDTH, moved, write_stream
 
 
+def capture_of(stream: StreamReader) -> Capture:
+    return open_stream_capture(stream, None, [0])
+
+
+@pytest.mark.usefixtures("small_images")
 def test_truth_for_camera__resamples_to_a_coarser_grid(fitted_clip: Path) -> None:
     small = load_capture(fitted_clip / "capture", downscale=2)
     full, half = (truth_for_camera(small, c, 1) for c in (CAMERAS[0], small.cameras[0]))
@@ -46,6 +59,54 @@ def test_render_stream__renders_the_available_channels(fitted_clip: Path, tmp_pa
     assert all(channel_image(n, i).shape == (HEIGHT, WIDTH, 3) for n, i in frames[0][1].items())
     write_stream(tmp_path / "s.morgs", {}, logit=None)
     assert "confidence" not in next(render_stream(open_stream(tmp_path / "s.morgs"), CAMERAS[0]))[1]
+
+
+@pytest.mark.parametrize(
+    ("metadata", "read", "message"),
+    [
+        ({"config": 3}, render_config, r"`config.render` of the header's metadata must be an object, got None"),
+        ({"config": {"render": []}}, render_config, r"`config.render` of .* must be an object, got \[\]"),
+        ({"config": {"render": {"x": 1}}}, render_config, r"`config.render` of the header's metadata: `x` is unknown"),
+        ({"config": {"render": {"eps2d": "a"}}}, render_config, r"metadata: `eps2d` must be a number, got 'a'"),
+        ({"config": {"render": {"block_width": 5}}}, render_config, r"metadata: `block_width` must be 4, 8, 12 or 16"),
+        ({"config": {"motion": 1}}, has_confidence, r"`config.motion.learn_confidence` of .* must be true or false"),
+        ({"num_frames": "many"}, num_frames, r"`num_frames` of the header's metadata must be an integer, got 'many'"),
+        ({"downscale": None}, capture_of, r"`downscale` of .* must be an integer or a number, got None"),
+        ({"test_view": [1]}, capture_of, r"`test_view` of .* must be an integer or a string or null, got \[1\]"),
+        ({"reading": {"offset": {"cam0": 0.5}}}, capture_of, r"`reading` of the header's metadata: `offset` must be"),
+        ({"reading": {"offset": {"cam0": 2}, "trim": 1}}, capture_of, r"metadata: `trim` must be true or false, got 1"),
+    ],
+    ids=str,
+)
+def test_open_stream__metadata_of_other_types_are_refused_where_they_are_read(
+    tmp_path: Path, metadata: dict[str, Any], read: Callable[[StreamReader], Any], message: str
+) -> None:
+    write_stream(tmp_path / "s.morgs", {"capture": str(tmp_path), **metadata})
+    stream = open_stream(tmp_path / "s.morgs")
+    with pytest.raises(ValueError, match=rf"s.morgs: packet 0: .*{message}"):
+        read(stream)
+    assert len(list(stream)) == FRAMES
+
+
+@pytest.mark.parametrize("metadata", [{}, {"capture": None}, {"capture": ["x"]}])
+def test_open_stream_capture__needs_a_path(tmp_path: Path, metadata: dict[str, Any]) -> None:
+    write_stream(tmp_path / "s.morgs", metadata)
+    with pytest.raises(
+        ValueError, match=r"expected the path of its capture in the capture\.json beside it, found none"
+    ):
+        capture_of(open_stream(tmp_path / "s.morgs"))
+
+
+def test_open_stream_capture__finds_the_path_in_the_header_or_beside_the_stream(
+    fitted_clip: Path, tmp_path: Path
+) -> None:
+    path = str(fitted_clip / "capture")
+    write_stream(tmp_path / "s.morgs", {"test_view": 0})
+    (tmp_path / "capture.json").write_text(json.dumps({"capture": path}))
+    for stream in (open_stream(fitted_clip), open_stream(tmp_path / "s.morgs")):
+        assert open_stream_capture(stream, None, list(range(FRAMES))).num_frames == FRAMES
+    with pytest.raises(ValueError, match="expected at least one frame, got a header alone"):
+        open_stream_capture(stream, None, [])
 
 
 @pytest.mark.parametrize(("camera", "name"), [(1, "cam1"), ("1", "cam1"), ("cam0", "cam0")])
@@ -107,3 +168,28 @@ def test_channel_image__draws_other_channels_as_grey_values() -> None:
     image = channel_image("wetness", ramp)
     assert (image == image[..., :1]).all()
     np.testing.assert_array_equal(image, channel_image("alpha", ramp))
+
+
+@pytest.mark.parametrize("stored", ["beside", "header", "header, then moved and resumed"])
+def test_open_stream_capture__finds_the_capture_of_the_fit(fitted_clip: Path, tmp_path: Path, stored: str) -> None:
+    capture, header = str(fitted_clip / "capture"), {"test_view": 0}
+    if stored != "beside":
+        header |= {"capture": capture if stored == "header" else str(tmp_path / "moved")}
+    write_stream(tmp_path / "stream.morgs", header)
+    # Earlier versions stored the path beside the stream as it was given, relative to an unknown folder.
+    beside = "capture" if stored == "header" else capture
+    (tmp_path / "capture.json").write_text(json.dumps({"capture": beside}))
+    assert str(open_stream_capture(open_stream(tmp_path), None, [0, 1, 2]).path) == capture
+
+
+def test_open_stream_capture__asks_for_a_capture_that_has_moved(fitted_clip: Path, tmp_path: Path) -> None:
+    write_stream(tmp_path / "stream.morgs", {"test_view": 0})
+    for content in ("{", "[]", '{"capture": 3}', "{}"):
+        (tmp_path / "capture.json").write_text(content)
+        with pytest.raises(ValueError, match=r"stream\.morgs: expected the path of its capture .* --capture\.$"):
+            open_stream_capture(open_stream(tmp_path), None, [0, 1, 2])
+    (tmp_path / "capture.json").write_text(json.dumps({"capture": str(tmp_path / "old")}))
+    with pytest.raises(FileNotFoundError, match=rf"{tmp_path}/old: expected the capture of .* moved, .* --capture\.$"):
+        open_stream_capture(open_stream(tmp_path), None, [0, 1, 2])
+    shutil.copytree(fitted_clip / "capture", tmp_path / "new")
+    assert open_stream_capture(open_stream(tmp_path), tmp_path / "new", [0, 1, 2]).path == tmp_path / "new"

@@ -44,6 +44,11 @@ def test_grey_image__is_the_mean_of_the_components():
     assert (visualise.grey_image(np.tile([0, 0, 0.4, 0.4], (2, 3, 1))) == 51).all()
 
 
+def test_depth_range__are_the_percentiles_of_known_depths():
+    assert_close(visualise.depth_range(np.r_[np.arange(101.0), np.nan, -5, 0]), (1.99, 99.01), atol=1e-6)
+    assert visualise.depth_range(np.zeros(3)) == (1, 1)
+
+
 def test_confidence_legend__agrees_with_the_image():
     legend = visualise.confidence_legend(size=90)
     for row, value in ((0, 1.0), (89, 0.0)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -43,6 +44,25 @@ def videos(path: Path, names: tuple[str, ...], suffix: str = ".mkv") -> None:
     """Write the clips as .mkv, which can still be read after truncation."""
     for i, name in enumerate(names):
         write_video(path / f"{name}{suffix}", frames(i), FPS)
+
+
+def write_timed_video(path: Path, images: list[np.ndarray], times: list[int]) -> None:
+    """Write an .mp4 whose frames are shown at `times`, in ascending milliseconds from 0."""
+    write_video(path, images, 1000)
+    data = path.read_bytes()
+    # The box `stts` is a list of (number of frames, duration in units of the track); OpenCV's has one entry.
+    start = data.index(b"stts") - 4
+    (millisecond,) = struct.unpack(">I", data[start + 20 : start + 24])
+    durations = np.diff([*times, 2 * times[-1] - times[-2]]) * millisecond
+    entries = b"".join(struct.pack(">II", 1, duration) for duration in durations)
+    box = struct.pack(">I4sII", 16 + len(entries), b"stts", 0, len(durations)) + entries
+    grown = bytearray(data[:start] + box + data[start + 24 :])
+    for parent in (b"moov", b"trak", b"mdia", b"minf", b"stbl"):
+        at = grown.index(parent) - 4
+        (size,) = struct.unpack(">I", grown[at : at + 4])
+        grown[at : at + 4] = struct.pack(">I", size + len(box) - 24)
+    # The edit list cuts the clip at its former end.
+    path.write_bytes(grown.replace(b"edts", b"free"))
 
 
 def n3dv(path: Path, names: tuple[str, ...] = ("cam00", "cam02", "cam11"), clips: Callable = videos) -> Path:

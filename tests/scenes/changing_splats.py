@@ -9,7 +9,7 @@ import numpy as np
 
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, residual_packet
+from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, reemitted_keyframe, residual_packet
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from tests.scenes.cameras import look_at_cameras
@@ -39,8 +39,10 @@ def splats(N: int = 40, degree: int = 1, seed: int = 0) -> Gaussians:
     )
 
 
-def write_stream(path: Path, frames: int = 4, start: Gaussians | None = None) -> list[CodedFrame]:
-    """Write a stream with offsets and return its decoded frames.
+def write_stream(
+    path: Path, frames: int = 4, start: Gaussians | None = None, keyframe_interval: int = 0
+) -> list[CodedFrame]:
+    """Write a stream with offsets and return its decoded frames; 0: only the first frame has a keyframe.
 
     The first half of the splats moves from frame 1. In frame 2 one dies and two are born.
     """
@@ -50,6 +52,8 @@ def write_stream(path: Path, frames: int = 4, start: Gaussians | None = None) ->
         for t in range(frames):
             writer.write(packet)
             states.append(decode(states[-1] if states else None, packet))
+            if t and keyframe_interval and t % keyframe_interval == 0:
+                writer.write(reemitted_keyframe(states[-1]))
             before, source = states[-1].gaussians, np.arange(len(states[-1]))
             moves = np.asarray(before.logit_confidence) > 0
             after = replace(before, means=before.numpy()["means"] + 0.1 * moves[:, None] * np.float32([1, 0, 0]))

@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import mitsuba as mi
 import numpy as np
 import pytest
 
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import read_colmap
 from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds
 from morgs_mi.io.video import open_frames
@@ -18,6 +20,7 @@ from morgs_mi.synth.ground_truth import compute_ground_truth, load_tracks, load_
 from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import Light, Object, Scene, load_scene, translate
 from morgs_mi.synth.synthesize import synthesize
+from morgs_mi.synth.textures import lights, textured
 from tests.assertions import assert_close
 
 FPS = 30.0
@@ -198,7 +201,7 @@ def test_synthesize__colmap_points_lie_on_the_surface_within_their_noise(clip):
     assert np.percentile(best, 95) < 4
 
 
-@pytest.mark.parametrize("name", ["spheres", "arm", "thin", "flicker"])
+@pytest.mark.parametrize("name", ["spheres", "arm", "thin", "flicker", "random"])
 def test_load_scene__poses_are_rigid_and_repeatable(name):
     for item in load_scene(name).objects.values():
         if item.pose is not None:
@@ -274,14 +277,20 @@ def test_synthesize__rejects_a_non_empty_folder_and_replaces_a_capture_with_over
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(FileExistsError, match="not empty; choose another folder"):
         synthesize("spheres", tmp_path, **small)
-    with pytest.raises(FileExistsError, match="is not a capture"):
-        synthesize("spheres", tmp_path, **small, overwrite=True)
+    for content in (None, "{", '{"layout": "COLMAP"}'):  # the last is that of a fit; a recording may have one too
+        if content is not None:
+            (tmp_path / "capture.json").write_text(content)
+        with pytest.raises(FileExistsError, match="is not a synthetic capture"):
+            synthesize("spheres", tmp_path, **small, overwrite=True)
+    (tmp_path / "capture.json").unlink()
     out = shutil.copytree(clip, tmp_path / "clip")
     seen = []
     synthesize("spheres", out, **small, overwrite=True, progress=lambda done, total: seen.append((done, total)))
     assert json.loads((out / "capture.json").read_text())["scene"] == "spheres"
     assert not (out / "cam02.mp4").exists()
     assert seen == [(1, 2), (2, 2)]
+    with pytest.raises(ValueError, match=f"expected an output outside of captures, .* in the capture {out}"):
+        synthesize("spheres", out / "clip", **small)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["clip", "notes.txt"]
 
 
@@ -305,7 +314,7 @@ def test_synthesize__removes_its_output_after_a_failure(tmp_path, monkeypatch):
         ({"width": 63}, "must be even, got 63x240"),
         ({"fps": 0}, "`fps` must be positive"),
         ({"noise": -0.1}, "`noise` must be at least 0 and below 1, got -0.1"),
-        ({"scene": "nowhere"}, "no scene 'nowhere'; name one of .*'arm', 'flicker', 'spheres', 'thin'"),
+        ({"scene": "nowhere"}, "no scene 'nowhere'; name one of .*'arm', 'flicker', 'random', 'spheres', 'thin'"),
     ],
 )
 def test_synthesize__rejects_invalid_arguments(tmp_path, arguments, message):
@@ -318,6 +327,151 @@ def test_load_scene__accepts_any_file_path(tmp_path):
         "from morgs_mi.synth.scene import Scene\n\n\ndef build(seed):\n    return Scene('mine', {}, {})\n"
     )
     assert load_scene(tmp_path / "mine.py").name == "mine"
-    (tmp_path / "empty.py").write_text("")
-    with pytest.raises(ValueError, match=r"must define `build\(seed\) -> Scene`"):
-        load_scene(tmp_path / "empty.py")
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("", r"scene.py must define `build\(seed\) -> Scene`"),
+        ("build = 3", r"scene.py must define `build\(seed\) -> Scene`"),
+        ("def build(): pass", r"`build` in .*scene.py must take the seed alone.*got `build\(\)`"),
+        (
+            "def build(seed, size): pass",
+            r"must take the seed alone.*got `build\(seed, size\)`; give further parameters",
+        ),
+        ("def build(seed): pass", "`build` in .*scene.py must return a Scene, got None"),
+        ("def build(seed): return {}", "must return a Scene, got a dict"),
+        ("import nowhere\n", "scene.py, line 1: ModuleNotFoundError: No module named 'nowhere'; correct the scene"),
+        ("\ndef build(seed:\n", "scene.py, line 2: SyntaxError: '.' was never closed; correct the scene"),
+        ("import math\ndef build(seed):\n\n    return math.sqrt(-1)", "scene.py, line 4: ValueError: "),
+        (
+            "import mitsuba as mi\ndef build(seed):\n    return mi.Bitmap('no.png')",
+            "scene.py, line 3: RuntimeError: .*no.png.*No such file",
+        ),
+    ],
+)
+def test_load_scene__names_the_file_and_line_of_a_mistake(tmp_path, monkeypatch, code, message):
+    (tmp_path / "scene.py").write_text(code)
+    monkeypatch.chdir(tmp_path)
+    for path in (tmp_path / "scene.py", Path("scene.py")):
+        with pytest.raises(ValueError, match=message) as error:
+            load_scene(path)
+        assert str(path) in str(error.value)
+
+
+def sphere(**entries):
+    return {"type": "sphere", "bsdf": textured(np.full((2, 2, 3), 0.5, np.float32)), **entries}
+
+
+def bitmap(file):
+    return {"type": "diffuse", "reflectance": {"type": "bitmap", "filename": file}}
+
+
+def fails(time):
+    raise KeyError("hinge")
+
+
+BALL = {"ball": Object({"ball": sphere()})}
+# Objects, lights and what is said about them.
+WRONG_SCENES = {
+    "mesh": (
+        {"fox": Object({"body": {"type": "ply", "filename": "no.ply"}})},
+        {},
+        "object 'fox', shape 'body': its file no.ply does not exist; .*__file__",
+    ),
+    "texture": (
+        {"a": Object({"b": sphere(bsdf=bitmap("no.png"))})},
+        {},
+        "shape 'b', bsdf, reflectance: its file no.png does not exist",
+    ),
+    "path": (
+        {"a": Object({"b": sphere(bsdf=bitmap(Path(__file__)))})},
+        {},
+        "`filename` must be text, got a PosixPath; wrap it in str",
+    ),
+    "image": (
+        {"a": Object({"b": sphere(bsdf=bitmap(__file__))})},
+        lights(),
+        'scene .mine.: Mitsuba cannot load it: .*"a_b.bsdf.reflectance"',
+    ),
+    "plugin": ({"a": Object({"b": {"type": "spere"}})}, lights(), 'Mitsuba cannot load it: .*"a_b".*"spere"'),
+    "no dictionary": (
+        {"a": Object({"b": None})},
+        {},
+        "shape 'b': expected a Mitsuba dictionary with a `type`, got None",
+    ),
+    "none": ({"a": Object({"b": sphere(radius=None)})}, {}, "shape 'b': `radius` must have a value, got None"),
+    "no object": ({"a": sphere()}, {}, r"object 'a': expected Object\(...\), got a value of type dict"),
+    "no light": (BALL, {"lamp": sphere()}, r"light 'lamp': expected Light\(...\), got a value of type dict"),
+    "names": (
+        {"lamp": Object({"a": sphere()}, lambda t: np.eye(4))},
+        lights(),
+        "light 'lamp': the name 'lamp' is used twice",
+    ),
+    "scaled": (
+        {"a": Object({"b": sphere()}, lambda t: 2 * np.eye(4))},
+        {},
+        "object 'a': its pose at 0 s is not rigid: .*undo any scaling",
+    ),
+    "later": (
+        {"a": Object({"b": sphere()}, lambda t: np.diag([1 + t, 1, 1, 1]))},
+        {},
+        "its pose at 0.03333 s is not rigid",
+    ),
+    "shape": (
+        {"a": Object({"b": sphere()}, lambda t: np.eye(3))},
+        {},
+        r"must be a finite matrix \[4, 4\], got the shape \(3, 3\)",
+    ),
+    "nan": ({"a": Object({"b": sphere()}, lambda t: np.nan * np.eye(4))}, {}, "must be a finite matrix .*, got NaN"),
+    "pose fails": (
+        {"a": Object({"b": sphere()}, fails)},
+        {},
+        "object 'a': its pose at 0 s fails with KeyError: 'hinge'",
+    ),
+    "lamp pose": (BALL, {"p": Light({"type": "point"}, lambda t: np.eye(4))}, "a lamp with a pose must be a shape"),
+    "black": (BALL, {}, "it has no emitter, so its images would be black; give it lights"),
+    "nothing": ({}, lights(), "cam00 sees no object at 0 s; move the objects"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_SCENES)
+def test_synthesize__refuses_a_wrong_scene_before_rendering(tmp_path, case):
+    objects, lamps, message = WRONG_SCENES[case]
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        synthesize(Scene("mine", objects, lamps), tmp_path / "clip", num_cameras=2, num_frames=1, width=16, height=16)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_synthesize__warns_of_black_images(tmp_path, caplog):
+    dark = Light({"type": "point", "position": [0, 0, 0]})
+    size = {"num_cameras": 2, "num_frames": 1, "width": 16, "height": 16, "spp": 1}
+    synthesize(
+        Scene("mine", {"a": Object({"b": sphere(center=[0, 0.8, 0])})}, {"inside": dark}), tmp_path / "clip", **size
+    )
+    assert "scene 'mine': cam00 is black at 0 s: no lamp reaches" in caplog.text
+
+
+def test_synthesize__writes_videos_that_browsers_play_beside_the_lossless_frames(clip):
+    video = cv2.VideoCapture(str(clip / "cam01.mp4"))
+    assert int(video.get(cv2.CAP_PROP_FOURCC)).to_bytes(4, "little") == b"VP90"
+    played, stored = (np.array(list(open_frames(clip / name).frames())) for name in ("cam01.mp4", "frames/cam01"))
+    assert played.shape == stored.shape
+    assert psnr(played, stored) > 25
+    np.testing.assert_array_equal(np.array([f.images[1] for f in load_capture(clip).frames()]), stored)
+
+
+def test_synthesize__without_lossless_frames_records_the_videos(tmp_path):
+    size = {"num_cameras": 2, "num_frames": 2, "width": 32, "height": 32, "spp": 1}
+    out = synthesize("spheres", tmp_path / "clip", **size, lossless=False)
+    assert not (out / "frames").exists()
+    played = np.array(list(open_frames(out / "cam01.mp4").frames()))
+    np.testing.assert_array_equal(np.array([f.images[1] for f in load_capture(out).frames()]), played)
+
+
+def test_synthesize__writes_lossless_videos_where_opencv_has_no_playable_encoder(tmp_path, monkeypatch):
+    monkeypatch.setattr("morgs_mi.synth.synthesize.playable_format", lambda: (".mkv", "FFV1"))
+    size = {"num_cameras": 2, "num_frames": 1, "width": 16, "height": 16, "spp": 1}
+    out = synthesize("spheres", tmp_path / "clip", **size)
+    played, stored = (np.array(list(open_frames(out / name).frames())) for name in ("cam01.mkv", "frames/cam01"))
+    np.testing.assert_array_equal(played, stored)

@@ -71,3 +71,11 @@ def test_trails__are_the_displacements_of_the_moving_gaussians(tmp_path, states)
     assert_close(lines[:, 1] - lines[:, 0], np.broadcast_to([0.1, 0, 0], (len(lines), 3)), atol=0.01)
     assert len(cache.trails(3, length=2, count=5)[0]) <= 10
     assert cache.trails(0, length=2)[0].shape == (0, 2, 3)
+
+
+def test_first_moving__skips_frames_without_motion(tmp_path, states):
+    cache = FrameCache(tmp_path)
+    assert [cache.first_moving(frame) for frame in cache.frames] == [1, *cache.frames[1:]]
+    still = tmp_path / "still.morgs"
+    write_stream(still, 1)
+    assert FrameCache(still).first_moving(0) == 0

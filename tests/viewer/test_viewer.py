@@ -1,4 +1,4 @@
-"""The page in headless Chromium: loading, scrubbing, modes, exact images, a growing file."""
+"""The page in headless Chromium: loading, scrubbing, modes, cameras, recorded images, keys, a growing file."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import signal
 import socket
 import subprocess
 import sys
+from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,13 +19,15 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.export.axes import up_direction
+from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.player import channel_image, open_stream, render, render_config
-from tests.scenes.changing_splats import write_stream
+from tests.scenes.captures import n3dv
+from tests.scenes.changing_splats import NAMES, write_stream
 
 pytest.importorskip("viser", reason="install it with pip install 'morgs-mi[viewer]'")
 playwright = pytest.importorskip("playwright.sync_api", reason="install it with pip install 'morgs-mi[viewer-test]'")
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+CHROMIUM = next(filter(None, map(shutil.which, BROWSERS)), None)
 pytestmark = pytest.mark.skipif(
     CHROMIUM is None,
     reason="no Chromium found; install it with tools/setup_browser.sh (apt-get install chromium)",
@@ -34,6 +38,13 @@ WIDTH, HEIGHT = 480, 360
 KNOWN_ERROR = "THREE.BufferGeometry.computeBoundingSphere(): Computed radius is NaN"
 # A software rasteriser on a busy machine starts slowly.
 TIMEOUT_MS = 60_000
+# Colours of the recorded images by frame.
+RECORDED = ((200, 60, 40), (40, 200, 60), (60, 40, 200), (200, 200, 40))
+
+
+def write_clips(path: Path, names: tuple[str, ...]) -> None:
+    for name in names:
+        write_video(path / f"{name}.mkv", [np.full((48, 64, 3), color, np.uint8) for color in RECORDED], 10)
 
 
 @pytest.fixture
@@ -47,7 +58,8 @@ def page(tmp_path):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     code = "import sys; from morgs_mi.cli import main; sys.exit(main())"
-    arguments = ["view", str(tmp_path), "--port", str(port), "--no-open-browser"]
+    capture = n3dv(tmp_path / "capture", NAMES, write_clips)
+    arguments = ["view", str(tmp_path), "--port", str(port), "--no-open-browser", "--capture", str(capture)]
     server = subprocess.Popen([sys.executable, "-c", code, *arguments], stderr=subprocess.PIPE, stdout=subprocess.PIPE)
     console_errors = []
     try:
@@ -109,6 +121,96 @@ def select_mode(page, mode: str) -> None:
     page.get_by_role("option", name=mode).click()
 
 
+def set_number(page, name: str, value: float) -> None:
+    row = page.get_by_text(name, exact=True).locator("xpath=ancestor::*[.//input][1]")
+    number = row.locator("input[inputmode=decimal]").first
+    number.fill(str(value))
+    number.press("Enter")
+
+
+def go_to(page, camera: str) -> None:
+    page.get_by_label("Go to camera").click()
+    page.get_by_role("option", name=camera).click()
+
+
+def press(page, key: str) -> None:
+    """Press a key while no control has the focus."""
+    page.evaluate("document.activeElement.blur()")
+    page.keyboard.press(key)
+
+
+def test_viewer__goes_to_cameras_and_compares_with_the_recording(page, tmp_path):
+    page, states, _ = page
+    stream = open_stream(tmp_path)
+    camera = page.get_by_label("Go to camera")
+    page.get_by_text("Frame 0 of 2, 40 Gaussians").wait_for()
+    playwright.expect(camera).to_have_value("left")  # where the page starts
+
+    go_to(page, "right")
+    view = stream.cameras[2].resized(WIDTH, HEIGHT)
+    image = channel_image("color", render(states[0].gaussians, view, ("color",), render_config(stream))["color"])
+    wait_for(page, image, 38)
+    playwright.expect(camera).to_have_value("right")
+
+    set_number(page, "Recorded %", 75)
+    image[:, : WIDTH * 3 // 4] = RECORDED[0]
+    wait_for(page, image, 22)  # the labels and the line between the images
+    press(page, "l")
+    page.get_by_text("Frame 1 of 2").wait_for()
+    image[:, : WIDTH * 3 // 4] = RECORDED[1]
+    wait_for(page, image, 18)  # the Gaussians of the right quarter have moved
+    page.mouse.move(60, 300)
+    page.mouse.wheel(0, 2000)
+    page.get_by_text("Go to a camera to see its recorded image").wait_for()
+    playwright.expect(camera).to_have_value("free")
+
+    set_number(page, "Recorded %", 0)
+    page.get_by_text("Go to a camera to see its recorded image").wait_for(state="detached")
+    page.wait_for_timeout(1000)
+    without = screenshot(page)
+    page.get_by_label("Show cameras").check()
+    for _ in range(100):
+        changed = (np.abs(screenshot(page).astype(int) - without).max(-1) > 40).mean()
+        if changed > 0:
+            break
+        page.wait_for_timeout(100)
+    assert 0 < changed < 0.1, "lines and names"
+    press(page, "r")
+    playwright.expect(camera).to_have_value("left")
+    wait_for(page, rendered(stream, states[1], "color"), 35)
+
+
+def test_viewer__shows_motion_by_key_with_its_legend(page, tmp_path):
+    page, states, _ = page
+    page.get_by_text("Frame 0 of 2, 40 Gaussians").wait_for()
+    press(page, "m")
+    page.get_by_text("Frame 1 of 2, 40 Gaussians", exact=True).wait_for()  # the first frame has no motion
+    page.get_by_text(f"Rim: {0.03 * WIDTH:.3g} px per frame or more").wait_for()
+    press(page, "m")
+    page.get_by_text("1 moving").wait_for()
+    press(page, "Home")
+    page.get_by_text("Frame 0 of 2").wait_for()
+    press(page, "Space")
+    playwright.expect(page.get_by_label("Play")).to_be_checked()
+    press(page, "Space")
+    playwright.expect(page.get_by_label("Play")).not_to_be_checked()
+    press(page, "End")
+    page.get_by_text("Frame 2 of 2").wait_for()
+    press(page, "j")
+    page.get_by_text("Frame 1 of 2").wait_for()
+
+    select_mode(page, "color")
+    page.get_by_text("1 moving").wait_for(state="detached")
+    page.get_by_text("Crop", exact=True).click()
+    set_number(page, "Opacity", 0.6)
+    gaussians = states[1].gaussians
+    opaque = gaussians.select(np.asarray(gaussians.opacities) >= 0.6)
+    page.get_by_text(f"Frame 1 of 2, {len(opaque)} of 40 Gaussians").wait_for()
+    wait_for(page, rendered(open_stream(tmp_path), replace(states[1], gaussians=opaque), "color"), 38)
+    page.get_by_role("button", name="Show all").click()
+    page.get_by_text("Frame 1 of 2, 40 Gaussians", exact=True).wait_for()
+
+
 def test_viewer__shows_the_first_frame_and_follows_the_fit(page, tmp_path):
     page, states, grow = page
     page.get_by_text("Frame 0 of 2, 40 Gaussians").wait_for()
@@ -127,10 +229,10 @@ def test_viewer__shows_the_images_of_the_renderer(page, tmp_path):
     wait_for(page, rendered(stream, states[0], "color"), 40)
 
     select_mode(page, "offset")
+    page.get_by_text("Frame 1 of 2, 40 Gaussians", exact=True).wait_for()
+    set_number(page, "Frame", 0)
     page.get_by_text("This frame stores no offset: set codec.offset").wait_for()
-    frame = page.locator("input[inputmode=decimal]").first
-    frame.fill("1")
-    frame.press("Enter")
+    set_number(page, "Frame", 1)
     page.get_by_text("Frame 1 of 2, 40 Gaussians", exact=True).wait_for()
     # The renderer colours the blended values, the page blends colours; a white page has 13 dB.
     wait_for(page, rendered(stream, states[1], "offset"), 16)

@@ -5,21 +5,28 @@ A reader module exposes a `Layout`, which `registry.py` lists.
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
-from morgs_mi.capture.layouts.clips import check_frames, clips_by_camera, clips_by_frame, view_of_image
+from morgs_mi.capture.layouts.clips import (
+    EXAMPLE,
+    check_frames,
+    clips_by_camera,
+    clips_by_frame,
+    photos,
+    view_of_image,
+)
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video import VIDEO_SUFFIXES, Clip, natural_key
 
-__all__ = ["NO_POINTS", "Calibration", "Layout", "PoseConvention", "match_clips", "read_json", "required_clips"]
+__all__ = ["NO_POINTS", "Calibration", "Layout", "PoseConvention", "match_clips", "required_clips"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -82,29 +89,18 @@ class Layout:
     poses: PoseConvention | None = PoseConvention()
 
 
-def required_clips(path: Path) -> dict[str, Path]:
-    """Return each camera's video or folder of images by the camera's name, in numerical order.
+def required_clips(path: Path) -> Mapping[str, Clip]:
+    """Return each camera's video, folder of images or photo by the camera's name, in numerical order.
 
     Raises:
         FileNotFoundError: the capture folder has none.
     """
-    if clips := clips_by_camera(path):
+    if clips := clips_by_camera(path) or photos(path):
         return clips
     raise FileNotFoundError(
-        f"{path}: expected videos ({', '.join(VIDEO_SUFFIXES)}) or folders of frames, found none; check the path."
+        f"{path}: expected videos ({', '.join(VIDEO_SUFFIXES)}) or folders of frames, found none; check the path, or "
+        f"make {EXAMPLE}"
     )
-
-
-def read_json(path: Path) -> Any:
-    """Return the content of a JSON file.
-
-    Raises:
-        ValueError: the file is broken.
-    """
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path}: expected JSON, got a broken file ({error}); export it again.") from None
 
 
 def match_clips(
@@ -113,7 +109,7 @@ def match_clips(
     """Return one camera, lens and clip per fixed camera, in numerical order of the clips' names.
 
     Args:
-        path: the capture folder; its frame folders are tried if `clips` do not match.
+        path: the capture folder; its photos and frame folders are tried if `clips` do not match.
         source: file or folder of the calibration, for messages.
         clips: from `required_clips`.
         cameras: one or more per fixed camera; their names are those of the calibration's images.
@@ -126,12 +122,13 @@ def match_clips(
     try:
         index = _camera_of_clip(source, clips, cameras, lenses)
     except (FileNotFoundError, ValueError) as error:
-        clips = by_frame = clips_by_frame(path)
-        try:
-            index = _camera_of_clip(source, clips, cameras, lenses)
-        except (FileNotFoundError, ValueError):
+        for clips in (photos(path), clips_by_frame(path)):
+            with suppress(FileNotFoundError, ValueError):
+                index = _camera_of_clip(source, clips, cameras, lenses)
+                break
+        else:
             raise error from None
-        check_frames(path, by_frame)
+        check_frames(path, clips)
     if unused := [name for name in clips if name not in index]:
         _LOG.warning("%s does not calibrate %s: not used.", source, ", ".join(unused))
     names = sorted(index, key=natural_key)

@@ -6,21 +6,27 @@ camera or per frame; cameras are ordered numerically, cam_2 before cam_10:
 - per camera: ``cam01.mp4``, ``cam01/0000.png`` or ``cam01/images/0000.png``, in the capture or in a folder of it
   (``videos/cam01.mp4``, ``images/cam01/0000.png``). Of several clips of one name the lossless one in ``frames/``
   takes precedence, then a video, then a folder; clips in the capture itself take precedence over those in a folder;
-- per frame: ``0000/cam01.png`` or ``0000/images/cam01.png``, with the same cameras in every folder.
+- per frame: ``0000/cam01.png`` or ``0000/images/cam01.png``, with the same cameras in every folder;
+- photos: ``cam01.png`` or ``images/cam01.png``, one image per camera.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 from morgs_mi.io.video import IMAGE_SUFFIXES, VIDEO_SUFFIXES, natural_key, numbering_gap
 
-__all__ = ["check_frames", "clips_by_camera", "clips_by_frame", "view_of_image"]
+__all__ = ["EXAMPLE", "check_frames", "clips_by_camera", "clips_by_frame", "photos", "view_of_image"]
+
+EXAMPLE = "one folder per camera: cam01/0000.png, cam01/0001.png, ..., cam02/0000.png, cam02/0001.png, ..."
+"""The layout of a recording in images, for messages."""
 
 # Folders without clips, and folders whose own images do not belong to a camera.
 _NOT_CLIPS = {"sparse", "truth", "masks", "seg"}
-_NOT_CAMERAS = _NOT_CLIPS | {"frames", "images"}
+# Nerfstudio writes downscaled copies to `images_2`, `images_4`, ...
+_NOT_CAMERAS = re.compile(rf"{'|'.join(_NOT_CLIPS)}|frames|images(_[0-9]+)?|\..*")
 
 
 def clips_by_camera(path: Path) -> dict[str, Path]:
@@ -33,6 +39,13 @@ def clips_by_camera(path: Path) -> dict[str, Path]:
     if (path / "frames").is_dir():
         found |= {f.stem: f for f in (path / "frames").iterdir() if _is_video(f)} | _folders(path / "frames")
     return {name: found[name] for name in sorted(found, key=natural_key)}
+
+
+def photos(path: Path) -> dict[str, tuple[Path]]:
+    """Return the images directly in a capture or its folder `images` as clips of one frame, by their names."""
+    folder = _image_folder(path)
+    images = sorted(filter(_is_image, folder.iterdir()), key=lambda f: natural_key(f.stem)) if folder else ()
+    return {f.stem: (f,) for f in images}
 
 
 def clips_by_frame(path: Path) -> dict[str, tuple[Path, ...]]:
@@ -67,12 +80,12 @@ def view_of_image(views: Collection[str], image: str) -> str | None:
     It is cam01 for ``cam01.png``, ``cam01.mp4``, ``cam01/0000.png`` and ``cam01/images/0000.png``.
     """
     place = PurePosixPath(image.replace("\\", "/"))
-    names = (place.stem, *(parent.name for parent in place.parents))
+    names = (place.stem, *reversed(place.parts[:-1]))
     return next((name for name in names if name in views), None)
 
 
 def _folders(folder: Path) -> dict[str, Path]:
-    inner = [f for f in folder.iterdir() if f.is_dir() and f.name not in _NOT_CAMERAS and not f.name.startswith(".")]
+    inner = [f for f in folder.iterdir() if f.is_dir() and not _NOT_CAMERAS.fullmatch(f.name)]
     return {f.name: found for f in inner if (found := _image_folder(f))}
 
 

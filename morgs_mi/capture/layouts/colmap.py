@@ -20,10 +20,15 @@ from scipy.spatial.transform import Rotation
 from morgs_mi.capture.layouts.calibration import Calibration, Layout, match_clips, required_clips
 from morgs_mi.capture.lens import MODELS, Lens, lens_and_intrinsics
 from morgs_mi.core.camera import Camera
+from morgs_mi.io.bounded import check_claim
 
 __all__ = ["LAYOUT", "ColmapModel", "find_colmap", "read_colmap", "write_colmap"]
 
 _FILES = ("cameras", "images", "points3D")
+# More than any camera model's line of a text file has.
+_MAX_CAMERA_FIELDS = 20
+# Memory of a `Camera`, which a line of a few characters may describe.
+_CAMERA_BYTES = 500
 
 
 @dataclass(frozen=True)
@@ -79,6 +84,7 @@ def read_colmap(folder: str | Path) -> ColmapModel:
             intrinsics[camera_id] = (*lens_and_intrinsics(model, params), width, height)
         except ValueError as error:
             raise ValueError(f"{cameras_path}: camera {camera_id}: {error}") from None
+        check_claim(cameras_path, _CAMERA_BYTES * len(intrinsics), f"{len(intrinsics)} cameras")
     cameras, lenses = [], []
     for name, camera_id, pose in (_text_images if text else _binary_images)(images_path):
         if camera_id not in intrinsics:
@@ -92,10 +98,11 @@ def read_colmap(folder: str | Path) -> ColmapModel:
         except ValueError as error:
             raise ValueError(f"{images_path}, image {name!r}: {error}") from None
         lenses.append(lens)
+        check_claim(images_path, _CAMERA_BYTES * len(cameras), f"{len(cameras)} images")
     if not cameras:
         raise ValueError(f"{images_path}: expected at least one image, got none; register the images.")
-    points = np.array(list((_text_points if text else _binary_points)(points_path)), dtype=np.float64)
-    points = points.reshape(-1, 6)
+    rows = (_text_points if text else _binary_points)(points_path)
+    points = np.asarray(np.fromiter(rows, np.dtype((np.float64, 6))), np.float64)
     if not np.isfinite(points).all():
         raise ValueError(f"{points_path}: the points must be finite, got NaN or Inf; export the model again.")
     return ColmapModel(
@@ -185,8 +192,10 @@ LAYOUT = Layout("COLMAP", ("sparse/0", "sparse"), lambda path: find_colmap(path)
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Yield the number, from 1, and the text of all lines that are not comments, including blank ones."""
-    text = path.read_text(encoding="utf-8", errors="replace")
-    return ((i, s) for i, s in enumerate(text.splitlines(), start=1) if not s.startswith("#"))
+    with path.open(encoding="utf-8", errors="replace") as file:
+        for i, line in enumerate(file, start=1):
+            if not line.startswith("#"):
+                yield i, line.rstrip("\n")
 
 
 def _broken(path: Path, number: int, expected: str, line: str) -> ValueError:
@@ -195,7 +204,7 @@ def _broken(path: Path, number: int, expected: str, line: str) -> ValueError:
 
 def _text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]:
     for number, line in _lines(path):
-        if fields := line.split():
+        if fields := line.split(maxsplit=_MAX_CAMERA_FIELDS):
             try:
                 camera_id, width, height = int(fields[0]), int(fields[2]), int(fields[3])
                 yield camera_id, fields[1], width, height, [float(f) for f in fields[4:]]
@@ -214,14 +223,20 @@ def _text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
         except (ValueError, IndexError):
             raise _broken(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line) from None
         number, line = next(lines, (number, ""))
-        if len(line.split()) % 3:
+        if _count_words(line) % 3:
             raise _broken(path, number, "POINTS2D[] as (X, Y, POINT3D_ID), or a blank line", line)
         yield name, camera_id, pose
 
 
+def _count_words(line: str) -> int:
+    """Return the length of `line.split()`, which would take many times the memory of a line of thousands of points."""
+    black = np.frombuffer(f" {line}".encode(), np.uint8) > 32
+    return int(np.count_nonzero(black[1:] & ~black[:-1]))
+
+
 def _text_points(path: Path) -> Iterator[list[float]]:
     for number, line in _lines(path):
-        if fields := line.split():
+        if fields := line.split(maxsplit=8):
             try:
                 xyz_rgb = [float(f) for f in fields[1:7]]
                 float(fields[7])

@@ -9,16 +9,17 @@ r, g, b in [0, 1] and a label.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
-from morgs_mi.capture.layouts.calibration import NO_POINTS, Calibration, Layout, read_json
+from morgs_mi.capture.layouts.calibration import NO_POINTS, Calibration, Layout
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.io.bounded import read_array, read_json
 from morgs_mi.io.video import natural_key
 
 __all__ = ["LAYOUT", "MetaCamera", "read_meta", "read_point_cloud"]
@@ -47,8 +48,9 @@ def read_meta(path: Path) -> list[MetaCamera]:
     if missing:
         raise ValueError(f"{path}: expected the keys {', '.join(_KEYS)}, {', '.join(missing)} missing; export again.")
     _check_counts(path, meta)
-    ids = meta["cam_id"][0]
-    return [_camera(path, meta, camera_id) for camera_id in sorted(ids, key=lambda i: natural_key(str(i)))]
+    columns = [{str(camera_id): column for column, camera_id in enumerate(row)} for row in meta["cam_id"]]
+    names = sorted(map(str, meta["cam_id"][0]), key=natural_key)
+    return [_camera(path, meta, name, [row[name] for row in columns]) for name in names]
 
 
 def _check_counts(path: Path, meta: dict[str, Any]) -> None:
@@ -68,15 +70,15 @@ def _check_counts(path: Path, meta: dict[str, Any]) -> None:
         )
 
 
-def _camera(path: Path, meta: dict[str, Any], camera_id: Any) -> MetaCamera:
-    columns = [row.index(camera_id) for row in meta["cam_id"]]
-    where = f"{path}, camera {camera_id}"
+def _camera(path: Path, meta: dict[str, Any], name: str, columns: Sequence[int]) -> MetaCamera:
+    """Return a camera, which is in the columns `columns` of the frames."""
+    where = f"{path}, camera {name}"
     try:
         K, w2c = (
             np.array([row[c] for row, c in zip(meta[key], columns, strict=True)], dtype=np.float64)
             for key in ("k", "w2c")
         )
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         K = w2c = np.zeros(0)
     if K.shape[1:] != (3, 3) or w2c.shape[1:] not in ((4, 4), (3, 4)):
         raise ValueError(f"{where}: `k` must be [3, 3] and `w2c` [4, 4] in every frame; export it again.")
@@ -94,12 +96,12 @@ def _camera(path: Path, meta: dict[str, Any], camera_id: Any) -> MetaCamera:
     if not all(isinstance(size, int) and size > 0 for size in sizes):
         raise ValueError(f"{path}: `w` and `h` must be positive whole numbers, got {sizes}; export it again.")
     try:
-        camera = Camera(K[0], rigid(where, w2c[0]), *sizes, name=str(camera_id))
+        camera = Camera(K[0], rigid(where, w2c[0]), *sizes, name=name)
     except ValueError as error:
         message = str(error)
         raise ValueError(message if message.startswith(where) else f"{where}: {message}") from None
-    names = [row[c] for row, c in zip(meta["fn"], columns, strict=True)]
-    return MetaCamera(camera, tuple(path.parent / "ims" / str(name) for name in names))
+    files = [row[c] for row, c in zip(meta["fn"], columns, strict=True)]
+    return MetaCamera(camera, tuple(path.parent / "ims" / str(file) for file in files))
 
 
 def read_point_cloud(path: Path) -> tuple[np.ndarray, np.ndarray]:
@@ -108,14 +110,10 @@ def read_point_cloud(path: Path) -> tuple[np.ndarray, np.ndarray]:
     Raises:
         ValueError: it is not a NumPy archive with an array `data` [P, 6 or more] of finite numbers.
     """
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            rows = archive["data"]
-    except (ValueError, EOFError, KeyError, BadZipFile) as error:
-        raise ValueError(f"{path}: expected an array `data` [P, 7], got a broken file ({error}).") from None
+    rows = read_array(path, "data")
     if rows.ndim != 2 or rows.shape[1] < 6 or rows.dtype.kind not in "fiu" or not np.isfinite(rows).all():
         raise ValueError(f"{path}: `data` must be [P, 7], finite, got {rows.dtype} {rows.shape}; export it again.")
-    return rows[:, :3].astype(np.float32), np.clip(rows[:, 3:6], 0, 1).astype(np.float32)
+    return rows[:, :3].astype(np.float32), rows[:, 3:6].astype(np.float32)
 
 
 def _read_calibration(path: Path) -> Calibration:

@@ -8,6 +8,7 @@ and `applied_scale` are not undone.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -20,11 +21,12 @@ from morgs_mi.capture.layouts.calibration import (
     Layout,
     PoseConvention,
     match_clips,
-    read_json,
     required_clips,
 )
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.io.bounded import read_json
+from morgs_mi.io.ply import read_vertices
 
 __all__ = ["LAYOUT", "read_points_ply", "read_transforms"]
 
@@ -69,7 +71,7 @@ def _camera(where: str, values: Mapping[str, Any], name: str) -> Camera:
     cx, cy = _number(where, values, "cx", width / 2), _number(where, values, "cy", height / 2)
     try:
         matrix = np.array(values.get("transform_matrix"), dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     to_world = rigid(where, matrix)
     viewmat = np.linalg.inv(to_world @ _OPENGL_FROM_OPENCV)
@@ -97,8 +99,8 @@ def _lens(where: str, values: Mapping[str, Any]) -> Lens:
 
 def _number(where: str, values: Mapping[str, Any], key: str, default: float | None = None) -> float:
     value = values.get(key, default)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not np.isfinite(value):
-        got = "none" if value is None else repr(value)
+    if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) < sys.float_info.max:
+        got = "none" if value is None else repr(value)[:80]
         raise ValueError(f"{where}: `{key}` must be a finite number, here or at the top of the file, got {got}.")
     return float(value)
 
@@ -110,22 +112,22 @@ def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
         FileNotFoundError: there is no such file.
         ValueError: it is not a PLY file with vertices x, y, z, or they are not finite.
     """
-    from plyfile import PlyData, PlyParseError
-
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected the points' PLY file, found none; copy it or drop `ply_file_path`.")
-    try:
-        vertices = PlyData.read(str(path))["vertex"].data
-        points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
-    except (PlyParseError, KeyError, ValueError) as error:
-        raise ValueError(f"{path}: expected a PLY file with vertices x, y, z, got {error}; export it again.") from None
+    vertices = read_vertices(path)
+    if missing := {"x", "y", "z"} - vertices.keys():
+        raise ValueError(
+            f"{path}: expected a PLY file with vertices x, y, z, got vertices without {', '.join(sorted(missing))}; "
+            "export it again."
+        )
+    points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
     if not np.isfinite(points).all():
         raise ValueError(f"{path}: the points must be finite, got NaN or Inf; export them again.")
-    if not {"red", "green", "blue"} <= set(vertices.dtype.names or ()):
+    if not {"red", "green", "blue"} <= vertices.keys():
         return points, np.full(points.shape, 0.5, np.float32)
     colors = np.stack([vertices[band] for band in ("red", "green", "blue")], axis=1)
     scale = 255 if colors.dtype.kind in "iu" else 1
-    return points, np.clip(colors.astype(np.float32) / scale, 0, 1)
+    return points, colors.astype(np.float32) / np.float32(scale)
 
 
 def _read_calibration(path: Path) -> Calibration:

@@ -16,6 +16,7 @@ from morgs_mi.capture.layouts.calibration import Calibration, Layout, required_c
 from morgs_mi.capture.layouts.clips import check_frames, clips_by_frame
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
+from morgs_mi.io.bounded import read_array
 from morgs_mi.io.video import Clip
 
 __all__ = ["LAYOUT", "count_rows", "read_poses_bounds", "write_poses_bounds"]
@@ -49,15 +50,9 @@ def count_rows(path: Path) -> int:
 
 
 def _rows(path: Path) -> np.ndarray:
-    try:
-        rows = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise ValueError(
-            f"{path}: expected a NumPy array [C, 17], got a broken file ({error}); export it again."
-        ) from None
-    if not isinstance(rows, np.ndarray) or rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
-        what = f"{rows.dtype} {rows.shape}" if isinstance(rows, np.ndarray) else "an archive"
-        raise ValueError(f"{path}: expected a float array [C, 17], got {what}; export it again.")
+    rows = read_array(path)
+    if rows.ndim != 2 or rows.shape[1] != 17 or rows.dtype.kind != "f":
+        raise ValueError(f"{path}: expected a float array [C, 17], got {rows.dtype} {rows.shape}; export it again.")
     return rows
 
 

@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 
 from morgs_mi.capture.layouts.calibration import Layout, required_clips
+from morgs_mi.capture.layouts.clips import EXAMPLE
 
 __all__ = ["LAYOUTS", "find_layout", "layout_called"]
 
@@ -31,11 +32,13 @@ def find_layout(path: Path) -> Layout:
     """
     if layout := next((layout for layout in LAYOUTS if layout.find(path)), None):
         return layout
-    required_clips(path)  # without clips the path itself is likely wrong
+    clips = required_clips(path)  # without clips the path itself is likely wrong
+    static = all(isinstance(clip, tuple) for clip in clips.values())
+    recording = f" The {len(clips)} photos count as cameras with one frame each; a recording has {EXAMPLE}"
     *files, last = [file for layout in LAYOUTS for file in layout.files]
     raise FileNotFoundError(
         f"{path}: expected a calibration ({', '.join(files)} or {last}), found none; run `morgs-mi calibrate` on the "
-        "folder."
+        f"folder.{recording if static else ''}"
     )
 
 

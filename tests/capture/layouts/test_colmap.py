@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +118,38 @@ def test_read_colmap__refuses_broken_text(tmp_path: Path, file: str, old: str, n
     assert count
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
+        read_colmap(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "message"),
+    [
+        ("cameras.txt", "1 PINHOLE 1 1 1 1 1 1 {}", "camera 1: .* takes 4 parameters, got 16|expected `CAMERA_ID"),
+        ("images.txt", "1 1 0 0 0 0 0 0 1 a.png\n{}", "expected `POINTS2D"),
+        ("points3D.txt", "1 0 0 0 word 0 0 0 {}", "expected `POINT3D_ID"),
+    ],
+)
+def test_read_colmap__does_not_split_long_lines(tmp_path: Path, file: str, line: str, message: str) -> None:
+    (write(tmp_path) / file).write_text(line.format("10 " * 2_000_000 + "10 10"))
+    tracemalloc.start()
+    with pytest.raises(ValueError, match=message):
+        read_colmap(tmp_path)
+    assert tracemalloc.get_traced_memory()[1] < 60e6, "10 times the 6 MB of the file"
+    tracemalloc.stop()
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_read_colmap__refuses_a_binary_file_that_claims_more_than_its_size(tmp_path: Path, name: str) -> None:
+    file = write(tmp_path, "bin") / f"{name}.bin"
+    file.write_bytes((2**63).to_bytes(8, "little") + file.read_bytes()[8:])
+    with pytest.raises(ValueError, match=rf"{name}.bin: expected \d+ more bytes"):
+        read_colmap(tmp_path)
+
+
+def test_read_colmap__refuses_lenses_that_are_not_finite(tmp_path: Path) -> None:
+    path = write(tmp_path) / "cameras.txt"
+    path.write_text(path.read_text().replace("-0.02", "nan"))
+    with pytest.raises(ValueError, match=r"cameras.txt: camera 2: its parameters must be finite"):
         read_colmap(tmp_path)
 
 

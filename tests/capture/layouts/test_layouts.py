@@ -289,6 +289,7 @@ def test_at_clip_size__scales_the_intrinsics_of_smaller_clips(tmp_path: Path, ca
     assert_close(capture.cameras[1].K[:2], rig(("a", "b"), shift=3)[1].K[:2] / 2, atol=PIXEL_ABS)
 
 
+@pytest.mark.usefixtures("small_images")
 def test_metadata__describes_how_frames_were_read(tmp_path: Path) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
     metadata = load_capture(path, downscale=2, test_view=1, max_frames=3).metadata()

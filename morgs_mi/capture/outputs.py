@@ -1,0 +1,30 @@
+"""Protection of captures against being written into: a new file in a capture may be read as a part of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TypeVar
+
+from morgs_mi.capture.layouts.registry import LAYOUTS
+
+__all__ = ["check_output"]
+
+PathLike = TypeVar("PathLike", str, Path)
+
+
+def check_output(path: PathLike) -> PathLike:
+    """Return `path`, the file or folder that is about to be written, if it is outside of all captures.
+
+    Links are followed. A capture is a folder with a calibration.
+
+    Raises:
+        ValueError: `path` is a capture, or lies in one.
+    """
+    final = Path(path).resolve()
+    for folder in (final, *final.parents):
+        if any(layout.find(folder) for layout in LAYOUTS):
+            raise ValueError(
+                f"{path}: expected an output outside of captures, which stay as they were recorded, got one in the "
+                f"capture {folder}; choose another place."
+            )
+    return path

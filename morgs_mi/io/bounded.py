@@ -1,0 +1,92 @@
+"""Readers whose memory is bounded by the size of the file, whatever its header claims.
+
+A file may make its reader use 10 times its size plus 200 MB. The allowance is for small files that decode to large
+data without being broken, such as an image of one colour.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+import zlib
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+__all__ = ["check_claim", "read_array", "read_json"]
+
+_FACTOR, _ALLOWANCE = 10, 200_000_000
+# What NumPy and zipfile raise for broken files.
+_BROKEN = (ValueError, TypeError, EOFError, KeyError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error)
+# At most, in bytes: an empty dict or list as the value of a list, and a number or a short key with its reference.
+_DICT_BYTES, _LIST_BYTES, _VALUE_BYTES = 240, 64, 40
+
+
+def check_claim(path: str | Path, claimed: int, content: str) -> None:
+    """Check that decoding a file takes no more memory than its size allows.
+
+    Args:
+        path: the file.
+        claimed: bytes that the decoded content takes.
+        content: what the file claims to hold, for the message, e.g. ``an image of 20000x20000 pixels``.
+
+    Raises:
+        ValueError: it takes more.
+    """
+    size = Path(path).stat().st_size
+    if claimed > _FACTOR * size + _ALLOWANCE:
+        raise ValueError(
+            f"{path}: expected content that fits its {size} bytes, got a claim of {content}, which takes "
+            f"{claimed / 1e6:.0f} MB; the file is broken, create it again."
+        )
+
+
+def read_json(path: str | Path) -> Any:
+    """Return the content of a JSON file.
+
+    Raises:
+        ValueError: the file is broken, nested too deeply, or has too many tiny values.
+    """
+    data = Path(path).read_bytes()
+    counts = data.count(b"{"), data.count(b"["), data.count(b",")
+    values = counts[0] * _DICT_BYTES + counts[1] * _LIST_BYTES + counts[2] * _VALUE_BYTES
+    check_claim(path, values, f"{sum(counts)} values")
+    try:
+        return json.loads(data.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: expected JSON, got a broken file ({error}); export it again.") from None
+
+
+def read_array(path: str | Path, name: str | None = None) -> np.ndarray:
+    """Return the array in a NumPy file, or the array `name` in an archive (.npz); it is not writable.
+
+    Raises:
+        ValueError: the file is broken, claims more numbers than it holds, or holds Python objects.
+    """
+    try:
+        data = Path(path).read_bytes() if name is None else _member(path, f"{name}.npy")
+        stream = BytesIO(data)
+        version = np.lib.format.read_magic(stream)
+        read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, in_columns, dtype = read_header(stream)
+        # NumPy would execute what such a file contains.
+        if dtype.hasobject:
+            raise ValueError("it holds Python objects, not numbers")
+        count, held = math.prod(shape), len(data) - stream.tell()
+        if min(shape, default=0) < 0 or count * dtype.itemsize > held:
+            raise ValueError(f"its header claims {dtype} {shape}, but {held} bytes follow")
+        flat = np.frombuffer(data, dtype, count, stream.tell())
+        return flat.reshape(shape, order="F" if in_columns else "C")
+    except _BROKEN as error:
+        what = "a NumPy array" if name is None else f"an array `{name}` in a NumPy archive"
+        raise ValueError(f"{path}: expected {what}, got a broken file ({error}); export it again.") from None
+
+
+def _member(path: str | Path, name: str) -> bytes:
+    with zipfile.ZipFile(path) as archive:
+        size = archive.getinfo(name).file_size
+        check_claim(path, size, f"{size} bytes of {name}")
+        return archive.read(name)

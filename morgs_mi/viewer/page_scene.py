@@ -1,0 +1,108 @@
+"""What the page draws: Gaussians or an image behind them, trajectories, the cameras of the rig, the crop box."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.geometry import covariances
+from morgs_mi.viewer.crop import box_edges
+from morgs_mi.viewer.modes import BACKGROUNDS, splat_colors
+from morgs_mi.viewer.page_view import orientation
+
+__all__ = ["PageScene"]
+
+_HALF_MAX = 6e4
+# Size of a camera on the page.
+_FRUSTUM = 0.4
+_CAMERA, _HELD_OUT = (90, 170, 255), (255, 160, 0)
+
+
+class PageScene:
+    """The scene of a page.
+
+    Args:
+        scene: viser's `SceneApi`.
+        scale: factor by which the page shows the scene larger.
+    """
+
+    def __init__(self, scene: Any, scale: float) -> None:
+        self._scene, self._scale = scene, scale
+        self._splats: Any = None
+        self._cameras: list[tuple[Any, Any]] = []
+
+    def show_splats(self, gaussians: Gaussians, camera: Camera, mode: str) -> None:
+        """Show Gaussians in the colours that a camera sees."""
+        self._scene.set_background_image(np.full((2, 2, 3), BACKGROUNDS[mode], np.uint8), format="png")
+        if len(gaussians):
+            splats = (
+                self._scale * gaussians.numpy()["means"],
+                np.clip(self._scale**2 * covariances(gaussians), -_HALF_MAX, _HALF_MAX),
+                splat_colors(gaussians, camera, mode),
+                np.asarray(gaussians.opacities)[:, None],
+            )
+            if self._splats is None:
+                self._splats = self._scene.add_gaussian_splats("/splats", *splats)
+            else:
+                self._splats.set_gaussians(*splats)
+        self._set_splats_visible(len(gaussians) > 0)
+
+    def show_image(self, image: np.ndarray) -> None:
+        """Show an image [H, W, 3] in place of the Gaussians."""
+        self._scene.set_background_image(image, format="png")
+        self._set_splats_visible(False)
+
+    def show_trails(self, lines: np.ndarray, ages: np.ndarray) -> None:
+        """Show trails, see `FrameCache.trails`."""
+        level = (255 * (1 - 0.8 * ages)).astype(np.uint8)
+        colors = np.stack([level, level, np.full_like(level, 40)], axis=-1)[:, None]
+        self._show_lines("/trails", lines, colors)
+
+    def show_box(self, box: np.ndarray | None) -> None:
+        """Show the edges of a box with corners [2, 3], or no box."""
+        self._show_lines("/box", np.zeros((0, 2, 3)) if box is None else box_edges(box), np.full((1, 1, 3), 200))
+
+    def add_cameras(self, cameras: Sequence[Camera], held_out: int | None, go_to: Callable[[Any, int], None]) -> None:
+        """Add the cameras with their names, hidden; `go_to` is called with (client, index) when one is clicked."""
+        for index, camera in enumerate(cameras):
+            position = self._scale * camera.position
+            frustum = self._scene.add_camera_frustum(
+                f"/cameras/{index}",
+                2 * float(np.arctan(0.5 * camera.height / camera.K[1, 1])),
+                camera.width * camera.K[1, 1] / (camera.height * camera.K[0, 0]),
+                scale=_FRUSTUM,
+                thickness=2,
+                thickness_units="screen",
+                color=_HELD_OUT if index == held_out else _CAMERA,
+                wxyz=orientation(camera),
+                position=position,
+                visible=False,
+                cast_shadow=False,
+                receive_shadow=False,
+            )
+            frustum.on_click(lambda event, index=index: go_to(event.client, index))
+            name = f"{camera.name} (held out)" if index == held_out else camera.name
+            label = self._scene.add_label(f"/names/{index}", name, position=position, visible=False)
+            self._cameras.append((frustum, label))
+
+    def show_cameras(self, visible: bool, at: int | None) -> None:
+        """Show or hide the cameras; the one at which the page is, `at`, is always hidden."""
+        for index, nodes in enumerate(self._cameras):
+            for node in nodes:
+                node.visible = visible and index != at
+
+    def _set_splats_visible(self, visible: bool) -> None:
+        if self._splats is not None:
+            self._splats.visible = visible
+
+    def _show_lines(self, name: str, lines: np.ndarray, colors: np.ndarray) -> None:
+        """Show line segments [S, 2, 3] with colours broadcastable to them, or none."""
+        if len(lines):
+            colors = np.broadcast_to(colors.astype(np.uint8), lines.shape)
+            self._scene.add_line_segments(name, self._scale * lines, colors, thickness=1.5, thickness_units="screen")
+        else:
+            self._scene.remove_by_name(name)

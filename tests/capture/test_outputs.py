@@ -1,0 +1,25 @@
+"""Outputs must lie outside of captures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from morgs_mi.capture.outputs import check_output
+from tests.scenes.captures import colmap, dynamic3dgs, meet_room, n3dv, nerfstudio
+
+
+@pytest.mark.parametrize("build", [colmap, nerfstudio, dynamic3dgs, n3dv, meet_room])
+def test_check_output__refuses_captures_of_every_layout(tmp_path: Path, build) -> None:
+    capture = build(tmp_path / "clip")
+    (tmp_path / "link").symlink_to(capture)
+    for path in (capture, capture / "new", tmp_path / "link" / "a" / "b.mp4", f"{capture}/../clip/c"):
+        with pytest.raises(ValueError, match=f"expected an output outside of captures, .* in the capture {capture};"):
+            check_output(path)
+
+
+def test_check_output__accepts_the_folder_around_a_capture(tmp_path: Path) -> None:
+    colmap(tmp_path / "clip")
+    for path in (tmp_path, tmp_path / "clip-fit", tmp_path / "clip.mp4"):
+        assert check_output(path) == path

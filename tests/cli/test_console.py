@@ -1,0 +1,82 @@
+"""Console output: progress and tables without a terminal, and error messages in the words of the command line."""
+
+from __future__ import annotations
+
+import logging
+import time
+
+import pytest
+from rich.table import Table
+
+from morgs_mi.cli.console import LogHandler, print_table, progress, sentence_of, with_option_names
+
+
+def test_progress__prints_a_line_every_30_seconds_without_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    with progress() as report:
+        for done in range(13):
+            report("Fitting frames", done, 12)
+            now += 10.0
+        report("Drawing", 0, 2)
+    assert capsys.readouterr().err.splitlines() == [
+        "Fitting frames: 3/12, 0:00:30 elapsed, about 0:01:30 left.",
+        "Fitting frames: 6/12, 0:01:00 elapsed, about 0:01:00 left.",
+        "Fitting frames: 9/12, 0:01:30 elapsed, about 0:00:30 left.",
+        "Fitting frames: 12/12, 0:02:00 elapsed, about 0:00:00 left.",
+    ]
+
+
+def test_progress__prints_nothing_without_a_terminal_for_short_work(capsys: pytest.CaptureFixture[str]) -> None:
+    with progress() as report:
+        report("Rendering", 1, 2)
+    assert capsys.readouterr().err == ""
+
+
+def test_print_table__is_as_wide_as_its_content_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    table = Table("camera", "x" * 60)
+    table.add_row("a_camera_with_a_name_of_50_characters_or_a_few_more", "y" * 70)
+    print_table(table)
+    text = capsys.readouterr().out
+    assert all(word in text for word in ("a_camera_with_a_name_of_50_characters_or_a_few_more", "x" * 60, "y" * 70))
+    assert len(text.splitlines()) == 5
+
+
+def test_LogHandler__prints_one_line_with_the_level(capsys: pytest.CaptureFixture[str]) -> None:
+    LogHandler().emit(logging.LogRecord("name", logging.WARNING, "", 0, "%s: [left out]", ("cam1" * 40,), None))
+    assert capsys.readouterr().err == f"Warning: {'cam1' * 40}: [left out]\n"
+
+
+@pytest.mark.parametrize(
+    ("error", "sentence"),
+    [
+        (FileNotFoundError(2, "No such file or directory", "a/b"), "a/b: No such file or directory."),
+        (OSError(28, "No space left on device"), "No space left on device."),
+        (OSError(28, "s.morgs: 9 bytes; free space"), "s.morgs: 9 bytes; free space."),
+        (OSError("write_png(): cannot write a.png: full."), "Cannot write a.png: full."),
+        (FileExistsError("f(): out is not empty; set `overwrite`."), "out is not empty; set --overwrite."),
+        (ValueError("f(): `b` must\nbe 1."), "f(): `b` must be 1."),
+        (MemoryError(), "MemoryError."),
+    ],
+)
+def test_sentence_of__has_no_number_and_no_function(error: Exception, sentence: str) -> None:
+    assert sentence_of(error, {"overwrite": "--overwrite"}) == sentence
+
+
+@pytest.mark.parametrize(
+    ("sentence", "expected"),
+    [
+        ("f(): `a` must be 1, got 2.", "--a must be 1, got 2."),
+        ("A.f(): `b` must be below `a`.", "`b` must be below --a."),
+        ("f(): `b` must be 1.", "f(): `b` must be 1."),
+        ("clip: `a` must be 1.", "clip: --a must be 1."),
+        ("clip/cam.mp4: use `a=3` or `b`.", "clip/cam.mp4: use --a 3 or `b`."),
+        ("clip/file.json: `a` must be 1.", "clip/file.json: `a` must be 1."),
+        ("f(): `x.a` must be 1.", "--x-a must be 1."),
+        ("Something about `a`.", "Something about `a`."),
+    ],
+)
+def test_with_option_names__changes_only_arguments(sentence: str, expected: str) -> None:
+    assert with_option_names(sentence, {"a": "--a", "x.a": "--x-a"}, "clip") == expected

@@ -1,0 +1,242 @@
+"""Program that reads damaged and forged streams until a time is over, with little memory and little time for each.
+
+`python -m tests.codec.fuzz SECONDS [FUZZER ...]` prints the number of streams and of refusals by kind as JSON. It needs
+a process of its own: a limit on the address space may end any thread of any library, at once and without an exception
+(glibc exits with status 127 where it has no memory for the thread-local data of a library).
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import json
+import re
+import resource
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+import morgs_mi  # noqa: F401  (finds a usable LLVM before the variant is set)
+from morgs_mi.codec.packets import CodedFrame, coded_frames, seek
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.codec.salvage import DamagedRange, salvage, write_salvaged
+from morgs_mi.playback.player import has_confidence, has_offset, num_frames, open_stream_capture, render_config
+from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
+from tests.scenes.short_clip import FRAMES, Clip, short_clip
+
+# What a stream of a few kB may take: far less than a damaged length or count may request. A thread of a library that
+# starts meanwhile reserves 64 MiB for its heap and 8 MiB for its stack (glibc).
+MEMORY_BYTES, THREAD_BYTES, THREADS = 200 * 10**6, 72 * 2**20, 4
+CASE_SECONDS = 30
+PLACE = re.compile(
+    r"packet \d+ at byte \d+: |expected a stream that starts with|expected format version|`.*` of the header|"
+    r"expected the path of its capture"
+)
+
+
+class Refusals(Counter[str]):
+    """Number of refusals by kind: their sentences without paths, numbers and quoted values."""
+
+    def add(self, path: Path, error: Exception) -> None:
+        """Count an error, which must be a sentence that names the file and the place."""
+        sentence = str(error)
+        assert sentence.startswith(f"{path}: "), sentence
+        assert PLACE.search(sentence), sentence
+        problem = re.split(r"packet \d+(?: at byte \d+)?: ", sentence.removeprefix(f"{path}: "), maxsplit=1)[-1]
+        problem = re.split(r",? got |; \d+ packets before", problem)[0].rstrip(".")
+        self[
+            re.sub(
+                r"`[^`]*`|'[^']*'|\[.*\]|\[.*$", "...", re.sub(r"\b\d[\d.]*(e[+-]?\d+)?\b|\b[\da-f]{8}\b", "N", problem)
+            )
+        ] += 1
+
+
+def check_damage(clip: Clip, path: Path, rng: np.random.Generator, refusals: Refusals) -> None:
+    """Check that all damage is reported, and that every intact frame plays as it was."""
+    data = damaged(clip, rng)
+    path.write_bytes(data)
+    if data != clip.data:
+        check_intact_frames(clip, data, path)
+        check_readers(path, refusals)
+
+
+def check_intact_frames(clip: Clip, data: bytes, path: Path) -> None:
+    """Check the frames and damaged ranges of a file that differs from the clip by damage without a right CRC."""
+    intact = [data[piece.start : piece.stop] == clip.data[piece.start : piece.stop] for piece in clip.pieces]
+    intact = [same and piece.stop <= len(data) for same, piece in zip(intact, clip.pieces, strict=True)]
+    first = intact.index(False)  # the first damaged piece
+    played, error = play(path)
+    if clip.pieces[first].start == len(data) and first > 1:
+        assert error is None  # the file just ends
+        assert not StreamReader(path).closed()
+    elif first:  # the sentence names the place, except for the preamble
+        assert f"packet {max(first - 1, 0)} at byte {clip.pieces[first].start}: " in str(error)
+    assert [state.frame for state in played] == sorted({p.frame for p in clip.pieces[2:first] if p.kind < 3})
+    # Intact packets behind it play as well, and damaged ones are reported.
+    found = list(salvage(path))
+    states = [entry for entry in found if isinstance(entry, CodedFrame)]
+    assert [state.frame for state in states] == playable(clip, intact)
+    assert not any(differs(state, clip) for state in [*played, *states])
+    ranges = [entry for entry in found if isinstance(entry, DamagedRange)]
+    for piece, ok in zip(clip.pieces, intact, strict=True):
+        end = min(piece.stop, len(data))
+        assert ok or piece.start >= end or any(r.start <= piece.start and end <= r.stop for r in ranges), piece
+    for damage in ranges:
+        assert 0 <= damage.start < damage.stop <= len(data) or not data
+    # A reader that trusts an intact index also reaches the frames behind the damage.
+    if intact[0] and intact[1] and intact[-1]:
+        for piece in clip.pieces[first + 1 : -1]:
+            behind = [p for p in clip.pieces[first:] if p.start >= piece.start and p.frame <= piece.frame + 1]
+            if piece.kind == 1 and piece.frame + 1 < FRAMES and all(intact[clip.pieces.index(p)] for p in behind):
+                assert not differs(seek(StreamReader(path), piece.frame + 1), clip)
+
+
+def playable(clip: Clip, intact: list[bool]) -> list[int]:
+    """Return the playable frames: those whose packets are intact back to a keyframe."""
+    frames: list[int] = []
+    for piece, ok in zip(clip.pieces, intact, strict=True):
+        known = bool(frames) and piece.frame in (frames[-1], frames[-1] + 1)
+        if ok and piece.frame not in frames and (piece.kind == 1 or (piece.kind == 2 and known)):
+            frames.append(piece.frame)
+    return frames
+
+
+def check_bytes(clip: Clip, path: Path, rng: np.random.Generator, refusals: Refusals) -> None:
+    """Check that a forged packet affects its own frame at most: the next residual refuses another state."""
+    data, frame = with_forged_bytes(clip, rng)
+    path.write_bytes(data)
+    found = [*play(path)[0], *(entry for entry in salvage(path) if isinstance(entry, CodedFrame))]
+    assert {state.frame for state in found if differs(state, clip)} <= {frame}
+    check_readers(path, refusals)
+
+
+def check_packets(clip: Clip, path: Path, rng: np.random.Generator, refusals: Refusals) -> None:
+    """Check the readers of a stream with forged packets."""
+    path.write_bytes(with_forged_packets(clip, rng).data)
+    check_readers(path, refusals)
+
+
+def check_header(clip: Clip, path: Path, rng: np.random.Generator, refusals: Refusals) -> None:
+    """Check the readers of a stream with a forged header."""
+    path.write_bytes(with_forged_header(clip, rng).data)
+    check_readers(path, refusals)
+
+
+def check_readers(path: Path, refusals: Refusals) -> None:
+    """Check that a file plays, can be sought and salvaged, or is refused by sentences that name file and place."""
+    played, error = play(path)
+    if error is not None:
+        refusals.add(path, error)
+    ranges = [entry for entry in salvage(path) if isinstance(entry, DamagedRange)]
+    assert all(0 <= damage.start < damage.stop <= path.stat().st_size or not path.stat().st_size for damage in ranges)
+    try:
+        stream = StreamReader(path)
+    except ValueError:
+        return
+    check_seek(stream, played)
+    new = path.with_name("new")
+    try:
+        frames, _ = write_salvaged(stream, new)
+        again, error = play(new)
+        assert error is None
+        assert [state.frame for state in again] == frames == sorted(set(frames))
+        check_seek(StreamReader(new), again)
+    except ValueError as refusal:
+        if played or "expected at least one frame that plays, got none" not in str(refusal):
+            raise
+    for read in (
+        render_config,
+        has_confidence,
+        has_offset,
+        num_frames,
+        lambda stream: open_stream_capture(stream, None, [0]),
+    ):
+        try:
+            read(stream)
+        except ValueError as refusal:
+            refusals.add(path, refusal)
+        except FileNotFoundError:  # the capture
+            pass
+
+
+def check_seek(stream: StreamReader, played: list[CodedFrame]) -> None:
+    """Check that frames that play can be sought: one in the middle and the last."""
+    for state in (*played[len(played) // 2 : -1][:1], *played[-1:]):
+        assert np.array_equal(seek(stream, state.frame).digest, state.digest), state.frame
+
+
+def play(path: Path) -> tuple[list[CodedFrame], ValueError | None]:
+    """Return the frames that a reader decodes from the start, and the error that ends it."""
+    played: list[CodedFrame] = []
+    try:
+        played.extend(coded_frames(StreamReader(path)))
+    except ValueError as error:
+        return played, error
+    return played, None
+
+
+def differs(state: CodedFrame, clip: Clip) -> bool:
+    known = clip.states.get(state.frame)
+    return known is None or not np.array_equal(state.digest, known.digest)
+
+
+FUZZERS: dict[str, Callable[[Clip, Path, np.random.Generator, Refusals], None]] = {
+    "damage": check_damage,
+    "bytes": check_bytes,
+    "packets": check_packets,
+    "header": check_header,
+}
+
+
+def limit_memory() -> None:
+    """Limit the address space to what it has now and what a case may take."""
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + MEMORY_BYTES + THREADS * THREAD_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (most, resource.RLIM_INFINITY))
+
+
+def run(name: str, clip: Clip, seconds: float) -> dict[str, object]:
+    """Run a fuzzer and return its counts.
+
+    Raises:
+        AssertionError: a case fails; its seed is the name of the fuzzer and the number of the case.
+    """
+    refusals, case, end = Refusals(), 0, time.monotonic() + seconds
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "s"
+        while time.monotonic() < end:
+            faulthandler.dump_traceback_later(CASE_SECONDS, exit=True)
+            try:
+                FUZZERS[name](clip, path, np.random.default_rng([case, *name.encode()]), refusals)
+            except BaseException as error:
+                raise AssertionError(f"case {case} of {name}") from error
+            case += 1
+            if case % 100 == 0:
+                dr.flush_malloc_cache()
+    faulthandler.cancel_dump_traceback_later()
+    return {"streams": case, "refusals": dict(refusals.most_common())}
+
+
+def main(seconds: str, *names: str) -> None:
+    """Run fuzzers for some seconds each and print the results."""
+    mi.set_variant("llvm_ad_rgb")
+    faulthandler.enable()
+    clip = short_clip()
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / "s").write_bytes(clip.data)
+        check_readers(Path(folder) / "s", Refusals())  # what is loaded and cached once does not count
+    limit_memory()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    results = {name: run(name, clip, float(seconds)) for name in names or FUZZERS}
+    grown = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+    print(json.dumps({"seconds": float(seconds), "memory_bytes": grown, "fuzzers": results}, indent=1))
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,154 @@
+"""Files whose headers claim more than they hold are refused before memory is allocated."""
+
+from __future__ import annotations
+
+import json
+import struct
+import tracemalloc
+import zipfile
+import zlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.io.bounded import read_array, read_json
+from morgs_mi.io.exr import read_exr, write_exr
+from morgs_mi.io.ply import read_vertices
+from morgs_mi.io.video import FolderReader
+
+
+@pytest.fixture(autouse=True)
+def bounded_memory() -> Iterator[None]:
+    """Check that no test allocates more than small files may take."""
+    tracemalloc.start()
+    yield
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 250e6
+
+
+def archived(path: Path) -> np.ndarray:
+    return read_array(path, "data")
+
+
+def image(path: Path) -> FolderReader:
+    return FolderReader.of_files([path])
+
+
+def npy(shape: str, dtype: str = "'<f8'", body: bytes = bytes(48)) -> bytes:
+    """Return a NumPy file with any header."""
+    header = f"{{'descr': {dtype}, 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x01\0" + struct.pack("<H", len(header)) + header + body
+
+
+def npz(member: bytes, name: str = "data.npy") -> Callable[[Path], object]:
+    def write(path: Path) -> None:
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr(name, member)
+
+    return write
+
+
+def ply(header: str, body: bytes = b"") -> bytes:
+    return b"ply\n" + header.encode() + b"end_header\n" + body
+
+
+def png(width: int, height: int) -> bytes:
+    header = struct.pack(">4sIIBBBBB", b"IHDR", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header)) + bytes(99)
+
+
+def jpeg(width: int, height: int) -> bytes:
+    data = bytearray(cv2.imencode(".jpg", np.zeros((16, 16, 3), np.uint8))[1].tobytes())
+    at = data.index(b"\xff\xc0")
+    data[at + 5 : at + 9] = struct.pack(">HH", height, width)
+    return bytes(data)
+
+
+def large_exr(path: Path) -> None:
+    write_exr(path, {"a": np.zeros((5, 7))})
+    window = b"box2i\0" + struct.pack("<I4i", 16, 0, 0, 6, 4)
+    claim = b"box2i\0" + struct.pack("<I4i", 16, 0, 0, 39999, 39999)
+    path.write_bytes(path.read_bytes().replace(window, claim))
+
+
+BINARY = "format binary_little_endian 1.0\n"
+LARGE = "element vertex 99999999999\nproperty float x\n"
+CASES = {
+    "npy of many rows": (read_array, npy("(1000000000000, 17)"), r"claims float64 \(1000000000000, 17\), but 48 bytes"),
+    "npy of an overflow": (read_array, npy("(9223372036854775807, 17)"), "its header claims"),
+    "npy of negative size": (read_array, npy("(-2, -3)"), r"its header claims float64 \(-2, -3\)"),
+    "npy of a truth value": (read_array, npy("(True,)"), "expected a NumPy array, got a broken file"),
+    "npy of objects": (read_array, npy("(1,)", "'|O'", b"cos\nsystem\n."), "it holds Python objects, not numbers"),
+    "npy of no bytes": (read_array, npy("(3,)", "'|V0'"), "expected a NumPy array, got a broken file"),
+    "npy of code": (read_array, npy("().__class__"), "expected a NumPy array, got a broken file"),
+    "npz in place of npy": (read_array, npz(npy("(6,)")), "expected a NumPy array, got a broken file"),
+    "npz of many rows": (
+        archived,
+        npz(npy("(1000000000, 7)")),
+        r"an array `data` in .* claims float64 \(1000000000, 7",
+    ),
+    "npz bomb": (archived, npz(bytes(250_000_000)), "got a claim of 250000000 bytes of data.npy"),
+    "npz of another name": (archived, npz(npy("(6,)"), "a.npy"), "expected an array `data` in a NumPy archive"),
+    "deep JSON": (read_json, b"[" * 100_000, "expected JSON, got a broken file"),
+    "JSON of empty lists": (read_json, b"[" + b"[]," * 3_000_000 + b"0]", "got a claim of 6000001 values"),
+    "JSON of long number": (read_json, b"9" * 5000, "expected JSON, got a broken file"),
+    "PLY of many vertices": (
+        read_vertices,
+        ply(BINARY + LARGE),
+        "99999999999 vertex need at least 399999999996 bytes",
+    ),
+    "text PLY of many vertices": (
+        read_vertices,
+        ply("format ascii 1.0\n" + LARGE, b"1\n"),
+        "at least .* 2 follow",
+    ),
+    "PLY of negative size": (read_vertices, ply(BINARY + LARGE.replace("9", "-9", 1)), "-99999999999 vertex"),
+    "PLY of empty lists": (
+        read_vertices,
+        ply(BINARY + "element face 3000000\nproperty list uchar int i\n" + LARGE, bytes(3_000_000)),
+        "element face has lists",
+    ),
+    "PLY of one line": (read_vertices, b"ply\n" + b"a" * 1_000_000, "expected a complete PLY file"),
+    "PLY without an element": (read_vertices, ply(BINARY + "property float x\n"), "expected a complete PLY file"),
+    "PLY of a word": (read_vertices, ply(BINARY + "element vertex many\n"), "expected a complete PLY file"),
+    "EXR of many pixels": (read_exr, large_exr, "got a claim of 40000x40000 pixels of 1 channels"),
+    "PNG of many pixels": (image, png(30000, 30000), "0.png: expected content .* got a claim of 30000x30000 pixels"),
+    "JPEG of many pixels": (image, jpeg(30000, 30000), "0.png: expected content .* got a claim of 30000x30000 pixels"),
+}
+
+
+@pytest.mark.parametrize(("read", "content", "message"), CASES.values(), ids=CASES)
+def test_readers__refuse_a_hostile_file_in_one_sentence(tmp_path: Path, read, content, message: str) -> None:
+    path = tmp_path / "0.png"
+    content(path) if callable(content) else path.write_bytes(content)
+    with pytest.raises((ValueError, OSError), match=message) as caught:
+        read(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("order", "CF")
+def test_read_array__inverts_save(tmp_path: Path, order) -> None:
+    array = np.asarray(np.arange(6.0).reshape(2, 3), order=order)
+    np.save(tmp_path / "a.npy", array)
+    np.savez_compressed(tmp_path / "a.npz", data=array, scalar=np.int64(3))
+    np.testing.assert_array_equal(read_array(tmp_path / "a.npy"), array)
+    np.testing.assert_array_equal(read_array(tmp_path / "a.npz", "data"), array)
+    assert read_array(tmp_path / "a.npz", "scalar") == 3
+
+
+def test_read_json__inverts_dumps(tmp_path: Path) -> None:
+    value = {"a": [1, 2.5, None, {"é": [[]]}]}
+    (tmp_path / "a.json").write_text(json.dumps(value))
+    assert read_json(tmp_path / "a.json") == value
+
+
+def test_readers__accept_images_of_one_colour(tmp_path: Path) -> None:
+    """They take many times the size of their files, which is not a claim."""
+    write_exr(tmp_path / "a.exr", {"a": np.zeros((1000, 1500))})
+    assert read_exr(tmp_path / "a.exr")["a"].shape == (1000, 1500)
+    cv2.imwrite(str(tmp_path / "0.png"), np.zeros((2160, 3840, 3), np.uint8))
+    assert image(tmp_path / "0.png").width == 3840
