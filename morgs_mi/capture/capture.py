@@ -21,6 +21,7 @@ from morgs_mi.capture.layouts.registry import find_layout
 from morgs_mi.capture.lens import undistortion
 from morgs_mi.capture.timeline import ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import check_points
 from morgs_mi.io.prefetch import prefetched
 from morgs_mi.io.video import open_clips
 
@@ -91,6 +92,9 @@ class Capture:
     layout: str = ""
     reading: ReadConfig = field(default_factory=ReadConfig)
     colors: ColorFit | None = None
+
+    def __post_init__(self) -> None:
+        check_points(str(self.path), self.points, self.point_colors)
 
     @property
     def names(self) -> tuple[str, ...]:
