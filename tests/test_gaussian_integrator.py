@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 import subprocess
 import sys
@@ -18,6 +17,7 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, ellipsoids, rasterize
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
+from morgs_mi.io.ply import write_ply
 from tests import reference
 from tests import tolerances as tol
 from tests.assertions import assert_close
@@ -451,16 +451,26 @@ def test_ellipsoids__refuse_no_gaussians(raw):
         ellipsoids(to_gaussians({name: value[:0] for name, value in raw.items()}))
 
 
+SCENE_FILE = """<scene version="3.0.0">
+    <integrator type="gaussian_splat"/>
+    <shape type="ellipsoids"><string name="filename" value="gaussians.ply"/></shape>
+    <sensor type="perspective">
+        <transform name="to_world"><lookat origin="0, 0, -3" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="16"/></film>
+    </sensor>
+</scene>"""
+
+
 def test_gaussian_splat__renders_a_scene_file_as_the_limits_describe(tmp_path, raw):
     """The command `mitsuba` does not find the plugin; the Python command in docs/limits.md renders the same file."""
-    scene = {"gaussians": ellipsoids(to_gaussians(raw)), "sensor": make_sensor_camera().sensor()}
-    mi.xml.dict_to_xml(
-        {"type": "scene", "integrator": {"type": "gaussian_splat"}, **scene}, str(tmp_path / "scene.xml")
-    )
+    write_ply(tmp_path / "gaussians.ply", to_gaussians(raw))
+    (tmp_path / "scene.xml").write_text(SCENE_FILE)
     page = (Path(__file__).parents[1] / "docs/limits.md").read_text(encoding="utf-8")
-    command = textwrap.dedent(re.findall(r"```bash\n(.*?)```", page, re.DOTALL)[0]).replace("python -c", "$PYTHON -c")
-    environment = os.environ | {"PYTHON": sys.executable}
-    subprocess.run(["bash", "-c", command], check=True, cwd=tmp_path, env=environment, timeout=120)
+    command = textwrap.dedent(re.findall(r"```bash\n(.*?)```", page, re.DOTALL)[0])
+    program = re.search(r'python -c "\n(.*?)"', command, re.DOTALL)[1]
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=tmp_path, timeout=120)
     image = np.array(mi.Bitmap(str(tmp_path / "image.exr")))
-    expected = np.array(mi.render(mi.load_dict({"type": "scene", "integrator": {"type": "gaussian_splat"}, **scene})))
+    assert image.shape[:2] == (16, 32)
+    expected = np.array(mi.render(mi.load_file(str(tmp_path / "scene.xml"))))
+    assert expected.max() > 0.1
     assert_close(image[..., :3], expected[..., :3], atol=2e-3)  # half precision

@@ -97,16 +97,17 @@ class Camera:
             ValueError: `target` is at `origin` or above or below it in the direction of `up`, and as for `Camera`.
         """
         where = "Camera.look_at()"
+        check_size(where, width, height)
         check_number(where, "fov_x", fov_x, "(0, 180)")
         vectors = {}
-        for name, value in (("origin", origin), ("target", target), ("up", up)):
-            vectors[name] = numbers(where, name, value).astype(np.float64)
-            if vectors[name].shape != (3,):
-                raise ValueError(f"{where}: `{name}` must be [3], got {list(vectors[name].shape)}; pass x, y and z.")
+        for key, value in (("origin", origin), ("target", target), ("up", up)):
+            vectors[key] = numbers(where, key, value).astype(np.float64)
+            if vectors[key].shape != (3,):
+                raise ValueError(f"{where}: `{key}` must be [3], got {list(vectors[key].shape)}; pass x, y and z.")
         forward = vectors["target"] - vectors["origin"]
         right = np.cross(forward, vectors["up"])
         if not np.linalg.norm(right) > 1e-12 * np.linalg.norm(forward) * np.linalg.norm(vectors["up"]):
-            found = ", ".join(f"{name} {value.tolist()}" for name, value in vectors.items())
+            found = ", ".join(f"{key} {value.tolist()}" for key, value in vectors.items())
             raise ValueError(f"{where}: `up` must not be parallel to the direction of view, got {found}; tilt it.")
         forward /= np.linalg.norm(forward)
         right /= np.linalg.norm(right)

@@ -45,8 +45,8 @@ __all__ = ["OnRegion", "Target", "WholeView"]
 
 _Read = Callable[[Float], list[Float]]  # plane -> its numbers around the lane's row
 
-# Floats may exceed [0, 1] by as much.
-_ROUNDING = 1e-3
+# Noise and rendered colours exceed [0, 1] by less, 8-bit values by more.
+_MARGIN = 1.0
 _C1, _C2 = 0.01**2, 0.03**2
 _WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
 _WINDOW = (_WINDOW / _WINDOW.sum()).astype(np.float32)
@@ -122,7 +122,7 @@ def _check_image(image: np.ndarray) -> None:
     if image.dtype == np.uint8:
         return
     low, high = (image.min(), image.max()) if image.dtype.kind == "f" else (np.nan, np.nan)
-    if not (low >= -_ROUNDING and high <= 1 + _ROUNDING):
+    if not (low >= -_MARGIN and high <= 1 + _MARGIN):
         found = f"{image.dtype} from {low:g} to {high:g}" if image.dtype.kind == "f" else str(image.dtype)
         raise ValueError(
             f"Target(): `image` must be uint8, or floats in [0, 1], got {found}; divide 8-bit values by 255."
