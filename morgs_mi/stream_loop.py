@@ -132,8 +132,7 @@ def step(
     Raises:
         ValueError: an image has another size or type than its camera, or the first frame has no image at all.
     """
-    _check_images(setup.cameras, images, state.frame)
-    seen = {view: image.copy() for view, image in enumerate(images) if image is not None}
+    seen = _copies(setup.cameras, images, state.frame)
     if state.coded is None:
         return _first_step(setup, state, seen, on_step)
     return _later_step(setup, state, seen, on_step)
@@ -288,6 +287,12 @@ def _missing(setup: Setup, images: Images) -> tuple[str, ...]:
     return tuple(camera.name for view, camera in enumerate(setup.cameras) if view not in images)
 
 
+def _copies(cameras: Sequence[Camera], images: Sequence[np.ndarray | None], frame: int) -> dict[int, np.ndarray]:
+    """Return copies of the images of those views that have one, by view index, if all have their camera's size."""
+    _check_images(cameras, images, frame)
+    return {view: image.copy() for view, image in enumerate(images) if image is not None}
+
+
 def _check_images(cameras: Sequence[Camera], images: Sequence[np.ndarray | None], frame: int) -> None:
     count = len(images) if isinstance(images, (Sequence, np.ndarray)) else f"a {type(images).__name__}"
     if count != len(cameras):
@@ -391,7 +396,7 @@ class StreamLoop:
         """
         state = StreamState()
         for images in frames:
-            seen = {view: image for view, image in enumerate(images) if image is not None}
+            seen = _copies(self.setup.cameras, images, coded.frame)
             changes = _changes(self.setup, state.references, seen)
             state = StreamState(coded.frame + 1, coded, seen, _references(self.setup, state, seen, changes))
         self.state = state

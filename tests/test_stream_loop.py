@@ -367,3 +367,14 @@ def test_step__is_pure_and_complete(clip):
     again, _, _ = stream_loop.step(setup, first, clip[1][:4])
     assert again.frame == 2
     assert first.frame == 1
+
+
+def test_resume__copies_its_images_and_refuses_those_of_another_size(clip, full):
+    loop, buffers = new_loop(), [image.copy() for image in clip[0][:4]]
+    coded = full[0].state.coded
+    loop.resume(coded, [buffers])
+    for buffer in buffers:
+        buffer[:] = 0
+    assert all(np.array_equal(loop.state.images[view], clip[0][view]) for view in range(4))
+    with pytest.raises(ValueError, match=r"must be uint8 \[72, 96, 3\]"):
+        loop.resume(coded, [[image[:50] for image in buffers]])
