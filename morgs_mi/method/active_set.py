@@ -23,11 +23,11 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import UInt32
 from morgs_mi.render.active_view import ActiveView, make_active_view
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.projection import project
-from morgs_mi.render.region import owned_copy
 
 __all__ = ["ActiveSet", "ActiveSetConfig", "find_active_set", "full_active_set", "with_zero_motion"]
 
@@ -164,7 +164,7 @@ def _covered(box: Corners, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the fraction of each box that a mask [H, W] covers [N], and whether the box has any pixel [N]."""
     x0, y0, x1, y1 = box
     pitch, area = dr.opaque(mi.UInt32, mask.shape[1] + 1), (x1 - x0) * (y1 - y0)
-    table = owned_copy(mi.UInt32(cv2.integral(mask.astype(np.uint8)).astype(np.uint32).ravel()))
+    table = from_numpy(mi.UInt32, cv2.integral(mask.astype(np.uint8)))
 
     def sum_before(x: UInt32, y: UInt32) -> UInt32:
         return dr.gather(mi.UInt32, table, y * pitch + x)
