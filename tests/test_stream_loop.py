@@ -266,7 +266,8 @@ def test_stream_capture__writes_a_file(clip, tmp_path):
     assert sum(r.num_bytes for r in reports) < path.stat().st_size
     assert ticks[-1] == (1, 16, 16)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["capture.json", "report.json", "stream.morgs"]
-    assert json.loads((tmp_path / "out" / "capture.json").read_text()) == {"layout": "in memory"}
+    about = json.loads((tmp_path / "out" / "capture.json").read_text())
+    assert about == {"layout": "in memory", "capture": str(capture.path)}
 
 
 def masked(masks):

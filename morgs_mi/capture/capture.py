@@ -99,15 +99,6 @@ class Capture:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        colors = self.point_colors
-        if colors.shape != self.points.shape or not ((colors >= 0) & (colors <= 1)).all():
-            span = f"{colors.min():g} to {colors.max():g}" if colors.size else "none"
-            raise ValueError(
-                f"{self.path}: the colours of the points must be {list(self.points.shape)} in [0, 1], got "
-                f"{list(colors.shape)}, {span}; divide by 255 if they are bytes, and export the points again."
-            )
-
-    def __post_init__(self) -> None:
         check_points(str(self.path), self.points, self.point_colors)
 
     @property
