@@ -48,12 +48,12 @@ async function compiled(name) {
 async function notice() {
   const parts = await Promise.all(
     BUNDLED.map(async (name) => {
-    const folder = `node_modules/${name}`;
-    const { version, license } = JSON.parse(await readFile(`${folder}/package.json`, "utf8"));
-    return `${name} ${version} (${license})\n\n${(await readFile(`${folder}/LICENSE`, "utf8")).trim()}\n`;
-  }),
-);
-return `The web player contains these libraries.\n\n${parts.join("\n" + "-".repeat(80) + "\n\n")}`;
+      const folder = `node_modules/${name}`;
+      const { version, license } = JSON.parse(await readFile(`${folder}/package.json`, "utf8"));
+      return `${name} ${version} (${license})\n\n${(await readFile(`${folder}/LICENSE`, "utf8")).trim()}\n`;
+    }),
+  );
+  return `The web player contains these libraries.\n\n${parts.join("\n" + "-".repeat(80) + "\n\n")}`;
 }
 
 const folder = resolve(process.argv[2]);

@@ -64,10 +64,7 @@ class Player {
         this.count();
         if (!this.started) this.start(update.confidence);
       },
-      failed: (message, position) => {
-        const before = position > 0 ? ` Frames ${this.frames[0]} to ${this.frames[position - 1]} come before it.` : "";
-        say(`This stream is damaged. ${message}${before}`);
-      },
+      failed: (message) => say(`This stream is damaged. ${message} The frames before play.`),
       playing: (playing) => {
         element("play").ariaLabel = playing ? "Pause" : "Play";
         element("play").querySelector("path")!.setAttribute("d", playing ? PAUSE : PLAY);

@@ -13,7 +13,7 @@ type Shown = Extract<Reply, { kind: "shown" }>;
 export interface Events {
   opened(stream: Opened): void;
   show(update: Update, position: number): void;
-  failed(message: string, position: number): void;
+  failed(message: string): void;
   playing(playing: boolean): void;
 }
 
@@ -40,7 +40,7 @@ export class Playback {
   constructor(bytes: Uint8Array<ArrayBuffer>, private readonly events: Events) {
     this.worker = new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
     this.worker.onmessage = ({ data }: MessageEvent<Reply>) => this.receive(data);
-    this.worker.onerror = ({ message }) => events.failed(message, -1);
+    this.worker.onerror = ({ message }) => events.failed(message);
     this.send({ kind: "open", bytes }, [bytes.buffer]);
   }
 
@@ -135,10 +135,10 @@ export class Playback {
     } else if (reply.kind === "state") {
       this.answers.shift()?.(reply.state);
     } else if (reply.kind === "failed" && reply.ticket === -1) {
-      this.events.failed(reply.message, -1);
+      this.events.failed(reply.message);
     } else if (reply.ticket === this.ticket) {
       this.waiting--;
-      if (reply.kind === "failed") this.fail(reply.message, reply.position);
+      if (reply.kind === "failed") this.fail(reply.message);
       else this.accept(reply);
     }
   }
@@ -153,11 +153,11 @@ export class Playback {
     this.present(shown);
   }
 
-  private fail(message: string, position: number): void {
+  private fail(message: string): void {
     this.broken = true;
     this.jumping = false;
     this.play(false);
-    this.events.failed(message, position);
+    this.events.failed(message);
   }
 
   private send(request: Request, transfer: Transferable[] = []): void {

@@ -23,7 +23,7 @@ export type Reply =
   | Opened
   | { kind: "shown"; position: number; ticket: number; milliseconds: number; update: Update }
   | { kind: "state"; state: State }
-  | { kind: "failed"; position: number; ticket: number; message: string };
+  | { kind: "failed"; ticket: number; message: string };
 
 let stream: Stream | null = null;
 let decoder: Decoder | null = null;
@@ -46,8 +46,8 @@ onmessage = ({ data }: MessageEvent<Request>) => {
       reply({ kind: "state", state: new Decoder(stream!).stateAt(data.position) });
     }
   } catch (error) {
-    const { position, ticket } = { position: -1, ticket: -1, ...data };
-    reply({ kind: "failed", position, ticket, message: error instanceof Error ? error.message : String(error) });
+    const ticket = data.kind === "show" ? data.ticket : -1;
+    reply({ kind: "failed", ticket, message: error instanceof Error ? error.message : String(error) });
   }
 };
 
