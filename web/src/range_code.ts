@@ -29,10 +29,10 @@ export class ColumnReader {
     open(start, words.length);
   }
 
-  /** Decode a column of `n` integers. */
+  /** Decode a column of `n` integers, which are valid until the next one is decoded. */
   take(n: number): Int32Array {
     reserve(this.column + 4 * n);
     if (!take(n, this.column)) throw new Error("the range code is broken");
-    return new Int32Array(memory.buffer, this.column, n).slice();
+    return new Int32Array(memory.buffer, this.column, n);
   }
 }

@@ -91,7 +91,7 @@ export function keyframe(frame: number, arrays: Arrays): State {
   const confidence = optional === 1;
   const { E, C } = columnCounts(degree, confidence);
   const reader = new ColumnReader(code);
-  const gaps = reader.take(N);
+  const gaps = reader.take(N).slice();
   const columns = gaussians(reader, N, 1 + E + C);
 
   // Gaussians that are likely to move come first, so that updates of the textures touch few of their lines.
@@ -115,8 +115,8 @@ export function keyframe(frame: number, arrays: Arrays): State {
 
 /** Decode a group of Gaussians: M columns of N numbers. */
 function gaussians(reader: ColumnReader, N: number, M: number): Int32Array[] {
-  return Array.from(reader.take(M), (shift) => {
-    const column = reader.take(N);
+  return Array.from(reader.take(M).slice(), (shift) => {
+    const column = reader.take(N).slice();
     if (shift !== 0) for (let i = 0; i < N; i++) column[i] += shift;
     return column;
   });
@@ -155,47 +155,57 @@ function removeDead(state: State, dead: Uint8Array): number[] {
     if (dead[order[i]] === 1) freed.push(order[i]);
     else order[count++] = order[i];
   }
-  state.order = order.slice(0, count);
+  if (freed.length > 0) state.order = order.slice(0, count);
   for (const row of freed) free.push(row);
   return freed;
+}
+
+const buffers: Uint32Array[] = [];
+
+/** Return an array with any contents, valid until the next call with the same number; a new one costs page faults. */
+function scratch(which: number, length: number): Uint32Array {
+  if (!(buffers[which]?.length >= length)) buffers[which] = new Uint32Array(length);
+  return buffers[which];
 }
 
 /** Return the rows of the Gaussians with a confidence of at most 1/2, and of the others. */
 function classes({ order, confidence, values }: State): Uint32Array[] {
   const logits = values[values.length - 1];
-  const found = [new Uint32Array(order.length), new Uint32Array(order.length)];
-  const counts = [0, 0];
+  const still = scratch(2, order.length);
+  const moving = scratch(3, order.length);
+  let count = 0;
   for (let i = 0; i < order.length; i++) {
-    const c = confidence && logits[order[i]] > 0 ? 1 : 0;
-    found[c][counts[c]++] = order[i];
+    const row = order[i];
+    if (confidence && logits[row] > 0) moving[i - count] = row;
+    else still[count++] = row;
   }
-  return found.map((rows, c) => rows.subarray(0, counts[c]));
+  return [still.subarray(0, count), moving.subarray(0, order.length - count)];
 }
 
 function applyClass(state: State, members: Uint32Array, reader: ColumnReader, factor: number, dead: Uint8Array): Change {
   // Bits 0 to 3: the first column of flags. Bits 4 and above: the second and third one, of which each has one.
-  const flags = reader.take(members.length);
-  const lists = [new Uint32Array(members.length), new Uint32Array(members.length)];
-  const counts = [0, 0];
+  const flags = reader.take(members.length).slice();
+  const still = scratch(0, members.length);
+  const others = scratch(1, members.length);
+  let stillCount = 0;
+  let otherCount = 0;
   for (let k = 0; k < flags.length; k++) {
-    if (flags[k] === 0) lists[0][counts[0]++] = k;
-    else if (flags[k] < DIED) lists[1][counts[1]++] = k;
+    if (flags[k] === 0) still[stillCount++] = k;
+    else if (flags[k] < DIED) others[otherCount++] = k;
     else dead[members[k]] = 1;
   }
-  lists.forEach((list, which) => {
-    const more = reader.take(counts[which]);
-    for (let j = 0; j < more.length; j++) flags[list[j]] |= more[j] << 4;
-  });
-  const rows = new Uint32Array(members.length);
-  const changes = new Int32Array(members.length);
+  addFlags(flags, still, reader.take(stillCount));
+  addFlags(flags, others, reader.take(otherCount));
+  const changed = scratch(0, members.length);
   let count = 0;
-  for (let k = 0; k < flags.length; k++) {
-    if ((flags[k] & ~DIED) === 0) continue;
-    rows[count] = members[k];
-    changes[count++] = flags[k];
+  for (let k = 0; k < flags.length; k++) if ((flags[k] & ~DIED) !== 0) changed[count++] = k;
+  const listed = new Uint32Array(count);
+  const changes = new Int32Array(count);
+  for (let j = 0; j < count; j++) {
+    listed[j] = members[changed[j]];
+    changes[j] = flags[changed[j]];
   }
 
-  const listed = rows.subarray(0, count);
   const moved = withBit(listed, changes, 1);
   const displacements = new Float32Array(3 * moved.length);
   const { C } = columnCounts(state.degree, false);
@@ -206,10 +216,14 @@ function applyClass(state: State, members: Uint32Array, reader: ColumnReader, fa
       const r = reader.take(touched.length);
       const values = state.values[column];
       if (g === 0) move(values, state.exponents[0], touched, r, factor, displacements, column);
-      else for (let k = 0; k < r.length; k++) values[touched[k]] += rint(r[k] * factor);
+      else add(values, touched, r, factor);
     }
   }
   return { rows: listed, freed: [], moved, displacements };
+}
+
+function addFlags(flags: Int32Array, list: Uint32Array, more: Int32Array): void {
+  for (let j = 0; j < more.length; j++) if (more[j] !== 0) flags[list[j]] |= more[j] << 4;
 }
 
 /** Change the means along one axis and store the displacements, in float32. */
@@ -229,6 +243,10 @@ function move(
     values[row] += rint(r[k] * factor);
     displacements[3 * k + axis] = Math.fround(values[row] * unit) - before;
   }
+}
+
+function add(values: Int32Array, rows: Uint32Array, r: Int32Array, factor: number): void {
+  for (let k = 0; k < r.length; k++) values[rows[k]] += rint(r[k] * factor);
 }
 
 /** Return the rows whose change has a bit. */
