@@ -11,6 +11,7 @@ from the request to the answer. Drawing depends on the GPU and is not timed.
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import tempfile
 from dataclasses import dataclass, replace
@@ -120,6 +121,7 @@ def measure(options: Options) -> dict[str, Any]:
             "stream_bytes": stream.stat().st_size,
             "page_bytes": html.stat().st_size,
             "browser": browser.version,
+            "load_average": round(os.getloadavg()[0], 1),
         }
 
 

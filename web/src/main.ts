@@ -28,6 +28,10 @@ function say(text: string): void {
   element("message").hidden = false;
 }
 
+function sayFailure(error: unknown): void {
+  say(`This page could not start: ${error instanceof Error ? error.message : error}.`);
+}
+
 async function streamBytes(): Promise<Uint8Array<ArrayBuffer>> {
   const address = element("stream").dataset.address;
   if (address === undefined) return embedded("stream");
@@ -57,7 +61,13 @@ class Player {
 
   constructor(bytes: Uint8Array<ArrayBuffer>) {
     this.playback = new Playback(bytes, {
-      opened: (stream) => this.open(stream),
+      opened: (stream) => {
+        try {
+          this.open(stream);
+        } catch (error) {
+          sayFailure(error);
+        }
+      },
       show: (update, position) => {
         this.splats.apply(update);
         slider.value = String(position);
@@ -99,6 +109,7 @@ class Player {
     this.selectCamera(Math.max(0, wished));
     this.selectMode(MODES.find((mode) => mode === this.wishes.get("mode")) ?? "color");
     this.listen();
+    this.lastInput = performance.now();
     const still = matchMedia("(prefers-reduced-motion: reduce)").matches;
     this.playback.play(!still && !this.wishes.has("pause") && this.frames.length > 1);
     requestAnimationFrame((now) => this.tick(now));
@@ -236,4 +247,4 @@ class Player {
 // Tests read `player`.
 streamBytes()
   .then((bytes) => Object.assign(window, { player: new Player(bytes) }))
-  .catch((error) => say(`This page could not start: ${error.message}.`));
+  .catch(sayFailure);

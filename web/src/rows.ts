@@ -2,13 +2,19 @@
 
 import { type Change, type State, step } from "./state";
 
-/** Floats of a row: mean xyz, opacity | quaternion xyzw | scales xyz, confidence | displacement xyz, unused. */
+/**
+ * Floats of a row: mean xyz, logit of the opacity | quaternion xyzw | log-scales xyz, logit of the confidence |
+ * displacement xyz, unused. Shaders apply exponentials faster.
+ */
 export const GEOMETRY = 16;
+/** Place of the logit of the opacity, and its value in a free row. */
+export const OPACITY = 3;
+export const FREE = -1e9;
 const DISPLACEMENT = 12;
 /** Halves per SH coefficient: R, G, B and one unused. */
 export const COEFFICIENT = 4;
 
-/** New contents of some rows; after a reset, all others are free. A free row has the opacity 0. */
+/** New contents of some rows; after a reset, all others are free. */
 export interface Update {
   reset: boolean;
   /** Number of rows, free ones included. */
@@ -60,6 +66,7 @@ function updated(state: State, rows: Uint32Array, free: number, reset: boolean):
   const sh = new Uint16Array(COEFFICIENT * K * rows.length);
   const members = rows.subarray(0, rows.length - free);
   fillGeometry(state, members, geometry);
+  for (let k = members.length; k < rows.length; k++) geometry[GEOMETRY * k + OPACITY] = FREE;
   fillCoefficients(state, members, K, sh);
   const { degree, confidence } = state;
   return { reset, capacity: state.ids.length, count: state.order.length, degree, confidence, rows: rows.slice(), geometry, sh };
@@ -74,9 +81,9 @@ function fillGeometry(state: State, rows: Uint32Array, geometry: Float32Array): 
     const ofMeans = step(exponents[0][row]);
     for (let axis = 0; axis < 3; axis++) {
       geometry[at + axis] = values[axis][row] * ofMeans;
-      geometry[at + 8 + axis] = Math.exp(values[3 + axis][row] * step(exponents[1 + axis][row]));
+      geometry[at + 8 + axis] = values[3 + axis][row] * step(exponents[1 + axis][row]);
     }
-    geometry[at + 3] = sigmoid(values[9][row] * step(exponents[5][row]));
+    geometry[at + OPACITY] = values[9][row] * step(exponents[5][row]);
     const ofQuats = step(exponents[4][row]);
     const u = values[6][row] * ofQuats;
     const v = values[7][row] * ofQuats;
@@ -88,7 +95,7 @@ function fillGeometry(state: State, rows: Uint32Array, geometry: Float32Array): 
     geometry[at + 4] = unit * (omitted === 0 ? u : omitted === 1 ? 1 : v);
     geometry[at + 5] = unit * (omitted <= 1 ? v : omitted === 2 ? 1 : w);
     geometry[at + 6] = unit * (omitted === 3 ? 1 : w);
-    if (confidence) geometry[at + 11] = sigmoid(logits[row] * step(exponents[8][row]));
+    if (confidence) geometry[at + 11] = logits[row] * step(exponents[8][row]);
   }
 }
 
@@ -102,10 +109,6 @@ function fillCoefficients(state: State, rows: Uint32Array, K: number, sh: Uint16
       sh[COEFFICIENT * K * k + place] = half(column[rows[k]] * step(exponent[rows[k]]));
     }
   }
-}
-
-function sigmoid(x: number): number {
-  return 1 / (1 + Math.exp(-x));
 }
 
 const FLOAT = new Float32Array(1);

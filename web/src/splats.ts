@@ -4,7 +4,7 @@ import { dyno, SparkRenderer, SplatGenerator } from "@sparkjsdev/spark";
 import * as THREE from "three";
 import { FullScreenQuad } from "three/addons/postprocessing/Pass.js";
 import { CONFIDENCE_COLORS } from "./colors";
-import { COEFFICIENT, GEOMETRY, type Update } from "./rows";
+import { COEFFICIENT, FREE, GEOMETRY, OPACITY, type Update } from "./rows";
 
 export type Mode = "color" | "motion" | "confidence";
 export const MODES: Mode[] = ["color", "motion", "confidence"];
@@ -24,6 +24,10 @@ export interface Cutoffs {
 const FUNCTIONS = /* glsl */ `
 vec4 texelOf(sampler2D rows, int i) {
   return texelFetch(rows, ivec2(i % ${WIDTH}, i / ${WIDTH}), 0);
+}
+
+float sigmoid(float x) {
+  return 1.0 / (1.0 + exp(-x));
 }
 
 vec3 colorSeenFrom(sampler2D sh, int row, int degree, vec3 d) {
@@ -147,17 +151,17 @@ export class Splats {
             vec4 place = texelOf(${i.geometry}, 4 * ${i.index});
             vec4 scales = texelOf(${i.geometry}, 4 * ${i.index} + 2);
             vec3 displacement = texelOf(${i.geometry}, 4 * ${i.index} + 3).xyz;
-            ${gsplat}.flags = place.w > 0.0 ? GSPLAT_FLAG_ACTIVE : 0u;
+            ${gsplat}.flags = place.w > ${FREE}.0 ? GSPLAT_FLAG_ACTIVE : 0u;
             ${gsplat}.index = ${i.index};
             ${gsplat}.center = place.xyz * ${i.unit};
-            ${gsplat}.scales = scales.xyz * ${i.unit};
+            ${gsplat}.scales = exp(scales.xyz) * ${i.unit};
             ${gsplat}.quaternion = texelOf(${i.geometry}, 4 * ${i.index} + 1);
             vec3 color = ${i.mode} == 0
               ? colorSeenFrom(${i.sh}, ${i.index}, ${i.degree}, normalize(place.xyz * ${i.unit} - ${i.eye}))
               : ${i.mode} == 1
               ? motionSeenFrom(${i.view}, place.xyz * ${i.unit}, displacement * ${i.unit}, ${i.saturation})
-              : vec3(scales.w);
-            ${gsplat}.rgba = vec4(color, place.w);
+              : vec3(sigmoid(scales.w));
+            ${gsplat}.rgba = vec4(color, sigmoid(place.w));
           `),
         });
         return { gsplat: read.outputs.gsplat };
@@ -178,7 +182,7 @@ export class Splats {
   apply(update: Update): void {
     const K = (update.degree + 1) ** 2;
     if (update.capacity > this.capacity || update.degree !== this.degree) this.allocate(update.capacity, update.degree);
-    if (update.reset) (this.geometry.image.data as Float32Array).fill(0);
+    if (update.reset) (this.geometry.image.data as Float32Array).fill(FREE);
     scatter(this.geometry, update.rows, update.geometry, GEOMETRY, update.reset);
     scatter(this.sh, update.rows, update.sh, COEFFICIENT * K, update.reset);
     // After a reset, the order of the frame before is of no use.
@@ -253,7 +257,7 @@ export class Splats {
     const point = new THREE.Vector3();
     const stride = GEOMETRY * Math.max(1, Math.floor(this.capacity / 5000));
     for (let at = 0; at < GEOMETRY * this.capacity; at += stride) {
-      if (data[at + 3] < 0.1) continue;
+      if (data[at + OPACITY] < -2) continue;
       point.set(data[at], data[at + 1], data[at + 2]).multiplyScalar(this.unit).applyMatrix4(camera.matrixWorldInverse);
       const depth = -point.z;
       point.applyMatrix4(camera.projectionMatrix);
@@ -268,7 +272,7 @@ type Texels = Float32ArrayConstructor | Uint16ArrayConstructor;
 /** Return a texture for a number of texels RGBA, in floats or halves. */
 function texture(texels: number, type: Texels, before?: Float32Array | Uint16Array): THREE.DataTexture {
   const height = Math.max(1, Math.ceil(texels / WIDTH));
-  const data = new type(4 * WIDTH * height);
+  const data = new type(4 * WIDTH * height).fill(type === Float32Array ? FREE : 0);
   if (before !== undefined) data.set(before.subarray(0, data.length));
   const precision = type === Float32Array ? THREE.FloatType : THREE.HalfFloatType;
   const result = new THREE.DataTexture(data, WIDTH, height, THREE.RGBAFormat, precision);
