@@ -13,7 +13,9 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.codec.packets import CodedFrame, coded_frames
+from morgs_mi.cli import main
+from morgs_mi.codec.container import StreamWriter
+from morgs_mi.codec.packets import CodedFrame, coded_frames, reemitted_keyframe
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.export.web import text_of_bytes, write_web_folder, write_web_page
 from morgs_mi.playback.player import channel_image, open_stream, render, render_config
@@ -75,6 +77,15 @@ def test_write_web_page__escapes_the_title(tmp_path):
     write_stream(tmp_path / "stream.morgs")
     write_web_page(open_stream(tmp_path), tmp_path / "page.html", title="</title><script>alert()</script>")
     assert b"<title>&lt;/title&gt;" in (tmp_path / "page.html").read_bytes()
+
+
+def test_export_web__writes_a_page_or_a_folder(tmp_path, capsys):
+    write_stream(tmp_path / "stream.morgs")
+    assert main(["export", "web", str(tmp_path)]) == 0
+    assert main(["export", "web", str(tmp_path), str(tmp_path / "site"), "--folder", "--title", "A clip"]) == 0
+    assert (tmp_path / "player.html").stat().st_size > 1e6
+    assert b"<title>A clip</title>" in (tmp_path / "site" / "index.html").read_bytes()
+    assert "player.html: 4 frames" in " ".join(capsys.readouterr().out.split())
 
 
 # --------------------------------------------------------------------------------------------------
@@ -171,18 +182,35 @@ def page(opened):
     assert elsewhere == [opened.page.url.split("#")[0]]
 
 
+def decodes(page: Page, position: int, coded: CodedFrame) -> bool:
+    """Return whether the page decodes a position to the integers of a state."""
+    found = page.page.evaluate(
+        """async (position) => {
+          const { ids, largest, exponents, values } = await player.playback.state(position);
+          return [ids, largest, ...exponents, ...values].map((column) => [...column]);
+        }""",
+        position,
+    )
+    expected = [coded.ids, coded.grid.largest_components, *coded.grid.exponents.T, *coded.grid.values.T]
+    return all(itertools.starmap(np.array_equal, zip(found, expected, strict=True)))
+
+
 def test_page__decodes_the_same_integers(page, clip):
-    for position in (0, 3, 1, 2):
-        found = page.page.evaluate(
-            """async (position) => {
-              const { ids, largest, exponents, values } = await player.playback.state(position);
-              return [ids, largest, ...exponents, ...values].map((column) => [...column]);
-            }""",
-            position,
-        )
-        coded, grid = clip[1][position], clip[1][position].grid
-        expected = [coded.ids, grid.largest_components, *grid.exponents.T, *grid.values.T]
-        assert all(itertools.starmap(np.array_equal, zip(found, expected, strict=True)))
+    assert all(decodes(page, position, clip[1][position]) for position in (0, 3, 1, 2))
+
+
+@pytest.mark.slow
+def test_page__plays_a_salvaged_stream(browser, clip, tmp_path):
+    states, packets = clip[1], list(open_stream(clip[0]))
+    # Frame 1 is lost; keyframes were re-emitted at frames 2 and 3.
+    kept = [packets[0], reemitted_keyframe(states[2]), packets[3], reemitted_keyframe(states[3])]
+    with StreamWriter(tmp_path / "stream.morgs", rig(WIDTH, HEIGHT), 10) as writer:
+        for packet in kept:
+            writer.write(packet)
+    write_web_page(open_stream(tmp_path), tmp_path / "page.html")
+    with Page(browser, (tmp_path / "page.html").as_uri() + "#pause&frame=3") as page:
+        assert page.text("#count") == "3 / 3"
+        assert all(decodes(page, position, states[frame]) for position, frame in enumerate((0, 2, 3)))
 
 
 # Motion is divided by alpha, so it depends on rounding where little is drawn. A camera that is off by a degree: 20 dB.
