@@ -2,9 +2,10 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+WEB_PLAYER ?= morgs_mi/export/web_player
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-slow lint docs setup clean
+.PHONY: demo test test-slow lint docs web setup clean
 
 demo: setup
 	$(BIN)/morgs-mi demo out/demo
@@ -24,6 +25,10 @@ docs: setup
 	$(BIN)/sphinx-build -q -W --keep-going docs docs/_build/html
 	@echo "Documentation: docs/_build/html/index.html"
 
+# Needs Node.js 20 or newer. The result is part of the repository, so nothing else does.
+web:
+	cd web && npm ci --no-audit --no-fund && npm run build -- "$(abspath $(WEB_PLAYER))"
+
 # LLVM is checked every time: it is outside the environment, and finding it takes 50 ms.
 setup: $(STAMP)
 	@tools/setup_llvm.sh $(BIN)/python
@@ -33,5 +38,5 @@ $(STAMP): pyproject.toml constraints.txt tools/setup_venv.sh
 	@touch $@
 
 clean:
-	rm -rf $(VENV) out build dist *.egg-info .pytest_cache .ruff_cache docs/_build docs/notebooks docs/api/morgs_mi*.md
+	rm -rf $(VENV) out build dist web/node_modules *.egg-info .pytest_cache .ruff_cache docs/_build docs/notebooks docs/api/morgs_mi*.md
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

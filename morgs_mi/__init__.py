@@ -22,6 +22,7 @@ from morgs_mi.playback.visualise import confidence_image, depth_image, motion_im
 from morgs_mi.recorder import stream_capture  # noqa: E402
 from morgs_mi.render.config import RenderConfig  # noqa: E402
 from morgs_mi.render.rasterize import Image, rasterize  # noqa: E402
+from morgs_mi.render.recording import render_lock  # noqa: E402
 from morgs_mi.stream_loop import FrameReport, StreamLoop  # noqa: E402
 from morgs_mi.synth.ground_truth import load_tracks, load_truth  # noqa: E402
 from morgs_mi.synth.synthesize import synthesize  # noqa: E402
@@ -52,6 +53,7 @@ __all__ = [
     "motion_image",
     "open_stream",
     "rasterize",
+    "render_lock",
     "render_stream",
     "stream_capture",
     "synthesize",

@@ -31,9 +31,11 @@ import numpy as np
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians, tensor_rows
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, Tensor, UInt32
 from morgs_mi.render.channels import attribute_channels, exr_names
 from morgs_mi.render.rasterize import rasterize
+from morgs_mi.render.recording import render_lock
 
 __all__ = ["ellipsoids"]
 
@@ -65,7 +67,15 @@ def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
         >>> scene = mi.load_dict({"type": "scene", "gaussians": morgs_mi.ellipsoids(gaussians),
         ...                       "sensor": camera.sensor(), "integrator": {"type": "gaussian_splat"}})
         >>> image = mi.render(scene)
+
+    Raises:
+        ValueError: there are no Gaussians; Mitsuba ends the process then.
     """
+    if not hasattr(gaussians, "means") or not int(gaussians.means.shape[0]):
+        raise ValueError(
+            f"ellipsoids(): `gaussians` must be at least one Gaussian, got a {type(gaussians).__name__} without any; "
+            "leave the shape out of the scene."
+        )
     names = ("means", "scales", "quats", *_attribute_widths())
     values = {name: getattr(gaussians, name, None) for name in names}
     values = {name: np.array(dr.detach(value)) for name, value in values.items() if value is not None}
@@ -73,8 +83,8 @@ def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
     # Mitsuba expects unit quaternions.
     quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-30)
     data = np.concatenate([means, scales, np.roll(quats, -1, axis=1)], axis=1)
-    attributes = {name: mi.TensorXf(value.reshape(len(data), -1)) for name, value in values.items()}
-    return {"type": "ellipsoids", "data": mi.TensorXf(data), **attributes}
+    attributes = {name: from_numpy(mi.TensorXf, value.reshape(len(data), -1)) for name, value in values.items()}
+    return {"type": "ellipsoids", "data": from_numpy(mi.TensorXf, data), **attributes}
 
 
 class _SceneGaussians:
@@ -228,7 +238,8 @@ def _plugin() -> type:
         def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
             with dr.resume_grad():
                 image = self._expose(scene, sensor).develop()
-                dr.forward_to(image)
+                with render_lock:
+                    dr.forward_to(image)
                 return dr.grad(image)
 
         def render_backward(
@@ -237,7 +248,8 @@ def _plugin() -> type:
             with dr.resume_grad():
                 image = self._expose(scene, sensor).develop()
                 dr.set_grad(image, grad_in)
-                dr.backward_from(image)
+                with render_lock:
+                    dr.backward_from(image)
 
         def _expose(self, scene: Any, sensor: Any) -> Any:
             """Render the scene to the sensor's film and return the film."""

@@ -18,6 +18,7 @@ from morgs_mi.codec.container import Packet
 from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, residual_packet
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import check_mask, check_points, check_type
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.initialise import from_points, resample_points, scene_extent, seed_points
@@ -131,8 +132,7 @@ def step(
     Raises:
         ValueError: an image has another size or type than its camera, or the first frame has no image at all.
     """
-    _check_images(setup.cameras, images, state.frame)
-    seen = {view: image.copy() for view, image in enumerate(images) if image is not None}
+    seen = _copies(setup.cameras, images, state.frame)
     if state.coded is None:
         return _first_step(setup, state, seen, on_step)
     return _later_step(setup, state, seen, on_step)
@@ -289,18 +289,27 @@ def _missing(setup: Setup, images: Images) -> tuple[str, ...]:
     return tuple(camera.name for view, camera in enumerate(setup.cameras) if view not in images)
 
 
+def _copies(cameras: Sequence[Camera], images: Sequence[np.ndarray | None], frame: int) -> dict[int, np.ndarray]:
+    """Return copies of the images of those views that have one, by view index, if all have their camera's size."""
+    _check_images(cameras, images, frame)
+    return {view: image.copy() for view, image in enumerate(images) if image is not None}
+
+
 def _check_images(cameras: Sequence[Camera], images: Sequence[np.ndarray | None], frame: int) -> None:
-    if len(images) != len(cameras):
+    count = len(images) if isinstance(images, (Sequence, np.ndarray)) else f"a {type(images).__name__}"
+    if count != len(cameras):
         raise ValueError(
-            f"step(): frame {frame} must have one image or None for each of {len(cameras)} views, got {len(images)}."
+            f"step(): frame {frame} must have one image or None for each of {len(cameras)} views, got {count}."
         )
     if not frame and all(image is None for image in images):
         raise ValueError("step(): frame 0 must have an image of at least one view, got none; begin with one that has.")
-    for camera, image in zip(cameras, images, strict=True):
-        if image is not None and (image.shape != (camera.height, camera.width, 3) or image.dtype != np.uint8):
+    for view, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+        shape = camera.height, camera.width, 3
+        if image is not None and (not isinstance(image, np.ndarray) or (image.shape, image.dtype) != (shape, np.uint8)):
+            found = f"{image.dtype} {list(image.shape)}" if isinstance(image, np.ndarray) else type(image).__name__
             raise ValueError(
-                f"step(): frame {frame} of view {camera.name!r} must be uint8 [{camera.height}, {camera.width}, 3], "
-                f"got {image.dtype} {list(image.shape)}."
+                f"step(): frame {frame} of view {camera.name or view!r} must be uint8 {list(shape)}, got {found}; "
+                "convert it."
             )
 
 
@@ -312,22 +321,27 @@ def prepare(
     masks: Sequence[np.ndarray | None] | None = None,
 ) -> Setup:
     """Return what all frames share; arguments and errors are those of `StreamLoop`."""
-    config = config or StreamConfig()
-    if not cameras:
-        raise ValueError("StreamLoop(): `cameras` must hold at least one view, got none.")
-    points, point_colors = np.reshape(points, (-1, 3)).copy(), np.reshape(point_colors, (-1, 3)).copy()
-    if points.shape != point_colors.shape:
+    config = StreamConfig() if config is None else config
+    check_type("StreamLoop()", "config", config, StreamConfig)
+    if not isinstance(cameras, Sequence) or not cameras:
+        found = f"a {type(cameras).__name__}" if cameras else "none"
+        raise ValueError(f"StreamLoop(): `cameras` must be a sequence of at least one view, got {found}; pass a list.")
+    for camera in cameras:
+        check_type("StreamLoop()", "cameras", camera, Camera)
+    points, point_colors = check_points("StreamLoop()", points, point_colors)
+    masks = (None,) * len(cameras) if masks is None else masks
+    if len(masks) != len(cameras):
         raise ValueError(
-            f"StreamLoop(): `point_colors` must be {points.shape} like `points`, got {point_colors.shape}."
+            f"StreamLoop(): `masks` must have one mask or None for each of {len(cameras)} views, got {len(masks)}; "
+            "pass None where all pixels are valid."
         )
-    if not np.isfinite(points).all():
-        raise ValueError(
-            f"StreamLoop(): `points` must be finite, point {np.argwhere(~np.isfinite(points))[0][0]} is not; "
-            "remove it from the model."
-        )
-    copies = (None,) * len(cameras) if masks is None else tuple(None if m is None else m.copy() for m in masks)
+    for view, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
+        if mask is not None:
+            check_mask(f"StreamLoop(): view {camera.name or view!r}", mask, camera.height, camera.width)
+    copies = tuple(None if mask is None else mask.copy() for mask in masks)
     key_views = choose_key_views(cameras, config.motion.key_views)
-    return Setup(tuple(cameras), copies, points, point_colors, key_views, scene_extent(cameras), config)
+    extent = scene_extent(cameras)
+    return Setup(tuple(cameras), copies, points.copy(), point_colors.copy(), key_views, extent, config)
 
 
 class StreamLoop:
@@ -348,7 +362,8 @@ class StreamLoop:
         ...     packet, report = loop.push(images)
 
     Raises:
-        ValueError: no cameras, or points that do not fit their colours.
+        ValueError: no cameras, points that are not finite, colours outside [0, 1] or of another shape, or a mask of
+            another shape than its view.
     """
 
     def __init__(
@@ -383,7 +398,7 @@ class StreamLoop:
         """
         state = StreamState()
         for images in frames:
-            seen = {view: image for view, image in enumerate(images) if image is not None}
+            seen = _copies(self.setup.cameras, images, coded.frame)
             changes = _changes(self.setup, state.references, seen)
             state = StreamState(coded.frame + 1, coded, seen, _references(self.setup, state, seen, changes))
         self.state = state

@@ -27,7 +27,7 @@ WITH_EXAMPLE = (
 
 def test_front_door__names_are_documented():
     for name in morgs_mi.__all__:
-        if name != "SH_C0":
+        if name not in ("SH_C0", "render_lock"):  # data, which has no docstring at run time
             assert inspect.getdoc(getattr(morgs_mi, name)), name
 
 

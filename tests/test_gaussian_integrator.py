@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import logging
+import re
 import subprocess
 import sys
+import textwrap
 from dataclasses import replace
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -14,6 +17,7 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, ellipsoids, rasterize
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
+from morgs_mi.io.ply import write_ply
 from tests import reference
 from tests import tolerances as tol
 from tests.assertions import assert_close
@@ -440,3 +444,33 @@ def test_gaussian_splat__refuses_films_other_than_rgb():
 def test_gaussian_splat__refuses_bad_props_when_the_scene_is_loaded(props, message):
     with pytest.raises(RuntimeError, match=message):
         mi.load_dict({"type": "gaussian_splat", **props})
+
+
+def test_ellipsoids__refuse_no_gaussians(raw):
+    with pytest.raises(ValueError, match="at least one Gaussian"):
+        ellipsoids(to_gaussians({name: value[:0] for name, value in raw.items()}))
+
+
+SCENE_FILE = """<scene version="3.0.0">
+    <integrator type="gaussian_splat"/>
+    <shape type="ellipsoids"><string name="filename" value="gaussians.ply"/></shape>
+    <sensor type="perspective">
+        <transform name="to_world"><lookat origin="0, 0, -3" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="16"/></film>
+    </sensor>
+</scene>"""
+
+
+def test_gaussian_splat__renders_a_scene_file_as_the_limits_describe(tmp_path, raw):
+    """The command `mitsuba` does not find the plugin; the Python command in docs/limits.md renders the same file."""
+    write_ply(tmp_path / "gaussians.ply", to_gaussians(raw))
+    (tmp_path / "scene.xml").write_text(SCENE_FILE)
+    page = (Path(__file__).parents[1] / "docs/limits.md").read_text(encoding="utf-8")
+    command = textwrap.dedent(re.findall(r"```bash\n(.*?)```", page, re.DOTALL)[0])
+    program = re.search(r'python -c "\n(.*?)"', command, re.DOTALL)[1]
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=tmp_path, timeout=120)
+    image = np.array(mi.Bitmap(str(tmp_path / "image.exr")))
+    assert image.shape[:2] == (16, 32)
+    expected = np.array(mi.render(mi.load_file(str(tmp_path / "scene.xml"))))
+    assert expected.max() > 0.1
+    assert_close(image[..., :3], expected[..., :3], atol=2e-3)  # half precision

@@ -46,9 +46,8 @@ VALUES: dict[str, Any] = {
     "motion.flow.fine_width": 32,
     "motion.propagation.floor_px": 10.0,
     "motion.propagation.min_logit": 2.5,
-    "motion.active_set.max_fraction": 0.1,
+    "motion.active_set.max_changed": 0.0,
     "render.stop_transmittance": 0.5,
-    "motion.active_set.min_cluster": 1,
     "motion.change.min_margin": 2,
     "render.alpha_max": 0.5,
     "render.block_width": 4,
@@ -58,7 +57,8 @@ VALUES: dict[str, Any] = {
 ELSEWHERE: dict[str, str] = {
     "render.reproducible": "changes the order of sums only: tests/render",
     "motion.flow.farneback": "a method that is not the default: tests/method/flow_sources",
-    "motion.active_set.min_unexplained": "no change here is unexplained: tests/method/test_active_set.py",
+    "motion.active_set.min_explained": "no change here is unexplained: tests/method/test_active_set.py",
+    "motion.active_set.min_cluster": "no change here is unexplained: tests/method/test_active_set.py",
     "motion.masks": "tests/method/test_confidence.py and tests/method/mask_refiners",
     "codec.keyframe_interval": "keyframes are written by the recorder: tests/test_recorder.py",
 }

@@ -266,7 +266,12 @@ def test_stream_capture__writes_a_file(clip, tmp_path):
     assert sum(r.num_bytes for r in reports) < path.stat().st_size
     assert ticks[-1] == (1, 16, 16)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["capture.json", "report.json", "stream.morgs"]
-    assert json.loads((tmp_path / "out" / "capture.json").read_text()) == {"layout": "in memory"}
+    about = json.loads((tmp_path / "out" / "capture.json").read_text())
+    assert about == {"layout": "in memory", "capture": str(capture.path)}
+
+
+def masked(masks):
+    return StreamLoop(cameras()[:4], [], [], masks=masks)
 
 
 @pytest.mark.parametrize(
@@ -277,11 +282,26 @@ def test_stream_capture__writes_a_file(clip, tmp_path):
         (lambda clip: new_loop().push([None] * 4), "frame 0 must have an image of at least one view, got none"),
         (lambda clip: new_loop().push([i[:50] for i in clip[0][:4]]), r"view 'cam00' must be uint8 \[72, 96, 3\]"),
         (lambda clip: new_loop().push([i / 255 for i in clip[0][:4]]), "got float64"),
-        (lambda clip: StreamLoop(cameras(), np.full((200, 3), np.nan), np.zeros((200, 3))), "point 0 is not"),
+        (
+            lambda clip: StreamLoop(cameras(), np.full((200, 3), np.nan), np.zeros((200, 3))),
+            r"`points` must be finite, got .* at 0",
+        ),
         (
             lambda clip: StreamLoop(cameras(), np.zeros((200, 3)), np.zeros((10, 3))),
-            r"`point_colors` must be \(200, 3\)",
+            r"`point_colors` must be \[200, 3\]",
         ),
+        (lambda clip: StreamLoop(cameras(), np.zeros((3, 4)), np.zeros((4, 3))), r"`points` must be \[P, 3\]"),
+        (
+            lambda clip: StreamLoop(cameras(), np.zeros((200, 3)), np.full((200, 3), 128)),
+            r"`point_colors` must be in \[0, 1\], got \[128, 128, 128\] at 0; divide colours of 8 bits by 255",
+        ),
+        (lambda clip: masked([None]), "one mask or None for each of 4 views, got 1"),
+        (lambda clip: masked([None, np.ones((50, 96), bool), None, None]), r"view 'cam01': the mask must be bool \[72"),
+        (lambda clip: masked([np.ones((72, 96), np.uint8), None, None, None]), "got uint8"),
+        (lambda clip: StreamLoop(["cam00"], [], []), "`cameras` must be a .*Camera, got a str"),
+        (lambda clip: StreamLoop(cameras(), [], [], {}), "`config` must be a .*StreamConfig, got a dict"),
+        (lambda clip: new_loop().push(None), "one image or None for each of 4 views, got a NoneType"),
+        (lambda clip: new_loop().push(["a", None, None, None]), "got str; convert it"),
         (lambda clip: FitConfig(epochs=0), "`epochs` must be at least 1, got 0"),
         (lambda clip: LearningRates(means=np.nan), "`means` must be finite and not negative, got nan"),
         (lambda clip: FitConfig(sh_degree=4), "`sh_degree` must be 0 to 3, got 4"),
@@ -348,3 +368,14 @@ def test_step__is_pure_and_complete(clip):
     again, _, _ = stream_loop.step(setup, first, clip[1][:4])
     assert again.frame == 2
     assert first.frame == 1
+
+
+def test_resume__copies_its_images_and_refuses_those_of_another_size(clip, full):
+    loop, buffers = new_loop(), [image.copy() for image in clip[0][:4]]
+    coded = full[0].state.coded
+    loop.resume(coded, [buffers])
+    for buffer in buffers:
+        buffer[:] = 0
+    assert all(np.array_equal(loop.state.images[view], clip[0][view]) for view in range(4))
+    with pytest.raises(ValueError, match=r"must be uint8 \[72, 96, 3\]"):
+        loop.resume(coded, [[image[:50] for image in buffers]])

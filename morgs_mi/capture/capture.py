@@ -22,6 +22,7 @@ from morgs_mi.capture.layouts.registry import find_layout
 from morgs_mi.capture.lens import undistortion
 from morgs_mi.capture.timeline import ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import check_points
 from morgs_mi.io.prefetch import prefetched
 from morgs_mi.io.video import Clip, FolderReader, FrameReader, ImageOrError, open_clips
 
@@ -98,13 +99,7 @@ class Capture:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        colors = self.point_colors
-        if colors.shape != self.points.shape or not ((colors >= 0) & (colors <= 1)).all():
-            span = f"{colors.min():g} to {colors.max():g}" if colors.size else "none"
-            raise ValueError(
-                f"{self.path}: the colours of the points must be {list(self.points.shape)} in [0, 1], got "
-                f"{list(colors.shape)}, {span}; divide by 255 if they are bytes, and export the points again."
-            )
+        check_points(str(self.path), self.points, self.point_colors)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -166,6 +166,32 @@ class Tracks:
 
 
 @dataclass(frozen=True)
+class Web:
+    """Write a web page that plays the stream without a server, or a folder for one."""
+
+    out: Positional[Path]
+    """Folder of a fit, or a stream file."""
+    output: Positional[Path | None] = None
+    """FILE.html, or with --folder a new folder; by default OUT/player.html or OUT/web."""
+    folder: bool = False
+    """Write a folder with the page and the stream as two files, for hosting."""
+    title: str | None = None
+    """Title of the page; by default the name of the stream's folder or file."""
+
+    def run(self) -> None:
+        from morgs_mi.export.clips import frame_numbers
+        from morgs_mi.export.web import write_web_folder, write_web_page
+        from morgs_mi.playback.player import open_stream
+
+        stream = open_stream(self.out)
+        output = self.output or stream.path.with_name("web" if self.folder else "player.html")
+        total, write = len(frame_numbers(stream)), write_web_folder if self.folder else write_web_page
+        with progress() as report:
+            size = write(stream, output, self.title, lambda done: report("Checking", done, total))
+        print_result(f"{output}: {total} frames, {size / 1e6:.2f} MB.")
+
+
+@dataclass(frozen=True)
 class Export:
     """Export a stream for other programs."""
 
@@ -173,7 +199,8 @@ class Export:
         Annotated[Ply, tyro.conf.subcommand("ply")]
         | Annotated[Gltf, tyro.conf.subcommand("gltf")]
         | Annotated[Flight, tyro.conf.subcommand("video")]
-        | Annotated[Tracks, tyro.conf.subcommand("tracks")],
+        | Annotated[Tracks, tyro.conf.subcommand("tracks")]
+        | Annotated[Web, tyro.conf.subcommand("web")],
         arg(name=""),
     ]
 

@@ -9,9 +9,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any
 
+import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike
 
+from morgs_mi.core.checks import check_number, check_size, numbers
 from morgs_mi.core.types import Tensor
 
 __all__ = ["Camera", "rigid"]
@@ -25,8 +27,9 @@ class Camera:
     """A pinhole camera in OpenCV's convention.
 
     Attributes:
-        K: intrinsics [3, 3] in pixels; an off-centre principal point is honoured.
-        viewmat: extrinsics [4, 4], world -> camera: a NumPy array, or a Dr.Jit tensor for gradients of the pose.
+        K: intrinsics [3, 3] in pixels, copied; an off-centre principal point is honoured.
+        viewmat: extrinsics [4, 4], world -> camera: a NumPy array, which is copied, or a Dr.Jit tensor for
+            gradients of the pose.
         width: image width in pixels.
         height: image height in pixels.
         name: in the capture, e.g. ``cam00``.
@@ -35,6 +38,10 @@ class Camera:
     Example:
         >>> camera = morgs_mi.Camera.look_at((0, -4, 1), (0, 0, 0), up=(0, 0, 1), fov_x=40, width=320, height=240)
         >>> pixels, depths = camera.project(points)
+
+    Raises:
+        ValueError: a size below 1x1, matrices of another shape or with numbers that are not finite, a focal length or
+            `near` that is not positive. A Dr.Jit `viewmat` is checked by `rasterize`.
     """
 
     K: np.ndarray
@@ -46,24 +53,31 @@ class Camera:
 
     def __post_init__(self) -> None:
         where = f"Camera({self.name!r})" if self.name else "Camera()"
-        if self.width < 1 or self.height < 1:
-            raise ValueError(
-                f"{where}: the image size must be at least 1x1, got {self.width}x{self.height}; check width and height."
-            )
-        K = np.asarray(self.K, dtype=np.float64)
+        check_size(where, self.width, self.height)
+        check_number(where, "near", self.near, "[1e-30, inf)")  # its reciprocal is a finite float32
+        K = numbers(where, "K", self.K).astype(np.float64)
         if K.shape != (3, 3):
             raise ValueError(f"{where}: `K` must be [3, 3], got {K.shape}; pass one camera's intrinsics.")
-        if tuple(self.viewmat.shape) != (4, 4):
+        viewmat = self.viewmat
+        if not isinstance(viewmat, dr.ArrayBase):
+            viewmat = numbers(where, "viewmat", viewmat).astype(np.float64)
+        if tuple(viewmat.shape) != (4, 4):
             raise ValueError(
-                f"{where}: `viewmat` must be [4, 4], got {tuple(self.viewmat.shape)}; pass one world-to-camera matrix."
+                f"{where}: `viewmat` must be [4, 4], got {tuple(viewmat.shape)}; pass one world-to-camera matrix."
             )
         if not np.isfinite(K).all() or not K[0, 0] > 0 or not K[1, 1] > 0:
             raise ValueError(
                 f"{where}: `K` must be finite with positive focal lengths, got {K.tolist()}; check the calibration."
             )
-        if isinstance(self.viewmat, np.ndarray) and not np.isfinite(self.viewmat).all():
-            raise ValueError(f"{where}: `viewmat` must be finite, got {self.viewmat.tolist()}; check the calibration.")
+        if isinstance(viewmat, np.ndarray) and not np.isfinite(viewmat).all():
+            raise ValueError(f"{where}: `viewmat` must be finite, got {viewmat.tolist()}; check the calibration.")
+        if K[0, 1] or K[1, 0] or not np.array_equal(K[2], (0, 0, 1)):
+            raise ValueError(
+                f"{where}: `K` must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; resample the images to "
+                "a camera without skew."
+            )
         object.__setattr__(self, "K", K)
+        object.__setattr__(self, "viewmat", viewmat)
 
     @classmethod
     def look_at(
@@ -77,14 +91,29 @@ class Camera:
         name: str = "",
         near: float = 0.01,
     ) -> Camera:
-        """Return the camera at `origin` [3] that looks at `target` [3]; `fov_x` in degrees across."""
-        forward = np.asarray(target, float) - np.asarray(origin, float)
+        """Return the camera at `origin` [3] that looks at `target` [3]; `fov_x` in degrees across, below 180.
+
+        Raises:
+            ValueError: `target` is at `origin` or above or below it in the direction of `up`, and as for `Camera`.
+        """
+        where = "Camera.look_at()"
+        check_size(where, width, height)
+        check_number(where, "fov_x", fov_x, "(0, 180)")
+        vectors = {}
+        for key, value in (("origin", origin), ("target", target), ("up", up)):
+            vectors[key] = numbers(where, key, value).astype(np.float64)
+            if vectors[key].shape != (3,):
+                raise ValueError(f"{where}: `{key}` must be [3], got {list(vectors[key].shape)}; pass x, y and z.")
+        forward = vectors["target"] - vectors["origin"]
+        right = np.cross(forward, vectors["up"])
+        if not np.linalg.norm(right) > 1e-12 * np.linalg.norm(forward) * np.linalg.norm(vectors["up"]):
+            found = ", ".join(f"{key} {value.tolist()}" for key, value in vectors.items())
+            raise ValueError(f"{where}: `up` must not be parallel to the direction of view, got {found}; tilt it.")
         forward /= np.linalg.norm(forward)
-        right = np.cross(forward, np.asarray(up, float))
         right /= np.linalg.norm(right)
         R = np.stack([right, np.cross(forward, right), forward])
         viewmat = np.eye(4)
-        viewmat[:3, :3], viewmat[:3, 3] = R, -R @ np.asarray(origin, float)
+        viewmat[:3, :3], viewmat[:3, 3] = R, -R @ vectors["origin"]
         f = 0.5 * width / np.tan(np.deg2rad(0.5 * fov_x))
         K = np.array([[f, 0, 0.5 * width], [0, f, 0.5 * height], [0, 0, 1.0]])
         return cls(K, viewmat, width, height, name, near)

@@ -8,7 +8,7 @@ activation in its name (`log_scales`, `logit_opacities`, `logit_confidence`). N 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import Protocol
 
 import drjit as dr
@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from morgs_mi.core.attributes import ATTRIBUTES, BY_ACTIVATED_NAME, sigmoid
+from morgs_mi.core.checks import numbers
+from morgs_mi.core.memory import float_tensor
 from morgs_mi.core.types import Float, Tensor, UInt32
 
 __all__ = ["ActivatedGaussians", "Gaussians", "join_sh", "repeat_each", "split_sh", "tensor_rows"]
@@ -101,24 +103,11 @@ class _RepeatEach(dr.CustomOp):
         return "morgs_mi.repeat_each"
 
 
-def _aligned_tensor(value: ArrayLike) -> Tensor:
-    """Return a NumPy array as a float tensor in memory that Dr.Jit owns.
-
-    Dr.Jit borrows NumPy's memory where it can. Packets of floats can be read from it only if it happens to be aligned,
-    and kernels would be compiled for both cases. Multiplying by an opaque 1 makes a copy.
-    """
-    tensor = mi.TensorXf(np.ascontiguousarray(value, dtype=np.float32))
-    if tensor.array.shape[0]:
-        tensor = tensor * dr.opaque(mi.Float, 1)  # pyright: ignore[reportOperatorIssue]
-        dr.eval(tensor)
-    return tensor
-
-
 @dataclass(frozen=True)
 class Gaussians:
     """N Gaussians as raw (optimisable) Dr.Jit tensors of the active Mitsuba variant.
 
-    NumPy arrays are converted. Quaternions are wxyz and need not be unit.
+    NumPy arrays are copied, Dr.Jit tensors are shared. Quaternions are wxyz and need not be unit.
 
     Attributes:
         means: centres [N, 3], world units.
@@ -135,7 +124,8 @@ class Gaussians:
         >>> image = morgs_mi.rasterize(gaussians, camera).color
 
     Raises:
-        ValueError: a shape that does not agree with `means`, or a K that is not 1, 4, 9 or 16.
+        ValueError: a shape that does not agree with `means`, a K that is not 1, 4, 9 or 16, or something else than
+            numbers.
     """
 
     means: Tensor
@@ -150,8 +140,12 @@ class Gaussians:
     def __post_init__(self) -> None:
         for f in fields(self):
             value = getattr(self, f.name)
-            if value is not None and not dr.is_tensor_v(value):
-                object.__setattr__(self, f.name, _aligned_tensor(value))
+            if value is not None or f.default is MISSING:
+                object.__setattr__(self, f.name, float_tensor("Gaussians()", f.name, value))
+        if len(self.means.shape) != 2:
+            raise ValueError(
+                f"Gaussians(): `means` must be [N, 3], got {tuple(self.means.shape)}; pass one row for each."
+            )
         N = len(self)
         for attribute in ATTRIBUTES:
             if attribute.activated_name == "sh_coeffs":  # two rows in one tensor, checked below
@@ -183,12 +177,25 @@ class Gaussians:
         sh_coeffs: ArrayLike,
         **more: ArrayLike,
     ) -> Gaussians:
-        """Return Gaussians with activated NumPy arrays: `scales` [N, 3] > 0 and `opacities` [N] in [0, 1].
+        """Return Gaussians with activated NumPy arrays: `scales` [N, 3] >= 0 and `opacities` [N] in [0, 1].
 
-        Opacities are clipped to [1e-6, 1 - 1e-6], as the logit is infinite at 0 and 1.
+        Scales are at least 1e-30, opacities are clipped to [1e-6, 1 - 1e-6]: the logarithm of 0 and the logits of 0 and
+        1 are infinite.
+
+        Raises:
+            ValueError: a scale or an opacity out of these ranges, and as for `Gaussians`.
         """
-        opacities = np.clip(np.asarray(opacities, np.float64), 1e-6, 1 - 1e-6)
-        log_scales = np.log(np.maximum(np.asarray(scales, np.float64), 1e-30))
+        place = "Gaussians.from_activated()"
+        opacities, scales = numbers(place, "opacities", opacities), numbers(place, "scales", scales)
+        for name, values, high in (("scales", scales, np.inf), ("opacities", opacities, 1)):
+            bad = np.argwhere((values < 0) | (values > high))
+            if len(bad):
+                raise ValueError(
+                    f"{place}: `{name}` must be {'at least 0' if high > 1 else 'in [0, 1]'}, got "
+                    f"{values[tuple(bad[0])]} at {bad[0].tolist()}; pass activated values, not logarithms or logits."
+                )
+        opacities = np.clip(opacities.astype(np.float64), 1e-6, 1 - 1e-6)
+        log_scales = np.log(np.maximum(scales.astype(np.float64), 1e-30))
         logits = np.log(opacities / (1 - opacities))
         return cls(means, log_scales, quats, logits, sh_coeffs, **more)
 
@@ -243,8 +250,8 @@ class Gaussians:
         return {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
 
     def numpy(self) -> dict[str, np.ndarray]:
-        """Return the raw attributes that are present as NumPy arrays."""
-        return {name: np.asarray(dr.detach(value)) for name, value in self.items().items()}
+        """Return copies of the raw attributes that are present, as NumPy arrays."""
+        return {name: np.array(dr.detach(value)) for name, value in self.items().items()}
 
     def detached(self) -> Gaussians:
         """Return the same values, detached from the gradient graph."""
@@ -266,8 +273,10 @@ class Gaussians:
         """Return the Gaussians of all `parts` in order.
 
         Raises:
-            ValueError: the parts have different attributes.
+            ValueError: there are no parts, or they have different attributes.
         """
+        if not parts:
+            raise ValueError("Gaussians.concatenate(): `parts` must hold at least one, got none; pass some Gaussians.")
         columns = [part.numpy() for part in parts]
         if any(column.keys() != columns[0].keys() for column in columns):
             raise ValueError(

@@ -14,6 +14,7 @@ from drjit.opt import Adam
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.density import plan_growth, resize_optimizer
@@ -108,7 +109,7 @@ def _add_band(optimizer: Adam, base: Gaussians) -> None:
     """Add the next SH band to the parameters, with its values in `base`."""
     rest = np.asarray(base.sh_coeffs)[:, 1:]
     if "sh_rest" not in optimizer:
-        optimizer["sh_rest"] = mi.TensorXf(np.ascontiguousarray(rest[:, :3]))
+        optimizer["sh_rest"] = from_numpy(mi.TensorXf, rest[:, :3])
         return
     known = np.asarray(dr.detach(optimizer["sh_rest"]))
     width = (round((known.shape[1] + 1) ** 0.5) + 1) ** 2 - 1
@@ -140,7 +141,7 @@ def fit_confidence(
         The Gaussians with the learned confidence, and the losses by name.
     """
     views = sorted(masks)
-    targets = {view: mi.TensorXf(masks[view].astype(np.float32)) for view in views}
+    targets = {view: from_numpy(mi.TensorXf, masks[view]) for view in views}
 
     def losses_at(values: Mapping[str, Tensor], k: int) -> dict[str, Tensor]:
         posed = replace(gaussians, logit_confidence=values["logit_confidence"])

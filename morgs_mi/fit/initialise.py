@@ -9,6 +9,7 @@ from scipy.spatial import KDTree
 
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import check_points
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 
@@ -35,18 +36,15 @@ def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int, opacity:
         opacity: of every Gaussian.
 
     Raises:
-        ValueError: no points, points that are not finite, or colours of another shape.
+        ValueError: no points, points that are not finite, or colours of another shape or outside [0, 1].
     """
-    points, colors = np.asarray(points, np.float64), np.asarray(colors, np.float64)
-    if points.ndim != 2 or points.shape[1:] != (3,) or not len(points) or points.shape != colors.shape:
-        raise ValueError(
-            f"from_points(): `points` and `colors` must be [P, 3] with P > 0, got {points.shape} and "
-            f"{colors.shape}; give a capture with SfM points, or seed some with seed_points()."
-        )
-    if not np.isfinite(points).all():
-        index = np.argwhere(~np.isfinite(points))[0].tolist()
-        raise ValueError(f"from_points(): `points` must be finite, got {points[tuple(index)]} at {index}.")
+    points, colors = (v.astype(np.float64) for v in check_points("from_points()", points, colors))
     n = len(points)
+    if not n:
+        raise ValueError(
+            "from_points(): `points` must be [P, 3] with P > 0, got none; give a capture with SfM points, or seed some "
+            "with seed_points()."
+        )
     neighbours = min(4, n)
     distance = KDTree(points).query(points, k=neighbours)[0].reshape(n, neighbours)[:, 1:]
     spacing = np.sqrt(np.mean(distance**2, axis=1)) if neighbours > 1 else np.ones(n)

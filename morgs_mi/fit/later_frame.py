@@ -11,6 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.density import apply_plan, plan_additions, resize_optimizer
@@ -134,7 +135,7 @@ def _on_active_views(problem: FrameProblem) -> dict[int, Observations]:
 
 
 def _tensor(array: np.ndarray, view: ActiveView) -> Tensor:
-    return mi.TensorXf(view.crop(array.astype(np.float32)))
+    return from_numpy(mi.TensorXf, view.crop(array))
 
 
 def _losses_at(

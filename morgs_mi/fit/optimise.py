@@ -10,7 +10,9 @@ import mitsuba as mi
 import numpy as np
 from drjit.opt import Adam
 
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
+from morgs_mi.render.recording import render_lock
 
 __all__ = ["Losses", "adam", "optimise", "replace_parameter", "values_of", "view_order"]
 
@@ -39,9 +41,9 @@ def replace_parameter(optimizer: Adam, name: str, value: np.ndarray, carry: Call
     """
     _, promoted, rate, (steps, first, second, largest) = optimizer.state[name]
     shape = tuple(optimizer[name].shape)
-    moments = [mi.Float(np.float32(carry(np.asarray(m).reshape(shape))).ravel()) for m in (first, second)]
+    moments = [from_numpy(mi.Float, carry(np.asarray(m).reshape(shape))) for m in (first, second)]
     dr.make_opaque(moments)
-    optimizer[name] = mi.TensorXf(np.ascontiguousarray(value, np.float32))
+    optimizer[name] = from_numpy(mi.TensorXf, value)
     state: Any = (optimizer.state[name][0], promoted, rate, (steps, *moments, largest))
     optimizer.state[name] = state
 
@@ -86,7 +88,8 @@ def optimise(
             optimizer.set_learning_rate({name: factor * rate for name, rate in scale.items()})
         losses = losses_at(optimizer, view)
         total: Tensor = sum(weights.get(name, 1.0) * loss for name, loss in losses.items())
-        dr.backward(total)
+        with render_lock:
+            dr.backward(total)
         optimizer.step()
         for name, loss in losses.items():
             history.setdefault(name, []).append(dr.detach(loss))

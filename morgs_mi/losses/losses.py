@@ -5,9 +5,12 @@ Every loss is a mean, over pixels or Gaussians, so that its weight does not depe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import drjit as dr
 import mitsuba as mi
 
+from morgs_mi.core.checks import check_number, check_type
 from morgs_mi.core.types import Float, Tensor
 from morgs_mi.losses.ssim import OnRegion, Target, WholeView
 from morgs_mi.render.region import Region
@@ -31,9 +34,9 @@ def recon_loss(image: Tensor, target: Target, dssim_weight: float = 0.2, region:
     Raises:
         ValueError: image and target differ in size.
     """
-    expected = tuple(target.shape if region is None else region.shape(3))
-    if tuple(image.shape) != expected:
-        raise ValueError(f"recon_loss(): `image` must be {expected} like its target, got {tuple(image.shape)}.")
+    check_type("recon_loss()", "target", target, Target)
+    check_number("recon_loss()", "dssim_weight", dssim_weight, "[0, 1]")
+    _check_shape("recon_loss()", "image", image, target.shape if region is None else region.shape(3))
     if region is None or region.whole:
         return dr.custom(WholeView, image.array, target, dssim_weight)
     if (region.height, region.width) != target.shape[:2]:
@@ -54,6 +57,10 @@ def flow_loss(motion: Tensor, target: Tensor, reliable: Tensor, num_pixels: int 
             little.
         num_pixels: of the whole view; None: those given.
     """
+    pixels = _shape_of(motion)[:-1]
+    _check_shape("flow_loss()", "motion", motion, (*pixels, 2))
+    _check_shape("flow_loss()", "target", target, (*pixels, 2))
+    _check_shape("flow_loss()", "reliable", reliable, pixels)
     lane = dr.arange(mi.UInt32, dr.width(motion) // 2) * 2
     x, y = (
         dr.gather(mi.Float, motion.array, lane + k, mode=dr.ReduceMode.NoConflicts)
@@ -66,6 +73,9 @@ def flow_loss(motion: Tensor, target: Tensor, reliable: Tensor, num_pixels: int 
 
 def mask_loss(confidence: Tensor, mask: Tensor, num_pixels: int | None = None) -> Tensor:
     """Return mean |M~ - M| of the rendered confidence [H, W, 1] and the motion mask [H, W] (eq. 11), as `flow_loss`."""
+    pixels = _shape_of(confidence)[:-1]
+    _check_shape("mask_loss()", "confidence", confidence, (*pixels, 1))
+    _check_shape("mask_loss()", "mask", mask, pixels)
     return _mean(dr.abs(confidence.array - mask.array), num_pixels)
 
 
@@ -77,7 +87,24 @@ def offset_loss(offset: Tensor, extent: float, num_gaussians: int | None = None)
         extent: of the scene, world units.
         num_gaussians: of the whole scene; None: those given.
     """
+    check_number("offset_loss()", "extent", extent, "(0, inf)")
+    _check_shape("offset_loss()", "offset", offset, (*_shape_of(offset)[:1], 3))
     return dr.sum(dr.abs(offset.array)) * dr.opaque(mi.Float, 1 / ((num_gaussians or int(offset.shape[0])) * extent))
+
+
+def _shape_of(tensor: Tensor) -> tuple[int, ...]:
+    """Return the shape of a tensor, and () for what is none, which `_check_shape` refuses."""
+    return tuple(getattr(tensor, "shape", ()))
+
+
+def _check_shape(place: str, name: str, tensor: Tensor, shape: Sequence[int]) -> None:
+    """Raise an error unless a tensor has a shape, none of whose sizes is 0."""
+    check_type(place, name, tensor, mi.TensorXf)
+    if tuple(tensor.shape) != tuple(shape) or 0 in shape:
+        raise ValueError(
+            f"{place}: `{name}` must be {list(shape)} with sizes above 0, got {list(tensor.shape)}; render and observe "
+            "the same pixels."
+        )
 
 
 def _mean(values: Float, count: int | None) -> Tensor:

@@ -23,6 +23,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.checks import check_mask
+from morgs_mi.core.memory import from_numpy, owned_copy
 from morgs_mi.core.types import Bool, Float, Int32, Jit, Tensor, UInt32
 from morgs_mi.losses.ssim_layout import (
     COLUMN,
@@ -37,12 +39,14 @@ from morgs_mi.losses.ssim_layout import (
 )
 from morgs_mi.render.backend import on_aligned_stack
 from morgs_mi.render.recording import recorded
-from morgs_mi.render.region import Region, owned_copy
+from morgs_mi.render.region import Region
 
 __all__ = ["OnRegion", "Target", "WholeView"]
 
 _Read = Callable[[Float], list[Float]]  # plane -> its numbers around the lane's row
 
+# Noise and rendered colours exceed [0, 1] by less, 8-bit values by more.
+_MARGIN = 1.0
 _C1, _C2 = 0.01**2, 0.03**2
 _WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
 _WINDOW = (_WINDOW / _WINDOW.sum()).astype(np.float32)
@@ -55,9 +59,15 @@ class Target:
     Args:
         image: [H, W, 3], RGB, uint8 or float in [0, 1], display-referred.
         mask: [H, W] bool; pixels that are False do not count. None: all pixels count.
+
+    Raises:
+        ValueError: an image of another shape or type, or that is not finite, or a mask of another shape or type.
     """
 
     def __init__(self, image: np.ndarray, mask: np.ndarray | None = None) -> None:
+        _check_image(image)
+        if mask is not None:
+            check_mask("Target()", mask, *image.shape[:2])
         pixels = image.astype(np.float32) / 255 if image.dtype == np.uint8 else image.astype(np.float32)
         self.shape: tuple[int, ...] = pixels.shape
         self.planes = Planes(*pixels.shape[:2])
@@ -73,7 +83,7 @@ class Target:
         self._layouts: dict[Region, tuple[UInt32, Bool, Runs, Runs]] = {}
 
     def _planes(self, image: np.ndarray) -> Float:
-        planes = self.planes.of(owned_copy(mi.Float(image.ravel())))
+        planes = self.planes.of(from_numpy(mi.Float, image))
         dr.eval(planes)
         return planes
 
@@ -103,6 +113,20 @@ class Target:
         if self.weight is None:
             return values
         return values * (self.weight if places is None else dr.gather(mi.Float, self.weight, places))
+
+
+def _check_image(image: np.ndarray) -> None:
+    if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        found = list(image.shape) if isinstance(image, np.ndarray) else type(image).__name__
+        raise ValueError(f"Target(): `image` must be [H, W, 3], got {found}; pass one RGB image.")
+    if image.dtype == np.uint8:
+        return
+    low, high = (image.min(), image.max()) if image.dtype.kind == "f" else (np.nan, np.nan)
+    if not (low >= -_MARGIN and high <= 1 + _MARGIN):
+        found = f"{image.dtype} from {low:g} to {high:g}" if image.dtype.kind == "f" else str(image.dtype)
+        raise ValueError(
+            f"Target(): `image` must be uint8, or floats in [0, 1], got {found}; divide 8-bit values by 255."
+        )
 
 
 def _blur(image: np.ndarray) -> np.ndarray:

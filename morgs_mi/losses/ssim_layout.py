@@ -14,8 +14,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Bool, Float, Int32, Jit, UInt32
-from morgs_mi.render.region import Region, owned_copy, quotient
+from morgs_mi.render.region import Region, quotient
 
 __all__ = ["COLUMN", "RADIUS", "STRIP", "Lanes", "Planes", "Runs", "packet_type", "read_packet", "write_packet"]
 
@@ -62,7 +63,7 @@ class Planes:
         self.size = 3 * self.num_columns * height * COLUMN * STRIP
 
     def of(self, image: Float) -> Float:
-        """Return the planes of a flat image [H * W * 3] in memory allocated by Dr.Jit (see `region.owned_copy`)."""
+        """Return the planes of a flat image [H * W * 3] in memory allocated by Dr.Jit (see `memory.owned_copy`)."""
         if self.width % STRIP == 0:
             target = dr.empty(mi.Float, self.size)
             strip, y, places = self._strips(self.num_columns * COLUMN)
@@ -116,7 +117,7 @@ class Planes:
         component = np.tile(np.arange(3), len(x) // 3)
         inside = (x < self.width) & (y < self.height)
         places = np.where(inside, _place(component, y, x, self.height, self.num_columns), 0)
-        return owned_copy(mi.UInt32(places)), owned_copy(mi.UInt32(inside)) != 0
+        return from_numpy(mi.UInt32, places), from_numpy(mi.UInt32, inside) != 0
 
     def runs(self, region: Region | None, reach: int) -> Runs:
         """Return the runs that cover a region, or the whole view, and `reach` <= 8 pixels around it."""
@@ -138,10 +139,10 @@ class Planes:
         x = np.tile(strip - 1, 3) * STRIP
         places = (_place(component, 0, x + k * STRIP, self.height, self.num_columns) // STRIP for k in (-1, 0, 1))
         lanes = Lanes(
-            tuple(owned_copy(mi.UInt32(place)) for place in places),  # pyright: ignore[reportArgumentType]
-            owned_copy(mi.Int32(np.tile(first, 3))),
-            owned_copy(mi.Int32(np.tile(end, 3))),
-            owned_copy(mi.UInt32(np.tile(columns, 3))),
+            tuple(from_numpy(mi.UInt32, place) for place in places),  # pyright: ignore[reportArgumentType]
+            from_numpy(mi.Int32, np.tile(first, 3)),
+            from_numpy(mi.Int32, np.tile(end, 3)),
+            from_numpy(mi.UInt32, np.tile(columns, 3)),
         )
         return Runs(lanes, 3 * int(((end - first) * columns).sum()))
 

@@ -1,12 +1,13 @@
 """The active set of a frame: the Gaussians that may change, and the pixels of the views where they are visible.
 
-A Gaussian is active if its responsibility for the changes of all views exceeds a threshold (see `responsibility`). A
-view is rendered where an active Gaussian is visible and where it changed, and skipped where neither is the case. All
-other Gaussians are static splats.
+A Gaussian is active if its responsibility for the changes of all views exceeds a threshold (see `responsibility`), or
+if it moved in the previous frame, so that its confidence can fall. A view is rendered where an active Gaussian is
+visible and where the image changed, and skipped where neither is the case. All other Gaussians are static splats.
 
 What appears in front of a static background changes another part of it in every view, so that no Gaussian is
 responsible. Where active Gaussians cover less than half of a connected change, all Gaussians on it are active that lie
-in it by more than half.
+in it by more than half. Where more than half of all pixels changed, all Gaussians are active: leaving out the others
+would cost more than it saves.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ __all__ = ["ActiveSet", "ActiveSetConfig", "find_active_set", "full_active_set",
 class ActiveSetConfig:
     """Settings of the selection, see the module."""
 
-    min_responsibility: float = 0.1
+    min_responsibility: float = 0.05
     """Responsibility above which a Gaussian is active."""
     min_weight: float = 1.0
     """Blend weight in changed blocks, summed over all views in px, below which a Gaussian counts as hidden."""
@@ -39,6 +40,8 @@ class ActiveSetConfig:
     """Fraction of a connected change that active Gaussians must cover to explain it."""
     min_cluster: int = 5
     """Side of the smallest square of unexplained pixels that counts, in px."""
+    max_changed: float = 0.5
+    """Fraction of all pixels above which all Gaussians are active."""
     core: float = 0.6
     """Half side of the box, as a fraction of the Gaussian's extent: two standard deviations of an opaque one, whose
     extent reaches the alpha cut-off at three and a third."""
@@ -102,6 +105,8 @@ def find_active_set(
         config: settings.
     """
     config = config or ActiveSetConfig()
+    if sum(c.mean() for c in changes.values()) > config.max_changed * len(cameras):
+        return full_active_set(gaussians, cameras, render)
     boxes = {view: boxes_around(gaussians, camera, render, config.core) for view, camera in cameras.items()}
     blame = responsibility(gaussians, cameras, changes, boxes, render, config.min_weight)
     active = blame.share > config.min_responsibility
@@ -131,9 +136,8 @@ def _unexplained(change: np.ndarray, covered: np.ndarray, config: ActiveSetConfi
     """Return the pixels [H, W] of the connected changes that a mask covers by less than half."""
     square = np.ones((config.min_cluster, config.min_cluster), np.uint8)
     clusters = cv2.morphologyEx(change.astype(np.uint8), cv2.MORPH_OPEN, square)
-    count, labels = cv2.connectedComponents(clusters)
-    size = np.bincount(labels.ravel(), minlength=count)
-    inside = np.bincount(labels.ravel(), covered.ravel(), minlength=count)
-    missing = inside < config.min_explained * size
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(clusters)
+    inside = np.bincount(labels[covered], minlength=count)
+    missing = inside < config.min_explained * stats[:, cv2.CC_STAT_AREA]
     missing[0] = False
     return missing[labels]

@@ -11,10 +11,10 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, UInt32
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.projection import project
-from morgs_mi.render.region import owned_copy
 
 __all__ = ["Boxes", "boxes_around"]
 
@@ -45,7 +45,7 @@ class Boxes:
     def covered(self, mask: np.ndarray) -> Float:
         """Return the number of pixels [N] of each box that a mask [H, W] covers."""
         pitch = dr.opaque(mi.UInt32, mask.shape[1] + 1)
-        table = owned_copy(mi.UInt32(cv2.integral(mask.astype(np.uint8)).astype(np.uint32).ravel()))
+        table = from_numpy(mi.UInt32, cv2.integral(mask.astype(np.uint8)))
 
         def sum_before(x: UInt32, y: UInt32) -> UInt32:
             return dr.gather(mi.UInt32, table, y * pitch + x)

@@ -4,14 +4,13 @@ Brightness and two differences of colours are compared, the latter at half the r
 averaged over a window, which averages out noise and keeps what is visible. A threshold follows from the noise: from
 that of the whole image, the median absolute deviation of the averaged change, which holds while most of the image is
 static and is bounded by a grey level; and from that of the surroundings, where it is larger, as in penumbrae of a path
-tracer. There, it is the median absolute deviation of the change minus its average over 3 x 3 pixels, which motion and
-shadows hardly contribute to.
+tracer. There, it is the median absolute deviation of mixed differences, (a - b) - (c - d) of 2 x 2 pixels, to which
+motion and shadows hardly contribute.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,9 +18,13 @@ import numpy as np
 __all__ = ["ChangeConfig", "box_around", "change_mask", "moving_region", "update_reference"]
 
 _GREY_LEVEL = 1 / 255
-# Brightness, red minus green, and yellow minus blue; the absolute weights of each sum to 1.
-_BRIGHTNESS = np.full((1, 3), 1 / 3, np.float32)
-_COLOR = np.array([[0.5, -0.5, 0], [0.25, 0.25, -0.5]], np.float32)
+# Standard deviations of normal noise in a median absolute deviation.
+_NORMAL = 1.4826
+# px: 5 x 5 groups of pixels, that far apart, are a sample of the noise that thin moving parts do not dominate.
+_NOISE_STEP = 4
+_SUM = np.ones((1, 3), np.float32)
+# Red minus green, and yellow minus blue; the absolute weights of each sum to 1.
+_COLORS = np.array([[0.5, -0.5, 0], [0.25, 0.25, -0.5]])
 
 
 @dataclass(frozen=True)
@@ -32,9 +35,6 @@ class ChangeConfig:
     """Side of the window over which changes of brightness are averaged, in px."""
     sigmas: float = 5.0
     """Threshold in standard deviations of the noise: normal noise exceeds 5 at less than one of 1.4 million pixels."""
-    noise_window: int = 31
-    """Side of the window in which the noise of the surroundings is estimated, in px: larger than thin moving parts,
-    which are no noise."""
     min_change: float = _GREY_LEVEL
     """Least threshold and bound of the noise of the whole image, of 1: a grey level."""
     min_margin: int = 24
@@ -57,14 +57,15 @@ def change_mask(
     config = config or ChangeConfig()
     H, W = before.shape[:2]
     if before.dtype == np.uint8 and after.dtype == np.uint8:
-        difference, unit = cv2.subtract(after, before, dtype=cv2.CV_16S).astype(np.float32), 255.0
+        difference, unit = cv2.subtract(after, before, dtype=cv2.CV_16S), _GREY_LEVEL
     else:
         difference, unit = np.subtract(after, before, dtype=np.float32), 1.0
-    mask = _exceeds_noise(cv2.transform(difference, _BRIGHTNESS) / unit, 1, config)
-    half = cv2.resize(difference, (max(W // 2, 1), max(H // 2, 1)), interpolation=cv2.INTER_AREA)
-    for channel in cv2.split(cv2.transform(half, _COLOR) / unit):
+    # Integers as long as possible: these images are large.
+    mask = _exceeds_noise(cv2.transform(difference, _SUM) * np.float32(unit / 3), 1, config)
+    half = cv2.resize(difference, (max(W // 2, 1), max(H // 2, 1)), interpolation=cv2.INTER_AREA).astype(np.float32)
+    for channel in cv2.split(cv2.transform(half, unit * _COLORS)):
         exceeds = _exceeds_noise(channel, 2, config).astype(np.uint8)
-        mask |= cv2.resize(exceeds, (W, H), interpolation=cv2.INTER_NEAREST) > 0
+        mask |= cv2.resize(exceeds, (W, H), interpolation=cv2.INTER_NEAREST).astype(bool)
     return mask if valid is None else mask & valid
 
 
@@ -73,25 +74,22 @@ def _exceeds_noise(change: np.ndarray, scale: int, config: ChangeConfig) -> np.n
     window = max(config.window // scale, 1) | 1
     # Zero padding: reflection would double the noise at the border.
     average = cv2.blur(change, (window, window), borderType=cv2.BORDER_CONSTANT)
-    sample = average.ravel()[:: max(1, average.size // 100_000)]
-    everywhere = min(_deviation(float(np.median(np.abs(sample - np.median(sample))))), config.min_change)
-    local = _noise_of_surroundings(change, scale, config) / window
-    return np.abs(average) > np.maximum(config.sigmas * np.maximum(local, everywhere), config.min_change)
+    sample = average.ravel()[:: max(1, average.size // 20_000)]
+    everywhere = min(_NORMAL * float(np.median(np.abs(sample - np.median(sample)))), config.min_change)
+    noise = np.maximum(_noise_of_surroundings(change, _NOISE_STEP // scale) / window, everywhere)
+    threshold = np.maximum(config.sigmas * noise, config.min_change).astype(np.float32)
+    return np.abs(average) > cv2.resize(threshold, change.shape[::-1])
 
 
-def _noise_of_surroundings(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
-    """Return the standard deviation [H, W] of the noise of single pixels."""
+def _noise_of_surroundings(change: np.ndarray, step: int) -> np.ndarray:
+    """Return the standard deviation of the noise of single pixels at one group of 2 x 2 pixels in `step` x `step`."""
     height, width = change.shape
-    # White noise keeps 8/9 of its variance.
-    noise = np.abs(change - cv2.blur(change, (3, 3)))[:: 2 // scale, :: 2 // scale] / np.sqrt(8 / 9)
-    levels = np.minimum(noise * (16 / _GREY_LEVEL), 255).astype(np.uint8)  # OpenCV's large medians are of bytes
-    median = cv2.medianBlur(levels, config.noise_window // 2 | 1).astype(np.float32)
-    return _deviation(cv2.resize(median, (width, height)) * (_GREY_LEVEL / 16))
-
-
-def _deviation(median: Any) -> Any:
-    """Return the standard deviation of normal noise with this median absolute deviation."""
-    return 1.4826 * median
+    change = change[: height // step * step, : width // step * step]
+    if not change.size:
+        return np.zeros((1, 1), np.float32)
+    a, b, c, d = (change[y::step, x::step] for y in (0, 1) for x in (0, 1))
+    median = cv2.medianBlur(np.abs(a - b - c + d) / 2, 5)
+    return _NORMAL * cv2.blur(median, (3, 3))
 
 
 def moving_region(change: np.ndarray, config: ChangeConfig | None = None) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -42,14 +43,20 @@ def initial_motion(
     if config.propagate_motion:
         views = {v: active.views[v] for v in sorted(flows.keys() & active.views.keys())}
         lifted = propagate_motion(gaussians, lifted, views, targets, rng, config.propagation)
-    return _only_changed(lifted, active, previous, config)
+    return replace(lifted, logit_confidence=_initial_confidence(lifted, active, previous, config))
 
 
-def _only_changed(lifted: Lift, active: ActiveSet, previous: Gaussians, config: MotionConfig) -> Lift:
-    """Return the start in which Gaussians do not move where the surface around them has hardly changed."""
+def _initial_confidence(lifted: Lift, active: ActiveSet, previous: Gaussians, config: MotionConfig) -> np.ndarray:
+    """Return the logits [M] that a frame's confidence starts from.
+
+    They are those of the previous frame, a little lower, or those of lifted flow where they are higher. What has hardly
+    changed has not moved, whatever the flow next to it.
+    """
+    logit = lifted.logit_confidence
+    if previous.logit_confidence is not None:
+        before = np.asarray(previous.logit_confidence)[active.indices]
+        logit = np.maximum(logit, before - np.float32(config.confidence_decay))
     if active.responsibility is None:
-        return lifted
+        return logit
     pooled = active.responsibility.pooled(np.asarray(previous.means), active.indices, config.changed_neighbours)
-    moves = pooled > config.min_changed
-    logit = np.where(moves, lifted.logit_confidence, -np.inf)
-    return Lift(lifted.displacement, logit.astype(np.float32))
+    return np.where(pooled > config.min_changed, logit, np.minimum(logit, -config.lift.max_logit))

@@ -11,11 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from math import inf
 from typing import Any
 
 import numpy as np
 
+from morgs_mi.core.checks import check_number
 from morgs_mi.core.types import Tensor
 from morgs_mi.losses.losses import flow_loss, mask_loss, offset_loss, recon_loss
 from morgs_mi.method.config import MotionConfig
@@ -57,8 +57,8 @@ class ObjectiveConfig:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if name.endswith("_weight") and not 0 <= value < inf:
-                raise ValueError(f"ObjectiveConfig(): `{name}` must be finite and not negative, got {value}.")
+            if name.endswith("_weight"):
+                check_number("ObjectiveConfig()", name, value, "[0, 1]" if name == "dssim_weight" else "[0, inf)")
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import mitsuba as mi
 import numpy as np
 from scipy.spatial import KDTree
 
@@ -75,7 +74,7 @@ def propagate_motion(
     means = np.asarray(previous.means)
 
     def error_of(d: np.ndarray) -> np.ndarray:
-        moved = replace(previous, means=mi.TensorXf(means + d))
+        moved = replace(previous, means=means + d)
         sums = np.sum([attribute_error(moved, views[view], targets[view]) for view in views], axis=0)
         return (sums[:, 0] + config.floor_px) / (sums[:, 1] + 1)
 

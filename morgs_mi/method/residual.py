@@ -20,6 +20,7 @@ import numpy as np
 
 from morgs_mi.core.attributes import ATTRIBUTES, BY_NAME, sigmoid
 from morgs_mi.core.gaussians import Gaussians, repeat_each
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.lift import Lift
@@ -52,15 +53,13 @@ def residual_parameters(previous: Gaussians, config: MotionConfig, start: Lift |
                 "`logit_confidence`, or switch the module off."
             )
         if start is not None and config.lift_confidence:
-            carried = np.maximum(start.logit_confidence, np.asarray(logit) - config.confidence_decay)
-            still = np.minimum(np.asarray(logit), -config.lift.max_logit)
-            logit = mi.TensorXf(np.where(np.isneginf(start.logit_confidence), still, carried))
+            logit = from_numpy(mi.TensorXf, start.logit_confidence)
         if displacement is not None:
             # The gate would shrink the displacement; a Gaussian that hardly moves may stay shrunk.
             displacement = displacement / np.maximum(np.asarray(sigmoid(logit.array)), config.min_gate)[:, None]
         parameters["logit_confidence"] = logit
     if displacement is not None:
-        parameters["motion"] = mi.TensorXf(displacement.astype(np.float32))
+        parameters["motion"] = from_numpy(mi.TensorXf, displacement)
     return parameters
 
 

@@ -8,16 +8,19 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float
 from morgs_mi.render.blocks import build_lists
 from morgs_mi.render.compositing import Channel, Layout, blend
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.projection import Splats, project
+from morgs_mi.render.recording import with_render_lock
 from morgs_mi.render.region import Region, full_view
 
 __all__ = ["backproject"]
 
 
+@with_render_lock
 def backproject(
     gaussians: ActivatedGaussians,
     camera: Camera,
@@ -31,7 +34,7 @@ def backproject(
     This is one pass of the renderer's channel adjoint with the image in place of a gradient.
 
     Args:
-        gaussians: N > 0 Gaussians.
+        gaussians: N Gaussians.
         camera: the view.
         image: [H, W, C], or on the region.
         config: cut-offs.
@@ -44,13 +47,16 @@ def backproject(
     Raises:
         ValueError: the size of the image differs from that of the camera or the region.
     """
-    config, C = config or RenderConfig(), image.shape[-1]
+    config, C = config or RenderConfig(), (np.shape(image) or (0,))[-1]
     region = region or full_view(camera.width, camera.height, config)
-    if image.shape != region.shape(C):
+    if not C or image.shape != region.shape(C):
+        size = ", ".join(map(str, region.shape(C)[:-1]))
         raise ValueError(
-            f"backproject(): `image` must be {list(region.shape(C))}, got {list(image.shape)}; "
-            "resize it to the camera, or crop it to the region."
+            f"backproject(): `image` must be [{size}, C] with C > 0, got {list(np.shape(image))}; resize it to the "
+            "camera, or crop it to the region."
         )
+    if not int(gaussians.means.shape[0]):
+        return np.zeros((0, C), np.float32)
     with dr.suspend_grad():
         splats = project(gaussians, camera, (), config)
         N = len(splats)
@@ -61,7 +67,7 @@ def backproject(
     dr.enable_grad(columns)
     layout = Layout((Channel(C, False),), False, False, config)
     (blended,) = blend(splats.shape, [tuple(columns)], region, lists, layout)
-    dr.set_grad(blended, mi.Float(np.ascontiguousarray(image, np.float32).ravel()))
+    dr.set_grad(blended, from_numpy(mi.Float, image))
     dr.enqueue(dr.ADMode.Backward, blended)
     dr.traverse(dr.ADMode.Backward)
     grads: list[Float] = [dr.grad(column) for column in columns]

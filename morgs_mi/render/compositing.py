@@ -118,7 +118,7 @@ def _padded(image: Float, region: Region, size: int) -> Float:
     if dr.width(image) != dr.prod(region.shape(size)):
         return dr.opaque(mi.Float, 0, total)
     if not region.whole or region.row == region.width:
-        # In memory allocated by Dr.Jit (see `region.owned_copy`); a product fuses with the kernel of the gradient.
+        # In memory allocated by Dr.Jit (see `memory.owned_copy`); a product fuses with the kernel of the gradient.
         return image * dr.opaque(mi.Float, 1)
     lane = dr.arange(mi.UInt32, total)
     row = quotient(lane, region.row * size)

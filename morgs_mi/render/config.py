@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from dataclasses import dataclass
+
+from morgs_mi.core.checks import check_number
 
 __all__ = ["RenderConfig"]
 
@@ -28,13 +31,22 @@ class RenderConfig:
     times as long (20k and 100k Gaussians, two cores), and 48 bytes for every pair of Gaussian and block."""
 
     def __post_init__(self) -> None:
-        if self.block_width not in (None, 4, 8, 12, 16):
+        check_number("RenderConfig()", "eps2d", self.eps2d, "[0, 1e18]")  # beyond that, float32 overflows
+        check_number("RenderConfig()", "alpha_max", self.alpha_max, "(0, 1)")
+        check_number("RenderConfig()", "alpha_min", self.alpha_min, f"(0, {self.alpha_max})")
+        check_number("RenderConfig()", "stop_transmittance", self.stop_transmittance, "[0, 1)")
+        if not _is_one_of(self.block_width, (4, 8, 12, 16)):
             raise ValueError(
-                f"RenderConfig(): `block_width` must be 4, 8, 12 or 16 px, got {self.block_width}; pixels are read and "
-                "written in packets of 4."
+                f"RenderConfig(): `block_width` must be 4, 8, 12 or 16 px, got {self.block_width!r}; pixels are "
+                "read and written in packets of 4."
             )
-        if self.block_height is not None and not 1 <= self.block_height <= 16:
+        if not _is_one_of(self.block_height, range(1, 17)):
             raise ValueError(
-                f"RenderConfig(): `block_height` must be 1 to 16 px, got {self.block_height}; the block's pixels are "
-                "unrolled."
+                f"RenderConfig(): `block_height` must be an integer from 1 to 16 px, got {self.block_height!r}; the "
+                "block's pixels are unrolled."
             )
+
+
+def _is_one_of(size: int | None, sizes: Container[int]) -> bool:
+    """Return whether a size is None, or an integer out of `sizes`: 8.0 and True are none."""
+    return size is None or (type(size) is int and size in sizes)

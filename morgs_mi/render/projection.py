@@ -21,10 +21,10 @@ from math import log2, sqrt
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians, tensor_rows
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Bool, Float, Jit, Tensor, UInt32
 from morgs_mi.render.channels import attribute_channels
 from morgs_mi.render.config import RenderConfig
@@ -166,7 +166,7 @@ def _pose(viewmat: Tensor) -> tuple[list[list[Float]], list[list[Float]], list[F
 
     All are width-1 Dr.Jit floats, attached to the gradient of a Dr.Jit `viewmat`.
     """
-    flat = mi.Float64(viewmat.array if dr.is_tensor_v(viewmat) else np.array(viewmat, np.float64).ravel())
+    flat = mi.Float64(viewmat.array) if dr.is_tensor_v(viewmat) else from_numpy(mi.Float64, viewmat)
     rows = [[dr.gather(mi.Float64, flat, mi.UInt32(4 * i + k)) for k in range(4)] for i in range(3)]
     eye = [-sum(row[k] * row[3] for row in rows) for k in range(3)]
     return [[mi.Float(v) for v in row[:3]] for row in rows], rows, eye
@@ -183,7 +183,7 @@ def _intrinsics(camera: Camera) -> list[Float]:
         margin = 0.15 * size / f  # 30 % of the half view on every side
         bounds += [-c / f - margin, (size - c) / f + margin]
     values = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.near, *bounds]
-    memory = mi.Float(np.array(values, np.float32))
+    memory = from_numpy(mi.Float, values)
     return [dr.gather(mi.Float, memory, mi.UInt32(i)) for i in range(len(values))]
 
 

@@ -11,7 +11,9 @@ import numpy as np
 
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import check_type, numbers
 from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
+from morgs_mi.core.memory import float_tensor, from_numpy, refuse_freezing
 from morgs_mi.core.types import Bool, Float, Tensor
 from morgs_mi.render.backend import block_shape
 from morgs_mi.render.blocks import build_lists, touches
@@ -19,7 +21,8 @@ from morgs_mi.render.channels import NORMALISED, attribute_channels, channel_siz
 from morgs_mi.render.compositing import Channel, Layout, blend
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.projection import Splats, concatenated, project
-from morgs_mi.render.region import Region, full_view, owned_copy
+from morgs_mi.render.recording import with_render_lock
+from morgs_mi.render.region import Region, full_view
 
 __all__ = ["Image", "rasterize"]
 
@@ -74,6 +77,7 @@ class Image:
         return Image(**{name: tensor for name, tensor in tensors.items() if name in names}, others=others)
 
 
+@with_render_lock
 def rasterize(
     gaussians: ActivatedGaussians,
     camera: Camera,
@@ -115,14 +119,19 @@ def rasterize(
         the gradients that remain are those of the full computation.
 
     Raises:
-        ValueError: an unknown channel, a channel whose attribute is missing, NaN or infinite attributes, a region of
-            another view or block shape.
+        ValueError: an unknown channel, a channel whose attribute is missing, NaN or infinite attributes or poses, a
+            region of another view or block shape, or a call inside a function under `dr.freeze`.
 
     Equal depths are blended in the order of the input. A quaternion of length 0 is the identity. Gaussians nearer than
     the camera's near plane or beyond 1e18 units, and those that overflow float32 once projected, are not drawn.
     There is no antialiasing beyond `eps2d`, and lens distortion is not removed.
+
+    Threads may share Gaussians; they render one after the other. Where one thread renders while another one computes
+    derivatives, hold `render_lock` around `dr.backward` and `dr.forward`: Dr.Jit 1.5 can deadlock otherwise.
     """
-    config = config or RenderConfig()
+    refuse_freezing("rasterize()")
+    config = RenderConfig() if config is None else config
+    _check_types(gaussians, camera, channels, detach_weights, region, static_splats, config)
     channels, sizes = tuple(dict.fromkeys(channels)), {**channel_sizes(), "alpha": 1}
     _check(gaussians, camera, channels, background, detach_weights)
     if features is not None:
@@ -142,7 +151,7 @@ def rasterize(
     if splats is None:
         return _empty(channels, sizes, background, region)
     dr.schedule(splats.shape, splats.channels, splats.depths, splats.extent, splats.valid)
-    _check_finite(splats.finite, gaussians, features)
+    _check_finite(splats.finite, gaussians, camera, features)
     values = [splats.channels[name] for name in blended]
     with dr.suspend_grad():
         lists = build_lists(splats, [column for columns in values for column in columns], region, config)
@@ -165,7 +174,7 @@ def _normalised(values: Float, weight: Float) -> Float:
 
 def _over(background: Sequence[float] | None) -> Callable[[Float, Float], Float]:
     """Return the function that composites a colour over the background."""
-    behind = mi.Float(np.array(background, np.float32))
+    behind = from_numpy(mi.Float, np.asarray(background))
     return lambda values, weight: dr.fma(
         1 - weight, dr.gather(mi.Float, behind, dr.arange(mi.UInt32, dr.width(weight)) % 3), values
     )
@@ -186,18 +195,12 @@ def _project_region(
         bare = project(detached, camera, (), config)
         visible = touches(bare, region)
         dr.schedule(visible)
-        _check_finite(bare.finite, gaussians, features)
+        _check_finite(bare.finite, gaussians, camera, features)
         if active is None:
             rows = [dr.compress(visible)]
         else:
-            active = mi.Bool(active)
-            N = int(gaussians.means.shape[0])
-            if dr.width(active) != N:
-                raise ValueError(
-                    f"rasterize(): `active` must be bool [N] with N={N}, got {dr.width(active)} values; pass one per "
-                    "Gaussian."
-                )
-            rows = [dr.compress(visible & active), dr.compress(visible & ~active)]
+            chosen = _checked_active(active, int(gaussians.means.shape[0]))
+            rows = [dr.compress(visible & chosen), dr.compress(visible & ~chosen)]
     parts = [
         project(some, camera, channels, config, index, blended)
         for some, blended, index in zip((gaussians, detached), (features, detached_features), rows, strict=False)
@@ -239,8 +242,8 @@ def _empty(
     """Return the image of no Gaussians."""
     images = {n: dr.zeros(mi.TensorXf, region.shape(sizes[n])) for n in channels}
     if background is not None and "color" in images:
-        behind = np.broadcast_to(np.array(background, np.float32), region.shape(3))
-        images["color"] = _tensor(mi.Float(behind.ravel()), region, 3)
+        behind = np.broadcast_to(background, region.shape(3))
+        images["color"] = _tensor(from_numpy(mi.Float, behind), region, 3)
     return Image._of(images)
 
 
@@ -253,6 +256,28 @@ def _check_region(region: Region, camera: Camera, config: RenderConfig) -> None:
             f"like the camera's and the config's, got {found[0]}x{found[1]} with {found[2]}x{found[3]}; build it for "
             "this camera with this config."
         )
+
+
+def _check_types(
+    gaussians: ActivatedGaussians,
+    camera: Camera,
+    channels: Sequence[str],
+    detach_weights: Sequence[str],
+    region: Region | None,
+    static_splats: Splats | None,
+    config: RenderConfig,
+) -> None:
+    if not hasattr(gaussians, "means"):
+        raise ValueError(f"rasterize(): `gaussians` must be Gaussians, got a {type(gaussians).__name__}; pass some.")
+    check_type("rasterize()", "camera", camera, Camera)
+    check_type("rasterize()", "config", config, RenderConfig)
+    if region is not None:
+        check_type("rasterize()", "region", region, Region)
+    if static_splats is not None:
+        check_type("rasterize()", "static_splats", static_splats, Splats)
+    for name, names in (("channels", channels), ("detach_weights", detach_weights)):
+        if isinstance(names, str) or not isinstance(names, Sequence):
+            raise ValueError(f"rasterize(): `{name}` must be a sequence of names, got {names!r}; pass a tuple.")
 
 
 def _check(
@@ -281,7 +306,9 @@ def _check(
                 f"rasterize(): channel {name!r} requires Gaussians with `{attribute.name}`, got none; set it or remove "
                 "the channel."
             )
-    if background is not None and not (np.shape(background) == (3,) and np.isfinite(background).all()):
+    if background is not None and not (
+        np.shape(background) == (3,) and np.isfinite(numbers("rasterize()", "background", background)).all()
+    ):
         raise ValueError(
             f"rasterize(): `background` must be three finite numbers, got {background!r}; pass a colour or None."
         )
@@ -294,11 +321,7 @@ def _check(
 
 def _checked_features(features: Tensor | np.ndarray, gaussians: ActivatedGaussians) -> tuple[Tensor, int]:
     """Return the features as a tensor [N, F], and F."""
-    features = (
-        features
-        if dr.is_tensor_v(features)
-        else mi.TensorXf(owned_copy(mi.Float(np.ravel(features))), np.shape(features))
-    )
+    features = float_tensor("rasterize()", "features", features)
     shape, N = tuple(features.shape), int(gaussians.means.shape[0])
     if len(shape) != 2 or shape[0] != N or not 1 <= shape[1] <= _MOST_FEATURES:
         raise ValueError(
@@ -308,20 +331,40 @@ def _checked_features(features: Tensor | np.ndarray, gaussians: ActivatedGaussia
     return features, shape[1]
 
 
-def _check_finite(finite: Bool, gaussians: ActivatedGaussians, features: Tensor | None) -> None:
-    """Raise an error if a projected Gaussian is not finite because its attributes are not."""
+def _checked_active(active: Bool | np.ndarray, N: int) -> Bool:
+    """Return the mask of the active Gaussians [N]."""
+    if isinstance(active, mi.Bool):
+        found = dr.width(active)
+    else:
+        values = numbers("rasterize()", "active", active)
+        found = values.shape[0] if values.ndim == 1 and values.dtype == bool else f"{values.dtype} {list(values.shape)}"
+    if found != N:
+        raise ValueError(
+            f"rasterize(): `active` must be bool [N] with N={N}, got {found} values; pass one per Gaussian."
+        )
+    return active if isinstance(active, mi.Bool) else from_numpy(mi.Bool, active)
+
+
+def _check_finite(finite: Bool, gaussians: ActivatedGaussians, camera: Camera, features: Tensor | None) -> None:
+    """Raise an error if a projected Gaussian is not finite because its attributes, or the pose, are not."""
     if dr.all(finite):
         return
     names = ["means", "scales", "quats", "opacities", "sh_coeffs", "motion"]
     names += [attribute.activated_name for attribute in attribute_channels().values()]
-    for name, value in {**{name: getattr(gaussians, name, None) for name in names}, "features": features}.items():
+    values = {"camera.viewmat": camera.viewmat, **{name: getattr(gaussians, name, None) for name in names}}
+    for name, value in {**values, "features": features}.items():
         if value is None:
             continue
         array = np.asarray(dr.detach(value))
         bad = np.argwhere(~np.isfinite(array))
         if len(bad):
             index = ", ".join(map(str, bad[0]))
+            remedy = (
+                "lower the learning rate"
+                if name == "camera.viewmat"
+                else "remove these Gaussians or lower the learning rate"
+            )
             raise ValueError(
                 f"rasterize(): `{name}` must be finite, got {array[tuple(bad[0])]} at "
-                f"[{index}] ({len(bad)} such values); remove these Gaussians or lower the learning rate."
+                f"[{index}] ({len(bad)} such values); {remedy}."
             )

@@ -1,51 +1,94 @@
-"""Recordings of traced functions (`dr.freeze`): tracing a long loop again costs several ms per call."""
+"""Recordings of traced functions (`dr.freeze`): tracing a long loop again costs several ms per call.
+
+In Dr.Jit 1.5 they are not safe with threads. A recording is replayed into memory of its own, so that two replays at
+once end the process. While Dr.Jit inspects the arguments, it holds a lock that `dr.backward` in another thread waits
+for, and waits for one that `dr.backward` holds: a deadlock. All recordings, and all derivatives that the package
+computes, hold `render_lock` therefore.
+"""
 
 from __future__ import annotations
 
 import gc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import cache
-from typing import Any
+from dataclasses import is_dataclass
+from functools import cache, partial, wraps
+from threading import RLock
+from typing import Any, ParamSpec, TypeVar
 
 import drjit as dr
 import mitsuba as mi
 
 from morgs_mi.core.types import Jit
 
-__all__ = ["recorded"]
+__all__ = ["recorded", "render_lock", "with_render_lock"]
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 _MOST_RECORDINGS = 500
 
+render_lock = RLock()
+"""Lock of the renderer, which a thread may take more than once.
+
+`rasterize` and all that fits Gaussians take it. Hold it around `dr.backward` and `dr.forward` if another thread renders
+meanwhile.
+"""
+
+
+def with_render_lock(function: Callable[P, R]) -> Callable[P, R]:
+    """Return the function holding `render_lock` while it runs."""
+
+    @wraps(function)
+    def locked(*args: P.args, **kwargs: P.kwargs) -> R:
+        with render_lock:
+            return function(*args, **kwargs)
+
+    return locked
+
 
 def recorded(function: Callable[..., Jit], *static: Any) -> Callable[..., Jit]:
-    """Return a recording of `function` with its first arguments fixed to `static`; the others are Dr.Jit arrays.
+    """Return a recording of `function` with its first arguments fixed to `static`.
 
-    There is one recording per variant and `static`. Arguments that are not arrays must be in `static`: Dr.Jit 1.5
-    distinguishes other arguments by a hash in which two booleans can cancel. Sizes inside a recording are those of its
-    arguments, or static: `dr.empty` and similar functions need a static size.
+    The other arguments are Dr.Jit arrays, or dataclasses of them. There is one recording per variant and `static`.
+    Arguments that are not arrays must be in `static`: Dr.Jit 1.5 distinguishes other arguments by a hash in which two
+    booleans can cancel. Sizes inside a recording are those of its arguments, or static: `dr.empty` and similar
+    functions need a static size.
     """
-    return _recorded(function, mi.variant(), static)
 
-
-@cache
-def _recorded(function: Callable[..., Jit], variant: str, static: tuple[Any, ...]) -> Callable[..., Jit]:
-    # A long fit meets new combinations of sizes again and again; the least used recordings are evicted.
-    recording = dr.freeze(lambda *arrays: function(*static, *arrays), limit=_MOST_RECORDINGS, warn_after=2**31 - 1)
-
-    def call(*arrays: Jit) -> Jit:
-        with _garbage_collection_off():
-            return recording(*arrays)
+    def call(*arguments: Any) -> Jit:
+        classes = tuple(type(a) if is_dataclass(a) else None for a in arguments)
+        # Dr.Jit holds its own lock while it inspects the arguments. For a dataclass that runs Python code, in which
+        # another thread can get the interpreter's lock and then wait for Dr.Jit's: a deadlock.
+        plain = [vars(a) if c else a for a, c in zip(arguments, classes, strict=True)]
+        with render_lock, _garbage_collection_off():
+            return _recording(function, mi.variant(), static, classes)(*plain)
 
     return call
 
 
+@cache
+def _recording(
+    function: Callable[..., Jit], variant: str, static: tuple[Any, ...], classes: tuple[type | None, ...]
+) -> Callable[..., Jit]:
+    # Dr.Jit also inspects the variables of a closure; what is in a `partial` it compares by identity.
+    rebuilt = partial(_rebuilt, function, static, classes)
+    # A long fit meets new combinations of sizes again and again; the least used recordings are evicted.
+    return dr.freeze(lambda *plain: rebuilt(plain), limit=_MOST_RECORDINGS, warn_after=2**31 - 1)
+
+
+def _rebuilt(
+    function: Callable[..., Jit], static: tuple[Any, ...], classes: tuple[type | None, ...], plain: tuple[Any, ...]
+) -> Jit:
+    """Return the result of `function` for arguments of which the dataclasses have become dicts."""
+    return function(*static, *(c(**a) if c else a for a, c in zip(plain, classes, strict=True)))
+
+
 @contextmanager
 def _garbage_collection_off() -> Iterator[None]:
-    """Switch off Python's garbage collection in all threads meanwhile.
+    """Switch off Python's garbage collection meanwhile.
 
-    Dr.Jit 1.5 inspects a recording's arguments with Python code while it holds its own lock. Another thread that
-    collects arrays at that moment waits for that lock while it holds the interpreter's: a deadlock.
+    An array that is collected while Dr.Jit inspects the arguments waits for Dr.Jit's lock forever.
     """
     enabled = gc.isenabled()
     gc.disable()

@@ -12,11 +12,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.core.types import Float, Int32, UInt32
+from morgs_mi.core.checks import check_type
+from morgs_mi.core.memory import from_numpy
+from morgs_mi.core.types import Float, UInt32
 from morgs_mi.render.backend import block_shape
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["ACROSS", "DOWN", "NO_SLOT", "Region", "full_view", "owned_copy", "quotient"]
+__all__ = ["ACROSS", "DOWN", "NO_SLOT", "Region", "full_view", "quotient"]
 
 # Blocks of a tile, across and down: one for each bit of a word.
 ACROSS, DOWN = 4, 8
@@ -45,6 +47,7 @@ class Region:
     """
 
     def __init__(self, mask: np.ndarray, config: RenderConfig | None = None) -> None:
+        check_type("Region()", "mask", mask, np.ndarray)
         if mask.ndim != 2 or mask.dtype != bool or not mask.any():
             found = f"{mask.dtype} {mask.shape}" if mask.ndim != 2 or mask.dtype != bool else "none"
             raise ValueError(
@@ -106,11 +109,11 @@ class Region:
             "tile_table": _summed_area(active.any(1).reshape(self.down, self.across)),
         }
         for name, values in arrays.items():
-            setattr(self, name, owned_copy(mi.UInt32(np.asarray(values, np.uint32))))
-        self.corner_x = owned_copy(mi.Float(np.float32(tiles % self.across * (ACROSS * bw))))
-        self.corner_y = owned_copy(mi.Float(np.float32(tiles // self.across * (DOWN * bh))))
+            setattr(self, name, from_numpy(mi.UInt32, values))
+        self.corner_x = from_numpy(mi.Float, tiles % self.across * (ACROSS * bw))
+        self.corner_y = from_numpy(mi.Float, tiles // self.across * (DOWN * bh))
         inside = None if whole else self.inside()
-        self.weights = None if inside is None or inside.all() else owned_copy(mi.Float(np.float32(inside).ravel()))
+        self.weights = None if inside is None or inside.all() else from_numpy(mi.Float, inside)
 
     def shape(self, channels: int) -> tuple[int, ...]:
         """Return the shape of an image with `channels` floats per pixel on this region."""
@@ -150,18 +153,6 @@ class Region:
 def _summed_area(grid: np.ndarray) -> np.ndarray:
     """Return the number of set cells left of and above every corner of a grid [R, C], flat [(R + 1) (C + 1)]."""
     return np.pad(grid, ((1, 0), (1, 0))).cumsum(0).cumsum(1).ravel()
-
-
-def owned_copy(values: Float | UInt32 | Int32) -> Float | UInt32 | Int32:
-    """Return an evaluated copy in memory that Dr.Jit has allocated.
-
-    Dr.Jit borrows NumPy's memory where it can. Packets cannot be read from there unless it happens to be aligned, and
-    kernels would be compiled for both cases; a gather works in either. The opaque 0 prevents its removal by the
-    optimiser.
-    """
-    copy = dr.gather(type(values), values, dr.arange(mi.UInt32, dr.width(values)) + dr.opaque(mi.UInt32, 0))
-    dr.eval(copy)
-    return copy
 
 
 def quotient(lane: UInt32, divisor: int) -> UInt32:

@@ -267,14 +267,14 @@ def test_load_capture__refuses_point_colours_out_of_range(tmp_path: Path, colors
     (row,) = (line for line in (path / "sparse/0/points3D.txt").read_text().splitlines() if line[0] != "#")
     fields = [*row.split()[:4], *map(str, colors[0]), "0.5"]
     (path / "sparse/0/points3D.txt").write_text(" ".join(fields) + "\n")
-    with pytest.raises(ValueError, match=r"the colours of the points must be .* in \[0, 1\], got .*; divide by 255"):
+    with pytest.raises(ValueError, match=r"`point_colors` must be in \[0, 1\], got .*; divide"):
         load_capture(path)
 
 
 def test_load_capture__does_not_clip_the_colours_of_a_point_cloud(tmp_path: Path) -> None:
     path = layouts.dynamic3dgs(tmp_path / "a")
     np.savez(path / "init_pt_cld.npz", data=[[1, 2, 3, 128, 255, 0, 1]])
-    with pytest.raises(ValueError, match=r"in \[0, 1\], got \[1, 3\], 0 to 255; divide by 255"):
+    with pytest.raises(ValueError, match=r"in \[0, 1\], got \[128.0, 255.0, 0.0\] at 0; divide"):
         load_capture(path)
 
 

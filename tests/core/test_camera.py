@@ -67,3 +67,53 @@ def test_projection_jacobian__agrees_with_central_differences(camera):
         np.testing.assert_allclose(J[:, :, k], difference, rtol=1e-6, atol=1e-6)
     behind = camera.unproject(np.zeros((1, 2)), np.array([-1.0]))
     assert not camera.projection_jacobian(behind).any()
+
+
+K, VIEWMAT = np.array([[40.0, 0, 16], [0, 40, 8], [0, 0, 1]]), np.eye(4)
+
+
+def test_camera__copies_its_matrices():
+    intrinsics, viewmat = K.copy(), VIEWMAT.copy()
+    camera = Camera(intrinsics, viewmat, 32, 16)
+    intrinsics[:], viewmat[:] = 7, 7
+    np.testing.assert_array_equal(camera.K, K)
+    np.testing.assert_array_equal(camera.viewmat, VIEWMAT)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"near": np.nan}, r"`near` must be a number in \[1e-30, inf\), got nan"),
+        ({"near": np.inf}, "`near` must be a number"),
+        ({"near": 0}, "`near` must be a number"),
+        ({"near": "1"}, "`near` must be a number"),
+        ({"width": 8.5}, "at least 1x1 in integers, got 8.5x16"),
+        ({"height": 0}, "at least 1x1 in integers, got 32x0"),
+        ({"K": "K"}, "`K` must be an array of real numbers, got 'K'"),
+        ({"K": np.eye(2)}, r"`K` must be \[3, 3\]"),
+        ({"K": K + np.eye(3, k=1)}, "a camera without skew"),
+        ({"K": -K}, "positive focal lengths"),
+        ({"viewmat": None}, "`viewmat` must be an array of real numbers, got None"),
+        ({"viewmat": VIEWMAT[:3]}, r"`viewmat` must be \[4, 4\]"),
+        ({"viewmat": VIEWMAT * np.nan}, "`viewmat` must be finite"),
+        ({"viewmat": VIEWMAT * 1j}, "got complex128"),
+    ],
+)
+def test_camera__refuses_bad_input(change, message):
+    with pytest.raises(ValueError, match=message):
+        Camera(**{"K": K, "viewmat": VIEWMAT, "width": 32, "height": 16, **change})
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"target": (0, -3, 0)}, "`up` must not be parallel"),
+        ({"up": (0, 1, 0)}, "`up` must not be parallel"),
+        ({"origin": (0, 0)}, r"`origin` must be \[3\], got \[2\]"),
+        ({"fov_x": 180}, r"`fov_x` must be a number in \(0, 180\), got 180"),
+    ],
+)
+def test_look_at__refuses_bad_input(change, message):
+    view = {"origin": (0, -3, 0), "target": (0, 0, 0), "up": (0, 0, 1), "fov_x": 40, "width": 8, "height": 8}
+    with pytest.raises(ValueError, match=message):
+        Camera.look_at(**{**view, **change})

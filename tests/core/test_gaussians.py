@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -42,5 +43,44 @@ def test_gaussians__refuse_shapes_that_disagree_and_unknown_attributes():
         Gaussians(**{**raw, "quats": raw["quats"][:4]})
     with pytest.raises(ValueError, match="K in 1, 4, 9, 16"):
         Gaussians(**{**raw, "sh_coeffs": raw["sh_coeffs"][:, :2]})
+    for means in (np.zeros(3), 0.0):
+        with pytest.raises(ValueError, match=r"`means` must be \[N, 3\]"):
+            Gaussians(**{**raw, "means": means})
+    for means in (None, "abc", [[1, 2], [3]], np.zeros((5, 3), complex)):
+        with pytest.raises(ValueError, match="`means` must be an array of real numbers"):
+            Gaussians(**{**raw, "means": means})
+    with pytest.raises(ValueError, match="must be a NumPy array or a drjit"):
+        Gaussians(**{**raw, "logit_opacities": mi.Float(np.zeros(5))})
+    with pytest.raises(ValueError, match="must hold at least one"):
+        Gaussians.concatenate([])
     with pytest.raises(AttributeError, match="no attribute 'roughness'"):
         _ = cloud(0).roughness
+
+
+def test_gaussians__are_not_changed_by_later_writes_to_their_arrays():
+    """One buffer per attribute is refilled for each of five frames, so large that kernels run while it is written."""
+    N = 200_000
+    shapes = {"means": (3,), "log_scales": (3,), "quats": (4,), "logit_opacities": (), "sh_coeffs": (1, 3)}
+    buffers = {name: np.zeros((N, *shape), np.float32) for name, shape in shapes.items()}
+    frames = []
+    for frame in range(5):
+        for buffer in buffers.values():
+            buffer[:] = frame
+        frames.append(Gaussians(**buffers))
+    for name in shapes:
+        assert [np.unique(np.asarray(getattr(g, name))).tolist() for g in frames] == [[k] for k in range(5)], name
+
+
+def test_numpy__returns_copies():
+    gaussians = cloud(0)
+    gaussians.numpy()["means"][:] = 7
+    assert not (np.asarray(gaussians.means) == 7).any()
+
+
+@pytest.mark.parametrize(("name", "value"), [("scales", -1), ("opacities", -0.1), ("opacities", 1.5)])
+def test_from_activated__refuses_values_that_are_not_activated(name, value):
+    values = {"means": (3,), "scales": (3,), "quats": (4,), "opacities": (), "sh_coeffs": (1, 3)}
+    values = {name: np.full((2, *shape), 0.5) for name, shape in values.items()}
+    values[name][1] = value
+    with pytest.raises(ValueError, match=rf"`{name}` must be .*, got {value}.* at \[1"):
+        Gaussians.from_activated(**values)

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.method.change import box_around, change_mask, update_reference
+from morgs_mi.method.change import box_around, change_mask, moving_region, update_reference
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.registry import FramePair
 
@@ -47,6 +47,42 @@ def test_change_mask__covers_an_image_without_static_pixels():
     rng = np.random.default_rng(5)
     noise = cv2.resize(rng.integers(0, 255, (15, 20, 3), np.uint8), (W, H), interpolation=cv2.INTER_NEAREST)
     assert change_mask(noise, np.roll(noise, 8, axis=1)).mean() > 0.8
+
+
+def test_change_mask__ignores_noise_that_is_larger_in_some_places():
+    """As in a penumbra of a path tracer: 20 grey levels in a part of the image, 3 elsewhere."""
+    rng = np.random.default_rng(6)
+    noise = np.where((np.mgrid[:H, :W][1] > 100)[..., None], 20, NOISE)
+    before, after = (np.clip(128 + rng.normal(0, 1, (H, W, 3)) * noise, 0, 255).astype(np.uint8) for _ in range(2))
+    assert change_mask(before, after).mean() < 0.005
+
+
+def test_change_mask__finds_a_change_of_colour_alone():
+    rng = np.random.default_rng(7)
+    before, after = noisy_image(rng), noisy_image(rng)
+    after[40:60, 50:80] = np.clip(after[40:60, 50:80] + np.array([12, -12, 0]), 0, 255)
+    found = change_mask(before, after)
+    assert found[42:58, 52:78].all()
+    assert not found[:34].any()
+
+
+def test_change_mask__takes_floats_like_bytes():
+    rng = np.random.default_rng(8)
+    before, after = noisy_image(rng), noisy_image(rng, disc=(70, 50))
+    floats = change_mask(before / np.float32(255), after / np.float32(255))
+    assert np.mean(floats != change_mask(before, after)) < 0.01
+
+
+def test_moving_region__includes_what_changes_enclose():
+    """An outline with a gap of 3 px, and an arc that encloses nothing."""
+    change = np.zeros((H, W), np.uint8)
+    cv2.rectangle(change, (20, 20), (60, 50), 1, 2)
+    change[30:33, 15:25] = 0
+    cv2.line(change, (100, 20), (100, 90), 1, 2)
+    found = moving_region(change.astype(bool))
+    assert found[22:49, 22:59].all()
+    assert not found[:, 105:].any()
+    assert not found[60:, :95].any()
 
 
 def test_update_reference__detects_slow_changes_once_they_add_up():
@@ -91,3 +127,22 @@ def test_observe_key_views__flow_in_a_box_equals_that_of_the_whole_image(with_ma
     assert outside.any()
     assert not found[1].reliable[outside].any()
     assert not found[1].motion[outside].any()
+
+
+def test_observe_key_views__what_has_not_changed_has_not_moved():
+    """Flow bleeds over the edges of a patch that moves by 6 px before a plain wall."""
+    rng = np.random.default_rng(9)
+    before, after = np.full((2, H, W, 3), 120, np.uint8)
+    patch = cv2.resize(rng.integers(0, 255, (8, 8, 3), np.uint8), (32, 32), interpolation=cv2.INTER_CUBIC)
+    before[34:66, 54:86], after[34:66, 60:92] = patch, patch
+    region = moving_region(change_mask(before, after))
+    observed = {
+        name: observe_key_views({0: FramePair(after, before, region=r)})[0]
+        for name, r in (("plain", None), ("with region", region))
+    }
+    assert np.linalg.norm(observed["plain"].motion[~region], axis=-1).max() > 1
+    found = observed["with region"]
+    assert not found.motion[~region].any()
+    assert not found.forward_flow[~region].any()
+    assert found.reliable[~region].all()
+    assert np.median(found.motion[40:60, 66:86], axis=(0, 1)) == pytest.approx((6, 0), abs=0.2)

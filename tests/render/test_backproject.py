@@ -33,5 +33,5 @@ def test_backproject__of_ones_sums_to_alpha():
 
 
 def test_backproject__refuses_an_image_of_another_size():
-    with pytest.raises(ValueError, match=r"`image` must be \[18, 21, 1\], got \[4, 5, 1\]"):
+    with pytest.raises(ValueError, match=r"`image` must be \[18, 21, C\] with C > 0, got \[4, 5, 1\]"):
         backproject(to_gaussians(make_scene()), make_camera(), np.zeros((4, 5, 1), np.float32))

@@ -324,15 +324,94 @@ def test_rasterize__refuses_bad_arguments(scene):
             rasterize(to_gaussians(bare), camera, (channel,))
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"gaussians": None}, "`gaussians` must be Gaussians, got a NoneType"),
+        ({"camera": None}, "`camera` must be a .*Camera, got a NoneType"),
+        ({"channels": "color"}, "`channels` must be a sequence of names, got 'color'"),
+        ({"detach_weights": "color"}, "`detach_weights` must be a sequence of names"),
+        ({"region": "all"}, "`region` must be a .*Region, got a str"),
+        ({"static_splats": "all"}, "`static_splats` must be a .*Splats"),
+        ({"config": {}}, "`config` must be a .*RenderConfig, got a dict"),
+        ({"active": np.arange(10)}, r"`active` must be bool \[N\] with N=10, got int64 \[10\]"),
+        ({"active": np.ones(9, bool)}, r"`active` must be bool \[N\] with N=10, got 9"),
+        ({"background": "red"}, "`background` must be three finite numbers"),
+        ({"features": "all"}, "`features` must be an array of real numbers"),
+        ({"features": mi.Float(1)}, "`features` must be a NumPy array or a"),
+    ],
+)
+def test_rasterize__refuses_arguments_of_another_type(scene, arguments, message):
+    raw, camera = scene
+    with pytest.raises(ValueError, match=message):
+        rasterize(**{"gaussians": to_gaussians(raw), "camera": camera, **arguments})
+
+
+@pytest.mark.parametrize("on_region", [False, True])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_rasterize__refuses_a_pose_that_is_not_finite(scene, value, on_region):
+    raw, camera = scene
+    viewmat = np.float32(camera.viewmat)
+    viewmat[2, 3] = value
+    posed = replace(camera, viewmat=mi.TensorXf(viewmat))
+    region = Region(np.ones((camera.height, camera.width), bool)) if on_region else None
+    with pytest.raises(ValueError, match=rf"`camera.viewmat` must be finite, got {value} at \[2, 3\]"):
+        rasterize(to_gaussians(raw), posed, region=region)
+
+
+def test_rasterize__refuses_to_be_frozen(scene):
+    """Dr.Jit would end the process."""
+    raw, camera = scene
+    gaussians = to_gaussians(raw)
+    frozen = dr.freeze(lambda means: rasterize(replace(gaussians, means=means), camera).color)
+    with pytest.raises(RuntimeError) as error:
+        frozen(gaussians.means)
+    assert "rasterize(): expected a call outside dr.freeze" in str(error.value.__cause__)
+
+
+def test_rasterize__copies_masks_and_features_before_it_returns(scene):
+    raw, camera = scene
+    active, features, background = np.arange(10) < 5, np.ones((10, 2), np.float32), np.full(3, 0.5)
+    images = []
+    for overwritten in (False, True):
+        gaussians = to_gaussians(raw, grad=True)
+        arguments = [array.copy() for array in (active, features, background)]
+        image = rasterize(
+            gaussians, camera, ("color",), active=arguments[0], features=arguments[1], background=arguments[2]
+        )
+        for array in arguments if overwritten else ():
+            array[:] = 0
+        dr.backward(dr.sum(image.color) + dr.sum(image.features))
+        images.append([np.asarray(v) for v in (image.color, image.features, dr.grad(gaussians.means))])
+    for before, after in zip(*images, strict=True):
+        np.testing.assert_allclose(before, after, rtol=1e-5, atol=1e-5)
+
+
 def test_gaussians__refuse_attributes_of_another_length(scene):
     raw, _ = scene
     with pytest.raises(ValueError, match=r"`quats` must be \[N, 4\] with N=10, got \(9, 4\)"):
         Gaussians(**{**raw, "quats": raw["quats"][:9]})
 
 
-def test_render_config__refuses_unsupported_blocks():
-    with pytest.raises(ValueError, match="must be 4, 8, 12 or 16 px, got 17"):
-        RenderConfig(block_width=17)
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"block_width": 17}, "must be 4, 8, 12 or 16 px, got 17"),
+        ({"block_width": 8.0}, "must be 4, 8, 12 or 16 px, got 8.0"),
+        ({"block_height": 2.5}, "must be an integer from 1 to 16 px, got 2.5"),
+        ({"block_height": 0}, "must be an integer from 1 to 16 px, got 0"),
+        ({"eps2d": np.nan}, r"`eps2d` must be a number in \[0, 1e18\], got nan"),
+        ({"eps2d": -1}, "`eps2d` must be a number"),
+        ({"eps2d": "0.3"}, "`eps2d` must be a number"),
+        ({"alpha_min": 0}, r"`alpha_min` must be a number in \(0, 0.99\)"),
+        ({"alpha_min": 0.5, "alpha_max": 0.4}, r"`alpha_min` must be a number in \(0, 0.4\)"),
+        ({"alpha_max": 1}, r"`alpha_max` must be a number in \(0, 1\)"),
+        ({"stop_transmittance": np.inf}, r"`stop_transmittance` must be a number in \[0, 1\)"),
+    ],
+)
+def test_render_config__refuses_bad_settings(settings, message):
+    with pytest.raises(ValueError, match=message):
+        RenderConfig(**settings)
 
 
 def test_rasterize__compiles_its_kernels_once_for_all_cameras_and_sizes():

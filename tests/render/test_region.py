@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
-from morgs_mi.render.region import Region, owned_copy
+from morgs_mi.render.region import Region
 from tests import tolerances as tol
 from tests.assertions import assert_close
 from tests.scenes.cameras import make_wide_camera
@@ -215,10 +215,3 @@ def test_rasterize__backward_reads_gradients_at_any_alignment(raw, offset):
     dr.enqueue(dr.ADMode.Backward, image)
     dr.traverse(dr.ADMode.Backward)
     assert np.isfinite(np.asarray(dr.grad(gaussians.means))).all()
-
-
-def test_owned_copy__is_aligned():
-    borrowed = mi.Float(np.arange(1001, dtype=np.float32)[1:])
-    copy = np.asarray(owned_copy(borrowed))
-    assert np.array_equal(copy, np.arange(1, 1001))
-    assert copy.__array_interface__["data"][0] % 64 == 0

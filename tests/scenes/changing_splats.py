@@ -40,14 +40,19 @@ def splats(N: int = 40, degree: int = 1, seed: int = 0) -> Gaussians:
 
 
 def write_stream(
-    path: Path, frames: int = 4, start: Gaussians | None = None, keyframe_interval: int = 0
+    path: Path,
+    frames: int = 4,
+    start: Gaussians | None = None,
+    cameras: tuple[Camera, ...] | None = None,
+    metadata: dict | None = None,
+    keyframe_interval: int = 0,
 ) -> list[CodedFrame]:
     """Write a stream with offsets and return its decoded frames; 0: only the first frame has a keyframe.
 
     The first half of the splats moves from frame 1. In frame 2 one dies and two are born.
     """
-    cameras, states = rig(), []
-    with StreamWriter(path, cameras, 10) as writer:
+    cameras, states = cameras or rig(), []
+    with StreamWriter(path, cameras, 10, metadata) as writer:
         packet = keyframe_packet(start or splats(), 0, cameras)
         for t in range(frames):
             writer.write(packet)

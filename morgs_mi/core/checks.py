@@ -1,0 +1,112 @@
+"""Checks of values that callers pass, with one sentence for each kind of fault."""
+
+from __future__ import annotations
+
+from numbers import Real
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+__all__ = ["check_mask", "check_number", "check_points", "check_size", "check_type", "numbers"]
+
+
+def check_number(place: str, name: str, value: Any, interval: str) -> None:
+    """Raise an error unless a setting is a number in an interval.
+
+    Args:
+        place: where the error's sentence begins.
+        name: of the setting.
+        value: of the setting.
+        interval: such as ``[0, 1)``, which contains 0 but not 1; a bound may be ``inf``.
+
+    Raises:
+        ValueError: it is not, which includes NaN.
+    """
+    low, high = map(float, interval[1:-1].split(","))
+    if isinstance(value, Real) and not isinstance(value, bool):
+        x = float(value)
+        above = low <= x if interval[0] == "[" else low < x
+        if above and (x <= high if interval[-1] == "]" else x < high):
+            return
+    raise ValueError(f"{place}: `{name}` must be a number in {interval}, got {value!r}; set another value.")
+
+
+def check_type(place: str, name: str, value: Any, kind: type) -> None:
+    """Raise an error unless an argument is an instance of a class.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if not isinstance(value, kind):
+        expected = f"{kind.__module__}.{kind.__qualname__}"
+        raise ValueError(f"{place}: `{name}` must be a {expected}, got a {type(value).__name__}; pass another value.")
+
+
+def check_size(place: str, width: Any, height: Any) -> None:
+    """Raise an error unless the size of an image is two integers of at least 1.
+
+    Raises:
+        ValueError: it is not.
+    """
+    if not all(isinstance(v, (int, np.integer)) and v >= 1 for v in (width, height)):
+        raise ValueError(
+            f"{place}: the image size must be at least 1x1 in integers, got {width!r}x{height!r}; check width and "
+            "height."
+        )
+
+
+def check_mask(place: str, mask: Any, height: int, width: int) -> None:
+    """Raise an error unless the mask of an image [H, W, ...] is a bool array [H, W].
+
+    Raises:
+        ValueError: it is not.
+    """
+    if not isinstance(mask, np.ndarray) or mask.shape != (height, width) or mask.dtype != bool:
+        found = f"{mask.dtype} {list(mask.shape)}" if isinstance(mask, np.ndarray) else type(mask).__name__
+        raise ValueError(
+            f"{place}: the mask must be bool [{height}, {width}] like its image, got {found}; resize it without "
+            "interpolation, or compare it with a threshold."
+        )
+
+
+def numbers(place: str, name: str, values: ArrayLike) -> np.ndarray:
+    """Return an argument as a NumPy array, which is not a copy where it is one already.
+
+    Raises:
+        ValueError: it is not an array of real numbers.
+    """
+    try:
+        array = np.asarray(values)
+    except (TypeError, ValueError, RuntimeError):  # for instance rows of different lengths
+        array = np.array(None)
+    if array.dtype.kind not in "fiub":
+        found = f"{array.dtype} {list(array.shape)}" if isinstance(values, np.ndarray) else repr(values)[:80]
+        raise ValueError(f"{place}: `{name}` must be an array of real numbers, got {found}; convert it to floats.")
+    return array
+
+
+def check_points(place: str, points: ArrayLike, colors: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and colours as arrays [P, 3], P >= 0, if they are finite and the colours lie in [0, 1].
+
+    Raises:
+        ValueError: they are not.
+    """
+    points, colors = numbers(place, "points", points), numbers(place, "point_colors", colors)
+    if not points.size and not colors.size:
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"{place}: `points` must be [P, 3], got {list(points.shape)}; pass one row for each point.")
+    if colors.shape != points.shape:
+        raise ValueError(
+            f"{place}: `point_colors` must be {list(points.shape)} like `points`, got {list(colors.shape)}; pass one "
+            "colour for each point."
+        )
+    for name, values, good, expected, remedy in (
+        ("points", points, np.isfinite(points), "finite", "remove this point"),
+        ("point_colors", colors, (colors >= 0) & (colors <= 1), "in [0, 1]", "divide colours of 8 bits by 255"),
+    ):
+        if not good.all():
+            row = np.flatnonzero(~good.all(axis=1))[0]
+            raise ValueError(f"{place}: `{name}` must be {expected}, got {values[row].tolist()} at {row}; {remedy}.")
+    return points, colors

@@ -1,0 +1,83 @@
+"""Memory that NumPy and Dr.Jit exchange.
+
+Dr.Jit borrows NumPy's memory where it can, and reads it when a kernel runs: after the call that passed it, when the
+caller may have written to it. The package therefore passes copies.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from morgs_mi.core.checks import numbers
+from morgs_mi.core.types import Jit, Tensor
+
+__all__ = ["float_tensor", "from_numpy", "owned_copy", "refuse_freezing"]
+
+# Bytes: Dr.Jit aligns its own memory to as many.
+_ALIGNMENT = 64
+
+
+def from_numpy(kind: type[Jit], values: ArrayLike) -> Jit:
+    """Return numbers as a Dr.Jit tensor [...], or flattened as an array [M], copied before this returns.
+
+    Dr.Jit borrows the copy, and holds a reference to it until all kernels that read it have run. It is aligned, because
+    packets can only be read from aligned memory, and kernels are compiled for either case.
+
+    Args:
+        kind: the result's type, such as `mi.TensorXf` or `mi.UInt32`.
+        values: anything that `numpy.asarray` accepts, converted to the numbers of `kind`.
+
+    Raises:
+        ValueError: it is called inside a function under `dr.freeze`.
+    """
+    refuse_freezing("from_numpy()")
+    source, dtype = np.asarray(values), np.dtype(dr.type_v(kind).name.lower())
+    memory = np.empty(source.size * dtype.itemsize + _ALIGNMENT, np.uint8)
+    first = -memory.ctypes.data % _ALIGNMENT
+    copy = memory[first : first + source.size * dtype.itemsize].view(dtype).reshape(source.shape)
+    copy[...] = source
+    return kind(copy if dr.is_tensor_v(kind) else copy.ravel())
+
+
+def float_tensor(place: str, name: str, values: ArrayLike | Tensor) -> Tensor:
+    """Return an argument as a float tensor: a `mi.TensorXf` itself, or a copy of numbers.
+
+    Raises:
+        ValueError: it is neither. Other Dr.Jit arrays would lose their gradients.
+    """
+    if isinstance(values, mi.TensorXf):
+        return values
+    if dr.is_array_v(values):
+        raise ValueError(
+            f"{place}: `{name}` must be a NumPy array or a {mi.TensorXf.__module__}.TensorXf, got a "
+            f"{type(values).__module__}.{type(values).__name__}; convert it with mi.TensorXf(array, shape)."
+        )
+    return from_numpy(mi.TensorXf, numbers(place, name, values))
+
+
+def refuse_freezing(place: str) -> None:
+    """Raise an error while Dr.Jit records a function under `dr.freeze`.
+
+    Dr.Jit 1.5 ends the process when memory that it has borrowed from NumPy is released in a recording.
+
+    Raises:
+        ValueError: it does.
+    """
+    if dr.flag(dr.JitFlag.FreezingScope):
+        raise ValueError(
+            f"{place}: expected a call outside dr.freeze, got one inside, which Dr.Jit cannot record; call it before "
+            "the frozen function and pass its result. The renderer records its own kernels."
+        )
+
+
+def owned_copy(values: Jit) -> Jit:
+    """Return an evaluated copy of a Dr.Jit array, aligned even if the array is borrowed from NumPy (see `from_numpy`).
+
+    The opaque 0 prevents its removal by the optimiser.
+    """
+    copy = dr.gather(type(values), values, dr.arange(mi.UInt32, dr.width(values)) + dr.opaque(mi.UInt32, 0))
+    dr.eval(copy)
+    return copy

@@ -1,0 +1,133 @@
+"""A stream as a web page that plays it: one file, or a folder for a web server.
+
+The page is built from `web/` and part of the package. It contains its script, compressed, and in a single file the
+stream as well. Both are stored as text with 7 bits per character, see "In a web page" in docs/stream-format.md.
+"""
+
+from __future__ import annotations
+
+import gzip
+import html
+import io
+from collections.abc import Callable
+from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.codec.container import StreamWriter
+from morgs_mi.codec.packets import decode
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.files import atomic_folder, atomic_path
+
+__all__ = ["text_of_bytes", "write_web_folder", "write_web_page"]
+
+Progress = Callable[[int], None]
+
+# What an HTML parser replaces (NUL, carriage return) or could take for the end of a script (<).
+_UNSAFE = (0x00, 0x0D, 0x3C)
+_STREAM = "stream.morgs"
+
+
+def write_web_page(
+    stream: StreamReader, path: str | Path, title: str | None = None, progress: Progress | None = None
+) -> int:
+    """Write a self-contained page that plays a stream, and return its number of bytes.
+
+    It is one HTML file that runs from a disk and requests nothing. The stream's metadata is left out, except for the
+    renderer's settings, because it contains paths of the machine that made the fit.
+
+    Args:
+        stream: the file.
+        path: the page.
+        title: its title; by default the name of the stream's folder or file.
+        progress: called with the number of frames that were checked.
+
+    Raises:
+        ValueError: a packet of the stream is broken.
+        OSError: the page cannot be written.
+    """
+    data = _script("stream", _published(stream, progress))
+    page = _page(title or _title(stream), data, "data: blob:")
+    with atomic_path(path, "write_web_page()") as partial:
+        partial.write_bytes(page)
+    return len(page)
+
+
+def write_web_folder(
+    stream: StreamReader, path: str | Path, title: str | None = None, progress: Progress | None = None
+) -> int:
+    """Write a folder for a web server, with the page `index.html` and the stream as a file, and return their bytes.
+
+    Args:
+        stream: the file.
+        path: the new folder.
+        title: as for `write_web_page`.
+        progress: as for `write_web_page`.
+
+    Raises:
+        FileExistsError: `path` exists.
+        ValueError: a packet of the stream is broken.
+        OSError: the folder cannot be written.
+    """
+    data = _published(stream, progress)
+    page = _page(title or _title(stream), f'<i id="stream" data-address="{_STREAM}" hidden></i>', "'self' data: blob:")
+    with atomic_folder(path, "write_web_folder()") as partial:
+        (partial / "index.html").write_bytes(page)
+        (partial / _STREAM).write_bytes(data)
+    return len(page) + len(data)
+
+
+def text_of_bytes(data: bytes) -> str:
+    """Return bytes as text with 7 bits per character, which HTML stores in a script without changing it.
+
+    Bits are taken from the highest down, the last ones are filled up with zeros. 128 is added to the characters that
+    HTML would change, so that a reader takes the low 7 bits of each. As UTF-8, the text is 1.17 times as long as
+    random bytes; base64 is 1.33 times as long.
+    """
+    bits = np.unpackbits(np.frombuffer(data, np.uint8))
+    septets = np.pad(bits, (0, -len(bits) % 7)).reshape(-1, 7)
+    codes = np.packbits(septets, axis=1)[:, 0] >> 1
+    return (codes + np.uint8(128) * np.isin(codes, _UNSAFE)).tobytes().decode("latin-1")
+
+
+def _published(stream: StreamReader, progress: Progress | None) -> bytes:
+    """Return the stream with the metadata that the page reads, after decoding it once."""
+    render = stream.metadata.get("config", {}).get("render", {})
+    sink, coded, frames = io.BytesIO(), None, 0
+    with StreamWriter(sink, stream.cameras, stream.fps, {"config": {"render": render}}) as writer:
+        for packet in stream:
+            if coded is None or packet.frame != coded.frame:
+                coded, frames = decode(coded, packet), frames + 1
+                if progress is not None:
+                    progress(frames)
+            writer.write(packet)
+    if coded is None:
+        raise ValueError(f"{stream.path}: expected at least one frame to show, got none.")
+    return sink.getvalue()
+
+
+def _title(stream: StreamReader) -> str:
+    path = stream.path.resolve()
+    return path.parent.name if path.name == _STREAM else path.stem
+
+
+def _page(title: str, data: str, connect: str) -> bytes:
+    player = files("morgs_mi.export") / "web_player"
+    code = gzip.compress((player / "player.js").read_bytes(), 9, mtime=0)
+    page = (player / "player.html").read_text(encoding="utf-8")
+    values = {
+        "{version}": version("morgs-mi"),
+        "{connect}": connect,
+        "{title}": html.escape(title),
+        "{notice}": (player / "NOTICE").read_text(encoding="utf-8").replace("--", "- "),
+        "{data}": data + "\n" + _script("code", code),
+    }
+    for name, value in values.items():
+        page = page.replace(name, value)
+    return page.encode()
+
+
+def _script(name: str, data: bytes) -> str:
+    return f'<script type="text/plain" id="{name}" data-bytes="{len(data)}">{text_of_bytes(data)}</script>'

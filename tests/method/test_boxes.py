@@ -1,0 +1,44 @@
+"""Boxes around projected Gaussians, against loops over them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from morgs_mi import RenderConfig
+from morgs_mi.method.boxes import Boxes, boxes_around
+from tests.scenes.cameras import arc, look_at_cameras
+from tests.scenes.gaussians import isotropic
+
+(CAMERA,) = look_at_cameras(arc([0.0], 4), 40, 64, 48)
+
+
+@pytest.fixture(scope="module")
+def boxes() -> Boxes:
+    rng = np.random.default_rng(0)
+    means = rng.uniform(-2, 2, (50, 3)) * (1, 1, 0.3)
+    means[7] = (0, 0, -9)  # behind the camera
+    return boxes_around(isotropic(means, 0.1, 0.9, np.zeros((50, 1, 3))), CAMERA, RenderConfig(), 0.6)
+
+
+def slices(boxes: Boxes) -> list[tuple[slice, slice]]:
+    corners = (np.asarray(side).astype(int) for side in (boxes.left, boxes.top, boxes.right, boxes.bottom))
+    return [(slice(y0, y1), slice(x0, x1)) for x0, y0, x1, y1 in zip(*corners, strict=True)]
+
+
+def test_boxes__area_and_cover_count_pixels(boxes):
+    mask = np.random.default_rng(1).random((48, 64)) < 0.3
+    np.testing.assert_array_equal(boxes.area, [np.ones((48, 64))[box].sum() for box in slices(boxes)])
+    np.testing.assert_array_equal(boxes.covered(mask), [mask[box].sum() for box in slices(boxes)])
+    assert np.asarray(boxes.area)[7] == 0
+
+
+def test_union__covers_the_chosen_boxes_and_little_more(boxes):
+    chosen = np.arange(50) % 3 == 0
+    expected = np.zeros((48, 64), bool)
+    for box in np.array(slices(boxes), object)[chosen]:
+        expected[tuple(box)] = True
+    found = boxes.union(chosen, (48, 64))
+    assert found[expected].all()
+    cells = expected.reshape(12, 4, 16, 4).any(axis=(1, 3))
+    np.testing.assert_array_equal(found, cells.repeat(4, 0).repeat(4, 1))

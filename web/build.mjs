@@ -1,0 +1,65 @@
+// Build the player into a folder of the Python package: the page, its script, and the licences of its libraries.
+//
+//     node build.mjs FOLDER
+import { mkdir, readFile, writeFile } from "node:fs/promises";
+import { resolve } from "node:path";
+import asc from "assemblyscript/asc";
+import * as esbuild from "esbuild";
+
+const BUNDLED = ["three", "@sparkjsdev/spark", "fflate"];
+const settings = {
+  absWorkingDir: import.meta.dirname,
+  bundle: true,
+  minify: true,
+  write: false,
+  format: "iife",
+  target: "es2022",
+  charset: "ascii",
+  legalComments: "none",
+  logLevel: "warning",
+};
+
+const generated = {
+  name: "generated",
+  setup(build) {
+    build.onResolve({ filter: /^(wasm|worker):/ }, ({ path }) => ({ path, namespace: "generated" }));
+    build.onLoad({ filter: /^wasm:/, namespace: "generated" }, async ({ path }) => {
+      return { contents: await compiled(path.slice("wasm:".length)), loader: "binary" };
+    });
+    build.onLoad({ filter: /^worker:/, namespace: "generated" }, async () => {
+      const { outputFiles } = await esbuild.build({ ...settings, entryPoints: ["src/worker.ts"], plugins: [generated] });
+      return { contents: outputFiles[0].text, loader: "text" };
+    });
+  },
+};
+
+async function compiled(name) {
+  let wasm;
+  const options = [`wasm/${name}.ts`, "-O3", "--runtime", "stub", "--noAssert", "--use", "abort=", "--outFile", "out.wasm"];
+  const { error, stderr } = await asc.main(options, {
+    readFile: (path) => readFile(new URL(path, import.meta.url), "utf8").catch(() => null),
+    writeFile: (_, contents) => (wasm = contents),
+    listFiles: () => [],
+  });
+  if (error) throw new Error(stderr.toString());
+  return wasm;
+}
+
+async function notice() {
+  const parts = await Promise.all(
+    BUNDLED.map(async (name) => {
+      const folder = `node_modules/${name}`;
+      const { version, license } = JSON.parse(await readFile(`${folder}/package.json`, "utf8"));
+      return `${name} ${version} (${license})\n\n${(await readFile(`${folder}/LICENSE`, "utf8")).trim()}\n`;
+    }),
+  );
+  return `The web player contains these libraries.\n\n${parts.join("\n" + "-".repeat(80) + "\n\n")}`;
+}
+
+const folder = resolve(process.argv[2]);
+process.chdir(import.meta.dirname);
+const { outputFiles } = await esbuild.build({ ...settings, entryPoints: ["src/main.ts"], plugins: [generated] });
+await mkdir(folder, { recursive: true });
+await writeFile(`${folder}/player.js`, outputFiles[0].text);
+await writeFile(`${folder}/player.html`, await readFile("src/player.html", "utf8"));
+await writeFile(`${folder}/NOTICE`, await notice());

@@ -1,0 +1,166 @@
+/** Frames in time: requests to the worker, frames that are ready ahead, and the clock. */
+
+import type { Update } from "./rows";
+import type { State } from "./state";
+import source from "worker:decoder";
+import type { Opened, Reply, Request } from "./worker";
+
+/** Frames that are decoded ahead. */
+const AHEAD = 3;
+
+type Shown = Extract<Reply, { kind: "shown" }>;
+
+export interface Events {
+  opened(stream: Opened): void;
+  show(update: Update, position: number): void;
+  failed(message: string): void;
+  playing(playing: boolean): void;
+}
+
+export class Playback {
+  position = -1;
+  playing = false;
+  speed = 1;
+  /** Milliseconds for decoding each frame that was shown. */
+  readonly decodeTimes: number[] = [];
+  private readonly worker: Worker;
+  private loops = true;
+  private length = 0;
+  private fps = 30;
+  private ready: Shown[] = [];
+  private due = 0;
+  /** The ticket of the last jump; frames with an older one are dropped. */
+  private ticket = 0;
+  private requested = -1;
+  private waiting = 0;
+  private jumping = false;
+  private broken = false;
+  private answers: ((state: State) => void)[] = [];
+
+  constructor(bytes: Uint8Array<ArrayBuffer>, private readonly events: Events) {
+    this.worker = new Worker(URL.createObjectURL(new Blob([source], { type: "text/javascript" })));
+    this.worker.onmessage = ({ data }: MessageEvent<Reply>) => this.receive(data);
+    this.worker.onerror = ({ message }) => events.failed(message);
+    this.send({ kind: "open", bytes }, [bytes.buffer]);
+  }
+
+  get last(): number {
+    return this.length - 1;
+  }
+
+  /** Whether the first frame follows the last one. */
+  get loop(): boolean {
+    return this.loops;
+  }
+
+  set loop(loop: boolean) {
+    this.loops = loop;
+    if (!this.jumping) this.prefetch();
+  }
+
+  /** Whether a jump is under way. */
+  get busy(): boolean {
+    return this.jumping;
+  }
+
+  /** Show a position as soon as it is decoded. */
+  seek(position: number): void {
+    const target = Math.max(0, Math.min(this.last, position));
+    if (this.ready[0]?.position === target && !this.jumping) {
+      this.present(this.ready.shift()!);
+      return;
+    }
+    this.ready = [];
+    this.waiting = 0;
+    this.ticket++;
+    this.jumping = true;
+    this.broken = false;
+    this.request(target, true);
+  }
+
+  play(playing: boolean): void {
+    if (playing && this.atEnd) this.seek(0);
+    this.playing = playing;
+    this.due = performance.now();
+    this.events.playing(playing);
+  }
+
+  /** Show the frame that is due at a time. */
+  tick(now: number): void {
+    if (!this.playing || this.jumping) return;
+    const period = 1000 / (this.fps * this.speed);
+    if (now - this.due > 5 * period) this.due = now; // decoding is too slow, or the page was hidden
+    while (now >= this.due && this.ready.length > 0 && !this.atEnd) {
+      this.due += period;
+      this.present(this.ready.shift()!);
+    }
+    if (this.atEnd) this.play(false);
+  }
+
+  /** Return the state at a position, without showing it. */
+  state(position: number): Promise<State> {
+    this.send({ kind: "state", position });
+    return new Promise((resolve) => this.answers.push(resolve));
+  }
+
+  private get atEnd(): boolean {
+    return this.position === this.last && !this.loops;
+  }
+
+  private present({ update, position, milliseconds }: Shown): void {
+    this.position = position;
+    this.decodeTimes.push(milliseconds);
+    this.events.show(update, position);
+    this.prefetch();
+  }
+
+  private prefetch(): void {
+    while (!this.broken && this.waiting + this.ready.length < AHEAD) {
+      if (this.requested === this.last && !this.loops) return;
+      this.request(this.requested === this.last ? 0 : this.requested + 1, false);
+    }
+  }
+
+  private request(position: number, fresh: boolean): void {
+    this.requested = position;
+    this.waiting++;
+    this.send({ kind: "show", position, fresh, ticket: this.ticket });
+  }
+
+  private receive(reply: Reply): void {
+    if (reply.kind === "opened") {
+      this.length = reply.frames.length;
+      this.fps = reply.fps > 0 ? reply.fps : 30;
+      this.events.opened(reply);
+    } else if (reply.kind === "state") {
+      this.answers.shift()?.(reply.state);
+    } else if (reply.kind === "failed" && reply.ticket === -1) {
+      this.events.failed(reply.message);
+    } else if (reply.ticket === this.ticket) {
+      this.waiting--;
+      if (reply.kind === "failed") this.fail(reply.message);
+      else this.accept(reply);
+    }
+  }
+
+  private accept(shown: Shown): void {
+    if (!this.jumping) {
+      this.ready.push(shown);
+      return;
+    }
+    this.jumping = false;
+    this.due = performance.now() + 1000 / (this.fps * this.speed);
+    this.present(shown);
+  }
+
+  private fail(message: string): void {
+    this.broken = true;
+    this.jumping = false;
+    this.play(false);
+    this.events.failed(message);
+  }
+
+  private send(request: Request, transfer: Transferable[] = []): void {
+    this.worker.postMessage(request, transfer);
+  }
+}

@@ -1,0 +1,99 @@
+/** Packets of a stream (docs/stream-format.md). */
+
+export const KEYFRAME = 1;
+export const RESIDUAL = 2;
+const HEADER = 0;
+const MAGIC = "MORGS-MI";
+const VERSION = 2;
+const PREAMBLE = 12;
+const HEAD = 20;
+
+export interface CameraFields {
+  name: string;
+  K: number[][];
+  viewmat: number[][];
+  width: number;
+  height: number;
+  near: number;
+}
+
+export interface PacketPlace {
+  kind: number;
+  frame: number;
+  start: number;
+  stop: number;
+}
+
+export interface Stream {
+  bytes: Uint8Array;
+  cameras: CameraFields[];
+  fps: number;
+  metadata: Record<string, unknown>;
+  /** Keyframes and residuals in the order of the file. */
+  packets: PacketPlace[];
+  /** Description of what ends the file before its end, if anything does. */
+  damage: string | null;
+}
+
+/** Parse the header and find the packets; checksums are checked when a packet is opened. */
+export function openStream(bytes: Uint8Array): Stream {
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  const magic = String.fromCharCode(...bytes.subarray(0, MAGIC.length));
+  if (magic !== MAGIC || bytes.length < PREAMBLE) throw new Error("this is not a .morgs stream");
+  const version = view.getUint32(8, true);
+  if (version !== VERSION) throw new Error(`expected format version ${VERSION}, found ${version}`);
+  const packets: PacketPlace[] = [];
+  let damage: string | null = null;
+  for (let start = PREAMBLE; start < bytes.length; ) {
+    const complete = start + HEAD <= bytes.length;
+    const stop = complete ? start + HEAD + Number(view.getBigUint64(start + 8, true)) : Infinity;
+    if (stop > bytes.length) {
+      damage = `the stream is truncated or damaged at byte ${start} of ${bytes.length}`;
+      break;
+    }
+    packets.push({ kind: view.getUint32(start, true), frame: view.getUint32(start + 4, true), start, stop });
+    start = stop;
+  }
+  if (packets.length === 0 || packets[0].kind !== HEADER) throw new Error("the header of the stream is missing");
+  const fields = JSON.parse(new TextDecoder().decode(openPacket(bytes, packets[0])));
+  return { ...fields, bytes, damage, packets: packets.filter((p) => p.kind === KEYFRAME || p.kind === RESIDUAL) };
+}
+
+/** Return the payload of a packet after checking its CRC. */
+export function openPacket(bytes: Uint8Array, place: PacketPlace): Uint8Array {
+  const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+  const payload = bytes.subarray(place.start + HEAD, place.stop);
+  const head = bytes.subarray(place.start, place.start + HEAD - 4);
+  if (crc32(payload, crc32(head)) !== view.getUint32(place.start + HEAD - 4, true)) {
+    throw new Error(`the packet at byte ${place.start} is damaged, its checksum is wrong`);
+  }
+  return payload;
+}
+
+/** Return the arrays of a payload by name; only uint8 and uint32 occur in the packets that are read. */
+export function openArrays(payload: Uint8Array): Record<string, Uint8Array | Uint32Array> {
+  const view = new DataView(payload.buffer, payload.byteOffset, payload.byteLength);
+  let at = 4 + view.getUint32(0, true);
+  const found: Record<string, Uint8Array | Uint32Array> = {};
+  for (const [name, dtype, shape] of JSON.parse(new TextDecoder().decode(payload.subarray(4, at)))) {
+    const count = (shape as number[]).reduce((a, b) => a * b, 1);
+    const end = at + count * (dtype === "uint8" ? 1 : 4);
+    if (!(end <= payload.length)) throw new Error(`the array ${name} does not fit its packet`);
+    // A copy, because the words of a packet may lie at any address.
+    const data = payload.slice(at, end);
+    found[name] = dtype === "uint8" ? data : new Uint32Array(data.buffer);
+    at = end;
+  }
+  return found;
+}
+
+const CRC_TABLE = Uint32Array.from({ length: 256 }, (_, n) => {
+  for (let k = 0; k < 8; k++) n = n & 1 ? 0xedb88320 ^ (n >>> 1) : n >>> 1;
+  return n;
+});
+
+function crc32(bytes: Uint8Array, before = 0): number {
+  let crc = ~before;
+  for (let i = 0; i < bytes.length; i++) crc = CRC_TABLE[(crc ^ bytes[i]) & 0xff] ^ (crc >>> 8);
+  return ~crc >>> 0;
+}

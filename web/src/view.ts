@@ -1,0 +1,117 @@
+/** The camera: the views of the rig, and orbiting from there. */
+
+import * as THREE from "three";
+import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import type { CameraFields } from "./stream";
+
+/** Mean up direction of the cameras; that of the first one where they cancel out. */
+function upDirection(cameras: CameraFields[]): THREE.Vector3 {
+  const up = new THREE.Vector3();
+  for (const { viewmat } of cameras) up.sub(row(viewmat, 1));
+  return (up.length() > 0.1 * cameras.length ? up : row(cameras[0].viewmat, 1).negate()).normalize();
+}
+
+function row(viewmat: number[][], i: number): THREE.Vector3 {
+  return new THREE.Vector3(viewmat[i][0], viewmat[i][1], viewmat[i][2]);
+}
+
+export function positionOf({ viewmat }: CameraFields): THREE.Vector3 {
+  const position = new THREE.Vector3();
+  for (let i = 0; i < 3; i++) position.addScaledVector(row(viewmat, i), -viewmat[i][3]);
+  return position;
+}
+
+export class View {
+  readonly camera = new THREE.PerspectiveCamera();
+  private controls: OrbitControls | null = null;
+  private current: CameraFields;
+  private size = { width: 1, height: 1 };
+
+  constructor(
+    private readonly cameras: CameraFields[],
+    private readonly unit: number,
+    private readonly element: HTMLElement,
+    private readonly onChange: () => void,
+  ) {
+    this.current = cameras[0];
+  }
+
+  /** Show what a camera of the rig sees; orbits turn around the point on its axis at a distance. */
+  select(index: number, distance: (camera: THREE.PerspectiveCamera) => number): void {
+    this.current = this.cameras[index];
+    const { viewmat, near } = this.current;
+    const { camera, unit } = this;
+    const [right, down, ahead] = [0, 1, 2].map((i) => row(viewmat, i));
+    camera.position.copy(positionOf(this.current)).multiplyScalar(unit);
+    camera.near = near * unit;
+    camera.far = 1e5;
+    // Turntable around the rig's up, tilted sideways as far as this camera is, so that selecting it shows its pose.
+    camera.up.copy(upDirection(this.cameras)).addScaledVector(right, -upDirection(this.cameras).dot(right)).normalize();
+    if (camera.up.dot(down) > -0.1) camera.up.copy(down).negate();
+    camera.lookAt(ahead.clone().add(camera.position));
+    this.project();
+    this.controls?.dispose();
+    this.controls = new OrbitControls(camera, this.element);
+    this.controls.target.copy(camera.position).addScaledVector(ahead, distance(camera));
+    this.controls.enableDamping = true;
+    this.controls.dampingFactor = 0.15;
+    this.controls.zoomSpeed = 0.7;
+    this.controls.addEventListener("change", this.onChange);
+    this.controls.update();
+    this.onChange();
+  }
+
+  resize(width: number, height: number): void {
+    this.size = { width, height };
+    this.project();
+    this.onChange();
+  }
+
+  /** Continue a movement that slows down. */
+  update(): void {
+    this.controls?.update();
+  }
+
+  /** Turn by angles in radians, positive to the right and up. */
+  turn(right: number, up: number): void {
+    if (this.controls === null) return;
+    const { camera } = this;
+    const offset = camera.position.clone().sub(this.controls.target);
+    offset.applyAxisAngle(camera.up, right);
+    const axis = new THREE.Vector3().crossVectors(camera.up, offset).normalize();
+    offset.applyAxisAngle(axis, -up);
+    if (Math.abs(offset.clone().normalize().dot(camera.up)) < 0.99) {
+      camera.position.copy(this.controls.target).add(offset);
+      this.controls.update();
+    }
+  }
+
+  zoom(factor: number): void {
+    if (this.controls === null) return;
+    this.camera.position.sub(this.controls.target).multiplyScalar(factor).add(this.controls.target);
+    this.controls.update();
+  }
+
+  /** Tangent of an angle that a fraction of the image's width spans. */
+  tangent(fraction: number): number {
+    return (fraction * this.current.width) / this.current.K[0][0];
+  }
+
+  /** Fit the camera's image into the page: the whole image is visible, and more beside it. */
+  private project(): void {
+    const { K, width: w, height: h } = this.current;
+    const { width, height } = this.size;
+    const scale = Math.min(width / w, height / h);
+    const { camera } = this;
+    const { near, far } = camera;
+    // prettier-ignore
+    camera.projectionMatrix.set(
+      (2 * K[0][0] * scale) / width, 0, (-2 * (K[0][2] - w / 2) * scale) / width, 0,
+      0, (2 * K[1][1] * scale) / height, (2 * (K[1][2] - h / 2) * scale) / height, 0,
+      0, 0, (near + far) / (near - far), (2 * far * near) / (near - far),
+      0, 0, -1, 0,
+    );
+    camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+    camera.fov = THREE.MathUtils.radToDeg(2 * Math.atan(height / (2 * K[1][1] * scale))); // for the speed of panning
+  }
+}
