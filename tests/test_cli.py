@@ -550,9 +550,10 @@ def test_main__reports_a_full_standard_output_in_one_sentence(capsys, monkeypatc
         assert run(capsys, "fit", "--print-config")[::2] == (1, "standard output: No space left on device.\n")
 
 
-def test_info__names_standard_output_if_it_is_full(capture: Path) -> None:
+@pytest.mark.parametrize("option", ["--no-check", "--help"])
+def test_info__names_standard_output_if_it_is_full(capture: Path, option: str) -> None:
     with open("/dev/full", "w") as full:
-        command = [sys.executable, "-m", "morgs_mi", "info", str(capture), "--no-check"]
+        command = [sys.executable, "-m", "morgs_mi", "info", str(capture), option]
         result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert (result.returncode, result.stderr) == (1, "standard output: No space left on device.\n")
 

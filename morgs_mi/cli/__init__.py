@@ -78,16 +78,17 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
     args = sys.argv[1:] if args is None else list(args)
     command: Any = None
     try:
-        options: Any = tyro.cli(
-            options_type,
-            prog=prog,
-            args=args,
-            config=(
-                tyro.conf.CascadeSubcommandArgs,
-                tyro.conf.OmitSubcommandPrefixes,
-                tyro.conf.PositionalMetavarFromFieldName,
-            ),
-        )
+        with naming_output():  # the help goes there
+            options: Any = tyro.cli(
+                options_type,
+                prog=prog,
+                args=args,
+                config=(
+                    tyro.conf.CascadeSubcommandArgs,
+                    tyro.conf.OmitSubcommandPrefixes,
+                    tyro.conf.PositionalMetavarFromFieldName,
+                ),
+            )
         command = options.command
         with _terminable():
             _set_up(options)
