@@ -128,7 +128,7 @@ def read_config(path: str | Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: the file is missing.
-        ValueError: the file is not valid TOML.
+        ValueError: the file is not valid TOML, or is nested too deeply.
     """
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8"))
@@ -136,7 +136,7 @@ def read_config(path: str | Path) -> dict[str, Any]:
         raise FileNotFoundError(
             f"{path}: expected a TOML file with settings, found none; write one with `morgs-mi fit --print-config`."
         ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: expected valid TOML, got an error: {error}.") from None
 
 

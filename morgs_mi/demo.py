@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -19,9 +18,10 @@ from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.figures import motion_scale
 from morgs_mi.evaluate.results import Evaluation
-from morgs_mi.export.frames import PLAYABLE, pad_to_even
+from morgs_mi.export.frames import pad_to_even
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.io.video_writer import write_video
+from morgs_mi.io.bounded import read_json
+from morgs_mi.io.video_writer import playable_format, write_video
 from morgs_mi.playback.player import channel_image, open_stream, render_stream, truth_for_camera
 from morgs_mi.playback.visualise import contact_sheet, label, motion_legend, side_by_side, write_png
 from morgs_mi.recorder import stream_capture
@@ -170,10 +170,10 @@ def _synthesize_clip(folder: Path, config: DemoConfig, report: Callable[[float, 
     """Path-trace the clip unless `folder` has it already; captures are written atomically, so it is complete."""
     wanted = {"scene": config.scene, "seed": config.stream.seed, **asdict(config.clip)}
     try:
-        about = json.loads((folder / "capture.json").read_text(encoding="utf-8"))
+        about = read_json(folder / "capture.json")
     except (OSError, ValueError):
-        about = {}
-    if all(about.get(name) == value for name, value in wanted.items()):
+        about = None
+    if isinstance(about, dict) and all(about.get(name) == value for name, value in wanted.items()):
         report(1, 1)
         return
     settings = {**asdict(config.clip), "seed": config.stream.seed}
@@ -200,7 +200,7 @@ def _draw(out: Path, capture: Capture, report: Callable[[float, float], None]) -
     shown = ("truth", "render", "motion", "confidence")
     rows = [side_by_side([panels[name] for name in shown if name in panels]) for panels in full]
     fps = min(capture.fps, len(rows) / _LEAST_SECONDS)
-    write_video(out / "side_by_side.mp4", map(pad_to_even, rows), fps, PLAYABLE)
+    write_video(out / "side_by_side.mp4", map(pad_to_even, rows), fps, playable_format()[1])
     report(1, 2)
     last = len(plain) - 1
     frames = sorted({min(1, len(full) - 1), last, len(full) - 1})

@@ -11,9 +11,10 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from hashlib import blake2b
 from itertools import chain, islice
 from pathlib import Path
@@ -31,6 +32,7 @@ from morgs_mi.codec.packets import CodedFrame, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import is_same_file, locked_folder, write_json
+from morgs_mi.io.bounded import read_json
 from morgs_mi.method.flow import choose_key_views
 from morgs_mi.stream_loop import MIN_POINTS, FrameReport, StreamLoop
 
@@ -46,6 +48,7 @@ def stream_capture(
     config: StreamConfig | None = None,
     on_step: Callable[[int, int, int], None] | None = None,
     resume: bool = False,
+    on_stage: Callable[[str, int, int], None] | None = None,
 ) -> list[FrameReport]:
     """Fit a whole capture and write OUT/stream.morgs packet by packet, and OUT/report.json with every frame.
 
@@ -59,6 +62,7 @@ def stream_capture(
         on_step: called with (frame, steps done, steps of that frame).
         resume: continue after the last complete packet of the stream in `out`, if there is one. With
             `RenderConfig(reproducible=True)` the stream has the same bytes as without an interruption.
+        on_stage: called with (name, done, total) of the work before the first frame that is fitted.
 
     Returns:
         The reports of all frames, including those before an interruption.
@@ -73,7 +77,7 @@ def stream_capture(
     for name in FILES:
         check_output(out / name)
     with locked_folder(out, "stream_capture()"):
-        return _stream(capture, out, config or StreamConfig(), on_step, resume)
+        return _stream(capture, out, config or StreamConfig(), on_step, resume, on_stage or (lambda *_: None))
 
 
 def _stream(
@@ -82,6 +86,7 @@ def _stream(
     config: StreamConfig,
     on_step: Callable[[int, int, int], None] | None,
     resume: bool,
+    on_stage: Callable[[str, int, int], None],
 ) -> list[FrameReport]:
     """Fit a capture into a folder that nobody else writes into."""
     path, train, frames = out / "stream.morgs", capture.train_views, capture.partial_frames()
@@ -89,7 +94,9 @@ def _stream(
     metadata = _metadata(capture, first, config)
     interrupted = _interrupted(out, capture, metadata) if resume else None
     if interrupted is None and len(capture.points) < MIN_POINTS:
-        capture = triangulate_points(capture, match_capture(capture))
+        shared = match_capture(capture, partial(on_stage, "Matching views"))
+        on_stage("Triangulating points", 0, 1)
+        capture = triangulate_points(capture, shared)
     loop = StreamLoop(
         [capture.cameras[v] for v in train],
         capture.points,
@@ -106,7 +113,8 @@ def _stream(
         # Changes are detected against references that depend on all images so far.
         start, now = 0 if config.fit.skip_static else interrupted.coded.frame, interrupted.coded.frame
         frames = capture.partial_frames(start)
-        past = islice(frames, now + 1 - start)
+        count = now + 1 - start
+        past = _reported(islice(frames, count), partial(on_stage, "Reading the fitted frames"), count)
         loop.resume(interrupted.coded, ([frame.images[v] for v in train] for frame in past))
         write_json(out / "capture.json", about)
         writer = StreamWriter.continued(path, interrupted.index, interrupted.end)
@@ -126,6 +134,13 @@ def _stream(
             _reemit_keyframe(writer, loop.state.coded, interval)
     _check_in_place(path, written)
     return reports
+
+
+def _reported(frames: Iterable[PartialFrame], report: Callable[[int, int], None], count: int) -> Iterator[PartialFrame]:
+    """Yield frames and report how many were there before."""
+    for done, frame in enumerate(frames):
+        report(done, count)
+        yield frame
 
 
 def _check_in_place(path: Path, written: os.stat_result) -> None:
@@ -220,11 +235,11 @@ def _without_folder(method: str) -> str:
 
 def _about(capture: Capture, earlier: Path | None) -> dict[str, Any]:
     """Return the content of `capture.json`: that of an earlier fit if there is one, with the capture's present path."""
-    about = capture.metadata()
+    about = None
     if earlier is not None:
         with suppress(OSError, ValueError):
-            about = json.loads(earlier.read_text(encoding="utf-8"))
-    return {**about, "capture": str(Path(capture.path).resolve())}
+            about = read_json(earlier)
+    return {**(about if isinstance(about, dict) else capture.metadata()), "capture": str(Path(capture.path).resolve())}
 
 
 def _fingerprint(arrays: Iterable[np.ndarray | None]) -> str:
@@ -246,15 +261,19 @@ def _difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any] | No
 def _reports(path: Path, count: int) -> list[FrameReport]:
     """Return the reports of the first `count` frames."""
     remedy = "start again without --resume"
+    document = read_json(path) if path.exists() else {}
     try:
-        rows = json.loads(path.read_text(encoding="utf-8"))["frames"][:count]
-        reports = [FrameReport(**{**row, "missing_views": tuple(row["missing_views"])}) for row in rows]
-    except (OSError, KeyError, TypeError, ValueError) as error:
+        reports = [_report(row) for row in document["frames"][:count]]
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         found = f"a broken one ({error})" if path.exists() else "none"
         raise ValueError(f"{path}: expected the report of the fit, got {found}; {remedy}.") from None
     if [report.frame for report in reports] != list(range(count)):
         raise ValueError(f"{path}: expected the rows of {count} frames, got {len(reports)}; {remedy}.")
     return reports
+
+
+def _report(row: Mapping[str, Any]) -> FrameReport:
+    return FrameReport(**{**row, "seconds": float(row["seconds"]), "missing_views": tuple(row["missing_views"])})
 
 
 def _reemit_keyframe(writer: StreamWriter, coded: CodedFrame | None, interval: int) -> None:

@@ -7,6 +7,7 @@ import os
 import re
 import resource
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -211,6 +212,8 @@ def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
         (["--masks", "some"], ("--masks must be one of none,", "got 'some'")),
         (["--config", "nowhere.toml"], ("nowhere.toml: expected a TOML file with settings, found none",)),
         (["--config", "[fit"], ("bad.toml: expected valid TOML",)),
+        (["--config", "[fit]\na = " + "[" * 5000], ("bad.toml: expected valid TOML",)),
+        (["--config", "[fit]\na = " + "9" * 5000], ("bad.toml: expected valid TOML",)),
         (["--config", "[fit]\nepoch = 1"], ("bad.toml: `fit.epoch` is unknown, expected `fit.epochs`",)),
         (["--config", "[fit]\nepochs = 'many'"], ("bad.toml: `fit.epochs` must be a whole number, got 'many'",)),
         (["--config", "[fit.rates]\nmeans = nan"], ("bad.toml: `fit.rates.means` must be finite and not negative",)),
@@ -544,7 +547,62 @@ def interrupt(*_: object, **__: object) -> None:
 def test_main__reports_a_full_standard_output_in_one_sentence(capsys, monkeypatch: pytest.MonkeyPatch) -> None:
     with open("/dev/full", "w") as full:
         monkeypatch.setattr(sys, "stdout", full)
-        assert run(capsys, "fit", "--print-config")[::2] == (1, "No space left on device.\n")
+        assert run(capsys, "fit", "--print-config")[::2] == (1, "standard output: No space left on device.\n")
+
+
+@pytest.mark.parametrize("option", ["--no-check", "--help"])
+def test_info__names_standard_output_if_it_is_full(capture: Path, option: str) -> None:
+    with open("/dev/full", "w") as full:
+        command = [sys.executable, "-m", "morgs_mi", "info", str(capture), option]
+        result = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
+    assert (result.returncode, result.stderr) == (1, "standard output: No space left on device.\n")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[" * 100_000, "expected JSON, got a broken file"),
+        ("[]", "expected a fit's report, got a broken one"),
+        (f'{{"frames": [{{"frame": 0, "seconds": {10**400}}}]}}', "expected a fit's report, got a broken one"),
+    ],
+)
+def test_eval__reports_a_hostile_report_in_one_sentence(
+    fitted_clip: Path, tmp_path: Path, capsys, text: str, message: str
+) -> None:
+    shutil.copy(fitted_clip / "stream.morgs", tmp_path)
+    (tmp_path / "report.json").write_text(text)
+    status, _, error = run(capsys, "eval", tmp_path, "--capture", fitted_clip / "capture")
+    assert status == 1
+    assert_one_sentence(error, f"report.json: {message}")
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "[]"])
+def test_synth__replaces_no_folder_with_a_hostile_description(tmp_path: Path, capsys, text: str) -> None:
+    (tmp_path / "capture.json").write_text(text)
+    status, _, error = run(capsys, "synth", "arm", tmp_path, "--overwrite")
+    assert status == 1
+    assert_one_sentence(error, "is not a synthetic capture")
+
+
+def test_main__reports_an_unexpected_error_in_one_sentence(capture: Path, capsys, monkeypatch) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise AttributeError("'NoneType' object has no attribute 'a'")
+
+    monkeypatch.setattr("morgs_mi.cli.info.load_capture", fail)
+    status, _, error = run(capsys, "info", capture)
+    assert status == 1
+    assert_one_sentence(error, "Unexpected AttributeError: 'NoneType' object has no attribute 'a'", "--debug")
+
+
+def test_fit__reports_progress_before_the_first_frame(capture: Path, tmp_path: Path, capsys, monkeypatch) -> None:
+    write_colmap(capture / "sparse" / "0", rig(), np.zeros((0, 3)), np.zeros((0, 3)))
+    now = iter(range(0, 10**9, 40))
+    monkeypatch.setattr("morgs_mi.cli.console.time.monotonic", lambda: float(next(now)))
+    monkeypatch.setattr("morgs_mi.recorder.StreamLoop", interrupt)
+    status, _, error = run(capsys, "fit", capture, tmp_path / "out", *QUICK)
+    assert status == 130
+    assert error.startswith("Matching views: 0/3, 0:00:00 elapsed.\nMatching views: 1/3, ")
+    assert "Triangulating points: 0/1, " in error
 
 
 @pytest.mark.parametrize(

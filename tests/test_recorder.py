@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +22,11 @@ from morgs_mi.codec.packets import CodedFrame, coded_frames, play, reemitted_key
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.recorder import _metadata, _without_folder, stream_capture
 from morgs_mi.stream_loop import StreamLoop
+from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
 from tests.scenes.captures import colmap
 from tests.scenes.coded_clip import history
 from tests.scenes.recording import CONFIG, FRAMES, Recording, recording
+from tests.scenes.short_clip import Clip, Piece
 
 # About what the fit takes here; on a slower machine all kills come early.
 SECONDS = 0.8
@@ -195,7 +198,7 @@ def test_stream_capture__does_not_resume_another_fit(
 def test_stream_capture__does_not_resume_a_damaged_fit(whole: Path, tmp_path: Path) -> None:
     out = interrupted(whole, tmp_path / "out", len(stream_of(whole)))
     (out / "report.json").write_text("{")
-    with pytest.raises(ValueError, match=r"report\.json: expected the report of the fit, got a broken one"):
+    with pytest.raises(ValueError, match=r"report\.json: expected JSON, got a broken file"):
         stream_capture(recording(), out, CONFIG, resume=True)
     (out / "report.json").unlink()
     with pytest.raises(ValueError, match=r"report\.json: expected the report of the fit, got none; start again"):
@@ -279,6 +282,51 @@ def test_stream_capture__resumes_a_stream_whose_header_has_a_path(whole: Path, t
     stream_capture(recording(), out, CONFIG, resume=True)
     assert history(coded_frames(StreamReader(out / "stream.morgs"))) == history(coded_frames(reader))
     assert json.loads((out / "capture.json").read_text())["capture"] == str(Path("noise").resolve())
+
+
+@pytest.mark.parametrize("text", ["[]", "[" * 100_000])
+def test_stream_capture__resumes_beside_a_hostile_description(whole: Path, tmp_path: Path, text: str) -> None:
+    out = interrupted(whole, tmp_path / "out", len(stream_of(whole)) * 3 // 4)
+    (out / "capture.json").write_text(text)
+    stream_capture(recording(), out, CONFIG, resume=True)
+    assert_same(out, whole)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[" * 100_000, "expected JSON, got a broken file"),
+        ("[]", "expected the report of the fit, got a broken one"),
+        ('{"frames": [{"seconds": "many"}]}', "expected the report of the fit, got a broken one"),
+        (f'{{"frames": [{{"seconds": {10**400}}}]}}', "expected the report of the fit, got a broken one"),
+    ],
+)
+def test_stream_capture__refuses_a_hostile_report(whole: Path, tmp_path: Path, text: str, message: str) -> None:
+    out = interrupted(whole, tmp_path / "out", len(stream_of(whole)))
+    (out / "report.json").write_text(text)
+    with pytest.raises(ValueError, match=f"report.json: {message}"):
+        stream_capture(recording(), out, CONFIG, resume=True)
+
+
+def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence(whole: Path, tmp_path: Path) -> None:
+    data = stream_of(whole)
+    ends = [offset for *_, offset in StreamReader(whole / "stream.morgs").index()] + [len(data)]
+    packets = list(StreamReader(whole / "stream.morgs"))
+    pieces = [Piece(-1, 0, 0, 12), Piece(0, 0, 12, ends[0])]
+    pieces += [Piece(p.kind, p.frame, a, b) for p, (a, b) in zip(packets, pairwise(ends), strict=True)]
+    clip, out = Clip(data, pieces, {}), tmp_path / "out"
+    for case in range(12):
+        forge = (damaged, with_forged_bytes, with_forged_packets, with_forged_header)[case % 4]
+        forged = forge(clip, np.random.default_rng(case))
+        shutil.rmtree(out, ignore_errors=True)
+        shutil.copytree(whole, out)
+        (out / "stream.morgs").write_bytes(forged if isinstance(forged, bytes) else forged.data)
+        refusal = ""
+        try:
+            stream_capture(recording(), out, CONFIG, resume=True)
+        except ValueError as error:
+            refusal = str(error)
+        assert refusal.startswith(f"{out}/") or seek(StreamReader(out / "stream.morgs"), FRAMES - 1)
 
 
 @pytest.mark.parametrize("link", ["", "folder", "file"])

@@ -17,10 +17,12 @@ import numpy as np
 
 from morgs_mi.calibration.mistakes import same_poses
 from morgs_mi.calibration.rig_check import MAX_ERROR, CameraCheck
+from morgs_mi.capture.capture import opaque_pixels
 from morgs_mi.capture.layouts.clips import EXAMPLE, clips_by_camera, photos
+from morgs_mi.capture.timeline import nearest_frames
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path
-from morgs_mi.io.video import open_frames
+from morgs_mi.io.video import FrameReader, open_frames
 
 __all__ = ["CalibrateConfig", "CalibrationResult", "calibrate"]
 
@@ -41,11 +43,11 @@ class CalibrateConfig:
     ] = "SIMPLE_RADIAL"
     """COLMAP camera model; one with more parameters needs more views, or shared intrinsics."""
     shared_intrinsics: bool = False
-    """Whether all cameras share one set of intrinsics, which needs fewer views; for cameras of equal make and zoom."""
+    """One set of intrinsics for all cameras, which needs fewer views; for cameras of equal make and zoom."""
     frame: int = 0
-    """Frame to calibrate on."""
+    """Frame to calibrate on; in clips of variable frame rate, the one nearest in time."""
     partial: bool = False
-    """Whether to accept a model that lacks some of the cameras."""
+    """Accept a model that lacks some of the cameras."""
     seed: int = 0
     """Seed of COLMAP's random samples."""
 
@@ -101,10 +103,10 @@ def calibrate(
             f"{path / 'sparse'}: expected no model, got one; remove it, or overwrite it (--overwrite)."
         )
     report("Reading frames", 0, 1)
-    images = _frames(path, config)
+    images, masks = _frames(path, config)
     report("Reading frames", 1, 1)
     with tempfile.TemporaryDirectory() as scratch, _quiet():
-        model = _map(path, images, Path(scratch), config, report)
+        model = _map(path, images, masks, Path(scratch), config, report)
         registered = {Path(model.image(i).name).stem for i in model.reg_image_ids()}
         names = tuple(name for name in images if name in registered)
         left_out = tuple(name for name in images if name not in registered)
@@ -148,8 +150,8 @@ def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
     return CameraCheck(name, len(seen), error, not advice, advice)
 
 
-def _frames(path: Path, config: CalibrateConfig) -> dict[str, np.ndarray]:
-    """Return one image of each camera by its name."""
+def _frames(path: Path, config: CalibrateConfig) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Return one image of each camera by its name, and the masks of the opaque pixels where not all are."""
     clips = clips_by_camera(path) or photos(path)
     if len(clips) < 2:
         found = ", ".join(clips) or "none"
@@ -157,22 +159,30 @@ def _frames(path: Path, config: CalibrateConfig) -> dict[str, np.ndarray]:
             f"{path}: expected the clips of at least two cameras, found {found}; check the path, or make {EXAMPLE}"
         )
     readers = {name: open_frames(clip) for name, clip in clips.items()}
-    short = [name for name, reader in readers.items() if not 0 <= config.frame < reader.num_held]
+    short = [name for name, reader in readers.items() if not 0 <= config.frame <= _last_position(reader)]
     if short:
         raise ValueError(f"{path}: frame {config.frame} is not in the clips of {', '.join(short)}; choose another.")
-    images = {name: next(reader.frames(config.frame, config.frame + 1)) for name, reader in readers.items()}
+    at = {name: int(nearest_frames(reader, np.array([config.frame]))[0][0]) for name, reader in readers.items()}
+    images = {name: next(reader.frames(at[name], at[name] + 1)) for name, reader in readers.items()}
     sizes = {image.shape[1::-1] for image in images.values()}
     if config.shared_intrinsics and len(sizes) > 1:
         raise ValueError(
             f"{path}: shared intrinsics need clips of one size, got {', '.join(f'{w}x{h}' for w, h in sorted(sizes))}; "
             "give each camera its own."
         )
-    return images
+    masks = {name: opaque_pixels(reader, name)[0] for name, reader in readers.items()}
+    return images, {name: mask for name, mask in masks.items() if mask is not None}
+
+
+def _last_position(reader: FrameReader) -> int:
+    """Return the last instant of a clip, in frames of a constant rate."""
+    return reader.num_held - 1 if reader.positions is None else round(reader.positions[-1])
 
 
 def _map(
     path: Path,
     images: dict[str, np.ndarray],
+    masks: dict[str, np.ndarray],
     scratch: Path,
     config: CalibrateConfig,
     report: Callable[[str, int, int], None],
@@ -180,15 +190,20 @@ def _map(
     """Return pycolmap's reconstruction with the most cameras."""
     import pycolmap
 
-    folder, database = scratch / "images", scratch / "database.db"
+    folder, masked, database = scratch / "images", scratch / "masks", scratch / "database.db"
     folder.mkdir()
+    masked.mkdir()
     for name, image in images.items():
-        data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
-        (folder / f"{name}.png").write_bytes(data)
+        _write_png(folder / f"{name}.png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
+        if masks:  # COLMAP needs one for every image, or none at all
+            opaque = masks.get(name, np.ones(image.shape[:2], bool))
+            _write_png(masked / f"{name}.png.png", 255 * opaque.astype(np.uint8))
     pycolmap.set_random_seed(config.seed)
     report("Finding features", 0, 1)
     mode = pycolmap.CameraMode.SINGLE if config.shared_intrinsics else pycolmap.CameraMode.PER_IMAGE
     reader = pycolmap.ImageReaderOptions(camera_model=config.camera_model)
+    if masks:
+        reader.mask_path = masked
     pycolmap.extract_features(database, folder, camera_mode=mode, reader_options=reader, device=pycolmap.Device.cpu)
     report("Finding features", 1, 1)
     _check_features(path, database)
@@ -258,3 +273,7 @@ def _quiet() -> Iterator[None]:
         yield
     finally:
         pycolmap.logging.minloglevel = before
+
+
+def _write_png(file: Path, image: np.ndarray) -> None:
+    file.write_bytes(cv2.imencode(".png", image)[1].tobytes())

@@ -26,7 +26,7 @@ from morgs_mi.core.checks import check_points
 from morgs_mi.io.prefetch import prefetched
 from morgs_mi.io.video import Clip, FolderReader, FrameReader, ImageOrError, open_clips
 
-__all__ = ["Capture", "Frame", "PartialFrame", "load_capture"]
+__all__ = ["Capture", "Frame", "PartialFrame", "load_capture", "opaque_pixels"]
 
 _LOG = logging.getLogger(__name__)
 # Pixels of the shorter side that a downscaled image needs.
@@ -240,7 +240,7 @@ def load_capture(
         )
     names = [camera.name for camera in recorded]
     common = timeline(path, names, readers, reading, max_frames, settings.get("fps"))
-    opaque = [_opaque(reader, camera.name) for reader, camera in zip(readers, recorded, strict=True)]
+    opaque = [opaque_pixels(reader, camera.name) for reader, camera in zip(readers, recorded, strict=True)]
     sources = tuple(
         CameraSource(reader, lens, undistortion(camera, lens), indices, opaque=mask)
         for reader, lens, camera, indices, (mask, _) in zip(
@@ -269,8 +269,12 @@ def load_capture(
     return _color_corrected(capture, reading) if reading.color != "none" or reading.exposure else capture
 
 
-def _opaque(reader: FrameReader, name: str) -> tuple[np.ndarray | None, str]:
-    """Return the mask of the pixels that are not transparent, None if all are opaque or it varies, and a note."""
+def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, str]:
+    """Return the mask of the pixels that are not transparent, None if all are opaque or it varies, and a note.
+
+    Raises:
+        ValueError: no pixel is opaque.
+    """
     if not isinstance(reader, FolderReader):
         return None, ""
     mask, constant = reader.opaque()

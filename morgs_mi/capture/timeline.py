@@ -20,7 +20,7 @@ import numpy as np
 from morgs_mi.io.bounded import read_json
 from morgs_mi.io.video import FrameReader
 
-__all__ = ["ReadConfig", "Timeline", "read_settings", "timeline"]
+__all__ = ["ReadConfig", "Timeline", "nearest_frames", "read_settings", "timeline"]
 
 _LOG = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0
@@ -108,7 +108,7 @@ def timeline(
         offsets = np.array([*shifts], float)
         instants = _common_instants(path, names, readers, config, rates, offsets, lowest)[:max_frames]
     indices, apart = zip(
-        *(_nearest(reader, o + r * instants) for reader, o, r in zip(readers, offsets, rates, strict=True)),
+        *(nearest_frames(reader, o + r * instants) for reader, o, r in zip(readers, offsets, rates, strict=True)),
         strict=True,
     )
     if config.gaps:
@@ -148,7 +148,7 @@ def _position(reader: FrameReader, index: int) -> int:
     return round(reader.positions[held]) + index - held
 
 
-def _nearest(reader: FrameReader, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def nearest_frames(reader: FrameReader, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the frames nearest to ascending positions, int [T], and their distances in frames [T]."""
     if reader.positions is None:
         indices = np.rint(positions).astype(int)

@@ -23,7 +23,7 @@ import tyro
 from tyro.conf import arg
 
 from morgs_mi.cli.calibrate import Calibrate
-from morgs_mi.cli.console import ERR, LogHandler, print_warning, sentence_of
+from morgs_mi.cli.console import ERR, LogHandler, naming_output, print_warning, sentence_of
 from morgs_mi.cli.demo import Demo
 from morgs_mi.cli.evaluate import Eval
 from morgs_mi.cli.export import Export
@@ -78,23 +78,25 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
     args = sys.argv[1:] if args is None else list(args)
     command: Any = None
     try:
-        options: Any = tyro.cli(
-            options_type,
-            prog=prog,
-            args=args,
-            config=(
-                tyro.conf.CascadeSubcommandArgs,
-                tyro.conf.OmitSubcommandPrefixes,
-                tyro.conf.PositionalMetavarFromFieldName,
-            ),
-        )
+        with naming_output():  # the help goes there
+            options: Any = tyro.cli(
+                options_type,
+                prog=prog,
+                args=args,
+                config=(
+                    tyro.conf.CascadeSubcommandArgs,
+                    tyro.conf.OmitSubcommandPrefixes,
+                    tyro.conf.PositionalMetavarFromFieldName,
+                ),
+            )
         command = options.command
         with _terminable():
             _set_up(options)
             command.run()
-            sys.stdout.flush()
+            with naming_output():
+                sys.stdout.flush()
         return 0
-    except (KeyboardInterrupt, ValueError, OSError, MemoryError, ArithmeticError) as error:
+    except (KeyboardInterrupt, Exception) as error:
         interrupted = isinstance(error, KeyboardInterrupt)
         place = str(getattr(command, "capture", None) or "")
         sentence = "Interrupted." if interrupted else sentence_of(error, _option_names(command), place)

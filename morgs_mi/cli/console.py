@@ -8,46 +8,89 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import timedelta
+from typing import Any
 
 from rich.console import Console
 from rich.measure import Measurement
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 __all__ = [
     "ERR",
     "OUT",
     "LogHandler",
     "Report",
+    "naming_output",
     "print_result",
     "print_table",
     "print_warning",
+    "printable",
     "progress",
     "sentence_of",
     "with_option_names",
 ]
 
-# Rich would wrap paths and sentences at 80 columns without a terminal, and turn `:100:` into an emoji.
-OUT = Console(soft_wrap=True, highlight=False, emoji=False)
-ERR = Console(stderr=True, soft_wrap=True, highlight=False, emoji=False)
+
+def printable(text: str) -> str:
+    r"""Return a text with its control characters as ``\u001b``: names in a file may hold escape sequences."""
+    return "".join(c if c == "\n" or c.isprintable() else _escaped(c) for c in text)
+
+
+def _escaped(character: str) -> str:
+    """Return a character as TOML has it."""
+    return f"\\u{ord(character):04x}" if ord(character) < 0x10000 else f"\\U{ord(character):08x}"
+
+
+class _Console(Console):
+    """Console that prints texts and the cells of tables as they are, but no control characters."""
+
+    def __init__(self, **options: Any) -> None:
+        # Rich would wrap paths and sentences at 80 columns without a terminal, and turn `:100:` into an emoji.
+        super().__init__(markup=False, highlight=False, emoji=False, **options)
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return a text as Rich prints it."""
+        return super().render_str(printable(text), **{**options, "markup": False})
+
+
+OUT = _Console(soft_wrap=True)
+ERR = _Console(stderr=True, soft_wrap=True)
 Report = Callable[[str, float, float], None]
+# Errors that the user can correct; any other is a fault of the package, or of a library.
+_EXPECTED = (ValueError, OSError, MemoryError, ArithmeticError)
 _PERIOD = 30.0  # seconds between two lines of progress without a terminal
 
 
+@contextmanager
+def naming_output() -> Iterator[None]:
+    """Name standard output in an error of the system."""
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, "standard output") from error
+
+
 def print_result(text: str) -> None:
-    """Print to standard output."""
-    print(text)
+    """Print to standard output.
+
+    Raises:
+        OSError: it is full or closed; the error names it.
+    """
+    with naming_output():
+        print(printable(text))
 
 
 def print_table(table: Table) -> None:
     """Print to standard output with complete columns, even where the terminal is narrower than the table."""
     needed = Measurement.get(OUT, OUT.options.update(max_width=10_000), table).maximum
-    Console(width=max(OUT.width, needed), highlight=False, emoji=False).print(table)
+    with naming_output():
+        _Console(width=max(OUT.width, needed)).print(table)
 
 
 def print_warning(text: str) -> None:
-    """Print to standard error."""
-    ERR.print(text, markup=False)
+    """Print one line to standard error."""
+    ERR.print(text.replace("\n", " "))
 
 
 class LogHandler(logging.Handler):
@@ -67,8 +110,12 @@ def sentence_of(error: BaseException, names: Mapping[str, str], place: str = "")
     if isinstance(error, OSError) and error.errno is not None and error.strerror:
         text = f"{f'{error.filename}: ' if error.filename else ''}{error.strerror.rstrip('.')}."
     text = with_option_names(" ".join(text.split()), names, place)
+    if not isinstance(error, _EXPECTED):
+        text = f"Unexpected {type(error).__name__}: {text.rstrip('.')}; run the command with --debug for the traceback."
     if isinstance(error, OSError):  # it is about a file; the function is of no use to a user
         text = re.sub(r"^cannot", "Cannot", re.sub(r"^[\w.]+\(\): ", "", text))
+    if isinstance(error, MemoryError):
+        text = text or "Out of memory; process smaller images, or fewer frames or Gaussians."
     return text or f"{type(error).__name__}."
 
 

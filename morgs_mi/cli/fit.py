@@ -64,7 +64,7 @@ class Fit:
                 started.append(frame)
                 report("Fitting frames", frame + step / steps, count)
 
-            reports = stream_capture(capture, self.out, config, on_step, self.resume)
+            reports = stream_capture(capture, self.out, config, on_step, self.resume, report)
         seconds = [row.seconds for row in reports[1:]]
         later = f", {sum(seconds) / len(seconds):.1f} s for each later one" if seconds else ""
         print_result(

@@ -12,7 +12,6 @@ ones.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import blake2b
@@ -47,6 +46,7 @@ __all__ = [
     "CodedFrame",
     "coded_frames",
     "decode",
+    "frames_near",
     "keyframe_packet",
     "play",
     "reemitted_keyframe",
@@ -257,26 +257,38 @@ def play(packets: Iterable[Packet]) -> Iterator[tuple[int, Gaussians]]:
 
 
 def seek(stream: StreamReader, frame: int) -> CodedFrame:
-    """Return the state at a frame; decoding starts at the last keyframe before it.
-
-    Where the frame cannot be reached from there, because that keyframe or the index is forged, the stream is played.
+    """Return the state at a frame; decoding starts as in `frames_near`.
 
     Raises:
         ValueError: the stream has no such frame, is not a file, or a packet is broken.
     """
-    near = stream.near(frame)
-    with suppress(ValueError):
-        if (found := _state_at(near, frame)) is not None:
-            return found
-    if (found := _state_at(stream, frame)) is not None:
-        return found
-    raise ValueError(f"{stream.path}: expected a frame of the stream, got {frame}; choose one that it contains.")
+    last = next((coded for coded in frames_near(stream, frame) if coded.frame >= frame), None)
+    if last is None or last.frame != frame:
+        raise ValueError(f"{stream.path}: expected a frame of the stream, got {frame}; choose one that it contains.")
+    return last
 
 
-def _state_at(packets: Iterable[Packet], frame: int) -> CodedFrame | None:
-    """Return the state at a frame, None if the packets have none."""
-    last = next((coded for coded in coded_frames(packets) if coded.frame >= frame), None)
-    return last if last is not None and last.frame == frame else None
+def frames_near(stream: StreamReader, frame: int) -> Iterator[CodedFrame]:
+    """Yield the states from the last keyframe before a frame on.
+
+    Where the frame cannot be reached from there, because that keyframe or the index is forged, those from the start of
+    the stream follow.
+
+    Raises:
+        ValueError: the stream is not a file, or a packet is broken.
+    """
+    near, reached = stream.near(frame), False
+    try:
+        for coded in coded_frames(near):
+            if coded.frame > frame and not reached:
+                break
+            reached = reached or coded.frame == frame
+            yield coded
+    except ValueError:
+        if reached:
+            raise
+    if not reached:
+        yield from coded_frames(stream)
 
 
 def _decoded_keyframe(packet: Packet) -> CodedFrame:

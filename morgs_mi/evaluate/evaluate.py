@@ -8,7 +8,6 @@ by more than its noise if there is no truth.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -36,6 +35,7 @@ from morgs_mi.evaluate.results import (
     known_mean,
 )
 from morgs_mi.evaluate.temporal import StillVariation, recorded_change, slope
+from morgs_mi.io.bounded import read_json
 from morgs_mi.playback.player import (
     has_confidence,
     open_stream,
@@ -260,8 +260,8 @@ def _seconds(stream: Path) -> dict[int, float]:
     path = stream.with_name("report.json")
     if not path.is_file():
         return {}
+    report = read_json(path)
     try:
-        report = json.loads(path.read_text(encoding="utf-8"))
         return {row["frame"]: float(row["seconds"]) for row in report["frames"]}
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{path}: expected a fit's report, got a broken one ({error!r}); remove it.") from None

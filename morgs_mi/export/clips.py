@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.codec.packets import coded_frames, play, seek
+from morgs_mi.codec.packets import CodedFrame, frames_near, play, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import atomic_folder
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.export.frames import PLAYABLE, pad_to_even
+from morgs_mi.export.frames import pad_to_even
 from morgs_mi.export.paths import CameraPath
-from morgs_mi.io.video_writer import write_video
+from morgs_mi.io.video_writer import playable_format, write_video
 from morgs_mi.playback.player import channel_image, render, render_config
 from morgs_mi.playback.visualise import side_by_side
 
@@ -134,7 +134,7 @@ def write_flight(
             if progress is not None:
                 progress(i + 1, count)
 
-    write_video(output, images(), stream.fps, PLAYABLE)
+    write_video(output, images(), stream.fps, playable_format()[1])
 
 
 def repeated_seconds(clip: float, least: float) -> float:
@@ -161,9 +161,9 @@ def _frames_backwards(stream: StreamReader) -> Iterator[Gaussians]:
     """Yield the frames between the first and the last one backwards, decoded from one keyframe to the next."""
     between = frame_numbers(stream)[1:-1]
     while between:
-        block = []
-        for coded in coded_frames(stream.near(between[-1])):
-            block.append(coded)
+        block: list[CodedFrame] = []
+        for coded in frames_near(stream, between[-1]):
+            block = [*(before for before in block if before.frame < coded.frame), coded]
             if coded.frame == between[-1]:
                 break
         # A keyframe has no motion of its own: it follows from the residual, in the block before.

@@ -12,14 +12,11 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import srgb_to_linear
 from morgs_mi.core.files import atomic_folder
 from morgs_mi.io.exr import write_exr
-from morgs_mi.io.video_writer import write_video
+from morgs_mi.io.video_writer import playable_format, write_video
 from morgs_mi.playback.player import channel_image, render_stream
 from morgs_mi.playback.visualise import side_by_side, write_png
 
-__all__ = ["PLAYABLE", "exr_channels", "pad_to_even", "write_frames"]
-
-PLAYABLE = "vp09"
-"""Codec that OpenCV's wheels encode and all browsers play: the wheels have no H.264, and browsers do not play mp4v."""
+__all__ = ["exr_channels", "pad_to_even", "write_frames"]
 
 
 def write_frames(
@@ -62,7 +59,8 @@ def write_frames(
                 progress(done)
 
     if video:
-        write_video(output, (pad_to_even(_combined_image(images)) for _, images in frames()), stream.fps, PLAYABLE)
+        padded = (pad_to_even(_combined_image(images)) for _, images in frames())
+        write_video(output, padded, stream.fps, playable_format()[1])
         return
     with atomic_folder(output, "write_frames()") as folder:
         for frame, images in frames():

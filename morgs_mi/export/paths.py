@@ -6,7 +6,6 @@ rotation spline (both with continuous acceleration), the focal lengths and the p
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,6 +18,7 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.export.axes import up_direction
+from morgs_mi.io.bounded import read_json
 
 __all__ = ["CameraPath", "focus", "load_path", "orbit", "through_cameras"]
 
@@ -168,8 +168,8 @@ def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
     """
     if not Path(file).is_file():
         raise FileNotFoundError(f"{file}: expected a camera path, found none; check the path.")
+    document = read_json(file)
     try:
-        document = json.loads(Path(file).read_text(encoding="utf-8"))
         keys = [dict(key) for key in document["keys"]]
     except (ValueError, TypeError, KeyError) as error:
         raise ValueError(f"{file}: expected a JSON object with a list `keys` of objects, got {error!r}.") from None
@@ -181,7 +181,7 @@ def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
             views.append(_key_view({**common, **key}, cameras))
         except KeyError as error:
             raise ValueError(f"{file}: key {i}: {error.args[0]!r} is missing.") from None
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, OverflowError) as error:
             raise ValueError(f"{file}: key {i}: {error}") from None
     try:
         return CameraPath(np.asarray(times), tuple(views))

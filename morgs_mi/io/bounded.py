@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import tokenize
 import zipfile
 import zlib
 from io import BytesIO
@@ -19,8 +20,11 @@ import numpy as np
 __all__ = ["check_claim", "read_array", "read_json"]
 
 _FACTOR, _ALLOWANCE = 10, 200_000_000
-# What NumPy and zipfile raise for broken files.
-_BROKEN = (ValueError, TypeError, EOFError, KeyError, MemoryError, RuntimeError, zipfile.BadZipFile, zlib.error)
+# What NumPy and zipfile raise for broken files. NumPy parses headers as Python.
+_BROKEN = (
+    *(ValueError, TypeError, EOFError, KeyError, MemoryError, RuntimeError, OverflowError, zipfile.BadZipFile),
+    *(zlib.error, SyntaxError, tokenize.TokenError),
+)
 # At most, in bytes: an empty dict or list as the value of a list, and a number or a short key with its reference.
 _DICT_BYTES, _LIST_BYTES, _VALUE_BYTES = 240, 64, 40
 
@@ -48,6 +52,7 @@ def read_json(path: str | Path) -> Any:
     """Return the content of a JSON file.
 
     Raises:
+        OSError: there is no such file, or it cannot be read.
         ValueError: the file is broken, nested too deeply, or has too many tiny values.
     """
     data = Path(path).read_bytes()
@@ -57,7 +62,7 @@ def read_json(path: str | Path) -> Any:
     try:
         return json.loads(data.decode("utf-8"))
     except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: expected JSON, got a broken file ({error}); export it again.") from None
+        raise ValueError(f"{path}: expected JSON, got a broken file ({error}); write it again.") from None
 
 
 def read_array(path: str | Path, name: str | None = None) -> np.ndarray:

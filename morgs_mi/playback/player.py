@@ -6,7 +6,6 @@ pixel grid and holds x_t - x_{t-1}, like the ground truth. Keyframes store no di
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -29,6 +28,7 @@ from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Tensor
+from morgs_mi.io.bounded import read_json
 from morgs_mi.playback.visualise import confidence_image, depth_image, grey_image, motion_image, to_uint8
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
@@ -41,6 +41,7 @@ __all__ = [
     "available_channels",
     "channel_image",
     "find_camera",
+    "fitted_capture",
     "has_confidence",
     "has_offset",
     "num_frames",
@@ -288,7 +289,7 @@ def open_stream_capture(stream: StreamReader, capture: str | Path | None, frames
         ValueError: no capture is named, the header's metadata do not state how it was read, the capture is not the one
             that was fitted, or there are no frames.
     """
-    path = capture or _fitted_capture(stream)
+    path = capture or fitted_capture(stream)
     reading = apply_values(ReadConfig(), _metadata(stream, "reading", {}, dict), _place(stream, "reading"))
     downscale = _metadata(stream, "downscale", 1, int, float)
     test_view = _metadata(stream, "test_view", "auto", int, str, NoneType)
@@ -309,7 +310,7 @@ def open_stream_capture(stream: StreamReader, capture: str | Path | None, frames
     return recording
 
 
-def _fitted_capture(stream: StreamReader) -> str:
+def fitted_capture(stream: StreamReader) -> str:
     """Return the path of a stream's capture, which is in the `capture.json` beside it; in the header of older streams.
 
     Raises:
@@ -318,7 +319,7 @@ def _fitted_capture(stream: StreamReader) -> str:
     """
     beside = None
     with suppress(OSError, ValueError):
-        beside = json.loads(stream.path.with_name("capture.json").read_text(encoding="utf-8"))
+        beside = read_json(stream.path.with_name("capture.json"))
     stored = [about.get("capture") for about in (stream.metadata, beside) if isinstance(about, dict)]
     paths, remedy = [path for path in stored if isinstance(path, str)], "name its folder with --capture"
     if not paths:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -149,6 +150,8 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
     assert spec
     assert spec.loader
     module = importlib.util.module_from_spec(spec)
+    # Dataclasses look up the names of their postponed annotations there.
+    sys.modules[spec.name] = module
     with _failures_in(path):
         spec.loader.exec_module(module)
     build = getattr(module, "build", None)

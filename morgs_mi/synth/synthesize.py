@@ -6,7 +6,6 @@ centres, so it has no noise and does not mix foreground and background.
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable, Iterator, Sequence
 from importlib import metadata
@@ -20,6 +19,7 @@ from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path, write_json
+from morgs_mi.io.bounded import read_json
 from morgs_mi.io.video import open_frames
 from morgs_mi.io.video_writer import playable_format, write_video
 from morgs_mi.synth.ground_truth import Tracks, compute_ground_truth, move_with_objects, save_truth
@@ -260,7 +260,7 @@ def _check_folder(out: Path, overwrite: bool) -> None:
 def _is_synthetic(folder: Path) -> bool:
     """Return whether a folder is a capture written by `synthesize`: recordings and fits have a `capture.json` too."""
     try:
-        about = json.loads((folder / "capture.json").read_text(encoding="utf-8"))
+        about = read_json(folder / "capture.json")
     except (OSError, ValueError):
         return False
     return isinstance(about, dict) and {"scene", "spp"} <= set(about)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.codec.container import PacketKind, TruncatedStreamError
-from morgs_mi.codec.packets import CodedFrame, coded_frames
+from morgs_mi.codec.packets import CodedFrame, frames_near
 from morgs_mi.playback.player import open_stream
 
 __all__ = ["NO_TRAILS", "FrameCache", "Trails"]
@@ -79,10 +79,11 @@ class FrameCache:
             return self._current
         if self._current is None or not self._keyframe_before(frame) <= self._current.frame < frame:
             self._current, self._upcoming = None, iter(())
-        self._advance(frame)
+        with suppress(ValueError):
+            self._advance(frame)
         if self._current is None or self._current.frame != frame:
             # An iterator that has reached the end of the file does not read on after the file has grown.
-            self._upcoming = coded_frames(self.stream.near(frame))
+            self._upcoming = frames_near(self.stream, frame)
             self._advance(frame)
         if self._current is None or self._current.frame != frame:
             raise ValueError(f"{self.stream.path}: expected a frame of the stream, got {frame}.")

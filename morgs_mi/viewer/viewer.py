@@ -21,7 +21,15 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.export.axes import up_direction
 from morgs_mi.export.paths import focus
-from morgs_mi.playback.player import MOTION_SCALE, channel_image, num_frames, open_stream_capture, render, render_config
+from morgs_mi.playback.player import (
+    MOTION_SCALE,
+    channel_image,
+    fitted_capture,
+    num_frames,
+    open_stream_capture,
+    render,
+    render_config,
+)
 from morgs_mi.viewer.access import checked_connections
 from morgs_mi.viewer.controls import FREE, Controls
 from morgs_mi.viewer.crop import crop_limits, is_in_box, is_shown
@@ -340,9 +348,8 @@ class Viewer:
 
     def _missing_capture(self) -> str | None:
         """Return why there are no recorded images, without opening them; None if there are."""
-        path = self._capture or self._cache.stream.metadata.get("capture")
-        if path is None:
-            return f"{self._cache.stream.path} does not name its capture; pass one (--capture)."
-        if not Path(path).is_dir():
-            return f"{path}: expected the capture, found none; pass its folder (--capture)."
-        return None
+        try:
+            path = Path(self._capture or fitted_capture(self._cache.stream))
+        except (OSError, ValueError) as error:
+            return str(error)
+        return None if path.is_dir() else f"{path}: expected the capture, found none; pass its folder (--capture)."

@@ -12,13 +12,14 @@ import numpy as np
 import pytest
 
 from morgs_mi import cli
-from morgs_mi.calibration.calibrate import CalibrateConfig, calibrate
+from morgs_mi.calibration.calibrate import CalibrateConfig, _frames, calibrate
 from morgs_mi.calibration.rig_check import check_rig, match_capture
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
 from tests.assertions import assert_close
 from tests.scenes import textured
+from tests.scenes.captures import write_timed_video
 
 
 def film(path: Path, cameras: list[Camera], suffix: str = ".mkv") -> Path:
@@ -87,6 +88,26 @@ def test_calibrate__prints_a_verdict_per_camera(tmp_path: Path, capsys) -> None:
     assert re.match(r"0 +- +not checked", rows["other"])
     assert "cam9 does not fit: it has the same pose as cam1: one clip seems to be a copy" in printed.err
     assert "other not checked: it could not be registered and has no pose" in printed.err
+
+
+def test_calibrate__finds_no_features_in_transparent_pixels(tmp_path: Path) -> None:
+    planes = textured.textures()
+    for camera in (camera.resized(240, 180) for camera in textured.rig(2)):
+        image = cv2.cvtColor(textured.render(camera, planes), cv2.COLOR_RGB2BGRA)
+        image[:, 10:, 3] = 0
+        (tmp_path / camera.name).mkdir()
+        cv2.imwrite(str(tmp_path / camera.name / "0000.png"), image)
+    with pytest.raises(ValueError, match=r"expected at least 100 features in every view, got \d\d? in cam"):
+        calibrate(tmp_path)
+
+
+def test_frames__are_the_nearest_in_time_at_a_variable_frame_rate(tmp_path: Path) -> None:
+    for name, times in (("a", [0, 50, 100, 150, 200, 250, 300]), ("b", [0, 50, 100, 250, 300])):
+        write_timed_video(tmp_path / f"{name}.mp4", [np.full((48, 64, 3), t // 2, np.uint8) for t in times], times)
+    images, _ = _frames(tmp_path, CalibrateConfig(frame=5))
+    assert_close(images["b"].astype(float), images["a"], atol=2)
+    with pytest.raises(ValueError, match="frame 7 is not in the clips of a, b"):
+        _frames(tmp_path, CalibrateConfig(frame=7))
 
 
 def noise_clips(path: Path) -> None:

@@ -4,11 +4,21 @@ from __future__ import annotations
 
 import logging
 import time
+import tomllib
 
 import pytest
 from rich.table import Table
 
-from morgs_mi.cli.console import LogHandler, print_table, progress, sentence_of, with_option_names
+from morgs_mi.cli.console import (
+    LogHandler,
+    print_result,
+    print_table,
+    print_warning,
+    printable,
+    progress,
+    sentence_of,
+    with_option_names,
+)
 
 
 def test_progress__prints_a_line_every_30_seconds_without_a_terminal(
@@ -44,6 +54,26 @@ def test_print_table__is_as_wide_as_its_content_without_a_terminal(capsys: pytes
     assert len(text.splitlines()) == 5
 
 
+HOSTILE = "a\x1b[2J\x9b\x7f\udcff\u202e[red]b"
+
+
+def test_console__prints_control_characters_escaped(capsys: pytest.CaptureFixture[str]) -> None:
+    table = Table(HOSTILE, title=HOSTILE)
+    table.add_row(HOSTILE)
+    print_result(HOSTILE + "\nb")
+    print_table(table)
+    print_warning(HOSTILE + "\nb")
+    printed, escaped = capsys.readouterr(), r"a\u001b[2J\u009b\u007f\udcff\u202e[red]b"
+    assert printed.out.count(escaped) == 4
+    assert printed.out.startswith(f"{escaped}\nb\n")
+    assert printed.err == f"{escaped} b\n"
+
+
+def test_printable__changes_no_text_and_no_toml() -> None:
+    assert printable("é ✓ 日本\n") == "é ✓ 日本\n"
+    assert tomllib.loads(printable('a = "\x9b\U000e0001"')) == {"a": "\x9b\U000e0001"}
+
+
 def test_LogHandler__prints_one_line_with_the_level(capsys: pytest.CaptureFixture[str]) -> None:
     LogHandler().emit(logging.LogRecord("name", logging.WARNING, "", 0, "%s: [left out]", ("cam1" * 40,), None))
     assert capsys.readouterr().err == f"Warning: {'cam1' * 40}: [left out]\n"
@@ -58,7 +88,9 @@ def test_LogHandler__prints_one_line_with_the_level(capsys: pytest.CaptureFixtur
         (OSError("write_png(): cannot write a.png: full."), "Cannot write a.png: full."),
         (FileExistsError("f(): out is not empty; set `overwrite`."), "out is not empty; set --overwrite."),
         (ValueError("f(): `b` must\nbe 1."), "f(): `b` must be 1."),
-        (MemoryError(), "MemoryError."),
+        (MemoryError(), "Out of memory; process smaller images, or fewer frames or Gaussians."),
+        (MemoryError("Unable to allocate 9 GiB."), "Unable to allocate 9 GiB."),
+        (AttributeError("no a."), "Unexpected AttributeError: no a; run the command with --debug for the traceback."),
     ],
 )
 def test_sentence_of__has_no_number_and_no_function(error: Exception, sentence: str) -> None:

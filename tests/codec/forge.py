@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from morgs_mi.codec.container import PAYLOAD, PREAMBLE, decode_packet
-from morgs_mi.codec.packets import decode
+from morgs_mi.codec.packets import decode, keyframe_packet
+from tests.scenes.coded_clip import CAMERAS, cloud
 from tests.scenes.short_clip import Clip, sealed
 
 HOSTILE_TEXT = (
@@ -87,6 +88,22 @@ def with_forged_header(clip: Clip, rng: np.random.Generator) -> Forgery:
         text = text.replace(f'"{mark}"', HOSTILE_TEXT[rng.integers(len(HOSTILE_TEXT))])
     return Forgery(
         clip.data[: PREAMBLE.size] + sealed(text.encode("latin1"), 0) + clip.data[clip.pieces[1].stop :], None
+    )
+
+
+def forged_streams(clip: Clip) -> tuple[bytes, bytes]:
+    """Return the stream with another keyframe of frame 3, and with an index whose second entry is no keyframe.
+
+    Both play from the start as the clip does.
+    """
+    forged = keyframe_packet(cloud(9, 0), 3, CAMERAS).encoded
+    keyframe, at = clip.pieces[6], clip.pieces[-1].start
+    assert (keyframe.kind, keyframe.frame) == (1, 3)
+    entries = [(1, 0, clip.pieces[2].start), (1, 3, clip.pieces[4].start)]
+    index = b"".join(struct.pack("<IIQ", *entry) for entry in entries)
+    return (
+        clip.data[: keyframe.start] + forged + clip.data[keyframe.stop : at],
+        clip.data[:at] + sealed(index + struct.pack("<Q8s", at, b"MORGSIDX"), 3),
     )
 
 

@@ -19,9 +19,10 @@ from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, keyframe_pa
 from morgs_mi.codec.quantisation import Grid
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.codec.salvage import DamagedRange, salvage, write_salvaged
+from tests.codec.forge import forged_streams
 from tests.codec.fuzz import FUZZERS, check_intact_frames, differs
 from tests.scenes.coded_clip import CAMERAS, cloud
-from tests.scenes.short_clip import FRAMES, Clip, sealed, short_clip
+from tests.scenes.short_clip import FRAMES, Clip, short_clip
 
 FUZZ_SECONDS = float(os.environ.get("MORGS_FUZZ_SECONDS", "600"))
 """Time that `make test-slow` spends on each fuzzer."""
@@ -119,16 +120,7 @@ def test_salvage__continues_behind_a_packet_that_takes_too_much_memory(clip: Cli
 
 
 def test_seek__plays_from_the_start_where_a_keyframe_or_the_index_is_forged(clip: Clip, tmp_path: Path) -> None:
-    forged = keyframe_packet(cloud(9, 0), 3, CAMERAS).encoded
-    keyframe = clip.pieces[6]
-    assert (keyframe.kind, keyframe.frame) == (1, 3)
-    entries = [(1, 0, clip.pieces[2].start), (1, 3, clip.pieces[4].start)]
-    index = b"".join(struct.pack("<IIQ", *entry) for entry in entries)
-    at = clip.pieces[-1].start
-    for data in (
-        clip.data[: keyframe.start] + forged + clip.data[keyframe.stop : at],
-        clip.data[:at] + sealed(index + struct.pack("<Q8s", at, b"MORGSIDX"), 3),
-    ):
+    for data in forged_streams(clip):
         (tmp_path / "s").write_bytes(data)
         stream = StreamReader(tmp_path / "s")
         for state in coded_frames(stream):

@@ -12,12 +12,15 @@ import pytest
 from morgs_mi import cli
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import srgb_to_linear
-from morgs_mi.export.clips import _frames_backwards, repeated_seconds, select_frames
-from morgs_mi.export.frames import exr_channels, pad_to_even
+from morgs_mi.export.clips import _frames_backwards, repeated_seconds, select_frames, write_flight
+from morgs_mi.export.frames import exr_channels, pad_to_even, write_frames
+from morgs_mi.export.paths import through_cameras
 from morgs_mi.io.ply import read_ply
 from morgs_mi.render.rasterize import rasterize
 from tests.assertions import assert_close
+from tests.codec.forge import forged_streams
 from tests.scenes.changing_splats import rig, write_stream
+from tests.scenes.short_clip import FRAMES, short_clip
 
 
 @pytest.fixture
@@ -85,6 +88,24 @@ def test_frames_backwards__are_those_of_the_clip_with_their_motion(tmp_path):
     for gaussians, state in zip(backwards, states[-2:0:-1], strict=True):
         for name, values in state.gaussians.numpy().items():
             np.testing.assert_array_equal(gaussians.numpy()[name], values)
+
+
+def test_frames_backwards__are_those_of_the_clip_if_a_keyframe_is_forged(tmp_path):
+    clip = short_clip()
+    (tmp_path / "s").write_bytes(forged_streams(clip)[0])
+    frames = _frames_backwards(StreamReader(tmp_path / "s"))
+    for frame, gaussians in zip(range(FRAMES - 2, 0, -1), frames, strict=True):
+        np.testing.assert_array_equal(gaussians.means, clip.states[frame].gaussians.means)
+
+
+@pytest.mark.parametrize("write", [write_frames, write_flight])
+def test_export__writes_videos_in_the_playable_format(stream, tmp_path, monkeypatch, write):
+    monkeypatch.setattr(f"{write.__module__}.playable_format", lambda: (".mp4", "mp4v"))
+    reader = StreamReader(tmp_path / "stream.morgs")
+    view = reader.cameras[0] if write is write_frames else through_cameras(reader.cameras, 0.2)
+    write(reader, view, tmp_path / "a.mp4")
+    code = int(cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FOURCC))
+    assert code.to_bytes(4, "little") in (b"mp4v", b"FMP4")
 
 
 def test_repeated_seconds__plays_whole_clips():

@@ -93,7 +93,13 @@ def test_load_path__accepts_cameras_matrices_and_positions(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("[", "expected a JSON object with a list `keys`"),
+        ("[", "expected JSON, got a broken file"),
+        ("[" * 100_000, "expected JSON, got a broken file"),
+        (
+            '{"keys": [{"time": 0, "camera": "left", "width": 1e999}]}',
+            "key 0: cannot convert float infinity",
+        ),
+        ("[]", "expected a JSON object with a list `keys`"),
         ('{"cameras": []}', "expected a JSON object with a list `keys`"),
         ('{"keys": [{"time": 0, "camera": "left"}]}', "at least two key views"),
         ('{"keys": [{"time": 0, "camera": "up"}]}', "key 0: `camera` must be one of left, middle, right, got 'up'"),

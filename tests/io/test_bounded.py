@@ -40,8 +40,11 @@ def image(path: Path) -> FolderReader:
 
 def npy(shape: str, dtype: str = "'<f8'", body: bytes = bytes(48)) -> bytes:
     """Return a NumPy file with any header."""
-    header = f"{{'descr': {dtype}, 'fortran_order': False, 'shape': {shape}, }}\n".encode()
-    return b"\x93NUMPY\x01\0" + struct.pack("<H", len(header)) + header + body
+    return npy_header(f"{{'descr': {dtype}, 'fortran_order': False, 'shape': {shape}, }}\n", body)
+
+
+def npy_header(header: str, body: bytes = b"") -> bytes:
+    return b"\x93NUMPY\x01\0" + struct.pack("<H", len(header)) + header.encode() + body
 
 
 def npz(member: bytes, name: str = "data.npy") -> Callable[[Path], object]:
@@ -85,6 +88,10 @@ CASES = {
     "npy of objects": (read_array, npy("(1,)", "'|O'", b"cos\nsystem\n."), "it holds Python objects, not numbers"),
     "npy of no bytes": (read_array, npy("(3,)", "'|V0'"), "expected a NumPy array, got a broken file"),
     "npy of code": (read_array, npy("().__class__"), "expected a NumPy array, got a broken file"),
+    "npy of an open bracket": (read_array, npy_header("("), "expected a NumPy array, got a broken file"),
+    "npy of bad indentation": (read_array, npy_header("\n  (\n )\n 1"), "expected a NumPy array, got a broken file"),
+    "npy of no type": (read_array, npy("(6,)", "'<,4'"), "expected a NumPy array, got a broken file"),
+    "npy of no bytes and many": (read_array, npy(f"({10**30},)", "'|V0'"), "expected a NumPy array, got a broken file"),
     "npz in place of npy": (read_array, npz(npy("(6,)")), "expected a NumPy array, got a broken file"),
     "npz of many rows": (
         archived,

@@ -212,6 +212,21 @@ def test_load_scene__poses_are_rigid_and_repeatable(name):
                 np.testing.assert_array_equal(pose, item.pose(time))
 
 
+def test_load_scene__accepts_dataclasses_with_postponed_annotations(tmp_path):
+    (tmp_path / "own.py").write_text(
+        "from __future__ import annotations\n"
+        "from dataclasses import dataclass, field\n"
+        "from morgs_mi.synth.scene import Scene\n"
+        "@dataclass\n"
+        "class Part:\n"
+        "    size: float = 1.0\n"
+        "    below: list[Part] = field(default_factory=list)\n"
+        "def build(seed):\n"
+        "    return Scene(f'own{Part().size:g}', {}, {})\n"
+    )
+    assert load_scene(tmp_path / "own.py").name == "own1"
+
+
 @pytest.mark.parametrize(("name", "radius"), [("roller", 0.38), ("circler", 0.28)])
 def test_spheres__balls_roll_without_slipping(name, radius):
     pose, step = load_scene("spheres").objects[name].pose, 1e-5

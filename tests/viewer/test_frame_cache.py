@@ -5,11 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.codec.packets import CodedFrame
+from morgs_mi.codec.packets import CodedFrame, coded_frames
+from morgs_mi.codec.reader import StreamReader
 from morgs_mi.playback.player import open_stream
 from morgs_mi.viewer.frame_cache import FrameCache
 from tests.assertions import assert_close
+from tests.codec.forge import forged_streams
 from tests.scenes.changing_splats import splats, write_stream
+from tests.scenes.short_clip import FRAMES, short_clip
 
 
 @pytest.fixture
@@ -79,3 +82,15 @@ def test_first_moving__skips_frames_without_motion(tmp_path, states):
     still = tmp_path / "still.morgs"
     write_stream(still, 1)
     assert FrameCache(still).first_moving(0) == 0
+
+
+@pytest.mark.parametrize("order", [range(FRAMES), range(FRAMES)[::-1], (7, 4, 1, 5, 3, 6, 2, 0)])
+def test_frame_cache__returns_every_frame_that_plays(tmp_path, order):
+    for data in forged_streams(short_clip()):
+        (tmp_path / "stream.morgs").write_bytes(data)
+        states = {state.frame: state for state in coded_frames(StreamReader(tmp_path / "stream.morgs"))}
+        assert len(states) == FRAMES
+        cache = FrameCache(tmp_path)
+        for frame in order:
+            np.testing.assert_array_equal(cache.at(frame).digest, states[frame].digest)
+            assert len(cache.trails(cache.frames[-1], 3)) == 2

@@ -15,7 +15,7 @@ import numpy as np
 from morgs_mi.capture.layouts.calibration import Calibration, Layout, required_clips
 from morgs_mi.capture.layouts.clips import check_frames, clips_by_frame
 from morgs_mi.capture.lens import Lens
-from morgs_mi.core.camera import Camera
+from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.io.bounded import read_array
 from morgs_mi.io.video import Clip
 
@@ -63,13 +63,7 @@ def _camera(path: Path, index: int, row: np.ndarray, name: str) -> Camera:
     pose = row[:15].reshape(3, 5).astype(np.float64)
     down, right, back, centre, (height, width, focal) = pose.T
     R = np.stack([right, down, -back])
-    if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
-        raise ValueError(
-            f"{where}: the axes (down, right, back) must be a right-handed orthonormal frame, got "
-            f"{pose[:, :3].round(4).tolist()}; check the order of the columns."
-        )
-    viewmat = np.eye(4)
-    viewmat[:3, :3], viewmat[:3, 3] = R, -R @ centre
+    viewmat = rigid(f"{where}, columns in the order down, right, back", np.column_stack([R, -R @ centre]))
     K = np.array([[focal, 0, 0.5 * width], [0, focal, 0.5 * height], [0, 0, 1]])
     try:
         return Camera(K, viewmat, round(width), round(height), name)

@@ -53,6 +53,7 @@ class FlowFolder:
         self.folder = Path(folder)
         if not self.folder.is_dir():
             raise FileNotFoundError(f"{folder}: expected a folder of flow files, found none; check the path.")
+        self._listed: dict[Path, dict[int, list[Path]]] = {}
 
     def flows(self, camera: str, frame: int, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
         """Return the flow from frame t to t - 1 on frame t's grid, and from t - 1 to t on frame t - 1's grid.
@@ -81,10 +82,10 @@ class FlowFolder:
         return flow
 
     def _find(self, folder: Path, frame: int) -> Path:
-        numbered = {}
-        for path in sorted(folder.iterdir()) if folder.is_dir() else ():
-            if path.suffix.lower() in SUFFIXES and (digits := re.findall(r"\d+", path.stem)):
-                numbered.setdefault(int(digits[-1]), []).append(path)
+        # Files may have been added since.
+        if frame not in self._listed.get(folder, {}):
+            self._listed[folder] = _files_by_frame(folder)
+        numbered = self._listed[folder]
         found = numbered.get(frame, [])
         if not found:
             got = f"those of frames {min(numbered)} to {max(numbered)}" if numbered else "no flow at all"
@@ -96,6 +97,14 @@ class FlowFolder:
             names = ", ".join(path.name for path in found)
             raise ValueError(f"{folder}: expected one file of frame {frame}, got {names}; keep one.")
         return found[0]
+
+
+def _files_by_frame(folder: Path) -> dict[int, list[Path]]:
+    numbered: dict[int, list[Path]] = {}
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if path.suffix.lower() in SUFFIXES and (digits := re.findall(r"\d+", path.stem)):
+            numbered.setdefault(int(digits[-1]), []).append(path)
+    return numbered
 
 
 def read_flow(path: str | Path) -> np.ndarray:

@@ -65,7 +65,7 @@ def mirrored(rows: np.ndarray) -> np.ndarray:
     ("change", "message"),
     [
         (with_nan, r"row 1 \(cam01\): the pose must be finite"),
-        (mirrored, r"row 0 \(cam00\): the axes .* right-handed"),
+        (mirrored, r"row 0 \(cam00\), columns in the order down, right, back: the axes must be a right-handed"),
         (lambda rows: rows[:1], r"got 1 rows for 2 videos \(cam00, cam01\)"),
         (lambda rows: rows[:, :16], r"expected a float array \[C, 17\], got float64 \(2, 16\)"),
         (lambda rows: rows.astype(object), "got a broken file"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -149,3 +151,17 @@ def test_flow_folder__rejects_two_files_of_one_frame(folder):
 def test_flow_source__rejects_a_missing_flow_folder(tmp_path):
     with pytest.raises(FileNotFoundError, match="expected a folder of flow files, found none"):
         flow_source(f"files:{tmp_path / 'flow'}")
+
+
+def test_FlowFolder__lists_a_folder_again_only_for_a_file_that_was_added(folder, monkeypatch):
+    listed = []
+    iterdir = Path.iterdir
+    monkeypatch.setattr(Path, "iterdir", lambda path: [listed.append(path), *iterdir(path)][1:])
+    flows = FlowFolder(folder)
+    for frame in (1, 2, 1, 2):
+        flows.flows("cam00", frame, (6, 9))
+    assert len(listed) == 2
+    write_flow(folder / "cam00" / "backward" / "3.flo", random_flow())
+    write_flow(folder / "cam00" / "forward" / "2.flo", random_flow())
+    flows.flows("cam00", 3, (6, 9))
+    assert len(listed) == 4
