@@ -136,7 +136,8 @@ def _unexplained(change: np.ndarray, covered: np.ndarray, config: ActiveSetConfi
     """Return the pixels [H, W] of the connected changes that a mask covers by less than half."""
     square = np.ones((config.min_cluster, config.min_cluster), np.uint8)
     clusters = cv2.morphologyEx(change.astype(np.uint8), cv2.MORPH_OPEN, square)
-    count, labels, stats, _ = cv2.connectedComponentsWithStats(clusters)
+    count, components, stats, _ = cv2.connectedComponentsWithStats(clusters)
+    labels = np.asarray(components, np.int32)
     inside = np.bincount(labels[covered], minlength=count)
     missing = inside < config.min_explained * stats[:, cv2.CC_STAT_AREA]
     missing[0] = False
