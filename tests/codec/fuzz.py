@@ -23,7 +23,7 @@ import mitsuba as mi
 import numpy as np
 
 import morgs_mi  # noqa: F401  (finds a usable LLVM before the variant is set)
-from morgs_mi.codec.packets import CodedFrame, coded_frames, seek
+from morgs_mi.codec.packets import CodedFrame, coded_frames, frames_near, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.codec.salvage import DamagedRange, salvage, write_salvaged
 from morgs_mi.playback.player import has_confidence, has_offset, num_frames, open_stream_capture, render_config
@@ -166,9 +166,17 @@ def check_readers(path: Path, refusals: Refusals) -> None:
 
 
 def check_seek(stream: StreamReader, played: list[CodedFrame]) -> None:
-    """Check that frames that play can be sought: one in the middle and the last."""
+    """Check that frames that play can be sought: one in the middle and the last.
+
+    A reader that starts at a keyframe has nothing to compare it with: what it finds may differ from what plays, where
+    that keyframe is forged.
+    """
+    digests = {state.frame: state.digest for state in played}
     for state in (*played[len(played) // 2 : -1][:1], *played[-1:]):
-        assert np.array_equal(seek(stream, state.frame).digest, state.digest), state.frame
+        start, found = next(frames_near(stream, state.frame)), seek(stream, state.frame)
+        assert found.frame == state.frame
+        if np.array_equal(start.digest, digests.get(start.frame)):
+            assert np.array_equal(found.digest, state.digest), state.frame
 
 
 def play(path: Path) -> tuple[list[CodedFrame], ValueError | None]:
