@@ -129,7 +129,7 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Progre
 
 
 def _run(root: Path, config: DemoConfig, report_progress: Progress) -> DemoReport:
-    """Run the demonstration in a folder that nobody else writes into."""
+    """Run the demonstration in a locked folder."""
     seconds: dict[str, float] = {}
 
     def run_step(name: str, work: Callable[[Callable[[float, float], None]], Any]) -> Any:

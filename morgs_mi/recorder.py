@@ -88,7 +88,7 @@ def _stream(
     resume: bool,
     on_stage: Callable[[str, int, int], None],
 ) -> list[FrameReport]:
-    """Fit a capture into a folder that nobody else writes into."""
+    """Fit a capture into a locked folder."""
     path, train, frames = out / "stream.morgs", capture.train_views, capture.partial_frames()
     first = next(frames)
     metadata = _metadata(capture, first, config)

@@ -411,7 +411,7 @@ def test_main__runs_as_a_module() -> None:
 def test_main__names_an_output_that_cannot_be_written(capture: Path, stream: Path, tmp_path: Path, capsys) -> None:
     (tmp_path / "file").write_text("")
     size = ("--cameras", 2, "--frames", 1, "--width", 16, "--height", 16)
-    for folder in (tmp_path / "file", Path("/sys")):  # nobody, not even root, may create files in /sys
+    for folder in (tmp_path / "file", Path("/sys")):  # /sys accepts no new files, even from root
         for args in (
             ("fit", capture, folder / "out", *QUICK),
             ("synth", "spheres", folder / "out", *size),

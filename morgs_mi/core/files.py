@@ -138,7 +138,7 @@ def _write_error(start: str, error: OSError, own: Path) -> OSError:
 
 
 def _locked(file: int) -> bool:
-    """Lock an open file and return whether nobody else has locked it."""
+    """Lock an open file and return whether that succeeded; it fails if another process holds the lock."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:

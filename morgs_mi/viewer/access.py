@@ -1,4 +1,4 @@
-"""Who may connect to the viewer: only pages that the viewer itself has served, under a name of this machine.
+"""Access control of the viewer: it accepts connections only from its own page, under a name of this machine.
 
 A web page of another site can open a WebSocket to a server on this machine; browsers report it in `Origin` but do not
 prevent it. By DNS rebinding, such a page can also point its own name at this machine, and so share its origin; then
@@ -20,7 +20,7 @@ __all__ = ["checked_connections", "refusal"]
 
 _PATCHING = Lock()
 _LOG = logging.getLogger(__name__)
-# websockets prints a traceback when somebody connects and leaves without a word.
+# websockets logs a traceback for a connection that is closed before its first request.
 _LOG.addFilter(lambda record: record.getMessage() != "opening handshake failed")
 
 

@@ -215,7 +215,7 @@ def test_locked_folder__leaves_no_empty_folder_and_no_foreign_lock(tmp_path: Pat
     ],
 )
 def test_locked_folder__reports_a_folder_that_cannot_be_written(tmp_path: Path, folder: str, sentence: str) -> None:
-    """Nobody, not even root, may create files in /sys."""
+    """/sys accepts no new files, even from root."""
     (tmp_path / "file").touch()
     with pytest.raises(OSError, match=sentence):
         locked_folder(tmp_path / folder, "test()").__enter__()

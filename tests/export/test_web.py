@@ -55,7 +55,7 @@ def test_text_of_bytes__is_at_most_a_fifth_longer():
 
 
 def test_write_web_page__does_not_publish_the_metadata_of_the_fit(tmp_path):
-    states = write_stream(tmp_path / "stream.morgs", metadata={"capture": "/home/somebody/secret"})
+    states = write_stream(tmp_path / "stream.morgs", metadata={"capture": "/home/user/secret"})
     write_web_page(open_stream(tmp_path), tmp_path / "page.html")
     write_web_folder(open_stream(tmp_path), tmp_path / "folder")
     published = open_stream(tmp_path / "folder")
