@@ -16,6 +16,8 @@ from threading import Lock
 from typing import Any
 from urllib.parse import urlsplit
 
+from morgs_mi.viewer.arrow_keys import with_arrow_keys
+
 __all__ = ["checked_connections", "refusal"]
 
 _PATCHING = Lock()
@@ -65,7 +67,7 @@ def checked_connections(names: Collection[str] = ()) -> Iterator[None]:
             reason = refusal(request.headers.get("Host"), request.headers.get("Origin"), names)
             if reason is not None:
                 return connection.respond(HTTPStatus.FORBIDDEN, reason + "\n")
-            return process_request(connection, request)
+            return with_arrow_keys(process_request(connection, request))
 
         started.append(True)
         return original(*args, process_request=process, logger=_LOG, **options)

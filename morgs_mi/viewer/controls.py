@@ -12,7 +12,7 @@ __all__ = ["FREE", "Controls"]
 FREE = "free"
 """Name of a view that is not a camera's."""
 _KEYS = (
-    "Keys, after a click on the scene: **Space** play, **J** and **L** frame, **M** mode, **C** camera, **R** reset "
+    "Keys, after a click on the scene: **Space** play, **←** and **→** frame, **M** mode, **C** camera, **R** reset "
     "view, **Ctrl+K** all."
 )
 

@@ -31,6 +31,7 @@ from morgs_mi.playback.player import (
     render_config,
 )
 from morgs_mi.viewer.access import checked_connections
+from morgs_mi.viewer.arrow_keys import NEXT, PREVIOUS
 from morgs_mi.viewer.controls import FREE, Controls
 from morgs_mi.viewer.crop import crop_limits, is_in_box, is_shown
 from morgs_mi.viewer.frame_cache import NO_TRAILS, FrameCache
@@ -194,11 +195,11 @@ class Viewer:
         def move(change: Callable[[int], int]) -> Callable[[Any], None]:
             return lambda _: self._move_frame(change)
 
-        # The arrows and W, A, S, D, Q, E are viser's own keys for moving the camera.
+        # W, A, S, D, Q, E and the arrows up and down are viser's own keys for moving the camera.
         keys: list[tuple[str, Any, Callable[[Any], None]]] = [
             ("Play or pause", "space", flip(controls.playing)),
-            ("Previous frame", "J", move(lambda index: index - 1)),
-            ("Next frame", "L", move(lambda index: index + 1)),
+            ("Previous frame", PREVIOUS, move(lambda index: index - 1)),
+            ("Next frame", NEXT, move(lambda index: index + 1)),
             ("First frame", "home", move(lambda _: 0)),
             ("Last frame", "end", move(lambda _: len(self._cache.frames) - 1)),
             ("Next camera", "C", next_camera),

@@ -196,8 +196,13 @@ def test_viewer__shows_motion_by_key_with_its_legend(page, tmp_path):
     playwright.expect(page.get_by_label("Play")).not_to_be_checked()
     press(page, "End")
     page.get_by_text("Frame 2 of 2").wait_for()
-    press(page, "j")
+    press(page, "ArrowLeft")
     page.get_by_text("Frame 1 of 2").wait_for()
+    press(page, "j")
+    page.get_by_text("Frame 0 of 2").wait_for()
+    press(page, "ArrowRight")
+    page.get_by_text("Frame 1 of 2").wait_for()
+    playwright.expect(page.get_by_label("Go to camera")).to_have_value("left")  # viser turns the camera with arrows
 
     select_mode(page, "color")
     page.get_by_text("1 moving").wait_for(state="detached")
