@@ -10,15 +10,16 @@ every window, the second propagates them back through the window, which is its o
 
     dL/dx = (1 - lambda) sign(x - y) - lambda (M D_x + 2 x M D_xx + y M D_xy).
 
-In both, a SIMD lane walks down a run of rows of a strip (see `ssim_layout`). It blurs each row horizontally and adds
-it to the 11 windows that contain the row: every number is read once, and no blurred row is written to memory.
+My and Myy come from a pass of their own, once per target and region. In all three, a SIMD lane walks down a run of rows
+of a strip (see `ssim_layout`). It blurs each row horizontally and adds it to the 11 windows that contain the row: every
+number is read once, and no blurred row is written to memory.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
-import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -48,13 +49,29 @@ _Read = Callable[[Float], list[Float]]  # plane -> its numbers around the lane's
 # Noise and rendered colours exceed [0, 1] by less, 8-bit values by more.
 _MARGIN = 1.0
 _C1, _C2 = 0.01**2, 0.03**2
-_WINDOW = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
-_WINDOW = (_WINDOW / _WINDOW.sum()).astype(np.float32)
-_TAPS = [float(tap) for tap in _WINDOW]
+_TAPS = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
+_TAPS = (_TAPS / _TAPS.sum()).astype(np.float32).tolist()
+
+
+@dataclass(frozen=True, eq=False)
+class _Windows:
+    """The windows that pixels of a region lie in, and the target's statistics there.
+
+    Attributes:
+        windows: runs of the centres of the windows.
+        pixels: runs of the pixels.
+        mean: planes of M y, defined on `windows`.
+        variance: planes of M yy - (M y)^2, likewise.
+    """
+
+    windows: Runs
+    pixels: Runs
+    mean: Float
+    variance: Float
 
 
 class Target:
-    """A target image, with its terms of SSIM computed once.
+    """A target image. Its terms of SSIM are computed once for each region on which it is compared.
 
     Args:
         image: [H, W, 3], RGB, uint8 or float in [0, 1], display-referred.
@@ -68,19 +85,19 @@ class Target:
         _check_image(image)
         if mask is not None:
             check_mask("Target()", mask, *image.shape[:2])
-        pixels = image.astype(np.float32) / 255 if image.dtype == np.uint8 else image.astype(np.float32)
+        pixels = image.astype(np.float32)
+        if image.dtype == np.uint8:
+            pixels /= 255
         self.shape: tuple[int, ...] = pixels.shape
         self.planes = Planes(*pixels.shape[:2])
         self.weight: Float | None = None
         if mask is not None and not mask.all():
             weight = np.repeat(mask[..., None], 3, axis=2).astype(np.float32)
             pixels, self.weight = pixels * weight, self._planes(weight)
-        mean = _blur(pixels)
-        self.pixels, self.mean = self._planes(pixels), self._planes(mean)
-        self.variance = self._planes(_blur(pixels * pixels) - mean * mean)
-        self.windows, self.lines = self.planes.runs(None, RADIUS), self.planes.runs(None, 0)
+        self.pixels = self._planes(pixels)
         self.surroundings: Float | None = None
-        self._layouts: dict[Region, tuple[UInt32, Bool, Runs, Runs]] = {}
+        self._places: dict[Region, tuple[UInt32, Bool]] = {}
+        self._windows: dict[Region | None, _Windows] = {}
 
     def _planes(self, image: np.ndarray) -> Float:
         planes = self.planes.of(from_numpy(mi.Float, image))
@@ -92,16 +109,24 @@ class Target:
         if region is None or region.whole:
             error = self.pixels - self.masked(self.planes.of(owned_copy(dr.detach(image).array)))
             return np.asarray(self.planes.image(error)).reshape(self.shape)
-        places, inside, *_ = self.layout_on(region)
+        places, inside = self.places_on(region)
         pixels = dr.gather(mi.Float, self.pixels, places, active=inside)
         return np.asarray(pixels - self.masked(dr.detach(image).array, places)).reshape(region.shape(3))
 
-    def layout_on(self, region: Region) -> tuple[UInt32, Bool, Runs, Runs]:
-        """Return (places of the numbers of an image on a region, mask of those in the view, runs of both passes)."""
-        if region not in self._layouts:
-            runs = self.planes.runs(region, RADIUS), self.planes.runs(region, 0)
-            self._layouts[region] = (*self.planes.places_on(region), *runs)
-        return self._layouts[region]
+    def places_on(self, region: Region) -> tuple[UInt32, Bool]:
+        """Return (places of the numbers of an image on a region, mask of those in the view)."""
+        if region not in self._places:
+            self._places[region] = self.planes.places_on(region)
+        return self._places[region]
+
+    def windows_on(self, region: Region | None) -> _Windows:
+        """Return the windows that the pixels of a region lie in, those of the whole view for None."""
+        if region not in self._windows:
+            windows, pixels = (self.planes.runs(region, reach) for reach in (RADIUS, 0))
+            height = dr.opaque(mi.Int32, self.planes.height)
+            (mean, variance), _ = recorded(_statistics_pass, self.planes.size)(windows.lanes, height, self.pixels)
+            self._windows[region] = _Windows(windows, pixels, mean, variance)
+        return self._windows[region]
 
     def set_surroundings(self, image: Tensor) -> None:
         """Store a rendered image [H, W, 3] as the surroundings of the regions that are compared from now on."""
@@ -129,10 +154,6 @@ def _check_image(image: np.ndarray) -> None:
         )
 
 
-def _blur(image: np.ndarray) -> np.ndarray:
-    return cv2.sepFilter2D(image, -1, _WINDOW, _WINDOW, borderType=cv2.BORDER_CONSTANT)
-
-
 class _Recon(dr.CustomOp):
     gradient: Float
 
@@ -156,7 +177,7 @@ class WholeView(_Recon):
     def eval(self, x: Float, target: Target, weight: float) -> Float:
         planes = target.planes
         image = target.masked(planes.of(x * dr.opaque(mi.Float, 1)))  # in memory allocated by Dr.Jit
-        gradient, loss = _passes(image, target, weight, target.windows, target.lines)
+        gradient, loss = _passes(image, target, weight, target.windows_on(None))
         return self.finish(planes.image(target.masked(gradient)), loss)
 
 
@@ -164,23 +185,37 @@ class OnRegion(_Recon):
     def eval(self, x: Float, target: Target, weight: float, region: Region) -> Float:
         if target.surroundings is None:
             target.surroundings = target.pixels + 0
-        image, (places, inside, windows, pixels) = target.surroundings, target.layout_on(region)
+        image, (places, inside) = target.surroundings, target.places_on(region)
         dr.scatter(image, target.masked(x, places), places, active=inside, mode=dr.ReduceMode.NoConflicts)
-        gradient, loss = _passes(image, target, weight, windows, pixels)
+        gradient, loss = _passes(image, target, weight, target.windows_on(region))
         return self.finish(target.masked(dr.gather(mi.Float, gradient, places, active=inside), places), loss)
 
 
-def _passes(image: Float, target: Target, weight: float, windows: Runs, pixels: Runs) -> tuple[Float, Float]:
-    """Return dL/dx in planes, defined on the runs of `pixels`, and L over the runs of `windows` and `pixels`."""
+def _passes(image: Float, target: Target, weight: float, on: _Windows) -> tuple[Float, Float]:
+    """Return dL/dx in planes, defined on the runs of `on.pixels`, and L over the runs of `on`."""
     planes, scale = target.planes, dr.opaque(mi.Float, 1 / int(np.prod(target.shape)))
     height = dr.opaque(mi.Int32, planes.height)
     dr.eval(image)
-    arguments = (windows.lanes, height, image, target.pixels, target.mean, target.variance)
+    arguments = (on.windows.lanes, height, image, target.pixels, on.mean, on.variance)
     derivatives, ssim = recorded(_similarity_pass, planes.size)(*arguments)
-    arguments = (pixels.lanes, height, image, target.pixels, derivatives, scale)
+    arguments = (on.pixels.lanes, height, image, target.pixels, derivatives, scale)
     (gradient,), error = recorded(_gradient_pass, planes.size, weight)(*arguments)
-    structure = dr.opaque(mi.Float, windows.num_pixels) - dr.sum(ssim)
+    structure = dr.opaque(mi.Float, on.windows.num_pixels) - dr.sum(ssim)
     return gradient, scale * ((1 - weight) * dr.sum(error) + weight * structure)
+
+
+def _statistics_pass(size: int, lanes: Lanes, height: Int32, target: Float) -> tuple[list[Float], Float]:
+    """Return the planes of M y and M yy - (M y)^2, and the sum of M y over each run."""
+
+    def moments(read: _Read) -> list[list[Float]]:
+        y = read(target)
+        return [y, [v * v for v in y]]
+
+    def statistics(read: _Read, blurred: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
+        mean, square = blurred
+        return [mean, [dr.fma(-m, m, s) for m, s in zip(mean, square, strict=True)]], mean
+
+    return _walk(size, lanes, height, moments, statistics, 2, 2)
 
 
 def _similarity_pass(
@@ -197,7 +232,7 @@ def _similarity_pass(
         ssim, *derivatives = map(list, zip(*terms, strict=True))
         return derivatives, ssim
 
-    return _walk(size, lanes, height, products, similarity, 3)
+    return _walk(size, lanes, height, products, similarity, 3, 3)
 
 
 def _similarity(mx: Float, xx: Float, xy: Float, my: Float, variance: Float) -> tuple[Float, Float, Float, Float]:
@@ -235,7 +270,7 @@ def _gradient_pass(
             errors.append(dr.abs(error))
         return [row], errors
 
-    return _walk(size, lanes, height, unchanged, gradient, 1)
+    return _walk(size, lanes, height, unchanged, gradient, 3, 1)
 
 
 def _walk(
@@ -244,6 +279,7 @@ def _walk(
     height: Int32,
     across: Callable[[_Read], list[list[Float]]],
     finish: Callable[[_Read, list[list[Float]]], tuple[list[list[Float]], list[Float]]],
+    inputs: int,
     outputs: int,
 ) -> tuple[list[Float], Float]:
     """Walk down the runs with a window: blur the rows that `across` returns, and write those that `finish` returns.
@@ -252,8 +288,9 @@ def _walk(
         size: size of the planes.
         lanes: the runs.
         height: height of the image.
-        across: read -> three rows of numbers, wider than a strip by 5 on both sides.
-        finish: (read, three blurred rows of a strip) -> (rows of a strip to write, row of a strip to sum).
+        across: read -> rows of numbers, wider than a strip by 5 on both sides.
+        finish: (read, these rows blurred, of a strip) -> (rows of a strip to write, row of a strip to sum).
+        inputs: number of rows to blur.
         outputs: number of rows to write.
 
     Returns:
@@ -294,14 +331,14 @@ def _walk(
                 return list(read_packet(plane, center, ready))
 
             sums = list(done[k])
-            written, summed = finish(narrow, [sums[STRIP * c : STRIP * (c + 1)] for c in range(3)])
+            written, summed = finish(narrow, [sums[STRIP * c : STRIP * (c + 1)] for c in range(inputs)])
             for target, values in zip(targets, written, strict=True):
                 write_packet(target, [dr.select(t, v, 0) for t, v in zip(inside, values, strict=True)], center, ready)
             for t, v in zip(inside, summed, strict=True):
                 total = total + dr.select(t & ready, v, 0)
         return row + 2, end, first, places, columns, height, windows, total, targets
 
-    windows = [packet([mi.Float(0) for _ in range(3 * STRIP)]) for _ in range(2 * RADIUS)]
+    windows = [packet([mi.Float(0) for _ in range(inputs * STRIP)]) for _ in range(2 * RADIUS)]
     end = on_aligned_stack(lanes.end)
     state = (lanes.first - RADIUS, end, lanes.first, lanes.places, lanes.columns, height, windows, mi.Float(0), targets)
     *_, total, targets = dr.while_loop(state, lambda row, end, *_: row < end + RADIUS, body, label="window")

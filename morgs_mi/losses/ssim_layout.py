@@ -113,20 +113,25 @@ class Planes:
 
     def places_on(self, region: Region) -> tuple[UInt32, Bool]:
         """Return the places of the numbers of a flat image on a region, and the mask of those in the view."""
-        x, y = (np.repeat(v.ravel(), 3) for v in region.pixels())
-        component = np.tile(np.arange(3), len(x) // 3)
-        inside = (x < self.width) & (y < self.height)
-        places = np.where(inside, _place(component, y, x, self.height, self.num_columns), 0)
-        return from_numpy(mi.UInt32, places), from_numpy(mi.UInt32, inside) != 0
+        width, height = region.block
+        lane = dr.arange(mi.UInt32, 3 * region.num_blocks * width * height)
+        pixel = lane // 3
+        block = pixel // (width * height)
+        within = pixel - block * (width * height)
+        x = dr.gather(mi.UInt32, region.x, block) + within % width
+        y = dr.gather(mi.UInt32, region.y, block) + within // width
+        inside = (x < dr.opaque(mi.UInt32, self.width)) & (y < dr.opaque(mi.UInt32, self.height))
+        size = dr.opaque(mi.UInt32, self.height), dr.opaque(mi.UInt32, self.num_columns)
+        places = dr.select(inside, _place(lane - 3 * pixel, y, x, *size), 0)
+        dr.eval(places, inside)
+        return places, inside
 
     def runs(self, region: Region | None, reach: int) -> Runs:
         """Return the runs that cover a region, or the whole view, and `reach` <= 8 pixels around it."""
         drawn = np.ones((self.height, self.num_strips), bool)
         if region is not None:
-            x, y = region.pixels()
-            inside = (x < self.width) & (y < self.height)
-            drawn[:] = False
-            drawn[y[inside], x[inside] // STRIP] = True
+            mask = np.pad(region.mask, ((0, 0), (0, self.num_strips * STRIP - self.width)))
+            drawn = mask.reshape(self.height, self.num_strips, STRIP).any(axis=2)
         drawn = np.pad(drawn, ((reach, reach), (1, 1)))
         if reach:
             drawn[:, 1:-1] |= drawn[:, 2:] | drawn[:, :-2]

@@ -9,6 +9,8 @@ hardly so. Rendering all views to learn the denominator would cost more than the
 of pixels with changes are rendered, and a Gaussian counts as equally visible elsewhere: with its boxes b_iv,
 
     r_i = (sum_v sum_{R_v} w_iv c_v / sum_v sum_{R_v} w_iv) (sum_v |b_iv and R_v| / sum_v |b_iv|) .
+
+Large views are rendered at a fraction of their resolution, where c_v is the changed share of a pixel.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -73,6 +76,7 @@ def responsibility(
     boxes: Mapping[int, Boxes],
     render: RenderConfig,
     min_weight: float = 1.0,
+    width: int = 640,
 ) -> Responsibility:
     """Return the responsibility of each Gaussian for the changes.
 
@@ -83,6 +87,7 @@ def responsibility(
         boxes: boxes of the Gaussians in these views, by view index.
         render: cut-offs.
         min_weight: blend weight summed over all changed blocks, in px, below which a Gaussian counts as hidden.
+        width: views are reduced by the largest whole factor that leaves this width, in px.
     """
     changed, weight = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), np.float32)
     near, area = dr.zeros(mi.Float, len(gaussians)), dr.zeros(mi.Float, len(gaussians))
@@ -90,11 +95,26 @@ def responsibility(
         area += boxes[view].area
         if not changes[view].any():
             continue
-        region, c = Region(changes[view], render), changes[view]
-        image = region.crop(np.stack([c, np.ones_like(c)], axis=-1).astype(np.float32))
-        sums = backproject(gaussians, camera, image, render, region)
-        changed, weight = changed + sums[:, 0], weight + sums[:, 1]
-        near += boxes[view].covered(region.paste(np.ones(region.shape(1)[:3], bool), np.zeros_like(c)))
+        factor = max(camera.width // width, 1)
+        c = _reduced(changes[view], factor)
+        region = Region(c > 0, render)
+        small = camera.resized(c.shape[1], c.shape[0])
+        sums = backproject(gaussians, small, region.crop(np.stack([c, np.ones_like(c)], axis=-1)), render, region)
+        changed, weight = changed + factor**2 * sums[:, 0], weight + factor**2 * sums[:, 1]
+        near += boxes[view].covered(_enlarged(region.mask, changes[view].shape))
     seen = weight > min_weight
     elsewhere = np.asarray(area / dr.maximum(near, 1))
     return Responsibility(np.where(seen, changed, 0), np.where(seen, weight * elsewhere, 0))
+
+
+def _reduced(mask: np.ndarray, factor: int) -> np.ndarray:
+    """Return the covered share of the pixels of a mask [H, W] at 1 / factor of its resolution, float32."""
+    height, width = (max(size // factor, 1) for size in mask.shape)
+    return cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+
+
+def _enlarged(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return a mask at the resolution `shape` (H, W)."""
+    if mask.shape == shape:
+        return mask
+    return cv2.resize(mask.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)

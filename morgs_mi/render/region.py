@@ -72,6 +72,8 @@ class Region:
     corner_x: Float
     corner_y: Float
     weights: Float | None  # per pixel: 1 in the view, 0 outside; None: all pixels are in the view
+    _grid: np.ndarray  # drawn blocks of the view, bool [rows, columns], padded to whole tiles
+    _blocks: tuple[np.ndarray, np.ndarray]  # per block: row and column in that grid
 
     def _build(self, mask: np.ndarray, config: RenderConfig, whole: bool) -> None:
         H, W = mask.shape
@@ -85,8 +87,12 @@ class Region:
         active = active.reshape(-1, ACROSS * DOWN)  # [tiles, blocks of a tile]
         tiles = np.flatnonzero(active.any(1))
         tile, bit = np.nonzero(active[tiles])
-        x = (tiles[tile] % self.across * ACROSS + bit % ACROSS) * bw
-        y = (tiles[tile] // self.across * DOWN + bit // ACROSS) * bh
+        column, row = (
+            tiles[tile] % self.across * ACROSS + bit % ACROSS,
+            tiles[tile] // self.across * DOWN + bit // ACROSS,
+        )
+        x, y = column * bw, row * bh
+        self._grid, self._blocks = blocks, (row, column)
         slot_of = np.full(len(active), NO_SLOT, np.uint32)
         slot_of[tiles] = np.arange(len(tiles))
         pitch = -(-W // bw) * bw if whole else bw
@@ -121,33 +127,39 @@ class Region:
             return self.height, self.width, channels
         return self.num_blocks, self.block[1], self.block[0], channels
 
-    def pixels(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the column and row of every pixel on this region, two int arrays [A, block_height, block_width].
+    @property
+    def mask(self) -> np.ndarray:
+        """The drawn pixels, bool [H, W]."""
+        width, height = self.block
+        return self._grid.repeat(height, axis=0).repeat(width, axis=1)[: self.height, : self.width]
+
+    def inside(self) -> np.ndarray:
+        """Return the mask of the pixels that lie in the view, bool [A, block_height, block_width].
 
         If the size of the view is not a multiple of the block, pixels of the last blocks lie outside the view.
         """
-        i, j = np.arange(self.block[0]), np.arange(self.block[1])[:, None]
-        x, y = (np.asarray(v).astype(np.int64)[:, None, None] for v in (self.x, self.y))
-        return np.broadcast_arrays(x + i, y + j)  # pyright: ignore[reportReturnType]
-
-    def inside(self) -> np.ndarray:
-        """Return the mask of the pixels that lie in the view, bool [A, block_height, block_width]."""
-        x, y = self.pixels()
-        return (x < self.width) & (y < self.height)
+        return self.crop(np.ones((self.height, self.width), bool))
 
     def crop(self, image: np.ndarray) -> np.ndarray:
         """Return this region's pixels [A, block_height, block_width, ...] of an image [H, W, ...], 0 outside it."""
-        x, y = self.pixels()
-        inside = (x < self.width) & (y < self.height)
-        values = image[np.minimum(y, self.height - 1), np.minimum(x, self.width - 1)]
-        return np.where(inside.reshape(inside.shape + (1,) * (image.ndim - 2)), values, 0)
+        row, column = self._blocks
+        return self._in_blocks(image)[row, :, column]
 
     def paste(self, values: np.ndarray, image: np.ndarray) -> np.ndarray:
         """Return a copy of an image [H, W, ...] with this region's pixels replaced by `values`."""
-        (x, y), inside = self.pixels(), self.inside()
-        image = image.copy()
-        image[y[inside], x[inside]] = values[inside]
-        return image
+        row, column = self._blocks
+        blocks = self._in_blocks(image).copy()
+        blocks[row, :, column] = values
+        (rows, height, columns, width), rest = blocks.shape[:4], blocks.shape[4:]
+        return blocks.reshape(rows * height, columns * width, *rest)[: self.height, : self.width]
+
+    def _in_blocks(self, image: np.ndarray) -> np.ndarray:
+        """Return an image [H, W, ...] as [rows, block_height, columns, block_width, ...], padded by zeros."""
+        (rows, columns), (width, height) = self._grid.shape, self.block
+        missing = [(0, rows * height - image.shape[0]), (0, columns * width - image.shape[1])]
+        if any(after for _, after in missing):
+            image = np.pad(image, missing + [(0, 0)] * (image.ndim - 2))
+        return image.reshape(rows, height, columns, width, *image.shape[2:])
 
 
 def _summed_area(grid: np.ndarray) -> np.ndarray:
