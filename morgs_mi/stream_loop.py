@@ -20,6 +20,7 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_mask, check_points, check_type
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.initialise import from_points, resample_points, scene_extent, seed_points
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
@@ -208,8 +209,9 @@ def _changes(setup: Setup, references: Images, images: Images) -> dict[int, np.n
         return None
     nothing = {v: np.zeros(image.shape[:2], bool) for v, image in images.items()}  # where it is the view's first image
     config = setup.config.motion.change
-    known = images.keys() & references.keys()
-    return nothing | {v: change_mask(references[v], images[v], setup.masks[v], config) for v in known}
+    known = sorted(images.keys() & references.keys())
+    masks = map_in_threads(lambda v: change_mask(references[v], images[v], setup.masks[v], config), known)
+    return nothing | dict(zip(known, masks, strict=True))
 
 
 def _references(

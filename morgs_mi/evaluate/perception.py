@@ -8,14 +8,13 @@ Hunt-adjusted CIELAB, and differing edges or points increase the error.
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 
 import cv2
 import numpy as np
 
 from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.core.threads import map_in_threads
 from morgs_mi.evaluate.metrics import unit_pair
 
 __all__ = ["PIXELS_PER_DEGREE", "delta_e_map", "flip_map"]
@@ -94,8 +93,7 @@ def delta_e_map(image: np.ndarray, truth: np.ndarray) -> np.ndarray:
         return delta_E_CIE2000(lab(a[band]), lab(b[band]))
 
     # The temporaries of a whole image exceed the cache, and NumPy alone uses one core.
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        return np.concatenate(list(pool.map(rows, range(0, len(a), _ROWS))))
+    return np.concatenate(map_in_threads(rows, range(0, len(a), _ROWS)))
 
 
 def _colour_error(a: np.ndarray, b: np.ndarray) -> np.ndarray:

@@ -65,6 +65,8 @@ class DensityConfig:
     later_round: float = 0.625
     """That round, as a fraction of the frame's epochs: the residual has shown by then what is missing, and enough steps
     are left to fit what is added."""
+    later_views: int = 8
+    """Views, spread over the rig, in which a later frame looks for what is missing."""
     births: float = 0.02
     """Largest number of births in a later frame, as a fraction of the Gaussians."""
     max_gaussians: int = 30_000
@@ -84,7 +86,14 @@ class DensityConfig:
     """Opacity below which a Gaussian is pruned."""
 
     def __post_init__(self) -> None:
-        for name, low in (("rounds", 0), ("births", 0), ("max_gaussians", 1), ("split_scale", 0), ("min_error", 0)):
+        for name, low in (
+            ("rounds", 0),
+            ("births", 0),
+            ("max_gaussians", 1),
+            ("later_views", 1),
+            ("split_scale", 0),
+            ("min_error", 0),
+        ):
             if not getattr(self, name) >= low:
                 raise ValueError(f"DensityConfig(): `{name}` must be at least {low}, got {getattr(self, name)}.")
         for name in ("birth_opacity", "min_opacity"):

@@ -20,6 +20,7 @@ from morgs_mi.losses.attribution import densification_scores
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet, with_zero_motion
 from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.flow import choose_key_views
 from morgs_mi.method.lift import Lift
 from morgs_mi.method.objective import Observations, Prediction, channels_of, losses_of, weights_of
 from morgs_mi.method.residual import apply_residual, residual_parameters
@@ -96,8 +97,9 @@ def fit_later_frame(
     for epoch in range(config.epochs):
         if epoch == density_epoch and config.density.later_frames:
             now = _current(base, optimizer, motion)
-            active_views, targets = [active.views[v] for v in views], [problem.targets[v] for v in views]
-            scores = densification_scores(now, active_views, targets, config.density.noise_tolerance)
+            scores = densification_scores(
+                now, *_spread(problem, config.density.later_views), config.density.noise_tolerance
+            )
             plan = plan_additions(now, scores, config.density, rng, len(previous) - len(active.indices))
             # A birth starts from its parent's past and shares its residual, so that its motion is the parent's.
             base, source = apply_plan(base, plan), plan.source
@@ -124,6 +126,13 @@ def fit_later_frame(
 def _current(base: Gaussians, optimizer: Mapping[str, Tensor], motion: MotionConfig) -> Gaussians:
     with dr.suspend_grad():
         return apply_residual(base, values_of(optimizer), motion)
+
+
+def _spread(problem: FrameProblem, count: int) -> tuple[list[ActiveView], list[Target]]:
+    """Return `count` active views that are spread over the rig, or all if there are fewer, and their targets."""
+    indices = sorted(problem.active.views)
+    chosen = choose_key_views([problem.active.views[v].camera for v in indices], count)
+    return [problem.active.views[indices[k]] for k in chosen], [problem.targets[indices[k]] for k in chosen]
 
 
 def _on_active_views(problem: FrameProblem) -> dict[int, Observations]:
@@ -163,7 +172,9 @@ def _merge(
     """Return the changed Gaussians among the static ones, in the order of the previous frame, and their `source`."""
     if len(active.indices) == len(previous):
         return changed, source
-    static = np.setdiff1d(np.arange(len(previous)), active.indices)
+    is_static = np.ones(len(previous), bool)
+    is_static[active.indices] = False
+    static = np.flatnonzero(is_static)
     known = np.concatenate([static, np.where(source < 0, len(previous), active.indices[source])])
     order = np.argsort(known, kind="stable")  # births come last
     everything = Gaussians.concatenate([with_zero_motion(previous.select(static)), changed])

@@ -135,6 +135,8 @@ def with_zero_motion(gaussians: Gaussians) -> Gaussians:
 def _unexplained(change: np.ndarray, covered: np.ndarray, config: ActiveSetConfig) -> np.ndarray:
     """Return the pixels [H, W] of the connected changes that a mask covers by less than half."""
     square = np.ones((config.min_cluster, config.min_cluster), np.uint8)
+    if not cv2.morphologyEx((change & ~covered).astype(np.uint8), cv2.MORPH_OPEN, square).any():
+        return np.zeros_like(change)
     clusters = cv2.morphologyEx(change.astype(np.uint8), cv2.MORPH_OPEN, square)
     count, components, stats, _ = cv2.connectedComponentsWithStats(clusters)
     labels = np.asarray(components, np.int32)

@@ -118,7 +118,7 @@ def update_reference(reference: np.ndarray, image: np.ndarray, change: np.ndarra
         image: of the same camera [H, W, 3].
         change: the `change_mask` of both [H, W].
     """
-    return np.where(change[..., None], image, reference)
+    return np.asarray(cv2.copyTo(image, change.astype(np.uint8), reference.copy()))
 
 
 def box_around(mask: np.ndarray, config: ChangeConfig | None = None) -> tuple[slice, slice] | None:

@@ -8,12 +8,12 @@ and the coverage W_iv there (see `losses.attribution`), the error of a Gaussian 
 
     (0.01 px + sum_v E_iv) / (1 px + sum_v W_iv) .
 
-A Gaussian whose error falls clearly accepts its proposal.
+A Gaussian whose error falls clearly accepts its proposal. Only the surroundings of what may move are rendered.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +22,7 @@ from scipy.spatial import KDTree
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.losses.attribution import attribute_error
 from morgs_mi.losses.ssim import Target
+from morgs_mi.method.boxes import boxes_around
 from morgs_mi.method.lift import Lift
 from morgs_mi.render.active_view import ActiveView
 
@@ -72,13 +73,15 @@ def propagate_motion(
     if not views or not (d.any() or before.any()):
         return lifted
     means = np.asarray(previous.means)
+    near = _nearest(means, config.neighbours)
+    views = _narrowed(views, previous, _reached(near, np.any([d, before], axis=(0, 2)), config.rounds), (d, before))
 
     def error_of(d: np.ndarray) -> np.ndarray:
         moved = replace(previous, means=means + d)
-        sums = np.sum([attribute_error(moved, views[view], targets[view]) for view in views], axis=0)
+        sums = sum(attribute_error(moved, views[view], targets[view]) for view in views)
         return (sums[:, 0] + config.floor_px) / (sums[:, 1] + 1)
 
-    error, near = error_of(d), _nearest(means, config.neighbours)
+    error = error_of(d)
     for k in range(1 + config.rounds):
         proposal = (
             d[_moving_neighbour(near, d, rng)] if k else np.where(np.any(before, axis=1, keepdims=True), before, d)
@@ -100,6 +103,28 @@ def _nearest(means: np.ndarray, count: int) -> np.ndarray:
     k = min(count + 1, len(means))
     _, near = KDTree(means).query(means, k, workers=-1)
     return np.asarray(near).reshape(len(means), k)[:, -count:]
+
+
+def _reached(near: np.ndarray, moving: np.ndarray, rounds: int) -> np.ndarray:
+    """Return which Gaussians a motion can reach within some rounds, bool [N]."""
+    for _ in range(rounds):
+        moving = moving | moving[near].any(axis=1)
+    return moving
+
+
+def _narrowed(
+    views: Mapping[int, ActiveView], gaussians: Gaussians, chosen: np.ndarray, displacements: Sequence[np.ndarray]
+) -> dict[int, ActiveView]:
+    """Return the views with the blocks that the `chosen` Gaussians reach, in place or displaced; without empty ones."""
+    some = gaussians.select(np.flatnonzero(chosen))
+    means = np.asarray(some.means)
+    places = [some, *(replace(some, means=means + d[chosen]) for d in displacements if d.any())]
+    narrowed = {}
+    for index, view in views.items():
+        boxes = [boxes_around(place, view.camera, view.config, 1.0) for place in places]
+        shape, everyone = (view.camera.height, view.camera.width), np.ones(len(some), bool)
+        narrowed[index] = view.narrowed(np.any([box.union(everyone, shape) for box in boxes], axis=0))
+    return {index: view for index, view in narrowed.items() if view is not None}
 
 
 def _moving_neighbour(near: np.ndarray, d: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import drjit as dr
 import numpy as np
@@ -57,6 +57,11 @@ class ActiveView:
     def crop(self, image: np.ndarray) -> np.ndarray:
         """Return the drawn pixels of an image [H, W, ...] of the view."""
         return image if self.region is None else self.region.crop(image)
+
+    def narrowed(self, mask: np.ndarray) -> ActiveView | None:
+        """Return the view with those of its drawn blocks that contain a pixel of `mask` [H, W]; None if none does."""
+        mask = mask if self.region is None else mask & self.region.mask
+        return replace(self, region=Region(mask, self.config)) if mask.any() else None
 
     @property
     def pixel_fraction(self) -> float:

@@ -10,7 +10,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float
-from morgs_mi.render.blocks import build_lists
+from morgs_mi.render.blocks import build_lists, touches
 from morgs_mi.render.compositing import Channel, Layout, blend
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.projection import Splats, project
@@ -55,11 +55,16 @@ def backproject(
             f"backproject(): `image` must be [{size}, C] with C > 0, got {list(np.shape(image))}; resize it to the "
             "camera, or crop it to the region."
         )
-    if not int(gaussians.means.shape[0]):
-        return np.zeros((0, C), np.float32)
+    sums = np.zeros((int(gaussians.means.shape[0]), C), np.float32)
+    if not len(sums):
+        return sums
     with dr.suspend_grad():
-        splats = project(gaussians, camera, (), config)
-        N = len(splats)
+        # Lists of those that do not touch the region would take more time than the rest.
+        rows = dr.compress(touches(project(gaussians, camera, (), config), region))
+        N = dr.width(rows)
+        if not N:
+            return sums
+        splats = project(gaussians, camera, (), config, rows)
         if static_splats is not None:
             splats = splats.concatenated_with(static_splats, None)
         columns = [dr.zeros(mi.Float, len(splats)) for _ in range(C)]
@@ -72,4 +77,5 @@ def backproject(
     dr.traverse(dr.ADMode.Backward)
     grads: list[Float] = [dr.grad(column) for column in columns]
     dr.eval(grads)
-    return np.stack([np.asarray(grad)[:N] for grad in grads], axis=1)
+    sums[np.asarray(rows)] = np.stack([np.asarray(grad)[:N] for grad in grads], axis=1)
+    return sums
