@@ -69,7 +69,7 @@ def propagate_motion(
     """
     config = config or PropagationConfig()
     d, logit = lifted.displacement, lifted.logit_confidence  # [N, 3], [N]
-    before = np.zeros_like(d) if previous.motion is None else np.asarray(previous.motion)
+    before = _previous_motion(previous)
     if not views or not (d.any() or before.any()):
         return lifted
     means = np.asarray(previous.means)
@@ -96,6 +96,16 @@ def propagate_motion(
         moves = np.where(d.any(axis=1), np.maximum(logit, config.min_logit), np.minimum(logit, -config.min_logit))
         logit = np.where(accepted, moves, logit)
     return Lift(d, logit.astype(np.float32))
+
+
+def _previous_motion(gaussians: Gaussians) -> np.ndarray:
+    """Return the motion [N, 3] into the previous frame of those that moved then with confidence, 0 for the others."""
+    if gaussians.motion is None:
+        return np.zeros((len(gaussians), 3), np.float32)
+    motion = np.asarray(gaussians.motion)
+    if gaussians.logit_confidence is None:
+        return motion
+    return np.where(np.asarray(gaussians.logit_confidence)[:, None] > 0, motion, 0)
 
 
 def _nearest(means: np.ndarray, count: int) -> np.ndarray:
