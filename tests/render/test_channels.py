@@ -9,17 +9,13 @@ import numpy as np
 import pytest
 
 from morgs_mi import rasterize
-from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.render.region import Region
 from tests import tolerances as tol
 from tests.assertions import assert_close
 from tests.scenes.gaussians import (
-    NEW_ATTRIBUTES,
     ExtendedGaussians,
     to_gaussians,
 )
-
-
 
 
 @pytest.mark.usefixtures("new_attributes")
