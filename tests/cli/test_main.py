@@ -91,7 +91,7 @@ def test_main__names_options_not_arguments(tmp_path: Path, run, args, parts) -> 
 
 
 COMMANDS = ("synth", "info", "calibrate", "fit", "render", "view", "eval", "salvage", "demo")
-EXPORTS = ("ply", "gltf", "video", "tracks")
+EXPORTS = ("ply", "gltf", "video", "tracks", "web")
 
 
 @pytest.mark.parametrize("command", [*((name,) for name in COMMANDS), *(("export", name) for name in EXPORTS)])
@@ -125,6 +125,7 @@ def test_main__names_an_output_that_cannot_be_written(capture: Path, stream: Pat
             ("render", stream, "--camera", 0, "--output", folder / "exr"),
             ("export", "ply", stream, "--output", folder / "ply"),
             ("export", "tracks", stream, "--output", folder / "a.npz"),
+            ("export", "web", stream, folder / "page.html"),
             ("salvage", stream, folder / "a.morgs"),
             ("info", capture, "--no-check", "--plot", folder / "rig.png"),
             ("demo", folder / "out"),
@@ -156,6 +157,8 @@ def test_main__writes_nothing_into_a_capture(capture: Path, stream: Path, tmp_pa
         ("export", "gltf", stream, "--output", place / "gltf"),
         ("export", "video", stream, "--output", place / "cam0.mp4"),
         ("export", "tracks", stream, "--output", place / "a.npz"),
+        ("export", "web", stream, place / "page.html"),
+        ("export", "web", stream, place / "page", "--folder"),
         ("eval", stream, "--capture", capture, "--json", place / "capture.json"),
         ("eval", stream, "--capture", capture, "--figures", place / "figures"),
         ("info", capture, "--plot", place / "cam0.png"),
