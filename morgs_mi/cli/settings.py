@@ -52,7 +52,7 @@ def optional(metavar: str, hint: str = "", text: str | None = None) -> Any:
 
     Args:
         metavar: name of the value.
-        hint: text behind the help.
+        hint: text after the help.
         text: the help, if it is longer than the one line that tyro reads from a field's docstring unbroken.
     """
     return arg(metavar=metavar, help_behavior_hint=hint, help=text)

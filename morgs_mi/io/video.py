@@ -118,7 +118,7 @@ class VideoReader:
                 f"{path}: expected {held} frames at about {rate:.3g} per second, got time stamps that span "
                 f"{times[-1]:.3g} s; they are broken, convert the clip."
             )
-        # Where the number is not stored, it is the duration times the mean rate: what counts is that the time is full.
+        # Where the number is not stored, it is the duration times the mean rate; a clip that lasts so long is complete.
         if fps > 0 and declared / fps <= times[-1] + 1.5 / rate:
             declared = held
         if abs(fps / rate - 1) < _SAME_RATE:
