@@ -1,4 +1,4 @@
-"""One Mitsuba variant for all tests, and a capture with a stream that reproduces it exactly."""
+"""One Mitsuba variant for all tests, a capture with a stream that reproduces it exactly, and one of textured planes."""
 
 from __future__ import annotations
 
@@ -10,11 +10,16 @@ import numpy as np
 import pytest
 
 import morgs_mi  # noqa: F401  (finds a usable LLVM before the variant is set)
+from morgs_mi.calibration.rig_check import SharedFeatures, match_capture
+from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.visualise import to_uint8
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.synth.ground_truth import GroundTruth, save_truth
+from tests.scenes import textured
+from tests.scenes.gaussians import NEW_ATTRIBUTES
 from tests.scenes.moving_splats import CAMERAS, DISTANCE, FRAMES, PIXELS, STEP, moved, write_stream
 
 mi.set_variant("llvm_ad_rgb")  # one for all tests, which then share its kernels
@@ -32,6 +37,13 @@ def llvm_variant():
 def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
     """Accept downscaled images that are too small for a fit, so that tests are fast."""
     monkeypatch.setattr("morgs_mi.capture.capture._MIN_SIDE", 1)
+
+
+@pytest.fixture
+def new_attributes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Add two rows to the table of attributes."""
+    for attribute in NEW_ATTRIBUTES:
+        monkeypatch.setitem(BY_ACTIVATED_NAME, attribute.activated_name, attribute)
 
 
 @pytest.fixture(scope="session")
@@ -55,3 +67,15 @@ def fitted_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     rows = [{"frame": t, "seconds": 3.0 - t} for t in range(FRAMES)]
     (folder / "report.json").write_text(json.dumps({"frames": rows}))
     return folder
+
+
+@pytest.fixture(scope="session")
+def textured_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """Six cameras in front of textured planes."""
+    return textured.write_capture(tmp_path_factory.mktemp("rig"))
+
+
+@pytest.fixture(scope="session")
+def textured_features(textured_capture: Capture) -> SharedFeatures:
+    """The features of `textured_capture` and their matches."""
+    return match_capture(textured_capture)

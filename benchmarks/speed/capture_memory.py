@@ -9,7 +9,6 @@ the clip.
 
 from __future__ import annotations
 
-import json
 import shutil
 import tempfile
 import time
@@ -23,6 +22,7 @@ import mitsuba as mi
 import numpy as np
 import tyro
 
+from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.core.camera import Camera
@@ -30,11 +30,9 @@ from morgs_mi.io.video_writer import write_video
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Output):
     """Measure the memory of reading a capture."""
 
-    json: Path | None = None
-    """JSON file for the figures, which are also printed."""
     cameras: int = 20
     """Number of cameras."""
     frames: int = 300
@@ -99,16 +97,9 @@ def measure(options: Options) -> dict[str, Any]:
 def main() -> None:
     """Run the command line."""
     mi.set_variant("llvm_ad_rgb")
-    from morgs_mi.evaluate.environment import machine, versions
-
     options = tyro.cli(Options)
-    result = measure(options)
     settings = {name: value for name, value in asdict(options).items() if name != "json"}
-    result = {"settings": settings, **result, "machine": machine(), "versions": versions()}
-    print(json.dumps({name: value for name, value in result.items() if name != "rows"}, indent=2))
-    if options.json is not None:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    options.write({"settings": settings, **measure(options)}, unprinted=["rows"])
 
 
 if __name__ == "__main__":

@@ -9,10 +9,8 @@ include the bytes and the quantisation error of the means on screen.
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass, replace
-from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -20,22 +18,20 @@ import mitsuba as mi
 import numpy as np
 import tyro
 
+from benchmarks.speed.output import Output
 from benchmarks.workloads import ball
 from morgs_mi import Camera, Gaussians
 from morgs_mi.codec.container import decode_packet, encode_packet
 from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, residual_packet
-from morgs_mi.evaluate.environment import machine, versions
 
 # Number of Gaussians, number of moving ones.
 LADDER = ((20_000, 10_000), (200_000, 10_000), (200_000, 200_000))
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Output):
     """Time the stream's encoder and decoder."""
 
-    json: Path | None = None
-    """JSON file for the figures, which are also printed."""
     sizes: tuple[tuple[int, int], ...] = LADDER
     """Pairs of the number of Gaussians and the number of moving ones."""
     repeats: int = 7
@@ -63,9 +59,8 @@ def measure(count: int, moving: int, repeats: int) -> dict[str, Any]:
     now, source = change(before.gaussians, moving, float(np.median(depths(before.gaussians, camera)) / camera.K[0, 0]))
     encode_ms, decode_ms, data, after = [], [], b"", before
     for _ in range(repeats + 1):
-        parent = CodedFrame(
-            before.frame, before.grid, before.ids, before.next_id, before.gaussians
-        )  # without a cached digest
+        # A new value has no cached digest.
+        parent = CodedFrame(before.frame, before.grid, before.ids, before.next_id, before.gaussians)
         start = time.perf_counter()
         data = encode_packet(residual_packet(parent, now, source, [camera]))
         encoded = time.perf_counter()
@@ -95,11 +90,7 @@ def main() -> None:
     options = tyro.cli(Options)
     mi.set_variant("llvm_ad_rgb")
     rows = [measure(count, moving, options.repeats) for count, moving in options.sizes]
-    result = {"rows": rows, "seed": 0, "machine": machine(), "versions": versions()}
-    text = json.dumps(result, indent=2) + "\n"
-    print(text, end="")
-    if options.json is not None:
-        options.json.write_text(text, encoding="utf-8")
+    options.write({"rows": rows, "seed": 0})
 
 
 if __name__ == "__main__":

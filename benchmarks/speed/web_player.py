@@ -10,12 +10,10 @@ from the request to the answer. Drawing depends on the GPU and is not timed.
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import tempfile
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -26,11 +24,11 @@ import tyro
 from playwright.sync_api import Page, sync_playwright
 
 from benchmarks.speed.codec_speed import depths
+from benchmarks.speed.output import Output
 from benchmarks.workloads import ball
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.export.web import write_web_page
 from morgs_mi.playback.player import open_stream
 
@@ -54,11 +52,9 @@ TIME_SORTING = """async (repeats) => {
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Output):
     """Time the web player in headless Chromium."""
 
-    json: Path | None = None
-    """JSON file for the figures, which are also printed."""
     gaussians: int = 200_000
     """Number of Gaussians."""
     active: float = 0.1
@@ -129,12 +125,7 @@ def main() -> None:
     """Run the benchmark."""
     options = tyro.cli(Options)
     mi.set_variant("llvm_ad_rgb")
-    found = versions() | {"playwright": version("playwright")}
-    result = {"player": measure(options), "seed": 0, "machine": machine(), "versions": found}
-    text = json.dumps(result, indent=2) + "\n"
-    print(text, end="")
-    if options.json is not None:
-        options.json.write_text(text, encoding="utf-8")
+    options.write({"player": measure(options), "seed": 0}, packages=["playwright"])
 
 
 if __name__ == "__main__":

@@ -178,16 +178,13 @@ class _Pairs:
 
     def of_view(self, view: int, partners: Collection[int] | None = None) -> np.ndarray:
         """Return the errors of a view's matches with `partners`, by default with all views, px."""
-        found = [
-            errors
-            for match, errors in zip(self.shared.matches, self.errors, strict=True)
-            if view in match.views and (partners is None or (set(match.views) - {view}) <= set(partners))
-        ]
+        pairs = zip(self.shared.matches, self.errors, strict=True)
+        found = [errors for match, errors in pairs if _is_shared(match, view, partners)]
         return np.concatenate([np.zeros(0), *found])
 
     def of_replaced(self, view: int, camera: Camera, partners: Collection[int]) -> float:
         """Return the median error of a view's matches with `partners` if it had another camera, px."""
-        matches = [m for m in self.shared.matches if view in m.views and (set(m.views) - {view}) <= set(partners)]
+        matches = [match for match in self.shared.matches if _is_shared(match, view, partners)]
         cameras = [camera if i == view else c for i, c in enumerate(self.cameras)]
         return _median(_Pairs.of(replace(self.shared, matches=tuple(matches)), cameras).of_view(view))
 
@@ -220,6 +217,11 @@ class _Pairs:
                 break
             group = group - {worst}
         return group
+
+
+def _is_shared(match: Match, view: int, partners: Collection[int] | None) -> bool:
+    """Return whether a match is between a view and one of its `partners`, which are all views if None."""
+    return view in match.views and (partners is None or (set(match.views) - {view}) <= set(partners))
 
 
 def _share_of_large(errors: np.ndarray) -> float:

@@ -96,29 +96,43 @@ def timeline(
     """
     if unknown := [name for name in config.offset if name not in names]:
         raise ValueError(f"{path}: `offset` must name cameras of {', '.join(names)}, got {', '.join(unknown)}.")
-    rates, offsets = np.ones(len(readers)), np.zeros(len(readers))
-    if not config.aligns_clips:
-        instants = np.arange(_num_frames(path, readers, max_frames, config.gaps), dtype=float)
-        lowest = _fps(path, readers, fps)
+    if config.aligns_clips:
+        clocks = _aligned_clocks(names, readers, config, fps)
+        instants = _common_instants(path, names, readers, config, clocks)[:max_frames]
     else:
-        clip_fps = [fps or reader.fps for reader in readers]
-        lowest = min((rate for rate in clip_fps if rate), default=_DEFAULT_FPS)
-        rates = np.array([1.0 if not rate or rate < _SAME_RATE * lowest else rate / lowest for rate in clip_fps])
-        shifts = (_position(r, config.offset.get(name, 0)) for name, r in zip(names, readers, strict=True))
-        offsets = np.array([*shifts], float)
-        instants = _common_instants(path, names, readers, config, rates, offsets, lowest)[:max_frames]
-    indices, apart = zip(
-        *(nearest_frames(reader, o + r * instants) for reader, o, r in zip(readers, offsets, rates, strict=True)),
-        strict=True,
-    )
+        instants = np.arange(_num_frames(path, readers, max_frames, config.gaps), dtype=float)
+        clocks = _Clocks(np.zeros(len(readers)), np.ones(len(readers)), _fps(path, readers, fps))
+    positions = clocks.offsets[:, None] + clocks.rates[:, None] * instants
+    nearest = (nearest_frames(reader, own) for reader, own in zip(readers, positions, strict=True))
+    indices, apart = zip(*nearest, strict=True)
     if config.gaps:
         indices = [np.where(distance > _NEAR, -1, index) for index, distance in zip(indices, apart, strict=True)]
     used = [distance[index >= 0].max(initial=0) for index, distance in zip(indices, apart, strict=True)]
-    if (largest := float(np.max(used / (rates * lowest)))) > 1e-3:
+    if (largest := float(np.max(used / (clocks.rates * clocks.fps)))) > 1e-3:
         _LOG.warning("%s: images of one instant are up to %.1f ms apart.", path, 1e3 * largest)
     unchanged = all(np.array_equal(index, np.arange(len(instants))) for index in indices)
     notes = tuple(_note(r, k) for r, k in zip(readers, indices, strict=True) if r.positions is not None)
-    return Timeline(tuple(indices), lowest, unchanged, notes)
+    return Timeline(tuple(indices), clocks.fps, unchanged, notes)
+
+
+@dataclass(frozen=True)
+class _Clocks:
+    """Offset o and rate r of every clip [C], and the number of instants per second (see the module's docstring)."""
+
+    offsets: np.ndarray
+    rates: np.ndarray
+    fps: float
+
+
+def _aligned_clocks(
+    names: Sequence[str], readers: Sequence[FrameReader], config: ReadConfig, fps: float | None
+) -> _Clocks:
+    """Return the clocks of clips that are aligned by their offsets and their frame rates."""
+    clip_fps = [fps or reader.fps for reader in readers]
+    lowest = min((rate for rate in clip_fps if rate), default=_DEFAULT_FPS)
+    rates = [1.0 if not rate or rate < _SAME_RATE * lowest else rate / lowest for rate in clip_fps]
+    offsets = [_position(r, config.offset.get(name, 0)) for name, r in zip(names, readers, strict=True)]
+    return _Clocks(np.array(offsets, float), np.array(rates), lowest)
 
 
 def _common_instants(
@@ -126,16 +140,16 @@ def _common_instants(
     names: Sequence[str],
     readers: Sequence[FrameReader],
     config: ReadConfig,
-    rates: np.ndarray,
-    offsets: np.ndarray,
-    lowest: float,
+    clocks: _Clocks,
 ) -> np.ndarray:
     """Return the instants that all clips cover [T]."""
+    offsets, rates = clocks.offsets, clocks.rates
     lengths = np.array([_usable_periods(reader, config) for reader in readers])
     first, last = np.ceil(np.max(-offsets / rates)), np.floor(np.min((lengths - 1 - offsets) / rates))
     if last >= first:
         return np.arange(first, last + 1)
-    spans = zip(names, (0 - offsets) / rates / lowest, (lengths - offsets) / rates / lowest, strict=True)
+    per_second = rates * clocks.fps
+    spans = zip(names, (0 - offsets) / per_second, (lengths - offsets) / per_second, strict=True)
     table = ", ".join(f"{name} {start:.2f} to {stop:.2f} s" for name, start, stop in spans)
     raise ValueError(f"{path}: the clips have no instant in common, {table}; check `offset`.")
 

@@ -97,7 +97,7 @@ class LogHandler(logging.Handler):
     """Handler that prints log messages to standard error, one line each."""
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Print a message behind its level."""
+        """Print a message after its level."""
         print_warning(f"{record.levelname.capitalize()}: {record.getMessage()}")
 
 

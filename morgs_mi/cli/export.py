@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 import tyro
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, progress
-from morgs_mi.cli.settings import Flag, optional
+from morgs_mi.cli.settings import ChannelName, Flag, optional
 
 __all__ = ["Export"]
 
@@ -100,8 +100,10 @@ class Flight:
     """Frame at which time stands still; by default the clip plays and repeats."""
     width: Annotated[int | None, DisallowNone, optional("INT")] = None
     """Width of the video; by default that of the first camera or the JSON file."""
-    channels: tuple[Literal["color", "motion", "confidence", "depth", "alpha"], ...] = ("color",)
+    channels: tuple[ChannelName, ...] = ("color",)
     """Channels to render, side by side."""
+
+    arguments: ClassVar[Mapping[str, str]] = {"least": "--least-seconds"}
 
     def run(self) -> None:
         from morgs_mi.codec.packets import play
@@ -171,11 +173,11 @@ class Web:
 
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
-    output: Positional[Path | None] = None
+    output: Annotated[Positional[Path | None], DisallowNone, arg(help_behavior_hint="")] = None
     """FILE.html, or with --folder a new folder; by default OUT/player.html or OUT/web."""
-    folder: bool = False
+    folder: Flag = False
     """Write a folder with the page and the stream as two files, for hosting."""
-    title: str | None = None
+    title: Annotated[str | None, DisallowNone, optional("TEXT")] = None
     """Title of the page; by default the name of the stream's folder or file."""
 
     def run(self) -> None:
@@ -184,7 +186,7 @@ class Web:
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
-        output = self.output or stream.path.with_name("web" if self.folder else "player.html")
+        output = check_output(self.output or stream.path.with_name("web" if self.folder else "player.html"))
         total, write = len(frame_numbers(stream)), write_web_folder if self.folder else write_web_page
         with progress() as report:
             size = write(stream, output, self.title, lambda done: report("Checking", done, total))

@@ -52,19 +52,8 @@ class Info:
         points = origin or f"{len(capture.points)} points"
         truth = "with ground truth" if capture.truth else "without ground truth"
         print_result(f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.")
-        for note in capture.notes:
-            print_result(note)
-        if found:
-            error = f"median {found.error:.2f} px over " if found.matches else ""
-            print_result(f"Reprojection check: {error}{found.matches} matches in {found.pairs} pairs; {found.advice}")
-            for line in advice_lines(found.cameras):
-                print_result(line)
-        if fit := capture.colors:
-            changes = zip(capture.names, fit.before, fit.after, fit.samples, strict=True)
-            errors = ", ".join(
-                f"{name} {a:.1f} -> {b:.1f} ({n} points)" if n else f"{name} -" for name, a, b, n in changes
-            )
-            print_result(f"Colours towards {capture.names[fit.reference]}, dE2000 before -> after: {errors}.")
+        for line in (*capture.notes, *_check_lines(found), *_color_lines(capture)):
+            print_result(line)
         if self.plot is not None:
             write_rig(self.plot, capture)
             print_result(f"Plot of the rig: {self.plot}")
@@ -88,6 +77,25 @@ def _camera_table(capture: Capture, found: RigCheck | None) -> Table:
             *check_cells(found.cameras[index] if found else None),
         )
     return table
+
+
+def _check_lines(found: RigCheck | None) -> list[str]:
+    """Return the result of the reprojection check and its advice."""
+    if found is None:
+        return []
+    error = f"median {found.error:.2f} px over " if found.matches else ""
+    result = f"Reprojection check: {error}{found.matches} matches in {found.pairs} pairs; {found.advice}"
+    return [result, *advice_lines(found.cameras)]
+
+
+def _color_lines(capture: Capture) -> list[str]:
+    """Return the colour differences before and after the colour correction, if there is one."""
+    fit = capture.colors
+    if fit is None:
+        return []
+    changes = zip(capture.names, fit.before, fit.after, fit.samples, strict=True)
+    errors = ", ".join(f"{name} {a:.1f} -> {b:.1f} ({n} points)" if n else f"{name} -" for name, a, b, n in changes)
+    return [f"Colours towards {capture.names[fit.reference]}, dE2000 before -> after: {errors}."]
 
 
 def check_cells(check: CameraCheck | None) -> tuple[str, str, str]:

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, progress
-from morgs_mi.cli.settings import optional
+from morgs_mi.cli.settings import ChannelName, optional
 
 __all__ = ["Render"]
 
-Channel = Literal["color", "motion", "confidence", "depth", "alpha"]
 _CHANNELS = (
     "Channels to render, side by side: color, motion, confidence, depth, alpha. By default color, and for EXR files "
     "all that the stream stores."
@@ -33,7 +32,7 @@ class Render:
     """Folder of a fit, or a stream file."""
     camera: Annotated[str, arg(metavar="CAMERA")]
     """Camera of the stream, by index or name; `morgs-mi info` lists those of a capture."""
-    channels: Annotated[tuple[Channel, ...] | None, DisallowNone, optional("NAME ...", text=_CHANNELS)] = None
+    channels: Annotated[tuple[ChannelName, ...] | None, DisallowNone, optional("NAME ...", text=_CHANNELS)] = None
     output: Annotated[Path | None, DisallowNone, optional("PATH", text=_OUTPUT)] = None
 
     def run(self) -> None:

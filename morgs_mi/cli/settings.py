@@ -13,7 +13,17 @@ from tyro.conf import DisallowNone, FlagCreatePairsOff, arg
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.config import PresetName, StreamConfig, apply_preset, apply_values, read_config, relocated
 
-__all__ = ["SETTINGS", "Flag", "GivenReading", "GivenSettings", "Reading", "Settings", "optional", "setting"]
+__all__ = [
+    "SETTINGS",
+    "ChannelName",
+    "Flag",
+    "GivenReading",
+    "GivenSettings",
+    "Reading",
+    "Settings",
+    "optional",
+    "setting",
+]
 
 # The setting of every option. All others are set in a file.
 SETTINGS = {
@@ -31,6 +41,8 @@ SETTINGS = {
     "reproducible": "render.reproducible",
 }
 
+# A channel that commands render.
+ChannelName = Literal["color", "motion", "confidence", "depth", "alpha"]
 # A switch that is off by default.
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 
@@ -40,7 +52,7 @@ def optional(metavar: str, hint: str = "", text: str | None = None) -> Any:
 
     Args:
         metavar: name of the value.
-        hint: text behind the help.
+        hint: text after the help.
         text: the help, if it is longer than the one line that tyro reads from a field's docstring unbroken.
     """
     return arg(metavar=metavar, help_behavior_hint=hint, help=text)

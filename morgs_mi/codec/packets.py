@@ -218,7 +218,7 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
 
     Raises:
         ValueError: a residual without the state that it continues, a packet that contradicts itself, or one whose frame
-            is not behind that of `previous`.
+            is not after that of `previous`.
     """
     where = packet.place or f"packet of frame {packet.frame}"
     names = {"head", "code"} | ({"parent"} if packet.kind == PacketKind.RESIDUAL else set())

@@ -150,7 +150,7 @@ class StreamReader:
     def check(self) -> tuple[list[tuple[int, int, int]], int]:
         """Check every packet and return (kind, frame, offset) of all except the header, and the end of the last one.
 
-        An index at the file's end, and a packet that is truncated there, lie behind that byte.
+        An index at the file's end, and a packet that is truncated there, lie after that byte.
 
         Raises:
             ValueError: it is a pipe, or a packet is broken.

@@ -49,7 +49,7 @@ class DamagedRange:
 
     Attributes:
         start: the first byte.
-        stop: the first byte behind the range.
+        stop: the first byte after the range.
         problem: description of the damage.
     """
 
@@ -61,8 +61,8 @@ class DamagedRange:
 def salvage(path: str | Path) -> Iterator[CodedFrame | DamagedRange]:
     """Yield the damaged ranges of a stream file and the states of its playable frames, once each, by ascending frame.
 
-    A file that is truncated behind a complete packet has no damaged range; see `StreamReader.closed`. Cameras are not
-    needed, so the frames behind a broken header play as well.
+    A file that is truncated after a complete packet has no damaged range; see `StreamReader.closed`. Cameras are not
+    needed, so the frames after a broken header play too.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -79,7 +79,7 @@ def salvage(path: str | Path) -> Iterator[CodedFrame | DamagedRange]:
 def write_salvaged(stream: StreamReader, output: str | Path) -> tuple[list[int], list[DamagedRange]]:
     """Write the playable packets of a damaged stream as a new stream, atomically.
 
-    The packets are copied unchanged, by ascending frame. Behind a damaged range the new stream continues with a
+    The packets are copied unchanged, by ascending frame. After a damaged range the new stream continues with a
     keyframe, whose frame has no displacements. An undamaged stream is copied.
 
     Args:
@@ -115,29 +115,13 @@ def write_salvaged(stream: StreamReader, output: str | Path) -> tuple[list[int],
 def _playable(path: Path) -> Iterator[tuple[Packet, CodedFrame] | DamagedRange]:
     """Yield the damaged ranges, and each playable packet with the state after it, by ascending frame."""
     data = path.read_bytes()  # a memory map would end the process if the file were truncated meanwhile
-    if not data:
-        yield DamagedRange(0, 0, "the file is empty")
     found: list[_Found] = []
-    parents: set[bytes] = set()
-    at = PREAMBLE.size if data.startswith(PREAMBLE.pack(MAGIC, VERSION)) else 0
-    for number, (start, stop) in enumerate(_intact(data)):
-        if start > at:
-            yield DamagedRange(at, start, "the bytes are damaged")
-        at = stop
-        kind, frame, _ = HEAD.unpack_from(data, start)
-        if kind in (PacketKind.KEYFRAME, PacketKind.RESIDUAL):
-            entry = _Found(frame, -kind, number, start, stop)
-            try:
-                arrays = entry.packet(data).arrays
-            except ValueError as error:
-                yield entry.damaged(f"{entry.place}: {error}")
-                continue
+    for entry in _readable(data):
+        if isinstance(entry, DamagedRange):
+            yield entry
+        else:
             found.append(entry)
-            if "parent" in arrays:
-                parents.add(arrays["parent"].tobytes())
-    if at < len(data):
-        yield DamagedRange(at, len(data), "the bytes are damaged or truncated")
-    coded = None
+    parents, coded = {entry.parent for entry in found}, None
     for _, entries in groupby(sorted(found), lambda entry: entry.frame):
         best, states = None, []
         for entry in entries:
@@ -154,6 +138,28 @@ def _playable(path: Path) -> Iterator[tuple[Packet, CodedFrame] | DamagedRange]:
             yield from _once(data, coded, states)
 
 
+def _readable(data: bytes) -> Iterator[_Found | DamagedRange]:
+    """Yield the damaged ranges and the intact packets of frames, in their order in the file."""
+    if not data:
+        yield DamagedRange(0, 0, "the file is empty")
+    at = PREAMBLE.size if data.startswith(PREAMBLE.pack(MAGIC, VERSION)) else 0
+    for number, (start, stop) in enumerate(_intact(data)):
+        if start > at:
+            yield DamagedRange(at, start, "the bytes are damaged")
+        at = stop
+        kind, frame, _ = HEAD.unpack_from(data, start)
+        if kind in (PacketKind.KEYFRAME, PacketKind.RESIDUAL):
+            entry = _Found(frame, -kind, number, start, stop)
+            try:
+                arrays = entry.packet(data).arrays
+            except ValueError as error:
+                yield entry.damaged(f"{entry.place}: {error}")
+            else:
+                yield entry._replace(parent=arrays["parent"].tobytes() if "parent" in arrays else b"")
+    if at < len(data):
+        yield DamagedRange(at, len(data), "the bytes are damaged or truncated")
+
+
 def _once(
     data: bytes, coded: CodedFrame, states: list[tuple[_Found, bytes]]
 ) -> Iterator[tuple[Packet, CodedFrame] | DamagedRange]:
@@ -163,20 +169,21 @@ def _once(
         if digest != coded.digest.tobytes():
             yield entry.damaged(f"{entry.place}: another packet of frame {coded.frame} leads to another state")
         elif entry.kind == last or last == PacketKind.KEYFRAME:
-            yield entry.damaged(f"{entry.place}: frame {coded.frame} is there already")
+            yield entry.damaged(f"{entry.place}: it repeats frame {coded.frame}")
         else:
             last = entry.kind
             yield entry.packet(data), coded
 
 
 class _Found(NamedTuple):
-    """An intact packet. In their order, frames ascend and residuals precede keyframes."""
+    """An intact packet and the digest of its parent. In their order, frames ascend and residuals precede keyframes."""
 
     frame: int
     minus_kind: int
     number: int
     start: int
     stop: int
+    parent: bytes = b""
 
     @property
     def kind(self) -> int:

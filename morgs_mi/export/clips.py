@@ -144,7 +144,7 @@ def repeated_seconds(clip: float, least: float) -> float:
         ValueError: `least` is negative or not finite.
     """
     if not 0 <= least < math.inf:
-        raise ValueError(f"--least-seconds must not be negative and must be finite, got {least}.")
+        raise ValueError(f"repeated_seconds(): `least` must be finite and not negative, got {least}.")
     return clip * max(1, math.ceil(least / clip - 1e-9))
 
 

@@ -36,7 +36,7 @@ class Tracks:
 def extract_tracks(stream: StreamReader, progress: Callable[[int], None] | None = None) -> Tracks:
     """Return the tracks of all Gaussians of a stream; they take 16 bytes of memory per Gaussian and frame.
 
-    Where a keyframe starts a new set of Gaussians with ids from 0, these ids are shifted behind the earlier ones.
+    Where a keyframe starts a new set of Gaussians with ids from 0, these ids continue after the earlier ones.
 
     Args:
         stream: the file.

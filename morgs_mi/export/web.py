@@ -9,17 +9,18 @@ from __future__ import annotations
 import gzip
 import html
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.packets import decode
+from morgs_mi.codec.container import Packet, StreamWriter
+from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import atomic_folder, atomic_path
+from morgs_mi.playback.player import metadata_entry
 
 __all__ = ["text_of_bytes", "write_web_folder", "write_web_page"]
 
@@ -45,7 +46,7 @@ def write_web_page(
         progress: called with the number of frames that were checked.
 
     Raises:
-        ValueError: a packet of the stream is broken.
+        ValueError: a packet of the stream or its metadata is broken.
         OSError: the page cannot be written.
     """
     data = _script("stream", _published(stream, progress))
@@ -68,7 +69,7 @@ def write_web_folder(
 
     Raises:
         FileExistsError: `path` exists.
-        ValueError: a packet of the stream is broken.
+        ValueError: a packet of the stream or its metadata is broken.
         OSError: the folder cannot be written.
     """
     data = _published(stream, progress)
@@ -94,18 +95,22 @@ def text_of_bytes(data: bytes) -> str:
 
 def _published(stream: StreamReader, progress: Progress | None) -> bytes:
     """Return the stream with the metadata that the page reads, after decoding it once."""
-    render = stream.metadata.get("config", {}).get("render", {})
-    sink, coded, frames = io.BytesIO(), None, 0
-    with StreamWriter(sink, stream.cameras, stream.fps, {"config": {"render": render}}) as writer:
-        for packet in stream:
-            if coded is None or packet.frame != coded.frame:
-                coded, frames = decode(coded, packet), frames + 1
-                if progress is not None:
-                    progress(frames)
-            writer.write(packet)
-    if coded is None:
+    sink, frames = io.BytesIO(), 0
+    metadata = {"config": {"render": metadata_entry(stream, "config.render", {}, dict)}}
+    with StreamWriter(sink, stream.cameras, stream.fps, metadata) as writer:
+        for frames, _ in enumerate(coded_frames(_copied(stream, writer)), start=1):
+            if progress is not None:
+                progress(frames)
+    if not frames:
         raise ValueError(f"{stream.path}: expected at least one frame to show, got none.")
     return sink.getvalue()
+
+
+def _copied(packets: Iterable[Packet], writer: StreamWriter) -> Iterator[Packet]:
+    """Yield packets after writing them."""
+    for packet in packets:
+        writer.write(packet)
+        yield packet
 
 
 def _title(stream: StreamReader) -> str:

@@ -91,39 +91,25 @@ class VideoReader:
             ValueError: it is empty, OpenCV cannot decode it, or its time stamps are broken.
         """
         path = Path(path)
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: expected a video file, found none; check the path.")
-        if path.stat().st_size == 0:
-            raise ValueError(f"{path}: expected a video, got an empty file; copy or record it again.")
-        stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-        try:
-            ok, first = stream.read()
-            num_frames, fps = int(stream.get(cv2.CAP_PROP_FRAME_COUNT)), stream.get(cv2.CAP_PROP_FPS)
-        finally:
-            stream.release()
-        if not ok:
-            raise ValueError(
-                f"{path}: expected a video, got {path.stat().st_size} bytes of which OpenCV cannot decode "
-                "one frame: the file is truncated or no video; copy or convert it again."
-            )
+        (height, width), num_frames, fps = _video_header(path)
         times = _frame_times(path)
         held, clock = len(times), None if path.suffix.lower() in _WITHOUT_TIMES else _clock(times)
         # Some containers do not store the number, and a frame takes more than a byte.
         declared = num_frames if 0 < num_frames <= path.stat().st_size else held
         if clock is None:
-            return cls(path, declared, fps if fps > 0 else None, first.shape[1], first.shape[0], held)
+            return cls(path, declared, fps if fps > 0 else None, width, height, held)
         positions, rate = clock
         if positions[-1] > 10 * held + _MAX_PAUSE:
             raise ValueError(
                 f"{path}: expected {held} frames at about {rate:.3g} per second, got time stamps that span "
                 f"{times[-1]:.3g} s; they are broken, convert the clip."
             )
-        # Where the number is not stored, it is the duration times the mean rate: what counts is that the time is full.
+        # Where the number is not stored, it is the duration times the mean rate; a clip that lasts so long is complete.
         if fps > 0 and declared / fps <= times[-1] + 1.5 / rate:
             declared = held
         if abs(fps / rate - 1) < _SAME_RATE:
             rate = fps
-        return cls(path, declared, rate, first.shape[1], first.shape[0], held, positions)
+        return cls(path, declared, rate, width, height, held, positions)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
         """Yield frames start..stop-1, by default up to `num_frames`.
@@ -296,6 +282,31 @@ def open_frames(path: str | Path | tuple[Path, ...]) -> FrameReader:
     if isinstance(path, tuple):
         return FolderReader.of_files(path)
     return FolderReader.open(path) if Path(path).is_dir() else VideoReader.open(path)
+
+
+def _video_header(path: Path) -> tuple[tuple[int, int], int, float]:
+    """Return the height and width of a video's first frame, and the number and rate of frames in the file's header.
+
+    Raises:
+        FileNotFoundError, ValueError: as for `VideoReader.open`.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: expected a video file, found none; check the path.")
+    if path.stat().st_size == 0:
+        raise ValueError(f"{path}: expected a video, got an empty file; copy or record it again.")
+    stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    try:
+        ok, first = stream.read()
+        num_frames, fps = int(stream.get(cv2.CAP_PROP_FRAME_COUNT)), stream.get(cv2.CAP_PROP_FPS)
+    finally:
+        stream.release()
+    if not ok:
+        raise ValueError(
+            f"{path}: expected a video, got {path.stat().st_size} bytes of which OpenCV cannot decode one frame: the "
+            "file is truncated or no video; copy or convert it again."
+        )
+    height, width = first.shape[:2]
+    return (height, width), num_frames, fps
 
 
 def _frame_times(path: Path) -> np.ndarray:

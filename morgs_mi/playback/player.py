@@ -44,6 +44,7 @@ __all__ = [
     "fitted_capture",
     "has_confidence",
     "has_offset",
+    "metadata_entry",
     "num_frames",
     "open_stream",
     "open_stream_capture",
@@ -136,7 +137,7 @@ def has_confidence(stream: StreamReader) -> bool:
     Raises:
         ValueError: the header's metadata or the first packet is broken.
     """
-    learned = _metadata(stream, "config.motion.learn_confidence", True, bool)
+    learned = metadata_entry(stream, "config.motion.learn_confidence", True, bool)
     return learned and any(gaussians.logit_confidence is not None for _, gaussians in islice(play(stream), 1))
 
 
@@ -234,7 +235,7 @@ def render_config(stream: StreamReader) -> RenderConfig:
     Raises:
         ValueError: the stream's header has settings of other names, types or ranges.
     """
-    values = _metadata(stream, "config.render", {}, dict)
+    values = metadata_entry(stream, "config.render", {}, dict)
     return apply_values(RenderConfig(), values, _place(stream, "config.render"))
 
 
@@ -244,10 +245,10 @@ def num_frames(stream: StreamReader) -> int:
     Raises:
         ValueError: the header states something else.
     """
-    return _metadata(stream, "num_frames", 0, int)
+    return metadata_entry(stream, "num_frames", 0, int)
 
 
-def _metadata(stream: StreamReader, key: str, default: Any, *kinds: type) -> Any:
+def metadata_entry(stream: StreamReader, key: str, default: Any, *kinds: type) -> Any:
     """Return an entry of a stream's metadata, `default` where there is none.
 
     A stream may come from anybody, and its metadata may be any JSON object.
@@ -290,9 +291,9 @@ def open_stream_capture(stream: StreamReader, capture: str | Path | None, frames
             that was fitted, or there are no frames.
     """
     path = capture or fitted_capture(stream)
-    reading = apply_values(ReadConfig(), _metadata(stream, "reading", {}, dict), _place(stream, "reading"))
-    downscale = _metadata(stream, "downscale", 1, int, float)
-    test_view = _metadata(stream, "test_view", "auto", int, str, NoneType)
+    reading = apply_values(ReadConfig(), metadata_entry(stream, "reading", {}, dict), _place(stream, "reading"))
+    downscale = metadata_entry(stream, "downscale", 1, int, float)
+    test_view = metadata_entry(stream, "test_view", "auto", int, str, NoneType)
     if not frames:
         raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
     recording = load_capture(path, downscale, test_view, frames[-1] + 1, reading)

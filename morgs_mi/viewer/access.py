@@ -32,7 +32,7 @@ def refusal(host: str | None, origin: str | None, names: Collection[str] = ()) -
     Args:
         host: the request's `Host`, the address that the browser believes to be talking to.
         origin: the request's `Origin`; programs other than browsers send none.
-        names: allowed names besides `localhost` and addresses in digits.
+        names: allowed names in addition to `localhost` and addresses in digits.
     """
     name = urlsplit(f"//{host or ''}").hostname or ""
     if not (_is_address(name) or name in {"localhost", *map(str.lower, names)}):

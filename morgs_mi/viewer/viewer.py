@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
+from morgs_mi.codec.packets import CodedFrame
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.export.axes import up_direction
@@ -278,19 +279,18 @@ class Viewer:
         self._scene.show_trails(lines[inside], ages[inside])
         self._scene.show_cameras(controls.cameras.value, at)
         self._scene.show_box(controls.crop_box if controls.is_cropped else None)
-        mode, own = controls.mode.value, coded.gaussians
-        notes = (
-            (mode == "offset" and own.offset is None, _NO_OFFSET),
-            (mode == "motion" and own.motion is None, _NO_MOTION),
-            (share > 0 and at is None, _NOT_AT_CAMERA),
-            (share > 0 and at is not None and recorded is None, _NOT_RECORDED),
-        )
-        count = f"{len(own)}" if len(gaussians) == len(own) else f"{len(gaussians)} of {len(own)}"
-        controls.status.content = f"Frame {frame} of {self._cache.frames[-1]}, {count} Gaussians" + "".join(
-            note for applies, note in notes if applies
-        )
+        missing = "" if not share or recorded is not None else _NOT_AT_CAMERA if at is None else _NOT_RECORDED
+        controls.status.content = self._status(coded, len(gaussians)) + missing
         self._server.flush()
         self._shown = wanted
+
+    def _status(self, coded: CodedFrame, shown: int) -> str:
+        """Return the frame, the number of Gaussians of which `shown` are not cropped, and what the frame lacks."""
+        own, mode = coded.gaussians, self._controls.mode.value
+        count = f"{shown}" if shown == len(own) else f"{shown} of {len(own)}"
+        lacks_offset, lacks_motion = mode == "offset" and own.offset is None, mode == "motion" and own.motion is None
+        note = _NO_OFFSET if lacks_offset else _NO_MOTION if lacks_motion else ""
+        return f"Frame {coded.frame} of {self._cache.frames[-1]}, {count} Gaussians{note}"
 
     def _frame_at(self, index: int) -> int:
         return self._cache.frames[min(index, len(self._cache.frames) - 1)]

@@ -1,11 +1,16 @@
-"""Matches between views, where they fit no common geometry."""
+"""Features and matches: their places, the points behind them, and matches without a common geometry."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from morgs_mi.capture.features import Features, match_views
+from morgs_mi.calibration.rig_check import SharedFeatures
+from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.features import Features, detect, match_views, reprojection_errors, triangulate
 from morgs_mi.core.camera import Camera
+from tests.assertions import assert_close
+from tests.scenes import textured
+from tests.scenes.textured import turned, with_cameras
 
 
 def test_match_views__returns_none_for_matches_without_a_common_geometry():
@@ -18,3 +23,77 @@ def test_match_views__returns_none_for_matches_without_a_common_geometry():
     features = [Features(p, descriptors, np.zeros((count, 3), np.float32)) for p in (points, moved)]
     camera = Camera.look_at((0, 0, -3), (0, 0, 0), (0, -1, 0), 60, 96, 72)
     assert match_views(features, [camera, camera]) == []
+
+
+def test_reprojection_errors__are_bounded_by_epipolar_distances(
+    textured_capture: Capture, textured_features: SharedFeatures
+) -> None:
+    """No point can be nearer to both features than half their distance to the epipolar lines."""
+    moved = with_cameras(textured_capture, lambda i, c: turned(c, 4) if i == 2 else c).cameras
+    match = next(m for m in textured_features.matches if m.views == (1, 2))
+    errors = reprojection_errors(match, textured_features.features, moved)
+    a, b = (moved[v] for v in match.views)
+    relative = b.viewmat @ np.linalg.inv(a.viewmat)
+    x, y, z = relative[:3, 3]
+    E = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative[:3, :3]
+    F = np.linalg.inv(b.K).T @ E @ np.linalg.inv(a.K)
+    left, right = (
+        np.column_stack([textured_features.features[v].points[match.features[:, k]], np.ones(len(errors))])
+        for k, v in enumerate(match.views)
+    )
+    lines = left @ F.T
+    distance = np.abs((lines * right).sum(1)) / np.linalg.norm(lines[:, :2], axis=1)
+    back = right @ F
+    other = np.abs((back * left).sum(1)) / np.linalg.norm(back[:, :2], axis=1)
+    assert np.median(distance) > 1
+    assert (errors >= 0.45 * np.minimum(distance, other) - 1e-6).all()
+    assert (errors <= distance + other + 1e-6).mean() > 0.95
+
+
+def test_detect__finds_a_blob_at_its_position() -> None:
+    """A blob at a known position, at several image sizes: pixel centres lie at +0.5."""
+    for width, height in ((160, 120), (1600, 1200)):
+        scale = width / 160
+        u, v = 70.3 * scale, 52.6 * scale
+        y, x = np.mgrid[:height, :width] + 0.5
+        blob = 120 + 120 * np.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * (4 * scale) ** 2))
+        found = detect(np.repeat(blob[..., None], 3, -1).astype(np.uint8)).points
+        nearest = found[np.argmin(np.linalg.norm(found - (u, v), axis=1))]
+        assert_close(nearest, (u, v), atol=0.1 * scale)
+
+
+def test_detect__respects_the_mask(textured_capture: Capture) -> None:
+    image = next(textured_capture.frames()).images[0]
+    mask = np.zeros(image.shape[:2], bool)
+    mask[:, 160:] = True
+    assert detect(image, mask).points[:, 0].min() > 158
+
+
+def test_triangulate__finds_points_on_the_planes(textured_capture: Capture, textured_features: SharedFeatures) -> None:
+    points, colors = triangulate(textured_features.matches, textured_features.features, textured_capture.cameras)
+    assert points.dtype == colors.dtype == np.float32
+    assert len(points) > 1000
+    # 0.1 px at 4 units, 277 px focal length and a base of 0.5 is 1 cm; a few points at occlusion edges are wrong.
+    distance = textured.distance_to_planes(points)
+    assert np.percentile(distance, 90) < 0.05
+    assert np.percentile(distance, 98) < 0.3
+    # Their colours are those of the pixels onto which they project.
+    camera, image = textured_capture.cameras[2], next(textured_capture.frames()).images[2]
+    pixels, depths = camera.project(points)
+    u, v = pixels.astype(int).T
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height) & (depths > 0)
+    assert np.median(np.abs(image[v[inside], u[inside]] / 255 - colors[inside])) < 0.05
+
+
+def test_triangulate__leaves_out_points_with_a_small_angle(
+    textured_capture: Capture, textured_features: SharedFeatures
+) -> None:
+    counts = [
+        len(
+            triangulate(
+                textured_features.matches, textured_features.features, textured_capture.cameras, min_angle=angle
+            )[0]
+        )
+        for angle in (1, 20, 60)
+    ]
+    assert counts[0] > counts[1] > counts[2] == 0

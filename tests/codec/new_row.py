@@ -1,4 +1,4 @@
-"""Program that adds an attribute to the table and streams it; `test_packets` runs it in a process of its own."""
+"""Program that adds an attribute to the table and streams it; `test_quantisation` runs it in a process of its own."""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 import pytest
@@ -42,21 +43,7 @@ def with_entry(path: str, text: str) -> bytes:
         ("cameras", "[]", "`cameras` must name at least one camera"),
         ("cameras", "{}", "`cameras` must be a list, got an object"),
         ("cameras.1", "7", r"`cameras\[1\]` must be an object, got an integer"),
-        ("cameras.0.name", "3", r"`cameras\[0\].name` must be a string, got an integer"),
-        ("cameras.0.name", '"\\u001b[2J"', r"`cameras\[0\].name` must be printable"),
-        ("cameras.0.name", '"\\ud800"', r"`cameras\[0\].name` must be printable"),
-        ("cameras.0.name", "", r"`cameras\[0\].name` is missing"),
-        ("cameras.0.width", "32.5", r"`cameras\[0\].width` must be an integer, got a number"),
-        ("cameras.0.width", "0", r"`cameras\[0\].width` must lie between 1 and"),
-        ("cameras.0.height", "1000000", r"`cameras\[0\].width \* height` must lie between 1 and"),
-        ("cameras.0.near", "0", r"`cameras\[0\].near` must lie between"),
-        ("cameras.0.near", "null", r"`cameras\[0\].near` must be a number, got null"),
-        ("cameras.0.K", "[[1,0,0],[0,1,0]]", r"`cameras\[0\].K` must be a matrix \[3\]\[3\]"),
-        ("cameras.0.K.0.0", '"1"', r"`cameras\[0\].K` must be a number, got a string"),
         ("cameras.0.K.0.0", "-1", "must be finite with positive focal lengths"),
-        ("cameras.0.K.0.0", "1e300", r"`cameras\[0\].K` must lie between"),
-        ("cameras.0.viewmat", "[1,2,3,4]", r"`cameras\[0\].viewmat` must be a matrix \[4\]\[4\]"),
-        ("cameras.0.viewmat.2.1", "[1]", r"`cameras\[0\].viewmat` must be a number, got a list"),
         ("metadata", "[]", "`metadata` must be an object, got a list"),
         ("metadata.seed", "1e999", "numbers must be finite"),
         ("metadata.seed", "[" * 31 + "]" * 31, "nested at most 32 levels deep"),
@@ -68,6 +55,30 @@ def with_entry(path: str, text: str) -> bytes:
 def test_header_fields__refuse_other_types_and_ranges(path: str, text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         header_fields(with_entry(path, text))
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "message"),
+    [
+        ("name", "3", "name` must be a string, got an integer"),
+        ("name", '"\\u001b[2J"', "name` must be printable"),
+        ("name", '"\\ud800"', "name` must be printable"),
+        ("name", "", "name` is missing"),
+        ("width", "32.5", "width` must be an integer, got a number"),
+        ("width", "0", "width` must lie between 1 and"),
+        ("height", "1000000", "width * height` must lie between 1 and"),
+        ("near", "0", "near` must lie between"),
+        ("near", "null", "near` must be a number, got null"),
+        ("K", "[[1,0,0],[0,1,0]]", "K` must be a matrix [3][3]"),
+        ("K.0.0", '"1"', "K` must be a number, got a string"),
+        ("K.0.0", "1e300", "K` must lie between"),
+        ("viewmat", "[1,2,3,4]", "viewmat` must be a matrix [4][4]"),
+        ("viewmat.2.1", "[1]", "viewmat` must be a number, got a list"),
+    ],
+)
+def test_header_fields__refuse_other_types_and_ranges_of_a_camera(path: str, text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=re.escape(f"`cameras[0].{message}")):
+        header_fields(with_entry(f"cameras.0.{path}", text))
 
 
 @pytest.mark.parametrize(

@@ -136,7 +136,7 @@ def test_write_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
         (("video", "--freeze", "7"), "--freeze must be in 0 to 3, got 7"),
         (("video", "--width", "0"), "--width must be at least 1, got 0"),
         (("video", "--seconds", "-1"), "--seconds must be positive"),
-        (("video", "--least-seconds", "-1"), "--least-seconds must not be negative"),
+        (("video", "--least-seconds", "-1"), "--least-seconds must be finite and not negative, got -1"),
         (("video", "--path", "none.json"), "expected a camera path, found none"),
     ],
 )

@@ -73,6 +73,23 @@ def test_write_web_page__refuses_a_damaged_stream_and_writes_nothing(tmp_path):
     assert not (tmp_path / "page.html").exists()
 
 
+@pytest.mark.parametrize("config", [3, {"render": []}])
+def test_write_web_page__refuses_settings_of_another_type(tmp_path, config):
+    write_stream(tmp_path / "stream.morgs", metadata={"config": config})
+    with pytest.raises(ValueError, match=r"`config.render` of the header's metadata must be an object"):
+        write_web_page(open_stream(tmp_path), tmp_path / "page.html")
+
+
+def test_write_web_page__refuses_a_second_residual_of_a_frame(tmp_path):
+    write_stream(tmp_path / "stream.morgs")
+    packets = list(open_stream(tmp_path))
+    with StreamWriter(tmp_path / "stream.morgs", rig(), 30) as writer:
+        for packet in (*packets, packets[-1]):
+            writer.write(packet)
+    with pytest.raises(ValueError, match="its frame must be above 3, that of the state before, got 3"):
+        write_web_page(open_stream(tmp_path), tmp_path / "page.html")
+
+
 def test_write_web_page__escapes_the_title(tmp_path):
     write_stream(tmp_path / "stream.morgs")
     write_web_page(open_stream(tmp_path), tmp_path / "page.html", title="</title><script>alert()</script>")

@@ -8,13 +8,11 @@ import drjit as dr
 import numpy as np
 from drjit.opt import Adam
 
-from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from morgs_mi import Camera, Gaussians, rasterize
 from tests import reference
+from tests.render.exact import BACKGROUND, CONFIG
 from tests.scenes.gaussians import CHANNELS, Values
 
-# The settings of test_extremes, so that both share their kernels.
-BACKGROUND = (0.2, 0.5, 0.9)
-CONFIG = RenderConfig(stop_transmittance=1e-12)
 CAMERA = Camera(np.array([[60.0, 0, 16], [0, 60, 12], [0, 0, 1]]), np.eye(4), 32, 24)
 
 

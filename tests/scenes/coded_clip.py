@@ -76,3 +76,12 @@ def history(states: Iterable[CodedFrame]) -> str:
         for array in (state.digest, state.ids, *state.gaussians.numpy().values()):
             digest.update(np.ascontiguousarray(array))
     return digest.hexdigest()
+
+
+def assert_same(got: CodedFrame, expected: CodedFrame) -> None:
+    """Assert that two states agree to the bit."""
+    assert (got.frame, got.next_id) == (expected.frame, expected.next_id)
+    assert np.array_equal(got.digest, expected.digest)
+    found = got.gaussians.numpy()
+    for name, value in expected.gaussians.numpy().items():
+        assert np.array_equal(found[name], value), name

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.core.camera import Camera
+from morgs_mi.io.video_writer import write_video
 from tests.scenes.cameras import shift_principal_point
 
 _TEXTURE = 512
@@ -28,6 +33,26 @@ def rig(count: int = 6, width: int = 320, height: int = 240, shift: float = 0.0)
         view = Camera.look_at(place, (0, 0, 4.2), (0, -1, 0), 60, width, height, f"cam{i}")
         cameras.append(shift_principal_point(view, shift, -0.5 * shift))
     return cameras
+
+
+def write_capture(path: Path) -> Capture:
+    """Write and read six cameras with off-centre principal points and one frame, without points."""
+    cameras, planes = rig(shift=7), textures()
+    write_colmap(path / "sparse", cameras)
+    for camera in cameras:
+        write_video(path / f"{camera.name}.mkv", [render(camera, planes)], 30)
+    return load_capture(path)
+
+
+def with_cameras(capture: Capture, change: Callable[[int, Camera], Camera]) -> Capture:
+    """Return the capture with the cameras that `change` returns for an index and a camera."""
+    return replace(capture, cameras=tuple(change(i, camera) for i, camera in enumerate(capture.cameras)))
+
+
+def turned(camera: Camera, degrees: float) -> Camera:
+    """Return the camera rotated about its optical axis."""
+    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
+    return replace(camera, viewmat=np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ camera.viewmat)
 
 
 def textures() -> list[np.ndarray]:

@@ -230,8 +230,8 @@ def _text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
 
 def _count_words(line: str) -> int:
     """Return the length of `line.split()`, which would take many times the memory of a line of thousands of points."""
-    black = np.frombuffer(f" {line}".encode(), np.uint8) > 32
-    return int(np.count_nonzero(black[1:] & ~black[:-1]))
+    visible = np.frombuffer(f" {line}".encode(), np.uint8) > 32
+    return int(np.count_nonzero(visible[1:] & ~visible[:-1]))
 
 
 def _text_points(path: Path) -> Iterator[list[float]]:

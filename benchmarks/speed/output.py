@@ -1,0 +1,36 @@
+"""The figures of a benchmark as JSON, with the machine and the versions that they belong to."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from morgs_mi.core.files import write_json
+from morgs_mi.evaluate.environment import machine, versions
+
+
+@dataclass(frozen=True)
+class Output:
+    """Base of a benchmark's options."""
+
+    json: Path | None = None
+    """JSON file for the figures, which are also printed."""
+
+    def write(
+        self, figures: Mapping[str, Any], packages: Collection[str] = (), unprinted: Collection[str] = ()
+    ) -> None:
+        """Print the figures and write them to the file.
+
+        Args:
+            figures: by name.
+            packages: whose versions are recorded beside those of the package's own dependencies.
+            unprinted: names of figures that only the file has.
+        """
+        found = {**figures, "machine": machine(), "versions": versions() | {name: version(name) for name in packages}}
+        print(json.dumps({name: value for name, value in found.items() if name not in unprinted}, indent=2))
+        if self.json is not None:
+            write_json(self.json, found)

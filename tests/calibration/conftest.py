@@ -1,0 +1,18 @@
+"""The capture of textured planes, by short names."""
+
+from __future__ import annotations
+
+import pytest
+
+from morgs_mi.calibration.rig_check import SharedFeatures
+from morgs_mi.capture.capture import Capture
+
+
+@pytest.fixture(scope="session")
+def capture(textured_capture: Capture) -> Capture:
+    return textured_capture
+
+
+@pytest.fixture(scope="session")
+def shared(textured_features: SharedFeatures) -> SharedFeatures:
+    return textured_features

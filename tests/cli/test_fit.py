@@ -1,0 +1,238 @@
+"""`morgs-mi fit`: options, interruption, a full disk, and continuing."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi import cli
+from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.stream_loop import StreamLoop
+from tests.cli.commands import QUICK, assert_one_sentence, assert_refused, interrupt
+from tests.scenes.captures import colmap
+from tests.scenes.noise_capture import FRAMES, lengthen_clip, rig, truncate_clip
+
+
+def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
+    capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    truncate_clip(capture)
+    monkeypatch.setattr("morgs_mi.io.video._frame_times", lambda path: np.arange(FRAMES) / 25)
+    assert run("fit", capture, tmp_path / "out", *QUICK)[0] == 0
+    frames = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
+    assert [frame["missing_views"] for frame in frames] == [[], ["cam1"], ["cam1"]]
+    assert "cam1.mkv: frame 1 of 3 cannot be decoded" in frames[2]["status"]
+    assert run("eval", tmp_path / "out", "--json", tmp_path / "eval.json")[0] == 0
+    frames = json.loads((tmp_path / "eval.json").read_text())["frames"]
+    assert [frame["views"]["cam1"]["psnr"] is None for frame in frames] == [False, True, True]
+    assert all(frame["psnr"] > 0 for frame in frames)
+
+
+def test_fit__and_eval_use_the_same_instants(capture: Path, tmp_path: Path, run) -> None:
+    lengthen_clip(capture)
+    out, options = tmp_path / "out", ("--offset", "cam1", "-1", "cam2", "1", "--exposure")
+    assert run("info", capture, "--no-check", *options)[1].count("2 frames at 25 fps") == 1
+    assert run("fit", capture, out, *options, *QUICK)[0] == 0
+    record = json.loads((out / "capture.json").read_text())
+    assert (record["frames"], record["reading"]["offset"]) == (2, {"cam1": -1, "cam2": 1})
+    assert [camera["first_frame"] for camera in record["cameras"]] == [1, 0, 2]
+    assert run("eval", out, "--json", tmp_path / "eval.json")[0] == 0
+    result = json.loads((tmp_path / "eval.json").read_text())
+    assert (result["complete"], result["num_frames"]) == (True, 2)
+
+
+def before_frame_2(monkeypatch: pytest.MonkeyPatch, action: Callable[[], None]) -> None:
+    """Call `action` before frame 2 is fitted."""
+    push = StreamLoop.push
+
+    def acting_push(loop: StreamLoop, *args: object) -> object:
+        if loop.state.frame == 2:
+            action()
+        return push(loop, *args)
+
+    monkeypatch.setattr(StreamLoop, "push", acting_push)
+
+
+def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
+    capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before_frame_2(monkeypatch, interrupt)
+    assert run("fit", capture, tmp_path / "out", *QUICK)[0] == 130
+    status, _, error = run("eval", tmp_path / "out", "--json", tmp_path / "eval.json")
+    assert status == 0
+    assert "the fit was not finished" in error
+    assert not json.loads((tmp_path / "eval.json").read_text())["complete"]
+
+
+@pytest.mark.parametrize(
+    ("args", "parts"),
+    [
+        (["--frames", "0"], ("--frames must be at least 1, got 0",)),
+        (["--downscale", "0.5"], ("--downscale must be at least 1, got 0.5",)),
+        (["--test-view", "3"], ("--test-view must be an index in 0..2, one of cam0, cam1, cam2, or none", "got 3")),
+        (["--offset", "cam9", "1"], ("--offset must name cameras of cam0, cam1, cam2, got cam9",)),
+        (["--num-gaussians", "0"], ("--num-gaussians must be at least 1, got 0",)),
+        (["--epochs", "0", "--preset", "s"], ("--epochs must be at least 1, got 0",)),
+        (["--sh-degree", "4"], ("--sh-degree must be 0 to 3, got 4",)),
+        (["--key-views", "0"], ("--key-views must be at least 1, got 0",)),
+        (["--quality", "nan"], ("--quality must be positive and finite, got nan",)),
+        (["--target-size", "-1"], ("--target-size must not be negative, got -1",)),
+        (["--flow", "none"], ("--flow must be one of dis,", "got 'none'")),
+        (["--flow", "files:nowhere"], ("nowhere",)),
+        (["--masks", "some"], ("--masks must be one of none,", "got 'some'")),
+        (["--config", "nowhere.toml"], ("nowhere.toml: expected a TOML file with settings, found none",)),
+        (["--config", "[fit"], ("bad.toml: expected valid TOML",)),
+        (["--config", "[fit]\na = " + "[" * 5000], ("bad.toml: expected valid TOML",)),
+        (["--config", "[fit]\na = " + "9" * 5000], ("bad.toml: expected valid TOML",)),
+        (["--config", "[fit]\nepoch = 1"], ("bad.toml: `fit.epoch` is unknown, expected `fit.epochs`",)),
+        (["--config", "[fit]\nepochs = 'many'"], ("bad.toml: `fit.epochs` must be a whole number, got 'many'",)),
+        (["--config", "[fit.rates]\nmeans = nan"], ("bad.toml: `fit.rates.means` must be finite and not negative",)),
+        (["--config", "[render]\nblock_width = 17"], ("bad.toml: `render.block_width` must be 4, 8, 12 or 16",)),
+        (["--config", "[motion]\nflow_method = 'no'"], ("bad.toml: `motion.flow_method` must be one of dis,",)),
+        (["--config", "[motion]\nmask_method = 'no'"], ("bad.toml: `motion.mask_method` must be one of none,",)),
+        (["--variant", "cuda_ad_rgb"], ("--variant cuda_ad_rgb cannot be used here", "llvm_ad_rgb")),
+    ],
+)
+def test_fit__rejects_bad_input_in_one_sentence(capture: Path, tmp_path: Path, run, args, parts) -> None:
+    if "cuda_ad_rgb" in args and Path("/dev/nvidiactl").exists():
+        pytest.skip("this machine has a GPU")
+    option, value, *more = args
+    if option == "--config" and "[" in value:
+        value = tmp_path / "bad.toml"
+        value.write_text(args[1])
+    assert_refused(run("fit", capture, tmp_path / "out", option, value, *more), *parts)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("folders", [(), ("capture",)])
+def test_fit__asks_for_its_folders(folders: tuple[str, ...], run) -> None:
+    assert_refused(run("fit", *folders), "expected the folders CAPTURE and OUT")
+
+
+@pytest.mark.parametrize(
+    ("args", "part"),
+    [
+        (["--epochs", "many"], "many"),
+        (["--epochs", "None"], "--epochs"),
+        (["--preset", "xl"], "xl"),
+        (["--nonsense"], "--nonsense"),
+        (["--fit.epochs", "1"], "--fit.epochs"),
+    ],
+)
+def test_fit__rejects_arguments_that_cannot_be_parsed(capture: Path, tmp_path: Path, capsys, args, part) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["fit", str(capture), str(tmp_path / "out"), *args])
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    assert part in " ".join(error.replace("│", " ").split())
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("view", "test_view"), [("cam1", 1), ("2", 2), ("none", None), ("None", None), ("auto", None)])
+def test_fit__takes_the_held_out_camera_by_index_or_name(
+    capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, view: str, test_view: int | None
+) -> None:
+    assert fitted_capture(monkeypatch, run, capture, tmp_path, "--test-view", view).test_view == test_view
+
+
+def fitted_capture(monkeypatch: pytest.MonkeyPatch, run, capture: Path, out: Path, *args: object) -> Capture:
+    """Return the capture that `morgs-mi fit` passes on."""
+    passed: list[Capture] = []
+
+    def stop(capture: Capture, *_: object) -> None:
+        passed.append(capture)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("morgs_mi.recorder.stream_capture", stop)
+    assert run("fit", capture, out, *args)[0] == 130
+    return passed[0]
+
+
+def test_fit__refuses_to_leave_fewer_than_32_pixels(tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
+    clip = colmap(tmp_path / "clip")  # 62x46
+    assert_refused(
+        run("fit", clip, tmp_path / "out", "--downscale", 1.5),
+        "--downscale must leave images of at least 32 pixels on each side, got 1.5; use at most 1.43.",
+    )
+    assert fitted_capture(monkeypatch, run, clip, tmp_path / "out", "--downscale", 1.43).cameras[0].height == 32
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
+    capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    before_frame_2(monkeypatch, lambda: os.kill(os.getpid(), number))
+    args = ["fit", str(capture), str(tmp_path / "my out"), *QUICK]
+    status, _, error = run(*args)
+    again = shlex.join(["morgs-mi", *args, "--resume"])
+    stands = f"Interrupted. {tmp_path / 'my out'}/stream.morgs holds frames 0 to 1 of 3; continue with `{again}`."
+    assert (status, error) == (130, f"{stands}\n")
+
+
+def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
+    capture: Path, stream: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "out").mkdir()
+    stream.rename(tmp_path / "out" / "stream.morgs")
+    monkeypatch.setattr("morgs_mi.recorder.StreamLoop", interrupt)
+    status, _, error = run("fit", capture, tmp_path / "out", *QUICK)
+    assert (status, error) == (130, "Interrupted.\n")
+    assert len(StreamReader(tmp_path / "out" / "stream.morgs").index()) == 2
+
+
+def test_fit__reports_progress_before_the_first_frame(capture: Path, tmp_path: Path, run, monkeypatch) -> None:
+    write_colmap(capture / "sparse" / "0", rig(), np.zeros((0, 3)), np.zeros((0, 3)))
+    now = iter(range(0, 10**9, 40))
+    monkeypatch.setattr("morgs_mi.cli.console.time.monotonic", lambda: float(next(now)))
+    monkeypatch.setattr("morgs_mi.recorder.StreamLoop", interrupt)
+    status, _, error = run("fit", capture, tmp_path / "out", *QUICK)
+    assert status == 130
+    assert error.startswith("Matching views: 0/3, 0:00:00 elapsed.\nMatching views: 1/3, ")
+    assert "Triangulating points: 0/1, " in error
+
+
+def test_fit__ends_with_a_whole_packet_on_a_full_disk(capture: Path, tmp_path: Path) -> None:
+    """The second packet does not fit: the file ends with the first and still has the intended number of frames."""
+    script = (
+        "import resource, sys; from morgs_mi.codec import container; from morgs_mi import cli\n"
+        "write = container.StreamWriter.write\n"
+        "def limited(writer, packet):\n"
+        "    if packet.frame:\n"
+        "        resource.setrlimit(resource.RLIMIT_FSIZE, (writer.num_bytes + 9,) * 2)\n"
+        "    return write(writer, packet)\n"
+        "container.StreamWriter.write = limited\n"
+        "sys.exit(cli.main(sys.argv[1:]))\n"
+    )
+    args = [sys.executable, "-c", script, "fit", str(capture), str(tmp_path / "out"), *QUICK]
+    result = subprocess.run(args, capture_output=True, text=True, check=False)
+    assert result.returncode == 1
+    assert_one_sentence(result.stderr, "stream.morgs", "could not be written", "free space on the disk. ", "--resume`.")
+    assert "Errno" not in result.stderr
+    reader = StreamReader(tmp_path / "out" / "stream.morgs")
+    assert len(list(reader)) == 1
+    assert reader.metadata["num_frames"] == FRAMES
+
+
+def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, run) -> None:
+    out = tmp_path / "out"
+    fit = ("fit", capture, out, *QUICK, "--reproducible")
+    assert run(*fit)[0] == 0
+    whole = (out / "stream.morgs").read_bytes()
+    (out / "stream.morgs").write_bytes(whole[: len(whole) * 3 // 4])
+    status, output, _ = run(*fit, "--resume")
+    assert status == 0
+    assert f"stream.morgs: {FRAMES} frames" in output
+    assert (out / "stream.morgs").read_bytes() == whole
+    assert_refused(run(*fit, "--resume", "--seed", 1), "stream.morgs: expected to resume", "config.seed = 0, got 1")

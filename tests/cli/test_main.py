@@ -1,0 +1,266 @@
+"""`morgs-mi`: from a scene to an evaluation, help, and what all commands refuse with one sentence each."""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+
+from morgs_mi import cli
+from morgs_mi.codec.container import StreamWriter
+from morgs_mi.io.exr import read_exr
+from tests.cli.commands import QUICK, assert_one_sentence, assert_refused
+from tests.scenes.noise_capture import lengthen_clip, rig, truncate_clip
+
+
+# Each breaks the capture and returns parts of the expected message.
+def no_capture(path: Path) -> tuple[str, ...]:
+    path.rename(path.with_name("elsewhere"))
+    return "expected a capture folder", str(path)
+
+
+def no_clip(path: Path) -> tuple[str, ...]:
+    (path / "cam1.mkv").unlink()
+    return "its image 'cam1.png' needs a clip called cam1", "found cam0, cam2"
+
+
+def no_calibration(path: Path) -> tuple[str, ...]:
+    (path / "sparse").rename(path / "dense")
+    return ("expected a calibration",)
+
+
+def other_length(path: Path) -> tuple[str, ...]:
+    lengthen_clip(path)
+    return "the same number of frames", "cam2.mkv 5"
+
+
+def empty_clip(path: Path) -> tuple[str, ...]:
+    (path / "cam1.mkv").write_bytes(b"")
+    return "cam1.mkv", "got an empty file"
+
+
+def no_video(path: Path) -> tuple[str, ...]:
+    (path / "cam1.mkv").write_bytes(b"no video" * 100)
+    return "cam1.mkv", "truncated or no video"
+
+
+def truncated_clip(path: Path) -> tuple[str, ...]:
+    truncate_clip(path)
+    return "cam1.mkv: frame ", "cannot be read", "truncated"
+
+
+def broken_json(path: Path) -> tuple[str, ...]:
+    (path / "capture.json").write_text("{")
+    return ("capture.json: expected JSON",)
+
+
+BROKEN = [no_capture, no_clip, no_calibration, other_length, empty_clip, no_video, truncated_clip, broken_json]
+
+
+@pytest.mark.parametrize("spoil", BROKEN)
+def test_main__names_what_is_broken_in_a_capture(capture: Path, tmp_path: Path, run, spoil) -> None:
+    parts = spoil(capture)
+    for args in (("info", capture), ("fit", capture, tmp_path / "out", *QUICK)):
+        assert_refused(run(*args), *parts)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("args", "parts"),
+    [
+        (("synth", "spheres", "OUT", "--cameras", 1), ("--cameras must be at least 2, got 1",)),
+        (("synth", "spheres", "OUT", "--frames", 0), ("--frames must be at least 1, got 0",)),
+        (("synth", "spheres", "OUT", "--width", 3), ("--width and --height must be even, got 3x240",)),
+        (("synth", "spheres", "OUT", "--noise", 2), ("--noise must be at least 0 and below 1, got 2",)),
+        (("demo", "OUT", "--cameras", 1), ("--cameras must be at least 2, got 1",)),
+        (("demo", "OUT", "--seed", -1), ("--seed must be at least 0, got -1",)),
+        (("demo", "OUT", "--config", "nowhere.toml"), ("nowhere.toml: expected a TOML file with settings",)),
+    ],
+)
+def test_main__names_options_not_arguments(tmp_path: Path, run, args, parts) -> None:
+    out = tmp_path / "out"
+    status, _, error = run(*(out if arg == "OUT" else arg for arg in args))
+    assert status == 1
+    assert_one_sentence(error.splitlines()[-1], *parts)
+    assert not out.exists()
+
+
+COMMANDS = ("synth", "info", "calibrate", "fit", "render", "view", "eval", "salvage", "demo")
+EXPORTS = ("ply", "gltf", "video", "tracks", "web")
+
+
+@pytest.mark.parametrize("command", [*((name,) for name in COMMANDS), *(("export", name) for name in EXPORTS)])
+def test_main__has_at_most_30_options_per_command(command: tuple[str, ...], capsys) -> None:
+    with pytest.raises(SystemExit) as stop:
+        cli.main([*command, "--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    options = re.findall(r"^[│ ] (?:-\w, )?(--[\w.-]+|\[?[A-Z]+\]?)[, ]", text, re.MULTILINE)
+    assert "--help" in options
+    assert "--variant" in options
+    assert command not in [("fit",), ("eval",)] or any("OUT" in option for option in options)
+    assert len(options) <= 30
+    assert not any("." in option for option in options)
+
+
+def test_main__runs_as_a_module() -> None:
+    result = subprocess.run([sys.executable, "-m", "morgs_mi", "fit"], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout) == (1, "")
+    assert_one_sentence(result.stderr, "expected the folders CAPTURE and OUT")
+
+
+def test_main__names_an_output_that_cannot_be_written(capture: Path, stream: Path, tmp_path: Path, run) -> None:
+    (tmp_path / "file").write_text("")
+    size = ("--cameras", 2, "--frames", 1, "--width", 16, "--height", 16)
+    for folder in (tmp_path / "file", Path("/sys")):  # /sys accepts no new files, even from root
+        for args in (
+            ("fit", capture, folder / "out", *QUICK),
+            ("synth", "spheres", folder / "out", *size),
+            ("render", stream, "--camera", 0, "--output", folder / "a.mp4"),
+            ("render", stream, "--camera", 0, "--output", folder / "exr"),
+            ("export", "ply", stream, "--output", folder / "ply"),
+            ("export", "tracks", stream, "--output", folder / "a.npz"),
+            ("export", "web", stream, folder / "page.html"),
+            ("salvage", stream, folder / "a.morgs"),
+            ("info", capture, "--no-check", "--plot", folder / "rig.png"),
+            ("demo", folder / "out"),
+        ):
+            status, _, error = run(*args)
+            assert status == 1
+            assert_one_sentence(
+                error.splitlines()[-1], "Cannot write ", str(folder), "check that its folder is writable"
+            )
+            assert "Errno" not in error
+    for args in (("fit", capture, tmp_path / "file", *QUICK), ("demo", tmp_path / "file")):
+        assert_refused(run(*args), f"{tmp_path / 'file'} is a file; name a folder")
+
+
+def test_main__writes_nothing_into_a_capture(capture: Path, stream: Path, tmp_path: Path, run) -> None:
+    (capture / "capture.json").write_text('{"fps": 25}')
+    place = tmp_path / "link"
+    place.symlink_to(capture)
+    before = tree(capture)
+    for args in (
+        ("fit", capture, capture, *QUICK),
+        ("fit", capture, place, *QUICK, "--resume"),
+        ("fit", capture, capture / "new" / "out", *QUICK),
+        ("demo", place),
+        ("synth", "spheres", place / "clip"),
+        ("render", stream, "--camera", 0, "--output", place / "cam0.mkv.mp4"),
+        ("render", stream, "--camera", 0, "--output", place / "cam0"),
+        ("export", "ply", stream, "--output", place / "ply"),
+        ("export", "gltf", stream, "--output", place / "gltf"),
+        ("export", "video", stream, "--output", place / "cam0.mp4"),
+        ("export", "tracks", stream, "--output", place / "a.npz"),
+        ("export", "web", stream, place / "page.html"),
+        ("export", "web", stream, place / "page", "--folder"),
+        ("eval", stream, "--capture", capture, "--json", place / "capture.json"),
+        ("eval", stream, "--capture", capture, "--figures", place / "figures"),
+        ("info", capture, "--plot", place / "cam0.png"),
+        ("salvage", stream, place / "capture.json"),
+    ):
+        assert_refused(
+            run(*args), "expected an output outside of captures, which stay as they were recorded, got one in"
+        )
+    assert_refused(run("synth", "spheres", capture, "--overwrite"), f"{capture} is not a synthetic capture")
+    assert tree(capture) == before
+
+
+def tree(path: Path) -> dict[str, bytes | None]:
+    """Return the content of every file below `path` by its name, None for folders."""
+    return {str(p.relative_to(path)): p.read_bytes() if p.is_file() else None for p in sorted(path.rglob("*"))}
+
+
+def test_main__reports_a_full_standard_output_in_one_sentence(run, monkeypatch: pytest.MonkeyPatch) -> None:
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert run("fit", "--print-config")[::2] == (1, "standard output: No space left on device.\n")
+
+
+def test_main__reports_an_unexpected_error_in_one_sentence(capture: Path, run, monkeypatch) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise AttributeError("'NoneType' object has no attribute 'a'")
+
+    monkeypatch.setattr("morgs_mi.cli.info.load_capture", fail)
+    assert_refused(run("info", capture), "Unexpected AttributeError: 'NoneType' object has no attribute 'a'", "--debug")
+
+
+@pytest.mark.parametrize(
+    ("damage", "parts"),
+    [
+        (lambda data: b"", ("the header is missing",)),
+        (lambda data: b"not a stream", ("expected a stream that starts with",)),
+        (lambda data: data[:-75], ("truncated or still written", "packet 2", "2 packets before it are intact")),
+        (lambda data: data[:-5] + b"\1" * 5, ("the bytes are damaged",)),
+    ],
+)
+def test_main__names_what_is_broken_in_a_stream(stream: Path, tmp_path: Path, run, damage, parts) -> None:
+    stream.write_bytes(damage(stream.read_bytes()))
+    outputs = [tmp_path / "a.mp4", tmp_path / "exr", tmp_path / "png"]
+    commands = [("render", stream, "--camera", 0, "--output", output) for output in outputs]
+    for args in (*commands, ("eval", stream, "--capture", tmp_path)):
+        assert_refused(run(*args), str(stream), *parts)
+    assert list(tmp_path.iterdir()) == [stream]
+
+
+def test_main__names_a_missing_or_empty_stream(stream: Path, tmp_path: Path, run) -> None:
+    assert_refused(run("render", tmp_path, "--camera", 0), "stream.morgs: expected a stream, found none")
+    assert_refused(run("eval", stream), "expected the path of its capture", "--capture")
+    with StreamWriter(stream, rig(), 25):
+        pass
+    for output in (tmp_path / "a.mp4", tmp_path / "exr"):
+        assert_refused(
+            run("render", stream, "--camera", 0, "--output", output), "at least one frame was expected, got none"
+        )
+        assert not output.exists()
+
+
+def test_main__prints_a_traceback_with_debug(tmp_path: Path, run) -> None:
+    status, _, error = run("info", tmp_path / "nothing", "--debug")
+    assert status == 1
+    assert "Traceback" in error
+    assert "load_capture" in error
+
+
+def test_main__goes_from_a_scene_to_an_evaluation(tmp_path: Path, run) -> None:
+    clip, out = tmp_path / "clip", tmp_path / "out"
+    size = ("--width", 64, "--height", 48, "--spp", 4)
+    assert run("synth", "spheres", clip, "--cameras", 4, "--frames", 3, *size)[0] == 0
+    fit = ("--test-view", 0, "--num-gaussians", 600, "--first-frame-steps", 60, "--epochs", 2)
+    status, output, _ = run("fit", clip, out, *fit)
+    assert status == 0
+    assert "stream.morgs: 3 frames" in output
+
+    status, output, _ = run("eval", out, "--json", "-")
+    assert status == 0
+    result = json.loads(output)
+    assert (result["held_out"], list(result["views"]), result["num_frames"]) == (True, ["cam00"], 3)
+    assert result["psnr"]["mean"] > 15
+    assert result["bytes"]["file"] == (out / "stream.morgs").stat().st_size
+    assert 0 < result["frames"][1]["motion_error_moving"] < 10
+    assert result["frames"][1]["seconds"] > 0
+    more = ("--json", tmp_path / "eval.json", "--figures", tmp_path / "figures")
+    status, output, _ = run("eval", out, *more)
+    assert status == 0
+    assert "held-out view cam00" in output
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {"slice.png", "motion.png", "confidence.png"}
+    assert 0 < result["motion_3d"]["num_gaussians"] <= 600
+    status, _, error = run("eval", out, "--lpips", tmp_path / "none.onnx")
+    assert (status, "expected an LPIPS network as ONNX, found none" in error) == (1, True)
+    assert json.loads((tmp_path / "eval.json").read_text())["psnr"] == result["psnr"]
+
+    assert run("render", out, "--camera", "cam02")[0] == 0
+    video = cv2.VideoCapture(str(out / "cam02.mp4"))
+    assert [video.read()[1].shape for _ in range(3)] == [(48, 64, 3)] * 3
+    assert not video.read()[0]
+    assert run("render", out, "--camera", 0, "--output", tmp_path / "exr")[0] == 0
+    channels = read_exr(tmp_path / "exr" / "0002.exr")
+    assert set(channels) == {"R", "G", "B", "motion.X", "motion.Y", "depth.Y", "confidence.Y"}
+    both = ("--channels", "color", "depth", "--output", tmp_path / "png")
+    assert run("render", out, "--camera", 0, *both)[0] == 0
+    assert cv2.imread(str(tmp_path / "png" / "0002.png")).shape == (48, 132, 3)

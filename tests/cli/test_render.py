@@ -1,0 +1,67 @@
+"""`morgs-mi render`: bad input, and outputs that could not be finished."""
+
+from __future__ import annotations
+
+import resource
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi.codec.container import StreamWriter
+from morgs_mi.codec.packets import keyframe_packet
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.io.exr import read_exr
+from tests.cli.commands import assert_one_sentence, assert_refused, interrupt
+from tests.scenes.noise_capture import rig
+
+
+@pytest.mark.parametrize(
+    ("args", "parts"),
+    [
+        (["--camera", "3"], ("index in 0..2 or one of cam0, cam1, cam2, got '3'",)),
+        (["--camera", "cam9"], ("got 'cam9'",)),
+        (
+            ["--camera", "0", "--channels", "confidence"],
+            ("channel 'confidence' requires Gaussians with `logit_confidence`",),
+        ),
+        (["--camera", "0", "--output", "a.gif"], ("must be FILE.mp4, or a folder", "'.gif'")),
+    ],
+)
+def test_render__rejects_bad_input_in_one_sentence(stream: Path, tmp_path: Path, run, args, parts) -> None:
+    assert_refused(run("render", stream, *args), *parts)
+    assert list(tmp_path.iterdir()) == [stream]
+
+
+def test_render__draws_a_stream_without_gaussians_black(tmp_path: Path, run) -> None:
+    empty = Gaussians(*(np.zeros((0, *tail)) for tail in ((3,), (3,), (4,), (), (1, 3))))
+    with StreamWriter(tmp_path / "s.morgs", rig(), 25) as writer:
+        writer.write(keyframe_packet(empty, 0))
+    assert run("render", tmp_path / "s.morgs", "--camera", 0, "--output", tmp_path / "exr")[0] == 0
+    assert not any(channel.any() for channel in read_exr(tmp_path / "exr" / "0000.exr").values())
+
+
+@pytest.mark.parametrize("name", ["a.mp4", "exr", "png"])
+def test_render__removes_its_output_on_a_full_disk(stream: Path, tmp_path: Path, run, name: str) -> None:
+    run(
+        "render", stream, "--camera", 0, "--output", tmp_path / f"warm-{name}"
+    )  # compiled kernels are cached on disk too
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200, hard))
+    try:
+        status, _, error = run("render", stream, "--camera", 0, "--output", tmp_path / name)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert status == 1
+    assert_one_sentence(error, name)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["good.morgs", f"warm-{name}"]
+
+
+def test_render__removes_its_output_when_interrupted(
+    stream: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("morgs_mi.playback.player.rasterize", interrupt)
+    status, _, error = run("render", stream, "--camera", 0)
+    assert status == 130
+    assert_one_sentence(error, "Interrupted")
+    assert list(tmp_path.iterdir()) == [stream]

@@ -1,0 +1,97 @@
+"""Settings of a fit: presets, files, options and their order."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from dataclasses import asdict
+from functools import reduce
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import pytest
+
+from morgs_mi import cli
+from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.cli.settings import SETTINGS, Reading
+from morgs_mi.config import StreamConfig, apply_values, config_toml
+
+
+def printed_config(run, *args: object) -> StreamConfig:
+    status, text, error = run("fit", *args, "--print-config")
+    assert (status, error) == (0, "")
+    return apply_values(StreamConfig(), tomllib.loads(text))
+
+
+@pytest.mark.parametrize(
+    ("args", "key", "expected"),
+    [
+        ((), "fit.epochs", 8),
+        (("--preset", "s"), "fit.epochs", 5),
+        (("--preset", "s", "--config", "FILE"), "fit.epochs", 3),
+        (("--config", "FILE", "--epochs", "2", "--preset", "s"), "fit.epochs", 2),
+        (("--preset", "paper", "--epochs", "2"), "fit.epochs", 2),
+        (("--preset", "paper", "--epochs", "2"), "motion.lift_flow", False),
+        (("--preset", "paper", "--config", "FILE"), "motion.lift_flow", False),
+        (("--config", "FILE"), "codec.quality", 2.5),
+        (("--config", "FILE", "--quality", "0.5"), "codec.quality", 0.5),
+        (("--config", "FILE", "--quality", "0.5"), "render.block_width", 4),
+        (("--config", "FILE"), "render.reproducible", True),
+        (("--config", "FILE", "--flow", "dis"), "motion.flow_method", "dis"),
+        (("--config", "FILE", "--target-size", "0"), "codec.target_size", 0),
+    ],
+)
+def test_fit__overrides_defaults_by_preset_by_file_by_options(tmp_path: Path, run, args, key, expected) -> None:
+    file = tmp_path / "a.toml"
+    file.write_text(
+        "[fit]\nepochs = 3\n[motion]\nflow_method = 'files:nowhere'\n[codec]\nquality = 2.5\ntarget_size = 9\n"
+        "[render]\nreproducible = true\nblock_width = 4\n"
+    )
+    config = printed_config(run, *(file if arg == "FILE" else arg for arg in args))
+    assert reduce(getattr, key.split("."), config) == expected
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        (),
+        ("--preset", "paper"),
+        (
+            *("--seed", 3, "--num-gaussians", 7, "--first-frame-steps", 5, "--epochs", 4, "--sh-degree", 2),
+            *("--key-views", 3, "--flow", "farneback", "--masks", "none", "--quality", 0.3, "--target-size", 99),
+            *("--keyframe-interval", 0, "--reproducible"),
+        ),
+    ],
+)
+def test_fit__prints_a_config_that_it_reads_back(tmp_path: Path, run, args: tuple[object, ...]) -> None:
+    config = printed_config(run, *args)
+    (tmp_path / "a.toml").write_text(config_toml(config))
+    assert printed_config(run, "--config", tmp_path / "a.toml") == config
+    if len(args) > 2:
+        default, given = (flattened(asdict(c)) for c in (StreamConfig(), config))
+        assert {key for key in given if given[key] != default[key]} == set(SETTINGS.values())
+
+
+def flattened(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    pairs = [
+        flattened(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+        for name, value in values.items()
+    ]
+    return {key: value for part in pairs for key, value in part.items()}
+
+
+def test_fit__shows_the_defaults_of_its_options(capsys) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["fit", "--help"])
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    for option, key in SETTINGS.items():
+        shown = (
+            rf"--{option.replace('_', '-')} (?:(?!--).)*\(default: {reduce(getattr, key.split('.'), StreamConfig())}\)"
+        )
+        assert option == "reproducible" or re.search(shown, text), option
+    assert "None)" not in text
+
+
+def test_Reading__has_the_fields_of_the_config() -> None:
+    assert get_type_hints(Reading) == get_type_hints(ReadConfig)
+    assert Reading().read_config() == ReadConfig()

@@ -1,0 +1,138 @@
+"""Steps of the quantised numbers: bounded errors, extremes, and the bytes that they take."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morgs_mi.codec.config import CodecConfig
+from morgs_mi.codec.container import encode_packet
+from morgs_mi.codec.packets import (
+    decode,
+    keyframe_packet,
+    reemitted_keyframe,
+    residual_packet,
+)
+from morgs_mi.core.gaussians import Gaussians
+from tests.scenes.coded_clip import CAMERAS, cloud, encoded_clip, history, jittered
+
+
+def test_residual_packet__errors_stay_within_the_tolerance() -> None:
+    """The error is at most half a step for a new Gaussian, a step for a moved one, half a step for its base colour."""
+    config = CodecConfig(birth_precision=2)
+    before = cloud(400)
+    state = decode(None, keyframe_packet(before, 0, CAMERAS, config))
+    after = jittered(before, np.random.default_rng(1))
+    moved = decode(state, residual_packet(state, after, None, CAMERAS, config))
+    for true, found, error, color_error in ((before, state, 0.5, 0.5), (after, moved, 2.0, 1.0)):
+        for camera in CAMERAS:
+            view = camera.viewmat
+            a, b = (g.numpy()["means"].astype(float) @ view[:3, :3].T + view[:3, 3] for g in (true, found.gaussians))
+            # At most, the errors of three coordinates add up.
+            pixels = camera.K[0, 0] * np.abs(a - b)[:, :2] / a[:, 2:]
+            assert pixels.max() < error * config.error_px * np.sqrt(3)
+        sh = np.abs(true.numpy()["sh_coeffs"] - found.gaussians.numpy()["sh_coeffs"])
+        assert 0.2821 * sh[:, 0].max() < 1.001 * color_error * config.error_color
+        assert sh[:, 1:].max() < 1.001 * error * config.error_color
+        opacity = np.abs(np.asarray(true.opacities) - np.asarray(found.gaussians.opacities))
+        assert opacity.max() < 1.001 * error * config.error_opacity
+        q, p = true.numpy()["quats"], found.gaussians.numpy()["quats"]
+        cosine = np.abs((q * p).sum(1)) / np.linalg.norm(q, axis=1)
+        # The steps are chosen for about 5 px: far below a tenth of a pixel at the ends of an axis.
+        assert np.rad2deg(2 * np.arccos(np.minimum(cosine, 1))).max() < 8 * error
+        assert opacity.max() > 0.7 * error * config.error_opacity, "the bound is near"
+
+
+def test_codec_config__more_quality_takes_more_bytes_and_has_smaller_errors() -> None:
+    before = cloud(400)
+    after = jittered(before, np.random.default_rng(1))
+    sizes, errors = [], []
+    for quality in (0.25, 1, 4, 1000):
+        config = CodecConfig(quality=quality)
+        state = decode(None, keyframe_packet(before, 0, CAMERAS, config))
+        packet = residual_packet(state, after, None, CAMERAS, config)
+        sizes.append(len(encode_packet(packet)))
+        errors.append(np.abs(decode(state, packet).gaussians.numpy()["means"] - after.numpy()["means"]).max())
+    assert sizes == sorted(sizes)
+    assert errors == sorted(errors, reverse=True)
+    # A thousandth of 0.04 px of 0.03 units.
+    assert errors[-1] < 2e-6
+
+
+@pytest.mark.parametrize("target", [2000, 4000, 8000])
+def test_residual_packet__stays_below_its_target_size_and_comes_near_it(target: int) -> None:
+    state = decode(None, keyframe_packet(cloud(1500), 0, CAMERAS))
+    after = jittered(state.gaussians, np.random.default_rng(1), share=1)
+    packet = residual_packet(state, after, None, CAMERAS, CodecConfig(target_size=target))
+    # The coarseness has steps of 2^(1/4), up to a fifth of the bytes where few numbers are left.
+    assert 0.75 * target < packet.arrays["code"].nbytes <= target
+    assert len(decode(state, packet)) == 1500
+
+
+def test_residual_packet__stores_changes_of_a_step_and_colours_of_half_a_step() -> None:
+    config = CodecConfig(birth_precision=1)
+    state = decode(None, keyframe_packet(cloud(), 0, CAMERAS, config))
+    raw = {name: value.astype(np.float64) for name, value in state.gaussians.numpy().items()}
+    for i, steps in ((7, 10.0), (8, 1.0), (9, 0.98)):
+        raw["means"][i] += steps * state.grid.steps("means")[i]
+    for i, steps in ((17, 0.51), (18, 0.49)):
+        raw["sh_coeffs"][i, 0] += steps * state.grid.steps("sh_dc")[i]
+    found = decode(state, residual_packet(state, Gaussians(**raw), None, CAMERAS, config))
+    assert np.flatnonzero((found.grid.values != state.grid.values).any(1)).tolist() == [7, 8, 17]
+    assert np.flatnonzero(found.gaussians.numpy()["motion"].any(1)).tolist() == [7, 8]
+
+
+def test_residual_packet__counts_offsets_towards_the_target_size() -> None:
+    state = decode(None, keyframe_packet(cloud(1500), 0, CAMERAS))
+    rng = np.random.default_rng(1)
+    after = replace(jittered(state.gaussians, rng, share=1), offset=rng.normal(0, 0.02, (1500, 3)))
+    arrays = residual_packet(state, after, None, CAMERAS, CodecConfig(target_size=8000, offset=True)).arrays
+    assert arrays["offset"].nbytes > 400
+    assert 0.75 * 8000 < arrays["code"].nbytes + arrays["offset"].nbytes <= 8000
+
+
+def test_grid__stores_the_attribute_of_a_new_row_of_the_table() -> None:
+    """One more row with an `error` and a field of that name; streams without the attribute stay the same."""
+    command = [sys.executable, "-m", "tests.codec.new_row"]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.strip() == history(encoded_clip(4)[1])
+
+
+def test_residual_packet__follows_a_turn_of_any_angle() -> None:
+    """The component that is not stored was the largest at birth; later it may vanish."""
+    angles = np.linspace(0, 2 * np.pi, 40)
+    one_axis = cloud(1)
+    state = decode(None, keyframe_packet(replace(one_axis, quats=[[1, 0, 0, 0]]), 0, CAMERAS))
+    for angle in angles:
+        q = np.array([np.cos(angle / 2), 0.6 * np.sin(angle / 2), 0, 0.8 * np.sin(angle / 2)])
+        packet = residual_packet(state, replace(state.gaussians, quats=q[None]), None, CAMERAS)
+        state = decode(state, packet)
+        assert abs(state.gaussians.numpy()["quats"][0] @ q) > np.cos(np.deg2rad(2))
+
+
+def test_keyframe_packet__codes_extremes_as_exactly_as_float32() -> None:
+    """Close to a lens steps are tiny, and large, distant or bright Gaussians would need unbounded integers."""
+    raw = cloud(40).numpy()
+    raw["means"][:8] = CAMERAS[0].position + 1.001 * CAMERAS[0].near * CAMERAS[0].viewmat[2, :3]
+    raw["log_scales"][:4] = 12, -30, 0
+    raw["means"][8:12] = -1e9
+    raw["sh_coeffs"][12:16] = -1e8
+    extreme = Gaussians(**raw)
+    first = decode(None, keyframe_packet(extreme, 0, CAMERAS))
+    for name in ("means", "log_scales", "sh_coeffs"):
+        before, now = (np.asarray(getattr(g, name)).astype(np.float64) for g in (extreme, first.gaussians))
+        largest = np.abs(before).reshape(40, -1).max(1).reshape(40, *[1] * (before.ndim - 1))
+        usual = 2 * np.abs(now[16:] - before[16:]).max()  # of the other Gaussians; twice, because steps come in octaves
+        assert np.all(np.abs(now - before) <= np.maximum(2.0**-23 * largest, usual)), name
+
+    # A Gaussian that is born close and small and flies off stops at the limit of its integers.
+    gone = replace(first.gaussians, means=first.gaussians.means + np.float32(1e30))
+    for config in (CodecConfig(), CodecConfig(birth_precision=1), CodecConfig(target_size=1)):
+        second = decode(first, residual_packet(first, gone, cameras=CAMERAS, config=config))
+        assert np.asarray(second.gaussians.means).min() > 100
+        assert np.array_equal(decode(None, reemitted_keyframe(second)).digest, second.digest)

@@ -1,0 +1,145 @@
+"""Reading a stream: in order, from a frame on, from a pipe, and on any number of threads."""
+
+from __future__ import annotations
+
+import io
+import os
+import socket
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import BinaryIO
+
+import pytest
+
+from morgs_mi.codec.container import StreamWriter, TruncatedStreamError, encode_packet
+from morgs_mi.codec.packets import (
+    CodedFrame,
+    coded_frames,
+    seek,
+)
+from morgs_mi.codec.reader import StreamReader
+from tests.scenes.coded_clip import CAMERAS, assert_same, encoded_clip, history, write
+
+
+def test_seek__equals_playing_with_and_without_an_index(tmp_path: Path) -> None:
+    packets, states = encoded_clip(14)
+    path = tmp_path / "s"
+    write(path, packets, states)
+    whole = path.read_bytes()
+    for data in (whole, whole[: -(20 + 16 + 16 * (14 + 3))]):
+        path.write_bytes(data)
+        reader = StreamReader(path)
+        assert len(reader.index()) == 14 + 3
+        for state in states:
+            assert_same(seek(reader, state.frame), state)
+        assert len(list(reader.near(9))) == 14 + 3 - 10  # starting at the keyframe of frame 8
+    with pytest.raises(ValueError, match="expected a frame of the stream, got 14"):
+        seek(StreamReader(path), 14)
+
+
+def pipe() -> tuple[BinaryIO, BinaryIO]:
+    """Return the ends for reading and for writing."""
+    read, write_end = os.pipe()
+    return open(read, "rb"), open(write_end, "wb", buffering=0)
+
+
+def tcp() -> tuple[BinaryIO, BinaryIO]:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        sender = socket.create_connection(server.getsockname())
+        receiver, _ = server.accept()
+    with sender, receiver:  # the files keep them open
+        return receiver.makefile("rb"), sender.makefile("wb", buffering=0)
+
+
+@pytest.mark.parametrize("channel", [pipe, tcp])
+def test_stream_reader__receives_frames_while_they_are_written(channel) -> None:
+    packets, states = encoded_clip(5)
+    source, sink = channel()
+    got: list[CodedFrame] = []
+    arrived = threading.Semaphore(0)
+
+    def receive() -> None:
+        with source:
+            for state in coded_frames(StreamReader(source)):
+                got.append(state)
+                arrived.release()
+
+    receiver = threading.Thread(target=receive)
+    receiver.start()
+    with sink:
+        with StreamWriter(sink, CAMERAS, 25) as writer:
+            for packet in packets:
+                writer.write(packet)
+                assert arrived.acquire(timeout=20), "a frame arrives as soon as it was written"
+        assert not sink.closed
+    receiver.join(20)
+    for found, state in zip(got, states, strict=True):
+        assert_same(found, state)
+
+
+def test_stream_reader__reports_a_lost_connection_after_complete_frames() -> None:
+    packets, states = encoded_clip(3)
+    source, sink = tcp()
+    with sink:
+        writer = StreamWriter(sink, CAMERAS, 25)
+        writer.write(packets[0])
+        sink.write(encode_packet(packets[1])[:-1])
+    got = []
+    with (
+        source,
+        pytest.raises(TruncatedStreamError, match=r"packet 2 at byte .*: truncated or still written; 2 packets"),
+    ):
+        got.extend(coded_frames(StreamReader(source)))
+    assert_same(got[0], states[0])
+    assert len(got) == 1
+
+
+def test_stream_reader__refuses_to_seek_in_a_pipe() -> None:
+    data = io.BytesIO()
+    with StreamWriter(data, CAMERAS, 25):
+        pass
+    data.seek(0)
+    reader = StreamReader(data)
+    with pytest.raises(ValueError, match="expected a file to seek in, got a pipe"):
+        next(reader.near(1))
+    with pytest.raises(ValueError, match="expected a file that is read twice, got a pipe"):
+        reader.check()
+
+
+@pytest.mark.parametrize("frames", [60, pytest.param(300, marks=pytest.mark.slow)])
+def test_coded_frames__equal_the_encoders_states_on_one_thread_and_on_many(tmp_path: Path, frames: int) -> None:
+    packets, states = encoded_clip(frames, degree=0)
+    write(tmp_path / "s", packets, states, every=50)
+    program = f"""
+import drjit as dr
+import mitsuba as mi; mi.set_variant("llvm_ad_rgb")
+from morgs_mi.codec.packets import coded_frames
+from morgs_mi.codec.reader import StreamReader
+from tests.scenes.coded_clip import history
+dr.set_thread_count(1)
+print(history(coded_frames(StreamReader({str(tmp_path / "s")!r}))))
+"""
+    single = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+    command = [sys.executable, "-c", program]
+    result = subprocess.run(command, capture_output=True, text=True, check=True, env=os.environ | single)
+    expected = history(states)
+    assert result.stdout.strip() == expected
+    assert history(coded_frames(StreamReader(tmp_path / "s"))) == expected
+    assert_same(seek(StreamReader(tmp_path / "s"), frames - 1), states[-1])
+
+
+def test_coded_frames__name_file_packet_and_byte(tmp_path: Path) -> None:
+    packets, states = encoded_clip(4)
+    write(tmp_path / "s", [packets[0], packets[2], packets[3]], [states[0], states[2], states[3]])
+    at = StreamReader(tmp_path / "s").index()[1][2]
+    with pytest.raises(ValueError, match=f"s: packet 2 at byte {at}: it does not continue the state after frame 0; "):
+        list(coded_frames(StreamReader(tmp_path / "s")))
+
+
+def test_coded_frames__refuse_frames_that_do_not_ascend(tmp_path: Path) -> None:
+    packets, states = encoded_clip(4)
+    write(tmp_path / "s", [*packets, packets[0]], [*states, states[0]])
+    with pytest.raises(ValueError, match=r"s: packet 5 at byte \d+: its frame must be above 3, .* got 0"):
+        list(coded_frames(StreamReader(tmp_path / "s")))

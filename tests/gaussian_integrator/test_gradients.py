@@ -1,0 +1,137 @@
+"""The plugin `gaussian_splat`: derivatives of mi.render(scene, params)."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from tests import reference
+from tests import tolerances as tol
+from tests.assertions import assert_close
+from tests.gaussian_integrator.expected import expected_image
+from tests.reference import rasterize_view
+from tests.scenes.cameras import make_sensor_camera
+from tests.scenes.gaussians import to_gaussians
+from tests.scenes.plugin import AOVS, make_mitsuba_scene
+
+# Raw attributes, and their derivatives with respect to the activated parameters of a Mitsuba scene.
+ACTIVATED = {
+    "log_scales": lambda raw: 1 / np.exp(raw["log_scales"]),
+    "logit_opacities": lambda raw: 2 + 2 * np.cosh(raw["logit_opacities"]),
+    "logit_confidence": lambda raw: 2 + 2 * np.cosh(raw["logit_confidence"]),
+}
+
+
+def parameter_gradients(gradient, raw):
+    """Return the gradient with respect to Mitsuba's parameters from the one with respect to raw attributes."""
+    gradient = {name: g * ACTIVATED[name](raw) if name in ACTIVATED else g for name, g in gradient.items()}
+    quats = np.roll(gradient["quats"], -1, axis=1)
+    return {
+        "gaussians.data": np.concatenate([gradient["means"], gradient["log_scales"], quats], axis=1).ravel(),
+        "gaussians.opacities": gradient["logit_opacities"],
+        "gaussians.sh_coeffs": gradient["sh_coeffs"].ravel(),
+        "gaussians.motion": gradient["motion"].ravel(),
+        "gaussians.confidence": gradient["logit_confidence"],
+    }
+
+
+@pytest.fixture(scope="module")
+def weight(raw):
+    """A random linear loss on all channels, where normalised channels do not divide by a small alpha."""
+    solid = rasterize_view(raw, make_sensor_camera())["alpha"] > 0.02
+    return np.float32(np.random.default_rng(1).normal(size=(*solid.shape[:2], 8)) * solid)
+
+
+@pytest.fixture(scope="module")
+def gradients(raw, weight):
+    """The loss's gradient by Mitsuba's parameters, exact to rounding."""
+    expected = reference.complex_step(lambda values: np.sum(expected_image(values) * weight), raw, list(raw))
+    return parameter_gradients(expected, raw)
+
+
+def test_gaussian_splat__backward_agrees_with_the_reference_for_every_parameter(raw, weight, gradients):
+    scene = make_mitsuba_scene(to_gaussians(raw), {"pixel_format": "rgba"}, aovs=AOVS)
+    params = mi.traverse(scene)
+    dr.enable_grad([params[name] for name in gradients])
+    dr.backward(dr.sum(mi.render(scene, params) * mi.TensorXf(weight), axis=None))
+    for name, expected in gradients.items():
+        assert_close(dr.grad(params[name]), expected, rtol=tol.GRADIENT_REL, name=name)
+
+
+def test_gaussian_splat__forward_agrees_with_the_reference(raw, weight, gradients):
+    """All parameters change at once; the derivative of the loss is <gradient, direction>."""
+    scene = make_mitsuba_scene(to_gaussians(raw), {"pixel_format": "rgba"}, aovs=AOVS)
+    params, rng = mi.traverse(scene), np.random.default_rng(2)
+    slope = 0.0
+    for name, gradient in gradients.items():
+        # The direction is the sign of the gradient, so that no cancellation hides an error.
+        direction = np.float32(np.sign(gradient) * rng.uniform(0.5, 1, gradient.shape))
+        dr.enable_grad(params[name])
+        dr.set_grad(params[name], mi.Float(direction))
+        slope += np.vdot(gradient, direction)
+    image = mi.render(scene, params)
+    dr.forward_to(image)
+    found = np.sum(np.asarray(dr.grad(image), np.float64) * weight)
+    assert found == pytest.approx(slope, rel=tol.GRADIENT_REL)
+
+
+def test_gaussian_splat__backward_agrees_with_central_differences(raw):
+    scene = make_mitsuba_scene(to_gaussians(raw))
+    params = mi.traverse(scene)
+    for name in ("gaussians.data", "gaussians.opacities", "gaussians.sh_coeffs"):
+        start = np.array(params[name])  # a copy: the parameter is a reference to the scene's array
+        dr.enable_grad(params[name])
+        dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
+        gradient = np.asarray(dr.grad(params[name]), np.float64)
+        direction = np.sign(gradient) * np.random.default_rng(4).uniform(0.5, 1, gradient.shape)
+        losses = []
+        for h in (1e-3, -1e-3):
+            params[name] = mi.Float(np.float32(start + h * direction))
+            params.update()
+            losses.append(np.sum(np.asarray(mi.render(scene), np.float64) ** 2))
+        params[name] = mi.Float(start)
+        slope = (losses[0] - losses[1]) / 2e-3
+        assert slope == pytest.approx(np.vdot(gradient, direction), rel=tol.CENTRAL_DIFFERENCE_REL), name
+
+
+def test_gaussian_splat__gradient_of_the_sensors_pose(raw):
+    """The camera moves to its left by t: to_world = M T(t), so that viewmat moves points to the right."""
+    scene = make_mitsuba_scene(to_gaussians(raw))
+    params = mi.traverse(scene)
+    t = mi.Float(0)
+    dr.enable_grad(t)
+    params["sensor.to_world"] = params["sensor.to_world"] @ mi.AffineTransform4f().translate([t, 0, 0])
+    params.update()
+    dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
+    right = np.zeros((4, 4))
+    right[0, 3] = 1
+    viewmat = np.float32(make_sensor_camera().viewmat).astype(np.float64)
+    expected = reference.directional(
+        lambda v: np.sum(expected_image(raw, v["viewmat"])[..., :3] ** 2), {"viewmat": viewmat}, {"viewmat": right}
+    )
+    assert dr.grad(t)[0] == pytest.approx(expected, rel=10 * tol.GRADIENT_REL)
+
+
+def test_gaussian_splat__differentiates_filter_and_crop(raw):
+    """<g, J v> = <J' g, v> through a film that blurs, crops and normalises."""
+    film = {
+        "rfilter": {"type": "gaussian"},
+        "crop_offset_x": 3,
+        "crop_offset_y": 2,
+        "crop_width": 11,
+        "crop_height": 12,
+    }
+    scene = make_mitsuba_scene(to_gaussians(raw), {**film, "pixel_format": "luminance_alpha"}, aovs=AOVS)
+    params = mi.traverse(scene)
+    data, rng = params["gaussians.data"], np.random.default_rng(5)
+    g, v = (np.float32(rng.normal(size=s)) for s in ((12, 11, 6), dr.width(data)))
+    dr.enable_grad(data)
+    dr.set_grad(data, mi.Float(v))
+    image = mi.render(scene, params)
+    dr.forward_to(image)
+    forward = np.vdot(np.asarray(dr.grad(image), np.float64), g)
+    dr.set_grad(data, 0)
+    dr.backward(dr.sum(mi.render(scene, params) * mi.TensorXf(g), axis=None))
+    assert np.vdot(np.asarray(dr.grad(data), np.float64), v) == pytest.approx(forward, rel=tol.DUALITY_REL)

@@ -1,0 +1,185 @@
+"""The plugin `gaussian_splat` in Mitsuba: files, variants, changed scenes, and what it refuses."""
+
+from __future__ import annotations
+
+import logging
+import re
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi import ellipsoids, rasterize
+from morgs_mi.io.ply import write_ply
+from tests import tolerances as tol
+from tests.assertions import assert_close
+from tests.gaussian_integrator.expected import to_linear
+from tests.scenes.cameras import make_sensor_camera
+from tests.scenes.gaussians import make_unit_scene, to_gaussians
+from tests.scenes.plugin import AOVS, make_mitsuba_scene
+
+
+def test_gaussian_splat__writes_undeveloped_renders(raw, tmp_path):
+    """The command `mitsuba scene.xml` requests no tensor and writes the film."""
+    scene = make_mitsuba_scene(to_gaussians(raw), aovs=AOVS)
+    image = np.asarray(mi.render(scene))
+    assert scene.integrator().render(scene, develop=False).shape == (0,)
+    path = tmp_path / "image.exr"
+    scene.sensors()[0].film().write(str(path))
+    np.testing.assert_array_equal(np.array(mi.Bitmap(str(path)))[..., :3], image[..., :3])
+
+
+def test_gaussian_splat__reads_props_of_an_xml_scene(raw):
+    text = """<integrator version="3.0.0" type="gaussian_splat">
+        <string name="aovs" value="depth"/><boolean name="srgb_primitives" value="false"/>
+        <rgb name="background" value="0.1, 0.2, 0.3"/>
+    </integrator>"""
+    integrator = mi.load_string(text)
+    assert integrator.background == pytest.approx([0.1, 0.2, 0.3])
+    image = np.asarray(mi.render(make_mitsuba_scene(to_gaussians(raw)), integrator=integrator))
+    expected = np.asarray(rasterize(to_gaussians(raw), make_sensor_camera(), background=(0.1, 0.2, 0.3)).color)
+    assert_close(image[..., :3], expected, atol=tol.IMAGE_ABS)
+
+
+def test_gaussian_splat__ignores_emitters_with_one_warning(raw, caplog):
+    shape, sensor = ellipsoids(to_gaussians(raw)), make_sensor_camera().sensor()
+    scene = {"type": "scene", "gaussians": shape, "sensor": sensor, "integrator": {"type": "gaussian_splat"}}
+    dark, lit = mi.load_dict(scene), mi.load_dict({**scene, "sky": {"type": "constant"}})
+    with caplog.at_level(logging.WARNING):
+        images = [np.asarray(mi.render(s)) for s in (dark, lit, lit)]
+    np.testing.assert_array_equal(images[0], images[1])
+    assert [r.getMessage().split(";")[0] for r in caplog.records] == ["gaussian_splat ignores the scene's emitters"]
+
+
+def test_gaussian_splat__stays_registered_when_variants_are_switched():
+    """Importing before any variant is set works; a variant without derivatives is refused with an explanation."""
+    script = r"""
+import morgs_mi, mitsuba as mi
+for variant in ("scalar_rgb", "llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_rgb"):
+    mi.set_variant(variant)
+    try:
+        integrator = mi.load_dict({"type": "gaussian_splat", "aovs": "depth"})
+        print("\n>", variant, integrator.aov_names())
+    except RuntimeError as error:
+        print("\n>", variant, "ValueError: gaussian_splat: expected a variant such as 'llvm_ad_rgb'" in str(error))
+"""
+    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert [line for line in found.splitlines() if line.startswith(">")] == [
+        "> scalar_rgb True",
+        "> llvm_ad_rgb ['depth.Y']",
+        "> llvm_ad_mono ['depth.Y']",
+        "> llvm_ad_rgb ['depth.Y']",
+    ]
+
+
+def test_gaussian_splat__renders_a_shape_after_density_control(raw):
+    """All attributes of a shape may change their length together."""
+    scene = make_mitsuba_scene(to_gaussians(raw))
+    params = mi.traverse(scene)
+    half = {name: value[:5] for name, value in raw.items()}
+    shape = ellipsoids(to_gaussians(half))
+    for name in ("data", "opacities", "sh_coeffs", "motion", "confidence"):
+        params[f"gaussians.{name}"] = shape[name].array
+    params.update()
+    expected = to_linear(np.asarray(rasterize(to_gaussians(half), make_sensor_camera()).color, np.float64))
+    assert_close(mi.render(scene), expected, atol=tol.IMAGE_ABS)
+
+
+def with_shape(**changes):
+    shape = {**ellipsoids(to_gaussians(make_unit_scene())), **changes}
+    return {"gaussians": {name: value for name, value in shape.items() if value is not None}}
+
+
+def ones(*shape):
+    return mi.TensorXf(np.ones(shape, np.float32))
+
+
+BAD_SCENES = {
+    "no shape": (lambda: {"gaussians": None}, {}, "expected a scene with an `ellipsoids` shape, got none"),
+    "mesh": (lambda: {"wall": {"type": "rectangle"}}, {}, "expected `ellipsoids` shapes only, got Rectangle 'wall'"),
+    "no opacities": (lambda: with_shape(opacities=None), {}, r"'gaussians' must have `opacities` \[N, 1\] with N=10"),
+    "no sh": (lambda: with_shape(sh_coeffs=None), {}, r"must have `sh_coeffs` \[N, 3 or 12 or 27 or 48\]"),
+    "odd sh": (lambda: with_shape(sh_coeffs=ones(10, 6)), {}, r"with N=10, got 60 values"),
+    "no motion": (
+        lambda: with_shape(motion=None),
+        {"aovs": "motion"},
+        r"`motion` \[N, 3\] with N=10, got only \['",
+    ),
+    "nan": (lambda: with_shape(opacities=ones(10, 1) * dr.nan), {}, r"`opacities` must be finite, got nan at \[0\]"),
+    "thin lens": (
+        lambda: {"sensor": {"type": "thinlens", "aperture_radius": 0.1}},
+        {},
+        "expected a `perspective` sensor, got ThinLensCamera",
+    ),
+    "orthographic": (lambda: {"sensor": {"type": "orthographic"}}, {}, "sensor, got OrthographicCamera"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_SCENES)
+def test_gaussian_splat__refuses_bad_scenes(case):
+    change, props, message = BAD_SCENES[case]
+    scene = {"type": "scene", "sensor": make_sensor_camera().sensor(), **with_shape(), **change()}
+    scene = mi.load_dict({name: value for name, value in scene.items() if value is not None})
+    integrator = mi.load_dict({"type": "gaussian_splat", **props})
+    with pytest.raises(ValueError, match=message):
+        integrator.render(scene)
+    # mi.render wraps the errors of an integrator.
+    with pytest.raises(RuntimeError) as error:
+        mi.render(scene, integrator=integrator)
+    assert isinstance(error.value.__cause__, ValueError)
+
+
+def test_gaussian_splat__refuses_films_other_than_rgb():
+    mi.set_variant("llvm_ad_spectral")
+    film = {"type": "specfilm", "band": {"type": "spectrum", "value": [(400, 0.5), (700, 0.5)]}}
+    scene = mi.load_dict({"type": "scene", "sensor": {"type": "perspective", "film": film}, **with_shape()})
+    with pytest.raises(ValueError, match="expected an `hdrfilm`, got SpecFilm"):
+        mi.load_dict({"type": "gaussian_splat"}).render(scene)
+
+
+@pytest.mark.parametrize(
+    ("props", "message"),
+    [
+        ({"aovs": "normal"}, "`aovs` must be out of motion, confidence, depth, got 'normal'"),
+        ({"max_depth": 3}, "unreferenced property"),
+        ({"background": [0.5, 0.5]}, "background"),
+    ],
+)
+def test_gaussian_splat__refuses_bad_props_when_the_scene_is_loaded(props, message):
+    with pytest.raises(RuntimeError, match=message):
+        mi.load_dict({"type": "gaussian_splat", **props})
+
+
+def test_ellipsoids__refuse_no_gaussians(raw):
+    with pytest.raises(ValueError, match="at least one Gaussian"):
+        ellipsoids(to_gaussians({name: value[:0] for name, value in raw.items()}))
+
+
+SCENE_FILE = """<scene version="3.0.0">
+    <integrator type="gaussian_splat"/>
+    <shape type="ellipsoids"><string name="filename" value="gaussians.ply"/></shape>
+    <sensor type="perspective">
+        <transform name="to_world"><lookat origin="0, 0, -3" target="0, 0, 0" up="0, 1, 0"/></transform>
+        <film type="hdrfilm"><integer name="width" value="32"/><integer name="height" value="16"/></film>
+    </sensor>
+</scene>"""
+
+
+def test_gaussian_splat__renders_a_scene_file_as_the_limits_describe(tmp_path, raw):
+    """The command `mitsuba` does not find the plugin; the Python command in docs/limits.md renders the same file."""
+    write_ply(tmp_path / "gaussians.ply", to_gaussians(raw))
+    (tmp_path / "scene.xml").write_text(SCENE_FILE)
+    page = (Path(__file__).parents[2] / "docs/limits.md").read_text(encoding="utf-8")
+    command = textwrap.dedent(re.findall(r"```bash\n(.*?)```", page, re.DOTALL)[0])
+    program = re.search(r'python -c "\n(.*?)"', command, re.DOTALL)[1]
+    subprocess.run([sys.executable, "-c", program], check=True, cwd=tmp_path, timeout=120)
+    image = np.array(mi.Bitmap(str(tmp_path / "image.exr")))
+    assert image.shape[:2] == (16, 32)
+    expected = np.array(mi.render(mi.load_file(str(tmp_path / "scene.xml"))))
+    assert expected.max() > 0.1
+    assert_close(image[..., :3], expected[..., :3], atol=2e-3)  # half precision

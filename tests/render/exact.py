@@ -1,0 +1,132 @@
+"""The renderer beside the reference in extended precision, and the exact derivatives of the reference.
+
+The reference runs with 80-bit `longdouble` where the platform has it, because its textbook determinant cancels for
+needles. Pixels where an alpha lies within `AMBIGUOUS` of a cut-off are excluded: there, rounding decides what is drawn.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi import Camera, RenderConfig, rasterize
+from morgs_mi.core.gaussians import tensor_rows
+from tests import reference
+from tests.scenes.gaussians import CHANNELS, Values
+
+SIZES = {"color": 3, "motion": 2}
+ATTRIBUTES = ("means", "scales", "quats", "opacities", "sh_coeffs", "motion", "confidence")
+BACKGROUND = (0.2, 0.5, 0.9)
+AMBIGUOUS = 1e-3  # relative distance of an alpha to a cut-off
+# Practically no stop, so that gradients of opaque scenes can be compared with the reference, which has none.
+CONFIG = RenderConfig(stop_transmittance=1e-12)
+
+
+class Activated:
+    """Activated attributes, as the plugin passes them, without a logit or a logarithm."""
+
+    def __init__(self, values: Values) -> None:
+        one = dr.opaque(mi.Float, 1)  # multiplying copies what Dr.Jit borrows from NumPy
+        for name in ATTRIBUTES:
+            setattr(self, name, mi.TensorXf(np.ascontiguousarray(values[name], np.float32)) * one)
+        self.tensors = [getattr(self, name) for name in ATTRIBUTES]
+        dr.enable_grad(*self.tensors)
+
+    def rows(self, name: str, index: Any) -> list[Any]:
+        return tensor_rows(getattr(self, name), index)
+
+    def gradients(self) -> Values:
+        return {name: np.asarray(dr.grad(getattr(self, name)), np.float64) for name in ATTRIBUTES}
+
+
+def exact_image(
+    values: dict[str, Any], camera: Camera, alpha_min: float = 1 / 255, alpha_max: float = 0.99, viewmat: Any = None
+) -> dict[str, Any]:
+    """Return the reference's channels of activated attributes."""
+    with np.errstate(all="ignore"):
+
+        def logit(x):  # infinite at 1; 60 has the same sigmoid
+            return np.where(x == 1, 60, np.log(x / np.where(x == 1, 1, 1 - x)))
+
+        zero = (values["quats"] == 0).all(axis=1, keepdims=True)
+        raw = {
+            "means": values["means"],
+            "log_scales": np.log(values["scales"]),
+            "quats": np.where(zero, np.array([1, 0, 0, 0]), values["quats"]),
+            "logit_opacities": logit(values["opacities"]),
+            "sh_coeffs": values["sh_coeffs"],
+            "motion": values["motion"],
+            "logit_confidence": logit(values["confidence"]),
+        }
+        return reference.rasterize(
+            raw,
+            np.float32(camera.K).astype(np.longdouble),
+            np.asarray(camera.viewmat).astype(np.longdouble) if viewmat is None else viewmat,
+            camera.width,
+            camera.height,
+            BACKGROUND,
+            near=float(np.float32(camera.near)),
+            alpha_min=alpha_min,
+            alpha_max=alpha_max,
+        )
+
+
+def clear_pixels(values: Values, camera: Camera) -> np.ndarray:
+    """Return the mask of the pixels [H, W] where no alpha is near a cut-off, found by moving the cut-offs."""
+    low, high = (exact_image(values, camera, alpha_min=(1 + s * AMBIGUOUS) / 255)["alpha"][..., 0] for s in (-1, 1))
+    under, at, over = (
+        exact_image(values, camera, alpha_max=0.99 * (1 + s * 1e-4))["alpha"][..., 0] for s in (-1, 0, 1)
+    )
+    return (low == high) & (np.abs(under - 2 * at + over) < 1e-6)
+
+
+def weights(expected: dict[str, np.ndarray], clear: np.ndarray, seed: int = 1) -> dict[str, np.ndarray]:
+    """Return random weights per channel, relative to its scale, for a loss of all channels."""
+    rng = np.random.default_rng(seed)
+    solid = clear & (expected["alpha"][..., 0] > 0.02)
+    result = {}
+    for name in CHANNELS:
+        mask = solid if name in ("depth", "motion") else clear
+        scale = max(1e-30, float(np.abs(expected[name]).max()))
+        result[name] = np.float32(rng.normal(size=(*clear.shape, SIZES.get(name, 1))) * mask[..., None] / scale)
+    return result
+
+
+def exact_gradients(values: Values, camera: Camera, weight: dict[str, np.ndarray]) -> Values:
+    """Return gradients by complex steps relative to each number: none from 1e-30 to 1e30 loses its imaginary part."""
+    grads = {}
+    for name in ATTRIBUTES:
+        grad = np.zeros(values[name].shape)
+        for index in np.ndindex(*grad.shape):
+            nudged = values[name].astype(np.clongdouble)
+            step = np.longdouble(1e-30) * (np.abs(values[name][index]) or 1)
+            nudged[index] += 1j * step
+            image = exact_image({**values, name: nudged}, camera)
+            grad[index] = sum(np.sum(image[c].imag * weight[c]) for c in CHANNELS) / step
+        grads[name] = grad
+    return grads
+
+
+def exact_slope(values: Values, camera: Camera, weight: dict[str, np.ndarray], name: str, along: np.ndarray) -> float:
+    """Return the derivative of the weighted channels along a direction of one attribute."""
+    image = exact_image({**values, name: values[name].astype(np.clongdouble) + 1e-30j * along}, camera)
+    return float(sum(np.sum(image[c].imag * weight[c]) for c in CHANNELS) / 1e-30)
+
+
+def run(
+    values: Values, camera: Camera, weight: dict[str, np.ndarray] | None = None, config: RenderConfig = CONFIG
+) -> tuple[Values, Values]:
+    """Return the channels and the gradients of the sum of the weighted channels; all must be finite."""
+    gaussians = Activated(values)
+    image = rasterize(gaussians, camera, CHANNELS, BACKGROUND, config=config)
+    found = {name: np.asarray(dr.detach(image[name]), np.float64) for name in CHANNELS}
+    if weight is None:
+        weight = weights(found, np.ones((camera.height, camera.width), bool))
+    dr.backward(sum(dr.sum(image[name] * mi.TensorXf(weight[name]), axis=None) for name in CHANNELS))
+    grads = gaussians.gradients()
+    for name, value in (*found.items(), *grads.items()):
+        assert np.isfinite(value).all(), f"{name} is not finite at {np.argwhere(~np.isfinite(value))[:5].tolist()}"
+    return found, grads

@@ -1,0 +1,61 @@
+"""Channels of the table of attributes, with rows that a test adds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from morgs_mi import rasterize
+from morgs_mi.render.region import Region
+from tests import tolerances as tol
+from tests.assertions import assert_close
+from tests.scenes.gaussians import (
+    ExtendedGaussians,
+    to_gaussians,
+)
+
+
+@pytest.mark.usefixtures("new_attributes")
+def test_rasterize__renders_a_new_attribute_of_the_table(scene):
+    raw, camera = scene
+    rng = np.random.default_rng(6)
+    normals = np.float32(rng.normal(size=(len(raw["means"]), 3)))
+    gaussians = ExtendedGaussians(**raw, logit_roughness=raw["logit_confidence"], normals=normals)
+    dr.enable_grad(gaussians.logit_confidence, gaussians.logit_roughness)
+    channels = ("color", "roughness", "confidence", "normal")
+    image = rasterize(gaussians, camera, channels, features=normals)
+    assert image["color"].shape == (camera.height, camera.width, 3)
+    assert_close(image["roughness"], image.confidence)
+    assert_close(image["normal"], image.features)
+    dr.backward(dr.sum(dr.square(image["roughness"]), axis=None) + dr.sum(dr.square(image.confidence), axis=None))
+    grad = np.asarray(dr.grad(gaussians.logit_confidence))
+    assert np.abs(grad).max() > 0
+    assert_close(dr.grad(gaussians.logit_roughness), grad, rtol=tol.SUM_ORDER_REL)
+    with pytest.raises(ValueError, match="channel 'roughness' requires Gaussians with `logit_roughness`, got none"):
+        rasterize(to_gaussians(raw), camera, ("roughness",))
+    broken = replace(gaussians, normals=np.where(np.arange(30).reshape(10, 3) == 7, np.nan, normals))
+    with pytest.raises(ValueError, match=r"`normals` must be finite, got nan at \[2, 1\]"):
+        rasterize(broken, camera, ("normal",))
+
+
+@pytest.mark.usefixtures("new_attributes")
+def test_rasterize__renders_on_a_region_a_new_attribute_of_the_table(scene):
+    raw, camera = scene
+    gaussians = ExtendedGaussians(**raw, logit_roughness=raw["logit_confidence"])
+    mask = np.zeros((camera.height, camera.width), bool)
+    mask[9, 10] = True
+    region, active = Region(mask), np.arange(len(raw["means"])) % 2 == 0
+    image = rasterize(gaussians, camera, ("roughness", "confidence"), region=region, active=active)
+    assert_close(image["roughness"], image.confidence)
+
+
+def test_image__is_indexed_by_channel(scene):
+    raw, camera = scene
+    image = rasterize(to_gaussians(raw), camera, ("color", "depth"))
+    assert image["color"] is image.color
+    assert image["depth"] is image.depth
+    with pytest.raises(KeyError, match="expected a channel out of color, depth, got 'alpha'"):
+        image["alpha"]
