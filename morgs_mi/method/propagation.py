@@ -78,7 +78,7 @@ def propagate_motion(
 
     def error_of(d: np.ndarray) -> np.ndarray:
         moved = replace(previous, means=means + d)
-        sums = sum(attribute_error(moved, views[view], targets[view]) for view in views)
+        sums = np.sum([attribute_error(moved, views[view], targets[view]) for view in views], axis=0)
         return (sums[:, 0] + config.floor_px) / (sums[:, 1] + 1)
 
     error = error_of(d)

@@ -1,0 +1,16 @@
+"""Work in threads."""
+
+from __future__ import annotations
+
+import pytest
+
+from morgs_mi.core.threads import map_in_threads
+
+
+def test_map_in_threads__keeps_the_order():
+    assert map_in_threads(lambda x: x * x, range(50)) == [x * x for x in range(50)]
+
+
+def test_map_in_threads__raises_what_the_function_raises():
+    with pytest.raises(ZeroDivisionError):
+        map_in_threads(lambda x: 1 // x, [1, 0])
