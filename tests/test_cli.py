@@ -346,7 +346,7 @@ def flattened(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return {key: value for part in pairs for key, value in part.items()}
 
 
-COMMANDS = ("synth", "info", "calibrate", "fit", "render", "view", "eval", "salvage", "demo")
+COMMANDS = ("synth", "info", "calibrate", "fit", "render", "import", "view", "eval", "salvage", "demo")
 EXPORTS = ("ply", "gltf", "video", "tracks")
 
 
@@ -451,6 +451,7 @@ def test_main__writes_nothing_into_a_capture(capture: Path, stream: Path, tmp_pa
         ("export", "ply", stream, "--output", place / "ply"),
         ("export", "gltf", stream, "--output", place / "gltf"),
         ("export", "video", stream, "--output", place / "cam0.mp4"),
+        ("import", tmp_path, place / "new.morgs"),
         ("export", "tracks", stream, "--output", place / "a.npz"),
         ("eval", stream, "--capture", capture, "--json", place / "capture.json"),
         ("eval", stream, "--capture", capture, "--figures", place / "figures"),
