@@ -347,7 +347,7 @@ def flattened(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 COMMANDS = ("synth", "info", "calibrate", "fit", "render", "import", "view", "eval", "salvage", "demo")
-EXPORTS = ("ply", "gltf", "video", "tracks")
+EXPORTS = ("ply", "gltf", "usd", "video", "tracks")
 
 
 @pytest.mark.parametrize("command", [*((name,) for name in COMMANDS), *(("export", name) for name in EXPORTS)])
@@ -450,6 +450,7 @@ def test_main__writes_nothing_into_a_capture(capture: Path, stream: Path, tmp_pa
         ("render", stream, "--camera", 0, "--output", place / "cam0"),
         ("export", "ply", stream, "--output", place / "ply"),
         ("export", "gltf", stream, "--output", place / "gltf"),
+        ("export", "usd", stream, place / "a.usda"),
         ("export", "video", stream, "--output", place / "cam0.mp4"),
         ("import", tmp_path, place / "new.morgs"),
         ("export", "tracks", stream, "--output", place / "a.npz"),

@@ -85,6 +85,34 @@ class Gltf:
 
 
 @dataclass(frozen=True)
+class Usd:
+    """Write an OpenUSD stage with a time sample per frame: ParticleField3DGaussianSplat, rotated to y up."""
+
+    out: Positional[Path]
+    """Folder of a fit, or a stream file."""
+    output: Positional[Path | None] = None
+    """FILE.usd, .usdc (binary), .usda (text) or .usdz (package); by default OUT/stream.usdc."""
+    frames: Annotated[str | None, DisallowNone, optional("FRAMES")] = None
+    """Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."""
+    half: Flag = False
+    """Half precision of all attributes but the positions."""
+
+    arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
+
+    def run(self) -> None:
+        from morgs_mi.export.clips import select_frames
+        from morgs_mi.export.usd import write_usd
+        from morgs_mi.playback.player import open_stream
+
+        stream = open_stream(self.out)
+        frames = select_frames(stream, self.frames)
+        output = check_output(self.output or stream.path.with_name("stream.usdc"))
+        with progress() as report:
+            write_usd(stream, output, frames, self.half, partial(report, "Writing"))
+        print_result(f"{output}: {len(frames)} frames, {output.stat().st_size / 1e6:.2f} MB.")
+
+
+@dataclass(frozen=True)
 class Flight:
     """Render a stream along a moving camera into an mp4."""
 
@@ -204,6 +232,7 @@ class Export:
     kind: Annotated[
         Annotated[Ply, tyro.conf.subcommand("ply")]
         | Annotated[Gltf, tyro.conf.subcommand("gltf")]
+        | Annotated[Usd, tyro.conf.subcommand("usd")]
         | Annotated[Flight, tyro.conf.subcommand("video")]
         | Annotated[Tracks, tyro.conf.subcommand("tracks")]
         | Annotated[Web, tyro.conf.subcommand("web")],

@@ -29,7 +29,7 @@ def frames_with_first_id(stream: StreamReader) -> Iterator[tuple[int, CodedFrame
         if coded is not None and packet.frame == coded.frame:
             continue  # a re-emitted keyframe, from which a receiver can start
         if coded is not None and packet.kind == PacketKind.KEYFRAME:
-            first_id += coded.next_id
+            first_id += max(coded.next_id, 1)  # also after a set without Gaussians
         coded = decode(coded, packet)
         yield first_id, coded
 
