@@ -14,6 +14,7 @@ from morgs_mi import cli
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.compressed_ply import read_compressed_ply, write_compressed_ply
 from morgs_mi.io.ply import read_ply, write_ply
+from morgs_mi.io.splats import read_splats
 from tests.assertions import assert_close
 from tests.scenes.changing_splats import splats, write_stream
 
@@ -72,6 +73,16 @@ def test_write_ply__is_returned_by_splat_transform_unchanged(program, tmp_path):
     write_ply(tmp_path / "a.ply", splats(100, 3))
     convert(program, tmp_path / "a.ply", tmp_path / "b.ply")
     assert_same(read_ply(tmp_path / "a.ply"), read_ply(tmp_path / "b.ply"), atol=1e-6)
+
+
+def test_read_splats__agrees_with_splat_transform_on_a_splat_file(program, tmp_path):
+    rng = np.random.default_rng(0)
+    bytes_of = rng.integers(20, 236, (50, 8), np.uint8)
+    numbers = rng.uniform(0.05, 1, (50, 6)).astype("<f4").view(np.uint8)
+    (tmp_path / "a.splat").write_bytes(np.concatenate([numbers, bytes_of], axis=1).tobytes())
+    convert(program, tmp_path / "a.splat", tmp_path / "b.ply")
+    # splat-transform takes the middle of 0 to 255 for the zero of a quaternion, the program that defined it 128.
+    assert_same(read_splats(tmp_path / "a.splat"), read_ply(tmp_path / "b.ply"), atol=0.03)
 
 
 @pytest.mark.parametrize(("command", "suffix"), [*zip(COMMANDS, (".sog", ".spz"), strict=True)])
