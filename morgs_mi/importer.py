@@ -30,7 +30,7 @@ from morgs_mi.io.splats import SUFFIXES, read_splats, suffix_of
 __all__ = ["Axes", "Imported", "default_camera", "find_frames", "import_frames", "same_gaussians"]
 
 Axes = Literal["y-down", "y-up", "z-up"]
-"""Direction that is up in the files. The layout of 3D Gaussian Splatting mostly has y down."""
+"""Direction that is up in the files, by axis. The layout of 3D Gaussian Splatting mostly has y down."""
 
 # Directions up and forward of the camera.
 _DIRECTIONS: dict[Axes, tuple[np.ndarray, np.ndarray]] = {
@@ -42,7 +42,7 @@ _WIDTH, _HEIGHT, _FOV_X = 1280, 720, 50.0
 _FRAMES_IN_VIEW = 3  # first, middle and last
 _MARGIN = 1.1
 _PERCENT_OUTSIDE = 2.0  # of the centres, on each side: floaters far from the scene
-# With rows of other Gaussians the share is about a half; with the same ones, only twins resemble each other more.
+# With rows of other Gaussians the share is about a half; with the same ones, only near-duplicates reduce it.
 _LEAST_SHARE = 0.95
 
 
@@ -156,7 +156,7 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
 
 
 def same_gaussians(before: Gaussians, now: Gaussians) -> bool:
-    """Return whether the rows of two frames are the same Gaussians, judged by centre, size, opacity and base colour."""
+    """Return whether the rows of two frames are the same Gaussians, by centre, size, opacity and base colour."""
     if len(before) != len(now) or before.sh_degree != now.sh_degree or not len(now):
         return False
     old, new = _features(before), _features(now)
@@ -193,7 +193,7 @@ def default_camera(frames: Sequence[Gaussians], axes: Axes = "y-down") -> Camera
 
 
 def _features(gaussians: Gaussians) -> np.ndarray:
-    """Return what tells Gaussians apart, float64 [N, 10]."""
+    """Return the numbers by which rows are compared, float64 [N, 10]."""
     raw = gaussians.numpy()
     # Opacities of 0 and 1 have logits far from all others.
     opacities = np.clip(raw["logit_opacities"], -5, 5)[:, None]

@@ -51,7 +51,7 @@ def test_through_cameras__visits_the_nearest_next_at_constant_speed():
 
 
 def test_through_cameras__names_the_path_for_a_single_camera():
-    with pytest.raises(ValueError, match="at least two cameras were expected .* use the path `orbit`"):
+    with pytest.raises(ValueError, match=r"at least two cameras were expected .* use the path `orbit`"):
         through_cameras(rig()[:1])
 
 
