@@ -25,6 +25,7 @@ SUBPACKAGES = (
     "calibration",
     "synth",
     "recorder",
+    "importer",
     "playback",
     "evaluate",
     "export",

@@ -1,6 +1,6 @@
 """Command line, the package's only argument parser.
 
-`morgs-mi synth`, `info`, `calibrate`, `fit`, `render`, `export`, `view`, `eval`, `salvage` and `demo`.
+`morgs-mi synth`, `info`, `calibrate`, `fit`, `render`, `export`, `import`, `view`, `eval`, `salvage` and `demo`.
 
 Results go to standard output; progress, warnings and errors to standard error. An error that the user can correct is
 one sentence and exit status 1, an interruption by Ctrl-C or SIGTERM is status 130; `--debug` adds the traceback.
@@ -28,6 +28,7 @@ from morgs_mi.cli.demo import Demo
 from morgs_mi.cli.evaluate import Eval
 from morgs_mi.cli.export import Export
 from morgs_mi.cli.fit import Fit
+from morgs_mi.cli.import_frames import Import
 from morgs_mi.cli.info import Info
 from morgs_mi.cli.render import Render
 from morgs_mi.cli.salvage import Salvage
@@ -44,6 +45,7 @@ Command = (
     | Annotated[Fit, tyro.conf.subcommand("fit")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Export, tyro.conf.subcommand("export")]
+    | Annotated[Import, tyro.conf.subcommand("import")]
     | Annotated[View, tyro.conf.subcommand("view")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Salvage, tyro.conf.subcommand("salvage")]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -19,27 +20,37 @@ __all__ = ["Export"]
 
 @dataclass(frozen=True)
 class Ply:
-    """Write a PLY file per frame in the layout of 3D Gaussian Splatting, in the capture's axes."""
+    """Write a PLY file per frame, in the layout of 3D Gaussian Splatting or compressed, in the capture's axes."""
 
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
     output: Annotated[Path | None, DisallowNone, optional("FOLDER")] = None
-    """New folder for 0000.ply, ...; by default OUT/ply."""
+    """New folder for 0000.ply, ...; by default OUT/ply, with --compressed OUT/compressed-ply."""
     frames: Annotated[str | None, DisallowNone, optional("FRAMES")] = None
     """Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."""
+    compressed: Flag = False
+    """Write 0000.compressed.ply, ... in PlayCanvas' layout, a sequence that SuperSplat plays."""
 
     arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
 
     def run(self) -> None:
+        from morgs_mi.codec.packets import play
         from morgs_mi.export.clips import select_frames, write_each
+        from morgs_mi.export.ids import by_place
+        from morgs_mi.io.compressed_ply import write_compressed_ply
         from morgs_mi.io.ply import write_ply
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
         frames = select_frames(stream, self.frames)
-        output = check_output(self.output or stream.path.with_name("ply"))
+        folder = "compressed-ply" if self.compressed else "ply"
+        output = check_output(self.output or stream.path.with_name(folder))
         with progress() as report:
-            write_each(stream, output, ".ply", write_ply, frames, lambda done, of: report("Writing", done, of))
+            tick = partial(report, "Writing")
+            if self.compressed:
+                write_each(by_place(stream), output, ".compressed.ply", write_compressed_ply, frames, tick)
+            else:
+                write_each(play(stream), output, ".ply", write_ply, frames, tick)
         print_result(f"{output}: {len(frames)} PLY files.")
 
 
@@ -57,6 +68,7 @@ class Gltf:
     arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
 
     def run(self) -> None:
+        from morgs_mi.codec.packets import play
         from morgs_mi.export.axes import gltf_axes
         from morgs_mi.export.clips import select_frames, write_each
         from morgs_mi.export.gltf import write_gltf
@@ -67,15 +79,37 @@ class Gltf:
         output = check_output(self.output or stream.path.with_name("gltf"))
         axes = gltf_axes(stream.cameras)
         with progress() as report:
-            write_each(
-                stream,
-                output,
-                ".glb",
-                lambda path, gaussians: write_gltf(path, gaussians, axes),
-                frames,
-                lambda done, of: report("Writing", done, of),
-            )
+            write = partial(write_gltf, axes=axes)
+            write_each(play(stream), output, ".glb", write, frames, partial(report, "Writing"))
         print_result(f"{output}: {len(frames)} glTF files.")
+
+
+@dataclass(frozen=True)
+class Usd:
+    """Write an OpenUSD stage with a time sample per frame: ParticleField3DGaussianSplat, rotated to y up."""
+
+    out: Positional[Path]
+    """Folder of a fit, or a stream file."""
+    output: Positional[Path | None] = None
+    """FILE.usd, .usdc (binary), .usda (text) or .usdz (package); by default OUT/stream.usdc."""
+    frames: Annotated[str | None, DisallowNone, optional("FRAMES")] = None
+    """Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."""
+    half: Flag = False
+    """Half precision of all attributes but the positions."""
+
+    arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
+
+    def run(self) -> None:
+        from morgs_mi.export.clips import select_frames
+        from morgs_mi.export.usd import write_usd
+        from morgs_mi.playback.player import open_stream
+
+        stream = open_stream(self.out)
+        frames = select_frames(stream, self.frames)
+        output = check_output(self.output or stream.path.with_name("stream.usdc"))
+        with progress() as report:
+            write_usd(stream, output, frames, self.half, partial(report, "Writing"))
+        print_result(f"{output}: {len(frames)} frames, {output.stat().st_size / 1e6:.2f} MB.")
 
 
 @dataclass(frozen=True)
@@ -200,6 +234,7 @@ class Export:
     kind: Annotated[
         Annotated[Ply, tyro.conf.subcommand("ply")]
         | Annotated[Gltf, tyro.conf.subcommand("gltf")]
+        | Annotated[Usd, tyro.conf.subcommand("usd")]
         | Annotated[Flight, tyro.conf.subcommand("video")]
         | Annotated[Tracks, tyro.conf.subcommand("tracks")]
         | Annotated[Web, tyro.conf.subcommand("web")],

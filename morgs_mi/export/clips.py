@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -62,7 +62,7 @@ def select_frames(stream: StreamReader, span: str | None) -> list[int]:
 
 
 def write_each(
-    stream: StreamReader,
+    clip: Iterable[tuple[int, Gaussians]],
     folder: str | Path,
     suffix: str,
     write: Callable[[Path, Gaussians], None],
@@ -72,7 +72,7 @@ def write_each(
     """Write frames as ``0000.ply``, ``0001.ply``, ... into a new folder, which is written atomically.
 
     Args:
-        stream: the file.
+        clip: (frame, Gaussians) of all frames, as `play` and `by_place` yield them.
         folder: must not exist.
         suffix: of the files, e.g. ``.ply``.
         write: function that writes the Gaussians of one frame.
@@ -85,7 +85,7 @@ def write_each(
     """
     wanted, done = set(frames), 0
     with atomic_folder(folder, "write_each()") as partial:
-        for frame, gaussians in play(stream):
+        for frame, gaussians in clip:
             if frame in wanted:
                 write(partial / f"{frame:04d}{suffix}", gaussians)
                 done += 1

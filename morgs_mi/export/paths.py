@@ -144,12 +144,17 @@ def through_cameras(cameras: Sequence[Camera], seconds: float = 1) -> CameraPath
     Raises:
         ValueError: there are fewer than two cameras.
     """
+    if len(cameras) < 2:
+        raise ValueError(
+            f"through_cameras(): at least two cameras were expected to move between, got {len(cameras)}; use the path "
+            "`orbit`."
+        )
     remaining = [camera.resized(cameras[0].width, cameras[0].height) for camera in cameras]
     keys = [remaining.pop(0)]
     while remaining:
         distances = [np.linalg.norm(camera.position - keys[-1].position) for camera in remaining]
         keys.append(remaining.pop(int(np.argmin(distances))))
-    steps = np.linalg.norm(np.diff([key.position for key in keys], axis=0), axis=-1) if len(keys) > 1 else np.zeros(0)
+    steps = np.linalg.norm(np.diff([key.position for key in keys], axis=0), axis=-1)
     # A rotation between cameras at the same position takes time too.
     steps = np.maximum(steps, 0.1 * steps.mean() if steps.any() else 1)
     return CameraPath(np.concatenate([[0], np.cumsum(steps)]), tuple(keys)).with_duration(seconds)

@@ -7,6 +7,7 @@ standard deviations), ``rot_0..3`` (w, x, y, z). World axes stay as they are; th
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -18,7 +19,7 @@ from plyfile import PlyData, PlyElement
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 
-__all__ = ["read_ply", "read_vertices", "write_ply"]
+__all__ = ["read_elements", "read_ply", "read_vertices", "write_ply"]
 
 _MEAN, _SCALE, _ROTATION = ("x", "y", "z"), ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
 # Type names of the format and of its older writers.
@@ -80,7 +81,7 @@ def read_ply(path: str | Path) -> Gaussians:
     names = set(vertices)
     if "packed_position" in names:
         raise ValueError(
-            f"{path}: expected an uncompressed PLY, got SuperSplat's compressed one; export it uncompressed."
+            f"{path}: expected an uncompressed PLY, got PlayCanvas' compressed one; read it with `read_splats`."
         )
     missing = [name for name in (*_MEAN, *_DC, "opacity", *_SCALE, *_ROTATION) if name not in names]
     if missing:
@@ -113,12 +114,29 @@ def read_ply(path: str | Path) -> Gaussians:
 def read_vertices(path: str | Path) -> dict[str, np.ndarray]:
     """Return the properties of the vertices in a PLY file, binary or text, by name, each [N] in its stored type.
 
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: as `read_elements`.
+    """
+    return read_elements(path, ("vertex",))["vertex"]
+
+
+def read_elements(
+    path: str | Path, required: Sequence[str], optional: Sequence[str] = ()
+) -> dict[str, dict[str, np.ndarray]]:
+    """Return the properties of elements of a PLY file, by the names of element and property, each [rows].
+
     Written by hand because plyfile allocates what the header claims, and Python objects for lists. Elements after the
-    vertices are not read; those before them and the vertices themselves must have no lists.
+    last one of these are not read; that one and those before it must have no lists.
+
+    Args:
+        path: the file, binary or text.
+        required: names of elements.
+        optional: names of elements that are left out of the result where the file does not have them.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not a PLY file, has no vertices, or has fewer of them than its header claims.
+        ValueError: it is not a PLY file, lacks an element, or has fewer rows than its header claims.
     """
     path = Path(path)
     if not path.is_file():
@@ -126,20 +144,26 @@ def read_vertices(path: str | Path) -> dict[str, np.ndarray]:
     try:
         with path.open("rb") as file:
             order, elements = _read_header(file)
+            wanted = {element.name for element in elements}.intersection((*required, *optional))
+            if lacking := [name for name in required if name not in wanted]:
+                raise ValueError(f"it has no element {lacking[0]}")
+            found: dict[str, dict[str, np.ndarray]] = {}
             for element in elements:
+                if found.keys() == wanted:
+                    break
                 dtype = element.dtype(order)
                 held = path.stat().st_size - file.tell()
                 # A number in a text takes a digit and a separator.
-                required = element.count * (dtype.itemsize if order else 2 * len(element.properties)) - (not order)
-                if element.count < 0 or required > held:
-                    raise ValueError(f"{element.count} {element.name} need at least {required} bytes, {held} follow")
-                if element.name == "vertex":
-                    return _read_rows(file, element.count, dtype, text=not order)
-                if order:
+                size = element.count * (dtype.itemsize if order else 2 * len(element.properties)) - (not order)
+                if element.count < 0 or size > held:
+                    raise ValueError(f"{element.count} {element.name} need at least {size} bytes, {held} follow")
+                if element.name in wanted:
+                    found[element.name] = _read_rows(file, element, dtype, text=not order)
+                elif order:
                     file.seek(element.count * dtype.itemsize, 1)
                 else:
                     next(islice(file, element.count, element.count), None)
-        raise ValueError("it has no vertices")
+            return found
     except (ValueError, KeyError, IndexError, OverflowError) as error:
         raise ValueError(f"{path}: expected a complete PLY file, got one that cannot be read: {error}.") from error
 
@@ -155,7 +179,7 @@ class _Element:
     def dtype(self, order: str) -> np.dtype:
         """Return the type of a row in the byte order `order`."""
         if any(words[1] == "list" for words in self.properties):
-            raise ValueError(f"the element {self.name} has lists before the end of the vertices, write it without them")
+            raise ValueError(f"the element {self.name} has lists before the end of what is read, write it without them")
         return np.dtype([(words[2], order + _TYPES[words[1]]) for words in self.properties])
 
 
@@ -180,15 +204,15 @@ def _read_header(file: BinaryIO) -> tuple[str, list[_Element]]:
     raise ValueError("its header does not end")
 
 
-def _read_rows(file: BinaryIO, count: int, dtype: np.dtype, text: bool) -> dict[str, np.ndarray]:
+def _read_rows(file: BinaryIO, element: _Element, dtype: np.dtype, text: bool) -> dict[str, np.ndarray]:
     if not text:
-        table = np.fromfile(file, dtype, count)
-    elif count == 0:
+        table = np.fromfile(file, dtype, element.count)
+    elif element.count == 0:
         table = np.empty(0, dtype)
     else:
-        table = np.loadtxt(islice(file, count), dtype, ndmin=1)
-    if len(table) < count:
-        raise ValueError(f"expected {count} vertices, got {len(table)}")
+        table = np.loadtxt(islice(file, element.count), dtype, ndmin=1)
+    if len(table) < element.count:
+        raise ValueError(f"expected {element.count} rows of {element.name}, got {len(table)}")
     return {name: table[name] for name in table.dtype.names or ()}
 
 

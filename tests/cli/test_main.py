@@ -90,8 +90,8 @@ def test_main__names_options_not_arguments(tmp_path: Path, run, args, parts) -> 
     assert not out.exists()
 
 
-COMMANDS = ("synth", "info", "calibrate", "fit", "render", "view", "eval", "salvage", "demo")
-EXPORTS = ("ply", "gltf", "video", "tracks", "web")
+COMMANDS = ("synth", "info", "calibrate", "fit", "render", "import", "view", "eval", "salvage", "demo")
+EXPORTS = ("ply", "gltf", "usd", "video", "tracks", "web")
 
 
 @pytest.mark.parametrize("command", [*((name,) for name in COMMANDS), *(("export", name) for name in EXPORTS)])
@@ -155,6 +155,8 @@ def test_main__writes_nothing_into_a_capture(capture: Path, stream: Path, tmp_pa
         ("render", stream, "--camera", 0, "--output", place / "cam0"),
         ("export", "ply", stream, "--output", place / "ply"),
         ("export", "gltf", stream, "--output", place / "gltf"),
+        ("export", "usd", stream, place / "a.usda"),
+        ("import", tmp_path, place / "new.morgs"),
         ("export", "video", stream, "--output", place / "cam0.mp4"),
         ("export", "tracks", stream, "--output", place / "a.npz"),
         ("export", "web", stream, place / "page.html"),

@@ -16,6 +16,7 @@ from morgs_mi.export.clips import _frames_backwards, repeated_seconds, select_fr
 from morgs_mi.export.frames import exr_channels, pad_to_even, write_frames
 from morgs_mi.export.paths import through_cameras
 from morgs_mi.io.ply import read_ply
+from morgs_mi.io.splats import read_splats
 from morgs_mi.render.rasterize import rasterize
 from tests.assertions import assert_close
 from tests.codec.forge import forged_streams
@@ -45,6 +46,15 @@ def test_export_ply__writes_every_frame(stream, tmp_path):
     for t, state in enumerate(stream):
         read = read_ply(tmp_path / "ply" / f"{t:04d}.ply")
         np.testing.assert_array_equal(read.numpy()["means"], state.gaussians.numpy()["means"])
+
+
+def test_export_ply__writes_compressed_files(stream, tmp_path):
+    assert run("export", "ply", tmp_path, "--compressed", "--frames", "2:") == 0
+    files = sorted((tmp_path / "compressed-ply").iterdir())
+    assert [path.name for path in files] == ["0002.compressed.ply", "0003.compressed.ply"]
+    for path, state in zip(files, stream[2:], strict=True):
+        read, expected = (np.sort(g.numpy()["means"], axis=0) for g in (read_splats(path), state.gaussians))
+        assert_close(read, expected, atol=2e-3)
 
 
 def test_export_gltf__writes_selected_frames(stream, tmp_path):

@@ -50,6 +50,11 @@ def test_through_cameras__visits_the_nearest_next_at_constant_speed():
     np.testing.assert_allclose(path.times, [0, 1, 2])
 
 
+def test_through_cameras__names_the_path_for_a_single_camera():
+    with pytest.raises(ValueError, match=r"at least two cameras were expected .* use the path `orbit`"):
+        through_cameras(rig()[:1])
+
+
 def test_orbit__has_a_constant_distance_and_looks_at_the_centre():
     path = orbit(ring(8), TARGET, seconds=4)
     assert_close(path.at(0).position, path.at(4).position, atol=1e-9)  # no gap of 90 degrees: a full turn

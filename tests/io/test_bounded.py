@@ -17,6 +17,7 @@ import pytest
 from morgs_mi.io.bounded import read_array, read_json
 from morgs_mi.io.exr import read_exr, write_exr
 from morgs_mi.io.ply import read_vertices
+from morgs_mi.io.splats import read_splats
 from morgs_mi.io.video import FolderReader
 
 
@@ -119,6 +120,16 @@ CASES = {
         ply(BINARY + "element face 3000000\nproperty list uchar int i\n" + LARGE, bytes(3_000_000)),
         "element face has lists",
     ),
+    "compressed PLY of many vertices": (
+        read_splats,
+        ply(BINARY + "element chunk 1\nproperty float min_x\n" + LARGE.replace(" x", " packed_position"), bytes(4)),
+        "99999999999 vertex need at least 399999999996 bytes, 0 follow",
+    ),
+    "compressed PLY of empty rows": (
+        read_splats,
+        ply(BINARY + "element chunk 99999999999\nelement vertex 1\nproperty uint packed_position\n", bytes(4)),
+        "expected a compressed PLY",
+    ),
     "PLY of one line": (read_vertices, b"ply\n" + b"a" * 1_000_000, "expected a complete PLY file"),
     "PLY without an element": (read_vertices, ply(BINARY + "property float x\n"), "expected a complete PLY file"),
     "PLY of a word": (read_vertices, ply(BINARY + "element vertex many\n"), "expected a complete PLY file"),
@@ -130,7 +141,7 @@ CASES = {
 
 @pytest.mark.parametrize(("read", "content", "message"), CASES.values(), ids=CASES)
 def test_readers__refuse_a_hostile_file_in_one_sentence(tmp_path: Path, read, content, message: str) -> None:
-    path = tmp_path / "0.png"
+    path = tmp_path / ("0.ply" if read is read_splats else "0.png")
     content(path) if callable(content) else path.write_bytes(content)
     with pytest.raises((ValueError, OSError), match=message) as caught:
         read(path)

@@ -111,7 +111,7 @@ def with_nan(records):
         (without("rot_3", "opacity"), "without opacity, rot_3; a point cloud"),
         (without("f_rest_4"), "expected f_rest_0 to f_rest_8, 23 or 44 .* got 44 of them"),
         (with_nan, "expected finite numbers, got others in scale_1"),
-        (lambda _: np.zeros(4, [("packed_position", "u4")]), "SuperSplat's compressed one"),
+        (lambda _: np.zeros(4, [("packed_position", "u4")]), "PlayCanvas' compressed one; read it with `read_splats`"),
     ],
 )
 def test_read_ply__refuses_files_that_it_cannot_read(tmp_path, change, message):

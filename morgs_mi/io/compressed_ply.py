@@ -1,0 +1,195 @@
+"""Gaussians as PLY files in PlayCanvas' compressed layout, which SuperSplat and splat-transform read.
+
+A file has up to three elements, little-endian. Chunk c has the bounds of Gaussians 256 c to 256 c + 255:
+
+    chunk     float   min_x .. max_z, min_scale_x .. max_scale_z (natural logarithms), min_r .. max_b (0.5 + SH)
+    vertex    uint    packed_position, packed_scale   11, 10 and 11 bits of x, y, z, between the bounds of the chunk
+                      packed_rotation                 2 bits: index of the largest component of wxyz; 10 for each other
+                      packed_color                    8 for each of r, g, b, between the bounds, and for the opacity
+    sh        uchar   f_rest_0 .. as in an uncompressed PLY, -4 to 4
+
+A number of b bits stands for k / (2^b - 1) of its range. The components of a quaternion lie between -sqrt(1/2) and
+sqrt(1/2), the opacity between 0 and 1. A byte k of `sh` stands for (k + 0.5) / 256 of its range, but 0 and 255 stand
+for its ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData, PlyElement
+from scipy.special import expit
+
+from morgs_mi.core.color_space import SH_C0
+from morgs_mi.core.files import atomic_path
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.geometry import unit_quats
+from morgs_mi.io.ply import read_elements
+
+__all__ = ["read_compressed_ply", "write_compressed_ply"]
+
+_CHUNK = 256
+_BOUNDS = {
+    "position": (("min_x", "min_y", "min_z"), ("max_x", "max_y", "max_z")),
+    "scale": (("min_scale_x", "min_scale_y", "min_scale_z"), ("max_scale_x", "max_scale_y", "max_scale_z")),
+    "color": (("min_r", "min_g", "min_b"), ("max_r", "max_g", "max_b")),
+}
+_PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+_XYZ_BITS, _ROTATION_BITS, _COLOR_BITS = (11, 10, 11), (10, 10, 10), (8, 8, 8, 8)
+_MOST_LOG_SCALE = 20.0
+_SH_RANGE = 4.0
+# The components of a quaternion that are not the largest one, by its index.
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+
+
+def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
+    """Write Gaussians as a compressed PLY file in their order, atomically.
+
+    The precision of the positions depends on the extent of each 256 successive Gaussians, so they should be ordered by
+    place (see `morgs_mi.export.ids.by_place`). Logarithms of scales beyond -20 to 20 and SH coefficients of degree 1 to
+    3 beyond -4 to 4 are clipped. Motion and confidence are not written.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    raw = gaussians.numpy()
+    N, K = raw["sh_coeffs"].shape[:2]
+    values = {
+        "position": raw["means"],
+        "scale": np.clip(raw["log_scales"], -_MOST_LOG_SCALE, _MOST_LOG_SCALE),
+        "color": 0.5 + SH_C0 * raw["sh_coeffs"][:, 0],
+    }
+    chunks = np.empty(-(-N // _CHUNK), [(name, "<f4") for ends in _BOUNDS.values() for names in ends for name in names])
+    fractions = {}
+    for key, value in values.items():
+        low, high, fractions[key] = _within_chunks(value.astype(np.float32))
+        for names, ends in zip(_BOUNDS[key], (low, high), strict=True):
+            for name, column in zip(names, ends.T, strict=True):
+                chunks[name] = column
+    opacities = expit(raw["logit_opacities"].astype(np.float64))[:, None]
+    vertices = np.empty(N, [(name, "<u4") for name in _PACKED])
+    vertices["packed_position"] = _packed(fractions["position"], _XYZ_BITS)
+    vertices["packed_rotation"] = _packed_rotations(unit_quats(gaussians))
+    vertices["packed_scale"] = _packed(fractions["scale"], _XYZ_BITS)
+    vertices["packed_color"] = _packed(np.concatenate([fractions["color"], opacities], axis=1), _COLOR_BITS)
+    elements = [PlyElement.describe(chunks, "chunk"), PlyElement.describe(vertices, "vertex")]
+    if K > 1:
+        rest = raw["sh_coeffs"][:, 1:].transpose(0, 2, 1).reshape(N, 3 * (K - 1))
+        steps = np.clip(np.floor((rest / (2 * _SH_RANGE) + 0.5) * 256), 0, 255).astype("u1")
+        names = [(f"f_rest_{i}", "u1") for i in range(steps.shape[1])]
+        elements.append(PlyElement.describe(steps.view(names)[:, 0], "sh"))
+    with atomic_path(path, "write_compressed_ply()") as partial:
+        PlyData(elements, byte_order="<").write(str(partial))
+
+
+def read_compressed_ply(path: str | Path) -> Gaussians:
+    """Return the Gaussians in a compressed PLY file of any tool, SH of degree 0 to 3.
+
+    Opacities are at least 1e-6 and at most 1 - 1e-6, as those of `Gaussians.from_activated`.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: it is not a PLY file, is truncated, lacks a property, or has a number that is not finite.
+    """
+    elements = read_elements(path, ("chunk", "vertex"), ("sh",))
+    chunks, vertices, rest = elements["chunk"], elements["vertex"], elements.get("sh", {})
+    _check_columns(path, "vertex", vertices, _PACKED, "<u4")
+    N, num_chunks = len(vertices["packed_position"]), len(next(iter(chunks.values()), ()))
+    if num_chunks != -(-N // _CHUNK):
+        raise ValueError(
+            f"{path}: expected {-(-N // _CHUNK)} chunks of {_CHUNK} for {N} Gaussians, got {num_chunks}; the file is "
+            "broken, export it again."
+        )
+    degree = {0: 0, 9: 1, 24: 2, 45: 3}.get(len(rest))
+    if degree is None or any(len(column) != N for column in rest.values()):
+        raise ValueError(
+            f"{path}: expected {N} rows of f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) or none, got "
+            f"{len(next(iter(rest.values()), ()))} rows of {len(rest)} properties; the file is broken, export it again."
+        )
+    names = [f"f_rest_{i}" for i in range(len(rest))]
+    _check_columns(path, "sh", rest, names, "u1")
+    position, scale = (
+        _between(path, chunks, key, _unpacked(vertices[f"packed_{key}"], _XYZ_BITS)) for key in ("position", "scale")
+    )
+    color = _unpacked(vertices["packed_color"], _COLOR_BITS)
+    base = color[:, :3] if "min_r" not in chunks else _between(path, chunks, "color", color[:, :3])
+    coeffs = np.empty((N, (degree + 1) ** 2, 3), np.float32)
+    coeffs[:, 0] = (base - 0.5) / SH_C0
+    if degree:
+        steps = np.stack([rest[name] for name in names], axis=1).reshape(N, 3, len(names) // 3).transpose(0, 2, 1)
+        coeffs[:, 1:] = (np.where(steps == 0, 0, np.where(steps == 255, 256, steps + 0.5)) / 128 - 1) * _SH_RANGE
+    quats = _unpacked_rotations(vertices["packed_rotation"])
+    return Gaussians.from_activated(position, np.exp(scale), quats, color[:, 3], coeffs)
+
+
+def _within_chunks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the bounds of the chunks [chunks, 3], twice, and the values [N, 3] as fractions between them."""
+    starts = np.arange(0, len(values), _CHUNK)
+    if not len(starts):
+        return values, values, values
+    low, high = (bound.reduceat(values, starts, axis=0) for bound in (np.minimum, np.maximum))
+    first, last = (np.repeat(bound, _CHUNK, axis=0)[: len(values)].astype(np.float64) for bound in (low, high))
+    return low, high, (values - first) / np.where(last > first, last - first, 1)
+
+
+def _between(path: str | Path, chunks: dict[str, np.ndarray], key: str, fractions: np.ndarray) -> np.ndarray:
+    """Return the values [N, 3] at fractions between the bounds of their chunks, the inverse of `_within_chunks`."""
+    names = [name for ends in _BOUNDS[key] for name in ends]
+    _check_columns(path, "chunk", chunks, names, "<f4")
+    low, high = (
+        np.stack([np.asarray(chunks[name], np.float64) for name in ends], axis=1).repeat(_CHUNK, axis=0)
+        for ends in _BOUNDS[key]
+    )
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise ValueError(f"{path}: expected finite bounds, got others in {', '.join(names)}; clean the Gaussians.")
+    N = len(fractions)
+    return low[:N] * (1 - fractions) + high[:N] * fractions
+
+
+def _check_columns(
+    path: str | Path, element: str, columns: dict[str, np.ndarray], names: Sequence[str], dtype: str
+) -> None:
+    if wrong := [name for name in names if name not in columns or columns[name].dtype.newbyteorder("<") != dtype]:
+        raise ValueError(
+            f"{path}: expected a compressed PLY, got an element {element} without {', '.join(wrong)} as "
+            f"{np.dtype(dtype).name}; export it again."
+        )
+
+
+def _packed(fractions: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+    """Return fractions [N, k] rounded to integers of these numbers of bits, the first one in the highest bits."""
+    packed = np.zeros(len(fractions), np.uint32)
+    for column, count in zip(fractions.T, bits, strict=True):
+        most = 2**count - 1
+        packed = packed << np.uint32(count) | np.floor(np.clip(column, 0, 1) * most + 0.5).astype(np.uint32)
+    return packed
+
+
+def _unpacked(packed: np.ndarray, bits: tuple[int, ...]) -> np.ndarray:
+    """Return the fractions [N, k] of the lowest bits, the inverse of `_packed`."""
+    columns, rest = [], packed.astype(np.uint32)
+    for count in reversed(bits):
+        most = 2**count - 1
+        columns.append((rest & np.uint32(most)) / most)
+        rest = rest >> np.uint32(count)
+    return np.stack(columns[::-1], axis=1)
+
+
+def _packed_rotations(quats: np.ndarray) -> np.ndarray:
+    """Return unit quaternions [N, 4] as integers; q and -q, which are the same rotation, become the same one."""
+    largest = np.abs(quats).argmax(axis=1)
+    signs = np.where(np.take_along_axis(quats, largest[:, None], axis=1) < 0, -1, 1)
+    others = np.take_along_axis(quats * signs, _OTHERS[largest], axis=1)
+    return largest.astype(np.uint32) << np.uint32(30) | _packed(others * np.sqrt(0.5) + 0.5, _ROTATION_BITS)
+
+
+def _unpacked_rotations(packed: np.ndarray) -> np.ndarray:
+    others = (_unpacked(packed, _ROTATION_BITS) - 0.5) * np.sqrt(2)
+    largest = (packed >> np.uint32(30)).astype(np.int64)
+    quats = np.empty((len(packed), 4))
+    np.put_along_axis(quats, _OTHERS[largest], others, axis=1)
+    rest = np.sqrt(np.maximum(1 - (others**2).sum(axis=1), 0))
+    np.put_along_axis(quats, largest[:, None], rest[:, None], axis=1)
+    return quats

@@ -1,0 +1,98 @@
+"""Exported files in another program, splat-transform, which npm fetches; skipped without npm or a network."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi import cli
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.io.compressed_ply import read_compressed_ply, write_compressed_ply
+from morgs_mi.io.ply import read_ply, write_ply
+from morgs_mi.io.splats import read_splats
+from tests.assertions import assert_close
+from tests.scenes.changing_splats import splats, write_stream
+
+PAGE = (Path(__file__).parents[2] / "docs/exports.md").read_text(encoding="utf-8")
+COMMANDS = re.findall(r"^    (for .*npx .*; done)$", PAGE, re.MULTILINE)
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def program() -> str:
+    """Return the program with its version, as the page names it."""
+    (name,) = set(re.findall(r"npx --yes (\S+)", PAGE))
+    if shutil.which("npx") is None:
+        pytest.skip("npx is missing")
+    if subprocess.run(["npx", "--yes", name, "--version"], capture_output=True, timeout=300, check=False).returncode:
+        pytest.skip(f"npm cannot fetch {name}")
+    return name
+
+
+def convert(program: str, *files: Path) -> None:
+    subprocess.run(["npx", "--yes", program, "-g", "cpu", *map(str, files)], check=True, timeout=300)
+
+
+def assert_same(before: Gaussians, after: Gaussians, atol: float) -> None:
+    """Compare Gaussians in any order; quaternions up to their sign and length."""
+    columns = []
+    for gaussians in (before, after):
+        raw = gaussians.numpy()
+        quats = raw["quats"] / np.linalg.norm(raw["quats"], axis=1, keepdims=True)
+        rotations = np.einsum("ni,nj->nij", quats, quats)
+        parts = [raw["means"], raw["log_scales"], np.asarray(gaussians.opacities), rotations, raw["sh_coeffs"]]
+        table = np.concatenate([part.reshape(len(gaussians), -1) for part in parts], axis=1)
+        columns.append(table[np.argsort(raw["means"][:, 0], kind="stable")])
+    assert_close(columns[1], columns[0], atol=atol)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_write_compressed_ply__is_read_by_splat_transform(program, tmp_path, degree):
+    write_compressed_ply(tmp_path / "a.compressed.ply", splats(700, degree))
+    convert(program, tmp_path / "a.compressed.ply", tmp_path / "b.ply")
+    assert_same(read_compressed_ply(tmp_path / "a.compressed.ply"), read_ply(tmp_path / "b.ply"), atol=2e-6)
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_read_compressed_ply__reads_a_file_of_splat_transform(program, tmp_path, degree):
+    write_ply(tmp_path / "a.ply", splats(20, degree))
+    convert(program, tmp_path / "a.ply", tmp_path / "b.compressed.ply")
+    convert(program, tmp_path / "b.compressed.ply", tmp_path / "c.ply")
+    compressed = read_compressed_ply(tmp_path / "b.compressed.ply")
+    assert_same(read_ply(tmp_path / "c.ply"), compressed, atol=2e-6)
+    assert_same(splats(20, degree), compressed, atol=4.1 / 256)
+
+
+def test_write_ply__is_returned_by_splat_transform_unchanged(program, tmp_path):
+    write_ply(tmp_path / "a.ply", splats(100, 3))
+    convert(program, tmp_path / "a.ply", tmp_path / "b.ply")
+    assert_same(read_ply(tmp_path / "a.ply"), read_ply(tmp_path / "b.ply"), atol=1e-6)
+
+
+def test_read_splats__agrees_with_splat_transform_on_a_splat_file(program, tmp_path):
+    rng = np.random.default_rng(0)
+    bytes_of = rng.integers(20, 236, (50, 8), np.uint8)
+    numbers = rng.uniform(0.05, 1, (50, 6)).astype("<f4").view(np.uint8)
+    (tmp_path / "a.splat").write_bytes(np.concatenate([numbers, bytes_of], axis=1).tobytes())
+    convert(program, tmp_path / "a.splat", tmp_path / "b.ply")
+    # splat-transform takes the middle of 0 to 255 for the zero of a quaternion, the program that defined it 128.
+    assert_same(read_splats(tmp_path / "a.splat"), read_ply(tmp_path / "b.ply"), atol=0.03)
+
+
+@pytest.mark.parametrize(("command", "suffix"), [*zip(COMMANDS, (".sog", ".spz"), strict=True)])
+def test_exports_page__commands_convert_every_frame(program, tmp_path, command, suffix):
+    write_stream(tmp_path / "stream.morgs", 2)
+    assert cli.main(["export", "ply", str(tmp_path)]) == 0
+    subprocess.run(["bash", "-c", command.replace("OUT", str(tmp_path))], check=True, timeout=300)
+    assert len(list((tmp_path / "ply").glob(f"*{suffix}"))) == 2
+    convert(program, tmp_path / "ply" / f"0001{suffix}", tmp_path / "back.ply")
+    frame, back = read_ply(tmp_path / "ply" / "0001.ply"), read_ply(tmp_path / "back.ply")
+    # Both formats quantise colours and harmonics coarsely, positions finely.
+    order, places = (np.sort(gaussians.numpy()["means"], axis=0) for gaussians in (frame, back))
+    assert_close(places, order, atol=2e-3)

@@ -1,0 +1,62 @@
+"""Files of other tools by their names, and `.splat`."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pytest
+
+from morgs_mi.core.color_space import SH_C0
+from morgs_mi.io.compressed_ply import write_compressed_ply
+from morgs_mi.io.ply import write_ply
+from morgs_mi.io.splats import read_splats
+from tests.assertions import assert_close
+from tests.scenes.changing_splats import splats
+
+RECORD = struct.Struct("<6f8B")
+
+
+def test_read_splats__reads_a_splat_file(tmp_path):
+    records = [(1, 2, 3, 0.5, 0.25, 1, 255, 0, 51, 204, 128, 255, 128, 128), (0,) * 10 + (128,) * 4]
+    (tmp_path / "a.SPLAT").write_bytes(b"".join(RECORD.pack(*record) for record in records))
+    gaussians = read_splats(tmp_path / "a.SPLAT")
+    raw = gaussians.numpy()
+    np.testing.assert_array_equal(raw["means"], [[1, 2, 3], [0, 0, 0]])
+    assert_close(np.asarray(gaussians.scales)[0], (0.5, 0.25, 1), rtol=1e-6)
+    assert_close(0.5 + SH_C0 * raw["sh_coeffs"][0, 0], (1, 0, 0.2), atol=1e-6)
+    assert_close(np.asarray(gaussians.opacities), (0.8, 0), atol=2e-6)
+    assert_close(raw["quats"], [[0, 127 / 128, 0, 0], [0, 0, 0, 0]], atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply"])
+def test_read_splats__recognises_a_compressed_ply(tmp_path, name):
+    write_compressed_ply(tmp_path / name, splats())
+    assert len(read_splats(tmp_path / name)) == len(splats())
+
+
+def test_read_splats__reads_an_uncompressed_ply(tmp_path):
+    write_ply(tmp_path / "a.ply", splats())
+    np.testing.assert_array_equal(read_splats(tmp_path / "a.ply").numpy()["means"], splats().numpy()["means"])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.splat", bytes(33), "expected 32 bytes for each Gaussian, got 33 bytes"),
+        ("a.splat", RECORD.pack(*(0,) * 14) + RECORD.pack(np.nan, *(0,) * 13), "expected finite means, .* Gaussian 1"),
+        ("a.splat", RECORD.pack(*(0,) * 3, -1, *(0,) * 10), "expected finite scales of at least 0, got .* Gaussian 0"),
+        ("a.ply", b"", "expected a complete PLY file"),
+        ("a.ksplat", b"", r"name ends in .compressed.ply, .ply, .splat, got '.ksplat'"),
+    ],
+)
+def test_read_splats__names_what_is_broken(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_splats(tmp_path / name)
+    assert str(tmp_path / name) in str(caught.value)
+
+
+def test_read_splats__names_a_missing_file(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"a\.splat: expected a file with Gaussians, found none"):
+        read_splats(tmp_path / "a.splat")
