@@ -116,6 +116,8 @@ class FitConfig:
     """Opacity of the Gaussians at the start of the first frame."""
     first_frame_steps: int = 1500
     """Steps of the first frame, one view each."""
+    dropping: float = 0.0
+    """Probability with which each step of the first frame leaves a Gaussian out (see `dropping`)."""
     sh_band_fraction: float = 1 / 30
     """Fraction of the first frame's steps after which another SH band is added, as in 3DGS."""
     confidence_steps: int = 40

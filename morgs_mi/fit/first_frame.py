@@ -18,6 +18,7 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.density import plan_growth, resize_optimizer
+from morgs_mi.fit.dropping import dropped
 from morgs_mi.fit.optimise import adam, optimise, replace_parameter, values_of, view_order
 from morgs_mi.losses.attribution import densification_scores
 from morgs_mi.losses.losses import mask_loss, recon_loss
@@ -76,7 +77,7 @@ def fit_first_frame(
             resize_optimizer(optimizer, plan, plan.edits)
 
         def losses_at(values: Mapping[str, Tensor], view: int, base: Gaussians = gaussians) -> dict[str, Tensor]:
-            image = views[view].render(base.with_parameters(values))
+            image = views[view].render(dropped(base.with_parameters(values), config.dropping, rng))
             return {"recon": recon_loss(image.color, targets[view], config.objective.dssim_weight)}
 
         losses = optimise(

@@ -1,0 +1,39 @@
+"""Random dropping of Gaussians, a prior for views that nobody filmed (DropGaussian, Park et al. 2025).
+
+Where views are few or noisy, Gaussians conspire: one corrects what another one shows in a single view. In every step of
+the first frame, each Gaussian is left out with probability p, and the opacities of the others are scaled by 1/(1-p), so
+that each has to be right without the others.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.core.attributes import sigmoid
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.memory import from_numpy
+
+__all__ = ["dropped"]
+
+# Logit of an opacity that no cut-off of the renderer lets pass, and the largest opacity.
+_INVISIBLE, _MOST = -30.0, 0.999
+
+
+def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) -> Gaussians:
+    """Return the Gaussians as one step of the first frame renders them, differentiable.
+
+    Args:
+        gaussians: N Gaussians.
+        probability: with which each is left out, below 1; 0: none is.
+        rng: draws which.
+    """
+    if not probability:
+        return gaussians
+    kept = from_numpy(mi.UInt32, rng.random(len(gaussians), np.float32) >= probability) != 0
+    opacity = dr.minimum(sigmoid(gaussians.logit_opacities.array) * dr.opaque(mi.Float, 1 / (1 - probability)), _MOST)
+    logits = dr.select(kept, dr.log(opacity) - dr.log(1 - opacity), _INVISIBLE)
+    return replace(gaussians, logit_opacities=mi.TensorXf(logits))
