@@ -47,6 +47,7 @@ __all__ = [
     "coded_frames",
     "decode",
     "frames_near",
+    "frames_with_lasting_ids",
     "keyframe_packet",
     "play",
     "reemitted_keyframe",
@@ -249,6 +250,21 @@ def coded_frames(packets: Iterable[Packet]) -> Iterator[CodedFrame]:
         if coded is None or (packet.kind, packet.frame) != (PacketKind.KEYFRAME, coded.frame):
             coded = decode(coded, packet)
             yield coded  # a re-emitted keyframe is for readers that start there
+
+
+def frames_with_lasting_ids(packets: Iterable[Packet]) -> Iterator[tuple[np.ndarray, CodedFrame]]:
+    """Decode packets in order and yield (ids, state) after each frame, with ids that are unique in the whole stream.
+
+    Where a keyframe starts a new set of Gaussians with ids from 0, they are shifted behind the earlier ones, int64 [N].
+    """
+    first_id, coded = 0, None
+    for packet in packets:
+        if coded is not None and packet.kind == PacketKind.KEYFRAME:
+            if packet.frame == coded.frame:
+                continue  # a re-emitted keyframe is for readers that start there
+            first_id += coded.next_id
+        coded = decode(coded, packet)
+        yield coded.ids.astype(np.int64) + first_id, coded
 
 
 def play(packets: Iterable[Packet]) -> Iterator[tuple[int, Gaussians]]:

@@ -35,6 +35,7 @@ from morgs_mi.evaluate.results import (
     known_mean,
 )
 from morgs_mi.evaluate.temporal import StillVariation, recorded_change, slope
+from morgs_mi.evaluate.tracking import evaluate_tracks
 from morgs_mi.io.bounded import read_json
 from morgs_mi.playback.player import (
     has_confidence,
@@ -138,6 +139,7 @@ def evaluate_stream(
         playback=PlaybackTimes(**playback_speed(stream, stream.cameras[views[0]])),
         psnr_slope=slope([row.scores.psnr for row in rows]),
         frames=tuple(rows),
+        tracking=evaluate_tracks(stream, recording, views),
     )
 
 

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.codec.container import PacketKind
-from morgs_mi.codec.packets import CodedFrame, decode
+from morgs_mi.codec.packets import frames_with_lasting_ids
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import atomic_path
 
@@ -46,12 +45,12 @@ def extract_tracks(stream: StreamReader, progress: Callable[[int], None] | None 
         ValueError: a broken packet, or a stream without a frame.
     """
     ids_of_frames, rows, frames = [], [], []
-    for first_id, coded in _frames_with_first_id(stream):
+    for ids, coded in frames_with_lasting_ids(stream):
         gaussians = coded.gaussians
         has_confidence = gaussians.confidence is not None
         confidence = np.asarray(gaussians.confidence) if has_confidence else np.full(len(coded), np.nan, np.float32)
         frames.append(coded.frame)
-        ids_of_frames.append(coded.ids.astype(np.int64) + first_id)
+        ids_of_frames.append(ids)
         rows.append((gaussians.numpy()["means"], confidence))
         if progress is not None:
             progress(len(frames))
@@ -79,15 +78,3 @@ def write_tracks(path: str | Path, tracks: Tracks) -> None:
         np.savez_compressed(
             file, ids=tracks.ids, frames=tracks.frames, positions=tracks.positions, confidence=tracks.confidence
         )
-
-
-def _frames_with_first_id(stream: StreamReader) -> Iterator[tuple[int, CodedFrame]]:
-    """Yield (first_id, frame) for every frame; `first_id` is added to the frame's ids."""
-    first_id, coded = 0, None
-    for packet in stream:
-        if coded is not None and packet.frame == coded.frame:
-            continue  # a re-emitted keyframe, from which a receiver can start
-        if coded is not None and packet.kind == PacketKind.KEYFRAME:
-            first_id += coded.next_id
-        coded = decode(coded, packet)
-        yield first_id, coded
