@@ -46,15 +46,15 @@ def evaluation_tables(result: Evaluation) -> Iterator[Table]:
 
 
 def _tracking_table(result: Evaluation) -> Table:
-    """Return the scores of 3D point tracks, as the papers give them: shares in percent, errors in world units."""
-    title = "3D point tracks, shares in %, MTE in world units and % of the extent"
-    table = _table(title, "", "tracks", "AJ", "<d avg", "OA", "MTE", "MTE %", "survival", "bound")
+    """Return the scores of 3D point tracks in the units of the papers: shares in percent."""
+    title = "3D point tracks: shares in %, MTE in world units and in % of the extent"
+    table = _table(title, "", "tracks", "AJ", "<d avg", "OA", "MTE", "MTE, %", "survival")
     for row in result.tracking:
         for name, scores in ((row.protocol, row.all), ("  moving", row.moving)):
             shares = (scores.average_jaccard, scores.delta_avg, scores.occlusion_accuracy)
-            error = figure(scores.median_error, 4), figure(scores.median_error_percent, 2)
-            ends = (figure(100 * share, 1) for share in (scores.survival, scores.bound))
-            table.add_row(name, str(scores.num_tracks), *(figure(100 * s, 1) for s in shares), *error, *ends)
+            errors = figure(scores.median_error, 4), figure(scores.median_error_percent, 2)
+            survival = figure(100 * scores.survival, 1)
+            table.add_row(name, str(scores.num_tracks), *(figure(100 * s, 1) for s in shares), *errors, survival)
     return table
 
 

@@ -51,21 +51,21 @@ class TrackTruth:
         return camera.project(self.points)[1] / focal
 
 
-def synthetic_tracks(capture: Capture, views: Sequence[int]) -> TrackTruth | None:
-    """Return the tracks of a synthetic capture as some of its views see them, None without any.
+def synthetic_tracks(capture: Capture, views: Sequence[int]) -> list[TrackTruth]:
+    """Return the tracks of a synthetic capture as the video of some of its views together; empty without any.
 
     A track starts at the first frame in which one of the views sees it. Tracks that none of them sees are left out.
     Without stored visibility, all tracks start at frame 0.
     """
     if capture.truth is None or not (capture.truth / "tracks.npz").is_file():
-        return None
+        return []
     tracks = load_tracks(capture.truth)
     cameras = tuple(capture.cameras[view] for view in views)
     if not all(camera.name in tracks.visible for camera in cameras):
-        return TrackTruth(cameras, tracks.points, None, np.zeros(len(tracks.points), int))
+        return [TrackTruth(cameras, tracks.points, None, np.zeros(len(tracks.points), int))]
     visible = np.any([tracks.visible[camera.name] for camera in cameras], axis=0)
     seen = visible.any(1)
-    return TrackTruth(cameras, tracks.points[seen], visible[seen], visible[seen].argmax(1))
+    return [TrackTruth(cameras, tracks.points[seen], visible[seen], visible[seen].argmax(1))]
 
 
 def tapvid3d_tracks(capture: Capture) -> list[TrackTruth]:

@@ -35,26 +35,26 @@ def evaluate_tracks(stream: StreamReader, recording: Capture, views: Sequence[in
     Raises:
         ValueError: a packet, an annotation or the true tracks are broken.
     """
-    frames = [frame for frame, _ in play(stream)]
-    together = [video for video in (synthetic_tracks(recording, recording.train_views),) if video is not None]
-    per_view = tapvid3d_tracks(recording)
-    if together:
-        per_view = [video for view in views if (video := synthetic_tracks(recording, [view])) is not None]
-    videos = [_during(video, frames) for video in (*per_view, *together)]
+    joint = synthetic_tracks(recording, recording.train_views)
+    single = [video for view in views for video in synthetic_tracks(recording, [view])]
+    single = single or tapvid3d_tracks(recording)
+    if not single:
+        return ()
+    frames = sorted({packet.frame for packet in stream})
+    videos = [_during(video, frames) for video in (*single, *joint)]
     if len(frames) < 2 or not any(len(video.points) for video in videos):
         return ()
     compared = _compared(stream, videos, frames[0])
-    single, joint = compared[: len(per_view)], compared[len(per_view) :] or compared
+    per_view, together = compared[: len(single)], compared[len(single) :] or compared
     scale = read_settings(recording.path / "capture.json").get("meters_per_unit") or 1
     extent = scene_extent([recording.cameras[view] for view in recording.train_views])
-    protocols = ((TAPVID3D, single), (DYNAMIC_3D_GAUSSIANS, joint), (MVTRACKER, joint))
+    protocols = ((TAPVID3D, per_view), (DYNAMIC_3D_GAUSSIANS, together), (MVTRACKER, together))
     return tuple(score_tracks(protocol, videos, scale, extent) for protocol, videos in protocols)
 
 
 def _during(video: TrackTruth, frames: Sequence[int]) -> TrackTruth:
     """Return the part of true tracks in the consecutive frames of a stream, without tracks that start in others."""
-    stop = min(frames[-1] + 1, video.points.shape[1]) if frames else 0
-    start = frames[0] if frames else 0
+    start, stop = frames[0], min(frames[-1] + 1, video.points.shape[1])
     kept = (video.queries >= start) & (video.queries < stop)
     visible = None if video.visible is None else video.visible[kept, start:stop]
     return TrackTruth(video.cameras, video.points[kept, start:stop], visible, video.queries[kept] - start)
