@@ -47,27 +47,24 @@ class Protocol:
 
     Attributes:
         name: name in tables.
-        thresholds: of the distance, in pixels or centimetres.
+        thresholds: of the distance: pixels if `per_view`, otherwise centimetres.
         survival: distance at which a track fails, cm; None if the protocol defines neither survival nor MTE.
+        per_view: whether each view is a video of its own, whose points are counted together in all frames.
     """
 
     name: str
     thresholds: tuple[float, ...]
     survival: float | None
-
-    @property
-    def in_pixels(self) -> bool:
-        """Whether thresholds are pixels, views are videos of their own, and their points are counted together."""
-        return self.survival is None
+    per_view: bool = False
 
     @property
     def description(self) -> str:
         """The thresholds with their unit."""
         numbers = ", ".join(f"{threshold:g}" for threshold in self.thresholds)
-        return f"{numbers} {'px at 256 px' if self.in_pixels else 'cm'}"
+        return f"{numbers} {'px at 256 px' if self.per_view else 'cm'}"
 
 
-TAPVID3D = Protocol("TAPVid-3D", (1, 2, 4, 8, 16), None)
+TAPVID3D = Protocol("TAPVid-3D", (1, 2, 4, 8, 16), None, per_view=True)
 DYNAMIC_3D_GAUSSIANS = Protocol("Dynamic 3D Gaussians", (1, 2, 4, 8, 16), 50)
 MVTRACKER = Protocol("MVTracker", (5, 10, 20, 40), 100)
 
@@ -126,17 +123,17 @@ def score_tracks(
 
 def score(protocol: Protocol, videos: Sequence[Comparison], meters_per_unit: float, extent: float) -> TrackScores:
     """Return the scores of the tracks of some videos; see `score_tracks`."""
-    if not protocol.in_pixels:
+    if not protocol.per_view:
         videos = [_countable(video) for video in videos]
     num_tracks = sum(len(video.truth) for video in videos)
     if not num_tracks:
         return TrackScores()
     masks = [_evaluated(protocol, video) for video in videos]
     counts = [_counts(protocol, video, mask, meters_per_unit) for video, mask in zip(videos, masks, strict=True)]
-    units = [count.sum(1, keepdims=True) for count in counts] if protocol.in_pixels else counts
-    average_jaccard, delta_avg, accuracy = (
-        known_mean(column) for column in np.concatenate(list(map(_shares, units))).T
-    )
+    if protocol.per_view:
+        counts = [count.sum(1, keepdims=True) for count in counts]
+    shares = np.concatenate([_shares(count) for count in counts])
+    average_jaccard, delta_avg, accuracy = (known_mean(column) for column in shares.T)
     alive = np.concatenate([video.alive[mask] for video, mask in zip(videos, masks, strict=True)])
     scores = TrackScores(
         num_tracks,
@@ -156,16 +153,18 @@ def score(protocol: Protocol, videos: Sequence[Comparison], meters_per_unit: flo
 
 def _evaluated(protocol: Protocol, video: Comparison) -> np.ndarray:
     """Return the mask [P, T] of the points and frames that count for all scores but MTE and survival."""
-    frames = np.arange(video.truth.shape[1])
-    return (frames >= 0) & (protocol.in_pixels | (frames > video.queries[:, None]))
+    later = np.arange(video.truth.shape[1]) > video.queries[:, None]
+    return np.ones_like(later) if protocol.per_view else later
 
 
 def _counts(protocol: Protocol, video: Comparison, evaluated: np.ndarray, meters_per_unit: float) -> np.ndarray:
     """Return numbers of points [6, P, D] for D thresholds: those that `_shares` needs."""
     visible, found = (mask[..., None] for mask in _visibility(video))
     error = np.linalg.norm(video.found - video.truth, axis=-1)[..., None]
-    # Where the protocol is in pixels, the video is a single view.
-    unit = _CENTIMETRE / meters_per_unit if video.pixel is None or not protocol.in_pixels else video.pixel[..., None]
+    unit = np.array(_CENTIMETRE / meters_per_unit)
+    if protocol.per_view:
+        assert video.pixel is not None
+        unit = video.pixel[..., None]
     within = visible & (error < np.array(protocol.thresholds) * unit)
     hits = within & found
     masks = (visible, within, hits, found & ~hits, visible == found, evaluated[..., None])
@@ -197,10 +196,9 @@ def _median_error_and_survival(video: Comparison, failure: float) -> np.ndarray:
 
 
 def _countable(video: Comparison) -> Comparison:
-    """Return the tracks with at least two visible frames from the query on, of which one is after it."""
-    frames, queries = np.arange(video.truth.shape[1]), video.queries[:, None]
+    """Return the tracks with at least two visible frames from the query on."""
     visible, _ = _visibility(video)
-    return video.select(((visible & (frames >= queries)).sum(1) >= 2) & (visible & (frames > queries)).any(1))
+    return video.select((visible & (np.arange(video.truth.shape[1]) >= video.queries[:, None])).sum(1) >= 2)
 
 
 def _visibility(video: Comparison) -> tuple[np.ndarray, np.ndarray]:
