@@ -86,8 +86,8 @@ def evaluate_stream(
 
     Raises:
         FileNotFoundError: the stream or the capture is missing.
-        ValueError: the stream is truncated, broken or empty, the stream was fitted to another capture, or the
-            network does not accept images of this size.
+        ValueError: the stream is truncated, broken or empty, the stream was fitted to another capture, the
+            network does not accept images of this size, or the true tracks are broken.
     """
     stream = open_stream(out)
     packets, count = _packets(stream)

@@ -136,10 +136,11 @@ def bind(gaussians: Gaussians, points: np.ndarray, num_gaussians: int) -> tuple[
         part = slice(start, start + step)
         x = points[part]
         response = np.hstack([x[:, i] * x[:, j], x, np.ones((len(x), 1))]) @ polynomial
-        best = np.argpartition(response, -count, axis=1)[:, -count:]
-        largest = np.take_along_axis(response, best, 1)
-        order = np.argsort(-largest, axis=1, kind="stable")
-        rows[part], largest = np.take_along_axis(best, order, 1), np.take_along_axis(largest, order, 1)
+        largest = np.zeros((len(x), count))
+        for k in range(count):  # several times faster than a partition of the rows
+            best = response.argmax(1)
+            rows[part, k], largest[:, k] = best, response[np.arange(len(x)), best]
+            response[np.arange(len(x)), best] = -np.inf
         # Relative to the largest: far from all Gaussians every response underflows.
         weights[part] = np.exp(largest - largest[:, :1])
     return rows, weights / weights.sum(1, keepdims=True)

@@ -105,8 +105,15 @@ def _lens(where: str, entry: Mapping[str, Any]) -> Lens:
 def _calibration_files(path: Path) -> list[Path]:
     """Return the calibrations of a capture, in it or in its folder `calibration`."""
     files = [file for folder in (path, path / "calibration") for file in sorted(folder.glob("*.toml"))]
-    texts = {file: file.read_text(encoding="utf-8", errors="replace") for file in files if file.is_file()}
-    return [file for file, text in texts.items() if all(mark.search(text) for mark in _MARKS)]
+    return [file for file in files if _is_calibration(file)]
+
+
+def _is_calibration(file: Path) -> bool:
+    try:
+        text = file.read_text(encoding="utf-8", errors="replace")
+    except OSError:  # a folder, or a file of somebody else
+        return False
+    return all(mark.search(text) for mark in _MARKS)
 
 
 def _read_calibration(path: Path) -> Calibration:
