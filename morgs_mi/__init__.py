@@ -13,6 +13,7 @@ from morgs_mi.core.camera import Camera  # noqa: E402
 from morgs_mi.core.color_space import SH_C0  # noqa: E402
 from morgs_mi.core.gaussians import Gaussians  # noqa: E402
 from morgs_mi.evaluate.evaluate import evaluate_stream  # noqa: E402
+from morgs_mi.evaluate.point_tracks import PointTracks, track_points  # noqa: E402
 from morgs_mi.export.tracks import extract_tracks  # noqa: E402
 from morgs_mi.fit.config import FitConfig  # noqa: E402
 from morgs_mi.gaussian_integrator import ellipsoids  # noqa: E402  (registers the integrator `gaussian_splat`)
@@ -37,6 +38,7 @@ __all__ = [
     "Gaussians",
     "Image",
     "MotionConfig",
+    "PointTracks",
     "RenderConfig",
     "StreamConfig",
     "StreamLoop",
@@ -57,4 +59,5 @@ __all__ = [
     "render_stream",
     "stream_capture",
     "synthesize",
+    "track_points",
 ]

@@ -14,7 +14,7 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 
-__all__ = ["Lens", "Undistortion", "lens_and_intrinsics", "undistortion"]
+__all__ = ["Lens", "Undistortion", "lens_and_intrinsics", "opencv_lens", "undistortion"]
 
 # Per COLMAP model, in the order of its binary ids: the number of focal lengths and of coefficients.
 MODELS = {
@@ -69,6 +69,12 @@ def lens_and_intrinsics(model: str, params: Sequence[float]) -> tuple[Lens, np.n
     fx, fy, (cx, cy) = params[0], params[focals - 1], params[focals : focals + 2]
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
     return Lens(model, tuple(map(float, params[focals + 2 :]))), K
+
+
+def opencv_lens(coefficients: Sequence[float]) -> Lens:
+    """Return the lens with OpenCV's coefficients k1 k2 p1 p2, or k1 k2 p1 p2 k3, or k1 k2 p1 p2 k3 k4 k5 k6."""
+    first, more = tuple(map(float, coefficients[:4])), tuple(map(float, coefficients[4:]))
+    return Lens("FULL_OPENCV", (*first, *more, *(0.0,) * (4 - len(more)))) if any(more) else Lens("OPENCV", first)
 
 
 @dataclass(frozen=True)

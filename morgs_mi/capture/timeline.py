@@ -262,19 +262,23 @@ def _fps(path: Path, readers: Sequence[FrameReader], given: float | None) -> flo
 
 
 def read_settings(path: Path) -> dict[str, Any]:
-    """Return the settings ``fps`` and ``test_view`` in a capture's `capture.json`, or {} without such a file.
+    """Return the settings in a capture's `capture.json`, or {} without such a file.
+
+    They are ``fps``, ``test_view`` and ``meters_per_unit``, the length of a world unit in metres.
 
     Raises:
-        ValueError: the file is not a JSON object, or `fps` or `test_view` is not valid.
+        ValueError: the file is not a JSON object, or a setting is not valid.
     """
     if not path.exists():
         return {}
     settings = read_json(path)
     if not isinstance(settings, dict):
         raise ValueError(f"{path}: expected a JSON object, got {type(settings).__name__}; correct it.")
-    fps, view = settings.get("fps"), settings.get("test_view")
-    if fps is not None and not (isinstance(fps, int | float) and fps > 0):
-        raise ValueError(f"{path}: `fps` must be a positive number, got {fps!r}; correct it.")
+    view = settings.get("test_view")
+    for name in ("fps", "meters_per_unit"):
+        value = settings.get(name)
+        if value is not None and not (isinstance(value, int | float) and value > 0):
+            raise ValueError(f"{path}: `{name}` must be a positive number, got {value!r}; correct it.")
     if view is not None and type(view) is not int:
         raise ValueError(f"{path}: `test_view` must be a camera's index or null, got {view!r}; correct it.")
     return settings

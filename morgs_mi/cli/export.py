@@ -36,7 +36,7 @@ class Ply:
     def run(self) -> None:
         from morgs_mi.codec.packets import play
         from morgs_mi.export.clips import select_frames, write_each
-        from morgs_mi.export.ids import by_place
+        from morgs_mi.export.order import by_place
         from morgs_mi.io.compressed_ply import write_compressed_ply
         from morgs_mi.io.ply import write_ply
         from morgs_mi.playback.player import open_stream

@@ -47,6 +47,8 @@ __all__ = [
     "coded_frames",
     "decode",
     "frames_near",
+    "frames_with_first_id",
+    "frames_with_lasting_ids",
     "keyframe_packet",
     "play",
     "reemitted_keyframe",
@@ -249,6 +251,26 @@ def coded_frames(packets: Iterable[Packet]) -> Iterator[CodedFrame]:
         if coded is None or (packet.kind, packet.frame) != (PacketKind.KEYFRAME, coded.frame):
             coded = decode(coded, packet)
             yield coded  # a re-emitted keyframe is for readers that start there
+
+
+def frames_with_first_id(packets: Iterable[Packet]) -> Iterator[tuple[int, CodedFrame]]:
+    """Decode packets in order and yield (first_id, state) after each frame; `first_id` is added to the state's ids.
+
+    It changes where a keyframe starts a new set of Gaussians with ids from 0, so that no two Gaussians have one id.
+    """
+    first_id, coded = 0, None
+    for packet in packets:
+        if coded is not None and packet.kind == PacketKind.KEYFRAME:
+            if packet.frame == coded.frame:
+                continue  # a re-emitted keyframe is for readers that start there
+            first_id += max(coded.next_id, 1)  # also after a set without Gaussians
+        coded = decode(coded, packet)
+        yield first_id, coded
+
+
+def frames_with_lasting_ids(packets: Iterable[Packet]) -> Iterator[tuple[np.ndarray, CodedFrame]]:
+    """Decode packets in order and yield (ids, state) after each frame; ids int64 [N] are unique in the whole stream."""
+    return ((coded.ids.astype(np.int64) + first_id, coded) for first_id, coded in frames_with_first_id(packets))
 
 
 def play(packets: Iterable[Packet]) -> Iterator[tuple[int, Gaussians]]:

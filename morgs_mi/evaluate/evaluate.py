@@ -35,6 +35,7 @@ from morgs_mi.evaluate.results import (
     known_mean,
 )
 from morgs_mi.evaluate.temporal import StillVariation, recorded_change, slope
+from morgs_mi.evaluate.tracking import evaluate_tracks
 from morgs_mi.io.bounded import read_json
 from morgs_mi.playback.player import (
     has_confidence,
@@ -85,8 +86,8 @@ def evaluate_stream(
 
     Raises:
         FileNotFoundError: the stream or the capture is missing.
-        ValueError: the stream is truncated, broken or empty, the stream was fitted to another capture, or the
-            network does not accept images of this size.
+        ValueError: the stream is truncated, broken or empty, the stream was fitted to another capture, the
+            network does not accept images of this size, or the true tracks are broken.
     """
     stream = open_stream(out)
     packets, count = _packets(stream)
@@ -138,6 +139,7 @@ def evaluate_stream(
         playback=PlaybackTimes(**playback_speed(stream, stream.cameras[views[0]])),
         psnr_slope=slope([row.scores.psnr for row in rows]),
         frames=tuple(rows),
+        tracking=evaluate_tracks(stream, recording, views),
     )
 
 

@@ -18,6 +18,8 @@ __all__ = [
     "PlaybackTimes",
     "Sizes",
     "Timings",
+    "TrackScores",
+    "TrackingScores",
     "VariationScores",
     "ViewScores",
     "known_mean",
@@ -101,6 +103,42 @@ class Motion3DScores(_Scores):
     """Mean of |d| divided by `true_length`."""
     angle: float = _NAN
     """Mean angle between d and d*, degrees; 90 for a Gaussian that does not move."""
+
+
+@dataclass(frozen=True)
+class TrackScores:
+    """Scores of 3D point tracks by one protocol (see `track_scores`); NaN where the protocol does not define one."""
+
+    num_tracks: int = 0
+    """Number of tracks that are compared."""
+    average_jaccard: float = _NAN
+    """AJ: Jaccard index of positions and visibility, mean over the thresholds, in [0, 1]."""
+    delta_avg: float = _NAN
+    """Share of the visible points that are within a threshold, mean over the thresholds, in [0, 1]."""
+    occlusion_accuracy: float = _NAN
+    """OA: share of the points whose visibility is right, in [0, 1]."""
+    median_error: float = _NAN
+    """MTE: median over the visible points of a track of the distance, mean over the tracks, world units."""
+    median_error_percent: float = _NAN
+    """The same in percent of the scene extent."""
+    survival: float = _NAN
+    """Share of a track before its first failure, mean over the tracks, in [0, 1]."""
+    bound: float = _NAN
+    """Share of the points and frames for which a Gaussian of the point is alive, in [0, 1]."""
+
+
+@dataclass(frozen=True)
+class TrackingScores:
+    """Scores of 3D point tracks by one protocol."""
+
+    protocol: str
+    """Name of the protocol."""
+    thresholds: str
+    """Its thresholds with their units."""
+    all: TrackScores
+    """Scores of all tracks."""
+    moving: TrackScores
+    """Scores of the tracks whose true paths are longer than 10 cm."""
 
 
 @dataclass(frozen=True)
@@ -206,6 +244,8 @@ class Evaluation:
     psnr_slope: float
     """Slope of the PSNR, dB per frame."""
     frames: tuple[FrameScores, ...]
+    tracking: tuple[TrackingScores, ...] = ()
+    """3D point tracks against the true ones, a row per protocol; empty without true tracks."""
 
     @property
     def num_frames(self) -> int:
@@ -251,6 +291,7 @@ class Evaluation:
             **means,
             "psnr_slope": self.psnr_slope,
             "motion_3d": _optional(self.motion_3d),
+            "tracking": [asdict(row) for row in self.tracking],
             "seconds": {**asdict(self.seconds), "definition": _SECONDS},
             "bytes": asdict(self.sizes),
             "mtv": asdict(self.variation),

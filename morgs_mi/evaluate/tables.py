@@ -24,7 +24,7 @@ def figure(value: float | None, digits: int) -> str:
 
 
 def evaluation_tables(result: Evaluation) -> Iterator[Table]:
-    """Yield a table of the frames and one of the regions."""
+    """Yield a table of the frames, one of the regions and, with true tracks, one of the point tracks."""
     frames = _table("frame by frame", "frame", *(title for title, *_ in _FRAME), "kB", "s")
     for row in result.frames:
         scores = (figure(getattr(row.scores, name), digits) for _, name, digits in _FRAME)
@@ -41,6 +41,21 @@ def evaluation_tables(result: Evaluation) -> Iterator[Table]:
         regions.add_row("mTV x100", "", "", figure(result.variation.render, 3))
         regions.add_row("mTV x100 of the recording", "", "", figure(result.variation.input, 3))
     yield regions
+    if result.tracking:
+        yield _tracking_table(result)
+
+
+def _tracking_table(result: Evaluation) -> Table:
+    """Return the scores of 3D point tracks in the units of the papers: shares in percent."""
+    title = "3D point tracks: shares in %, MTE in world units and in % of the extent"
+    table = _table(title, "", "tracks", "AJ", "<d avg", "OA", "MTE", "MTE, %", "survival")
+    for row in result.tracking:
+        for name, scores in ((row.protocol, row.all), ("  moving", row.moving)):
+            shares = (scores.average_jaccard, scores.delta_avg, scores.occlusion_accuracy)
+            errors = figure(scores.median_error, 4), figure(scores.median_error_percent, 2)
+            survival = figure(100 * scores.survival, 1)
+            table.add_row(name, str(scores.num_tracks), *(figure(100 * s, 1) for s in shares), *errors, survival)
+    return table
 
 
 def evaluation_summary(result: Evaluation) -> Iterator[str]:

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from morgs_mi.codec.packets import frames_with_lasting_ids
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import atomic_path
-from morgs_mi.export.ids import frames_with_first_id
 
 __all__ = ["Tracks", "extract_tracks", "write_tracks"]
 
@@ -45,12 +45,12 @@ def extract_tracks(stream: StreamReader, progress: Callable[[int], None] | None 
         ValueError: a broken packet, or a stream without a frame.
     """
     ids_of_frames, rows, frames = [], [], []
-    for first_id, coded in frames_with_first_id(stream):
+    for ids, coded in frames_with_lasting_ids(stream):
         gaussians = coded.gaussians
         has_confidence = gaussians.confidence is not None
         confidence = np.asarray(gaussians.confidence) if has_confidence else np.full(len(coded), np.nan, np.float32)
         frames.append(coded.frame)
-        ids_of_frames.append(coded.ids.astype(np.int64) + first_id)
+        ids_of_frames.append(ids)
         rows.append((gaussians.numpy()["means"], confidence))
         if progress is not None:
             progress(len(frames))

@@ -38,13 +38,12 @@ from typing import Any
 import numpy as np
 from scipy.special import expit
 
-from morgs_mi.codec.packets import CodedFrame
+from morgs_mi.codec.packets import CodedFrame, frames_with_first_id
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances, rotated, unit_quats
 from morgs_mi.export.axes import gltf_axes
-from morgs_mi.export.ids import frames_with_first_id
 
 __all__ = ["SUFFIXES", "write_usd"]
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["check_claim", "read_array", "read_json"]
+__all__ = ["array_names", "check_claim", "read_array", "read_json"]
 
 _FACTOR, _ALLOWANCE = 10, 200_000_000
 # What NumPy and zipfile raise for broken files. NumPy parses headers as Python.
@@ -88,6 +88,19 @@ def read_array(path: str | Path, name: str | None = None) -> np.ndarray:
     except _BROKEN as error:
         what = "a NumPy array" if name is None else f"an array `{name}` in a NumPy archive"
         raise ValueError(f"{path}: expected {what}, got a broken file ({error}); export it again.") from None
+
+
+def array_names(path: str | Path) -> list[str]:
+    """Return the names of the arrays in a NumPy archive (.npz).
+
+    Raises:
+        ValueError: the file is broken.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return [name.removesuffix(".npy") for name in archive.namelist()]
+    except _BROKEN as error:
+        raise ValueError(f"{path}: expected a NumPy archive, got a broken file ({error}); export it again.") from None
 
 
 def _member(path: str | Path, name: str) -> bytes:

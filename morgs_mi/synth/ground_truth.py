@@ -8,14 +8,15 @@ On disk: ``truth/cam00/0000.exr`` holds one camera's frame, ``truth/tracks.npz``
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.io.bounded import read_array
+from morgs_mi.io.bounded import array_names, read_array
 from morgs_mi.io.exr import read_exr, write_exr
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "load_tracks",
     "load_truth",
     "move_with_objects",
+    "save_tracks",
     "save_truth",
 ]
 
@@ -53,10 +55,12 @@ class Tracks:
     Attributes:
         points: positions at each frame [P, T, 3], world units.
         ids: object id of each point [P], int32.
+        visible: by camera name, whether the camera sees each point at each frame [P, T], bool; empty if unknown.
     """
 
     points: np.ndarray
     ids: np.ndarray
+    visible: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 def move_with_objects(
@@ -156,13 +160,27 @@ def load_tracks(folder: str | Path) -> Tracks:
 
     Raises:
         FileNotFoundError: the folder has none.
+        ValueError: the file is broken.
     """
     path = Path(folder) / "tracks.npz"
     if not path.is_file():
         raise FileNotFoundError(
             f"load_tracks(): there is no file {path}; pass the truth folder of a synthetic capture."
         )
-    return Tracks(read_array(path, "points"), read_array(path, "ids"))
+    points, ids = read_array(path, "points"), read_array(path, "ids")
+    prefix = "visible_"
+    names = [name.removeprefix(prefix) for name in array_names(path) if name.startswith(prefix)]
+    return Tracks(points, ids, {name: read_array(path, prefix + name) for name in names})
+
+
+def save_tracks(folder: str | Path, tracks: Tracks) -> None:
+    """Write the trajectories into a capture's ``truth`` folder.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    arrays: dict[str, Any] = {f"visible_{name}": mask for name, mask in tracks.visible.items()}
+    np.savez_compressed(Path(folder) / "tracks.npz", points=tracks.points, ids=tracks.ids, **arrays)
 
 
 def _path(folder: str | Path, camera: str, frame: int) -> Path:

@@ -14,6 +14,9 @@ from morgs_mi.synth.scene import Scene
 
 __all__ = ["PathTracer", "srgb_bytes"]
 
+# Share of a point's distance in which a hit is its own surface: intersections are single-precision.
+_OWN_SURFACE = 1e-4
+
 
 def srgb_bytes(linear: np.ndarray, noise: np.ndarray | float = 0.0) -> np.ndarray:
     """Return linear light [...] in [0, 1] as sRGB plus `noise`, clipped and rounded to uint8.
@@ -128,3 +131,14 @@ class PathTracer:
             ids[np.array((hit.shape == pointer) | (hit.instance == pointer))] = index
         shape = camera.height, camera.width
         return np.array(hit.p, float).T.reshape(*shape, 3), ids.reshape(shape)
+
+    def sees(self, camera: Camera, points: np.ndarray) -> np.ndarray:
+        """Return the mask of the surface points [P, 3] that a camera sees: inside its image, with nothing in front."""
+        pixels, depth = camera.project(points)
+        inside = ((depth > camera.near)[:, None] & (pixels >= 0) & (pixels < (camera.width, camera.height))).all(-1)
+        offset = points - camera.position
+        distance = np.linalg.norm(offset, axis=-1)
+        origins = np.repeat(camera.position[:, None], len(points), axis=1)
+        ray: Any = mi.Ray3f(mi.Point3f(origins), mi.Vector3f((offset / distance[:, None]).T))
+        ray.maxt = mi.Float((1 - _OWN_SURFACE) * distance)
+        return inside & ~np.array(self._scene.ray_test(ray))

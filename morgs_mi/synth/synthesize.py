@@ -22,7 +22,7 @@ from morgs_mi.core.files import atomic_path, write_json
 from morgs_mi.io.bounded import read_json
 from morgs_mi.io.video import open_frames
 from morgs_mi.io.video_writer import playable_format, write_video
-from morgs_mi.synth.ground_truth import Tracks, compute_ground_truth, move_with_objects, save_truth
+from morgs_mi.synth.ground_truth import Tracks, compute_ground_truth, move_with_objects, save_tracks, save_truth
 from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import Scene, check_scene, load_scene
 
@@ -140,8 +140,7 @@ def synthesize(
             write_video(video, images, fps, codec)
             clips.append(png if lossless else video)
             _write_truth(tracer, camera, times, fps, folder / "truth")
-        tracks = _sample_tracks(tracer, cameras, times, np.random.default_rng([seed, 1]))
-        np.savez_compressed(folder / "truth" / "tracks.npz", points=tracks.points, ids=tracks.ids)
+        save_tracks(folder / "truth", _sample_tracks(tracer, cameras, times, np.random.default_rng([seed, 1])))
         _write_calibration(tracer, cameras, clips, folder, np.random.default_rng([seed, 2]))
         about = {
             "scene": scene.name,
@@ -214,7 +213,13 @@ def _sample_tracks(
                 here, own = visible.reshape(-1, 3)[pixels], ids.ravel()[pixels]
                 points.append(np.stack([move_with_objects(here, own, poses, tracer.poses(t)) for t in times], axis=1))
                 owners.append(own)
-    return Tracks(np.concatenate(points), np.concatenate(owners))
+    tracks = np.concatenate(points)
+    visible = {camera.name: np.zeros(tracks.shape[:2], bool) for camera in cameras}
+    for frame, time in enumerate(times):
+        tracer.set_time(time)
+        for camera in cameras:
+            visible[camera.name][:, frame] = tracer.sees(camera, tracks[:, frame])
+    return Tracks(tracks, np.concatenate(owners), visible)
 
 
 def _write_calibration(

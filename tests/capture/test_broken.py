@@ -238,14 +238,62 @@ DYNAMIC3DGS = {
     "broken points": (truncated("init_pt_cld.npz"), "init_pt_cld.npz: expected an array `data`"),
     "truncated image": (empty("ims/1/000000.png"), "ims/1/000000.png: expected an image, got 0 bytes"),
 }
+ANIPOSE = {
+    "broken file": (truncated("calibration.toml"), "calibration.toml: expected TOML, got a broken file"),
+    "no clip": (missing("trial_1-camB.mkv"), "its image 'camB' needs a clip called camB, found trial_1-camA"),
+    "no pose": (
+        replace("calibration.toml", "translation", "translate"),
+        r"\[cam_0\]: `translation` must be .* got none",
+    ),
+    "word": (
+        replace("calibration.toml", "rotation = [", 'rotation = ["a", '),
+        r"`rotation` must be finite numbers \[3\]",
+    ),
+    "NaN pose": (
+        replace("calibration.toml", "rotation = [", "rotation = [nan, 0.0, 0.0]#"),
+        "`rotation` must be finite",
+    ),
+    "three coefficients": (
+        replace("calibration.toml", "distortions = [0.0, 0.0, ", "distortions = ["),
+        r"\[cam_0\]: `distortions` must be finite numbers \[4\] or \[5\] or \[8\], got",
+    ),
+    "no size": (
+        replace("calibration.toml", "size", "sizes"),
+        r"\[cam_0\]: `size` must be finite numbers \[2\], got none",
+    ),
+    "half a pixel": (replace("calibration.toml", "size = [62.0", "size = [62.5"), "`size` must be whole pixels"),
+    "name": (replace("calibration.toml", '"camA"', "[]"), r"\[cam_0\]: `name` must be a text, got \[\]"),
+    "negative focal length": (replace("calibration.toml", "matrix = [[", "matrix = [[-"), "positive focal lengths"),
+    "skew": (replace("calibration.toml", ", 0.0, ", ", 0.1, "), r"\[cam_0\]: .* resample the images"),
+}
+QUALISYS = {
+    "broken file": (truncated("rig.qca.txt"), "rig.qca.txt: expected XML, got a broken file"),
+    "no cameras": (replace("rig.qca.txt", "<cameras>", "<cameras/><!--"), "expected XML, got a broken file"),
+    "document type": (replace("rig.qca.txt", "<calibration>", "<!DOCTYPE a><calibration>"), "declares a document type"),
+    "no transform": (
+        replace("rig.qca.txt", "transform", "moved"),
+        "'26580': expected an element `transform`, found none",
+    ),
+    "no attribute": (replace("rig.qca.txt", " y=", " why="), "`y` of `transform` must be a finite number, got none"),
+    "word": (replace("rig.qca.txt", 'r11="', 'r11="none'), "`r11` of `transform` must be a finite number, got 'none"),
+    "no rotation": (replace("rig.qca.txt", 'r11="', 'r11="3'), "'26580': the axes must be a right-handed"),
+    "no serial": (replace("rig.qca.txt", 'serial="26580"', ""), "every `camera` must have a `serial`, got one without"),
+    "no image": (replace("rig.qca.txt", 'right="71"', 'right="8"'), "'26580': .* at least 1x1"),
+    "two files": (
+        lambda path: (path / "old.qca.txt").write_text((path / "rig.qca.txt").read_text()),
+        r"expected one file \*.qca.txt, got old.qca.txt, rig.qca.txt; keep",
+    ),
+}
 TABLES = {
     layouts.n3dv: POSES_BOUNDS,
     lambda path: layouts.meet_room(path, layouts.folder_per_frame): BY_FRAME,
     layouts.colmap: COLMAP,
     layouts.nerfstudio: NERFSTUDIO,
     layouts.dynamic3dgs: DYNAMIC3DGS,
+    layouts.anipose: ANIPOSE,
+    layouts.qualisys: QUALISYS,
 }
-TITLES = ("poses_bounds", "by frame", "COLMAP", "Nerfstudio", "Dynamic 3D Gaussians")
+TITLES = ("poses_bounds", "by frame", "COLMAP", "Nerfstudio", "Dynamic 3D Gaussians", "Anipose", "Qualisys")
 CASES = [
     pytest.param(build, *case, id=f"{title}: {name}")
     for title, (build, table) in zip(TITLES, TABLES.items(), strict=True)

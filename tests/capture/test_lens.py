@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.capture.lens import Lens, lens_and_intrinsics, undistortion
+from morgs_mi.capture.lens import Lens, lens_and_intrinsics, opencv_lens, undistortion
 from morgs_mi.core.camera import Camera
 from tests.assertions import assert_close
 
@@ -100,3 +100,18 @@ def test_undistortion__mask_ends_where_the_polynomial_folds(model: str, fold: fl
 def test_lens_and_intrinsics__refuse_bad_input(model: str, params: tuple[float, ...], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         lens_and_intrinsics(model, params)
+
+
+@pytest.mark.parametrize(
+    ("coefficients", "model", "distortion"),
+    [
+        ((0.1, 0.2, 0.3, 0.4), "OPENCV", (0.1, 0.2, 0.3, 0.4)),
+        ((0.1, 0.2, 0.3, 0.4, 0), "OPENCV", (0.1, 0.2, 0.3, 0.4)),
+        ((0.1, 0.2, 0.3, 0.4, 0.5), "FULL_OPENCV", (0.1, 0.2, 0.3, 0.4, 0.5, 0, 0, 0)),
+        ((1, 2, 3, 4, 5, 6, 7, 8), "FULL_OPENCV", (1, 2, 3, 4, 5, 6, 7, 8)),
+    ],
+)
+def test_opencv_lens__keeps_the_order_of_opencv(coefficients: tuple, model: str, distortion: tuple) -> None:
+    lens = opencv_lens(coefficients)
+    assert (lens.model, lens.distortion) == (model, distortion)
+    np.testing.assert_array_equal(lens.opencv_coefficients[: len(coefficients)], coefficients)

@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.io.bounded import read_array, read_json
+from morgs_mi.io.bounded import array_names, read_array, read_json
 from morgs_mi.io.exr import read_exr, write_exr
 from morgs_mi.io.ply import read_vertices
 from morgs_mi.io.splats import read_splats
@@ -156,6 +156,14 @@ def test_read_array__inverts_save(tmp_path: Path, order) -> None:
     np.testing.assert_array_equal(read_array(tmp_path / "a.npy"), array)
     np.testing.assert_array_equal(read_array(tmp_path / "a.npz", "data"), array)
     assert read_array(tmp_path / "a.npz", "scalar") == 3
+
+
+def test_array_names__lists_an_archive_or_names_a_broken_one(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", data=np.zeros(2), scalar=np.int64(3))
+    assert array_names(tmp_path / "a.npz") == ["data", "scalar"]
+    (tmp_path / "a.npz").write_bytes(b"PK")
+    with pytest.raises(ValueError, match=r"a.npz: expected a NumPy archive, got a broken file"):
+        array_names(tmp_path / "a.npz")
 
 
 def test_read_json__inverts_dumps(tmp_path: Path) -> None:

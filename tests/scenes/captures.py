@@ -152,3 +152,79 @@ def dynamic3dgs(path: Path) -> Path:
     (path / "train_meta.json").write_text(json.dumps(meta))
     np.savez(path / "init_pt_cld.npz", data=[[1, 2, 3, 0.1, 0.2, 0.3, 1]])
     return path
+
+
+def anipose(path: Path, distortions: tuple[float, ...] = (0, 0, 0, 0, 0), clips: Callable = videos) -> Path:
+    """Write a calibration of Anipose, beside clips whose names contain those of the cameras."""
+    path.mkdir(parents=True)
+    names = ("camA", "camB", "camC")
+    tables = []
+    for i, camera in enumerate(rig(names, shift=3)):
+        # OpenCV puts pixel centres at integers.
+        K = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        entries = {
+            "name": json.dumps(camera.name),
+            "size": [float(WIDTH), float(HEIGHT)],
+            "matrix": K.tolist(),
+            "distortions": list(map(float, distortions)),
+            "rotation": Rotation.from_matrix(camera.viewmat[:3, :3]).as_rotvec().tolist(),
+            "translation": camera.viewmat[:3, 3].tolist(),
+        }
+        tables.append("\n".join([f"[cam_{i}]", *(f"{key} = {value}" for key, value in entries.items())]))
+    text = "\n\n".join([*tables, "[metadata]\nadjusted = false\nerror = 0.2\n"])
+    (path / "calibration.toml").write_text(text)
+    clips(path, tuple(f"trial_1-{name}" for name in names))
+    return path
+
+
+QUALISYS = """  <camera active="1" calibrated="true" serial="{serial}" model="Miqus Video" viewrotation="0">
+    <fov_video left="10" top="20" right="{right}" bottom="{bottom}"/>
+    <transform x="{x}" y="{y}" z="{z}" {axes}/>
+    <intrinsic focallength="9.27" sensorMinU="0.0" sensorMaxU="122879.0" sensorMinV="0.0" sensorMaxV="69631.0"
+      focalLengthU="{fu}" focalLengthV="{fv}" centerPointU="{cu}" centerPointV="{cv}" skew="0.0"
+      radialDistortion1="{k1}" radialDistortion2="{k2}" radialDistortion3="0.0"
+      tangentalDistortion1="{p1}" tangentalDistortion2="{p2}"/>
+  </camera>
+"""
+
+
+def qualisys(path: Path, distortions: tuple[float, ...] = (0, 0, 0, 0)) -> Path:
+    """Write a calibration of Qualisys with a marker camera that has no clip, beside clips named after the others."""
+    path.mkdir(parents=True)
+    names = ("26580", "28984", "29005", "31111")
+    elements = []
+    for camera in rig(names, shift=3):
+        right, down, forward = camera.viewmat[:3, :3]
+        axes = np.stack([right, -down, -forward])
+        values = dict(zip("xyz", 1000 * camera.position, strict=True))
+        values["axes"] = " ".join(f'r{i + 1}{j + 1}="{axes[i, j]}"' for i in range(3) for j in range(3))
+        # The image begins at column 10 and row 20 of the sensor.
+        (fu, _, cu), (_, fv, cv) = 64 * (camera.K[:2] + np.array([[0, 0, 10], [0, 0, 20]]))
+        values |= {"fu": fu, "fv": fv, "cu": cu, "cv": cv, "right": 9 + WIDTH, "bottom": 19 + HEIGHT}
+        values |= dict(zip(("k1", "k2", "p1", "p2"), distortions, strict=True))
+        elements.append(QUALISYS.format(serial=camera.name, **values))
+    text = f"<calibration>\n <cameras>\n{''.join(elements)} </cameras>\n</calibration>\n"
+    (path / "rig.qca.txt").write_text(text)
+    videos(path, tuple(f"trial_Miqus_{i}_{name}" for i, name in enumerate(names[:3])))
+    return path
+
+
+def dot_clips(path: Path, names: tuple[str, ...], point: np.ndarray, lens: tuple[float, ...]) -> None:
+    """Write clips of a bright dot at `point`, recorded through OpenCV's lens by the rig with principal points off by 3.
+
+    The cameras of the clips are sorted by `names`.
+    """
+    x, y = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    for camera, name in zip(rig(names, shift=3), names, strict=True):
+        V = np.asarray(camera.viewmat)
+        K = camera.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+        u, v = cv2.projectPoints(point[None], V[:3, :3], V[:3, 3], K, np.array(lens))[0].ravel()
+        dot = 255 * np.exp(-0.5 * ((x - u) ** 2 + (y - v) ** 2) / 1.5**2)
+        write_video(path / name, [np.repeat(dot[..., None], 3, -1).astype(np.uint8)] * COUNT, FPS)
+
+
+def shown_dot(image: np.ndarray) -> np.ndarray:
+    """Return the position [2] of the dot of `dot_clips` in an image, with pixel centres at +0.5."""
+    weights = np.where(image[..., 0] > 60, image[..., 0], 0).astype(float)
+    y, x = np.indices(weights.shape) + 0.5
+    return np.array([(weights * x).sum(), (weights * y).sum()]) / weights.sum()

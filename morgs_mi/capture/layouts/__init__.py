@@ -1,1 +1,1 @@
-"""Readers of capture folders: COLMAP, Nerfstudio, Dynamic 3D Gaussians and poses_bounds.npy."""
+"""Readers of capture folders, one per layout; `registry.py` lists them."""

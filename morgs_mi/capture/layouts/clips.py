@@ -18,7 +18,15 @@ from pathlib import Path, PurePosixPath
 
 from morgs_mi.io.video import IMAGE_SUFFIXES, VIDEO_SUFFIXES, natural_key, numbering_gap
 
-__all__ = ["EXAMPLE", "check_frames", "clips_by_camera", "clips_by_frame", "photos", "view_of_image"]
+__all__ = [
+    "EXAMPLE",
+    "check_frames",
+    "clip_of_camera",
+    "clips_by_camera",
+    "clips_by_frame",
+    "photos",
+    "view_of_image",
+]
 
 EXAMPLE = "one folder per camera: cam01/0000.png, cam01/0001.png, ..., cam02/0000.png, cam02/0001.png, ..."
 """The layout of a recording in images, for messages."""
@@ -82,6 +90,15 @@ def view_of_image(views: Collection[str], image: str) -> str | None:
     place = PurePosixPath(image.replace("\\", "/"))
     names = (place.stem, *reversed(place.parts[:-1]))
     return next((name for name in names if name in views), None)
+
+
+def clip_of_camera(clips: Collection[str], camera: str) -> str | None:
+    """Return the clip called `camera`, or else the only one whose name contains it as a word (``trial_2-camA``)."""
+    if camera in clips:
+        return camera
+    word = re.compile(rf"(?<![A-Za-z0-9]){re.escape(camera)}(?![A-Za-z0-9])")
+    found = [clip for clip in dict.fromkeys(clips) if word.search(clip)]
+    return found[0] if len(found) == 1 else None
 
 
 def _folders(folder: Path) -> dict[str, Path]:

@@ -23,7 +23,7 @@ from morgs_mi.capture.layouts.calibration import (
     match_clips,
     required_clips,
 )
-from morgs_mi.capture.lens import Lens
+from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.io.bounded import read_json
 from morgs_mi.io.ply import read_vertices
@@ -94,7 +94,7 @@ def _lens(where: str, values: Mapping[str, Any]) -> Lens:
     if k4:
         # Nerfstudio's k4 is the coefficient of r^8, OpenCV's is in the denominator: COLMAP has no model for the former.
         raise ValueError(f"{where}: `k4` must be 0 in a perspective camera, got {k4}; undistort the images first.")
-    return Lens("FULL_OPENCV", (k1, k2, p1, p2, k3, 0.0, 0.0, 0.0)) if k3 else Lens("OPENCV", (k1, k2, p1, p2))
+    return opencv_lens((k1, k2, p1, p2, k3))
 
 
 def _number(where: str, values: Mapping[str, Any], key: str, default: float | None = None) -> float:

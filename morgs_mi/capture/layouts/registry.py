@@ -17,6 +17,8 @@ _READERS = (
     "colmap",
     "nerfstudio",
     "dynamic3dgs",
+    "qualisys",
+    "anipose",
     "poses_bounds",
 )
 LAYOUTS: tuple[Layout, ...] = tuple(import_module(f"{__package__}.{name}").LAYOUT for name in _READERS)

@@ -1,4 +1,4 @@
-"""The Gaussians of a stream with the ids that they have for life."""
+"""The Gaussians of a stream in an order that lasts."""
 
 from __future__ import annotations
 
@@ -6,32 +6,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from morgs_mi.codec.container import PacketKind
-from morgs_mi.codec.packets import CodedFrame, decode
+from morgs_mi.codec.packets import frames_with_lasting_ids
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.gaussians import Gaussians
 
-__all__ = ["by_place", "frames_with_first_id"]
+__all__ = ["by_place"]
 
 _CELL_BITS = 10
-
-
-def frames_with_first_id(stream: StreamReader) -> Iterator[tuple[int, CodedFrame]]:
-    """Yield (first_id, frame) for every frame; `first_id` is added to the frame's ids.
-
-    It changes where a keyframe starts a new set of Gaussians with ids from 0, so that no two Gaussians have one id.
-
-    Raises:
-        ValueError: a broken packet.
-    """
-    first_id, coded = 0, None
-    for packet in stream:
-        if coded is not None and packet.frame == coded.frame:
-            continue  # a re-emitted keyframe, from which a receiver can start
-        if coded is not None and packet.kind == PacketKind.KEYFRAME:
-            first_id += max(coded.next_id, 1)  # also after a set without Gaussians
-        coded = decode(coded, packet)
-        yield first_id, coded
 
 
 def by_place(stream: StreamReader) -> Iterator[tuple[int, Gaussians]]:
@@ -44,8 +25,8 @@ def by_place(stream: StreamReader) -> Iterator[tuple[int, Gaussians]]:
         ValueError: a broken packet.
     """
     known_ids, known_keys, cells = np.zeros(0, np.int64), np.zeros(0, np.int64), None
-    for first_id, coded in frames_with_first_id(stream):
-        ids, means = coded.ids.astype(np.int64) + first_id, coded.gaussians.numpy()["means"]
+    for ids, coded in frames_with_lasting_ids(stream):
+        means = coded.gaussians.numpy()["means"]
         if len(ids) and (cells is None or not np.isin(ids, known_ids).any()):
             # Cells with equal numbers of Gaussians along each axis, which far ones do not widen.
             cells = np.quantile(means, np.linspace(0, 1, 2**_CELL_BITS + 1)[1:-1], axis=0)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.packets import keyframe_packet, play
+from morgs_mi.codec.packets import frames_with_first_id, keyframe_packet, play
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.export.ids import by_place, frames_with_first_id
+from morgs_mi.export.order import by_place
 from tests.scenes.changing_splats import rig, splats, write_stream
 
 

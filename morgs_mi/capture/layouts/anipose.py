@@ -1,0 +1,132 @@
+"""Calibrations in Anipose's TOML format, which Pose2Sim, caliscope and FreeMoCap write too.
+
+A table per camera (``[cam_0]``, or nested as ``[cameras.0]``) has ``name``, ``size`` [w, h], ``matrix`` [3, 3],
+``distortions`` in OpenCV's order (k1 k2 p1 p2 k3, or k1 to k4 if ``fisheye`` is true), ``rotation`` (Rodrigues vector
+or matrix) and ``translation``: world -> camera with OpenCV's axes. Tables without any of these, such as ``[metadata]``,
+are ignored. OpenCV puts pixel centres at integers, so the principal point is shifted by half a pixel.
+
+World units are those of the file, which does not state them: millimetres or whatever the calibration board was measured
+in for Anipose and FreeMoCap, metres for Pose2Sim and caliscope.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from reprlib import repr as shortened
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from morgs_mi.capture.layouts.calibration import Calibration, Layout, match_clips, required_clips
+from morgs_mi.capture.layouts.clips import clip_of_camera
+from morgs_mi.capture.lens import Lens, opencv_lens
+from morgs_mi.core.camera import Camera, rigid
+
+__all__ = ["LAYOUT", "read_anipose"]
+
+_KEYS = ("matrix", "distortions", "rotation", "translation")
+# Recognises a calibration without parsing it, so that a broken one is reported as such.
+_MARKS = [re.compile(rf"^\s*{key}\s*=", re.MULTILINE) for key in ("matrix", "rotation")]
+
+
+def read_anipose(path: Path) -> tuple[list[Camera], list[Lens]]:
+    """Return the cameras, named as in the file, and their lenses.
+
+    Raises:
+        ValueError: the file is broken, a key of a camera is missing or has another form, or a rotation is none.
+    """
+    try:
+        content = tomllib.loads(path.read_bytes().decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: expected TOML, got a broken file ({error}); export it again.") from None
+    nested = content.get("cameras")
+    tables = nested if isinstance(nested, dict) else content
+    entries = {
+        key: table for key, table in tables.items() if isinstance(table, dict) and any(k in table for k in _KEYS)
+    }
+    if not entries:
+        raise ValueError(
+            f"{path}: expected a table for each camera, such as [cam_0], with {', '.join(_KEYS)}, found none; export "
+            "the calibration again."
+        )
+    found = [_camera(path, key, entry) for key, entry in entries.items()]
+    return [camera for camera, _ in found], [lens for _, lens in found]
+
+
+def _camera(path: Path, key: str, entry: Mapping[str, Any]) -> tuple[Camera, Lens]:
+    where = f"{path}, table [{key}]"
+    name = entry.get("name", key if key.startswith("cam") else f"cam_{key}")
+    if not isinstance(name, str | int) or name == "":
+        raise ValueError(f"{where}: `name` must be a text, got {shortened(name)}; name the camera as its clip.")
+    width, height = _array(where, entry, "size", (2,)).tolist()
+    if not (width.is_integer() and height.is_integer()):
+        raise ValueError(f"{where}: `size` must be whole pixels [w, h], got {entry['size']}; calibrate again.")
+    K = _array(where, entry, "matrix", (3, 3)).copy()
+    K[:2, 2] += 0.5
+    rotation = _array(where, entry, "rotation", (3,), (3, 3))
+    if rotation.shape == (3,):
+        rotation = Rotation.from_rotvec(rotation).as_matrix()
+    viewmat = rigid(where, np.column_stack([rotation, _array(where, entry, "translation", (3,))]))
+    try:
+        return Camera(K, viewmat, int(width), int(height), str(name)), _lens(where, entry)
+    except ValueError as error:
+        message = str(error)
+        raise ValueError(message if message.startswith(where) else f"{where}: {message}") from None
+
+
+def _array(where: str, entry: Mapping[str, Any], key: str, *shapes: tuple[int, ...]) -> np.ndarray:
+    """Return an entry as a finite array of one of `shapes`."""
+    try:
+        value = np.squeeze(np.array(entry.get(key), np.float64))
+    except (TypeError, ValueError, OverflowError):
+        value = np.zeros(0)
+    if value.shape not in shapes or not np.isfinite(value).all():
+        expected = " or ".join(str([*shape]) for shape in shapes)
+        got = shortened(entry[key]) if key in entry else "none"
+        raise ValueError(
+            f"{where}: `{key}` must be finite numbers {expected}, got {got}; calibrate this camera, or remove its "
+            "table and its clip."
+        )
+    return value
+
+
+def _lens(where: str, entry: Mapping[str, Any]) -> Lens:
+    fisheye = entry.get("fisheye", False)
+    lengths = (4,) if fisheye else (4, 5, 8)
+    values = _array(where, entry, "distortions", *((n,) for n in lengths)).tolist()
+    return Lens("OPENCV_FISHEYE", tuple(values)) if fisheye else opencv_lens(values)
+
+
+def _calibration_files(path: Path) -> list[Path]:
+    """Return the calibrations of a capture, in it or in its folder `calibration`."""
+    files = [file for folder in (path, path / "calibration") for file in sorted(folder.glob("*.toml"))]
+    return [file for file in files if _is_calibration(file)]
+
+
+def _is_calibration(file: Path) -> bool:
+    try:
+        text = file.read_text(encoding="utf-8", errors="replace")
+    except OSError:  # a folder, or a file of somebody else
+        return False
+    return all(mark.search(text) for mark in _MARKS)
+
+
+def _read_calibration(path: Path) -> Calibration:
+    source, *others = _calibration_files(path)
+    if others:
+        raise ValueError(
+            f"{path}: expected one calibration in TOML, got {', '.join(file.name for file in (source, *others))}; keep "
+            "the one of this recording."
+        )
+    cameras, lenses = read_anipose(source)
+    clips = required_clips(path)
+    named = [replace(camera, name=clip_of_camera(clips, camera.name) or camera.name) for camera in cameras]
+    return Calibration(*match_clips(path, source, clips, named, lenses))
+
+
+LAYOUT = Layout("Anipose", ("calibration.toml",), lambda path: bool(_calibration_files(path)), _read_calibration)

@@ -1,0 +1,146 @@
+"""Calibrations that Qualisys Track Manager exports: XML in a file ``*.qca.txt``.
+
+A ``camera`` has a ``serial``, and three elements:
+
+- ``fov_video``: the first and last column and row of the image on the sensor, in pixels;
+- ``transform``: the camera's position x, y, z in millimetres, and in r11 r12 r13, r21 r22 r23, r31 r32 r33 its axes
+  (x right, y up, z backward) in the world;
+- ``intrinsic``: focal lengths and principal point in 1/64 pixel from the sensor's corner, and the distortion
+  coefficients of OpenCV's model, which have no unit.
+
+The format is not documented. The signs and units are those of files of Qualisys systems and of the programs that read
+them; Pose2Sim also divides the distortion coefficients by 64, which makes them vanish. Positions are converted to
+metres.
+"""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from morgs_mi.capture.layouts.calibration import Calibration, Layout, PoseConvention, match_clips, required_clips
+from morgs_mi.capture.layouts.clips import clip_of_camera, clips_by_frame
+from morgs_mi.capture.lens import Lens, opencv_lens
+from morgs_mi.core.camera import Camera, rigid
+
+__all__ = ["LAYOUT", "read_qualisys"]
+
+_LOG = logging.getLogger(__name__)
+
+_SUBPIXELS = 64
+_METRES = 1e-3
+_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
+_DISTORTION = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2")
+
+
+def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
+    """Return the active cameras, named by their serial numbers, and their lenses; world units are metres.
+
+    Raises:
+        ValueError: the file is broken, an element or attribute of a camera is missing or is no number, or its axes are
+            not orthonormal.
+    """
+    data = path.read_bytes()
+    try:
+        if b"<!DOCTYPE" in data:
+            raise ValueError("it declares a document type")  # whose entities could expand without bound
+        root = ElementTree.fromstring(data)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise ValueError(f"{path}: expected XML, got a broken file ({error}); export it again.") from None
+    active = [element for element in root.iter("camera") if element.get("active", "1") != "0"]
+    if not active:
+        raise ValueError(
+            f"{path}: expected an element `camera` for each camera, found none; export the calibration again."
+        )
+    if turned := [element.get("serial", "?") for element in active if element.get("viewrotation", "0") != "0"]:
+        _LOG.warning(
+            "%s: QTM displays %s rotated (viewrotation); their clips must show the images as the sensor recorded them.",
+            *(path, ", ".join(turned)),
+        )
+    found = [_camera(path, element) for element in active]
+    return [camera for camera, _ in found], [lens for _, lens in found]
+
+
+def _camera(path: Path, element: Element) -> tuple[Camera, Lens]:
+    serial = element.get("serial", "")
+    where = f"{path}, camera {serial!r}"
+    if not serial:
+        raise ValueError(f"{path}: every `camera` must have a `serial`, got one without; export the calibration again.")
+    left, top, right, bottom = _numbers(where, element, "fov_video", "left", "top", "right", "bottom")
+    fu, fv, cu, cv = _numbers(
+        where, element, "intrinsic", "focalLengthU", "focalLengthV", "centerPointU", "centerPointV"
+    )
+    K = np.array([[fu, 0, cu], [0, fv, cv], [0, 0, _SUBPIXELS]]) / _SUBPIXELS
+    K[:2, 2] -= left, top
+    axes = _numbers(where, element, "transform", *(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3)))
+    R = _OPENCV_FROM_OPENGL @ np.reshape(axes, (3, 3))
+    position = _METRES * np.array(_numbers(where, element, "transform", "x", "y", "z"))
+    viewmat = rigid(where, np.column_stack([R, -R @ position]))
+    k1, k2, p1, p2 = _numbers(where, element, "intrinsic", *_DISTORTION)
+    (k3,) = _numbers(where, element, "intrinsic", "radialDistortion3")
+    try:
+        camera = Camera(K, viewmat, round(right - left + 1), round(bottom - top + 1), serial)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from None
+    return camera, opencv_lens((k1, k2, p1, p2, k3))
+
+
+def _numbers(where: str, camera: Element, name: str, *keys: str) -> list[float]:
+    """Return attributes of a camera's element `name`."""
+    element = camera.find(name)
+    if element is None:
+        raise ValueError(f"{where}: expected an element `{name}`, found none; export the calibration again.")
+    numbers = []
+    for key in keys:
+        text = element.get(key)
+        try:
+            numbers.append(float(text or "nan"))
+        except ValueError:
+            numbers.append(np.nan)
+        if not np.isfinite(numbers[-1]):
+            got = "none" if text is None else repr(text)
+            raise ValueError(
+                f"{where}: `{key}` of `{name}` must be a finite number, got {got}; calibrate in QTM and export again."
+            )
+    return numbers
+
+
+def _calibration_files(path: Path) -> list[Path]:
+    """Return the calibrations of a capture, in it or in its folder `calibration`."""
+    return [file for folder in (path, path / "calibration") for file in sorted(folder.glob("*.qca.txt"))]
+
+
+def _read_calibration(path: Path) -> Calibration:
+    """Return the cameras that have a clip; marker cameras have none."""
+    source, *others = _calibration_files(path)
+    if others:
+        raise ValueError(
+            f"{path}: expected one file *.qca.txt, got {', '.join(file.name for file in (source, *others))}; keep the "
+            "one of this recording."
+        )
+    cameras, lenses = read_qualisys(source)
+    clips = required_clips(path)
+    names = {camera.name: clip_of_camera([*clips, *clips_by_frame(path)], camera.name) for camera in cameras}
+    if not any(names.values()):
+        raise FileNotFoundError(
+            f"{source}: expected clips whose names contain the serial numbers {', '.join(names)}, found "
+            f"{', '.join(clips)}; name the clips after the cameras."
+        )
+    if without := [name for name, clip in names.items() if clip is None]:
+        _LOG.warning("%s: no clip is named after %s: left out, as marker cameras are.", source, ", ".join(without))
+    used = [(replace(c, name=clip), lens) for c, lens in zip(cameras, lenses, strict=True) if (clip := names[c.name])]
+    return Calibration(*match_clips(path, source, clips, [c for c, _ in used], [lens for _, lens in used]))
+
+
+LAYOUT = Layout(
+    "Qualisys",
+    ("*.qca.txt",),
+    lambda path: bool(_calibration_files(path)),
+    _read_calibration,
+    PoseConvention("camera to world", "OpenGL"),
+)

@@ -1,0 +1,122 @@
+"""True 3D tracks of a recording: those of synthetic captures, and annotations of TAPVid-3D.
+
+TAPVid-3D (Koppula et al. 2024) annotates the recordings of Panoptic Studio that Dynamic 3D Gaussians uses, whose layout
+is that of `train_meta.json`. A file ``NAME_CAMERA.npz`` holds the tracks of one view: ``tracks_XYZ`` [T, P, 3] in the
+camera's axes (OpenCV's), ``visibility`` [T, P], ``queries_xyt`` [P, 3] and ``fx_fy_cx_cy`` [4]. NAME is that of the
+capture's folder; the files lie in that folder or beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.layouts.dynamic3dgs import read_meta
+from morgs_mi.core.camera import Camera
+from morgs_mi.io.bounded import read_array
+from morgs_mi.synth.ground_truth import load_tracks
+
+__all__ = ["TrackTruth", "read_annotation", "synthetic_tracks", "tapvid3d_tracks"]
+
+_SHORT_SIDE = 256
+
+
+@dataclass(frozen=True)
+class TrackTruth:
+    """True tracks of P points through T frames, in one video: one view, or several that see as one.
+
+    Attributes:
+        cameras: the views.
+        points: [P, T, 3], world units.
+        visible: bool [P, T], whether any of the views sees the point; None if unknown.
+        queries: int [P], the frame at which each track starts.
+    """
+
+    cameras: tuple[Camera, ...]
+    points: np.ndarray
+    visible: np.ndarray | None
+    queries: np.ndarray
+
+    @property
+    def pixel(self) -> np.ndarray | None:
+        """Width of a pixel at each point [P, T], world units, for an image whose shorter side has 256; of one view."""
+        if len(self.cameras) != 1:
+            return None
+        (camera,) = self.cameras
+        focal = np.sqrt(camera.K[0, 0] * camera.K[1, 1]) * _SHORT_SIDE / min(camera.width, camera.height)
+        return camera.project(self.points)[1] / focal
+
+
+def synthetic_tracks(capture: Capture, views: Sequence[int]) -> list[TrackTruth]:
+    """Return the tracks of a synthetic capture as the video of some of its views together; empty without any.
+
+    A track starts at the first frame in which one of the views sees it. Tracks that none of them sees are left out.
+    Without stored visibility, all tracks start at frame 0.
+    """
+    if capture.truth is None or not (capture.truth / "tracks.npz").is_file():
+        return []
+    tracks = load_tracks(capture.truth)
+    cameras = tuple(capture.cameras[view] for view in views)
+    if not all(camera.name in tracks.visible for camera in cameras):
+        return [TrackTruth(cameras, tracks.points, None, np.zeros(len(tracks.points), int))]
+    visible = np.any([tracks.visible[camera.name] for camera in cameras], axis=0)
+    seen = visible.any(1)
+    return [TrackTruth(cameras, tracks.points[seen], visible[seen], visible[seen].argmax(1))]
+
+
+def tapvid3d_tracks(capture: Capture) -> list[TrackTruth]:
+    """Return the annotations of TAPVid-3D for a capture, one per annotated view; empty without any.
+
+    Raises:
+        ValueError: as `read_annotation`.
+    """
+    folder = capture.path.resolve()
+    # The frames of the annotations are numbered like those of the clips.
+    if capture.reading.aligns_clips or not (folder / "train_meta.json").is_file():
+        return []
+    files = [file for place in (folder, folder.parent) for file in place.glob(f"{folder.name}_*.npz")]
+    if not files:
+        return []
+    metas = [file for name in ("train_meta", "test_meta") if (file := folder / f"{name}.json").is_file()]
+    rig = {view.camera.name: view.camera for meta in metas for view in read_meta(meta)}
+    named = {file.stem.removeprefix(f"{folder.name}_"): file for file in reversed(files)}
+    return [read_annotation(file, rig[name]) for name, file in sorted(named.items()) if name in rig]
+
+
+def read_annotation(path: Path, camera: Camera) -> TrackTruth:
+    """Return the annotation of TAPVid-3D for one view, in world units.
+
+    Args:
+        path: the file.
+        camera: the view.
+
+    Raises:
+        ValueError: the file is broken, its arrays do not have the shapes above, or its intrinsics are not the camera's.
+    """
+    tracks, visible = read_array(path, "tracks_XYZ"), read_array(path, "visibility")
+    queries, intrinsics = read_array(path, "queries_xyt"), read_array(path, "fx_fy_cx_cy")
+    T, P = tracks.shape[:2] if tracks.ndim == 3 else (0, 0)
+    shapes = {"tracks_XYZ": (T, P, 3), "visibility": (T, P), "queries_xyt": (P, 3), "fx_fy_cx_cy": (4,)}
+    for (name, shape), found in zip(shapes.items(), (tracks, visible, queries, intrinsics), strict=True):
+        if found.shape != shape or found.dtype.kind not in "fiub":
+            raise ValueError(
+                f"{path}: expected `{name}` {[*shape]} with {T} frames and {P} points, got {found.dtype} "
+                f"{[*found.shape]}; download the annotation again."
+            )
+    K = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]
+    if not np.allclose(intrinsics, K, rtol=1e-3):
+        raise ValueError(
+            f"{path}: expected the intrinsics of camera {camera.name}, {K.round(2).tolist()}, got "
+            f"{np.round(intrinsics.astype(float), 2).tolist()} in `fx_fy_cx_cy`; use the annotation of this capture."
+        )
+    if not np.isfinite(tracks).all() or not ((queries[:, 2] >= 0) & (queries[:, 2] < T)).all():
+        raise ValueError(
+            f"{path}: `tracks_XYZ` must be finite and the frames in `queries_xyt` below {T}; download it again."
+        )
+    V = np.asarray(camera.viewmat, np.float64)
+    points = (tracks.astype(np.float64) - V[:3, 3]) @ V[:3, :3]
+    return TrackTruth((camera,), points.transpose(1, 0, 2), visible.T.astype(bool), queries[:, 2].astype(int))

@@ -1,0 +1,89 @@
+"""3D point tracks of a stream, compared with the true ones of its recording."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.timeline import read_settings
+from morgs_mi.codec.packets import play
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.evaluate.point_tracks import seen_in_depth, track_points
+from morgs_mi.evaluate.results import TrackingScores
+from morgs_mi.evaluate.track_scores import DYNAMIC_3D_GAUSSIANS, MVTRACKER, TAPVID3D, Comparison, score_tracks
+from morgs_mi.evaluate.track_truth import TrackTruth, synthetic_tracks, tapvid3d_tracks
+from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.playback.player import render, render_config
+
+__all__ = ["evaluate_tracks"]
+
+
+def evaluate_tracks(stream: StreamReader, recording: Capture, views: Sequence[int]) -> tuple[TrackingScores, ...]:
+    """Return the scores of a stream's point tracks by each protocol; empty without true tracks or a second frame.
+
+    Queries are the true points at the frames where their tracks start. In a synthetic capture, each of `views` is a
+    video of TAPVid-3D's protocol; in the other protocols a point is visible if a training view sees it. Annotations of
+    TAPVid-3D know the visibility in their own view only, which all protocols then use.
+
+    Args:
+        stream: the file.
+        recording: its capture, whose `capture.json` may state `meters_per_unit`, 1 by default.
+        views: the views that are evaluated.
+
+    Raises:
+        ValueError: a packet, an annotation or the true tracks are broken.
+    """
+    joint = synthetic_tracks(recording, recording.train_views)
+    single = [video for view in views for video in synthetic_tracks(recording, [view])]
+    single = single or tapvid3d_tracks(recording)
+    if not single:
+        return ()
+    frames = sorted({packet.frame for packet in stream})
+    videos = [_during(video, frames) for video in (*single, *joint)]
+    if len(frames) < 2 or not any(len(video.points) for video in videos):
+        return ()
+    compared = _compared(stream, videos, frames[0])
+    per_view, together = compared[: len(single)], compared[len(single) :] or compared
+    scale = read_settings(recording.path / "capture.json").get("meters_per_unit") or 1
+    extent = scene_extent([recording.cameras[view] for view in recording.train_views])
+    protocols = ((TAPVID3D, per_view), (DYNAMIC_3D_GAUSSIANS, together), (MVTRACKER, together))
+    return tuple(score_tracks(protocol, videos, scale, extent) for protocol, videos in protocols)
+
+
+def _during(video: TrackTruth, frames: Sequence[int]) -> TrackTruth:
+    """Return the part of true tracks in the consecutive frames of a stream, without tracks that start in others."""
+    start, stop = frames[0], min(frames[-1] + 1, video.points.shape[1])
+    kept = (video.queries >= start) & (video.queries < stop)
+    visible = None if video.visible is None else video.visible[kept, start:stop]
+    return TrackTruth(video.cameras, video.points[kept, start:stop], visible, video.queries[kept] - start)
+
+
+def _compared(stream: StreamReader, videos: Sequence[TrackTruth], start: int) -> list[Comparison]:
+    """Return the tracks of the stream beside the true ones of each video, which begins with the frame `start`."""
+    points = [video.points[np.arange(len(video.queries)), video.queries] for video in videos]
+    queries = np.concatenate([video.queries for video in videos]) + start
+    tracks = track_points(stream, np.concatenate(points), queries)
+    ends = np.cumsum([len(video.queries) for video in videos])
+    parts = np.split(tracks.points, ends[:-1]), np.split(tracks.alive, ends[:-1])
+    found = [(p[:, : v.points.shape[1]], a[:, : v.points.shape[1]]) for v, p, a in zip(videos, *parts, strict=True)]
+    seen = _seen(stream, videos, [positions for positions, _ in found])
+    return [
+        Comparison(video.points, positions, video.visible, mask & alive, alive, video.queries, video.pixel)
+        for video, (positions, alive), mask in zip(videos, found, seen, strict=True)
+    ]
+
+
+def _seen(stream: StreamReader, videos: Sequence[TrackTruth], found: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return the masks of the tracked points [P, T, 3] that a view of their video sees, [P, T]."""
+    seen = [np.zeros(positions.shape[:2], bool) for positions in found]
+    config = render_config(stream)
+    cameras = {camera.name: camera for video in videos if video.visible is not None for camera in video.cameras}
+    for t, (_, gaussians) in enumerate(play(stream) if cameras else ()):
+        for name, camera in cameras.items():
+            maps = render(gaussians, camera, ("depth", "alpha"), config)
+            for video, positions, mask in zip(videos, found, seen, strict=True):
+                if t < positions.shape[1] and name in [view.name for view in video.cameras]:
+                    mask[:, t] |= seen_in_depth(maps["depth"][..., 0], maps["alpha"][..., 0], camera, positions[:, t])
+    return seen
