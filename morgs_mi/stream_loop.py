@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,6 +21,8 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_mask, check_points, check_type
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.threads import map_in_threads
+from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, trial_steps
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.initialise import from_points, resample_points, scene_extent, seed_points
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
@@ -57,6 +59,8 @@ class FrameReport:
         status: "ok", or a sentence about what was done instead.
         missing_views: names of the views without an image.
         active: what took part, as fractions of everything, by name: gaussians, views, pixels, epochs.
+        expectation: of the first frame, a sentence about the quality of views between the cameras; empty if it was not
+            measured.
     """
 
     frame: int
@@ -67,6 +71,7 @@ class FrameReport:
     status: str = "ok"
     missing_views: tuple[str, ...] = ()
     active: dict[str, float] = field(default_factory=dict)
+    expectation: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,18 +179,45 @@ def _first_step(
     setup: Setup, state: StreamState, images: Images, on_step: Callable[[int, int], None] | None
 ) -> tuple[StreamState, Packet, FrameReport]:
     """Fit the first frame, see `step`."""
-    start, config, fit = time.perf_counter(), setup.config, setup.config.fit
+    start, config = time.perf_counter(), setup.config
     rng = np.random.default_rng([config.seed, 0])
-    cameras = [setup.cameras[v] for v in images]
-    targets = [Target(image, setup.masks[v]) for v, image in images.items()]
+    cameras, masks = [setup.cameras[v] for v in images], [setup.masks[v] for v in images]
     gaussians, status = _first_gaussians(setup, cameras, list(images.values()), rng)
-    tick = None if on_step is None else lambda done: on_step(done, fit.first_frame_steps)
+    fit, validation, tick = _validated(setup, gaussians, images, on_step)
+    targets = [Target(image, mask) for image, mask in zip(images.values(), masks, strict=True)]
     gaussians, losses = fit_first_frame(gaussians, cameras, targets, setup.extent, fit, config.render, rng, tick)
     packet = keyframe_packet(gaussians, 0, setup.cameras, config.codec)
     coded = decode(None, packet)
-    seconds, size = time.perf_counter() - start, packet.num_bytes
-    report = FrameReport(0, seconds, size, losses, len(coded), status, _missing(setup, images))
+    report = FrameReport(
+        0,
+        time.perf_counter() - start,
+        packet.num_bytes,
+        losses,
+        len(coded),
+        status,
+        _missing(setup, images),
+        expectation="" if validation is None else validation.sentence,
+    )
     return StreamState(1, coded, images, _references(setup, state, images, {})), packet, report
+
+
+def _validated(
+    setup: Setup, gaussians: Gaussians, images: Images, on_step: Callable[[int, int], None] | None
+) -> tuple[FitConfig, CrossValidation | None, Callable[[int], None] | None]:
+    """Return the first frame's settings, what cross-validation chose them by, and what to call after each step."""
+    config, fit = setup.config, setup.config.fit
+    if fit.dropping is not None:
+        return fit, None, None if on_step is None else lambda done: on_step(done, fit.first_frame_steps)
+    before = trial_steps(fit) * len(fit.cross_validation.candidates)
+    steps = before + fit.first_frame_steps
+    cameras, masks = [setup.cameras[v] for v in images], [setup.masks[v] for v in images]
+    tick = None if on_step is None else lambda done: on_step(done, steps)
+    seed = [config.seed, 0, 1]
+    found = cross_validate(
+        gaussians, cameras, list(images.values()), masks, setup.extent, fit, config.render, seed, tick
+    )
+    dropping = 0.0 if found is None else found.best.dropping
+    return replace(fit, dropping=dropping), found, None if tick is None else lambda done: tick(before + done)
 
 
 def _first_gaussians(

@@ -36,6 +36,8 @@ VALUES: dict[str, Any] = {
     "motion.flow_method": "farneback",
     "motion.mask_method": "superpixels",
     "fit.early_stopping_tolerance": 0.5,
+    "fit.dropping": 0.3,
+    "fit.density.later_views": 1,
     "fit.density.last_round": 0.3,
     "fit.density.later_round": 0.3,
     "fit.density.max_gaussians": 1000,
@@ -56,6 +58,7 @@ VALUES: dict[str, Any] = {
 # Fields that cannot change this stream, each with the reason and the test that shows that it acts.
 ELSEWHERE: dict[str, str] = {
     "render.reproducible": "changes the order of sums only: tests/render",
+    "fit.cross_validation": "chooses among few values: tests/fit/test_cross_validation.py",
     "motion.flow.farneback": "a method that is not the default: tests/method/flow_sources",
     "motion.active_set.min_explained": "no change here is unexplained: tests/method/test_active_set.py",
     "motion.active_set.min_cluster": "no change here is unexplained: tests/method/test_active_set.py",

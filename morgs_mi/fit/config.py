@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
+from itertools import pairwise
 from math import inf
 
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.method.objective import ObjectiveConfig
 
-__all__ = ["DensityConfig", "FitConfig", "LearningRates"]
+__all__ = ["CrossValidationConfig", "DensityConfig", "FitConfig", "LearningRates"]
 
 
 @dataclass(frozen=True)
@@ -105,6 +106,37 @@ class DensityConfig:
 
 
 @dataclass(frozen=True)
+class CrossValidationConfig:
+    """Settings of the cross-validation of the first frame (see `cross_validation`)."""
+
+    candidates: tuple[float, ...] = (0.0, 0.2, 0.4)
+    """Probabilities of dropping, in rising order."""
+    share: int = 6
+    """One view of that many is withheld, at least one."""
+    min_views: int = 3
+    """Number of views below which nothing is withheld."""
+    width: int = 640
+    """Images are reduced by the largest whole factor that leaves this width, in px."""
+    steps: float = 0.4
+    """Steps of each fit, as a fraction of the first frame's."""
+
+    def __post_init__(self) -> None:
+        rising = all(a < b for a, b in pairwise(self.candidates))
+        if not self.candidates or not rising or not 0 <= self.candidates[0] <= self.candidates[-1] < 1:
+            raise ValueError(
+                "CrossValidationConfig(): `candidates` must be rising numbers from 0 to less than 1, got "
+                f"{self.candidates}."
+            )
+        for name, low in (("share", 2), ("min_views", 2), ("width", 1)):
+            if not getattr(self, name) >= low:
+                raise ValueError(
+                    f"CrossValidationConfig(): `{name}` must be at least {low}, got {getattr(self, name)}."
+                )
+        if not 0 < self.steps <= 1:
+            raise ValueError(f"CrossValidationConfig(): `steps` must be above 0 and at most 1, got {self.steps}.")
+
+
+@dataclass(frozen=True)
 class FitConfig:
     """Settings of the optimisation."""
 
@@ -116,8 +148,11 @@ class FitConfig:
     """Opacity of the Gaussians at the start of the first frame."""
     first_frame_steps: int = 1500
     """Steps of the first frame, one view each."""
-    dropping: float = 0.0
-    """Probability with which each step of the first frame leaves a Gaussian out (see `dropping`)."""
+    cross_validation: CrossValidationConfig = field(default_factory=CrossValidationConfig)
+    """Cross-validation of the first frame."""
+    dropping: float | None = None
+    """Probability with which each step of the first frame leaves a Gaussian out (see `dropping`); None: chosen by
+    cross-validation."""
     sh_band_fraction: float = 1 / 30
     """Fraction of the first frame's steps after which another SH band is added, as in 3DGS."""
     confidence_steps: int = 40
@@ -157,6 +192,8 @@ class FitConfig:
             raise ValueError(f"FitConfig(): `sh_degree` must be 0 to 3, got {self.sh_degree}.")
         if not 0 < self.initial_opacity < 1:
             raise ValueError(f"FitConfig(): `initial_opacity` must lie between 0 and 1, got {self.initial_opacity}.")
+        if self.dropping is not None and not 0 <= self.dropping < 1:
+            raise ValueError(f"FitConfig(): `dropping` must be 0 to less than 1, or None, got {self.dropping}.")
         if not 0 < self.final_rate <= 1:
             raise ValueError(f"FitConfig(): `final_rate` must be above 0 and at most 1, got {self.final_rate}.")
 

@@ -77,7 +77,7 @@ def fit_first_frame(
             resize_optimizer(optimizer, plan, plan.edits)
 
         def losses_at(values: Mapping[str, Tensor], view: int, base: Gaussians = gaussians) -> dict[str, Tensor]:
-            image = views[view].render(dropped(base.with_parameters(values), config.dropping, rng))
+            image = views[view].render(dropped(base.with_parameters(values), config.dropping or 0.0, rng))
             return {"recon": recon_loss(image.color, targets[view], config.objective.dssim_weight)}
 
         losses = optimise(

@@ -1,0 +1,179 @@
+"""Cross-validation of the first frame: how well views between the cameras will look, and which prior helps them.
+
+Some training views are withheld, and a short fit to the others is judged by the PSNR of the withheld ones. It chooses
+the probability of dropping (see `dropping`): where images are noisy or few, dropping helps; where they are many and
+clean, it only costs. Candidates are tried in rising order until one is no better than the last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.first_frame import fit_first_frame
+from morgs_mi.losses.ssim import Target
+from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.rasterize import rasterize
+
+__all__ = ["CrossValidation", "Trial", "cross_validate", "trial_steps", "withheld_views"]
+
+_MIN_SIDE = 32  # px
+# PSNR of withheld views in dB below which they look poor, and difference to the others above which they look worse.
+_POOR, _WORSE = 22.0, 8.0
+_View = tuple[Camera, np.ndarray, np.ndarray | None]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One fit.
+
+    Attributes:
+        dropping: probability of dropping.
+        withheld_psnr: mean PSNR of the withheld views, dB.
+        training_psnr: mean PSNR of the others, dB.
+    """
+
+    dropping: float
+    withheld_psnr: float
+    training_psnr: float
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """What cross-validation found.
+
+    Attributes:
+        withheld: names of the withheld views.
+        spacing: mean angle from a camera to its nearest one, as seen from what they look at, in degrees.
+        trials: the fits, by rising probability of dropping.
+    """
+
+    withheld: tuple[str, ...]
+    spacing: float
+    trials: tuple[Trial, ...]
+
+    @property
+    def best(self) -> Trial:
+        """The fit with the best withheld views."""
+        return max(self.trials, key=lambda trial: trial.withheld_psnr)
+
+    @property
+    def sentence(self) -> str:
+        """What to expect of views between the cameras."""
+        best = self.best
+        gap = best.training_psnr - best.withheld_psnr
+        measured = f"about {best.withheld_psnr:.1f} dB, measured on {', '.join(self.withheld)} in a trial without it"
+        if len(self.withheld) > 1:
+            measured = measured.removesuffix("it") + "them"
+        if best.withheld_psnr >= _POOR and gap <= _WORSE:
+            return f"Views between the cameras will have {measured}."
+        return (
+            f"Views between the cameras will be poor: {measured}, {gap:.1f} dB below the other views; the cameras are "
+            f"{self.spacing:.0f} degrees apart."
+        )
+
+
+def cross_validate(
+    start: Gaussians,
+    cameras: Sequence[Camera],
+    images: Sequence[np.ndarray],
+    masks: Sequence[np.ndarray | None],
+    extent: float,
+    config: FitConfig,
+    render: RenderConfig,
+    seed: Sequence[int],
+    on_step: Callable[[int], None] | None = None,
+) -> CrossValidation | None:
+    """Return what cross-validation of the first frame finds; None if there are too few views.
+
+    Args:
+        start: Gaussians that each fit starts from.
+        cameras: the V training views.
+        images: their images [H, W, 3], uint8.
+        masks: valid pixels of each [H, W], or None.
+        extent: of the scene in world units.
+        config: settings of the fit.
+        render: cut-offs.
+        seed: of every fit.
+        on_step: called with the number of steps done, in all fits.
+    """
+    how = config.cross_validation
+    if len(cameras) < how.min_views:
+        return None
+    withheld, steps = withheld_views(cameras, how.share), trial_steps(config)
+    small = [_reduced(*view, how.width) for view in zip(cameras, images, masks, strict=True)]
+    trained = [view for index, view in enumerate(small) if index not in withheld]
+    judged, targets = [small[index] for index in withheld], [Target(image, mask) for _, image, mask in trained]
+    trials: list[Trial] = []
+    for dropping in how.candidates:
+        trial, rng = replace(config, dropping=dropping, first_frame_steps=steps), np.random.default_rng(seed)
+        tick = None if on_step is None else _shifted(on_step, len(trials) * steps)
+        views = [view[0] for view in trained]
+        fitted, _ = fit_first_frame(start, views, targets, extent, trial, render, rng, tick)
+        trials.append(Trial(dropping, _psnr(fitted, judged, render), _psnr(fitted, trained, render)))
+        if len(trials) > 1 and trials[-1].withheld_psnr <= trials[-2].withheld_psnr:
+            break
+    return CrossValidation(tuple(cameras[v].name for v in withheld), _spacing(cameras, start), tuple(trials))
+
+
+def trial_steps(config: FitConfig) -> int:
+    """Return the number of steps of one fit."""
+    return max(1, round(config.cross_validation.steps * config.first_frame_steps))
+
+
+def withheld_views(cameras: Sequence[Camera], share: int) -> tuple[int, ...]:
+    """Return the indices of the withheld views: one of `share`, at least one, spread over the inner half of the rig.
+
+    Views at its ends are not between others.
+    """
+    count, positions = max(1, len(cameras) // share), np.array([camera.position for camera in cameras])
+    away = np.linalg.norm(positions - positions.mean(axis=0), axis=1)
+    inner = np.argsort(away, kind="stable")[: max(count, len(cameras) // 2)]
+    chosen = [int(inner[0])]
+    while len(chosen) < count:
+        distance = np.linalg.norm(positions[inner][:, None] - positions[chosen], axis=-1).min(axis=1)
+        chosen.append(int(inner[np.argmax(distance)]))
+    return tuple(sorted(chosen))
+
+
+def _spacing(cameras: Sequence[Camera], gaussians: Gaussians) -> float:
+    """Return the mean angle between neighbouring cameras in degrees, as seen from the median of the Gaussians."""
+    rays = np.array([camera.position for camera in cameras]) - np.median(np.asarray(gaussians.means), axis=0)
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-30)
+    cosines = np.clip(rays @ rays.T, -1, 1)
+    np.fill_diagonal(cosines, -1)
+    return float(np.rad2deg(np.arccos(cosines.max(axis=1))).mean())
+
+
+def _shifted(on_step: Callable[[int], None], done: int) -> Callable[[int], None]:
+    return lambda step: on_step(done + step)
+
+
+def _reduced(camera: Camera, image: np.ndarray, mask: np.ndarray | None, width: int) -> _View:
+    """Return a view reduced by the largest whole factor that leaves a width.
+
+    A pixel is valid if all that it covers is.
+    """
+    factor = camera.width // width
+    if factor < 2 or camera.height // factor < _MIN_SIDE:
+        return camera, image, mask
+    size = (camera.width // factor, camera.height // factor)
+    smaller = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
+    valid = None if mask is None else cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
+    return camera.resized(*size), smaller, valid
+
+
+def _psnr(gaussians: Gaussians, views: Sequence[_View], render: RenderConfig) -> float:
+    """Return the mean PSNR of some views in dB, of their valid pixels."""
+    values = []
+    for camera, image, mask in views:
+        found = np.clip(np.asarray(rasterize(gaussians, camera, ("color",), config=render).color), 0, 1)
+        squares = ((found - image / 255.0) ** 2).mean(axis=-1)
+        values.append(-10 * np.log10(max(float(squares[slice(None) if mask is None else mask].mean()), 1e-10)))
+    return float(np.mean(values))
