@@ -60,7 +60,7 @@ def share_confidence(
     if not len(chosen) or count < 2:
         return logit
     _, near = KDTree(means).query(means[chosen], count, workers=-1)
-    near = near[:, 1:]  # the first is the Gaussian itself
+    near = np.asarray(near)[:, 1:]  # the first is the Gaussian itself
     chroma = _chromaticity(gaussians)
     affinity = np.exp(-np.sum((chroma[chosen][:, None] - chroma[near]) ** 2, axis=2) / (2 * config.chroma_scale**2))
     affinity /= np.maximum(affinity.sum(axis=1, keepdims=True), 1e-6)
