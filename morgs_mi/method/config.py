@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from morgs_mi.method.active_set import ActiveSetConfig
 from morgs_mi.method.change import ChangeConfig
+from morgs_mi.method.cohesion import CohesionConfig
 from morgs_mi.method.flow_sources.config import FlowConfig
 from morgs_mi.method.lift import LiftConfig
 from morgs_mi.method.mask_refiners.config import MaskConfig
@@ -50,10 +51,6 @@ class MotionConfig:
     """Frames from one supervision of the confidence by masks to the next."""
     min_gate: float = 0.1
     """Gate below which a lifted motion is no longer scaled up to pass the gate at full length."""
-    min_changed: float = 0.4
-    """Responsibility of a Gaussian and its neighbours up to which it has not moved."""
-    changed_neighbours: int = 48
-    """Number of these neighbours."""
     confidence_decay: float = 0.3
     """Logit that a confidence loses per frame without evidence of motion: where something moved, more is to correct."""
     flow: FlowConfig = field(default_factory=FlowConfig)
@@ -62,6 +59,8 @@ class MotionConfig:
     """Motion masks."""
     lift: LiftConfig = field(default_factory=LiftConfig)
     """Lifted flow."""
+    cohesion: CohesionConfig = field(default_factory=CohesionConfig)
+    """Confidence that neighbours share."""
     propagation: PropagationConfig = field(default_factory=PropagationConfig)
     """Motion proposals."""
     active_set: ActiveSetConfig = field(default_factory=ActiveSetConfig)

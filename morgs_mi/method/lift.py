@@ -14,12 +14,14 @@ Adam moves a mean by at most its learning rate per step; starting from d_i, larg
 
 Flow bleeds over the edges of moving objects, in each view onto another part of the static background. So a view's
 weight follows its agreement with the others, k_iv = 1 / (1 + |u_iv - J_v d_i|^2 / s_iv^2) with s_iv = 0.2 px + |J_v
-d_i| / 5, by iteratively reweighted least squares (Cauchy's cost r(e) = log(1 + |e|^2 / s^2)). Motion is separated from
-noise by how much better it explains the flow than no motion does,
+d_i| / 5, by iteratively reweighted least squares (Cauchy's cost r(e) = log(1 + |e|^2 / s^2)). There and below, |e|^2
+is the mean over the Gaussian's pixels, that is, the squared length plus the variance of the flow: on a rigid part the
+flow hardly varies; where it bleeds, it falls off. Motion is separated from noise by how much better it explains the
+flow than no motion does,
 
     e_i = sum_v a_iv (r(u_iv) - r(u_iv - J_v d_i)) / sum_v a_iv,    a_iv = W_iv / (W_iv + 1),
 
-the mean over the key views that see the Gaussian: it moves if e_i > 1 and its motion exceeds the noise of the flow in
+the mean over the key views that see the Gaussian: it moves if e_i > 0.5 and its motion exceeds the noise of the flow in
 some view.
 """
 
@@ -54,7 +56,7 @@ class LiftConfig:
     """Rounds of reweighting; more change little."""
     half_weight_pixels: float = 1.0
     """Covered pixels at which a view's evidence counts half."""
-    min_evidence: float = 1.0
+    min_evidence: float = 0.5
     """Evidence e_i above which a Gaussian moves."""
     confidence_slope: float = 4.0
     """Logit of the confidence per unit of evidence above `min_evidence`."""
@@ -77,10 +79,20 @@ class Lift:
 
 @dataclass(frozen=True, eq=False)
 class _LiftView:
-    """Flow of one key view at every Gaussian: W [N], u [N, 2] px, J [N, 2, 3] px per world unit, motion floor in px."""
+    """Flow of one key view at every Gaussian.
+
+    Attributes:
+        weight: W [N].
+        flow: u [N, 2], px.
+        variance: of the flow over the pixels of the Gaussian [N], px^2.
+        jacobian: J [N, 2, 3], px per world unit.
+        floor: of the motion, px.
+        config: settings.
+    """
 
     weight: np.ndarray
     flow: np.ndarray
+    variance: np.ndarray
     jacobian: np.ndarray
     floor: float
     config: LiftConfig
@@ -90,9 +102,9 @@ class _LiftView:
         return np.einsum("nij,nj->ni", self.jacobian, d)
 
     def cost(self, d: np.ndarray, motion: np.ndarray) -> np.ndarray:
-        """Return r(u - J d) [N], with the scale s that belongs to a motion [N, 2] in px."""
+        """Return r(u - J d) [N] (see the module), with the scale s that belongs to a motion [N, 2] in px."""
         scale = self.config.noise_px + self.config.noise_fraction * np.linalg.norm(motion, axis=1)
-        return np.log1p(np.sum((self.flow - self.project(d)) ** 2, axis=1) / scale**2)
+        return np.log1p((np.sum((self.flow - self.project(d)) ** 2, axis=1) + self.variance) / scale**2)
 
 
 def lift_flow(
@@ -143,11 +155,13 @@ def _lift_view(
     config: LiftConfig,
 ) -> _LiftView:
     reliable = observation.forward_reliable[..., None].astype(np.float32)
-    image = np.concatenate([observation.forward_flow * reliable, reliable], axis=2)
-    sums = view.backproject(gaussians, view.crop(image))
-    flow = sums[:, :2] / np.maximum(sums[:, 2:], 1e-6)
+    flow = observation.forward_flow
+    image = np.concatenate([flow * reliable, np.sum(flow**2, axis=2, keepdims=True) * reliable, reliable], axis=2)
+    sums = view.backproject(gaussians, view.crop(image)).astype(float)
+    average = sums[:, :3] / np.maximum(sums[:, 3:], 1e-6)
+    variance = np.maximum(average[:, 2] - np.sum(average[:, :2] ** 2, axis=1), 0)
     jacobian = view.camera.projection_jacobian(means)
-    return _LiftView(sums[:, 2].astype(float), flow.astype(float), jacobian, floor, config)
+    return _LiftView(sums[:, 3], average[:, :2], variance, jacobian, floor, config)
 
 
 def _solve(views: list[_LiftView], trust: list[np.ndarray], config: LiftConfig) -> np.ndarray:

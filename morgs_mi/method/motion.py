@@ -10,6 +10,7 @@ import numpy as np
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet
+from morgs_mi.method.cohesion import share_confidence
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.lift import Lift, lift_flow
@@ -49,14 +50,11 @@ def initial_motion(
 def _initial_confidence(lifted: Lift, active: ActiveSet, previous: Gaussians, config: MotionConfig) -> np.ndarray:
     """Return the logits [M] that a frame's confidence starts from.
 
-    They are those of the previous frame, a little lower, or those of lifted flow where they are higher. What has hardly
-    changed has not moved, whatever the flow next to it.
+    They are those of the previous frame, a little lower, or those of lifted flow where they are higher, shared among
+    neighbours.
     """
     logit = lifted.logit_confidence
     if previous.logit_confidence is not None:
         before = np.asarray(previous.logit_confidence)[active.indices]
         logit = np.maximum(logit, before - np.float32(config.confidence_decay))
-    if active.responsibility is None:
-        return logit
-    pooled = active.responsibility.pooled(np.asarray(previous.means), active.indices, config.changed_neighbours)
-    return np.where(pooled > config.min_changed, logit, np.minimum(logit, -config.lift.max_logit))
+    return share_confidence(previous, active.indices, logit, -config.lift.max_logit, config.cohesion)

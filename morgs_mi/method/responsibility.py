@@ -22,7 +22,6 @@ import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
-from scipy.spatial import KDTree
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
@@ -50,19 +49,6 @@ class Responsibility:
     def share(self) -> np.ndarray:
         """Ratio of both [N], from 0 to 1; 0 for hidden Gaussians."""
         return _ratio(self.changed, self.visible)
-
-    def pooled(self, means: np.ndarray, chosen: np.ndarray, count: int) -> np.ndarray:
-        """Return r of the `count` nearest Gaussians of each chosen one together [M], which averages out noise.
-
-        Args:
-            means: centres of all Gaussians [N, 3].
-            chosen: int [M], indices of the Gaussians that are asked for.
-            count: number of nearest Gaussians, the chosen one included.
-        """
-        count = min(count, len(means))
-        _, near = KDTree(means).query(means[chosen], count, workers=-1)
-        near = np.reshape(near, (len(chosen), count))
-        return _ratio(self.changed[near].sum(axis=1), self.visible[near].sum(axis=1))
 
 
 def _ratio(changed: np.ndarray, visible: np.ndarray) -> np.ndarray:

@@ -92,3 +92,15 @@ def test_choose_key_views__are_spread_and_distinct():
     assert len(set(chosen)) == 4
     assert {0, 8} <= set(chosen)
     assert choose_key_views(cameras, 20) == tuple(range(9))
+
+
+def test_lift_flow__counts_flow_that_varies_within_a_gaussian_as_weak_evidence():
+    """The same mean flow everywhere, uniform or alternating from column to column as far as it bleeds."""
+    flows = {view: uniform_flow(camera, SHIFT) for view, camera in enumerate(rig())}
+    varying = {}
+    for view, known in flows.items():
+        spread = np.where(np.arange(known.forward_flow.shape[1]) % 2, 0, 2)[None, :, None]
+        varying[view] = replace(known, forward_flow=known.forward_flow * spread.astype(np.float32))
+    rigid, bleeding = (lifted_from(cloud(), each).logit_confidence for each in (flows, varying))
+    assert np.median(rigid) > 1.9
+    assert np.median(bleeding) < np.median(rigid) - 1

@@ -1,4 +1,4 @@
-"""Responsibility: against the exact ratio of blend weights, and pooled over neighbours."""
+"""Responsibility: against the exact ratio of blend weights."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from morgs_mi import RenderConfig
 from morgs_mi.method.boxes import boxes_around
-from morgs_mi.method.responsibility import Responsibility, responsibility
+from morgs_mi.method.responsibility import responsibility
 from morgs_mi.render.backproject import backproject
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
@@ -66,11 +66,3 @@ def test_responsibility__is_zero_or_one_where_nothing_or_everything_changed(gaus
     assert seen.any() == changed
     np.testing.assert_allclose(found.share[seen], 1, atol=1e-5)
     assert not found.share[~seen].any()
-
-
-def test_pooled__sums_over_neighbours_before_it_divides():
-    means = np.array([[0.0, 0, 0], [0.1, 0, 0], [0.2, 0, 0], [9, 0, 0]])
-    found = Responsibility(np.array([1.0, 3, 0, 5]), np.array([1.0, 9, 0, 5]))
-    np.testing.assert_allclose(found.share, [1, 1 / 3, 0, 1])
-    np.testing.assert_allclose(found.pooled(means, np.array([0, 3]), 3), [0.4, 0.5714], atol=1e-4)
-    np.testing.assert_allclose(found.pooled(means, np.array([3]), 99), [0.6])

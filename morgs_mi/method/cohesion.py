@@ -1,0 +1,79 @@
+"""Cohesion: neighbours of similar colour are parts of one object, and move or stand still together.
+
+Flow is evidence of motion in one place and none in the next: inside an object whose texture is weak it is zero, and
+beside the object it bleeds onto the background, where shadows have flow, too. But objects are mostly separate from
+their surroundings in space or in colour. So the logit u_i of the confidence of each active Gaussian is replaced by z_i,
+an approximate solution of
+
+    z_i = (u_i + lambda sum_j a_ij z_j / sum_j a_ij) / (1 + lambda),    a_ij = exp(-|c_i - c_j|^2 / (2 s^2)),
+
+over its nearest neighbours j, where c is chromaticity, which shadows hardly change. All other Gaussians stand still.
+(A random walk on the graph of neighbours; Grady 2006 segments images so.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.spatial import KDTree
+
+from morgs_mi.core.color_space import SH_C0
+from morgs_mi.core.gaussians import Gaussians
+
+__all__ = ["CohesionConfig", "share_confidence"]
+
+# Of 1: chromaticity of what is darker is noise.
+_LEAST_COLOR = 0.02
+
+
+@dataclass(frozen=True)
+class CohesionConfig:
+    """Settings of the cohesion of neighbours."""
+
+    neighbours: int = 12
+    """Number of nearest Gaussians."""
+    weight: float = 100.0
+    """Weight lambda of the neighbours against the evidence of the Gaussian alone; 0: no cohesion."""
+    chroma_scale: float = 0.03
+    """Difference of chromaticity s at which the affinity has fallen to 0.61."""
+    rounds: int = 150
+    """Rounds of averaging (Jacobi's method). With more of them, and a larger weight, evidence spreads farther."""
+
+
+def share_confidence(
+    gaussians: Gaussians, chosen: np.ndarray, logit: np.ndarray, still: float, config: CohesionConfig | None = None
+) -> np.ndarray:
+    """Return the logits z [M] of the chosen Gaussians (see the module).
+
+    Args:
+        gaussians: N Gaussians, detached.
+        chosen: int [M], indices of the active ones.
+        logit: u [M], their own logits.
+        still: logit of all others.
+        config: settings.
+    """
+    config = config or CohesionConfig()
+    means = np.asarray(gaussians.means)
+    count = min(config.neighbours + 1, len(means))
+    if not len(chosen) or count < 2:
+        return logit
+    _, near = KDTree(means).query(means[chosen], count, workers=-1)
+    near = np.asarray(near)[:, 1:]  # the first is the Gaussian itself
+    chroma = _chromaticity(gaussians)
+    affinity = np.exp(-np.sum((chroma[chosen][:, None] - chroma[near]) ** 2, axis=2) / (2 * config.chroma_scale**2))
+    affinity /= np.maximum(affinity.sum(axis=1, keepdims=True), 1e-6)
+    starts = np.arange(0, near.size + 1, near.shape[1])
+    average = csr_array((affinity.astype(np.float32).ravel(), near.ravel(), starts), (len(chosen), len(means)))
+    everywhere = np.full(len(means), still, np.float32)
+    everywhere[chosen] = logit
+    for _ in range(config.rounds):
+        everywhere[chosen] = (logit + config.weight * (average @ everywhere)) / (1 + config.weight)
+    return everywhere[chosen]
+
+
+def _chromaticity(gaussians: Gaussians) -> np.ndarray:
+    """Return the colours [N, 3] without view-dependence, each divided by its sum."""
+    color = np.maximum(0.5 + SH_C0 * np.asarray(gaussians.sh_coeffs)[:, 0], _LEAST_COLOR)
+    return color / color.sum(axis=1, keepdims=True)

@@ -1,0 +1,79 @@
+"""Cohesion: an object moves as a whole, and a patch of a large static surface does not."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from morgs_mi.core.color_space import SH_C0
+from morgs_mi.method.cohesion import CohesionConfig, share_confidence
+from tests.scenes.gaussians import isotropic, random_sheet
+
+STILL = -2.0
+GREY, RED = (0.5, 0.5, 0.5), (0.7, 0.2, 0.2)
+# The wall has 600 Gaussians, the object 100.
+WALL = np.arange(700) < 600
+
+
+def wall_and_object(height, color, brightness=1.0):
+    """Return Gaussians of a wall, and of a patch at some height above it."""
+    rng = np.random.default_rng(0)
+    means = np.concatenate([random_sheet(rng, 600, 1.0, 0.0), random_sheet(rng, 100, 0.3, height)])
+    colors = np.where(WALL[:, None], GREY, color) * np.where(rng.random(700) < 0.5, brightness, 1)[:, None]
+    return isotropic(means, 0.05, 0.9, ((colors - 0.5) / SH_C0)[:, None])
+
+
+def moving(share, seed=1):
+    """Return logits of 700 Gaussians: a share of the object's moves for sure, and everything else stands still."""
+    rng = np.random.default_rng(seed)
+    return np.where(~WALL & (rng.random(700) < share), 2.0, STILL).astype(np.float32)
+
+
+def shared(gaussians, logit, config=None):
+    return share_confidence(gaussians, np.arange(700), logit, STILL, config)
+
+
+def test_share_confidence__fills_gaps_in_an_object_that_is_separate_in_space():
+    found = shared(wall_and_object(1.0, GREY), moving(0.7))
+    assert (found[~WALL] > 0).all()
+    assert (found[WALL] < -1).all()
+
+
+def test_share_confidence__fills_gaps_in_an_object_that_is_separate_in_color():
+    found = shared(wall_and_object(0.0, RED), moving(0.7))
+    assert (found[~WALL] > 0).mean() > 0.95
+    assert (found[WALL] < 0).mean() > 0.98
+
+
+def test_share_confidence__rejects_evidence_on_a_part_of_a_static_surface():
+    """A shadow on the wall: its Gaussians are those of the patch, some of them dark."""
+    found = shared(wall_and_object(0.0, GREY, brightness=0.6), moving(0.7))
+    assert (found < 0).mean() > 0.98
+
+
+def test_share_confidence__solves_its_equation():
+    gaussians = wall_and_object(0.3, RED)
+    few, many = (shared(gaussians, moving(0.5), CohesionConfig(weight=2, rounds=rounds)) for rounds in (60, 61))
+    np.testing.assert_allclose(few, many, atol=1e-5)
+    means = np.asarray(gaussians.means)
+    i = 650
+    near = np.argsort(np.linalg.norm(means - means[i], axis=1))[1:13]
+    color = 0.5 + SH_C0 * np.asarray(gaussians.sh_coeffs)[:, 0]
+    chroma = color / color.sum(axis=1, keepdims=True)
+    affinity = np.exp(-np.sum((chroma[near] - chroma[i]) ** 2, axis=1) / (2 * 0.03**2))
+    average = np.average(many[near], weights=affinity)
+    np.testing.assert_allclose(many[i], (moving(0.5)[i] + 2 * average) / 3, atol=1e-4)
+
+
+def test_share_confidence__counts_all_but_the_chosen_as_still():
+    gaussians, chosen = wall_and_object(0.0, GREY), np.flatnonzero(~WALL)
+    found = share_confidence(gaussians, chosen, np.full(100, 2.0, np.float32), STILL)
+    assert found.shape == (100,)
+    assert (found < 0).all()
+
+
+def test_share_confidence__returns_the_logits_without_neighbours_or_weight():
+    one, logit = isotropic(np.zeros((1, 3)), 0.1, 0.9), np.array([1.5], np.float32)
+    np.testing.assert_array_equal(share_confidence(one, np.arange(1), logit, STILL), logit)
+    alone = shared(wall_and_object(0.0, GREY), moving(0.5), CohesionConfig(weight=0))
+    np.testing.assert_array_equal(alone, moving(0.5))
+    assert not len(share_confidence(one, np.arange(0), logit[:0], STILL))
