@@ -21,7 +21,7 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.boxes import boxes_around
-from morgs_mi.method.responsibility import Responsibility, responsibility
+from morgs_mi.method.responsibility import responsibility
 from morgs_mi.render.active_view import ActiveView, make_active_view
 from morgs_mi.render.config import RenderConfig
 
@@ -56,14 +56,12 @@ class ActiveSet:
         num_gaussians: N.
         views: active views in which they are visible, by view index.
         num_views: V, the views that have an image.
-        responsibility: of all N Gaussians for the changes; None where all are active.
     """
 
     indices: np.ndarray
     num_gaussians: int
     views: Mapping[int, ActiveView]
     num_views: int
-    responsibility: Responsibility | None = None
 
     def select(self, gaussians: Gaussians) -> Gaussians:
         """Return the active ones among N Gaussians."""
@@ -108,8 +106,8 @@ def find_active_set(
     if sum(c.mean() for c in changes.values()) > config.max_changed * len(cameras):
         return full_active_set(gaussians, cameras, render)
     boxes = {view: boxes_around(gaussians, camera, render, config.core) for view, camera in cameras.items()}
-    blame = responsibility(gaussians, cameras, changes, boxes, render, config.min_weight)
-    active = blame.share > config.min_responsibility
+    shares = responsibility(gaussians, cameras, changes, boxes, render, config.min_weight)
+    active = shares > config.min_responsibility
     if gaussians.logit_confidence is not None:
         active |= np.asarray(gaussians.logit_confidence) > 0
     for view, box in boxes.items():
@@ -123,7 +121,7 @@ def find_active_set(
         for view, mask in drawn.items()
         if mask.any()
     }
-    return ActiveSet(np.flatnonzero(active), len(gaussians), views, len(cameras), blame)
+    return ActiveSet(np.flatnonzero(active), len(gaussians), views, len(cameras))
 
 
 def with_zero_motion(gaussians: Gaussians) -> Gaussians:

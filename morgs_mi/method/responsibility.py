@@ -16,7 +16,6 @@ Large views are rendered at a fraction of their resolution, where c_v is the cha
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import cv2
 import drjit as dr
@@ -30,29 +29,7 @@ from morgs_mi.render.backproject import backproject
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.region import Region
 
-__all__ = ["Responsibility", "responsibility"]
-
-
-@dataclass(frozen=True, eq=False)
-class Responsibility:
-    """Responsibility of N Gaussians for the changes of all views.
-
-    Attributes:
-        changed: blend weight in changed pixels [N], summed over all views.
-        visible: blend weight in all pixels [N], likewise; 0 for a Gaussian that counts as hidden.
-    """
-
-    changed: np.ndarray
-    visible: np.ndarray
-
-    @property
-    def share(self) -> np.ndarray:
-        """Ratio of both [N], from 0 to 1; 0 for hidden Gaussians."""
-        return _ratio(self.changed, self.visible)
-
-
-def _ratio(changed: np.ndarray, visible: np.ndarray) -> np.ndarray:
-    return np.where(visible > 0, changed / np.maximum(visible, 1e-30), 0)
+__all__ = ["responsibility"]
 
 
 def responsibility(
@@ -63,8 +40,8 @@ def responsibility(
     render: RenderConfig,
     min_weight: float = 1.0,
     width: int = 640,
-) -> Responsibility:
-    """Return the responsibility of each Gaussian for the changes.
+) -> np.ndarray:
+    """Return the responsibility r [N] of each Gaussian for the changes, from 0 to 1; 0 for hidden ones.
 
     Args:
         gaussians: N Gaussians of the previous frame, detached.
@@ -90,7 +67,7 @@ def responsibility(
         near += boxes[view].covered(_enlarged(region.mask, changes[view].shape))
     seen = weight > min_weight
     elsewhere = np.asarray(area / dr.maximum(near, 1))
-    return Responsibility(np.where(seen, changed, 0), np.where(seen, weight * elsewhere, 0))
+    return np.where(seen, changed / np.maximum(weight * elsewhere, 1e-30), 0)
 
 
 def _reduced(mask: np.ndarray, factor: int) -> np.ndarray:
