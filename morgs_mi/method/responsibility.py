@@ -66,8 +66,9 @@ def responsibility(
         changed, weight = changed + factor**2 * sums[:, 0], weight + factor**2 * sums[:, 1]
         near += boxes[view].covered(_enlarged(region.mask, changes[view].shape))
     seen = weight > min_weight
-    elsewhere = np.asarray(area / dr.maximum(near, 1))
-    return np.where(seen, changed / np.maximum(weight * elsewhere, 1e-30), 0)
+    # At least 1: the box of a Gaussian beside the view may be empty, although it reaches into the view.
+    elsewhere = np.maximum(np.asarray(area / dr.maximum(near, 1)), 1)
+    return np.where(seen, changed / np.where(seen, weight * elsewhere, 1), 0)
 
 
 def _reduced(mask: np.ndarray, factor: int) -> np.ndarray:
