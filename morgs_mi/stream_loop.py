@@ -10,7 +10,8 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -59,8 +60,8 @@ class FrameReport:
         status: "ok", or a sentence about what was done instead.
         missing_views: names of the views without an image.
         active: what took part, as fractions of everything, by name: gaussians, views, pixels, epochs.
-        expectation: of the first frame, a sentence about the quality of views between the cameras; empty if it was not
-            measured.
+        validation: of the first frame, what cross-validation found (see `fit.cross_validation`), with a `sentence` on
+            views between the cameras; empty if there was none.
     """
 
     frame: int
@@ -71,7 +72,7 @@ class FrameReport:
     status: str = "ok"
     missing_views: tuple[str, ...] = ()
     active: dict[str, float] = field(default_factory=dict)
-    expectation: str = ""
+    validation: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +197,7 @@ def _first_step(
         len(coded),
         status,
         _missing(setup, images),
-        expectation="" if validation is None else validation.sentence,
+        validation={} if validation is None else {"sentence": validation.sentence, **asdict(validation)},
     )
     return StreamState(1, coded, images, _references(setup, state, images, {})), packet, report
 

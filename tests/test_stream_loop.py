@@ -189,6 +189,20 @@ def test_push__replaces_too_few_points_and_reports_it(clip):
     assert 590 < len(loop.gaussians) <= 600  # those pruned in the last round are not replaced
 
 
+def test_push__reports_what_cross_validation_of_the_first_frame_found(clip):
+    fit, ticks = dataclasses.replace(QUICK.fit, first_frame_steps=20), []
+    given = dataclasses.replace(QUICK, fit=dataclasses.replace(fit, dropping=0.0))
+    _, report = new_loop(dataclasses.replace(QUICK, fit=fit)).push(clip[0][:4], lambda *tick: ticks.append(tick))
+    found = report.validation
+    assert "Views between the cameras" in found["sentence"]
+    assert len(found["withheld"]) == 1
+    assert [trial["dropping"] for trial in found["trials"]][:2] == [0.0, 0.2]
+    steps = [done for done, _ in ticks]
+    assert steps == sorted(set(steps))
+    assert ticks[-1][0] == ticks[-1][1] == 20 + 3 * 8
+    assert new_loop(given).push(clip[0][:4])[1].validation == {}
+
+
 def without(images, *views):
     return [None if view in views else image for view, image in enumerate(images[:4])]
 

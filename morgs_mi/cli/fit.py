@@ -71,8 +71,8 @@ class Fit:
             f"{stream}: {len(reports)} frames, {stream.stat().st_size / 1e6:.1f} MB, "
             f"{reports[0].seconds:.1f} s for the first frame{later}."
         )
-        if reports[0].expectation:
-            print_result(reports[0].expectation)
+        if reports[0].validation:
+            print_result(reports[0].validation["sentence"])
 
 
 @contextmanager

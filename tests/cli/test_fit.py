@@ -39,6 +39,13 @@ def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
     assert all(frame["psnr"] > 0 for frame in frames)
 
 
+def test_fit__reports_what_to_expect_of_views_between_the_cameras(capture: Path, tmp_path: Path, run) -> None:
+    code, output, _ = run("fit", capture, tmp_path / "out", *QUICK, "--test-view", "none")
+    (first, *_) = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
+    assert code == 0
+    assert first["validation"]["sentence"] in " ".join(output.split())
+
+
 def test_fit__and_eval_use_the_same_instants(capture: Path, tmp_path: Path, run) -> None:
     lengthen_clip(capture)
     out, options = tmp_path / "out", ("--offset", "cam1", "-1", "cam2", "1", "--exposure")

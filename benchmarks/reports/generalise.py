@@ -1,0 +1,87 @@
+"""First frames with and without cross-validation: quality of the held-out view, and the estimate of it.
+
+    python -m benchmarks.reports.generalise --seeds 3 4 5 6 7 8 --json out.json
+
+Each clip is `morgs-mi synth random --seed SEED`, as in `random_scenes`. The first frame is fitted as by default, where
+cross-validation chooses the probability of dropping, and without dropping.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import tyro
+
+from benchmarks.speed.output import Output
+from morgs_mi import StreamLoop, rasterize
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.config import StreamConfig
+from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.synth.synthesize import synthesize
+
+
+@dataclass(frozen=True)
+class Options(Output):
+    """Clips and output."""
+
+    seeds: tuple[int, ...] = (3, 4, 5, 6, 7, 8)
+    """Seeds of the scenes."""
+    clips: Path = Path("out/random")
+    """Folder of the clips."""
+    steps: int = 1500
+    """Steps of the first frame."""
+
+
+def measure(capture: Capture, config: StreamConfig) -> dict[str, float]:
+    """Fit the first frame; return PSNR of the held-out view and of the training views, seconds, and the estimate."""
+    train, test = capture.train_views, capture.test_view
+    assert test is not None
+    cameras, masks = [capture.cameras[v] for v in train], [capture.masks[v] for v in train]
+    loop = StreamLoop(cameras, capture.points, capture.point_colors, config, masks)
+    images = next(iter(capture.partial_frames(0, 1))).images
+    _, report = loop.push([images[v] for v in train])
+    gaussians = loop.gaussians
+    assert gaussians is not None
+
+    def score(view: int) -> float:
+        found = np.asarray(rasterize(gaussians, capture.cameras[view], ("color",)).color)
+        return psnr(np.clip(found, 0, 1), np.asarray(images[view]) / 255.0)
+
+    figures = {
+        "held_out": score(test),
+        "training": float(np.mean([score(v) for v in train])),
+        "seconds": report.seconds,
+    }
+    if not report.validation:
+        return figures
+    best = max(report.validation["trials"], key=lambda trial: trial["withheld_psnr"])
+    return {**figures, "dropping": best["dropping"], "estimate": best["withheld_psnr"]}
+
+
+def main(options: Options) -> None:
+    """Run the report."""
+    mi.set_variant("llvm_ad_rgb")
+    config = StreamConfig()
+    config = replace(config, fit=replace(config.fit, first_frame_steps=options.steps))
+    rows: dict[str, Any] = {}
+    for seed in options.seeds:
+        clip = options.clips / f"random-{seed}"
+        if not clip.exists():
+            synthesize("random", clip, num_frames=8, seed=seed)
+        capture = load_capture(clip)
+        without = replace(config, fit=replace(config.fit, dropping=0.0))
+        rows[str(seed)] = {
+            "views": len(capture.train_views),
+            "without": measure(capture, without),
+            "chosen": measure(capture, config),
+        }
+        print(f"seed {seed}", rows[str(seed)], flush=True)
+    options.write({"steps": options.steps, "seeds": rows})
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
