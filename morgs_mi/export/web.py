@@ -20,7 +20,7 @@ from morgs_mi.codec.container import Packet, StreamWriter
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import atomic_folder, atomic_path
-from morgs_mi.playback.player import metadata_entry
+from morgs_mi.playback.player import metadata_entry, stream_name
 
 __all__ = ["text_of_bytes", "write_web_folder", "write_web_page"]
 
@@ -50,7 +50,7 @@ def write_web_page(
         OSError: the page cannot be written.
     """
     data = _script("stream", _published(stream, progress))
-    page = _page(title or _title(stream), data, "data: blob:")
+    page = _page(title or stream_name(stream), data, "data: blob:")
     with atomic_path(path, "write_web_page()") as partial:
         partial.write_bytes(page)
     return len(page)
@@ -73,7 +73,8 @@ def write_web_folder(
         OSError: the folder cannot be written.
     """
     data = _published(stream, progress)
-    page = _page(title or _title(stream), f'<i id="stream" data-address="{_STREAM}" hidden></i>', "'self' data: blob:")
+    place = f'<i id="stream" data-address="{_STREAM}" hidden></i>'
+    page = _page(title or stream_name(stream), place, "'self' data: blob:")
     with atomic_folder(path, "write_web_folder()") as partial:
         (partial / "index.html").write_bytes(page)
         (partial / _STREAM).write_bytes(data)
@@ -111,11 +112,6 @@ def _copied(packets: Iterable[Packet], writer: StreamWriter) -> Iterator[Packet]
     for packet in packets:
         writer.write(packet)
         yield packet
-
-
-def _title(stream: StreamReader) -> str:
-    path = stream.path.resolve()
-    return path.parent.name if path.name == _STREAM else path.stem
 
 
 def _page(title: str, data: str, connect: str) -> bytes:

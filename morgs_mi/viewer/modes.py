@@ -8,9 +8,9 @@ from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import colors_seen_from
-from morgs_mi.playback.player import CHANNELS, MOTION_SCALE, channel_image
+from morgs_mi.playback.player import CHANNELS, channel_image
 
-__all__ = ["BACKGROUNDS", "MODES", "available_modes", "splat_colors", "splat_values"]
+__all__ = ["BACKGROUNDS", "MODES", "available_modes", "splat_values", "value_colors"]
 
 _ATTRIBUTE_MODES = {row.channel: row for row in ATTRIBUTES if row.channel is not None}
 
@@ -26,19 +26,10 @@ def available_modes(gaussians: Gaussians) -> tuple[str, ...]:
     return tuple(mode for mode in MODES if mode not in missing)
 
 
-def splat_colors(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray:
-    """Return the colours of N Gaussians as a camera sees them, uint8 [N, 3].
+def splat_values(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray:
+    """Return the values [N, C] that a mode shows of N Gaussians as a camera sees them, in the channel's units.
 
     Motion and offset are the first-order projections of the displacements; the offset is zero where none is stored.
-
-    Raises:
-        ValueError: `mode` is not one of `MODES`, or the Gaussians do not have its attribute.
-    """
-    return channel_image(mode, splat_values(gaussians, camera, mode)[:, None], MOTION_SCALE * camera.width)[:, 0]
-
-
-def splat_values(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray:
-    """Return the values [N, C] that a mode shows, in the channel's units.
 
     Raises:
         ValueError: `mode` is not one of `MODES`, or the Gaussians do not have its attribute.
@@ -57,3 +48,8 @@ def splat_values(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray:
             f"splat_values(): the mode must be one of {', '.join(MODES)} that the stream stores, got {mode!r}."
         )
     return np.asarray(getattr(gaussians, row.activated_name)).reshape(len(gaussians), -1)
+
+
+def value_colors(mode: str, values: np.ndarray, motion_scale: float) -> np.ndarray:
+    """Return the colours of values [N, C] of a mode, uint8 [N, 3]; `motion_scale` is that of `channel_image`."""
+    return channel_image(mode, values[:, None], motion_scale)[:, 0]
