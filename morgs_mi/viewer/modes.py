@@ -10,9 +10,11 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import colors_seen_from
 from morgs_mi.playback.player import CHANNELS, channel_image
 
-__all__ = ["BACKGROUNDS", "MODES", "available_modes", "splat_values", "value_colors"]
+__all__ = ["BACKGROUNDS", "MODES", "available_modes", "sees_same", "splat_values", "value_colors"]
 
 _ATTRIBUTE_MODES = {row.channel: row for row in ATTRIBUTES if row.channel is not None}
+
+_ROUNDING = 1e-4
 
 MODES = tuple(channel for channel in CHANNELS if channel != "alpha")
 """All channels that can be shown, apart from alpha."""
@@ -24,6 +26,14 @@ def available_modes(gaussians: Gaussians) -> tuple[str, ...]:
     """Return the modes for which Gaussians have an attribute; motion, offset and depth always count."""
     missing = {mode for mode, row in _ATTRIBUTE_MODES.items() if getattr(gaussians, row.name) is None}
     return tuple(mode for mode in MODES if mode not in missing)
+
+
+def sees_same(camera: Camera, other: Camera, mode: str) -> bool:
+    """Return whether two cameras see the same colours of Gaussians in a mode, up to the rounding of a page's camera."""
+    pairs = [(camera.position, other.position)]
+    if mode != "color":  # which depends on the position only
+        pairs += [(camera.viewmat[:3, :3], other.viewmat[:3, :3]), (camera.K, other.K)]
+    return all(np.allclose(a, b, rtol=_ROUNDING, atol=_ROUNDING) for a, b in pairs)
 
 
 def splat_values(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray:

@@ -15,11 +15,13 @@ from morgs_mi.export.order import equal_cells, z_order
 
 __all__ = ["SplatChunks", "packed_splats"]
 
-# Rows of a chunk, 128 KiB, and the least; fewer rows fit the changes more closely, more objects take longer.
-_ROWS, _LEAST_ROWS = 4096, 64
+# Chunks, and the fewest and most rows of one: small ones fit the changes more closely, many take the page longer.
+_CHUNKS, _LEAST_ROWS, _MOST_ROWS = 64, 64, 4096
 # Share of the rows that are free for Gaussians that are born.
 _SPARE = 1 / 16
 _FREE = -1
+# Share of the rows above which a change is that of a mode or a view and says nothing about motion.
+_NEARLY_ALL = 0.75
 # Upper triangle of a covariance.
 _UPPER = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
 # Variance of the transparent Gaussians in free rows: small, so that they cover few pixels.
@@ -48,8 +50,8 @@ def packed_splats(
 class SplatChunks:
     """The Gaussians of a page.
 
-    Where the changes are scattered over the chunks, Gaussians are distributed again, with those first that have
-    changed. That sends all of them once, so it waits until as many rows have been sent in vain.
+    Where the changes are scattered over the chunks, Gaussians are distributed again, in the order of how often they
+    have changed. That sends all of them once, so it waits until as many rows have been sent in vain.
 
     Args:
         scene: viser's `SceneApi`.
@@ -61,7 +63,7 @@ class SplatChunks:
         self._ids = np.zeros(0, np.int64)  # of the Gaussian in each row
         self._empty = np.zeros(8, np.uint32)  # a free row
         self._shown = np.zeros((0, 8), np.uint32)
-        self._has_changed = np.zeros(0, bool)  # since they were distributed
+        self._changes = np.zeros(0, np.int64)  # how often the Gaussian in each row has changed
         self._sent_in_vain = 0
 
     def show(self, ids: np.ndarray, splats: np.ndarray) -> None:
@@ -80,8 +82,8 @@ class SplatChunks:
         self._shown = buffer
         per_chunk = len(buffer) // max(len(self._chunks), 1)
         sent = np.flatnonzero(changed.reshape(len(self._chunks), -1).any(axis=1))
-        if 2 * changed.sum() < len(buffer):  # another mode or view changes nearly all, which tells nothing about motion
-            self._has_changed |= changed
+        if changed.sum() < _NEARLY_ALL * len(buffer):
+            self._changes += changed
         self._sent_in_vain += per_chunk * len(sent) - int(changed.sum())
         for index in sent:
             self._chunks[index].buffer = buffer[index * per_chunk : (index + 1) * per_chunk]
@@ -105,23 +107,26 @@ class SplatChunks:
         if len(born) > len(free):
             return None
         rows[born] = free[: len(born)]
-        self._ids[is_free] = _FREE
+        self._ids[is_free], self._changes[is_free] = _FREE, 0
         self._ids[rows] = ids
         return rows
 
     def _distribute(self, ids: np.ndarray, splats: np.ndarray) -> np.ndarray:
         """Distribute Gaussians over new rows and return the row [N] of each."""
         centers = np.ascontiguousarray(splats[:, :3]).view(np.float32)
-        restless = np.isin(ids, self._ids[self._has_changed])
+        changes = np.zeros(len(ids), np.int64)
+        _, here, before = np.intersect1d(ids, self._ids, return_indices=True)
+        changes[here] = self._changes[before]
         place = z_order(centers, equal_cells(centers)) if len(ids) else np.zeros(0, np.int64)
         rows = np.empty(len(ids), np.int64)
-        rows[np.lexsort((place, ~restless))] = np.arange(len(ids))
-        size = int(np.clip(len(ids) // 16, _LEAST_ROWS, _ROWS))
+        rows[np.lexsort((place, -changes))] = np.arange(len(ids))
+        size = int(np.clip(len(ids) // _CHUNKS, _LEAST_ROWS, _MOST_ROWS))
         count = int(np.ceil(max(len(ids) * (1 + _SPARE), 1) / size))
         self._ids = np.full(count * size, _FREE, np.int64)
         self._ids[rows] = ids
         self._shown = np.zeros((count * size, 8), np.uint32)  # differs from every row, so that all are sent
-        self._has_changed, self._sent_in_vain = np.zeros(count * size, bool), 0
+        self._changes, self._sent_in_vain = np.zeros(count * size, np.int64), 0
+        self._changes[rows] = changes
         # Beside the others, as the page sorts by depths between the least and the largest.
         beside = centers[:1] if len(ids) else np.zeros((1, 3))
         self._empty = packed_splats(beside, _TINY * np.eye(3)[None], np.zeros((1, 3), np.uint8), np.zeros(1))[0]

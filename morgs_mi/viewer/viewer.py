@@ -41,7 +41,7 @@ from morgs_mi.viewer.controls import FREE, Controls
 from morgs_mi.viewer.crop import crop_limits, is_in_box, is_shown
 from morgs_mi.viewer.frame_cache import NO_TRAILS, FrameCache
 from morgs_mi.viewer.legend import legend_html
-from morgs_mi.viewer.modes import available_modes, splat_values
+from morgs_mi.viewer.modes import available_modes, sees_same, splat_values
 from morgs_mi.viewer.page_scene import PageScene
 from morgs_mi.viewer.page_view import camera_at, move_page, page_view, point_ahead
 from morgs_mi.viewer.picking import blend_weights, description
@@ -63,6 +63,8 @@ _NOT_RECORDED = ". There is no recorded image of this camera at this frame."
 _ANY, _LOCAL = ("0.0.0.0", "::", ""), ("127.0.0.1", "::1", "localhost")
 # In seconds: period of the loop, period of reading the file again, time without motion after which the camera rests.
 _TICK, _REFRESH, _REST = 0.01, 1.0, 0.2
+# Seconds for which a new page may report the camera of an empty scene, before it has the initial one.
+_ARRIVAL = 3.0
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,7 @@ class Viewer:
         self._recording: RecordedImages | None = None
         self._shown: tuple[Any, ...] | None = None
         self._rendered: tuple[Any, np.ndarray] | None = None
+        self._colored_for = self._cameras[0]  # camera that sees the colours of the Gaussians on the page
         self._picked: int | None = None
         self._requests: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._frame_time = time.monotonic()
@@ -250,7 +253,16 @@ class Viewer:
             gui.add_command(label, hotkey=key).on_trigger(lambda event, act=act: act(event.client))
 
     def _watch(self, client: Any) -> None:
-        client.camera.on_update(lambda _: self._set_view(client))
+        arriving_until = time.monotonic() + _ARRIVAL
+
+        def moved(_: Any) -> None:
+            nonlocal arriving_until
+            at_start = np.allclose(client.camera.position, self._server.initial_camera.position, atol=_AT_CAMERA)
+            if at_start or time.monotonic() > arriving_until:
+                arriving_until = 0.0
+                self._set_view(client)
+
+        client.camera.on_update(moved)
 
     def _move_frame(self, change: Callable[[int], int]) -> None:
         self._controls.playing.value = self._controls.follow.value = False
@@ -354,6 +366,7 @@ class Viewer:
 
     def _show_splats(self, ids: np.ndarray, gaussians: Gaussians, camera: Camera) -> None:
         mode, motion_scale = self._controls.mode.value, MOTION_SCALE * camera.width
+        camera = self._colored_for = self._colored_for if sees_same(camera, self._colored_for, mode) else camera
         values = splat_values(gaussians, camera, mode)
         self._scene.show_splats(ids, gaussians, values, mode, motion_scale)
         self._controls.show_legend(legend_html(mode, values, motion_scale))

@@ -49,7 +49,8 @@ def in_order(rows: np.ndarray) -> np.ndarray:
 def random_splats(count: int, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     covariances = 0.01 * np.eye(3) * rng.uniform(0.5, 1, (count, 1, 1))
-    return packed_splats(rng.normal(size=(count, 3)), covariances, np.full((count, 3), 200, np.uint8), np.full(count, 0.8))
+    colors = np.full((count, 3), 200, np.uint8)
+    return packed_splats(rng.normal(size=(count, 3)), covariances, colors, np.full(count, 0.8))
 
 
 def moved(splats: np.ndarray, rows: np.ndarray) -> np.ndarray:
