@@ -68,7 +68,7 @@ class PageScene:
     def show_picked(self, path: np.ndarray, position: np.ndarray | None, text: str) -> None:
         """Show the path [P, 3] of a Gaussian and a label at its position [3], or neither if there is none."""
         segments = np.stack([path[:-1], path[1:]], axis=1)
-        self._show_lines("/path", segments, np.full((1, 1, 3), _PATH))
+        self._show_lines("/path", segments, np.full((1, 1, 3), _PATH), thickness=5.0)
         if position is None:
             self._scene.remove_by_name("/picked")
         else:
@@ -107,10 +107,12 @@ class PageScene:
             for node in nodes:
                 node.visible = visible and index != at
 
-    def _show_lines(self, name: str, lines: np.ndarray, colors: np.ndarray) -> None:
+    def _show_lines(self, name: str, lines: np.ndarray, colors: np.ndarray, thickness: float = 1.5) -> None:
         """Show line segments [S, 2, 3] with colours broadcastable to them, or none."""
         if len(lines):
             colors = np.broadcast_to(colors.astype(np.uint8), lines.shape)
-            self._scene.add_line_segments(name, self._scale * lines, colors, thickness=1.5, thickness_units="screen")
+            self._scene.add_line_segments(
+                name, self._scale * lines, colors, thickness=thickness, thickness_units="screen"
+            )
         else:
             self._scene.remove_by_name(name)
