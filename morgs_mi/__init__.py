@@ -8,12 +8,15 @@ ensure_llvm()
 from morgs_mi.capture.capture import Capture, load_capture  # noqa: E402
 from morgs_mi.capture.live import live_frames  # noqa: E402
 from morgs_mi.codec.config import CodecConfig  # noqa: E402
+from morgs_mi.codec.reader import StreamReader  # noqa: E402
 from morgs_mi.config import StreamConfig  # noqa: E402
 from morgs_mi.core.camera import Camera  # noqa: E402
 from morgs_mi.core.color_space import SH_C0  # noqa: E402
 from morgs_mi.core.gaussians import Gaussians  # noqa: E402
+from morgs_mi.core.progress import ProgressBar  # noqa: E402
 from morgs_mi.evaluate.evaluate import evaluate_stream  # noqa: E402
 from morgs_mi.evaluate.point_tracks import PointTracks, track_points  # noqa: E402
+from morgs_mi.export.notebook import stream_html  # noqa: E402
 from morgs_mi.export.tracks import extract_tracks  # noqa: E402
 from morgs_mi.fit.config import FitConfig  # noqa: E402
 from morgs_mi.gaussian_integrator import ellipsoids  # noqa: E402  (registers the integrator `gaussian_splat`)
@@ -28,6 +31,9 @@ from morgs_mi.stream_loop import FrameReport, StreamLoop  # noqa: E402
 from morgs_mi.synth.ground_truth import load_tracks, load_truth  # noqa: E402
 from morgs_mi.synth.synthesize import synthesize  # noqa: E402
 
+# Here, because the reader cannot import what draws it.
+StreamReader._repr_html_ = stream_html  # type: ignore[attr-defined]
+
 __all__ = [
     "SH_C0",
     "Camera",
@@ -39,6 +45,7 @@ __all__ = [
     "Image",
     "MotionConfig",
     "PointTracks",
+    "ProgressBar",
     "RenderConfig",
     "StreamConfig",
     "StreamLoop",

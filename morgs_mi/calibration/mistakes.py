@@ -12,7 +12,6 @@ from itertools import combinations, permutations
 from typing import Any
 
 import numpy as np
-from scipy.optimize import minimize_scalar
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts import poses_bounds
@@ -129,6 +128,8 @@ def best_focal_factor(error: Callable[[float], float]) -> float:
     steps = np.arange(-_FACTOR_OCTAVES, _FACTOR_OCTAVES + _FACTOR_STEP, _FACTOR_STEP)
     start = min(steps, key=of_octaves)
     bounds = (start - _FACTOR_STEP, start + _FACTOR_STEP)
+    from scipy.optimize import minimize_scalar  # not at the start of every command, which it slows down
+
     found: Any = minimize_scalar(of_octaves, bounds=bounds, method="bounded", options={"xatol": 3e-3})
     return float(2.0**found.x)
 

@@ -13,7 +13,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from morgs_mi.cli.console import print_result
-from morgs_mi.viewer.viewer import ViewerConfig
+from morgs_mi.viewer.viewer import Viewer, ViewerConfig
 
 __all__ = ["View"]
 
@@ -29,12 +29,15 @@ class View:
     config: Annotated[ViewerConfig, arg(name="")] = field(default_factory=ViewerConfig)
 
     def run(self) -> None:
-        from morgs_mi.viewer.viewer import Viewer
-
         try:
-            viewer = Viewer(self.out, self.config)
+            viewer = Viewer(self.out, self.config, self._announce)
         except ImportError as error:
             raise ValueError(str(error)) from error
+        with _stopped_by_interrupt(viewer.stop):
+            viewer.run()
+
+    def _announce(self, viewer: Viewer) -> None:
+        """Report the address and open it."""
         print_result(f"{viewer.url} (Ctrl-C to stop)")
         if viewer.is_public:
             print_result(
@@ -43,8 +46,6 @@ class View:
             )
         if self.open_browser:
             webbrowser.open(viewer.url)
-        with _stopped_by_interrupt(viewer.stop):
-            viewer.run()
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from morgs_mi.codec.packets import frames_with_lasting_ids
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.gaussians import Gaussians
 
-__all__ = ["by_place"]
+__all__ = ["by_place", "equal_cells", "z_order"]
 
 _CELL_BITS = 10
 
@@ -28,17 +28,24 @@ def by_place(stream: StreamReader) -> Iterator[tuple[int, Gaussians]]:
     for ids, coded in frames_with_lasting_ids(stream):
         means = coded.gaussians.numpy()["means"]
         if len(ids) and (cells is None or not np.isin(ids, known_ids).any()):
-            # Cells with equal numbers of Gaussians along each axis, which far ones do not widen.
-            cells = np.quantile(means, np.linspace(0, 1, 2**_CELL_BITS + 1)[1:-1], axis=0)
+            cells = equal_cells(means)
         born = ~np.isin(ids, known_ids)
         if cells is not None and born.any():
             known_ids = np.concatenate([known_ids, ids[born]])
-            known_keys = np.concatenate([known_keys, _z_order(means[born], cells)])
+            known_keys = np.concatenate([known_keys, z_order(means[born], cells)])
         keys = known_keys[np.searchsorted(known_ids, ids)]
         yield coded.frame, coded.gaussians.select(np.argsort(keys, kind="stable"))
 
 
-def _z_order(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
+def equal_cells(points: np.ndarray) -> np.ndarray:
+    """Return the inner bounds [1023, 3] of cells with equal numbers of points [N, 3] along each axis.
+
+    Unlike cells of equal size, they are not widened by far points.
+    """
+    return np.quantile(points, np.linspace(0, 1, 2**_CELL_BITS + 1)[1:-1], axis=0)
+
+
+def z_order(points: np.ndarray, cells: np.ndarray) -> np.ndarray:
     """Return the places int64 [N] of points [N, 3] on a Z-order curve through a grid with the inner bounds `cells`."""
     keys = np.zeros(len(points), np.int64)
     for axis in range(3):

@@ -10,15 +10,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.export.axes import up_direction
 from morgs_mi.io.bounded import read_json
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
 
 __all__ = ["CameraPath", "focus", "load_path", "orbit", "through_cameras"]
 
@@ -83,6 +85,8 @@ class CameraPath:
 
     @cached_property
     def _splines(self) -> tuple[CubicSpline, RotationSpline, CubicSpline]:
+        from scipy.interpolate import CubicSpline  # not at the start of every command, which it slows down
+
         K = np.stack([key.K for key in self.keys])
         # With logarithms the focal lengths stay positive where the spline overshoots.
         intrinsics = np.stack([np.log(K[:, 0, 0]), np.log(K[:, 1, 1]), K[:, 0, 2], K[:, 1, 2]], axis=1)

@@ -20,9 +20,9 @@ from morgs_mi.codec.container import Packet, StreamWriter
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import atomic_folder, atomic_path
-from morgs_mi.playback.player import metadata_entry
+from morgs_mi.playback.player import metadata_entry, stream_name
 
-__all__ = ["text_of_bytes", "write_web_folder", "write_web_page"]
+__all__ = ["text_of_bytes", "web_page", "write_web_folder", "write_web_page"]
 
 Progress = Callable[[int], None]
 
@@ -49,11 +49,16 @@ def write_web_page(
         ValueError: a packet of the stream or its metadata is broken.
         OSError: the page cannot be written.
     """
-    data = _script("stream", _published(stream, progress))
-    page = _page(title or _title(stream), data, "data: blob:")
+    page = web_page(stream, title, progress)
     with atomic_path(path, "write_web_page()") as partial:
         partial.write_bytes(page)
     return len(page)
+
+
+def web_page(stream: StreamReader, title: str | None = None, progress: Progress | None = None) -> bytes:
+    """Return the page that `write_web_page` writes; arguments and errors are the same."""
+    data = _script("stream", _published(stream, progress))
+    return _page(title or stream_name(stream), data, "data: blob:")
 
 
 def write_web_folder(
@@ -73,7 +78,8 @@ def write_web_folder(
         OSError: the folder cannot be written.
     """
     data = _published(stream, progress)
-    page = _page(title or _title(stream), f'<i id="stream" data-address="{_STREAM}" hidden></i>', "'self' data: blob:")
+    place = f'<i id="stream" data-address="{_STREAM}" hidden></i>'
+    page = _page(title or stream_name(stream), place, "'self' data: blob:")
     with atomic_folder(path, "write_web_folder()") as partial:
         (partial / "index.html").write_bytes(page)
         (partial / _STREAM).write_bytes(data)
@@ -111,11 +117,6 @@ def _copied(packets: Iterable[Packet], writer: StreamWriter) -> Iterator[Packet]
     for packet in packets:
         writer.write(packet)
         yield packet
-
-
-def _title(stream: StreamReader) -> str:
-    path = stream.path.resolve()
-    return path.parent.name if path.name == _STREAM else path.stem
 
 
 def _page(title: str, data: str, connect: str) -> bytes:

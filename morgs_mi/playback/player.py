@@ -52,6 +52,7 @@ __all__ = [
     "render",
     "render_config",
     "render_stream",
+    "stream_name",
     "truth_for_camera",
 ]
 
@@ -63,6 +64,7 @@ MOTION_SCALE = 0.03
 """Speed at which the colour of motion is fully saturated, as a fraction of the image width per frame."""
 OFFSET_SCALE = 0.1
 """The same for the learned offset, as a fraction of that speed: the offset is the smaller part of the motion."""
+_STREAM = "stream.morgs"
 _MOST_TIMED_FRAMES = 30
 _JSON_TYPES = {
     dict: "an object",
@@ -87,10 +89,16 @@ def open_stream(out: str | Path) -> StreamReader:
         ValueError: the file is not a stream, or its header is broken or missing.
     """
     path = Path(out)
-    path = path / "stream.morgs" if path.is_dir() else path
+    path = path / _STREAM if path.is_dir() else path
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a stream, found none; check the path or fit a capture first.")
     return StreamReader(path)
+
+
+def stream_name(stream: StreamReader) -> str:
+    """Return the name of a stream: that of its folder or file, without `.morgs`."""
+    path = stream.path.resolve()
+    return path.parent.name if path.name == _STREAM else path.stem
 
 
 def find_camera(stream: StreamReader, camera: int | str) -> Camera:

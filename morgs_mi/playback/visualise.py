@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.files import atomic_path
+from morgs_mi.io.png import png_bytes
 
 __all__ = [
     "confidence_image",
@@ -201,10 +202,9 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
     image = to_uint8(image)
     if not image.size:
         raise ValueError(f"write_png(): the image for {path} has no pixels: {image.shape}.")
-    _, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
     with atomic_path(path, "write_png()") as partial:
         partial.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(data.tobytes())
+        partial.write_bytes(png_bytes(image))
 
 
 def _apply_colour_map(values: np.ndarray, colour_map: int) -> np.ndarray:

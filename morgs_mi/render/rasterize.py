@@ -15,6 +15,7 @@ from morgs_mi.core.checks import check_type, numbers
 from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
 from morgs_mi.core.memory import float_tensor, from_numpy, refuse_freezing
 from morgs_mi.core.types import Bool, Float, Tensor
+from morgs_mi.io.png import png_bytes
 from morgs_mi.render.backend import block_shape
 from morgs_mi.render.blocks import build_lists, touches
 from morgs_mi.render.channels import NORMALISED, attribute_channels, channel_sizes
@@ -65,6 +66,12 @@ class Image:
         if channel not in tensors:
             raise KeyError(f"Image: expected a channel out of {', '.join(tensors)}, got {channel!r}; render it.")
         return tensors[channel]
+
+    def _repr_png_(self) -> bytes | None:
+        """Return the colour as a PNG file, which notebooks show; None without a colour, or on a region."""
+        if self.color is None or len(self.color.shape) != 3:
+            return None
+        return png_bytes(np.rint(255 * np.clip(np.nan_to_num(np.array(dr.detach(self.color))), 0, 1)).astype(np.uint8))
 
     def _tensors(self) -> dict[str, Tensor]:
         named = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "others"}

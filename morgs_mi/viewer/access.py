@@ -7,12 +7,13 @@ prevent it. By DNS rebinding, such a page can also point its own name at this ma
 
 from __future__ import annotations
 
+import asyncio
 import ipaddress
 import logging
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from http import HTTPStatus
-from threading import Lock
+from threading import Event, Lock
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -21,6 +22,7 @@ from morgs_mi.viewer.arrow_keys import with_arrow_keys
 __all__ = ["checked_connections", "refusal"]
 
 _PATCHING = Lock()
+_WAIT = 0.01  # seconds between two looks at whether the scene is ready
 _LOG = logging.getLogger(__name__)
 # websockets logs a traceback for a connection that is closed before its first request.
 _LOG.addFilter(lambda record: record.getMessage() != "opening handshake failed")
@@ -49,10 +51,11 @@ def refusal(host: str | None, origin: str | None, names: Collection[str] = ()) -
 
 
 @contextmanager
-def checked_connections(names: Collection[str] = ()) -> Iterator[None]:
+def checked_connections(names: Collection[str] = (), ready: Event | None = None) -> Iterator[None]:
     """Refuse connections according to `refusal` in the viser server that is started in this context.
 
-    viser passes no options to the `serve` of websockets, so that function is replaced while viser starts.
+    Until `ready` is set, pages load but do not connect. viser passes no options to the `serve` of websockets, so that
+    function is replaced while viser starts.
 
     Raises:
         RuntimeError: no server was started through `serve`, so its connections would not be checked.
@@ -62,12 +65,15 @@ def checked_connections(names: Collection[str] = ()) -> Iterator[None]:
     original, started = server.serve, []
 
     def serve(*args: Any, process_request: Callable[..., Any], **options: Any) -> Any:
-        def process(connection: Any, request: Any) -> Any:
+        async def process(connection: Any, request: Any) -> Any:
             # `get` raises for a header that is sent twice, which websockets answers with an error.
             reason = refusal(request.headers.get("Host"), request.headers.get("Origin"), names)
             if reason is not None:
                 return connection.respond(HTTPStatus.FORBIDDEN, reason + "\n")
-            return with_arrow_keys(process_request(connection, request))
+            response = with_arrow_keys(process_request(connection, request))
+            while response is None and ready is not None and not ready.is_set():
+                await asyncio.sleep(_WAIT)
+            return response
 
         started.append(True)
         return original(*args, process_request=process, logger=_LOG, **options)

@@ -50,6 +50,8 @@ class Controls:
             "Exact image", False, hint="Image of the renderer, whenever the camera comes to rest."
         )
         self.trails = gui.add_checkbox("Trajectories", False, hint="Paths of the Gaussians that moved farthest.")
+        self.pick = gui.add_checkbox("Pick", False, hint="Click a Gaussian for its attributes and its path.")
+        self.picked = gui.add_markdown("", visible=False)
         with gui.add_folder("View"):
             self.camera = gui.add_dropdown("Go to camera", (FREE, *cameras), initial_value=FREE)
             self.recorded = gui.add_slider(
@@ -62,7 +64,9 @@ class Controls:
             )
             self.problem = gui.add_markdown("", visible=False)
             self.cameras = gui.add_checkbox("Show cameras", False, hint="Click a camera to go to it.")
+            self.turntable = gui.add_checkbox("Turntable", False, hint="Orbit around the scene's centre.")
             self.reset = gui.add_button("Reset view")
+            self.screenshot = gui.add_button("Screenshot", hint="Download the exact image of this view.")
         with gui.add_folder("Crop", expand_by_default=False):
             self.opacity = gui.add_slider(
                 "Opacity", 0.0, 1.0, 0.01, 0.0, hint="Gaussians with a lower opacity are hidden."
@@ -84,7 +88,7 @@ class Controls:
     @property
     def settings(self) -> tuple[Any, ...]:
         """All settings that determine what the page draws."""
-        others = (self.exact, self.recorded, self.trails, self.cameras)
+        others = (self.exact, self.recorded, self.trails, self.pick, self.turntable, self.cameras)
         return (*self.render_settings, *(handle.value for handle in others))
 
     @property
@@ -120,6 +124,10 @@ class Controls:
             self.legend.content = html
         if self.legend.visible != bool(html):
             self.legend.visible = bool(html)
+
+    def show_picked(self, text: str) -> None:
+        """Show the attributes of the picked Gaussian, or none if the text is empty."""
+        self.picked.content, self.picked.visible = text, bool(text)
 
     def show_all(self) -> None:
         """Undo the crop."""

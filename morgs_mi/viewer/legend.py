@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import base64
 
-import cv2
 import numpy as np
 
+from morgs_mi.io.png import png_bytes
 from morgs_mi.playback.player import OFFSET_SCALE
 from morgs_mi.playback.visualise import confidence_image, depth_image, depth_range, grey_image, motion_wheel
 
@@ -53,5 +53,4 @@ def _bar(colors: np.ndarray, ticks: tuple[str, ...], unit: str) -> str:
 
 def _source(image: np.ndarray) -> str:
     """Return an image [H, W, 3] as the address of an HTML image."""
-    _, data = cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-    return "data:image/png;base64," + base64.b64encode(data.tobytes()).decode()
+    return "data:image/png;base64," + base64.b64encode(png_bytes(image)).decode()

@@ -8,11 +8,13 @@ from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import colors_seen_from
-from morgs_mi.playback.player import CHANNELS, MOTION_SCALE, channel_image
+from morgs_mi.playback.player import CHANNELS, channel_image
 
-__all__ = ["BACKGROUNDS", "MODES", "available_modes", "splat_colors", "splat_values"]
+__all__ = ["BACKGROUNDS", "MODES", "available_modes", "sees_same", "splat_values", "value_colors"]
 
 _ATTRIBUTE_MODES = {row.channel: row for row in ATTRIBUTES if row.channel is not None}
+
+_ROUNDING = 1e-4
 
 MODES = tuple(channel for channel in CHANNELS if channel != "alpha")
 """All channels that can be shown, apart from alpha."""
@@ -26,19 +28,18 @@ def available_modes(gaussians: Gaussians) -> tuple[str, ...]:
     return tuple(mode for mode in MODES if mode not in missing)
 
 
-def splat_colors(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray:
-    """Return the colours of N Gaussians as a camera sees them, uint8 [N, 3].
-
-    Motion and offset are the first-order projections of the displacements; the offset is zero where none is stored.
-
-    Raises:
-        ValueError: `mode` is not one of `MODES`, or the Gaussians do not have its attribute.
-    """
-    return channel_image(mode, splat_values(gaussians, camera, mode)[:, None], MOTION_SCALE * camera.width)[:, 0]
+def sees_same(camera: Camera, other: Camera, mode: str) -> bool:
+    """Return whether two cameras see the same colours of Gaussians in a mode, up to the rounding of a page's camera."""
+    pairs = [(camera.position, other.position)]
+    if mode != "color":  # which depends on the position only
+        pairs += [(camera.viewmat[:3, :3], other.viewmat[:3, :3]), (camera.K, other.K)]
+    return all(np.allclose(a, b, rtol=_ROUNDING, atol=_ROUNDING) for a, b in pairs)
 
 
 def splat_values(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray:
-    """Return the values [N, C] that a mode shows, in the channel's units.
+    """Return the values [N, C] that a mode shows of N Gaussians as a camera sees them, in the channel's units.
+
+    Motion and offset are the first-order projections of the displacements; the offset is zero where none is stored.
 
     Raises:
         ValueError: `mode` is not one of `MODES`, or the Gaussians do not have its attribute.
@@ -57,3 +58,8 @@ def splat_values(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray:
             f"splat_values(): the mode must be one of {', '.join(MODES)} that the stream stores, got {mode!r}."
         )
     return np.asarray(getattr(gaussians, row.activated_name)).reshape(len(gaussians), -1)
+
+
+def value_colors(mode: str, values: np.ndarray, motion_scale: float) -> np.ndarray:
+    """Return the colours of values [N, C] of a mode, uint8 [N, 3]; `motion_scale` is that of `channel_image`."""
+    return channel_image(mode, values[:, None], motion_scale)[:, 0]

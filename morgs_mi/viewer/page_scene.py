@@ -11,15 +11,16 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances
 from morgs_mi.viewer.crop import box_edges
-from morgs_mi.viewer.modes import BACKGROUNDS, splat_colors
+from morgs_mi.viewer.modes import BACKGROUNDS, value_colors
 from morgs_mi.viewer.page_view import orientation
+from morgs_mi.viewer.splat_chunks import SplatChunks, packed_splats
 
 __all__ = ["PageScene"]
 
 _HALF_MAX = 6e4
 # Size of a camera on the page.
 _FRUSTUM = 0.4
-_CAMERA, _HELD_OUT = (90, 170, 255), (255, 160, 0)
+_CAMERA, _HELD_OUT, _PATH = (90, 170, 255), (255, 160, 0), (255, 80, 200)
 
 
 class PageScene:
@@ -32,35 +33,46 @@ class PageScene:
 
     def __init__(self, scene: Any, scale: float) -> None:
         self._scene, self._scale = scene, scale
-        self._splats: Any = None
+        self._splats = SplatChunks(scene)
+        self._background: int | None = None
         self._cameras: list[tuple[Any, Any]] = []
 
-    def show_splats(self, gaussians: Gaussians, camera: Camera, mode: str) -> None:
-        """Show Gaussians in the colours that a camera sees."""
-        self._scene.set_background_image(np.full((2, 2, 3), BACKGROUNDS[mode], np.uint8), format="png")
-        if len(gaussians):
-            splats = (
-                self._scale * gaussians.numpy()["means"],
-                np.clip(self._scale**2 * covariances(gaussians), -_HALF_MAX, _HALF_MAX),
-                splat_colors(gaussians, camera, mode),
-                np.asarray(gaussians.opacities)[:, None],
-            )
-            if self._splats is None:
-                self._splats = self._scene.add_gaussian_splats("/splats", *splats)
-            else:
-                self._splats.set_gaussians(*splats)
-        self._set_splats_visible(len(gaussians) > 0)
+    def show_splats(
+        self, ids: np.ndarray, gaussians: Gaussians, values: np.ndarray, mode: str, motion_scale: float
+    ) -> None:
+        """Show Gaussians with numbers `ids` [N] in the colours of a mode; arguments are those of `value_colors`."""
+        if self._background != BACKGROUNDS[mode]:
+            self._background = BACKGROUNDS[mode]
+            self._scene.set_background_image(np.full((2, 2, 3), self._background, np.uint8), format="png")
+        splats = packed_splats(
+            self._scale * gaussians.numpy()["means"],
+            np.clip(self._scale**2 * covariances(gaussians), -_HALF_MAX, _HALF_MAX),
+            value_colors(mode, values, motion_scale),
+            np.asarray(gaussians.opacities),
+        )
+        self._splats.show(ids, splats)
+        self._splats.set_visible(True)
 
     def show_image(self, image: np.ndarray) -> None:
         """Show an image [H, W, 3] in place of the Gaussians."""
         self._scene.set_background_image(image, format="png")
-        self._set_splats_visible(False)
+        self._background = None
+        self._splats.set_visible(False)
 
     def show_trails(self, lines: np.ndarray, ages: np.ndarray) -> None:
         """Show trails, see `FrameCache.trails`."""
         level = (255 * (1 - 0.8 * ages)).astype(np.uint8)
         colors = np.stack([level, level, np.full_like(level, 40)], axis=-1)[:, None]
         self._show_lines("/trails", lines, colors)
+
+    def show_picked(self, path: np.ndarray, position: np.ndarray | None, text: str) -> None:
+        """Show the path [P, 3] of a Gaussian and a label at its position [3], or neither if there is none."""
+        segments = np.stack([path[:-1], path[1:]], axis=1)
+        self._show_lines("/path", segments, np.full((1, 1, 3), _PATH), thickness=5.0)
+        if position is None:
+            self._scene.remove_by_name("/picked")
+        else:
+            self._scene.add_label("/picked", text, position=self._scale * position)
 
     def show_box(self, box: np.ndarray | None) -> None:
         """Show the edges of a box with corners [2, 3], or no box."""
@@ -95,14 +107,12 @@ class PageScene:
             for node in nodes:
                 node.visible = visible and index != at
 
-    def _set_splats_visible(self, visible: bool) -> None:
-        if self._splats is not None:
-            self._splats.visible = visible
-
-    def _show_lines(self, name: str, lines: np.ndarray, colors: np.ndarray) -> None:
+    def _show_lines(self, name: str, lines: np.ndarray, colors: np.ndarray, thickness: float = 1.5) -> None:
         """Show line segments [S, 2, 3] with colours broadcastable to them, or none."""
         if len(lines):
             colors = np.broadcast_to(colors.astype(np.uint8), lines.shape)
-            self._scene.add_line_segments(name, self._scale * lines, colors, thickness=1.5, thickness_units="screen")
+            self._scene.add_line_segments(
+                name, self._scale * lines, colors, thickness=thickness, thickness_units="screen"
+            )
         else:
             self._scene.remove_by_name(name)

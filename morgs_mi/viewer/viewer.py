@@ -10,7 +10,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 from threading import Event
 from typing import Any
 
@@ -22,6 +24,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.export.axes import up_direction
 from morgs_mi.export.paths import focus
+from morgs_mi.io.png import png_bytes
 from morgs_mi.playback.player import (
     MOTION_SCALE,
     channel_image,
@@ -30,6 +33,7 @@ from morgs_mi.playback.player import (
     open_stream_capture,
     render,
     render_config,
+    stream_name,
 )
 from morgs_mi.viewer.access import checked_connections
 from morgs_mi.viewer.arrow_keys import NEXT, PREVIOUS
@@ -37,10 +41,12 @@ from morgs_mi.viewer.controls import FREE, Controls
 from morgs_mi.viewer.crop import crop_limits, is_in_box, is_shown
 from morgs_mi.viewer.frame_cache import NO_TRAILS, FrameCache
 from morgs_mi.viewer.legend import legend_html
-from morgs_mi.viewer.modes import available_modes, splat_values
+from morgs_mi.viewer.modes import available_modes, sees_same, splat_values
 from morgs_mi.viewer.page_scene import PageScene
 from morgs_mi.viewer.page_view import camera_at, move_page, page_view, point_ahead
+from morgs_mi.viewer.picking import blend_weights, description
 from morgs_mi.viewer.recorded import RecordedImages, seen_from, wipe
+from morgs_mi.viewer.turntable import Axis, Turntable
 
 __all__ = ["Viewer", "ViewerConfig"]
 
@@ -57,6 +63,8 @@ _NOT_RECORDED = ". There is no recorded image of this camera at this frame."
 _ANY, _LOCAL = ("0.0.0.0", "::", ""), ("127.0.0.1", "::1", "localhost")
 # In seconds: period of the loop, period of reading the file again, time without motion after which the camera rests.
 _TICK, _REFRESH, _REST = 0.01, 1.0, 0.2
+# Seconds for which a new page may report the camera of an empty scene, before it has the initial one.
+_ARRIVAL = 3.0
 
 
 @dataclass(frozen=True)
@@ -81,6 +89,7 @@ class Viewer:
     Args:
         path: stream file, or the folder of a fit; it may still be written.
         config: address and initial settings.
+        on_served: called as soon as a browser can open the page, which then loads while the first frame is decoded.
 
     Attributes:
         url: address of the page on this machine.
@@ -91,7 +100,12 @@ class Viewer:
         FileNotFoundError, ValueError: there is no stream, or the stream has no frame.
     """
 
-    def __init__(self, path: str | Path, config: ViewerConfig | None = None) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        config: ViewerConfig | None = None,
+        on_served: Callable[[Viewer], None] = lambda viewer: None,
+    ) -> None:
         try:
             import viser
         except ImportError as error:
@@ -104,37 +118,30 @@ class Viewer:
             raise ValueError(
                 f"{self._cache.stream.path}: at least one frame was expected, got none; wait for the first."
             )
-        first = self._cache.at(self._cache.frames[0]).gaussians
-        means = first.numpy()["means"]
         self._cameras = self._cache.stream.cameras
         self._view = (0, 0.0, self._cameras[0])  # number of the view, time of the last change, camera
-        self._center, self._up = focus(self._cameras, means), up_direction(self._cameras)
-        distance = float(np.linalg.norm(self._cameras[0].position - self._center))
-        self._scale = _DISTANCE / max(distance, 1e-12)
         self._config = render_config(self._cache.stream)
         self._capture = config.capture
         self._recording: RecordedImages | None = None
         self._shown: tuple[Any, ...] | None = None
         self._rendered: tuple[Any, np.ndarray] | None = None
+        self._colored_for = self._cameras[0]  # camera that sees the colours of the Gaussians on the page
+        self._picked: int | None = None
+        self._requests: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._frame_time = time.monotonic()
-        with checked_connections((config.host, *config.allowed_names)):
+        ready = Event()
+        with checked_connections((config.host, *config.allowed_names), ready):
             self._server = viser.ViserServer(config.host, config.port, label="morgs_mi", verbose=False)
         host = "localhost" if config.host in _ANY else config.host
         self.is_public = config.host not in _LOCAL
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{self._server.get_port()}"
-        self._set_up_page()
-        self._scene = PageScene(self._server.scene, self._scale)
-        self._scene.add_cameras(self._cameras, self._cache.stream.metadata.get("test_view"), self._go_to)
-        self._controls = Controls(
-            self._server.gui,
-            len(self._cache.frames),
-            available_modes(first),
-            [camera.name for camera in self._cameras],
-            crop_limits(means),
-            self._missing_capture(),
-        )
-        self._mode = self._controls.mode.value
-        self._connect()
+        try:
+            on_served(self)
+            self._set_up_page()
+        except BaseException:
+            self._server.stop()
+            raise
+        ready.set()
 
     def run(self) -> None:
         """Serve the page until `stop` is called, from the only thread that uses Dr.Jit."""
@@ -148,6 +155,8 @@ class Viewer:
                         if self._cache.refresh():
                             self._controls.set_count(len(self._cache.frames))
                             self._shown = None  # the number of frames is shown, and a replaced file has other frames
+                    while not self._requests.empty():
+                        self._requests.get()()
                     if self._cache.frames:  # empty while the file is being replaced
                         self._play(now)
                         self._show(now)
@@ -155,6 +164,7 @@ class Viewer:
                     self._controls.status.content, self._shown = str(error), None
                     self._stopped.wait(_REFRESH)
         finally:
+            self._turntable.turn(False)
             self._server.stop()
 
     def stop(self) -> None:
@@ -162,20 +172,48 @@ class Viewer:
         self._stopped.set()
 
     def _set_up_page(self) -> None:
-        """Set the look of the page and its initial view: the first camera, upright to the mean up."""
-        server, first = self._server, self._cameras[0]
+        """Decode the first frame and set up the page; it begins at the first camera, upright to the mean up."""
+        server, camera = self._server, self._cameras[0]
+        first = self._cache.at(self._cache.frames[0]).gaussians
+        means = first.numpy()["means"]
+        self._center, self._up = focus(self._cameras, means), up_direction(self._cameras)
+        self._scale = _DISTANCE / max(float(np.linalg.norm(camera.position - self._center)), 1e-12)
         server.gui.configure_theme(dark_mode=True, show_share_button=False, show_logo=False)
         server.scene.set_up_direction(self._up)
         start = server.initial_camera
-        start.up, start.position = self._up, self._scale * first.position
-        start.look_at = self._scale * point_ahead(first, self._center)
-        start.fov = 2 * float(np.arctan(0.5 * first.height / first.K[1, 1]))
+        start.up, start.position = self._up, self._scale * camera.position
+        start.look_at = self._scale * point_ahead(camera, self._center)
+        start.fov = 2 * float(np.arctan(0.5 * camera.height / camera.K[1, 1]))
+        self._scene = PageScene(server.scene, self._scale)
+        self._scene.add_cameras(self._cameras, self._cache.stream.metadata.get("test_view"), self._go_to)
+        self._turntable = Turntable(lambda: server.get_clients().values(), Axis(self._scale * self._center, self._up))
+        self._controls = Controls(
+            server.gui,
+            len(self._cache.frames),
+            available_modes(first),
+            [camera.name for camera in self._cameras],
+            crop_limits(means),
+            self._missing_capture(),
+        )
+        self._mode = self._controls.mode.value
+        self._connect()
 
     def _connect(self) -> None:
         """Connect the page's cameras, its buttons and its keys."""
         controls, gui = self._controls, self._server.gui
         self._server.on_client_connect(self._watch)
         controls.reset.on_click(lambda event: self._reset(event.client))
+        controls.turntable.on_update(lambda _: self._turntable.turn(controls.turntable.value))
+        controls.screenshot.on_click(lambda event: self._requests.put(partial(self._send_screenshot, event.client)))
+
+        @controls.pick.on_update
+        def _(_: Any) -> None:
+            # Only while picking, because the page's pointer shows that the scene can be clicked.
+            scene = self._server.scene
+            if controls.pick.value:
+                scene.on_click()(lambda event: self._requests.put(partial(self._pick, event.client, event.screen_pos)))
+            else:
+                scene.remove_click_callback()
 
         @controls.camera.on_update
         def _(event: Any) -> None:
@@ -207,13 +245,24 @@ class Viewer:
             ("Next mode", "M", next_mode),
             ("Exact image", "X", flip(controls.exact)),
             ("Trajectories", "T", flip(controls.trails)),
+            ("Pick", "P", flip(controls.pick)),
+            ("Turntable", "O", flip(controls.turntable)),
             ("Reset view", "R", self._reset),
         ]
         for label, key, act in keys:
             gui.add_command(label, hotkey=key).on_trigger(lambda event, act=act: act(event.client))
 
     def _watch(self, client: Any) -> None:
-        client.camera.on_update(lambda _: self._set_view(client))
+        arriving_until = time.monotonic() + _ARRIVAL
+
+        def moved(_: Any) -> None:
+            nonlocal arriving_until
+            at_start = np.allclose(client.camera.position, self._server.initial_camera.position, atol=_AT_CAMERA)
+            if at_start or time.monotonic() > arriving_until:
+                arriving_until = 0.0
+                self._set_view(client)
+
+        client.camera.on_update(moved)
 
     def _move_frame(self, change: Callable[[int], int]) -> None:
         self._controls.playing.value = self._controls.follow.value = False
@@ -268,19 +317,21 @@ class Viewer:
         if self._shown is None or number != self._shown[-1]:
             controls.camera.value = FREE if at is None else self._cameras[at].name
         coded, share = self._cache.at(frame), 0.01 * controls.recorded.value
-        gaussians = self._cropped(coded.gaussians)
-        recorded = None if at is None or not share else self._recorded_image(at, frame, camera)
-        if controls.exact.value or recorded is not None:
+        ids, gaussians = self._cropped(coded)
+        turning = controls.turntable.value  # no image is rendered until the camera comes to rest
+        recorded = None if at is None or not share or turning else self._recorded_image(at, frame, camera)
+        if (controls.exact.value and not turning) or recorded is not None:
             self._show_image(gaussians, camera, recorded, (frame, *controls.render_settings, number))
         else:
-            self._show_splats(gaussians, camera)
+            self._show_splats(ids, gaussians, camera)
         lines, ages = self._cache.trails(frame, self._trail) if controls.trails.value else NO_TRAILS
         inside = is_in_box(lines[:, 1], controls.open_crop_box)
         self._scene.show_trails(lines[inside], ages[inside])
         self._scene.show_cameras(controls.cameras.value, at)
         self._scene.show_box(controls.crop_box if controls.is_cropped else None)
+        self._show_picked(coded)
         missing = "" if not share or recorded is not None else _NOT_AT_CAMERA if at is None else _NOT_RECORDED
-        controls.status.content = self._status(coded, len(gaussians)) + missing
+        controls.status.content = self._status(coded, len(ids)) + missing
         self._server.flush()
         self._shown = wanted
 
@@ -305,17 +356,51 @@ class Viewer:
             moving = self._cache.first_moving(self._frame_at(int(controls.frame.value)))
             controls.frame.value = self._cache.frames.index(moving)
 
-    def _cropped(self, gaussians: Gaussians) -> Gaussians:
+    def _cropped(self, coded: CodedFrame) -> tuple[np.ndarray, Gaussians]:
+        """Return the numbers [N] of the Gaussians that are shown, and those Gaussians."""
         controls = self._controls
         if not controls.is_cropped and controls.opacity.value == 0:
-            return gaussians
-        return gaussians.select(is_shown(gaussians, controls.opacity.value, controls.open_crop_box))
+            return coded.ids, coded.gaussians
+        shown = is_shown(coded.gaussians, controls.opacity.value, controls.open_crop_box)
+        return coded.ids[shown], coded.gaussians.select(shown)
 
-    def _show_splats(self, gaussians: Gaussians, camera: Camera) -> None:
-        mode = self._controls.mode.value
-        self._scene.show_splats(gaussians, camera, mode)
+    def _show_splats(self, ids: np.ndarray, gaussians: Gaussians, camera: Camera) -> None:
+        mode, motion_scale = self._controls.mode.value, MOTION_SCALE * camera.width
+        camera = self._colored_for = self._colored_for if sees_same(camera, self._colored_for, mode) else camera
         values = splat_values(gaussians, camera, mode)
-        self._controls.show_legend(legend_html(mode, values, MOTION_SCALE * camera.width))
+        self._scene.show_splats(ids, gaussians, values, mode, motion_scale)
+        self._controls.show_legend(legend_html(mode, values, motion_scale))
+
+    def _show_picked(self, coded: CodedFrame) -> None:
+        """Show the attributes, the path and a label of the picked Gaussian, if there is one."""
+        picked = self._picked if self._controls.pick.value else None
+        if picked is None:
+            self._controls.show_picked("")
+            self._scene.show_picked(np.zeros((0, 3)), None, "")
+            return
+        self._controls.show_picked(description(coded, picked))
+        position = coded.gaussians.numpy()["means"][coded.ids == picked]
+        path = self._cache.path(picked, coded.frame, self._trail)
+        self._scene.show_picked(path, position[0] if len(position) else None, str(picked))
+
+    def _pick(self, client: Any, place: tuple[float, float]) -> None:
+        """Pick the Gaussian that the renderer blends with the largest weight at a place of a page, from 0 to 1."""
+        camera = page_view(client.camera, self._scale)
+        size = np.array([camera.width, camera.height])
+        column, row = np.minimum((np.array(place) * size).astype(int), size - 1)
+        ids, gaussians = self._cropped(self._cache.at(self._frame_at(int(self._controls.frame.value))))
+        weights = blend_weights(gaussians, camera, column, row, self._config)
+        self._picked = int(ids[np.argmax(weights)]) if weights.any() else None
+        self._shown = None
+
+    def _send_screenshot(self, client: Any) -> None:
+        """Send the image of the renderer, as large as the page."""
+        frame, mode = self._frame_at(int(self._controls.frame.value)), self._controls.mode.value
+        _, gaussians = self._cropped(self._cache.at(frame))
+        camera = page_view(client.camera, self._scale)
+        image = channel_image(mode, render(gaussians, camera, (mode,), self._config)[mode])
+        name = f"{stream_name(self._cache.stream)}-frame{frame:04d}-{mode}.png"
+        client.send_file_download(name, png_bytes(image), save_immediately=True)
 
     def _show_image(
         self, gaussians: Gaussians, camera: Camera, recorded: np.ndarray | None, key: tuple[Any, ...]

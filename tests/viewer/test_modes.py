@@ -18,7 +18,8 @@ from morgs_mi.playback.player import MOTION_SCALE, channel_image, render
 from morgs_mi.playback.visualise import confidence_image, motion_image
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import Image, rasterize
-from morgs_mi.viewer.modes import MODES, available_modes, splat_colors
+from morgs_mi.viewer import modes
+from morgs_mi.viewer.modes import MODES, available_modes
 from tests.assertions import assert_close
 from tests.scenes.changing_splats import rig, write_stream
 
@@ -28,7 +29,12 @@ def states(tmp_path) -> list[CodedFrame]:
     return write_stream(tmp_path / "stream.morgs", 2)
 
 
-def test_splat_colors__of_one_splat_equal_those_of_the_renderer(states):
+def splat_colors(gaussians: Any, camera: Camera, mode: str, modes: ModuleType = modes) -> np.ndarray:
+    """Return the colours of the Gaussians that a camera sees."""
+    return modes.value_colors(mode, modes.splat_values(gaussians, camera, mode), MOTION_SCALE * camera.width)
+
+
+def test_value_colors__of_one_splat_equal_those_of_the_renderer(states):
     camera = rig(65, 49)[1]
     for k in range(5):
         one = states[1].gaussians.select([k])
@@ -47,7 +53,7 @@ def test_splat_colors__of_one_splat_equal_those_of_the_renderer(states):
         assert_close(splat_colors(one, facing, "confidence")[0], confidence, atol=3)
 
 
-def test_splat_colors__every_mode_colours_every_splat(states):
+def test_value_colors__every_mode_colours_every_splat(states):
     for mode in MODES:
         colors = splat_colors(states[1].gaussians, rig()[0], mode)
         assert (colors.dtype, colors.shape) == (np.uint8, (40, 3))
@@ -92,9 +98,9 @@ def test_modes__include_a_new_row_of_the_attribute_table(states, monkeypatch):
     monkeypatch.setattr(player, "rasterize", lambda *_, **__: image)
     assert player.render(wet, rig()[0], ("color", "wetness"), RenderConfig())["wetness"].all()
     grey = np.rint(255 * wet.wetness)
-    assert np.abs(modes.splat_colors(wet, rig()[0], "wetness") - grey[:, None]).max() <= 1
+    assert np.abs(splat_colors(wet, rig()[0], "wetness", modes) - grey[:, None]).max() <= 1
     with pytest.raises(ValueError, match="got 'wetness'"):
-        modes.splat_colors(dry, rig()[0], "wetness")
+        splat_colors(dry, rig()[0], "wetness", modes)
 
 
 def test_available_modes__exclude_missing_attributes(states):

@@ -21,6 +21,7 @@ from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.export.axes import up_direction
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.player import channel_image, open_stream, render, render_config
+from morgs_mi.viewer.picking import blend_weights
 from tests.scenes.captures import n3dv
 from tests.scenes.changing_splats import NAMES, write_stream
 
@@ -270,3 +271,57 @@ def test_viewer__shows_the_images_of_the_renderer(page, tmp_path):
     page.get_by_text("the header is missing").wait_for()
     grow()
     page.get_by_text("of 3, 4").wait_for()
+
+
+def test_viewer__picks_a_gaussian_and_draws_its_path(page, tmp_path):
+    page, states, _ = page
+    stream = open_stream(tmp_path)
+    page.get_by_text("Frame 0 of 2, 40 Gaussians").wait_for()
+    set_number(page, "Frame", 2)
+    page.get_by_text("Frame 2 of 2, 41 Gaussians").wait_for()
+    first = stream.cameras[0]
+    ahead = first.position + first.viewmat[2, :3]
+    camera = Camera.look_at(first.position, ahead, up_direction(stream.cameras), 45, WIDTH, HEIGHT)
+    state, config = states[2], render_config(stream)
+    for column, row in ((170, 200), (100, 250)):
+        weights = blend_weights(state.gaussians, camera, column, row, config)
+        page.get_by_label("Pick", exact=True).check()
+        page.wait_for_timeout(500)
+        page.mouse.click(column + 0.5, row + 0.5)
+        page.get_by_text(f"Gaussian {state.ids[np.argmax(weights)]} of 41").wait_for()
+    page.get_by_text("units per frame", exact=False).wait_for()
+    page.get_by_label("Pick", exact=True).uncheck()
+    page.get_by_text("units per frame", exact=False).wait_for(state="hidden")
+
+
+def test_viewer__downloads_the_exact_image(page, tmp_path):
+    page, states, _ = page
+    page.get_by_text("Frame 0 of 2, 40 Gaussians").wait_for()
+    select_mode(page, "confidence")
+    page.get_by_text("Frame 1 of 2, 40 Gaussians").wait_for()
+    with page.expect_download() as download:
+        page.get_by_role("button", name="Screenshot").click()
+    assert download.value.suggested_filename == f"{tmp_path.name}-frame0001-confidence.png"
+    image = cv2.imread(str(download.value.path()))
+    assert image is not None
+    expected = rendered(open_stream(tmp_path), states[1], "confidence")
+    assert psnr(image[..., ::-1] / 255, expected / 255) > 50
+
+
+def test_viewer__turntable_orbits_and_stops(page, tmp_path):
+    page, _, _ = page
+    page.get_by_text("Frame 0 of 2, 40 Gaussians").wait_for()
+    page.wait_for_timeout(1000)
+    camera = page.get_by_label("Go to camera")
+    playwright.expect(camera).to_have_value("left")
+    before = screenshot(page)
+    press(page, "o")
+    playwright.expect(page.get_by_label("Turntable")).to_be_checked()
+    page.wait_for_timeout(1500)
+    press(page, "o")
+    playwright.expect(camera).to_have_value("free")
+    page.wait_for_timeout(1000)
+    after = screenshot(page)
+    assert psnr(before / 255, after / 255) < 30
+    page.wait_for_timeout(1000)
+    assert psnr(screenshot(page) / 255, after / 255) > 40, "it has stopped"

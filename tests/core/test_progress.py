@@ -1,0 +1,56 @@
+"""Progress bars in notebooks, on terminals and elsewhere."""
+
+from __future__ import annotations
+
+import io
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from morgs_mi.core import progress
+from morgs_mi.core.progress import ProgressBar
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_progress_bar__draws_on_a_terminal_and_ends_the_line(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    bar = ProgressBar("Evaluating")
+    for done in range(1, 5):
+        bar(done, 4)
+    lines = sys.stderr.getvalue().split("\r")
+    assert lines[1].startswith("Evaluating")
+    assert "1/4, 0:00:00" in lines[1]
+    assert "━" * 30 + " 4/4" in lines[-1]
+    assert lines[-1].endswith("\n")
+    assert len(lines) == 3, "updates in quick succession are left out"
+
+
+def test_progress_bar__writes_nothing_into_a_file(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    ProgressBar("Fitting", 2).on_step(1, 1, 1)
+    assert sys.stderr.getvalue() == ""
+
+
+def test_progress_bar__updates_one_element_of_a_notebook(monkeypatch):
+    display = pytest.importorskip("IPython.display", reason="comes with the extra `notebooks`")
+    shown: list[str] = []
+
+    def show(content, display_id):
+        assert display_id
+        shown.append(content.data)
+        return SimpleNamespace(update=lambda content: shown.append("updated: " + content.data))
+
+    monkeypatch.setattr(display, "display", show)
+    monkeypatch.setattr(progress, "_is_notebook", lambda: True)
+    bar = ProgressBar("Fitting <arm>", 3)
+    bar.on_step(0, 3, 6)
+    bar.on_step(2, 6, 6)
+    assert "Fitting &lt;arm&gt;" in shown[0]
+    assert 'value="0.5" max="3"' in shown[0]
+    assert shown[1].startswith("updated: ")
+    assert 'value="3.0" max="3"' in shown[1]
