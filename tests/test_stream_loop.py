@@ -17,7 +17,7 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
-from morgs_mi.fit.config import DensityConfig, FitConfig, LearningRates
+from morgs_mi.fit.config import CrossValidationConfig, DensityConfig, FitConfig, LearningRates
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.recorder import stream_capture
 from morgs_mi.stream_loop import StreamLoop
@@ -190,7 +190,8 @@ def test_push__replaces_too_few_points_and_reports_it(clip):
 
 
 def test_push__reports_what_cross_validation_of_the_first_frame_found(clip):
-    fit, ticks = dataclasses.replace(QUICK.fit, first_frame_steps=20), []
+    how, ticks = CrossValidationConfig(min_views=4), []
+    fit = dataclasses.replace(QUICK.fit, first_frame_steps=20, cross_validation=how)
     given = dataclasses.replace(QUICK, fit=dataclasses.replace(fit, dropping=0.0))
     _, report = new_loop(dataclasses.replace(QUICK, fit=fit)).push(clip[0][:4], lambda *tick: ticks.append(tick))
     found = report.validation

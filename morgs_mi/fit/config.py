@@ -113,8 +113,8 @@ class CrossValidationConfig:
     """Probabilities of dropping, in rising order."""
     share: int = 6
     """One view of that many is withheld, at least one."""
-    min_views: int = 3
-    """Number of views below which nothing is withheld."""
+    min_views: int = 6
+    """Number of views below which nothing is withheld: the others would be too few to stand for all."""
     width: int = 640
     """Images are reduced by the largest whole factor that leaves this width, in px."""
     steps: float = 0.4

@@ -13,7 +13,8 @@ from morgs_mi.fit.cross_validation import CrossValidation, Trial, cross_validate
 from tests.scenes.ball import ball, images_of, opaque_ball, views
 from tests.scenes.cameras import arc, look_at_cameras
 
-CONFIG = FitConfig(sh_degree=0, first_frame_steps=100, num_gaussians=150)
+HOW = CrossValidationConfig(min_views=4)
+CONFIG = FitConfig(sh_degree=0, first_frame_steps=100, num_gaussians=150, cross_validation=HOW)
 
 
 def validate(images, masks=None, config=CONFIG, on_step=None, render=None):
@@ -61,7 +62,7 @@ def test_cross_validate__needs_some_views():
 def test_cross_validate__judges_reduced_images_with_their_masks():
     images = bytes_of(images_of(opaque_ball()))
     masks = [np.ones(image.shape[:2], bool) for image in images]
-    how = CrossValidationConfig(candidates=(0.0,), width=images[0].shape[1] // 2)
+    how = dataclasses.replace(HOW, candidates=(0.0,), width=images[0].shape[1] // 2)
     config = dataclasses.replace(CONFIG, cross_validation=how)
     clean = validate(images, config=config).best
     for image, mask in zip(images, masks, strict=True):
