@@ -187,7 +187,8 @@ def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
     status, _, error = run(*args)
     again = shlex.join(["morgs-mi", *args, "--resume"])
     stands = f"Interrupted. {tmp_path / 'my out'}/stream.morgs holds frames 0 to 1 of 3; continue with `{again}`."
-    assert (status, error) == (130, f"{stands}\n")
+    assert status == 130
+    assert error.splitlines()[-1] == stands  # after lines of progress, on a slow machine
 
 
 def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
@@ -197,7 +198,8 @@ def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
     stream.rename(tmp_path / "out" / "stream.morgs")
     monkeypatch.setattr("morgs_mi.recorder.StreamLoop", interrupt)
     status, _, error = run("fit", capture, tmp_path / "out", *QUICK)
-    assert (status, error) == (130, "Interrupted.\n")
+    assert status == 130
+    assert error.splitlines()[-1] == "Interrupted."
     assert len(StreamReader(tmp_path / "out" / "stream.morgs").index()) == 2
 
 
