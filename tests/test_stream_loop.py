@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 from itertools import pairwise
 
@@ -349,19 +350,20 @@ def test_push__a_static_clip_costs_next_to_nothing(clip):
 
 
 def test_push__skipping_static_views_costs_no_quality(clip):
-    """With and without: the held-out image is as good, in fewer bytes."""
+    """With and without: the held-out image is as good in the mean of three seeds, in fewer bytes."""
     some = dataclasses.replace(QUICK, render=RenderConfig(reproducible=True))
-    everything = dataclasses.replace(some, fit=dataclasses.replace(QUICK.fit, skip_static=False))
-    quality, sizes = [], []
-    for config in (some, everything):
-        loop = new_loop(config)
+    quality, sizes = np.zeros((3, 2)), np.zeros((3, 2))
+    for seed, (column, skip) in itertools.product(range(3), enumerate((True, False))):
+        fit = dataclasses.replace(QUICK.fit, skip_static=skip)
+        loop = new_loop(dataclasses.replace(some, fit=fit, seed=seed))
         reports = [loop.push(images[:4])[1] for images in clip[:3]]
         found = np.asarray(rasterize(loop.gaussians, cameras()[4], ("color",)).color)
-        quality.append(psnr(np.clip(found, 0, 1), clip[2][4] / 255))
-        sizes.append(sum(report.num_bytes for report in reports[1:]))
-        assert (reports[-1].active["pixels"] < 1) == config.fit.skip_static
-    assert quality[0] > quality[1] - 0.5  # of five small views with a first frame that is far from done
-    assert sizes[0] < 0.9 * sizes[1]
+        quality[seed, column] = psnr(np.clip(found, 0, 1), clip[2][4] / 255)
+        sizes[seed, column] = sum(report.num_bytes for report in reports[1:])
+        assert (reports[-1].active["pixels"] < 1) == skip
+    # One seed differs by up to a decibel: five small views, and a first frame that is far from done.
+    assert quality[:, 0].mean() > quality[:, 1].mean() - 0.3
+    assert np.all(sizes[:, 0] < 0.9 * sizes[:, 1])
 
 
 def test_step__is_pure_and_complete(clip):
