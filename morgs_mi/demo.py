@@ -68,8 +68,8 @@ class DemoConfig:
     stream: StreamConfig = field(
         default_factory=lambda: StreamConfig(fit=FitConfig(first_frame_steps=600, dropping=0.0))
     )
-    """The fit, with a shortened first frame, and without the cross-validation that chooses no dropping on a clip without
-    noise, so that it takes minutes; its seed is also the clip's."""
+    """The fit, with a shortened first frame, and without cross-validation, which chooses no dropping on a clip without
+    noise; its seed is also the clip's."""
 
 
 @dataclass(frozen=True)
