@@ -16,12 +16,12 @@ import mitsuba as mi
 import numpy as np
 import tyro
 
+from benchmarks.reports.random_scenes import random_capture
 from benchmarks.speed.output import Output
 from morgs_mi import StreamLoop, rasterize
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import Capture
 from morgs_mi.config import StreamConfig
 from morgs_mi.evaluate.metrics import psnr
-from morgs_mi.synth.synthesize import synthesize
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,7 @@ def main(options: Options) -> None:
     config = replace(config, fit=replace(config.fit, first_frame_steps=options.steps))
     rows: dict[str, Any] = {}
     for seed in options.seeds:
-        clip = options.clips / f"random-{seed}"
-        if not clip.exists():
-            synthesize("random", clip, num_frames=8, seed=seed)
-        capture = load_capture(clip)
+        capture = random_capture(options.clips, seed)
         without = replace(config, fit=replace(config.fit, dropping=0.0))
         rows[str(seed)] = {
             "views": len(capture.train_views),
@@ -80,7 +77,7 @@ def main(options: Options) -> None:
             "chosen": measure(capture, config),
         }
         print(f"seed {seed}", rows[str(seed)], flush=True)
-    options.write({"steps": options.steps, "seeds": rows})
+    options.write({"steps": options.steps, "seeds": rows}, unprinted=["seeds"])
 
 
 if __name__ == "__main__":

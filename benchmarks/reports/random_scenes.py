@@ -17,18 +17,17 @@ import mitsuba as mi
 import numpy as np
 import tyro
 
+from benchmarks.speed.output import Output
 from morgs_mi import Gaussians, StreamLoop, rasterize
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.config import StreamConfig
-from morgs_mi.core.files import write_json
-from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.evaluate.metrics import iou, psnr
 from morgs_mi.synth.ground_truth import load_truth
 from morgs_mi.synth.synthesize import synthesize
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Output):
     """Clips, work and output."""
 
     seeds: tuple[int, ...] = (3, 4, 5, 6, 7, 8)
@@ -39,8 +38,14 @@ class Options:
     """Number of frames that are fitted, the first included."""
     epochs: int = 2
     """Epochs of a later frame."""
-    json: Path | None = None
-    """JSON file for the figures, which are also printed."""
+
+
+def random_capture(clips: Path, seed: int) -> Capture:
+    """Return the random scene of a seed, which is made in the folder `clips` if it is not there."""
+    clip = clips / f"random-{seed}"
+    if not clip.exists():
+        synthesize("random", clip, num_frames=8, seed=seed)
+    return load_capture(clip)
 
 
 def measure(capture: Capture, config: StreamConfig, num_frames: int) -> dict[str, float]:
@@ -87,13 +92,9 @@ def main(options: Options) -> None:
     config = replace(config, fit=replace(config.fit, epochs=options.epochs))
     rows: dict[str, Any] = {}
     for seed in options.seeds:
-        clip = options.clips / f"random-{seed}"
-        if not clip.exists():
-            synthesize("random", clip, num_frames=8, seed=seed)
-        rows[str(seed)] = measure(load_capture(clip), config, options.frames)
+        rows[str(seed)] = measure(random_capture(options.clips, seed), config, options.frames)
         print(f"seed {seed}", rows[str(seed)], flush=True)
-    if options.json is not None:
-        write_json(options.json, {"machine": machine(), "versions": versions(), "seeds": rows})
+    options.write({"seeds": rows}, unprinted=["seeds"])
 
 
 if __name__ == "__main__":

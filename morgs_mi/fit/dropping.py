@@ -1,8 +1,8 @@
-"""Random dropping of Gaussians, a prior for views that nobody filmed (DropGaussian, Park et al. 2025).
+"""Random dropping of Gaussians, which improves novel views (DropGaussian, Park et al. 2025).
 
-Where views are few or noisy, Gaussians conspire: one corrects what another one shows in a single view. In every step of
-the first frame, each Gaussian is left out with probability p, and the opacities of the others are scaled by 1/(1-p), so
-that each has to be right without the others.
+Where training views are few or noisy, Gaussians overfit them together: one compensates for another in a single view. In
+every step of the first frame, each Gaussian is left out with probability p, and the opacities of the others are scaled
+by 1 / (1 - p).
 """
 
 from __future__ import annotations

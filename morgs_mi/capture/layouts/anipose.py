@@ -111,7 +111,7 @@ def _calibration_files(path: Path) -> list[Path]:
 def _is_calibration(file: Path) -> bool:
     try:
         text = file.read_text(encoding="utf-8", errors="replace")
-    except OSError:  # a folder, or a file of somebody else
+    except OSError:  # a folder, or a file without read permission
         return False
     return all(mark.search(text) for mark in _MARKS)
 
