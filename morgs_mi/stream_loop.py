@@ -207,7 +207,8 @@ def _validated(
 ) -> tuple[FitConfig, CrossValidation | None, Callable[[int], None] | None]:
     """Return the first frame's settings, what cross-validation chose them by, and what to call after each step."""
     config, fit = setup.config, setup.config.fit
-    if fit.dropping is not None:
+    if fit.dropping is not None or len(images) < fit.cross_validation.min_views:
+        fit = replace(fit, dropping=fit.dropping or 0.0)
         return fit, None, None if on_step is None else lambda done: on_step(done, fit.first_frame_steps)
     before = trial_steps(fit) * len(fit.cross_validation.candidates)
     steps = before + fit.first_frame_steps
@@ -217,8 +218,7 @@ def _validated(
     found = cross_validate(
         gaussians, cameras, list(images.values()), masks, setup.extent, fit, config.render, seed, tick
     )
-    dropping = 0.0 if found is None else found.best.dropping
-    return replace(fit, dropping=dropping), found, None if tick is None else lambda done: tick(before + done)
+    return replace(fit, dropping=found.best.dropping), found, None if tick is None else lambda done: tick(before + done)
 
 
 def _first_gaussians(

@@ -205,6 +205,14 @@ def test_push__reports_what_cross_validation_of_the_first_frame_found(clip):
     assert new_loop(given).push(clip[0][:4])[1].validation == {}
 
 
+def test_push__withholds_nothing_from_few_views(clip):
+    ticks = []
+    config = dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, first_frame_steps=20))
+    _, report = new_loop(config).push(clip[0][:4], lambda *tick: ticks.append(tick))
+    assert report.validation == {}
+    assert ticks == [(done, 20) for done in range(1, 21)]
+
+
 def without(images, *views):
     return [None if view in views else image for view, image in enumerate(images[:4])]
 

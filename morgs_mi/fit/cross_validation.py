@@ -89,12 +89,12 @@ def cross_validate(
     render: RenderConfig,
     seed: Sequence[int],
     on_step: Callable[[int], None] | None = None,
-) -> CrossValidation | None:
-    """Return what cross-validation of the first frame finds; None if there are too few views.
+) -> CrossValidation:
+    """Return what cross-validation of the first frame finds.
 
     Args:
         start: Gaussians that each fit starts from.
-        cameras: the V training views.
+        cameras: the V training views, at least two.
         images: their images [H, W, 3], uint8.
         masks: valid pixels of each [H, W], or None.
         extent: of the scene in world units.
@@ -104,8 +104,6 @@ def cross_validate(
         on_step: called with the number of steps done, in all fits.
     """
     how = config.cross_validation
-    if len(cameras) < how.min_views:
-        return None
     withheld, steps = withheld_views(cameras, how.share), trial_steps(config)
     small = [_reduced(*view, how.width) for view in zip(cameras, images, masks, strict=True)]
     trained = [view for index, view in enumerate(small) if index not in withheld]
