@@ -42,6 +42,8 @@ STAGES = {
     "targets": ("losses/ssim.py", "__init__"),
     "lift": ("method/lift.py", "lift_flow"),
     "propagation": ("method/propagation.py", "propagate_motion"),
+    "refinement": ("method/photometric.py", "refine_displacement"),
+    "colour": ("method/photometric.py", "mean_color_error"),
     "steps": ("fit/optimise.py", "optimise"),
     "density": ("losses/attribution.py", "densification_scores"),
     "packet": ("codec/packets.py", "residual_packet"),

@@ -104,6 +104,10 @@ class Target:
         dr.eval(planes)
         return planes
 
+    def image(self) -> np.ndarray:
+        """Return the target [H, W, 3], float32 in [0, 1]; black where masked."""
+        return np.asarray(self.planes.image(self.pixels)).reshape(self.shape)
+
     def difference(self, image: Tensor, region: Region | None = None) -> np.ndarray:
         """Return the target minus an image, [H, W, 3] or on a region of it; 0 where masked."""
         if region is None or region.whole:

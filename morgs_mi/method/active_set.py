@@ -2,7 +2,9 @@
 
 A Gaussian is active if its responsibility for the changes of all views exceeds a threshold (see `responsibility`), or
 if it moved in the previous frame, so that its confidence can fall. A view is rendered where an active Gaussian is
-visible and where the image changed, and skipped where neither is the case. All other Gaussians are static splats.
+visible and where the image changed, and skipped where neither is the case. Where active Gaussians hardly changed, some
+views that are spread over the rig show well enough that they stay as they are; the others are rendered where more
+changed. All other Gaussians are static splats.
 
 What appears in front of a static background changes another part of it in every view, so that no Gaussian is
 responsible. Where active Gaussians cover less than half of a connected change, all Gaussians on it are active that lie
@@ -20,7 +22,8 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.method.boxes import boxes_around
+from morgs_mi.method.boxes import Boxes, boxes_around
+from morgs_mi.method.flow import choose_key_views
 from morgs_mi.method.responsibility import responsibility
 from morgs_mi.render.active_view import ActiveView, make_active_view
 from morgs_mi.render.config import RenderConfig
@@ -42,9 +45,13 @@ class ActiveSetConfig:
     """Side of the smallest square of unexplained pixels that counts, in px."""
     max_changed: float = 0.5
     """Fraction of all pixels above which all Gaussians are active."""
-    core: float = 0.6
-    """Half side of the box, as a fraction of the Gaussian's extent: two standard deviations of an opaque one, whose
+    core: float = 0.3
+    """Half side of the box, as a fraction of the Gaussian's extent: one standard deviation of an opaque one, whose
     extent reaches the alpha cut-off at three and a third."""
+    quiet_responsibility: float = 0.2
+    """Responsibility below which an active Gaussian is rendered in some views only."""
+    quiet_views: int = 8
+    """Number of these views."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +121,7 @@ def find_active_set(
         unexplained = _unexplained(changes[view], box.union(active, changes[view].shape), config)
         if unexplained.any():
             active |= np.asarray(box.covered(unexplained) > 0.5 * box.area)
-    drawn = {view: box.union(active, changes[view].shape) | changes[view] for view, box in boxes.items()}
+    drawn = _drawn(active, shares > config.quiet_responsibility, cameras, boxes, changes, config)
     static = with_zero_motion(gaussians.select(~active))
     views = {
         view: make_active_view(cameras[view], mask, static, channels[view], render)
@@ -128,6 +135,21 @@ def with_zero_motion(gaussians: Gaussians) -> Gaussians:
     """Return the Gaussians with a motion and an offset of zero."""
     zero = np.zeros((len(gaussians), 3))
     return replace(gaussians, motion=zero, offset=zero)
+
+
+def _drawn(
+    active: np.ndarray,
+    changing: np.ndarray,
+    cameras: Mapping[int, Camera],
+    boxes: Mapping[int, Boxes],
+    changes: Mapping[int, np.ndarray],
+    config: ActiveSetConfig,
+) -> dict[int, np.ndarray]:
+    """Return the masks [H, W] of what is rendered, by view index: changes, and boxes of active Gaussians [N]."""
+    views = list(cameras)
+    some = {views[k] for k in choose_key_views([cameras[v] for v in views], config.quiet_views)}
+    chosen = {view: active if view in some else active & changing for view in views}
+    return {view: box.union(chosen[view], changes[view].shape) | changes[view] for view, box in boxes.items()}
 
 
 def _unexplained(change: np.ndarray, covered: np.ndarray, config: ActiveSetConfig) -> np.ndarray:

@@ -10,6 +10,7 @@ from morgs_mi.method.cohesion import CohesionConfig
 from morgs_mi.method.flow_sources.config import FlowConfig
 from morgs_mi.method.lift import LiftConfig
 from morgs_mi.method.mask_refiners.config import MaskConfig
+from morgs_mi.method.photometric import PhotometricConfig
 from morgs_mi.method.propagation import PropagationConfig
 
 __all__ = ["MotionConfig"]
@@ -37,6 +38,8 @@ class MotionConfig:
     """Start each Gaussian's motion from lifted flow; False: from zero, as in the paper."""
     propagate_motion: bool = True
     """Also try the motion of the previous frame and of neighbours as starts; needs `lift_flow`."""
+    refine_start: bool = True
+    """Refine the start of motion and colour by the images of the key views; needs `lift_flow` and `two_gates`."""
     lift_confidence: bool = True
     """Raise each Gaussian's confidence to that of lifted flow; False: carry it over, as in the paper."""
     flow_method: str = "dis"
@@ -63,6 +66,8 @@ class MotionConfig:
     """Confidence that neighbours share."""
     propagation: PropagationConfig = field(default_factory=PropagationConfig)
     """Motion proposals."""
+    photometric: PhotometricConfig = field(default_factory=PhotometricConfig)
+    """Refinement by the images."""
     active_set: ActiveSetConfig = field(default_factory=ActiveSetConfig)
     """Selection of the Gaussians that a frame may change."""
     change: ChangeConfig = field(default_factory=ChangeConfig)

@@ -1,4 +1,4 @@
-"""The start of each Gaussian's motion (eq. 5): lifted flow, then motion proposals."""
+"""The start of each Gaussian's motion (eq. 5): lifted flow, then motion proposals, then the images themselves."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from morgs_mi.method.cohesion import share_confidence
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.lift import Lift, lift_flow
+from morgs_mi.method.photometric import mean_color_error, refine_displacement
 from morgs_mi.method.propagation import propagate_motion
 
 __all__ = ["initial_motion"]
@@ -27,7 +28,9 @@ def initial_motion(
     config: MotionConfig,
     rng: np.random.Generator,
 ) -> Lift | None:
-    """Return the start of motion (eq. 5) and confidence of the active Gaussians; None: no motion, confidence as before.
+    """Return the start of the active Gaussians' motion (eq. 5), confidence and colour.
+
+    None: all start as in the previous frame, without motion.
 
     Args:
         previous: N Gaussians of the previous frame, detached.
@@ -40,11 +43,15 @@ def initial_motion(
     if not (config.learn_motion and config.lift_flow and active.views and len(active.indices)):
         return None
     gaussians = active.select(previous)
-    lifted = lift_flow(gaussians, active.views, flows, config.lift, config.masks)
+    start = lift_flow(gaussians, active.views, flows, config.lift, config.masks)
+    views = {v: active.views[v] for v in sorted(flows.keys() & active.views.keys())}
     if config.propagate_motion:
-        views = {v: active.views[v] for v in sorted(flows.keys() & active.views.keys())}
-        lifted = propagate_motion(gaussians, lifted, views, targets, rng, config.propagation)
-    return replace(lifted, logit_confidence=_initial_confidence(lifted, active, previous, config))
+        start = propagate_motion(gaussians, start, views, targets, rng, config.propagation)
+    if config.refine_start and config.two_gates:
+        start = refine_displacement(gaussians, start, views, targets, config.photometric)
+        moved = replace(gaussians, means=np.asarray(gaussians.means) + start.displacement)
+        start = replace(start, color_change=mean_color_error(moved, views, targets, config.photometric))
+    return replace(start, logit_confidence=_initial_confidence(start, active, previous, config))
 
 
 def _initial_confidence(lifted: Lift, active: ActiveSet, previous: Gaussians, config: MotionConfig) -> np.ndarray:

@@ -26,7 +26,7 @@ from morgs_mi.method.boxes import boxes_around
 from morgs_mi.method.lift import Lift
 from morgs_mi.render.active_view import ActiveView
 
-__all__ = ["PropagationConfig", "propagate_motion"]
+__all__ = ["PropagationConfig", "narrowed_views", "nearest_neighbours", "propagate_motion"]
 
 
 @dataclass(frozen=True)
@@ -73,8 +73,10 @@ def propagate_motion(
     if not views or not (d.any() or before.any()):
         return lifted
     means = np.asarray(previous.means)
-    near = _nearest(means, config.neighbours)
-    views = _narrowed(views, previous, _reached(near, np.any([d, before], axis=(0, 2)), config.rounds), (d, before))
+    near = nearest_neighbours(means, config.neighbours)
+    views = narrowed_views(
+        views, previous, _reached(near, np.any([d, before], axis=(0, 2)), config.rounds), (d, before)
+    )
 
     def error_of(d: np.ndarray) -> np.ndarray:
         moved = replace(previous, means=means + d)
@@ -108,7 +110,7 @@ def _previous_motion(gaussians: Gaussians) -> np.ndarray:
     return np.where(np.asarray(gaussians.logit_confidence)[:, None] > 0, motion, 0)
 
 
-def _nearest(means: np.ndarray, count: int) -> np.ndarray:
+def nearest_neighbours(means: np.ndarray, count: int) -> np.ndarray:
     """Return the indices of the nearest neighbours of each mean, [N, count], or fewer if there are no more."""
     k = min(count + 1, len(means))
     _, near = KDTree(means).query(means, k, workers=-1)
@@ -122,7 +124,7 @@ def _reached(near: np.ndarray, moving: np.ndarray, rounds: int) -> np.ndarray:
     return moving
 
 
-def _narrowed(
+def narrowed_views(
     views: Mapping[int, ActiveView], gaussians: Gaussians, chosen: np.ndarray, displacements: Sequence[np.ndarray]
 ) -> dict[int, ActiveView]:
     """Return the views with the blocks that the `chosen` Gaussians reach, in place or displaced; without empty ones."""

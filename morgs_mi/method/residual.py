@@ -36,7 +36,7 @@ def residual_parameters(previous: Gaussians, config: MotionConfig, start: Lift |
     Args:
         previous: N Gaussians of the previous frame.
         config: which modules are on.
-        start: start of motion and confidence; None: no motion, and the confidence of the previous frame.
+        start: of motion, confidence and colour; None: all as in the previous frame, without motion.
 
     Raises:
         ValueError: the confidence is learned, and the Gaussians have none.
@@ -60,6 +60,8 @@ def residual_parameters(previous: Gaussians, config: MotionConfig, start: Lift |
         parameters["logit_confidence"] = logit
     if displacement is not None:
         parameters["motion"] = from_numpy(mi.TensorXf, displacement)
+    if start is not None and start.color_change is not None:
+        parameters["sh_dc"] = from_numpy(mi.TensorXf, start.color_change[:, None])
     return parameters
 
 

@@ -103,6 +103,22 @@ def test_find_active_set__covers_what_appears_in_front_of_a_static_wall(before):
     assert counts[0] < counts[1]
 
 
+def test_find_active_set__draws_what_hardly_changed_in_some_views_only(before, after):
+    changed = changes(before, after)
+
+    def drawn(**settings):
+        found = find_active_set(before, cameras(), changed, CHANNELS, RENDER, ActiveSetConfig(**settings))
+        return found, {view: found.views[view].region.mask for view in range(V)}
+
+    every, everywhere = drawn(quiet_views=V)
+    some, masks = drawn(quiet_views=2, quiet_responsibility=0.9)
+    assert np.array_equal(some.indices, every.indices)
+    fewer = [view for view in range(V) if masks[view].sum() < everywhere[view].sum()]
+    assert len(fewer) == V - 2
+    assert all(masks[view][changed[view]].all() for view in range(V))
+    assert drawn(quiet_views=2, quiet_responsibility=0.0)[0].fractions == every.fractions
+
+
 def test_find_active_set__keeps_what_moved_for_one_more_frame(before):
     """So that its confidence can fall."""
     logits = np.where(np.arange(len(before)) == 7, 2.0, -2.0)

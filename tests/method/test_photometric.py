@@ -1,0 +1,106 @@
+"""Photometric refinement: displacements of a fraction of a pixel and colours, from the images alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morgs_mi import SH_C0
+from morgs_mi.losses.ssim import Target
+from morgs_mi.method.lift import Lift
+from morgs_mi.method.photometric import PhotometricConfig, mean_color_error, refine_displacement
+from morgs_mi.render.active_view import ActiveView
+from tests.scenes.cameras import look_at_cameras
+from tests.scenes.gaussians import isotropic, random_sheet
+
+SHIFT = np.float32([0.05, -0.03, 0.02])  # two pixels
+MOVING, STATIC = 80, 400
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A bright clump that moves by SHIFT in front of a dark static wall, in two views."""
+    rng = np.random.default_rng(0)
+    means = np.concatenate([rng.normal(0, 0.15, (MOVING, 3)), random_sheet(rng, STATIC, 1.2, 0.6)])
+    colors = np.concatenate([rng.uniform(0.2, 1.5, (MOVING, 1, 3)), rng.uniform(-1.5, -1, (STATIC, 1, 3))])
+    before = isotropic(means, 0.05, 0.9, colors)
+    views = dict(enumerate(map(ActiveView, look_at_cameras([(x, 0.3, -3) for x in (-0.8, 0.8)], 45, 128, 96))))
+    return before, views, targets(moved(before), views)
+
+
+def moved(gaussians):
+    displacement = SHIFT * (np.arange(len(gaussians)) < MOVING)[:, None]
+    return replace(gaussians, means=np.asarray(gaussians.means) + displacement)
+
+
+def targets(gaussians, views):
+    return {v: Target(np.asarray(view.render(gaussians).color)) for v, view in views.items()}
+
+
+def with_colors(gaussians, change):
+    return replace(gaussians, sh_coeffs=np.asarray(gaussians.sh_coeffs) + change)
+
+
+def start(factor):
+    displacement = np.zeros((MOVING + STATIC, 3), np.float32)
+    displacement[:MOVING] = factor * SHIFT
+    return Lift(displacement, np.full(len(displacement), 1.0, np.float32))
+
+
+def errors(lift):
+    """Return the distances of the moving Gaussians from their true places, in lengths of SHIFT."""
+    return np.linalg.norm(lift.displacement[:MOVING] - SHIFT, axis=1) / np.linalg.norm(SHIFT)
+
+
+@pytest.mark.parametrize("factor", [0.6, 1.4])
+def test_refine_displacement__corrects_what_flow_left(scene, factor):
+    before, views, seen = scene
+    refined = refine_displacement(before, start(factor), views, seen)
+    assert np.median(errors(refined)) < 0.1  # 0.4 at the start
+    assert not refined.displacement[MOVING:].any()
+    assert np.array_equal(refined.logit_confidence, start(factor).logit_confidence)
+
+
+def test_refine_displacement__keeps_true_motion(scene):
+    before, views, seen = scene
+    assert np.median(errors(refine_displacement(before, start(1.0), views, seen))) < 0.01
+
+
+def test_refine_displacement__takes_no_step_longer_than_the_limit(scene):
+    before, views, seen = scene
+    config = PhotometricConfig(rounds=1, max_step_px=0.1)
+    step = refine_displacement(before, start(0.6), views, seen, config).displacement - start(0.6).displacement
+    px = [view.camera.projection_jacobian(np.asarray(before.means)) @ step[..., None] for view in views.values()]
+    assert 0.05 < np.linalg.norm(px, axis=2).max() < 0.11
+
+
+def test_refine_displacement__does_nothing_without_motion_or_views(scene):
+    before, views, seen = scene
+    assert refine_displacement(before, start(0.0), views, seen).displacement.any() == 0
+    assert np.array_equal(refine_displacement(before, start(0.6), {}, {}).displacement, start(0.6).displacement)
+
+
+def test_mean_color_error__follows_a_change_of_light(scene):
+    before, views, _ = scene
+    brighter = with_colors(before, 0.1 / SH_C0)
+    seen = targets(brighter, views)
+    followed = with_colors(before, mean_color_error(before, views, seen)[:, None])
+    left = [np.abs(seen[v].difference(view.render(followed).color)).mean() for v, view in views.items()]
+    there = [np.abs(seen[v].difference(view.render(before).color)).mean() for v, view in views.items()]
+    assert max(left) < 0.5 * min(there)  # the rest is at the border, and from the weight of ten pixels
+
+
+def test_mean_color_error__trusts_few_pixels_less(scene):
+    before, views, _ = scene
+
+    def followed(sizes):
+        smaller = replace(before, log_scales=np.asarray(before.log_scales) + np.log(sizes))
+        return np.median(mean_color_error(smaller, views, targets(with_colors(smaller, 0.1 / SH_C0), views)))
+
+    assert followed(0.2) < 0.3 * followed(1.0)
+
+
+def test_mean_color_error__is_zero_without_views(scene):
+    assert not mean_color_error(scene[0], {}, {}).any()
