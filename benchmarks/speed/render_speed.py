@@ -4,9 +4,9 @@
     python -m benchmarks.speed.render_speed [--quick] --json out.json --csv out.csv --plot out.png [--baselines]
 
 The whole step is: projection, lists, forward, L1 loss against a constant, adjoint, the projection's adjoint, and the
-gradients of all attributes in memory. All programs run in turn, so that background load affects them equally: compare
-ratios. Without `--workload` a ladder of workloads varies one property at a time: number of Gaussians, image size, size
-of the splats, channels.
+gradients of all attributes in memory; the optimised step has Adam's step, too. All programs run in turn, so that
+background load affects them equally: compare ratios. Without `--workload` a ladder of workloads varies one property at
+a time: number of Gaussians, image size, size of the splats, channels.
 """
 
 from __future__ import annotations

@@ -15,11 +15,13 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from drjit.opt import Adam
 
 from benchmarks.reports.reference64 import Reference64
 from benchmarks.speed import plain
 from benchmarks.workloads import TARGET, write_bin
 from morgs_mi import Camera, Gaussians, RenderConfig, ellipsoids, rasterize
+from morgs_mi.fit.optimise import adam
 from morgs_mi.losses.losses import recon_loss
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.blocks import build_lists
@@ -59,8 +61,8 @@ def stages(
     """Return the timed stages by name.
 
     Lists (with projection), forward (with lists), adjoint (from the image's gradient to the attributes'), and the whole
-    step; for colour alone also the step on a tenth of the tiles, drawn at random, and the L1 + D-SSIM loss with its
-    derivative.
+    step; for colour alone also the step with Adam's, the step on a tenth of the tiles, drawn at random, and the L1 +
+    D-SSIM loss with its derivative.
     """
     config = RenderConfig()
     target = np.broadcast_to(np.float32(TARGET), (camera.height, camera.width, 3)).copy()
@@ -112,6 +114,18 @@ def stages(
         return region, mi.TensorXf(region.crop(target))
 
     @cache
+    def optimizer() -> Adam:
+        made = adam({name: dr.detach(value) for name, value in gaussians.parameters().items()})
+        made.set_learning_rate(1e-9)  # the workload stays as it is
+        return made
+
+    def optimised_step() -> Any:
+        image = rasterize(gaussians.with_parameters(dict(optimizer().items())), camera, channels)
+        dr.backward(_distance(image, named, full, target.size))
+        optimizer().step()
+        return list(optimizer().values())
+
+    @cache
     def compared() -> tuple[Any, Target]:
         image = dr.detach(forward()[0])
         dr.enable_grad(image)
@@ -124,7 +138,7 @@ def stages(
         dr.clear_grad(image)
         return grad
 
-    return works | {"tenth_step": lambda: step(*tenth()), "loss": loss}
+    return works | {"optimised_step": optimised_step, "tenth_step": lambda: step(*tenth()), "loss": loss}
 
 
 def _distance(image: Any, channels: tuple[str, ...], target: Any, size: int) -> Any:

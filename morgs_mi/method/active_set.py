@@ -50,7 +50,7 @@ class ActiveSetConfig:
     extent reaches the alpha cut-off at three and a third."""
     quiet_responsibility: float = 0.2
     """Responsibility below which an active Gaussian is rendered in some views only."""
-    quiet_views: int = 8
+    quiet_views: int = 12
     """Number of these views."""
 
 

@@ -1,0 +1,78 @@
+"""Time the stages of a later frame on some numbers of threads, with the serial share of each (Amdahl 1967).
+
+    python -m benchmarks.speed.thread_scaling --threads 1 2 --json thread_scaling.json
+
+The scene is that of `frame_speed`. With T_n seconds on n threads, the share that does not get faster is
+(n T_n / T_1 - 1) / (n - 1).
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import cv2
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import tyro
+
+from benchmarks.speed.frame_speed import SIZES, Scene, film, measure
+from benchmarks.speed.output import Output
+from morgs_mi.config import StreamConfig
+from morgs_mi.fit.config import DensityConfig, FitConfig
+
+
+@dataclass(frozen=True)
+class Options(Output):
+    """Work and output."""
+
+    threads: tuple[int, ...] = (1, 2)
+    """Numbers of threads; the first must be 1."""
+    size: str = "n3dv"
+    """Size of the rig, small or n3dv."""
+    frames: int = 3
+    """Number of later frames; the first is warm-up, medians of the others are reported."""
+    epochs: int = 2
+    """Epochs of a later frame."""
+    seed: int = 0
+    """Seed of scene and noise."""
+
+
+def use_threads(count: int, cores: list[int]) -> None:
+    """Restrict Dr.Jit, OpenCV and threads that are started from now on to the first `count` cores."""
+    os.sched_setaffinity(0, cores[:count])
+    dr.set_thread_count(count)
+    cv2.setNumThreads(count)
+
+
+def serial_shares(seconds: dict[int, dict[str, float]]) -> dict[str, float]:
+    """Return the serial share of each stage, from the largest number of threads; 0 for stages that take no time."""
+    n = max(seconds)
+    ratios = {name: seconds[n][name] / first for name, first in seconds[1].items() if first > 0.01}
+    return {name: float(f"{np.clip((n * ratio - 1) / (n - 1), 0, 1):.2g}") for name, ratio in ratios.items()}
+
+
+def main(options: Options) -> None:
+    """Run the benchmark."""
+    mi.set_variant("llvm_ad_rgb")
+    cores = sorted(os.sched_getaffinity(0))
+    if options.threads[0] != 1 or not 1 < max(options.threads) <= len(cores):
+        raise SystemExit(f"--threads: expected 1 and numbers up to {len(cores)}, got {options.threads}.")
+    size = SIZES[options.size]
+    scene, rng = Scene(size, options.seed), np.random.default_rng(options.seed)
+    recorded = [film(scene.at(frame), scene.cameras(), rng) for frame in range(options.frames + 1)]
+    density = DensityConfig(max_gaussians=round(1.1 * size.gaussians))
+    config = StreamConfig(FitConfig(sh_degree=0, density=density, epochs=options.epochs))
+    seconds = {}
+    for count in options.threads:
+        use_threads(count, cores)
+        row = measure(size, config, recorded, scene)
+        seconds[count] = {name: value for name, value in row.items() if name == "seconds" or name.endswith("_s")}
+        print(f"{count:3d} threads: {seconds[count]['seconds']:.2f} s", flush=True)
+    figures = {"size": vars(size), "epochs": options.epochs, "seconds": seconds}
+    options.write({**figures, "serial_share": serial_shares(seconds)}, unprinted=["size"])
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
