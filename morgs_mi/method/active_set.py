@@ -45,8 +45,8 @@ class ActiveSetConfig:
     """Side of the smallest square of unexplained pixels that counts, in px."""
     max_changed: float = 0.5
     """Fraction of all pixels above which all Gaussians are active."""
-    core: float = 0.3
-    """Half side of the box, as a fraction of the Gaussian's extent: one standard deviation of an opaque one, whose
+    core: float = 0.6
+    """Half side of the box, as a fraction of the Gaussian's extent: two standard deviations of an opaque one, whose
     extent reaches the alpha cut-off at three and a third."""
     quiet_responsibility: float = 0.2
     """Responsibility below which an active Gaussian is rendered in some views only."""
