@@ -1,0 +1,63 @@
+"""The number of steps of the first frame within a time budget, from the speed of a few steps on this machine."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.first_frame import fit_first_frame
+from morgs_mi.losses.ssim import Target
+from morgs_mi.render.config import RenderConfig
+
+__all__ = ["steps_within"]
+
+# Steps that are timed, and the least number that a first frame gets.
+_TIMED, _LEAST = 20, 100
+# Mean time of a step over that of the first ones, whose Gaussians density control doubles.
+_GROWTH = 1.5
+
+
+def steps_within(
+    seconds: float,
+    gaussians: Gaussians,
+    cameras: Sequence[Camera],
+    targets: Sequence[Target],
+    extent: float,
+    config: FitConfig,
+    render: RenderConfig,
+    seed: Sequence[int],
+) -> int:
+    """Return the number of steps of the first frame, at least 100, that this machine makes in a time.
+
+    The time of the measurement and of cross-validation is part of it. The same number as `first_frame_steps` gives the
+    same result on any machine.
+
+    Args:
+        seconds: the time.
+        gaussians: the start.
+        cameras: V views.
+        targets: their images.
+        extent: of the scene in world units.
+        config: settings of the fit.
+        render: cut-offs.
+        seed: of the steps that are timed.
+    """
+    begin = time.perf_counter()
+    timed = replace(
+        config, first_frame_steps=_TIMED, dropping=0.0, density=replace(config.density, rounds=0), sh_band_fraction=0.0
+    )
+    took = 0.0
+    for _ in range(2):  # the first time, kernels are compiled
+        start = time.perf_counter()
+        fit_first_frame(gaussians, cameras, targets, extent, timed, render, np.random.default_rng(seed))
+        took = time.perf_counter() - start
+    validation = config.cross_validation
+    validated = config.dropping is None and len(cameras) >= validation.min_views
+    per_step = _GROWTH * took / _TIMED * (1 + validated * validation.steps * len(validation.candidates))
+    return max(_LEAST, int((seconds - (time.perf_counter() - begin)) / per_step))
