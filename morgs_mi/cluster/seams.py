@@ -37,6 +37,7 @@ __all__ = ["COMMON_FRAMES", "SeamConfig", "SeamScores", "approached", "changed_p
 COMMON_FRAMES = 2
 """Frames of the common model: the second one determines the confidence."""
 
+_AROUND = 8  # frames before and after a seam, with which it is compared
 _ATTRIBUTES = ("means", "quats", "log_scales", "logit_opacities", "sh_coeffs")
 
 
@@ -52,7 +53,7 @@ class SeamConfig:
     """Factor on the learning rates: there is further to go than between two frames."""
     births: float = 0.05
     """Largest number of births in each of them, as a fraction of the Gaussians."""
-    handover: int = 8
+    handover: int = 12
     """Last frames of a segment, in which it approaches the next one."""
     nearness: float = 0.3
     """Distance, in largest scales of the Gaussian, up to which it counts as the same in both segments."""
@@ -73,22 +74,24 @@ class SeamScores:
         frame: the first one of the segment.
         psnr: of that frame, dB.
         psnr_before: of the frame before, dB.
+        psnr_around: mean of the other frames around the seam, dB.
         mtv: mTV from the frame before to that frame.
-        mtv_around: mean mTV of the frame pairs before and after.
+        mtv_around: mean mTV of the other pairs of frames around the seam.
         mtv_recorded: mTV of the recording from the frame before to that frame.
     """
 
     frame: int
     psnr: float
     psnr_before: float
+    psnr_around: float
     mtv: float
     mtv_around: float
     mtv_recorded: float
 
     def __str__(self) -> str:
         return (
-            f"frame {self.frame}: PSNR {self.psnr - self.psnr_before:+.2f} dB, mTV {self.mtv:.3f}, around it "
-            f"{self.mtv_around:.3f}, recorded {self.mtv_recorded:.3f}"
+            f"frame {self.frame}: PSNR {self.psnr_before:.2f} and {self.psnr:.2f} dB, {self.psnr_around:.2f} dB "
+            f"around; mTV {self.mtv:.3f}, {self.mtv_around:.3f} around, {self.mtv_recorded:.3f} recorded"
         )
 
 
@@ -157,8 +160,11 @@ def changed_packet(
 
 
 def score_seam(stream: StreamReader, capture: Capture, frame: int) -> SeamScores:
-    """Return the scores of the seam before a frame, of a stream and its recording."""
-    first, last = max(frame - 2, 0), min(frame + 2, capture.num_frames)
+    """Return the scores of the seam before a frame, of a stream and its recording.
+
+    Pixels are static if they are so in all frames around the seam, eight on either side.
+    """
+    first, last = max(frame - _AROUND, 0), min(frame + _AROUND, capture.num_frames)
     views = capture.train_views if capture.test_view is None else (capture.test_view,)
     config = render_config(stream)
     rendered: dict[int, dict[int, np.ndarray]] = {}
@@ -171,13 +177,19 @@ def score_seam(stream: StreamReader, capture: Capture, frame: int) -> SeamScores
     frames = {f.index: f.images for f in capture.partial_frames(first, last)}
     recorded = {t: {v: i for v, i in enumerate(images) if i is not None} for t, images in frames.items()}
     views = [v for v in views if all(v in images for images in recorded.values())]
-    quality = {t: _mean([psnr(rendered[t][v], recorded[t][v]) for v in views]) for t in (frame - 1, frame)}
+    quality = {t: _mean([psnr(rendered[t][v], recorded[t][v]) for v in views]) for t in recorded}
     moving = {v: _moving(capture, v, recorded) for v in views}
     pairs = {t: [_variation(rendered, recorded, t, v, moving[v]) for v in views] for t in range(first + 1, last)}
     mtv = {t: _mean([variation.render for variation in found]) for t, found in pairs.items()}
-    around = _mean([value for t, value in mtv.items() if t != frame])
-    noise = _mean([variation.input for variation in pairs[frame]])
-    return SeamScores(frame, quality[frame], quality[frame - 1], mtv[frame], around, noise)
+    return SeamScores(
+        frame,
+        quality[frame],
+        quality[frame - 1],
+        _mean([value for t, value in quality.items() if t not in (frame - 1, frame)]),
+        mtv[frame],
+        _mean([value for t, value in mtv.items() if t != frame]),
+        _mean([variation.input for variation in pairs[frame]]),
+    )
 
 
 # Images by frame and view.
