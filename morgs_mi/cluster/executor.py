@@ -88,6 +88,11 @@ class Workers:
         except Exception as error:
             if type(error).__name__ == "KilledWorker":
                 raise ChildProcessError(_died("the workers")) from None
+            if isinstance(error, RuntimeError) and "deserialization" in str(error):
+                raise ValueError(
+                    f"{self.place}: expected a scheduler and workers with the versions of this client, got others that "
+                    "cannot read its tasks; install the same versions on all machines."
+                ) from None
             if type(error).__name__ in ("CommClosedError", "ClosedClientError", "FutureCancelledError"):
                 raise ConnectionError(_lost(self.place)) from None
             raise

@@ -1,9 +1,9 @@
 """Seams: where a segment of a recording begins, and the stream continues with other Gaussians.
 
-All segments start from one common model, the first two frames of the recording. The first frame of a segment is fitted
-like a later frame of that model, several times over, so that Gaussians that have travelled far since then arrive. What
-has not changed since the first frames stays as it is, to the bit, and every other Gaussian keeps the number that it has
-in the common model.
+All segments start from one common model, the first two frames of the recording. A frame shortly before the segment is
+fitted like a later frame of that model, several times over, so that Gaussians that have travelled far since then
+arrive. The frames up to the segment follow as usual (*warm-up*), and are discarded. What has not changed since the first frames
+stays as it is, to the bit, and every other Gaussian keeps the number that it has in the common model.
 
 The segment before ends elsewhere: it has followed the recording for many frames. In its last frames, each Gaussian that
 is in both models at nearly the same place is moved towards its state in the next segment, by an equal share per frame
@@ -46,20 +46,22 @@ class SeamConfig:
     """Settings of the seams between segments."""
 
     passes: int = 8
-    """Fits of a segment's first frame, one after the other, each with a round of density control."""
+    """Fits of the frame before the warm-up, one after the other, each with a round of density control."""
     epochs: int = 8
     """Passes over all training views in each of them."""
     rates: float = 2.0
     """Factor on the learning rates: there is further to go than between two frames."""
     births: float = 0.05
     """Largest number of births in each of them, as a fraction of the Gaussians."""
+    warm_up: int = 10
+    """Frames before a segment that are fitted first and discarded: the model follows the motion and improves."""
     handover: int = 12
     """Last frames of a segment, in which it approaches the next one."""
     nearness: float = 0.3
     """Distance, in largest scales of the Gaussian, up to which it counts as the same in both segments."""
 
     def fit_config(self, config: StreamConfig, number: int) -> StreamConfig:
-        """Return the settings of a fit of a segment's first frame."""
+        """Return the settings of one of these fits."""
         rates = replace(config.fit.rates, **{n: self.rates * rate for n, rate in asdict(config.fit.rates).items()})
         density = replace(config.fit.density, births=self.births)
         fit = replace(config.fit, epochs=self.epochs, rates=rates, density=density, early_stopping_tolerance=0.0)
@@ -104,7 +106,7 @@ def fit_seam_frame(
     config: SeamConfig,
     on_step: Callable[[int, int], None] | None = None,
 ) -> tuple[CodedFrame, FrameReport]:
-    """Fit the first frame of a segment, and return its state and its report.
+    """Fit a frame far from the common model, and return its state and its report.
 
     Args:
         setup: what all frames share.

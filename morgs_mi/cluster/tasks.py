@@ -177,11 +177,17 @@ def fit_segment_start(fit: Fit, base: bytes, frame: int) -> Part:
     """Fit the first frame of a segment; `base` is a keyframe of the common model, as an encoded packet."""
     with _prepared(fit) as messages:
         capture, coded = fit.source.open(), decode(None, decode_packet(base))
-        setup = _loop(capture, fit, None).setup
-        earlier, now = (_images(capture, t) for t in (coded.frame, frame))
-        coded, report = fit_seam_frame(setup, coded, earlier, frame, now, fit.seams, _check_memory)
-        packet = reemitted_keyframe(coded)
-        report = replace(report, num_bytes=packet.num_bytes)
+        loop, first = _loop(capture, fit, None), max(frame - fit.seams.warm_up, coded.frame + 1)
+        earlier, now = (_images(capture, t) for t in (coded.frame, first))
+        coded, report = fit_seam_frame(loop.setup, coded, earlier, first, now, fit.seams, _check_memory)
+        loop.resume(coded, [[now.get(view) for view in range(len(loop.setup.cameras))]])
+        seconds = report.seconds
+        for recorded in capture.partial_frames(first + 1, frame + 1):
+            _, report = push_frame(loop, recorded, capture.train_views, _check_memory)
+            seconds += report.seconds
+        assert loop.state.coded is not None
+        packet = reemitted_keyframe(loop.state.coded)
+        report = replace(report, seconds=seconds, num_bytes=packet.num_bytes)
         return _part([packet], [report], (packet.encoded,), messages)
 
 

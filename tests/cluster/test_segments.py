@@ -29,7 +29,7 @@ from tests.scenes.recording import CONFIG, write_recording
 FRAMES, STARTS = 10, (0, 3, 7)
 # A keyframe that is re-emitted in the handover, and one that falls on a seam.
 SETTINGS = replace(CONFIG, codec=replace(CONFIG.codec, keyframe_interval=3))
-SEAMS = SeamConfig(passes=2, epochs=1, handover=2)
+SEAMS = SeamConfig(passes=2, epochs=1, warm_up=1, handover=2)
 
 
 @pytest.fixture(scope="module")
