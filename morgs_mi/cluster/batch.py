@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.cluster.executor import Workers
+from morgs_mi.cluster.executor import Workers, wait_for
 from morgs_mi.cluster.segments import SegmentedFit, fit_in_segments
 from morgs_mi.cluster.tasks import Part
 from morgs_mi.config import StreamConfig, apply_preset, apply_values, read_config
@@ -33,6 +33,7 @@ from morgs_mi.config import StreamConfig, apply_preset, apply_values, read_confi
 __all__ = ["BatchConfig", "Job", "JobState", "read_jobs", "run_batch"]
 
 LOG = "log.txt"
+_POLL = 0.1  # seconds between two looks for a worker that is free; their number may grow
 
 
 @dataclass(frozen=True)
@@ -172,32 +173,32 @@ def run_batch(
     Raises:
         ConnectionError: the scheduler was lost.
     """
-    return asyncio.run(_run(jobs, workers, on_change or (lambda _: None)))
+    return wait_for(_run(jobs, workers, on_change or (lambda _: None)))
 
 
 async def _run(
     jobs: Sequence[Job], workers: Workers, on_change: Callable[[Sequence[JobState]], None]
 ) -> list[JobState]:
-    states, free = [JobState(job) for job in jobs], asyncio.Semaphore(workers.count)
+    states = [JobState(job) for job in jobs]
 
     async def run(state: JobState) -> None:
-        async with free:
-            state.status = "fitting"
-            on_change(states)
-            try:
-                fit = await _fit(state, workers, lambda: on_change(states))
-                state.frames = state.num_frames = len(fit.reports)
-                state.status, state.num_bytes = "done", (state.job.out / "stream.morgs").stat().st_size
-            except ConnectionError:
-                raise
-            except Exception as error:
-                state.status, state.error = "failed", error
-                _log(state.job, f"failed: {error}")
-            on_change(states)
+        try:
+            fit = await _fit(state, workers, lambda: on_change(states))
+            state.frames = state.num_frames = len(fit.reports)
+            state.status, state.num_bytes = "done", (state.job.out / "stream.morgs").stat().st_size
+        except ConnectionError:
+            raise
+        except Exception as error:
+            state.status, state.error = "failed", error
+            _log(state.job, f"failed: {error}")
+        on_change(states)
 
     try:
         async with asyncio.TaskGroup() as group:
             for state in states:
+                while sum(other.status == "fitting" for other in states) >= workers.count:
+                    await asyncio.sleep(_POLL)
+                state.status = "fitting"
                 group.create_task(run(state))
     except BaseExceptionGroup as errors:
         raise errors.exceptions[0] from None

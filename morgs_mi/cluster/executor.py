@@ -12,13 +12,13 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any, TypeVar
 
-__all__ = ["Workers", "cores", "open_workers", "share_of_machine"]
+__all__ = ["Workers", "cores", "open_workers", "share_of_machine", "wait_for"]
 
 Result = TypeVar("Result")
 
@@ -34,17 +34,26 @@ class Workers:
 
     Args:
         executor: runs the tasks.
-        count: number of workers, at which no worker is idle.
+        count: returns the number of workers, which may grow.
         place: where they are, for messages.
         renew: returns a new executor of some processes in place of one that broke; None: the executor renews its
             workers itself.
     """
 
     def __init__(
-        self, executor: Executor, count: int, place: str, renew: Callable[[int], Executor] | None = None
+        self,
+        executor: Executor,
+        count: Callable[[], int],
+        place: str,
+        renew: Callable[[int], ProcessPoolExecutor] | None = None,
     ) -> None:
-        self.count, self.place = count, place
+        self.place, self._count = place, count
         self._executor, self._renew, self._alone = executor, renew, asyncio.Lock()
+
+    @property
+    def count(self) -> int:
+        """Number of workers."""
+        return self._count()
 
     async def run(self, function: Callable[..., Result], *args: Any) -> Result:
         """Return the result of a task.
@@ -65,8 +74,13 @@ class Workers:
         # its worker is not confused with others.
         async with self._alone:
             for _ in range(_RETRIES):
-                with suppress(BrokenProcessPool), self._renew(1) as executor:
+                executor = self._renew(1)
+                try:
                     return await self._result(executor, function, *args)
+                except BrokenProcessPool:
+                    continue
+                finally:
+                    _end(executor)
         raise ChildProcessError(_died(f"{_RETRIES + 1} processes"))
 
     def close(self) -> None:
@@ -98,6 +112,20 @@ class Workers:
             raise
 
 
+def wait_for(work: Coroutine[Any, Any, Result]) -> Result:
+    """Run a coroutine that awaits tasks, and return its result; an interruption is raised without further messages."""
+
+    def report(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        if not isinstance(context.get("exception"), KeyboardInterrupt):
+            loop.default_exception_handler(context)
+
+    async def reported() -> Result:
+        asyncio.get_running_loop().set_exception_handler(report)
+        return await work
+
+    return asyncio.run(reported())
+
+
 def _died(what: str) -> str:
     return (
         f"Workers.run(): expected the workers to stay alive, but {what} died at the same task, perhaps for lack of "
@@ -125,14 +153,13 @@ def open_workers(scheduler: str | None = None, count: int | None = None) -> Iter
     if count is not None and count < 1:
         raise ValueError(f"open_workers(): `workers` must be at least 1, got {count}.")
     if scheduler is None:
-        made: list[Workers] = []
         count = count or cores()
         renew = _process_pool(count)
-        made.append(Workers(renew(count), count, "this machine", renew))
+        workers = Workers(renew(count), lambda: count, "this machine", renew)
         try:
-            yield made[0]
+            yield workers
         finally:
-            made[0].close()
+            workers.close()
         return
     with ExitStack() as stack:
         yield _dask_workers(scheduler, count, stack)
@@ -192,8 +219,11 @@ def _dask_workers(scheduler: str, count: int | None, stack: ExitStack) -> Worker
     except (OSError, ValueError) as error:
         found = "no worker" if "client" in locals() else f"none ({error})"
         raise ConnectionError(f"{scheduler}: expected a scheduler with workers, got {found}; start it first.") from None
-    count = len(client.scheduler_info(n_workers=-1)["workers"])
-    return Workers(client.get_executor(pure=False), count, scheduler)
+
+    def number() -> int:
+        return len(client.scheduler_info(n_workers=-1)["workers"])
+
+    return Workers(client.get_executor(pure=False), number, scheduler)
 
 
 def cores() -> int:
@@ -209,7 +239,8 @@ def share_of_machine() -> tuple[int, int]:
         from distributed import get_worker
 
         worker: Any = get_worker()
-        return worker.state.nthreads, int(worker.memory_manager.memory_limit or 0)
+        # A little less than the 95 % at which its nanny ends it without a message.
+        return worker.state.nthreads, int(0.9 * (worker.memory_manager.memory_limit or 0))
     return cores(), 0
 
 

@@ -2,8 +2,8 @@
 
 All segments start from one common model, the first two frames of the recording. A frame shortly before the segment is
 fitted like a later frame of that model, several times over, so that Gaussians that have travelled far since then
-arrive. The frames up to the segment follow as usual (*warm-up*), and are discarded. What has not changed since the first frames
-stays as it is, to the bit, and every other Gaussian keeps the number that it has in the common model.
+arrive. The frames up to the segment follow as usual (*warm-up*), and are discarded. What has not changed since the
+first frames stays as it is, to the bit, and every other Gaussian keeps the number that it has in the common model.
 
 The segment before ends elsewhere: it has followed the recording for many frames. In its last frames, each Gaussian that
 is in both models at nearly the same place is moved towards its state in the next segment, by an equal share per frame

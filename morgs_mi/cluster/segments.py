@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.outputs import check_output
-from morgs_mi.cluster.executor import Workers
+from morgs_mi.cluster.executor import Workers, wait_for
 from morgs_mi.cluster.seams import COMMON_FRAMES, SeamConfig, SeamScores, score_seam
 from morgs_mi.cluster.tasks import (
     Fit,
@@ -71,7 +71,6 @@ class SegmentedFit:
     workers: Mapping[str, int] = field(default_factory=dict)
 
 
-# Called with (name of the stage, done, total) and with (worker, its warnings) of every task.
 OnStage = Callable[[str, float, float], None]
 OnPart = Callable[[Part], None]
 
@@ -103,9 +102,7 @@ def stream_segments(
         OSError: as `stream_capture`, a worker died several times, or the scheduler was lost. The finished frames stay.
         ValueError: as `stream_capture`, or there are more segments than pairs of frames.
     """
-    return asyncio.run(
-        fit_in_segments(capture, out, workers, config or StreamConfig(), segments, seams, resume, on_stage)
-    )
+    return wait_for(fit_in_segments(capture, out, workers, config or StreamConfig(), segments, seams, resume, on_stage))
 
 
 @contextmanager
@@ -178,9 +175,16 @@ class _Run:
 
     async def fit(self, resume: bool) -> SegmentedFit:
         """Fit, or continue, all segments and join them."""
+        with ExitStack() as self.files:
+            if (reports := await self._fit_all(resume)) is not None:
+                return SegmentedFit(tuple(reports))
+        return self._joined(self.out / "stream.morgs")
+
+    async def _fit_all(self, resume: bool) -> list[FrameReport] | None:
+        """Fit what is missing of the segments; return the reports of all frames if they had been joined before."""
         folder, path = self.out / FOLDER, self.out / "stream.morgs"
         if resume and not folder.exists() and (reports := self._complete(path)):
-            return SegmentedFit(tuple(reports))
+            return reports
         if not resume:
             shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(exist_ok=True)
@@ -194,14 +198,14 @@ class _Run:
         loop = asyncio.get_running_loop()
         self.base: asyncio.Future[Following] = loop.create_future()
         self.begun: list[asyncio.Future[bytes]] = [loop.create_future() for _ in self.segments]
-        self._show_progress()
+        self.show_progress()
         try:
             async with asyncio.TaskGroup() as group:
                 for segment in self.segments:
                     group.create_task(segment.fit(points))
         except BaseExceptionGroup as errors:
             raise errors.exceptions[0] from None
-        return self._joined(path)
+        return None
 
     async def run(self, function: Callable[..., Part], *args: Any) -> Part:
         """Return the result of a task on a worker."""
@@ -211,7 +215,7 @@ class _Run:
             self.on_part(part)
         return part
 
-    def _show_progress(self) -> None:
+    def show_progress(self) -> None:
         self.on_stage("Fitting frames", sum(s.num_fitted for s in self.segments), self.capture.num_frames)
 
     def _complete(self, path: Path) -> list[FrameReport] | None:
@@ -255,6 +259,7 @@ class _Segment:
         self.path = run.out / FOLDER / f"{number}.morgs"
         self.reports: list[FrameReport] = []
         self.restart: tuple[bytes, ...] = ()
+        self.writer: StreamWriter | None = None
         with suppress(FileNotFoundError, TruncatedStreamError):
             self._read()
 
@@ -265,30 +270,27 @@ class _Segment:
 
     async def fit(self, points: Points | None) -> None:
         """Fit what is missing of the segment, task after task."""
-        if not self.reports:
-            self._add(await self._first_part(points))
-        if not self.number:
-            coded = seek(StreamReader(self.path), COMMON_FRAMES - 1 if self.stop > 1 else 0)
+        common = min(COMMON_FRAMES, self.stop)
+        if self.number and not self.reports:
+            base = await self.run.base
+            self._add(await self.run.run(fit_segment_start, base.keyframe, self.start))
+        elif not self.number:
+            if self.num_fitted < common:
+                frames = FrameRange(0, self.num_fitted, common)
+                self._add(await self.run.run(fit_frames, frames, self.restart, None, points))
+            coded = seek(StreamReader(self.path), common - 1)
             self.run.base.set_result(Following(0, reemitted_keyframe(coded).encoded, coded.next_id))
         first = next(iter(StreamReader(self.path)))
         self.run.begun[self.number].set_result(first.encoded)
         while (at := self.start + self.num_fitted) < self.stop:
             stop = min(at + TASK_FRAMES, self.stop)
             frames, following = FrameRange(self.start, at, stop), await self._following(stop)
-            self._add(await self.run.run(fit_frames, frames, self.restart, following, None))
-
-    async def _first_part(self, points: Points | None) -> Part:
-        if self.number:
-            base = await self.run.base
-            return await self.run.run(fit_segment_start, base.keyframe, self.start)
-        stop = min(COMMON_FRAMES, self.stop)
-        return await self.run.run(fit_frames, FrameRange(0, 0, stop), (), await self._following(stop), points)
+            self._add(await self.run.run(fit_frames, frames, self.restart, following))
 
     async def _following(self, stop: int) -> Following | None:
         """Return the next segment if a task up to a frame approaches it."""
         last = self.stop == self.run.starts[-1]
-        # The common model itself approaches nothing.
-        if last or stop <= self.stop - self.run.seams.handover or stop <= COMMON_FRAMES:
+        if last or stop <= self.stop - self.run.seams.handover:
             return None
         base = await self.run.base
         return Following(self.stop, await self.run.begun[self.number + 1], base.shared_ids)
@@ -301,30 +303,28 @@ class _Segment:
         if not index:
             return
         coded = before = last = None
-        for packet in stream:
-            if coded is None or packet.frame > coded.frame:
-                before, coded, last = coded, decode(coded, packet), packet
+        with suppress(TruncatedStreamError):
+            for packet in stream:
+                if coded is None or packet.frame > coded.frame:
+                    before, coded, last = coded, decode(coded, packet), packet
         assert coded is not None
         assert last is not None
         self.reports = read_reports(self.path.with_suffix(".json"), range(self.start, coded.frame + 1))
         self.restart = (last.encoded,) if before is None else (reemitted_keyframe(before).encoded, last.encoded)
-        with StreamWriter.continued(self.path, index, end) as writer:
-            if index[-1][0] == PacketKind.RESIDUAL:
-                for packet in due_keyframe(coded, self.run.task.config.codec.keyframe_interval):
-                    writer.write(packet)
+        self.writer = self.run.files.enter_context(StreamWriter.continued(self.path, index, end))
+        if index[-1][0] == PacketKind.RESIDUAL:
+            for packet in due_keyframe(coded, self.run.task.config.codec.keyframe_interval):
+                self.writer.write(packet)
 
     def _add(self, part: Part) -> None:
         """Add the frames of a task: first to the report, then to the stream."""
         reports = [*self.reports, *part.reports]
         write_json(self.path.with_suffix(".json"), {"frames": [asdict(report) for report in reports]})
-        with self._writer() as writer:
-            for data in part.packets:
-                writer.write(decode_packet(data))
-        self.reports, self.restart = reports, part.restart
-        self.run._show_progress()
-
-    def _writer(self) -> StreamWriter:
-        if not self.reports:
+        if self.writer is None:
             capture = self.run.capture
-            return StreamWriter(self.path, capture.cameras, capture.fps, self.run.metadata)
-        return StreamWriter.continued(self.path, *StreamReader(self.path).check())
+            writer = StreamWriter(self.path, capture.cameras, capture.fps, self.run.metadata)
+            self.writer = self.run.files.enter_context(writer)
+        for data in part.packets:
+            self.writer.write(decode_packet(data))
+        self.reports, self.restart = reports, part.restart
+        self.run.show_progress()

@@ -125,7 +125,7 @@ def interrupt() -> None:
     raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("count", [0, 2, 5, 9])
+@pytest.mark.parametrize("count", [5, *(pytest.param(count, marks=pytest.mark.slow) for count in (0, 2, 9))])
 def test_stream_segments__interrupted_and_resumed_is_the_same(
     capture: Capture, workers: Workers, whole: Path, tmp_path: Path, count: int
 ) -> None:
@@ -149,7 +149,8 @@ def test_stream_segments__resumes_after_a_cut_packet(
     assert stream_of(tmp_path) == stream_of(whole)
 
 
-@pytest.mark.parametrize("count", [4, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [2, 4])
 def test_stream_segments__with_a_killed_process_is_the_same(
     capture: Capture, whole: Path, tmp_path: Path, count: int
 ) -> None:
