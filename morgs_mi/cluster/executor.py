@@ -91,7 +91,13 @@ class Workers:
     async def _result(self, executor: Executor, function: Callable[..., Result], *args: Any) -> Result:
         """Return the result of a task that is run once."""
         try:
-            return await asyncio.wrap_future(executor.submit(function, *args))
+            future = executor.submit(function, *args)
+        except OSError as error:
+            if isinstance(executor, ProcessPoolExecutor):  # a pool that is just breaking has closed its pipe
+                raise BrokenProcessPool from error
+            raise
+        try:
+            return await asyncio.wrap_future(future)
         except asyncio.CancelledError:
             task = asyncio.current_task()
             if task is None or task.cancelling():
@@ -188,7 +194,8 @@ def _begin(share: dict[str, int]) -> None:
 
 def _end(pool: ProcessPoolExecutor) -> None:
     processes = list((pool._processes or {}).values())
-    pool.shutdown(wait=False, cancel_futures=True)
+    with suppress(OSError):  # it is just breaking
+        pool.shutdown(wait=False, cancel_futures=True)
     for process in processes:
         process.terminate()
 
@@ -213,11 +220,12 @@ def _dask_workers(scheduler: str, count: int | None, stack: ExitStack) -> Worker
         raise ValueError(
             f"open_workers(): `scheduler` must be local or an address such as tcp://host:8786, got {scheduler}."
         )
+    found = "none"
     try:
         client = stack.enter_context(Client(address, timeout=_TIMEOUT, set_as_default=False))
+        found = "no worker"
         client.wait_for_workers(1, timeout=_TIMEOUT)
-    except (OSError, ValueError) as error:
-        found = "no worker" if "client" in locals() else f"none ({error})"
+    except (OSError, ValueError):
         raise ConnectionError(f"{scheduler}: expected a scheduler with workers, got {found}; start it first.") from None
 
     def number() -> int:

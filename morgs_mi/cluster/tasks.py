@@ -208,7 +208,7 @@ def _prepared(fit: Fit) -> Iterator[list[str]]:
     """Run a task alone in this process, with its variant and threads; the context is a list of its warnings.
 
     Raises:
-        RuntimeError: the worker has other versions than the client.
+        ValueError: the worker has other versions than the client.
     """
     for (name, expected), (_, found) in zip(fit.versions, installed(), strict=True):
         if expected != found:
