@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -27,7 +27,7 @@ import numpy as np
 from morgs_mi.calibration.rig_check import match_capture, triangulate_points
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.capture.outputs import check_output
-from morgs_mi.codec.container import PacketKind, StreamWriter, TruncatedStreamError, header_json
+from morgs_mi.codec.container import Packet, PacketKind, StreamWriter, TruncatedStreamError, header_json
 from morgs_mi.codec.packets import CodedFrame, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
@@ -36,7 +36,17 @@ from morgs_mi.io.bounded import read_json
 from morgs_mi.method.flow import choose_key_views
 from morgs_mi.stream_loop import MIN_POINTS, FrameReport, StreamLoop
 
-__all__ = ["FILES", "stream_capture"]
+__all__ = [
+    "FILES",
+    "check_same_fit",
+    "described_capture",
+    "due_keyframe",
+    "push_frame",
+    "read_reports",
+    "stream_capture",
+    "stream_metadata",
+    "with_points",
+]
 
 FILES = ("stream.morgs", "capture.json", "report.json")
 """Names of the files that a fit writes into its folder."""
@@ -91,12 +101,10 @@ def _stream(
     """Fit a capture into a locked folder."""
     path, train, frames = out / "stream.morgs", capture.train_views, capture.partial_frames()
     first = next(frames)
-    metadata = _metadata(capture, first, config)
+    metadata = stream_metadata(capture, first, config)
     interrupted = _interrupted(out, capture, metadata) if resume else None
-    if interrupted is None and len(capture.points) < MIN_POINTS:
-        shared = match_capture(capture, partial(on_stage, "Matching views"))
-        on_stage("Triangulating points", 0, 1)
-        capture = triangulate_points(capture, shared)
+    if interrupted is None:
+        capture = with_points(capture, on_stage)
     loop = StreamLoop(
         [capture.cameras[v] for v in train],
         capture.points,
@@ -104,7 +112,7 @@ def _stream(
         config,
         [capture.masks[v] for v in train],
     )
-    about = _about(capture, None if interrupted is None else out / "capture.json")
+    about = described_capture(capture, None if interrupted is None else out / "capture.json")
     if interrupted is None:
         write_json(out / "capture.json", about)
         writer, reports = StreamWriter(path, capture.cameras, capture.fps, metadata), []
@@ -122,18 +130,36 @@ def _stream(
     interval, written = config.codec.keyframe_interval, os.stat(path)
     with writer:
         if interrupted is not None and interrupted.index[-1][0] == PacketKind.RESIDUAL:
-            _reemit_keyframe(writer, interrupted.coded, interval)
+            for packet in due_keyframe(interrupted.coded, interval):
+                writer.write(packet)
         for frame in frames:
             tick = None if on_step is None else _frame_ticker(on_step, frame.index)
-            packet, report = loop.push([frame.images[v] for v in train], tick)
-            status = "; ".join([*([report.status] if report.status != "ok" else []), *frame.problems]) or "ok"
-            reports.append(replace(report, status=status))
+            packet, report = push_frame(loop, frame, train, tick)
+            reports.append(report)
             _check_in_place(path, written)
             write_json(out / "report.json", {**metadata, "frames": [asdict(r) for r in reports]})
-            writer.write(packet)
-            _reemit_keyframe(writer, loop.state.coded, interval)
+            for due in (packet, *due_keyframe(loop.state.coded, interval)):
+                writer.write(due)
     _check_in_place(path, written)
     return reports
+
+
+def with_points(capture: Capture, on_stage: Callable[[str, int, int], None]) -> Capture:
+    """Return a capture with triangulated points if it has too few; see `stream_capture`."""
+    if len(capture.points) >= MIN_POINTS:
+        return capture
+    shared = match_capture(capture, partial(on_stage, "Matching views"))
+    on_stage("Triangulating points", 0, 1)
+    return triangulate_points(capture, shared)
+
+
+def push_frame(
+    loop: StreamLoop, frame: PartialFrame, train: Sequence[int], on_step: Callable[[int, int], None] | None = None
+) -> tuple[Packet, FrameReport]:
+    """Fit the next frame of a loop on the views `train`; the report's status names the images that are missing."""
+    packet, report = loop.push([frame.images[v] for v in train], on_step)
+    status = "; ".join([*([report.status] if report.status != "ok" else []), *frame.problems]) or "ok"
+    return packet, replace(report, status=status)
 
 
 def _reported(frames: Iterable[PartialFrame], report: Callable[[int, int], None], count: int) -> Iterator[PartialFrame]:
@@ -176,11 +202,24 @@ def _interrupted(out: Path, capture: Capture, metadata: Mapping[str, Any]) -> _I
     Raises:
         ValueError: it is damaged, or does not belong to the capture or the settings.
     """
-    path = out / "stream.morgs"
     try:
-        stream = StreamReader(path)
+        stream = StreamReader(out / "stream.morgs")
     except (FileNotFoundError, TruncatedStreamError):
         return None
+    check_same_fit(stream, capture, metadata)
+    index, end = stream.check()
+    if not index:
+        return None
+    coded = seek(stream, index[-1][1])
+    return _Interrupted(index, end, coded, read_reports(out / "report.json", range(coded.frame + 1)))
+
+
+def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str, Any]) -> None:
+    """Check that a stream to resume has the header that a fit would write.
+
+    Raises:
+        ValueError: it belongs to another capture or other settings.
+    """
     # Streams of earlier versions have paths in their headers.
     recorded = _without_folders({name: value for name, value in stream.metadata.items() if name != "capture"})
     old, new = (
@@ -190,17 +229,12 @@ def _interrupted(out: Path, capture: Capture, metadata: Mapping[str, Any]) -> _I
     if difference := _difference(old, new):
         name, before, now = difference
         raise ValueError(
-            f"{path}: expected to resume a fit with {name} = {shortened(before)}, got {shortened(now)}; give the same "
-            "capture and settings, or start again without --resume."
+            f"{stream.path}: expected to resume a fit with {name} = {shortened(before)}, got {shortened(now)}; give "
+            "the same capture and settings, or start again without --resume."
         )
-    index, end = stream.check()
-    if not index:
-        return None
-    coded = seek(stream, index[-1][1])
-    return _Interrupted(index, end, coded, _reports(out / "report.json", coded.frame + 1))
 
 
-def _metadata(capture: Capture, first: PartialFrame, config: StreamConfig) -> dict[str, Any]:
+def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig) -> dict[str, Any]:
     """Return the entries of the stream's header about the fit; they must agree for a fit to be resumed."""
     train = capture.train_views
     key_views = choose_key_views([capture.cameras[v] for v in train], config.motion.key_views)
@@ -233,7 +267,7 @@ def _without_folder(method: str) -> str:
     return kind + colon + ",".join(Path(file).name for file in files.split(","))
 
 
-def _about(capture: Capture, earlier: Path | None) -> dict[str, Any]:
+def described_capture(capture: Capture, earlier: Path | None) -> dict[str, Any]:
     """Return the content of `capture.json`: that of an earlier fit if there is one, with the capture's present path."""
     about = None
     if earlier is not None:
@@ -258,17 +292,17 @@ def _difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any] | No
     return None if old == new else (name, old, new)
 
 
-def _reports(path: Path, count: int) -> list[FrameReport]:
-    """Return the reports of the first `count` frames."""
+def read_reports(path: Path, frames: range) -> list[FrameReport]:
+    """Return the reports of the first frames of a file, which are `frames`."""
     remedy = "start again without --resume"
     document = read_json(path) if path.exists() else {}
     try:
-        reports = [_report(row) for row in document["frames"][:count]]
+        reports = [_report(row) for row in document["frames"][: len(frames)]]
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         found = f"a broken one ({error})" if path.exists() else "none"
         raise ValueError(f"{path}: expected the report of the fit, got {found}; {remedy}.") from None
-    if [report.frame for report in reports] != list(range(count)):
-        raise ValueError(f"{path}: expected the rows of {count} frames, got {len(reports)}; {remedy}.")
+    if [report.frame for report in reports] != list(frames):
+        raise ValueError(f"{path}: expected the rows of {len(frames)} frames, got {len(reports)}; {remedy}.")
     return reports
 
 
@@ -276,10 +310,11 @@ def _report(row: Mapping[str, Any]) -> FrameReport:
     return FrameReport(**{**row, "seconds": float(row["seconds"]), "missing_views": tuple(row["missing_views"])})
 
 
-def _reemit_keyframe(writer: StreamWriter, coded: CodedFrame | None, interval: int) -> None:
-    """Write the state as a keyframe where one is due."""
-    if coded is not None and interval and coded.frame and coded.frame % interval == 0:
-        writer.write(reemitted_keyframe(coded))
+def due_keyframe(coded: CodedFrame | None, interval: int) -> list[Packet]:
+    """Return the state as a keyframe where one is due."""
+    if coded is None or not interval or not coded.frame or coded.frame % interval:
+        return []
+    return [reemitted_keyframe(coded)]
 
 
 def _frame_ticker(on_step: Callable[[int, int, int], None], frame: int) -> Callable[[int, int], None]:

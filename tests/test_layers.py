@@ -28,6 +28,7 @@ SUBPACKAGES = (
     "importer",
     "playback",
     "evaluate",
+    "cluster",
     "export",
     "viewer",
     "demo",

@@ -20,7 +20,7 @@ from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import PAYLOAD, TRAILER, StreamWriter
 from morgs_mi.codec.packets import CodedFrame, coded_frames, play, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.recorder import _metadata, _without_folder, stream_capture
+from morgs_mi.recorder import _without_folder, stream_capture, stream_metadata
 from morgs_mi.stream_loop import StreamLoop
 from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
 from tests.scenes.captures import colmap
@@ -262,7 +262,7 @@ def test_stream_capture__writes_no_path_into_the_stream(tmp_path: Path) -> None:
     secret = tmp_path / "home" / "jane"
     methods = replace(CONFIG.motion, flow_method=f"files:{secret}/flow", mask_method="none")
     capture = recording(path=secret / "clip")
-    header = _metadata(capture, next(capture.partial_frames()), replace(CONFIG, motion=methods))
+    header = stream_metadata(capture, next(capture.partial_frames()), replace(CONFIG, motion=methods))
     assert "jane" not in json.dumps(header)
     assert header["config"]["motion"]["flow_method"] == "files:flow"
     assert _without_folder("sam2:/a/encoder.onnx,/b/decoder.onnx") == "sam2:encoder.onnx,decoder.onnx"

@@ -1,6 +1,7 @@
 """Command line, the package's only argument parser.
 
-`morgs-mi synth`, `info`, `calibrate`, `fit`, `render`, `export`, `import`, `view`, `eval`, `salvage` and `demo`.
+`morgs-mi synth`, `info`, `calibrate`, `fit`, `batch`, `render`, `export`, `import`, `view`, `eval`, `salvage` and
+`demo`.
 
 Results go to standard output; progress, warnings and errors to standard error. An error that the user can correct is
 one sentence and exit status 1, an interruption by Ctrl-C or SIGTERM is status 130; `--debug` adds the traceback.
@@ -22,6 +23,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import arg
 
+from morgs_mi.cli.batch import Batch
 from morgs_mi.cli.calibrate import Calibrate
 from morgs_mi.cli.console import ERR, LogHandler, naming_output, print_warning, sentence_of
 from morgs_mi.cli.demo import Demo
@@ -43,6 +45,7 @@ Command = (
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
+    | Annotated[Batch, tyro.conf.subcommand("batch")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Import, tyro.conf.subcommand("import")]

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.settings import Flag, GivenReading, GivenSettings, Reading, Settings, optional
-from morgs_mi.config import config_toml
+from morgs_mi.config import StreamConfig, config_toml
+
+if TYPE_CHECKING:
+    from morgs_mi.capture.capture import Capture
+    from morgs_mi.stream_loop import FrameReport
 
 __all__ = ["Fit"]
 
@@ -39,6 +43,10 @@ class Fit:
     settings: GivenSettings = field(default_factory=Settings)
     resume: Flag = False
     """Continue an interrupted fit in OUT; capture and settings must be the same."""
+    segments: Annotated[int | None, DisallowNone, optional("INT", "(default: 1)")] = None
+    """Number of stretches of the recording that are fitted side by side; each begins with a keyframe."""
+    scheduler: Annotated[str | None, DisallowNone, optional("ADDRESS")] = None
+    """Dask scheduler whose workers fit them, such as tcp://host:8786, or local (docs/cluster.md)."""
     print_config: Flag = False
     """Print all settings as TOML and exit."""
 
@@ -57,6 +65,9 @@ class Fit:
         self.settings.check_methods(config)
         view = None if self.test_view.lower() == "none" else self.test_view
         capture = load_capture(self.capture, self.downscale, view, self.frames, self.reading.read_config())
+        if any(option is not None for option in (self.segments, self.scheduler)):
+            self._fit_in_segments(capture, config)
+            return
         count, stream, started = capture.num_frames, self.out / "stream.morgs", []
         with progress() as report, _noting_frames(stream, count, started):
 
@@ -65,14 +76,33 @@ class Fit:
                 report("Fitting frames", frame + step / steps, count)
 
             reports = stream_capture(capture, self.out, config, on_step, self.resume, report)
-        seconds = [row.seconds for row in reports[1:]]
-        later = f", {sum(seconds) / len(seconds):.1f} s for each later one" if seconds else ""
-        print_result(
-            f"{stream}: {len(reports)} frames, {stream.stat().st_size / 1e6:.1f} MB, "
-            f"{reports[0].seconds:.1f} s for the first frame{later}."
-        )
-        if reports[0].validation:
-            print_result(reports[0].validation["sentence"])
+        _print_summary(stream, reports)
+
+    def _fit_in_segments(self, capture: Capture, config: StreamConfig) -> None:
+        """Fit a capture in segments, and print the scores of the seams."""
+        from morgs_mi.cluster.executor import cores, open_workers
+        from morgs_mi.cluster.segments import noting_segments, stream_segments
+
+        assert self.out is not None
+        count = self.segments or 1
+        workers = min(count, cores())
+        with noting_segments(self.out), progress() as report, open_workers(self.scheduler, workers) as opened:
+            fit = stream_segments(capture, self.out, opened, config, count, resume=self.resume, on_stage=report)
+        _print_summary(self.out / "stream.morgs", fit.reports)
+        for seam in fit.seams:
+            print_result(f"Seam before {seam}.")
+
+
+def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
+    """Print the size of a stream and the time that its frames took."""
+    seconds = [row.seconds for row in reports[1:]]
+    later = f", {sum(seconds) / len(seconds):.1f} s for each later one" if seconds else ""
+    print_result(
+        f"{stream}: {len(reports)} frames, {stream.stat().st_size / 1e6:.1f} MB, "
+        f"{reports[0].seconds:.1f} s for the first frame{later}."
+    )
+    if reports[0].validation:
+        print_result(reports[0].validation["sentence"])
 
 
 @contextmanager

@@ -17,11 +17,15 @@ import pytest
 from morgs_mi import cli
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.cluster.seams import SeamConfig
+from morgs_mi.cluster.segments import _Segment
+from morgs_mi.cluster.tasks import Part
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.stream_loop import StreamLoop
 from tests.cli.commands import QUICK, assert_one_sentence, assert_refused, interrupt
 from tests.scenes.captures import colmap
 from tests.scenes.noise_capture import FRAMES, lengthen_clip, rig, truncate_clip
+from tests.scenes.recording import write_recording
 
 
 def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
@@ -247,3 +251,30 @@ def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, 
     assert f"stream.morgs: {FRAMES} frames" in output
     assert (out / "stream.morgs").read_bytes() == whole
     assert_refused(run(*fit, "--resume", "--seed", 1), "stream.morgs: expected to resume", "config.seed = 0, got 1")
+
+
+def test_fit__fits_segments_side_by_side(tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("morgs_mi.cluster.segments.SeamConfig", lambda: SeamConfig(passes=1, epochs=1))
+    clip, out = write_recording(tmp_path / "clip", 4), tmp_path / "out"
+    status, output, _ = run("fit", clip, out, *QUICK, "--segments", 2)
+    assert status == 0
+    assert "stream.morgs: 4 frames" in output
+    assert "Seam before frame 2: PSNR " in output
+    assert len({frame for _, frame, _ in StreamReader(out / "stream.morgs").index()}) == 4
+    assert_refused(run("fit", clip, out, *QUICK, "--segments", 3), "--segments must be 1 to 2 for 4 frames", "got 3")
+
+
+def test_fit__names_what_segments_stand_when_interrupted(tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
+    clip, out = write_recording(tmp_path / "clip", 4), tmp_path / "out"
+    add = _Segment._add
+
+    def add_and_stop(segment: _Segment, part: Part) -> None:
+        add(segment, part)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(_Segment, "_add", add_and_stop)
+    args = ["fit", str(clip), str(out), *QUICK, "--segments", "2"]
+    status, _, error = run(*args)
+    again = shlex.join(["morgs-mi", *args, "--resume"])
+    assert status == 130
+    assert error.splitlines()[-1] == f"Interrupted. {out / 'segments'} holds 2 frames; continue with `{again}`."

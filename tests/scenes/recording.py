@@ -15,11 +15,13 @@ import numpy as np
 
 from morgs_mi import RenderConfig
 from morgs_mi.capture.capture import Capture, PartialFrame
+from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec import container
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.config import StreamConfig
 from morgs_mi.fit.config import DensityConfig, FitConfig
 from morgs_mi.method.config import MotionConfig
+from morgs_mi.playback.visualise import write_png
 from morgs_mi.recorder import stream_capture
 from tests.scenes.cameras import look_at_cameras
 
@@ -72,6 +74,16 @@ def recording(**changes) -> Recording:
         "_sources": (),
     }
     return Recording(**(fields | changes))
+
+
+def write_recording(path: Path, num_frames: int = FRAMES) -> Path:
+    """Write the recording as a capture of PNG files, which other processes can open."""
+    scene = recording(num_frames=num_frames)
+    write_colmap(path / "sparse" / "0", scene.cameras, scene.points, scene.point_colors)
+    for frame in scene.partial_frames():
+        for name, image in zip(scene.names, frame.images, strict=True):
+            write_png(path / name / f"{frame.index:04d}.png", image)
+    return path
 
 
 class Dying:

@@ -1,0 +1,257 @@
+"""The one place where work leaves this process: an executor of processes on this machine, or of a Dask cluster.
+
+Everything else awaits `Workers.run`. A task is a function of the package with plain arguments, and returns bytes. If
+its worker dies, it is run again; tasks have no side effects, so that the result is the same.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Coroutine, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager, suppress
+from typing import Any, TypeVar
+
+__all__ = ["Workers", "cores", "open_workers", "share_of_machine", "wait_for"]
+
+Result = TypeVar("Result")
+
+_RETRIES = 2
+# Seconds after which a scheduler that does not answer counts as lost.
+_TIMEOUT = 10
+# Cores and bytes of this process as a worker on one machine, by name; set when it starts.
+_SHARE: dict[str, int] = {}
+
+
+class Workers:
+    """Workers that run tasks.
+
+    Args:
+        executor: runs the tasks.
+        count: returns the number of workers, which may grow.
+        place: where they are, for messages.
+        renew: returns a new executor of some processes in place of one that broke; None: the executor renews its
+            workers itself.
+    """
+
+    def __init__(
+        self,
+        executor: Executor,
+        count: Callable[[], int],
+        place: str,
+        renew: Callable[[int], ProcessPoolExecutor] | None = None,
+    ) -> None:
+        self.place, self._count = place, count
+        self._executor, self._renew, self._alone = executor, renew, asyncio.Lock()
+
+    @property
+    def count(self) -> int:
+        """Number of workers."""
+        return self._count()
+
+    async def run(self, function: Callable[..., Result], *args: Any) -> Result:
+        """Return the result of a task.
+
+        Raises:
+            ChildProcessError: its worker died, and those died that repeated it.
+            ConnectionError: the scheduler was lost.
+            Exception: what the task raised.
+        """
+        executor = self._executor
+        try:
+            return await self._result(executor, function, *args)
+        except BrokenProcessPool:
+            assert self._renew is not None
+            if self._executor is executor:
+                self._executor = self._renew(self.count)
+        # All tasks of a broken pool fail with it. Each is repeated in a process of its own, so that a task that kills
+        # its worker is not confused with others.
+        async with self._alone:
+            for _ in range(_RETRIES):
+                executor = self._renew(1)
+                try:
+                    return await self._result(executor, function, *args)
+                except BrokenProcessPool:
+                    continue
+                finally:
+                    _end(executor)
+        raise ChildProcessError(_died(f"{_RETRIES + 1} processes"))
+
+    def close(self) -> None:
+        """End the processes, also those that are at work."""
+        if isinstance(self._executor, ProcessPoolExecutor):
+            _end(self._executor)
+
+    async def _result(self, executor: Executor, function: Callable[..., Result], *args: Any) -> Result:
+        """Return the result of a task that is run once."""
+        try:
+            future = executor.submit(function, *args)
+        except OSError as error:
+            if isinstance(executor, ProcessPoolExecutor):  # a pool that is just breaking has closed its pipe
+                raise BrokenProcessPool from error
+            raise
+        try:
+            return await asyncio.wrap_future(future)
+        except asyncio.CancelledError:
+            task = asyncio.current_task()
+            if task is None or task.cancelling():
+                raise
+            raise ConnectionError(_lost(self.place)) from None  # Dask cancels what a lost scheduler ran
+        except BrokenProcessPool:
+            raise
+        except Exception as error:
+            if type(error).__name__ == "KilledWorker":
+                raise ChildProcessError(_died("the workers")) from None
+            if isinstance(error, RuntimeError) and "deserialization" in str(error):
+                raise ValueError(
+                    f"{self.place}: expected a scheduler and workers with the versions of this client, got others that "
+                    "cannot read its tasks; install the same versions on all machines."
+                ) from None
+            if type(error).__name__ in ("CommClosedError", "ClosedClientError", "FutureCancelledError"):
+                raise ConnectionError(_lost(self.place)) from None
+            raise
+
+
+def wait_for(work: Coroutine[Any, Any, Result]) -> Result:
+    """Run a coroutine that awaits tasks, and return its result; an interruption is raised without further messages."""
+
+    def report(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        if not isinstance(context.get("exception"), KeyboardInterrupt):
+            loop.default_exception_handler(context)
+
+    async def reported() -> Result:
+        asyncio.get_running_loop().set_exception_handler(report)
+        return await work
+
+    return asyncio.run(reported())
+
+
+def _died(what: str) -> str:
+    return (
+        f"Workers.run(): expected the workers to stay alive, but {what} died at the same task, perhaps for lack of "
+        "memory; use fewer workers, or process smaller images."
+    )
+
+
+def _lost(place: str) -> str:
+    return f"{place}: expected a scheduler that answers, but the connection was lost; start it again."
+
+
+@contextmanager
+def open_workers(scheduler: str | None = None, count: int | None = None) -> Iterator[Workers]:
+    """Start workers, or connect to those of a scheduler.
+
+    Args:
+        scheduler: None: processes on this machine; ``local``: a Dask cluster on this machine; otherwise the address of
+            a Dask scheduler, such as ``tcp://host:8786``.
+        count: number of workers on this machine; None: one per core. Their share of cores and memory is equal.
+
+    Raises:
+        ValueError: the number or the address is not one, or Dask is missing.
+        ConnectionError: the scheduler does not answer, or has no worker.
+    """
+    if count is not None and count < 1:
+        raise ValueError(f"open_workers(): `workers` must be at least 1, got {count}.")
+    if scheduler is None:
+        count = count or cores()
+        renew = _process_pool(count)
+        workers = Workers(renew(count), lambda: count, "this machine", renew)
+        try:
+            yield workers
+        finally:
+            workers.close()
+        return
+    with ExitStack() as stack:
+        yield _dask_workers(scheduler, count, stack)
+
+
+def _process_pool(workers: int) -> Callable[[int], ProcessPoolExecutor]:
+    """Return a function that returns a pool of some processes, each with the share of one of `workers`."""
+    share = {"threads": max(1, cores() // workers), "memory": _memory() // workers}
+
+    def pool(count: int) -> ProcessPoolExecutor:
+        # Dr.Jit and forked processes do not go together.
+        context = multiprocessing.get_context("spawn")
+        return ProcessPoolExecutor(count, context, _begin, (share,))
+
+    return pool
+
+
+def _begin(share: dict[str, int]) -> None:
+    """Prepare a process: it ends with its parent, which alone reacts to Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    threading.Thread(target=lambda: (parent.join(), os._exit(1)), daemon=True).start()
+    _SHARE.update(share)
+
+
+def _end(pool: ProcessPoolExecutor) -> None:
+    processes = list((pool._processes or {}).values())
+    with suppress(OSError):  # it is just breaking
+        pool.shutdown(wait=False, cancel_futures=True)
+    for process in processes:
+        process.terminate()
+
+
+def _dask_workers(scheduler: str, count: int | None, stack: ExitStack) -> Workers:
+    """Return the workers of a Dask cluster that `stack` disconnects from."""
+    try:
+        import dask.config
+        from distributed import Client, LocalCluster
+    except ImportError:
+        raise ValueError(
+            f"open_workers(): `scheduler={scheduler}` needs the package distributed; pip install 'morgs-mi[cluster]'."
+        ) from None
+    stack.enter_context(dask.config.set({"distributed.comm.timeouts.connect": _TIMEOUT}))
+    address: Any = scheduler
+    if scheduler == "local":
+        count = count or cores()
+        threads = max(1, cores() // count)
+        address = LocalCluster(count, threads, dashboard_address=":0", silence_logs=logging.CRITICAL)
+        stack.enter_context(address)
+    elif "://" not in scheduler:
+        raise ValueError(
+            f"open_workers(): `scheduler` must be local or an address such as tcp://host:8786, got {scheduler}."
+        )
+    found = "none"
+    try:
+        client = stack.enter_context(Client(address, timeout=_TIMEOUT, set_as_default=False))
+        found = "no worker"
+        client.wait_for_workers(1, timeout=_TIMEOUT)
+    except (OSError, ValueError):
+        raise ConnectionError(f"{scheduler}: expected a scheduler with workers, got {found}; start it first.") from None
+
+    def number() -> int:
+        return len(client.scheduler_info(n_workers=-1)["workers"])
+
+    return Workers(client.get_executor(pure=False), number, scheduler)
+
+
+def cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def share_of_machine() -> tuple[int, int]:
+    """Return the number of threads and of bytes of memory that this worker may use; 0 bytes: no limit is known."""
+    if _SHARE:
+        return _SHARE["threads"], _SHARE["memory"]
+    with suppress(ImportError, ValueError):
+        from distributed import get_worker
+
+        worker: Any = get_worker()
+        # A little less than the 95 % at which its nanny ends it without a message.
+        return worker.state.nthreads, int(0.9 * (worker.memory_manager.memory_limit or 0))
+    return cores(), 0
+
+
+def _memory() -> int:
+    """Return the bytes of this machine's memory."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

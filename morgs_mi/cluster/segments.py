@@ -1,0 +1,330 @@
+"""A fit in segments: stretches of a recording that are fitted side by side and joined into one stream.
+
+While it runs, OUT/segments has a stream and a report for each segment, to which the frames of each finished task are
+added. They are joined into OUT/stream.morgs at the end. Resuming continues every segment after its last frame.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.outputs import check_output
+from morgs_mi.cluster.executor import Workers, wait_for
+from morgs_mi.cluster.seams import COMMON_FRAMES, SeamConfig, SeamScores, score_seam
+from morgs_mi.cluster.tasks import (
+    Fit,
+    Following,
+    FrameRange,
+    Part,
+    Points,
+    Source,
+    fit_frames,
+    fit_segment_start,
+    installed,
+)
+from morgs_mi.codec.container import PacketKind, StreamWriter, TruncatedStreamError, decode_packet
+from morgs_mi.codec.packets import decode, reemitted_keyframe, seek
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.config import StreamConfig
+from morgs_mi.core.files import atomic_path, locked_folder, write_json
+from morgs_mi.recorder import (
+    FILES,
+    check_same_fit,
+    described_capture,
+    due_keyframe,
+    read_reports,
+    stream_metadata,
+    with_points,
+)
+from morgs_mi.stream_loop import FrameReport
+
+__all__ = ["SegmentedFit", "fit_in_segments", "noting_segments", "stream_segments"]
+
+FOLDER = "segments"
+# Frames of a task: a few tasks are lost if a worker dies, and the progress is known that finely.
+TASK_FRAMES = 10
+_MIN_FRAMES = 2  # of a segment
+
+
+@dataclass(frozen=True)
+class SegmentedFit:
+    """Result of a fit in segments.
+
+    Attributes:
+        reports: of all frames.
+        seams: scores of the seams.
+        workers: peak memory of the workers by their names, bytes.
+    """
+
+    reports: tuple[FrameReport, ...]
+    seams: tuple[SeamScores, ...] = ()
+    workers: Mapping[str, int] = field(default_factory=dict)
+
+
+OnStage = Callable[[str, float, float], None]
+OnPart = Callable[[Part], None]
+
+
+def stream_segments(
+    capture: Capture,
+    out: str | Path,
+    workers: Workers,
+    config: StreamConfig | None = None,
+    segments: int = 1,
+    seams: SeamConfig | None = None,
+    resume: bool = False,
+    on_stage: OnStage | None = None,
+) -> SegmentedFit:
+    """Fit a capture in segments, side by side, into the files that `stream_capture` writes.
+
+    Args:
+        capture: a capture from `load_capture`, at a path that all workers see.
+        out: folder, made if missing.
+        workers: from `open_workers`.
+        config: settings.
+        segments: number of segments of about the same length; with one, the stream is that of `stream_capture`.
+        seams: settings of the seams.
+        resume: continue the segments in `out`. With `RenderConfig(reproducible=True)` the stream has the same bytes as
+            without an interruption.
+        on_stage: called with (name of the stage, done, total).
+
+    Raises:
+        OSError: as `stream_capture`, a worker died several times, or the scheduler was lost. The finished frames stay.
+        ValueError: as `stream_capture`, or there are more segments than pairs of frames.
+    """
+    return wait_for(fit_in_segments(capture, out, workers, config or StreamConfig(), segments, seams, resume, on_stage))
+
+
+@contextmanager
+def noting_segments(out: Path) -> Iterator[None]:
+    """Add to an interruption or a failure how many frames the segments of a fit in `out` hold."""
+    try:
+        yield
+    except (KeyboardInterrupt, OSError, MemoryError) as error:
+        streams = sorted((out / FOLDER).glob("*.morgs"))
+        with suppress(OSError, ValueError):
+            count = sum(len({frame for _, frame, _ in StreamReader(path).index()}) for path in streams)
+            if count:
+                error.add_note(f"{out / FOLDER} holds {count} frames; continue with `--resume`.")
+        raise
+
+
+async def fit_in_segments(
+    capture: Capture,
+    out: str | Path,
+    workers: Workers,
+    config: StreamConfig,
+    segments: int = 1,
+    seams: SeamConfig | None = None,
+    resume: bool = False,
+    on_stage: OnStage | None = None,
+    on_part: OnPart | None = None,
+) -> SegmentedFit:
+    """Fit a capture in segments as `stream_segments`; `on_part` is called with the result of every task."""
+    out, seams = Path(out), seams or SeamConfig()
+    starts = _starts(capture.num_frames, segments)
+    for name in FILES:
+        check_output(out / name)
+    with locked_folder(out, "stream_segments()"):
+        run = _Run(capture, out, workers, config, seams, starts, on_stage or (lambda *_: None), on_part)
+        return await run.fit(resume)
+
+
+def _starts(num_frames: int, segments: int) -> list[int]:
+    """Return the first frames of segments of about the same length, and the number of frames."""
+    most = max(1, num_frames // _MIN_FRAMES)
+    if not 1 <= segments <= most:
+        raise ValueError(
+            f"stream_segments(): `segments` must be 1 to {most} for {num_frames} frames, {_MIN_FRAMES} for each, got "
+            f"{segments}."
+        )
+    return np.linspace(0, num_frames, segments + 1).round().astype(int).tolist()
+
+
+class _Run:
+    """A fit in segments that is under way."""
+
+    def __init__(
+        self,
+        capture: Capture,
+        out: Path,
+        workers: Workers,
+        config: StreamConfig,
+        seams: SeamConfig,
+        starts: Sequence[int],
+        on_stage: OnStage,
+        on_part: OnPart | None,
+    ) -> None:
+        self.capture, self.out, self.workers, self.seams = capture, out, workers, seams
+        self.starts, self.on_stage, self.on_part = starts, on_stage, on_part
+        self.task = Fit(Source.of(capture), config, seams, str(mi.variant()), installed())
+        self.metadata = stream_metadata(capture, next(capture.partial_frames(0, 1)), config)
+        if len(starts) > 2:
+            self.metadata["segments"] = {"starts": list(starts[:-1]), **asdict(seams)}
+        self.peaks: dict[str, int] = {}
+
+    async def fit(self, resume: bool) -> SegmentedFit:
+        """Fit, or continue, all segments and join them."""
+        with ExitStack() as self.files:
+            if (reports := await self._fit_all(resume)) is not None:
+                return SegmentedFit(tuple(reports))
+        return self._joined(self.out / "stream.morgs")
+
+    async def _fit_all(self, resume: bool) -> list[FrameReport] | None:
+        """Fit what is missing of the segments; return the reports of all frames if they had been joined before."""
+        folder, path = self.out / FOLDER, self.out / "stream.morgs"
+        if resume and not folder.exists() and (reports := self._complete(path)):
+            return reports
+        if not resume:
+            shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(exist_ok=True)
+        about = self.out / "capture.json"
+        write_json(about, described_capture(self.capture, about if resume else None))
+        self.segments = [_Segment(self, k) for k in range(len(self.starts) - 1)]
+        points = None
+        if not self.segments[0].num_fitted:
+            capture = with_points(self.capture, self.on_stage)
+            points = None if capture is self.capture else (capture.points, capture.point_colors)
+        loop = asyncio.get_running_loop()
+        self.base: asyncio.Future[Following] = loop.create_future()
+        self.begun: list[asyncio.Future[bytes]] = [loop.create_future() for _ in self.segments]
+        self.show_progress()
+        try:
+            async with asyncio.TaskGroup() as group:
+                for segment in self.segments:
+                    group.create_task(segment.fit(points))
+        except BaseExceptionGroup as errors:
+            raise errors.exceptions[0] from None
+        return None
+
+    async def run(self, function: Callable[..., Part], *args: Any) -> Part:
+        """Return the result of a task on a worker."""
+        part = await self.workers.run(function, self.task, *args)
+        self.peaks[part.worker] = max(part.peak_bytes, self.peaks.get(part.worker, 0))
+        if self.on_part is not None:
+            self.on_part(part)
+        return part
+
+    def show_progress(self) -> None:
+        self.on_stage("Fitting frames", sum(s.num_fitted for s in self.segments), self.capture.num_frames)
+
+    def _complete(self, path: Path) -> list[FrameReport] | None:
+        """Return the reports of an earlier fit that was finished, None if there is none."""
+        try:
+            stream = StreamReader(path)
+        except (FileNotFoundError, TruncatedStreamError):
+            return None
+        check_same_fit(stream, self.capture, self.metadata)
+        frames = self.capture.num_frames
+        if not stream.closed() or stream.index()[-1][1] != frames - 1:
+            return None
+        return read_reports(self.out / "report.json", range(frames))
+
+    def _joined(self, path: Path) -> SegmentedFit:
+        """Join the segments into one stream, with its report and the scores of the seams."""
+        reports = [report for segment in self.segments for report in segment.reports]
+        with atomic_path(path, "stream_segments()") as partial:
+            with StreamWriter(partial, self.capture.cameras, self.capture.fps, self.metadata) as writer:
+                for segment in self.segments:
+                    for packet in StreamReader(segment.path):
+                        writer.write(packet)
+            scores = []
+            for done, frame in enumerate(self.starts[1:-1]):
+                self.on_stage("Evaluating seams", done, len(self.starts) - 2)
+                scores.append(score_seam(StreamReader(partial), self.capture, frame))
+            report: dict[str, Any] = {**self.metadata, "frames": [asdict(r) for r in reports]}
+            if scores:
+                report |= {"seams": [asdict(s) for s in scores], "workers": self.peaks}
+            write_json(self.out / "report.json", report)
+        shutil.rmtree(self.out / FOLDER)
+        return SegmentedFit(tuple(reports), tuple(scores), self.peaks)
+
+
+class _Segment:
+    """One segment of a fit: its stream, its report, and the tasks that fit it."""
+
+    def __init__(self, run: _Run, number: int) -> None:
+        self.run, self.number = run, number
+        self.start, self.stop = run.starts[number], run.starts[number + 1]
+        self.path = run.out / FOLDER / f"{number}.morgs"
+        self.reports: list[FrameReport] = []
+        self.restart: tuple[bytes, ...] = ()
+        self.writer: StreamWriter | None = None
+        with suppress(FileNotFoundError, TruncatedStreamError):
+            self._read()
+
+    @property
+    def num_fitted(self) -> int:
+        """Number of frames that are fitted."""
+        return len(self.reports)
+
+    async def fit(self, points: Points | None) -> None:
+        """Fit what is missing of the segment, task after task."""
+        common = min(COMMON_FRAMES, self.stop)
+        if self.number and not self.reports:
+            base = await self.run.base
+            self._add(await self.run.run(fit_segment_start, base.keyframe, self.start))
+        elif not self.number:
+            if self.num_fitted < common:
+                frames = FrameRange(0, self.num_fitted, common)
+                self._add(await self.run.run(fit_frames, frames, self.restart, None, points))
+            coded = seek(StreamReader(self.path), common - 1)
+            self.run.base.set_result(Following(0, reemitted_keyframe(coded).encoded, coded.next_id))
+        first = next(iter(StreamReader(self.path)))
+        self.run.begun[self.number].set_result(first.encoded)
+        while (at := self.start + self.num_fitted) < self.stop:
+            stop = min(at + TASK_FRAMES, self.stop)
+            frames, following = FrameRange(self.start, at, stop), await self._following(stop)
+            self._add(await self.run.run(fit_frames, frames, self.restart, following))
+
+    async def _following(self, stop: int) -> Following | None:
+        """Return the next segment if a task up to a frame approaches it."""
+        last = self.stop == self.run.starts[-1]
+        if last or stop <= self.stop - self.run.seams.handover:
+            return None
+        base = await self.run.base
+        return Following(self.stop, await self.run.begun[self.number + 1], base.shared_ids)
+
+    def _read(self) -> None:
+        """Read an earlier fit of the segment."""
+        stream = StreamReader(self.path)
+        check_same_fit(stream, self.run.capture, self.run.metadata)
+        index, end = stream.check()
+        if not index:
+            return
+        coded = before = last = None
+        with suppress(TruncatedStreamError):
+            for packet in stream:
+                if coded is None or packet.frame > coded.frame:
+                    before, coded, last = coded, decode(coded, packet), packet
+        assert coded is not None
+        assert last is not None
+        self.reports = read_reports(self.path.with_suffix(".json"), range(self.start, coded.frame + 1))
+        self.restart = (last.encoded,) if before is None else (reemitted_keyframe(before).encoded, last.encoded)
+        self.writer = self.run.files.enter_context(StreamWriter.continued(self.path, index, end))
+        if index[-1][0] == PacketKind.RESIDUAL:
+            for packet in due_keyframe(coded, self.run.task.config.codec.keyframe_interval):
+                self.writer.write(packet)
+
+    def _add(self, part: Part) -> None:
+        """Add the frames of a task: first to the report, then to the stream."""
+        reports = [*self.reports, *part.reports]
+        write_json(self.path.with_suffix(".json"), {"frames": [asdict(report) for report in reports]})
+        if self.writer is None:
+            capture = self.run.capture
+            writer = StreamWriter(self.path, capture.cameras, capture.fps, self.run.metadata)
+            self.writer = self.run.files.enter_context(writer)
+        for data in part.packets:
+            self.writer.write(decode_packet(data))
+        self.reports, self.restart = reports, part.restart
+        self.run.show_progress()

@@ -1,0 +1,310 @@
+"""What workers do: fit a few frames of a segment, or the first frame of one.
+
+A task gets the state as packets, reads the recording from a path that the worker sees, and returns packets. It writes
+no files, so that it can be repeated anywhere. A worker keeps the loop of its last task: where the next one continues
+it, nothing is read twice.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import platform
+import resource
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Any
+
+import cv2
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.capture.capture import Capture, PartialFrame, load_capture
+from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.cluster.executor import share_of_machine
+from morgs_mi.cluster.seams import SeamConfig, approached, changed_packet, fit_seam_frame
+from morgs_mi.codec.container import Packet, decode_packet
+from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
+from morgs_mi.config import StreamConfig
+from morgs_mi.evaluate.environment import versions
+from morgs_mi.recorder import due_keyframe, push_frame
+from morgs_mi.stream_loop import FrameReport, StreamLoop
+
+__all__ = ["Fit", "Following", "FrameRange", "Part", "Source", "fit_frames", "fit_segment_start", "installed"]
+
+
+@dataclass(frozen=True)
+class Source:
+    """A capture as every worker opens it.
+
+    Attributes:
+        path: its folder, absolute.
+        downscale, test_view, num_frames, reading: as `load_capture` takes them.
+    """
+
+    path: str
+    downscale: float
+    test_view: int | None
+    num_frames: int
+    reading: ReadConfig
+
+    @classmethod
+    def of(cls, capture: Capture) -> Source:
+        """Return the source of an open capture."""
+        path = str(capture.path.resolve())
+        return cls(path, capture.downscale, capture.test_view, capture.num_frames, capture.reading)
+
+    def open(self) -> Capture:
+        """Return the capture."""
+        return load_capture(self.path, self.downscale, self.test_view, self.num_frames, self.reading)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What all tasks of a fit share.
+
+    Attributes:
+        source: the recording.
+        config: settings.
+        seams: settings of the seams.
+        variant: Mitsuba variant.
+        versions: as `installed` returns them to the client.
+    """
+
+    source: Source
+    config: StreamConfig
+    seams: SeamConfig
+    variant: str
+    versions: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
+class FrameRange:
+    """Frames of a task.
+
+    Attributes:
+        segment: first frame of their segment.
+        start, stop: the frames.
+    """
+
+    segment: int
+    start: int
+    stop: int
+
+
+@dataclass(frozen=True)
+class Following:
+    """The next segment.
+
+    Attributes:
+        frame: its first frame.
+        keyframe: state after that frame, an encoded packet.
+        shared_ids: number of ids of the common model.
+    """
+
+    frame: int
+    keyframe: bytes
+    shared_ids: int
+
+
+@dataclass(frozen=True)
+class Part:
+    """Result of a task.
+
+    Attributes:
+        packets: encoded packets of the frames, re-emitted keyframes included.
+        reports: of the frames.
+        restart: packets that lead a decoder to the state after the last frame: that frame's keyframe, or a keyframe of
+            the frame before and its residual.
+        worker: name of the worker.
+        peak_bytes: peak memory of the worker so far.
+        messages: warnings.
+    """
+
+    packets: tuple[bytes, ...]
+    reports: tuple[FrameReport, ...]
+    restart: tuple[bytes, ...]
+    worker: str
+    peak_bytes: int
+    messages: tuple[str, ...]
+
+
+Points = tuple[np.ndarray, np.ndarray]
+_BUSY = threading.Lock()  # Dask runs several tasks at once in a worker with several threads
+_OPEN: dict[tuple[Any, ...], tuple[StreamLoop, Capture, Iterator[PartialFrame]]] = {}  # the loop of the last task
+
+
+def fit_frames(
+    fit: Fit,
+    frames: FrameRange,
+    restart: tuple[bytes, ...],
+    following: Following | None = None,
+    points: Points | None = None,
+) -> Part:
+    """Fit frames of a segment, one after the other.
+
+    Args:
+        fit: what all tasks of the fit share.
+        frames: the frames.
+        restart: state before them, as in `Part`; empty before the first frame of the recording.
+        following: the next segment, if these frames approach it.
+        points: points and their colours in place of the capture's, where those have been triangulated.
+    """
+    with _prepared(fit) as messages:
+        loop, capture, recorded = _opened(fit, frames, restart, points)
+        packets, reports = [], []
+        before = packet = None
+        for frame in islice(recorded, frames.stop - frames.start):
+            before = loop.state.coded
+            packet, report = push_frame(loop, frame, capture.train_views, _check_memory)
+            if following is not None and frame.index >= following.frame - fit.seams.handover:
+                packet = _hand_over(loop, before, following, fit)
+                report = replace(report, num_bytes=packet.num_bytes)
+            packets += [packet, *due_keyframe(loop.state.coded, fit.config.codec.keyframe_interval)]
+            reports.append(report)
+        assert packet is not None
+        after = (packet.encoded,) if before is None else (reemitted_keyframe(before).encoded, packet.encoded)
+        _OPEN[_key(fit, frames.segment, frames.stop, after)] = loop, capture, recorded
+        return _part(packets, reports, after, messages)
+
+
+def fit_segment_start(fit: Fit, base: bytes, frame: int) -> Part:
+    """Fit the first frame of a segment; `base` is a keyframe of the common model, as an encoded packet."""
+    with _prepared(fit) as messages:
+        capture, coded = fit.source.open(), decode(None, decode_packet(base))
+        loop, first = _loop(capture, fit, None), max(frame - fit.seams.warm_up, coded.frame + 1)
+        earlier, now = (_images(capture, t) for t in (coded.frame, first))
+        coded, report = fit_seam_frame(loop.setup, coded, earlier, first, now, fit.seams, _check_memory)
+        loop.resume(coded, [[now.get(view) for view in range(len(loop.setup.cameras))]])
+        seconds = report.seconds
+        for recorded in capture.partial_frames(first + 1, frame + 1):
+            _, report = push_frame(loop, recorded, capture.train_views, _check_memory)
+            seconds += report.seconds
+        assert loop.state.coded is not None
+        packet = reemitted_keyframe(loop.state.coded)
+        report = replace(report, seconds=seconds, num_bytes=packet.num_bytes)
+        return _part([packet], [report], (packet.encoded,), messages)
+
+
+def installed() -> tuple[tuple[str, str], ...]:
+    """Return the versions that must be the same in client and workers."""
+    python = ".".join(platform.python_version_tuple()[:2])
+    return tuple(({**versions(), "python": python}).items())
+
+
+def _part(packets: list[Packet], reports: list[FrameReport], restart: tuple[bytes, ...], messages: list[str]) -> Part:
+    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    worker = f"{socket.gethostname()}:{os.getpid()}"
+    return Part(tuple(p.encoded for p in packets), tuple(reports), restart, worker, peak, tuple(messages))
+
+
+@contextmanager
+def _prepared(fit: Fit) -> Iterator[list[str]]:
+    """Run a task alone in this process, with its variant and threads; the context is a list of its warnings.
+
+    Raises:
+        ValueError: the worker has other versions than the client.
+    """
+    for (name, expected), (_, found) in zip(fit.versions, installed(), strict=True):
+        if expected != found:
+            raise ValueError(
+                f"{socket.gethostname()}: expected a worker with {name} {expected} like the client, got {found}; "
+                "install the same versions on both."
+            )
+    messages: list[str] = []
+    with _BUSY, _logged(messages):
+        if mi.variant() != fit.variant:
+            mi.set_variant(fit.variant)
+        threads, _ = share_of_machine()
+        if dr.thread_count() != threads:
+            dr.set_thread_count(threads)
+            cv2.setNumThreads(threads)
+        yield messages
+
+
+@contextmanager
+def _logged(messages: list[str]) -> Iterator[None]:
+    """Collect the warnings of the package."""
+    handler, log = logging.Handler(logging.WARNING), logging.getLogger("morgs_mi")
+    handler.emit = lambda record: messages.append(record.getMessage())
+    log.addHandler(handler)
+    try:
+        yield
+    finally:
+        log.removeHandler(handler)
+
+
+def _check_memory(step: int, steps: int) -> None:
+    """Raise an error if this process has more memory than its share; called after every step.
+
+    Raises:
+        MemoryError: it has.
+    """
+    _, limit = share_of_machine()
+    with suppress(OSError):
+        with open("/proc/self/statm", encoding="ascii") as file:
+            used = int(file.read().split()[1]) * resource.getpagesize()
+        if limit and used > limit:
+            raise MemoryError(
+                f"{socket.gethostname()}: expected a worker with at most {limit / 1e9:.1f} GB, its share, got "
+                f"{used / 1e9:.1f} GB; use fewer workers, or process smaller images."
+            )
+
+
+def _opened(
+    fit: Fit, frames: FrameRange, restart: tuple[bytes, ...], points: Points | None
+) -> tuple[StreamLoop, Capture, Iterator[PartialFrame]]:
+    """Return a loop before the first of some frames, with the capture and its frames from there on."""
+    found = _OPEN.pop(_key(fit, frames.segment, frames.start, restart), None)
+    _OPEN.clear()
+    if found is not None:
+        return found
+    capture = fit.source.open()
+    loop, recorded = _loop(capture, fit, points), capture.partial_frames(frames.segment)
+    if restart:
+        past = islice(recorded, frames.start - frames.segment)
+        loop.resume(_decoded(restart), ([frame.images[v] for v in capture.train_views] for frame in past))
+    return loop, capture, recorded
+
+
+def _key(fit: Fit, segment: int, start: int, restart: tuple[bytes, ...]) -> tuple[Any, ...]:
+    return (repr(fit), segment, start, restart)
+
+
+def _loop(capture: Capture, fit: Fit, points: Points | None) -> StreamLoop:
+    train = capture.train_views
+    positions, colors = points or (capture.points, capture.point_colors)
+    masks = [capture.masks[v] for v in train]
+    return StreamLoop([capture.cameras[v] for v in train], positions, colors, fit.config, masks)
+
+
+def _decoded(packets: tuple[bytes, ...]) -> CodedFrame:
+    coded = None
+    for data in packets:
+        coded = decode(coded, decode_packet(data))
+    assert coded is not None
+    return coded
+
+
+def _images(capture: Capture, frame: int) -> dict[int, np.ndarray]:
+    """Return the images of a frame, by training view."""
+    images = next(capture.partial_frames(frame, frame + 1)).images
+    found = {k: images[view] for k, view in enumerate(capture.train_views)}
+    return {view: image for view, image in found.items() if image is not None}
+
+
+def _hand_over(loop: StreamLoop, before: CodedFrame | None, following: Following, fit: Fit) -> Packet:
+    """Return the packet of the loop's last frame after a step of the handover, and set the loop's state to it."""
+    now, goal = loop.state.coded, decode(None, decode_packet(following.keyframe))
+    assert now is not None
+    assert before is not None
+    share = 1 / (following.frame - now.frame)
+    gaussians = approached(now, goal, following.shared_ids, share, fit.seams)
+    packet = changed_packet(before, now, gaussians, loop.setup.cameras, fit.config.codec)
+    loop.state = replace(loop.state, coded=decode(before, packet))
+    return packet

@@ -1,0 +1,74 @@
+"""The commands of docs/cluster.md run."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shlex
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from morgs_mi import cli
+from morgs_mi.codec.reader import StreamReader
+from tests.cli.commands import QUICK
+from tests.scenes.recording import CONFIG, write_recording
+
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"<!-- (run|start|file [^ ]+) -->\n```\w+\n(.*?)```", TEXT, re.DOTALL)
+FRAMES = 4
+
+
+def started(command: str) -> subprocess.Popen[str]:
+    """Start a command of Dask and wait until it listens."""
+    program, *args = shlex.split(command)
+    assert program == "dask"
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen([sys.executable, "-m", "dask", *args], stderr=subprocess.PIPE, text=True, env=env)
+    assert process.stderr is not None
+    next(line for line in process.stderr if "Scheduler at:" in line or "Registered to:" in line)
+    return process
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a small capture where the demo writes its own."""
+    write_recording(tmp_path / "out/demo/capture", FRAMES)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("morgs_mi.cluster.batch.StreamConfig", lambda: CONFIG)
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_cluster_page__commands_run(workplace: Path) -> None:
+    pytest.importorskip("distributed", reason="comes with the extra `cluster`")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    with contextlib.ExitStack() as stack:
+        for kind, text in BLOCKS:
+            command = text.strip().replace("8786", port).replace("40000", "100")
+            if kind == "start":
+                process = started(command)
+                stack.callback(process.wait)
+                stack.callback(process.terminate)
+            elif kind == "run":
+                program, *args = shlex.split(command)
+                assert program == "morgs-mi"
+                assert cli.main([*args, *(QUICK if args[0] == "fit" else [])]) == 0, command
+            else:
+                (workplace / kind.removeprefix("file ")).write_text(command)
+    streams = sorted(str(path.parent.relative_to("out")) for path in Path("out").rglob("stream.morgs"))
+    jobs = [f"sweep/capture-{name}-s{seed}" for name in ("detailed", "small") for seed in (0, 1)]
+    assert streams == ["cluster", "dask", "segments", *jobs]
+    for name in streams:
+        assert {frame for _, frame, _ in StreamReader(f"out/{name}/stream.morgs").index()} == set(range(FRAMES))
+
+
+def test_cluster_page__has_commands() -> None:
+    assert [kind for kind, _ in BLOCKS] == ["run", "file sweep.toml", "run", "run", "start", "start", "run"]
