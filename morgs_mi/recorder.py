@@ -34,12 +34,15 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import is_same_file, locked_folder, write_json
 from morgs_mi.io.bounded import read_json
 from morgs_mi.method.flow import choose_key_views
-from morgs_mi.stream_loop import MIN_POINTS, FrameReport, StreamLoop
+from morgs_mi.stream_loop import FrameReport, StreamLoop
 
 __all__ = ["FILES", "stream_capture"]
 
 FILES = ("stream.morgs", "capture.json", "report.json")
 """Names of the files that a fit writes into its folder."""
+
+# Fewer points are replaced by triangulated ones, if there are more of those.
+_FEW_POINTS = 100
 
 
 def stream_capture(
@@ -93,10 +96,10 @@ def _stream(
     first = next(frames)
     metadata = _metadata(capture, first, config)
     interrupted = _interrupted(out, capture, metadata) if resume else None
-    if interrupted is None and len(capture.points) < MIN_POINTS:
+    if interrupted is None and len(capture.points) < _FEW_POINTS:
         shared = match_capture(capture, partial(on_stage, "Matching views"))
         on_stage("Triangulating points", 0, 1)
-        capture = triangulate_points(capture, shared)
+        capture = max(capture, triangulate_points(capture, shared), key=lambda c: len(c.points))
     loop = StreamLoop(
         [capture.cameras[v] for v in train],
         capture.points,

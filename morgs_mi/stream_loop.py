@@ -25,7 +25,7 @@ from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, trial_steps
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
-from morgs_mi.fit.initialise import from_points, resample_points, scene_extent, seed_points
+from morgs_mi.fit.initialise import fill_points, from_points, resample_points, scene_extent, seed_points
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
@@ -36,12 +36,13 @@ from morgs_mi.method.flow_sources.registry import FramePair
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.objective import KeyView, Observations, channels_of, observe
 
-__all__ = ["MIN_POINTS", "FrameReport", "Setup", "StreamLoop", "StreamState", "prepare", "step"]
+__all__ = ["FrameReport", "Setup", "StreamLoop", "StreamState", "prepare", "step"]
 
 _LOG = logging.getLogger(__name__)
 
-# A capture with fewer points starts from random points inside the views.
-MIN_POINTS = 100
+# With fewer points, the first frame starts from random ones inside the views; with less than `_MANY_POINTS`, some are
+# added where views show none.
+_MIN_POINTS, _MANY_POINTS = 20, 1000
 
 # By view index: the images of those views that have one.
 Images = Mapping[int, np.ndarray]
@@ -183,7 +184,7 @@ def _first_step(
     start, config = time.perf_counter(), setup.config
     rng = np.random.default_rng([config.seed, 0])
     cameras, masks = [setup.cameras[v] for v in images], [setup.masks[v] for v in images]
-    gaussians, status = _first_gaussians(setup, cameras, list(images.values()), rng)
+    gaussians, status = _first_gaussians(setup, images, rng)
     fit, validation, tick = _validated(setup, gaussians, images, on_step)
     targets = [Target(image, mask) for image, mask in zip(images.values(), masks, strict=True)]
     gaussians, losses = fit_first_frame(gaussians, cameras, targets, setup.extent, fit, config.render, rng, tick)
@@ -221,17 +222,18 @@ def _validated(
     return replace(fit, dropping=found.best.dropping), found, None if tick is None else lambda done: tick(before + done)
 
 
-def _first_gaussians(
-    setup: Setup, cameras: Sequence[Camera], images: Sequence[np.ndarray], rng: np.random.Generator
-) -> tuple[Gaussians, str]:
+def _first_gaussians(setup: Setup, seen: Images, rng: np.random.Generator) -> tuple[Gaussians, str]:
     """Return the initial Gaussians, and a status about where they lie."""
     config, status = setup.config.fit, "ok"
-    count = config.first_count
+    count, images = config.first_count, list(seen.values())
+    cameras, masks = [setup.cameras[v] for v in seen], [setup.masks[v] for v in seen]
     points, colors = setup.points, setup.point_colors
-    if len(points) < MIN_POINTS:
+    if len(points) < _MIN_POINTS:
         status = f"the capture has {len(points)} points, too few: seeded {count} random ones inside the views"
         _LOG.warning("frame 0: %s", status)
         points, colors = seed_points(cameras, images, count, rng)
+    elif len(points) < min(_MANY_POINTS, count):
+        points, colors = fill_points(points, colors, cameras, images, masks, count, rng)
     points, colors = resample_points(points, colors, count, rng)
     return from_points(points, colors, config.sh_degree, config.initial_opacity), status
 
@@ -386,7 +388,7 @@ class StreamLoop:
 
     Args:
         cameras: the training views.
-        points: SfM points [P, 3], world units; fewer than 100 are replaced by random ones inside the views.
+        points: SfM points [P, 3], world units; fewer than 20 are replaced by random ones inside the views.
         point_colors: [P, 3] in [0, 1].
         config: settings.
         masks: per view [H, W] bool of valid pixels, or None.

@@ -2,12 +2,16 @@
 
 A camera fits if most of its matches with the other cameras that fit have a small reprojection error. If a pose does not
 fit, the common mistakes of `mistakes` are tried, and the one that explains the matches is reported.
+
+Features are found at the recorded size, and pixels are those of that size, however far the capture is downscaled: the
+smaller the images, the fewer features are found, and the less exactly.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -20,7 +24,15 @@ from morgs_mi.calibration.mistakes import (
     with_focal_factor,
 )
 from morgs_mi.capture.capture import Capture
-from morgs_mi.capture.features import Features, Match, detect, match_views, reprojection_errors, triangulate
+from morgs_mi.capture.features import (
+    Features,
+    Match,
+    detect,
+    match_views,
+    reprojection_errors,
+    triangulate,
+)
+from morgs_mi.capture.guided_matching import match_guided
 from morgs_mi.core.camera import Camera
 
 __all__ = ["MAX_ERROR", "CameraCheck", "RigCheck", "SharedFeatures", "check_rig", "match_capture", "triangulate_points"]
@@ -95,7 +107,7 @@ class SharedFeatures:
     """Features of a capture's first frame and their matches between views.
 
     Attributes:
-        features: per camera.
+        features: per camera, in pixels of the recorded size.
         matches: per pair of cameras with matches.
     """
 
@@ -109,9 +121,10 @@ def match_capture(capture: Capture, progress: Callable[[int, int], None] | None 
     A view without an image has no features.
 
     Args:
-        capture: a capture at any size; errors are in its pixels.
+        capture: a capture, downscaled or not.
         progress: called with (views done, views).
     """
+    capture = capture.at_recorded_size()
     images, count = next(capture.partial_frames(0, 1)).images, len(capture.cameras)
     features = []
     for done, (image, mask) in enumerate(zip(images, capture.masks, strict=True)):
@@ -126,6 +139,7 @@ def match_capture(capture: Capture, progress: Callable[[int, int], None] | None 
 
 def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
     """Return how well the capture's cameras fit the matches between its views."""
+    capture = capture.at_recorded_size()
     pairs, views = _Pairs.of(shared, capture.cameras), range(len(capture.cameras))
     group, improper = pairs.agreeing(), improper_poses(capture.cameras)
     checks = [_check(view, pairs, group) for view in views]
@@ -150,10 +164,14 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
 def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
     """Return the capture with its points replaced by ones triangulated from its training views.
 
-    Views that share few features give few points or none, which the fit reports. The held-out view is not used.
+    Pairs of views that are too far apart to be matched without their poses are matched with them. Views that share few
+    features give few points or none, which the fit reports. The held-out view is not used.
     """
+    cameras = capture.at_recorded_size().cameras
     matches = [match for match in shared.matches if capture.test_view not in match.views]
-    points, colors = triangulate(matches, shared.features, capture.cameras, MAX_ERROR)
+    unmatched = set(combinations(capture.train_views, 2)) - {match.views for match in matches}
+    matches += match_guided(shared.features, cameras, sorted(unmatched))
+    points, colors = triangulate(matches, shared.features, cameras, MAX_ERROR)
     return replace(capture, points=points, point_colors=colors)
 
 
