@@ -24,7 +24,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.calibration.rig_check import match_capture, triangulate_points
+from morgs_mi.calibration.rig_check import dense_points, match_capture
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.codec.container import PacketKind, StreamWriter, TruncatedStreamError, header_json
@@ -99,7 +99,7 @@ def _stream(
     if interrupted is None and len(capture.points) < _FEW_POINTS:
         shared = match_capture(capture, partial(on_stage, "Matching views"))
         on_stage("Triangulating points", 0, 1)
-        capture = max(capture, triangulate_points(capture, shared), key=lambda c: len(c.points))
+        capture = max(capture, dense_points(capture, shared, config.seed), key=lambda c: len(c.points))
     loop = StreamLoop(
         [capture.cameras[v] for v in train],
         capture.points,

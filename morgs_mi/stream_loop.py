@@ -232,7 +232,7 @@ def _first_gaussians(setup: Setup, seen: Images, rng: np.random.Generator) -> tu
         status = f"the capture has {len(points)} points, too few: seeded {count} random ones inside the views"
         _LOG.warning("frame 0: %s", status)
         points, colors = seed_points(cameras, images, count, rng)
-    elif len(points) < min(_MANY_POINTS, count):
+    elif len(points) < _MANY_POINTS:
         points, colors = fill_points(points, colors, cameras, images, masks, count, rng)
     points, colors = resample_points(points, colors, count, rng)
     return from_points(points, colors, config.sh_degree, config.initial_opacity), status

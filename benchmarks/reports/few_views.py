@@ -22,9 +22,8 @@ import tyro
 from benchmarks.reports.generalise import first_frame
 from benchmarks.reports.random_scenes import random_capture
 from benchmarks.speed.output import Output
-from morgs_mi.calibration.rig_check import SharedFeatures, match_capture, triangulate_points
+from morgs_mi.calibration.rig_check import dense_points, match_capture
 from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.capture.features import detect
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.fit.forecast import angles_to, forecast, scene_depths
@@ -83,23 +82,26 @@ def cases(options: Options) -> Iterator[tuple[Capture, tuple[int, ...]]]:
         for rig in options.rigs:
             make = random_capture if rig == "random" else wide_capture
             capture = make(options.clips, seed, options.downscale)
-            matched, others = match_capture(capture), capture.train_views
+            others = capture.train_views
             for count in (n for n in options.views if n <= len(others)):
                 train = tuple(others[k] for k in spread_views([capture.cameras[v] for v in others], count))
-                yield with_points(capture, matched, train), train
+                yield with_points(capture, train), train
     for path in options.captures:
         capture = load_capture(path, 8)
-        matched, views = match_capture(capture), range(len(capture.cameras))
+        views = range(len(capture.cameras))
         for held_out in views:
             train = tuple(v for v in views if v != held_out)
-            yield with_points(capture, matched, train), train
+            yield with_points(capture, train), train
 
 
-def with_points(capture: Capture, matched: SharedFeatures, train: Sequence[int]) -> Capture:
-    """Return the capture with the points that some of its views share."""
-    features = tuple(f if view in train else detect(None) for view, f in enumerate(matched.features))
-    among = tuple(match for match in matched.matches if set(match.views) <= set(train))
-    return triangulate_points(capture, SharedFeatures(features, among))
+def with_points(capture: Capture, train: Sequence[int]) -> Capture:
+    """Return the capture with the points that some of its views give."""
+    cameras, masks, sources = (
+        tuple(of_view[v] for v in train) for of_view in (capture.cameras, capture.masks, capture._sources)
+    )
+    alone = replace(capture, cameras=cameras, masks=masks, _sources=sources, test_view=None)
+    found = dense_points(alone, match_capture(alone))
+    return replace(capture, points=found.points, point_colors=found.point_colors)
 
 
 def measure(capture: Capture, train: Sequence[int], config: StreamConfig) -> dict[str, Any]:

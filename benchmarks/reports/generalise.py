@@ -43,14 +43,14 @@ def first_frame(capture: Capture, train: Sequence[int], config: StreamConfig) ->
     """Fit the first frame to the views `train`; return the PSNR of each view of the capture [C], and the report."""
     cameras, masks = [capture.cameras[v] for v in train], [capture.masks[v] for v in train]
     loop = StreamLoop(cameras, capture.points, capture.point_colors, config, masks)
-    images = next(iter(capture.partial_frames(0, 1))).images
+    images = next(capture.frames(0, 1)).images
     _, report = loop.push([images[v] for v in train])
     gaussians = loop.gaussians
     assert gaussians is not None
 
     def score(camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> float:
         found, valid = np.asarray(rasterize(gaussians, camera, ("color",)).color), slice(None) if mask is None else mask
-        return psnr(np.clip(found, 0, 1)[valid], np.asarray(image)[valid] / 255.0)
+        return psnr(np.clip(found, 0, 1)[valid], image[valid] / 255.0)
 
     return np.array([score(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]), report
 

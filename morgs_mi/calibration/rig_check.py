@@ -33,9 +33,19 @@ from morgs_mi.capture.features import (
     triangulate,
 )
 from morgs_mi.capture.guided_matching import match_guided
+from morgs_mi.capture.stereo import stereo_points
 from morgs_mi.core.camera import Camera
 
-__all__ = ["MAX_ERROR", "CameraCheck", "RigCheck", "SharedFeatures", "check_rig", "match_capture", "triangulate_points"]
+__all__ = [
+    "MAX_ERROR",
+    "CameraCheck",
+    "RigCheck",
+    "SharedFeatures",
+    "check_rig",
+    "dense_points",
+    "match_capture",
+    "triangulate_points",
+]
 
 # px. Distortion that a layout cannot represent causes errors of about a pixel, a wrong pose tens of pixels.
 MAX_ERROR = 2.0
@@ -172,6 +182,28 @@ def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
     unmatched = set(combinations(capture.train_views, 2)) - {match.views for match in matches}
     matches += match_guided(shared.features, cameras, sorted(unmatched))
     points, colors = triangulate(matches, shared.features, cameras, MAX_ERROR)
+    return replace(capture, points=points, point_colors=colors)
+
+
+def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Capture:
+    """Return the capture with its points replaced by triangulated ones and, where cameras are close, those of stereo.
+
+    Args:
+        capture: a capture; its held-out view is not used.
+        shared: features of its first frame.
+        seed: of the choice among the points of stereo.
+    """
+    sparse, recorded = triangulate_points(capture, shared), capture.at_recorded_size()
+    images = next(recorded.partial_frames(0, 1)).images
+    views = [(v, image) for v in capture.train_views if (image := images[v]) is not None]
+    points, colors = stereo_points(
+        [recorded.cameras[v] for v, _ in views],
+        [image for _, image in views],
+        [recorded.masks[v] for v, _ in views],
+        sparse.points,
+        np.random.default_rng(seed),
+    )
+    points, colors = np.concatenate([sparse.points, points]), np.concatenate([sparse.point_colors, colors])
     return replace(capture, points=points, point_colors=colors)
 
 

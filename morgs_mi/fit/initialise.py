@@ -135,7 +135,7 @@ def fill_points(
     in the image, which is far better than a random depth (see `docs/experiments/generalise.md`).
 
     Args:
-        points: [P, 3], world units; not more than `count`.
+        points: [P, 3], world units.
         colors: [P, 3] in [0, 1].
         cameras: C views.
         images: per view uint8 [H, W, 3], RGB.
@@ -151,14 +151,14 @@ def fill_points(
         pixels = rng.uniform(0, (camera.width, camera.height), (_share(count, view, len(cameras)), 2))
         columns, rows = pixels.astype(int).T
         free = ~_shown_cells(camera, seen)[_cells_of(camera, pixels)] & (True if mask is None else mask[rows, columns])
-        nearest = KDTree(seen).query(pixels[free], k=np.arange(min(_NEIGHBOURS, len(seen))) + 1)
-        weights = 1 / (nearest[0] + 1e-3)
-        depth = weights.sum(axis=1) / (weights / depths[nearest[1]]).sum(axis=1)
+        k = min(_NEIGHBOURS, len(seen))
+        distance, index = (np.reshape(found, (-1, k)) for found in KDTree(seen).query(pixels[free], k=k))
+        weights = 1 / (distance + 1e-3)
+        depth = weights.sum(axis=1) / (weights / depths[index]).sum(axis=1)
         added.append(camera.unproject(pixels[free], depth * rng.uniform(1 - _SPREAD, 1 + _SPREAD, len(depth))))
         added_colors.append(image[rows[free], columns[free]] / 255.0)
-    total = sum(map(len, added))
-    points, colors = resample_points(points, colors, max(count - total, len(points)), rng)
-    return np.concatenate([points, *added])[:count], np.concatenate([colors, *added_colors])[:count]
+    points, colors = resample_points(points, colors, count - sum(map(len, added)), rng)
+    return np.concatenate([points, *added]), np.concatenate([colors, *added_colors])
 
 
 def _share(count: int, view: int, views: int) -> int:
