@@ -25,6 +25,7 @@ from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, trial_steps
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
+from morgs_mi.fit.forecast import Forecast, forecast
 from morgs_mi.fit.initialise import fill_points, from_points, resample_points, scene_extent, seed_points
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.losses.ssim import Target
@@ -61,8 +62,8 @@ class FrameReport:
         status: "ok", or a sentence about what was done instead.
         missing_views: names of the views without an image.
         active: what took part, as fractions of everything, by name: gaussians, views, pixels, epochs.
-        validation: of the first frame, what cross-validation found (see `fit.cross_validation`), with a `sentence` on
-            views between the cameras; empty if there was none.
+        validation: of the first frame, what cross-validation found (see `fit.cross_validation`), or else the forecast
+            (see `fit.forecast`), with a `sentence` on views between the cameras; empty with a single view.
     """
 
     frame: int
@@ -198,19 +199,23 @@ def _first_step(
         len(coded),
         status,
         _missing(setup, images),
-        validation={} if validation is None else {"sentence": validation.sentence, **asdict(validation)},
+        validation={"sentence": validation.sentence, **asdict(validation)} if validation else {},
     )
     return StreamState(1, coded, images, _references(setup, state, images, {})), packet, report
 
 
 def _validated(
     setup: Setup, gaussians: Gaussians, images: Images, on_step: Callable[[int, int], None] | None
-) -> tuple[FitConfig, CrossValidation | None, Callable[[int], None] | None]:
-    """Return the first frame's settings, what cross-validation chose them by, and what to call after each step."""
+) -> tuple[FitConfig, CrossValidation | Forecast | None, Callable[[int], None] | None]:
+    """Return the first frame's settings, what is known of views between the cameras, and what to call after each step.
+
+    Where cross-validation does not choose the settings, that is a forecast.
+    """
     config, fit = setup.config, setup.config.fit
     if fit.dropping is not None or len(images) < fit.cross_validation.min_views:
         fit = replace(fit, dropping=fit.dropping or 0.0)
-        return fit, None, None if on_step is None else lambda done: on_step(done, fit.first_frame_steps)
+        expected = forecast([setup.cameras[v] for v in images], setup.points) if len(images) > 1 else None
+        return fit, expected, None if on_step is None else lambda done: on_step(done, fit.first_frame_steps)
     before = trial_steps(fit) * len(fit.cross_validation.candidates)
     steps = before + fit.first_frame_steps
     cameras, masks = [setup.cameras[v] for v in images], [setup.masks[v] for v in images]

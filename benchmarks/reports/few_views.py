@@ -116,6 +116,7 @@ def measure(capture: Capture, train: Sequence[int], config: StreamConfig) -> dic
         "points": len(capture.points),
         "spacing": round(rig.spacing, 2),
         "overlap": round(rig.overlap, 3),
+        "reach": round(rig.reach, 2),
         "training": round(float(scores[list(train)].mean()), 2),
         "held_out": [
             {"view": v, "angles": angles[v][:3].round(2).tolist(), "psnr": round(float(scores[v]), 2)} for v in held_out

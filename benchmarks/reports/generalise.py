@@ -65,7 +65,7 @@ def measure(capture: Capture, config: StreamConfig) -> dict[str, float]:
         "training": float(scores[list(train)].mean()),
         "seconds": report.seconds,
     }
-    if not report.validation:
+    if "trials" not in report.validation:
         return figures
     best = max(report.validation["trials"], key=lambda trial: trial["withheld_psnr"])
     return {**figures, "dropping": best["dropping"], "estimate": best["withheld_psnr"]}

@@ -168,7 +168,8 @@ def _share(count: int, view: int, views: int) -> int:
 
 def seen_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return which points [P, 3] lie in a view [P], the n pixel positions [n, 2] of those, and their depths [n]."""
-    pixels, depths = camera.project(np.asarray(points, np.float64).reshape(-1, 3))
+    with np.errstate(divide="ignore", invalid="ignore"):  # points beside the camera
+        pixels, depths = camera.project(np.asarray(points, np.float64).reshape(-1, 3))
     inside = (depths > camera.near) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
     return inside, pixels[inside], depths[inside]
 

@@ -20,7 +20,8 @@ def views(textured_capture: Capture):
 
 @pytest.fixture(scope="module")
 def found(views):
-    return stereo_points(*views, [None] * 3, NO_POINTS, np.random.default_rng(0))
+    cameras, images = views
+    return stereo_points(cameras, images, [None] * 3, NO_POINTS, np.random.default_rng(0))
 
 
 def test_stereo_points__lie_on_the_surfaces(views, found) -> None:
@@ -36,7 +37,8 @@ def test_stereo_points__lie_on_the_surfaces(views, found) -> None:
 
 
 def test_stereo_points__are_the_same_every_time(views, found) -> None:
-    again = stereo_points(*views, [None] * 3, NO_POINTS, np.random.default_rng(0))
+    cameras, images = views
+    again = stereo_points(cameras, images, [None] * 3, NO_POINTS, np.random.default_rng(0))
     np.testing.assert_array_equal(found[0], again[0])
 
 
@@ -52,6 +54,6 @@ def test_stereo_points__leaves_out_pixels_that_are_not_valid(views) -> None:
 
 def test_stereo_points__finds_none_between_distant_cameras(textured_capture: Capture) -> None:
     cameras, images = textured_capture.cameras, next(textured_capture.frames()).images
-    ends = ([of_view[0], of_view[5]] for of_view in (cameras, images))
-    points, colors = stereo_points(*ends, [None] * 2, NO_POINTS, np.random.default_rng(0))
+    ends = [cameras[0], cameras[5]], [images[0], images[5]]
+    points, colors = stereo_points(ends[0], ends[1], [None] * 2, NO_POINTS, np.random.default_rng(0))
     assert points.shape == colors.shape == (0, 3)
