@@ -4,14 +4,15 @@
 
 Each seed gives two clips: `morgs-mi synth random`, as in `random_scenes`, and the same scene without its side walls,
 with 13 cameras on an arc of 120 degrees. Of each, some cameras that are spread over the rig are trained on, and all
-others are held out. Of the captures given by `--captures`, one camera is held out in turn. All start from triangulated
-points.
+others are held out. Of the captures given by `--captures`, one camera is held out in turn. The points of the clips are
+not used.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,13 +23,15 @@ import tyro
 from benchmarks.reports.generalise import first_frame
 from benchmarks.reports.random_scenes import random_capture
 from benchmarks.speed.output import Output
-from morgs_mi.calibration.rig_check import dense_points, match_capture
+from morgs_mi.calibration.rig_check import dense_points, match_capture, triangulate_points
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.fit.forecast import angles_to, forecast, scene_depths
 from morgs_mi.synth.scene import load_scene
 from morgs_mi.synth.synthesize import synthesize
+
+Points = Literal["stereo", "triangulated", "random"]
 
 
 @dataclass(frozen=True)
@@ -45,6 +48,8 @@ class Options(Output):
     """Further captures, which are reduced by eight."""
     views: tuple[int, ...] = (3, 4, 6, 8, 12)
     """Numbers of training views of the clips."""
+    points: tuple[Points, ...] = ("stereo",)
+    """Points that the first frame starts from: triangulated and from stereo, triangulated, or random."""
     droppings: tuple[float, ...] = (0.0,)
     """Probabilities of dropping."""
     downscale: float = 2
@@ -77,7 +82,7 @@ def spread_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
 
 
 def cases(options: Options) -> Iterator[tuple[Capture, tuple[int, ...]]]:
-    """Yield each capture, with the points of the views to train on, and these views."""
+    """Yield each capture and the views to train on."""
     for seed in options.seeds:
         for rig in options.rigs:
             make = random_capture if rig == "random" else wide_capture
@@ -85,22 +90,25 @@ def cases(options: Options) -> Iterator[tuple[Capture, tuple[int, ...]]]:
             others = capture.train_views
             for count in (n for n in options.views if n <= len(others)):
                 train = tuple(others[k] for k in spread_views([capture.cameras[v] for v in others], count))
-                yield with_points(capture, train), train
+                yield capture, train
     for path in options.captures:
         capture = load_capture(path, 8)
         views = range(len(capture.cameras))
         for held_out in views:
             train = tuple(v for v in views if v != held_out)
-            yield with_points(capture, train), train
+            yield capture, train
 
 
-def with_points(capture: Capture, train: Sequence[int]) -> Capture:
+def with_points(capture: Capture, train: Sequence[int], points: Points) -> Capture:
     """Return the capture with the points that some of its views give."""
+    if points == "random":
+        return replace(capture, points=capture.points[:0], point_colors=capture.point_colors[:0])
     cameras, masks, sources = (
         tuple(of_view[v] for v in train) for of_view in (capture.cameras, capture.masks, capture._sources)
     )
     alone = replace(capture, cameras=cameras, masks=masks, _sources=sources, test_view=None)
-    found = dense_points(alone, match_capture(alone))
+    find = dense_points if points == "stereo" else triangulate_points
+    found = find(alone, match_capture(alone))
     return replace(capture, points=found.points, point_colors=found.point_colors)
 
 
@@ -130,10 +138,11 @@ def main(options: Options) -> None:
     mi.set_variant("llvm_ad_rgb")
     config, rows = StreamConfig(), []
     for capture, train in cases(options):
-        for dropping in options.droppings:
+        for points, dropping in product(options.points, options.droppings):
             fit = replace(config.fit, first_frame_steps=options.steps, num_gaussians=options.gaussians)
-            row = measure(capture, train, replace(config, fit=replace(fit, dropping=dropping)))
-            rows.append({"capture": capture.path.name, "dropping": dropping, **row})
+            start, settings = with_points(capture, train, points), replace(config, fit=replace(fit, dropping=dropping))
+            row = measure(start, train, settings)
+            rows.append({"capture": capture.path.name, "start": points, "dropping": dropping, **row})
             print(rows[-1], flush=True)
     options.write({"steps": options.steps, "gaussians": options.gaussians, "fits": rows}, unprinted=["fits"])
 

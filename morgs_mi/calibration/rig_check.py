@@ -9,6 +9,7 @@ smaller the images, the fewer features are found, and the less exactly.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
@@ -24,14 +25,7 @@ from morgs_mi.calibration.mistakes import (
     with_focal_factor,
 )
 from morgs_mi.capture.capture import Capture
-from morgs_mi.capture.features import (
-    Features,
-    Match,
-    detect,
-    match_views,
-    reprojection_errors,
-    triangulate,
-)
+from morgs_mi.capture.features import Features, Match, detect, match_views, reprojection_errors, triangulate
 from morgs_mi.capture.guided_matching import match_guided
 from morgs_mi.capture.stereo import stereo_points
 from morgs_mi.core.camera import Camera
@@ -60,6 +54,8 @@ _GAIN, _GOOD_ERROR = 3.0, 0.5
 _LEAST_FACTOR = 0.1
 # Matches of a pair, and pairs, with which candidates are compared: more are slow, and not more accurate.
 _SAMPLE, _FACTOR_PAIRS = 40, 8
+# A view that matches fewer others without its pose is also matched with it, which takes longer.
+_MIN_PARTNERS = 3
 _NO_OVERLAP = (
     "check that the clip is of this scene and not mirrored, compare the camera's place in the plot of the rig (--plot) "
     "with the real one, or add cameras in between and textured objects"
@@ -174,13 +170,12 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
 def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
     """Return the capture with its points replaced by ones triangulated from its training views.
 
-    Pairs of views that are too far apart to be matched without their poses are matched with them. Views that share few
-    features give few points or none, which the fit reports. The held-out view is not used.
+    Views that match few others without their poses are matched with them. Views that share few features give few points
+    or none, which the fit reports. The held-out view is not used.
     """
     cameras = capture.at_recorded_size().cameras
     matches = [match for match in shared.matches if capture.test_view not in match.views]
-    unmatched = set(combinations(capture.train_views, 2)) - {match.views for match in matches}
-    matches += match_guided(shared.features, cameras, sorted(unmatched))
+    matches += match_guided(shared.features, cameras, _unmatched(capture.train_views, matches))
     points, colors = triangulate(matches, shared.features, cameras, MAX_ERROR)
     return replace(capture, points=points, point_colors=colors)
 
@@ -205,6 +200,14 @@ def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Cap
     )
     points, colors = np.concatenate([sparse.points, points]), np.concatenate([sparse.point_colors, colors])
     return replace(capture, points=points, point_colors=colors)
+
+
+def _unmatched(views: Sequence[int], matches: Sequence[Match]) -> list[tuple[int, int]]:
+    """Return the pairs without matches of those views that match few others."""
+    matched = {match.views for match in matches}
+    partners = Counter(view for pair in matched for view in pair)
+    few = {view for view in views if partners[view] < _MIN_PARTNERS}
+    return [pair for pair in combinations(views, 2) if pair not in matched and few & set(pair)]
 
 
 @dataclass(frozen=True)
