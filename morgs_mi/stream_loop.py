@@ -23,7 +23,7 @@ from morgs_mi.core.checks import check_mask, check_points, check_type
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, trial_steps
+from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, dropping_by_noise, trial_steps
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.forecast import Forecast, forecast
 from morgs_mi.fit.initialise import fill_points, from_points, resample_points, scene_extent, seed_points
@@ -213,7 +213,8 @@ def _validated(
     """
     config, fit = setup.config, setup.config.fit
     if fit.dropping is not None or len(images) < fit.cross_validation.min_views:
-        fit = replace(fit, dropping=fit.dropping or 0.0)
+        dropping = dropping_by_noise(list(images.values())) if fit.dropping is None else fit.dropping
+        fit = replace(fit, dropping=dropping)
         expected = forecast([setup.cameras[v] for v in images], setup.points) if len(images) > 1 else None
         return fit, expected, None if on_step is None else lambda done: on_step(done, fit.first_frame_steps)
     before = trial_steps(fit) * len(fit.cross_validation.candidates)

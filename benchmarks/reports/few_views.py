@@ -144,7 +144,8 @@ def main(options: Options) -> None:
             row = measure(start, train, settings)
             rows.append({"capture": capture.path.name, "start": points, "dropping": dropping, **row})
             print(rows[-1], flush=True)
-    options.write({"steps": options.steps, "gaussians": options.gaussians, "fits": rows}, unprinted=["fits"])
+    given = {"downscale": options.downscale, "steps": options.steps, "gaussians": options.gaussians}
+    options.write({**given, "fits": rows}, unprinted=["fits"])
 
 
 if __name__ == "__main__":
