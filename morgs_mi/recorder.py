@@ -24,7 +24,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.calibration.rig_check import match_capture, triangulate_points
+from morgs_mi.calibration.rig_check import dense_points, match_capture
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.codec.container import Packet, PacketKind, StreamWriter, TruncatedStreamError, header_json
@@ -34,7 +34,7 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import is_same_file, locked_folder, write_json
 from morgs_mi.io.bounded import read_json
 from morgs_mi.method.flow import choose_key_views
-from morgs_mi.stream_loop import MIN_POINTS, FrameReport, StreamLoop
+from morgs_mi.stream_loop import FrameReport, StreamLoop
 
 __all__ = [
     "FILES",
@@ -50,6 +50,9 @@ __all__ = [
 
 FILES = ("stream.morgs", "capture.json", "report.json")
 """Names of the files that a fit writes into its folder."""
+
+# Fewer points are replaced by triangulated ones, if there are more of those.
+_FEW_POINTS = 100
 
 
 def stream_capture(
@@ -104,7 +107,7 @@ def _stream(
     metadata = stream_metadata(capture, first, config)
     interrupted = _interrupted(out, capture, metadata) if resume else None
     if interrupted is None:
-        capture = with_points(capture, on_stage)
+        capture = with_points(capture, config.seed, on_stage)
     loop = StreamLoop(
         [capture.cameras[v] for v in train],
         capture.points,
@@ -144,13 +147,13 @@ def _stream(
     return reports
 
 
-def with_points(capture: Capture, on_stage: Callable[[str, int, int], None]) -> Capture:
-    """Return a capture with triangulated points if it has too few; see `stream_capture`."""
-    if len(capture.points) >= MIN_POINTS:
+def with_points(capture: Capture, seed: int, on_stage: Callable[[str, int, int], None]) -> Capture:
+    """Return a capture with the points of `dense_points` if it has few and they are more; see `stream_capture`."""
+    if len(capture.points) >= _FEW_POINTS:
         return capture
     shared = match_capture(capture, partial(on_stage, "Matching views"))
     on_stage("Triangulating points", 0, 1)
-    return triangulate_points(capture, shared)
+    return max(capture, dense_points(capture, shared, seed), key=lambda c: len(c.points))
 
 
 def push_frame(

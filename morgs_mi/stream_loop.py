@@ -23,9 +23,10 @@ from morgs_mi.core.checks import check_mask, check_points, check_type
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, trial_steps
+from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, dropping_by_noise, trial_steps
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
-from morgs_mi.fit.initialise import from_points, resample_points, scene_extent, seed_points
+from morgs_mi.fit.forecast import Forecast, forecast
+from morgs_mi.fit.initialise import fill_points, from_points, resample_points, scene_extent, seed_points
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
@@ -36,12 +37,13 @@ from morgs_mi.method.flow_sources.registry import FramePair
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.objective import KeyView, Observations, channels_of, observe
 
-__all__ = ["MIN_POINTS", "FrameReport", "Setup", "StreamLoop", "StreamState", "prepare", "step"]
+__all__ = ["FrameReport", "Setup", "StreamLoop", "StreamState", "prepare", "step"]
 
 _LOG = logging.getLogger(__name__)
 
-# A capture with fewer points starts from random points inside the views.
-MIN_POINTS = 100
+# With fewer points, the first frame starts from random ones inside the views; with less than `_MANY_POINTS`, some are
+# added where views show none.
+_MIN_POINTS, _MANY_POINTS = 20, 1000
 
 # By view index: the images of those views that have one.
 Images = Mapping[int, np.ndarray]
@@ -60,8 +62,8 @@ class FrameReport:
         status: "ok", or a sentence about what was done instead.
         missing_views: names of the views without an image.
         active: what took part, as fractions of everything, by name: gaussians, views, pixels, epochs.
-        validation: of the first frame, what cross-validation found (see `fit.cross_validation`), with a `sentence` on
-            views between the cameras; empty if there was none.
+        validation: of the first frame, what cross-validation found (see `fit.cross_validation`), or else the forecast
+            (see `fit.forecast`), with a `sentence` on views between the cameras; empty with a single view.
     """
 
     frame: int
@@ -183,7 +185,7 @@ def _first_step(
     start, config = time.perf_counter(), setup.config
     rng = np.random.default_rng([config.seed, 0])
     cameras, masks = [setup.cameras[v] for v in images], [setup.masks[v] for v in images]
-    gaussians, status = _first_gaussians(setup, cameras, list(images.values()), rng)
+    gaussians, status = _first_gaussians(setup, images, rng)
     fit, validation, tick = _validated(setup, gaussians, images, on_step)
     targets = [Target(image, mask) for image, mask in zip(images.values(), masks, strict=True)]
     gaussians, losses = fit_first_frame(gaussians, cameras, targets, setup.extent, fit, config.render, rng, tick)
@@ -197,19 +199,24 @@ def _first_step(
         len(coded),
         status,
         _missing(setup, images),
-        validation={} if validation is None else {"sentence": validation.sentence, **asdict(validation)},
+        validation={"sentence": validation.sentence, **asdict(validation)} if validation else {},
     )
     return StreamState(1, coded, images, _references(setup, state, images, {})), packet, report
 
 
 def _validated(
     setup: Setup, gaussians: Gaussians, images: Images, on_step: Callable[[int, int], None] | None
-) -> tuple[FitConfig, CrossValidation | None, Callable[[int], None] | None]:
-    """Return the first frame's settings, what cross-validation chose them by, and what to call after each step."""
+) -> tuple[FitConfig, CrossValidation | Forecast | None, Callable[[int], None] | None]:
+    """Return the first frame's settings, what is known of views between the cameras, and what to call after each step.
+
+    Where cross-validation does not choose the settings, that is a forecast.
+    """
     config, fit = setup.config, setup.config.fit
     if fit.dropping is not None or len(images) < fit.cross_validation.min_views:
-        fit = replace(fit, dropping=fit.dropping or 0.0)
-        return fit, None, None if on_step is None else lambda done: on_step(done, fit.first_frame_steps)
+        dropping = dropping_by_noise(list(images.values())) if fit.dropping is None else fit.dropping
+        fit = replace(fit, dropping=dropping)
+        expected = forecast([setup.cameras[v] for v in images], setup.points) if len(images) > 1 else None
+        return fit, expected, None if on_step is None else lambda done: on_step(done, fit.first_frame_steps)
     before = trial_steps(fit) * len(fit.cross_validation.candidates)
     steps = before + fit.first_frame_steps
     cameras, masks = [setup.cameras[v] for v in images], [setup.masks[v] for v in images]
@@ -221,17 +228,18 @@ def _validated(
     return replace(fit, dropping=found.best.dropping), found, None if tick is None else lambda done: tick(before + done)
 
 
-def _first_gaussians(
-    setup: Setup, cameras: Sequence[Camera], images: Sequence[np.ndarray], rng: np.random.Generator
-) -> tuple[Gaussians, str]:
+def _first_gaussians(setup: Setup, seen: Images, rng: np.random.Generator) -> tuple[Gaussians, str]:
     """Return the initial Gaussians, and a status about where they lie."""
     config, status = setup.config.fit, "ok"
-    count = config.first_count
+    count, images = config.first_count, list(seen.values())
+    cameras, masks = [setup.cameras[v] for v in seen], [setup.masks[v] for v in seen]
     points, colors = setup.points, setup.point_colors
-    if len(points) < MIN_POINTS:
+    if len(points) < _MIN_POINTS:
         status = f"the capture has {len(points)} points, too few: seeded {count} random ones inside the views"
         _LOG.warning("frame 0: %s", status)
         points, colors = seed_points(cameras, images, count, rng)
+    elif len(points) < _MANY_POINTS:
+        points, colors = fill_points(points, colors, cameras, images, masks, count, rng)
     points, colors = resample_points(points, colors, count, rng)
     return from_points(points, colors, config.sh_degree, config.initial_opacity), status
 
@@ -386,7 +394,7 @@ class StreamLoop:
 
     Args:
         cameras: the training views.
-        points: SfM points [P, 3], world units; fewer than 100 are replaced by random ones inside the views.
+        points: SfM points [P, 3], world units; fewer than 20 are replaced by random ones inside the views.
         point_colors: [P, 3] in [0, 1].
         config: settings.
         masks: per view [H, W] bool of valid pixels, or None.

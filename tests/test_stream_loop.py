@@ -202,14 +202,15 @@ def test_push__reports_what_cross_validation_of_the_first_frame_found(clip):
     steps = [done for done, _ in ticks]
     assert steps == sorted(set(steps))
     assert ticks[-1][0] == ticks[-1][1] == 20 + 3 * 8
-    assert new_loop(given).push(clip[0][:4])[1].validation == {}
+    assert "trials" not in new_loop(given).push(clip[0][:4])[1].validation
 
 
 def test_push__withholds_nothing_from_few_views(clip):
     ticks = []
     config = dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, first_frame_steps=20))
     _, report = new_loop(config).push(clip[0][:4], lambda *tick: ticks.append(tick))
-    assert report.validation == {}
+    assert report.validation["sentence"].startswith("Views between the cameras will be ")
+    assert report.validation["cameras"] == 4
     assert ticks == [(done, 20) for done in range(1, 21)]
 
 

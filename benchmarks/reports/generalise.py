@@ -8,6 +8,7 @@ cross-validation chooses the probability of dropping, and without dropping.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,9 @@ from benchmarks.speed.output import Output
 from morgs_mi import StreamLoop, rasterize
 from morgs_mi.capture.capture import Capture
 from morgs_mi.config import StreamConfig
+from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.stream_loop import FrameReport
 
 
 @dataclass(frozen=True)
@@ -36,27 +39,33 @@ class Options(Output):
     """Steps of the first frame."""
 
 
-def measure(capture: Capture, config: StreamConfig) -> dict[str, float]:
-    """Fit the first frame; return PSNR of the held-out view and of the training views, seconds, and the estimate."""
-    train, test = capture.train_views, capture.test_view
-    assert test is not None
+def first_frame(capture: Capture, train: Sequence[int], config: StreamConfig) -> tuple[np.ndarray, FrameReport]:
+    """Fit the first frame to the views `train`; return the PSNR of each view of the capture [C], and the report."""
     cameras, masks = [capture.cameras[v] for v in train], [capture.masks[v] for v in train]
     loop = StreamLoop(cameras, capture.points, capture.point_colors, config, masks)
-    images = next(iter(capture.partial_frames(0, 1))).images
+    images = next(capture.frames(0, 1)).images
     _, report = loop.push([images[v] for v in train])
     gaussians = loop.gaussians
     assert gaussians is not None
 
-    def score(view: int) -> float:
-        found = np.asarray(rasterize(gaussians, capture.cameras[view], ("color",)).color)
-        return psnr(np.clip(found, 0, 1), np.asarray(images[view]) / 255.0)
+    def score(camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> float:
+        found, valid = np.asarray(rasterize(gaussians, camera, ("color",)).color), slice(None) if mask is None else mask
+        return psnr(np.clip(found, 0, 1)[valid], image[valid] / 255.0)
 
+    return np.array([score(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]), report
+
+
+def measure(capture: Capture, config: StreamConfig) -> dict[str, float]:
+    """Fit the first frame; return PSNR of the held-out view and of the training views, seconds, and the estimate."""
+    train, test = capture.train_views, capture.test_view
+    assert test is not None
+    scores, report = first_frame(capture, train, config)
     figures = {
-        "held_out": score(test),
-        "training": float(np.mean([score(v) for v in train])),
+        "held_out": float(scores[test]),
+        "training": float(scores[list(train)].mean()),
         "seconds": report.seconds,
     }
-    if not report.validation:
+    if "trials" not in report.validation:
         return figures
     best = max(report.validation["trials"], key=lambda trial: trial["withheld_psnr"])
     return {**figures, "dropping": best["dropping"], "estimate": best["withheld_psnr"]}

@@ -40,12 +40,12 @@ class Options(Output):
     """Epochs of a later frame."""
 
 
-def random_capture(clips: Path, seed: int) -> Capture:
+def random_capture(clips: Path, seed: int, downscale: float = 1) -> Capture:
     """Return the random scene of a seed, which is made in the folder `clips` if it is not there."""
     clip = clips / f"random-{seed}"
     if not clip.exists():
         synthesize("random", clip, num_frames=8, seed=seed)
-    return load_capture(clip)
+    return load_capture(clip, downscale)
 
 
 def measure(capture: Capture, config: StreamConfig, num_frames: int) -> dict[str, float]:

@@ -2,12 +2,17 @@
 
 A camera fits if most of its matches with the other cameras that fit have a small reprojection error. If a pose does not
 fit, the common mistakes of `mistakes` are tried, and the one that explains the matches is reported.
+
+Features are found at the recorded size, and pixels are those of that size, however far the capture is downscaled: the
+smaller the images, the fewer features are found, and the less exactly.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -21,9 +26,20 @@ from morgs_mi.calibration.mistakes import (
 )
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.features import Features, Match, detect, match_views, reprojection_errors, triangulate
+from morgs_mi.capture.guided_matching import match_guided
+from morgs_mi.capture.stereo import stereo_points
 from morgs_mi.core.camera import Camera
 
-__all__ = ["MAX_ERROR", "CameraCheck", "RigCheck", "SharedFeatures", "check_rig", "match_capture", "triangulate_points"]
+__all__ = [
+    "MAX_ERROR",
+    "CameraCheck",
+    "RigCheck",
+    "SharedFeatures",
+    "check_rig",
+    "dense_points",
+    "match_capture",
+    "triangulate_points",
+]
 
 # px. Distortion that a layout cannot represent causes errors of about a pixel, a wrong pose tens of pixels.
 MAX_ERROR = 2.0
@@ -38,6 +54,8 @@ _GAIN, _GOOD_ERROR = 3.0, 0.5
 _LEAST_FACTOR = 0.1
 # Matches of a pair, and pairs, with which candidates are compared: more are slow, and not more accurate.
 _SAMPLE, _FACTOR_PAIRS = 40, 8
+# A view that matches fewer others without its pose is also matched with it, which takes longer.
+_MIN_PARTNERS = 3
 _NO_OVERLAP = (
     "check that the clip is of this scene and not mirrored, compare the camera's place in the plot of the rig (--plot) "
     "with the real one, or add cameras in between and textured objects"
@@ -95,7 +113,7 @@ class SharedFeatures:
     """Features of a capture's first frame and their matches between views.
 
     Attributes:
-        features: per camera.
+        features: per camera, in pixels of the recorded size.
         matches: per pair of cameras with matches.
     """
 
@@ -109,9 +127,10 @@ def match_capture(capture: Capture, progress: Callable[[int, int], None] | None 
     A view without an image has no features.
 
     Args:
-        capture: a capture at any size; errors are in its pixels.
+        capture: a capture, downscaled or not.
         progress: called with (views done, views).
     """
+    capture = capture.at_recorded_size()
     images, count = next(capture.partial_frames(0, 1)).images, len(capture.cameras)
     features = []
     for done, (image, mask) in enumerate(zip(images, capture.masks, strict=True)):
@@ -126,6 +145,7 @@ def match_capture(capture: Capture, progress: Callable[[int, int], None] | None 
 
 def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
     """Return how well the capture's cameras fit the matches between its views."""
+    capture = capture.at_recorded_size()
     pairs, views = _Pairs.of(shared, capture.cameras), range(len(capture.cameras))
     group, improper = pairs.agreeing(), improper_poses(capture.cameras)
     checks = [_check(view, pairs, group) for view in views]
@@ -150,11 +170,44 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
 def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
     """Return the capture with its points replaced by ones triangulated from its training views.
 
-    Views that share few features give few points or none, which the fit reports. The held-out view is not used.
+    Views that match few others without their poses are matched with them. Views that share few features give few points
+    or none, which the fit reports. The held-out view is not used.
     """
+    cameras = capture.at_recorded_size().cameras
     matches = [match for match in shared.matches if capture.test_view not in match.views]
-    points, colors = triangulate(matches, shared.features, capture.cameras, MAX_ERROR)
+    matches += match_guided(shared.features, cameras, _unmatched(capture.train_views, matches))
+    points, colors = triangulate(matches, shared.features, cameras, MAX_ERROR)
     return replace(capture, points=points, point_colors=colors)
+
+
+def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Capture:
+    """Return the capture with its points replaced by triangulated ones and, where cameras are close, those of stereo.
+
+    Args:
+        capture: a capture; its held-out view is not used.
+        shared: features of its first frame.
+        seed: of the choice among the points of stereo.
+    """
+    sparse, recorded = triangulate_points(capture, shared), capture.at_recorded_size()
+    images = next(recorded.partial_frames(0, 1)).images
+    views = [(v, image) for v in capture.train_views if (image := images[v]) is not None]
+    points, colors = stereo_points(
+        [recorded.cameras[v] for v, _ in views],
+        [image for _, image in views],
+        [recorded.masks[v] for v, _ in views],
+        sparse.points,
+        np.random.default_rng(seed),
+    )
+    points, colors = np.concatenate([sparse.points, points]), np.concatenate([sparse.point_colors, colors])
+    return replace(capture, points=points, point_colors=colors)
+
+
+def _unmatched(views: Sequence[int], matches: Sequence[Match]) -> list[tuple[int, int]]:
+    """Return the pairs without matches of those views that match few others."""
+    matched = {match.views for match in matches}
+    partners = Counter(view for pair in matched for view in pair)
+    few = {view for view in views if partners[view] < _MIN_PARTNERS}
+    return [pair for pair in combinations(views, 2) if pair not in matched and few & set(pair)]
 
 
 @dataclass(frozen=True)

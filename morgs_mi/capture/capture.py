@@ -116,6 +116,14 @@ class Capture:
         """Width and height of the cameras' clips."""
         return tuple((source.reader.width, source.reader.height) for source in self._sources)
 
+    def at_recorded_size(self) -> Capture:
+        """Return the capture without downscaling, with the same points."""
+        if self.downscale == 1:
+            return self
+        cameras = tuple(c.resized(*size) for c, size in zip(self.cameras, self.recorded_sizes, strict=True))
+        masks = tuple(source.mask(camera) for source, camera in zip(self._sources, cameras, strict=True))
+        return replace(self, cameras=cameras, masks=masks, downscale=1)
+
     def process(self, view: int, image: np.ndarray) -> np.ndarray:
         """Return a recorded image of a camera undistorted, downscaled and colour-corrected, like its frames."""
         return self._sources[view].process(image, self.cameras[view])

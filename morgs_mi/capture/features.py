@@ -1,7 +1,7 @@
 """Points seen in several views of one instant: features, matches and triangulation.
 
 Notation: a feature x [2] is a pixel position with pixel centres at +0.5, as in `Camera`; a match is a pair of features
-in two views. Matching does not use the poses, so the poses can be checked against the matches.
+in two views. Matching does not use the poses, so the poses can be checked against the matches; `guided_matching` does.
 """
 
 from __future__ import annotations
@@ -14,7 +14,17 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 
-__all__ = ["Features", "Match", "detect", "match_views", "reprojection_errors", "triangulate"]
+__all__ = [
+    "Features",
+    "Match",
+    "descriptor_distances",
+    "detect",
+    "intersect",
+    "match_views",
+    "mutual_neighbours",
+    "reprojection_errors",
+    "triangulate",
+]
 
 # Larger images do not add corners that other views see too, and SIFT is slow.
 _DETECTION_PIXELS = 1.3e6
@@ -32,11 +42,13 @@ class Features:
         points: [K, 2] float64, pixels.
         descriptors: [K, 128] float32 of length 1.
         colors: [K, 3] float32 in [0, 1], colour of the pixel.
+        axes: [K, 2] float64, pixels, from the centre of the described patch along its orientation to its edge.
     """
 
     points: np.ndarray
     descriptors: np.ndarray
     colors: np.ndarray
+    axes: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -54,7 +66,7 @@ class Match:
 
 def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features:
     """Return the SIFT features of an image uint8 [H, W, 3] where `mask` [H, W] is true; none if the image is None."""
-    none = Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3), np.float32))
+    none = Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 2)))
     if image is None:
         return none
     height, width = image.shape[:2]
@@ -67,11 +79,14 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
     found, descriptors = sift.detectAndCompute(grey, where)
     if descriptors is None:
         return none
-    points = (np.array([k.pt for k in found]) + 0.5) * (width / size[0], height / size[1])
+    enlarged = width / size[0], height / size[1]
+    points = (np.array([k.pt for k in found]) + 0.5) * enlarged
+    angles, sizes = np.deg2rad([k.angle for k in found]), np.array([k.size for k in found])
+    axes = 0.5 * sizes[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1) * enlarged
     # RootSIFT: square roots of the normalised descriptors are easier to tell apart (Arandjelovic 2012).
     descriptors = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
     columns, rows = np.clip(points.astype(int), 0, (width - 1, height - 1)).T
-    return Features(points, descriptors, image[rows, columns].astype(np.float32) / 255)
+    return Features(points, descriptors, image[rows, columns].astype(np.float32) / 255, axes)
 
 
 def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list[Match]:
@@ -95,16 +110,11 @@ def _pairs(cameras: Sequence[Camera]) -> Iterator[tuple[int, int]]:
 
 
 def _matches(a: Features, b: Features) -> np.ndarray:
-    """Return the pairs [M, 2] that are mutual nearest neighbours and pass Lowe's ratio test."""
+    """Return the pairs [M, 2] of `mutual_neighbours` with a common epipolar geometry."""
     none = np.zeros((0, 2), int)
     if min(len(a.points), len(b.points)) < 2:
         return none
-    distance = np.sqrt(np.maximum(2 - 2 * a.descriptors @ b.descriptors.T, 0))
-    forth, back = distance.argmin(1), distance.argmin(0)
-    rows = np.arange(len(forth))
-    first, second = np.partition(distance, 1, axis=1)[:, :2].T
-    good = (back[forth] == rows) & (first < _RATIO * second)
-    pairs = np.stack([rows, forth], axis=1)[good]
+    pairs = mutual_neighbours(descriptor_distances(a, b))
     if len(pairs) < _MIN_MATCHES:
         return none
     points = a.points[pairs[:, 0]], b.points[pairs[:, 1]]
@@ -114,6 +124,20 @@ def _matches(a: Features, b: Features) -> np.ndarray:
         return none
     kept = pairs[inliers.ravel() > 0] if inliers is not None else none
     return kept if len(kept) >= _MIN_MATCHES else none
+
+
+def descriptor_distances(a: Features, b: Features) -> np.ndarray:
+    """Return the distances of all descriptors of two views [K, L]."""
+    return np.sqrt(np.maximum(2 - 2 * a.descriptors @ b.descriptors.T, 0))
+
+
+def mutual_neighbours(distances: np.ndarray) -> np.ndarray:
+    """Return the pairs [M, 2] that are mutual nearest neighbours and pass Lowe's ratio test, from distances [K, L]."""
+    forth, back = distances.argmin(1), distances.argmin(0)
+    rows = np.arange(len(forth))
+    first, second = np.partition(distances, 1, axis=1)[:, :2].T
+    good = (back[forth] == rows) & (first < _RATIO * second)
+    return np.stack([rows, forth], axis=1)[good]
 
 
 def reprojection_errors(match: Match, features: Sequence[Features], cameras: Sequence[Camera]) -> np.ndarray:
@@ -126,7 +150,7 @@ def reprojection_errors(match: Match, features: Sequence[Features], cameras: Seq
     tracks = np.tile(np.arange(count), 2)
     views = np.repeat(match.views, count)
     pixels = np.concatenate([features[v].points[match.features[:, k]] for k, v in enumerate(match.views)])
-    points = _intersect(tracks, views, pixels, cameras, count)
+    points = intersect(tracks, views, pixels, cameras, count)
     errors = _distances(points[tracks], views, pixels, cameras)
     return errors.reshape(2, count).mean(0)
 
@@ -174,7 +198,7 @@ def triangulate(
     _, track = np.unique(track[used], return_inverse=True)
     views, pixels, colors = views[used], pixels[used], colors[used]
     count = int(track.max()) + 1
-    points = _intersect(track, views, pixels, cameras, count)
+    points = intersect(track, views, pixels, cameras, count)
     worst = np.zeros(count)
     np.maximum.at(worst, track, _distances(points[track], views, pixels, cameras))
     mean = np.stack([np.bincount(track, band) for band in colors.T], axis=1) / np.bincount(track)[:, None]
@@ -182,7 +206,7 @@ def triangulate(
     return points[good].astype(np.float32), mean[good].astype(np.float32)
 
 
-def _intersect(
+def intersect(
     track: np.ndarray, views: np.ndarray, pixels: np.ndarray, cameras: Sequence[Camera], count: int
 ) -> np.ndarray:
     """Return the points [count, 3] with the least algebraic distance to the rays of their observations.

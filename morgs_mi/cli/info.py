@@ -16,6 +16,7 @@ from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, print_table, progress
 from morgs_mi.cli.settings import GivenReading, Reading, optional
+from morgs_mi.fit.forecast import forecast
 
 __all__ = ["Info"]
 
@@ -52,7 +53,7 @@ class Info:
         points = origin or f"{len(capture.points)} points"
         truth = "with ground truth" if capture.truth else "without ground truth"
         print_result(f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.")
-        for line in (*capture.notes, *_check_lines(found), *_color_lines(capture)):
+        for line in (*capture.notes, *_check_lines(found), *_color_lines(capture), *_forecast_lines(capture)):
             print_result(line)
         if self.plot is not None:
             write_rig(self.plot, capture)
@@ -86,6 +87,12 @@ def _check_lines(found: RigCheck | None) -> list[str]:
     error = f"median {found.error:.2f} px over " if found.matches else ""
     result = f"Reprojection check: {error}{found.matches} matches in {found.pairs} pairs; {found.advice}"
     return [result, *advice_lines(found.cameras)]
+
+
+def _forecast_lines(capture: Capture) -> list[str]:
+    """Return what to expect of views between the training cameras, if there are several."""
+    cameras = [capture.cameras[v] for v in capture.train_views]
+    return [forecast(cameras, capture.points).sentence] if len(cameras) > 1 else []
 
 
 def _color_lines(capture: Capture) -> list[str]:

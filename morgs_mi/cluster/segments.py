@@ -193,7 +193,7 @@ class _Run:
         self.segments = [_Segment(self, k) for k in range(len(self.starts) - 1)]
         points = None
         if not self.segments[0].num_fitted:
-            capture = with_points(self.capture, self.on_stage)
+            capture = with_points(self.capture, self.task.config.seed, self.on_stage)
             points = None if capture is self.capture else (capture.points, capture.point_colors)
         loop = asyncio.get_running_loop()
         self.base: asyncio.Future[Following] = loop.create_future()

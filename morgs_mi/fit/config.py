@@ -152,7 +152,7 @@ class FitConfig:
     """Cross-validation of the first frame."""
     dropping: float | None = None
     """Probability with which each step of the first frame leaves a Gaussian out (see `dropping`); None: chosen by
-    cross-validation."""
+    cross-validation, or by the noise of fewer than `min_views` views."""
     sh_band_fraction: float = 1 / 30
     """Fraction of the first frame's steps after which another SH band is added, as in 3DGS."""
     confidence_steps: int = 40

@@ -2,7 +2,8 @@
 
 Some training views are withheld, and a short fit to the others is judged by the PSNR of the withheld ones. It chooses
 the probability of dropping (see `dropping`): where images are noisy or few, dropping helps; where they are many and
-clean, it only costs. Candidates are tried in rising order until one is no better than the last.
+clean, it only costs. Candidates are tried in rising order until one is no better than the last. Of few views none can
+be spared: there the noise of the images decides.
 """
 
 from __future__ import annotations
@@ -17,15 +18,19 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_first_frame
+from morgs_mi.fit.forecast import POOR_LOSS, forecast
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 
-__all__ = ["CrossValidation", "Trial", "cross_validate", "trial_steps", "withheld_views"]
+__all__ = ["CrossValidation", "Trial", "cross_validate", "dropping_by_noise", "trial_steps", "withheld_views"]
 
+# Noise from which few views are fitted with dropping, standard deviation relative to white, and its probability.
+_NOISY, _NOISY_DROPPING = 0.015, 0.2
+# The difference of two Laplacians, which is zero on gradients and edges, with unit gain for noise (Immerkaer 1996).
+_NOISE_FILTER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
 _MIN_SIDE = 32  # px
-# PSNR of withheld views in dB below which they look poor, and difference to the others above which they look worse.
-_POOR, _WORSE = 22.0, 8.0
+_POOR = 22.0  # dB, PSNR of withheld views below which they look poor
 _View = tuple[Camera, np.ndarray, np.ndarray | None]
 
 
@@ -71,7 +76,7 @@ class CrossValidation:
         measured = f"about {best.withheld_psnr:.1f} dB, measured on {', '.join(self.withheld)} in a trial without it"
         if len(self.withheld) > 1:
             measured = measured.removesuffix("it") + "them"
-        if best.withheld_psnr >= _POOR and gap <= _WORSE:
+        if best.withheld_psnr >= _POOR and gap <= POOR_LOSS:
             return f"Views between the cameras will have {measured}."
         return (
             f"Views between the cameras will be poor: {measured}, {gap:.1f} dB below the other views; the cameras are "
@@ -117,7 +122,23 @@ def cross_validate(
         trials.append(Trial(dropping, _psnr(fitted, judged, render), _psnr(fitted, trained, render)))
         if len(trials) > 1 and trials[-1].withheld_psnr <= trials[-2].withheld_psnr:
             break
-    return CrossValidation(tuple(cameras[v].name for v in withheld), _spacing(cameras, start), tuple(trials))
+    spacing = forecast(cameras, np.asarray(start.means)).spacing
+    return CrossValidation(tuple(cameras[v].name for v in withheld), spacing, tuple(trials))
+
+
+def dropping_by_noise(images: Sequence[np.ndarray]) -> float:
+    """Return the probability of dropping for views that are too few for cross-validation, from their noise.
+
+    Args:
+        images: [H, W, 3], uint8.
+    """
+    return _NOISY_DROPPING if np.mean([_noise(image) for image in images]) >= _NOISY else 0.0
+
+
+def _noise(image: np.ndarray) -> float:
+    """Return the standard deviation of an image's noise relative to white; texture on less than half does not count."""
+    filtered = cv2.filter2D(image.astype(np.float32) / 255, -1, _NOISE_FILTER)
+    return float(np.median(np.abs(filtered)) / 0.6745)
 
 
 def trial_steps(config: FitConfig) -> int:
@@ -138,15 +159,6 @@ def withheld_views(cameras: Sequence[Camera], share: int) -> tuple[int, ...]:
         distance = np.linalg.norm(positions[inner][:, None] - positions[chosen], axis=-1).min(axis=1)
         chosen.append(int(inner[np.argmax(distance)]))
     return tuple(sorted(chosen))
-
-
-def _spacing(cameras: Sequence[Camera], gaussians: Gaussians) -> float:
-    """Return the mean angle between neighbouring cameras in degrees, as seen from the median of the Gaussians."""
-    rays = np.array([camera.position for camera in cameras]) - np.median(np.asarray(gaussians.means), axis=0)
-    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-30)
-    cosines = np.clip(rays @ rays.T, -1, 1)
-    np.fill_diagonal(cosines, -1)
-    return float(np.rad2deg(np.arccos(cosines.max(axis=1))).mean())
 
 
 def _shifted(on_step: Callable[[int], None], done: int) -> Callable[[int], None]:

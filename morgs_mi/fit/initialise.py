@@ -1,4 +1,4 @@
-"""The initial Gaussians: on SfM points, or on random points inside the views."""
+"""The initial Gaussians: on SfM points, on random points inside the views, or on both."""
 
 from __future__ import annotations
 
@@ -13,7 +13,12 @@ from morgs_mi.core.checks import check_points
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 
-__all__ = ["focus_point", "from_points", "resample_points", "scene_extent", "seed_points"]
+__all__ = ["fill_points", "focus_point", "from_points", "resample_points", "scene_extent", "seed_points", "seen_points"]
+
+# Rows and columns into which a view is divided to find where it shows no points.
+_CELLS = 8
+# Points in a view that a random one gets its depth from, and how far it may be off, as a fraction.
+_NEIGHBOURS, _SPREAD = 3, 0.1
 
 
 def scene_extent(cameras: Sequence[Camera]) -> float:
@@ -106,10 +111,77 @@ def seed_points(
     focus = focus_point(cameras)
     points, colors = [], []
     for view, (camera, image) in enumerate(zip(cameras, images, strict=True)):
-        n = count // len(cameras) + (view < count % len(cameras))
+        n = _share(count, view, len(cameras))
         distance = max(camera.project(focus)[1], 10 * camera.near)
         depth = distance / rng.uniform(1 / 3, 3, n)
         x, y = rng.uniform(0, camera.width, n), rng.uniform(0, camera.height, n)
         points.append(camera.unproject(np.stack([x, y], axis=1), depth))
         colors.append(image[y.astype(int), x.astype(int)] / 255.0)
     return np.concatenate(points), np.concatenate(colors)
+
+
+def fill_points(
+    points: np.ndarray,
+    colors: np.ndarray,
+    cameras: Sequence[Camera],
+    images: Sequence[np.ndarray],
+    masks: Sequence[np.ndarray | None],
+    count: int,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return points [count, 3] and their colours: the given ones, resampled, and random ones where views show none.
+
+    A view is divided into cells. Those that show no point get random pixels, at the mean depth of the nearest points
+    in the image, which is far better than a random depth (see `docs/experiments/generalise.md`).
+
+    Args:
+        points: [P, 3], world units.
+        colors: [P, 3] in [0, 1].
+        cameras: C views.
+        images: per view uint8 [H, W, 3], RGB.
+        masks: per view [H, W] bool of valid pixels, or None.
+        count: number of points.
+        rng: draws pixels and depths.
+    """
+    added, added_colors = [], []
+    for view, (camera, image, mask) in enumerate(zip(cameras, images, masks, strict=True)):
+        _, seen, depths = seen_points(camera, points)
+        if not len(seen):
+            continue
+        pixels = rng.uniform(0, (camera.width, camera.height), (_share(count, view, len(cameras)), 2))
+        columns, rows = pixels.astype(int).T
+        free = ~_shown_cells(camera, seen)[_cells_of(camera, pixels)] & (True if mask is None else mask[rows, columns])
+        k = min(_NEIGHBOURS, len(seen))
+        distance, index = (np.reshape(found, (-1, k)) for found in KDTree(seen).query(pixels[free], k=k))
+        weights = 1 / (distance + 1e-3)
+        depth = weights.sum(axis=1) / (weights / depths[index]).sum(axis=1)
+        added.append(camera.unproject(pixels[free], depth * rng.uniform(1 - _SPREAD, 1 + _SPREAD, len(depth))))
+        added_colors.append(image[rows[free], columns[free]] / 255.0)
+    points, colors = resample_points(points, colors, count - sum(map(len, added)), rng)
+    return np.concatenate([points, *added]), np.concatenate([colors, *added_colors])
+
+
+def _share(count: int, view: int, views: int) -> int:
+    """Return the share of a view in `count` things."""
+    return count // views + (view < count % views)
+
+
+def seen_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which points [P, 3] lie in a view [P], the n pixel positions [n, 2] of those, and their depths [n]."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # points beside the camera
+        pixels, depths = camera.project(np.asarray(points, np.float64).reshape(-1, 3))
+    inside = (depths > camera.near) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    return inside, pixels[inside], depths[inside]
+
+
+def _cells_of(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the row and the column of the cell of each pixel position [n, 2]."""
+    columns, rows = (pixels * _CELLS / (camera.width, camera.height)).astype(int).T
+    return rows, columns
+
+
+def _shown_cells(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+    """Return the cells of a view that have a pixel position, [_CELLS, _CELLS] bool."""
+    shown = np.zeros((_CELLS, _CELLS), bool)
+    shown[_cells_of(camera, pixels)] = True
+    return shown

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from morgs_mi.calibration.rig_check import SharedFeatures, check_rig, match_capture, triangulate_points
 from morgs_mi.capture.capture import Capture, load_capture
@@ -92,6 +93,27 @@ def test_triangulate_points__ignores_the_held_out_view(capture: Capture, shared:
     assert len(fewer.points) < len(found.points)
     wrong = with_cameras(capture, lambda i, c: replace(c, viewmat=np.diag([1.0, -1, -1, 1]) @ c.viewmat))
     assert len(triangulate_points(wrong, shared).points) == 0
+
+
+def test_match_capture__finds_features_at_the_recorded_size(capture: Capture, shared: SharedFeatures) -> None:
+    small = load_capture(capture.path, 4)
+    found = match_capture(small)
+    assert [len(f.points) for f in found.features] == [len(f.points) for f in shared.features]
+    assert check_rig(small, found).error == pytest.approx(check_rig(capture, shared).error, abs=0.01)
+    few, all_ = triangulate_points(small, found), triangulate_points(capture, shared)
+    assert len(few.points) == pytest.approx(len(all_.points), rel=0.01)
+    assert few.cameras is small.cameras
+
+
+def test_triangulate_points__matches_distant_views_with_their_poses(capture: Capture, shared: SharedFeatures) -> None:
+    ends = replace(capture, cameras=(capture.cameras[0], capture.cameras[5]), masks=(None, None), test_view=None)
+    unmatched = SharedFeatures((shared.features[0], shared.features[5]), ())
+    found = triangulate_points(ends, unmatched)
+    assert len(found.points) > 50
+    depth = [camera.project(found.points)[1] for camera in ends.cameras]
+    assert np.min(depth) > 1
+    wrong = with_cameras(ends, lambda i, c: replace(c, viewmat=np.diag([1.0, -1, -1, 1]) @ c.viewmat) if i else c)
+    assert len(triangulate_points(wrong, unmatched).points) < 0.2 * len(found.points)
 
 
 def test_check_rig__fits_with_undistortion_only(tmp_path: Path) -> None:

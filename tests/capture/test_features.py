@@ -20,7 +20,7 @@ def test_match_views__returns_none_for_matches_without_a_common_geometry():
     points = rng.uniform(0, 96, (count, 2)).round(1)
     moved = points + rng.normal(0, 3, (count, 2))
     descriptors = np.eye(count, 128, dtype=np.float32)
-    features = [Features(p, descriptors, np.zeros((count, 3), np.float32)) for p in (points, moved)]
+    features = [Features(p, descriptors, np.zeros((count, 3), np.float32), moved - points) for p in (points, moved)]
     camera = Camera.look_at((0, 0, -3), (0, 0, 0), (0, -1, 0), 60, 96, 72)
     assert match_views(features, [camera, camera]) == []
 

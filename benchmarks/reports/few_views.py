@@ -1,0 +1,152 @@
+"""Views between the cameras of rigs with few or distant cameras: how much worse they are than those trained on.
+
+    python -m benchmarks.reports.few_views --seeds 0 1 2 3 4 5 --captures CAPTURE --json out.json
+
+Each seed gives two clips: `morgs-mi synth random`, as in `random_scenes`, and the same scene without its side walls,
+with 13 cameras on an arc of 120 degrees. Of each, some cameras that are spread over the rig are trained on, and all
+others are held out. Of the captures given by `--captures`, one camera is held out in turn. The points of the clips are
+not used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any, Literal
+
+import mitsuba as mi
+import numpy as np
+import tyro
+
+from benchmarks.reports.generalise import first_frame
+from benchmarks.reports.random_scenes import random_capture
+from benchmarks.speed.output import Output
+from morgs_mi.calibration.rig_check import dense_points, match_capture, triangulate_points
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.config import StreamConfig
+from morgs_mi.core.camera import Camera
+from morgs_mi.fit.forecast import angles_to, forecast, scene_depths
+from morgs_mi.synth.scene import load_scene
+from morgs_mi.synth.synthesize import synthesize
+
+Points = Literal["stereo", "triangulated", "random"]
+
+
+@dataclass(frozen=True)
+class Options(Output):
+    """Clips, work and output."""
+
+    seeds: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
+    """Seeds of the scenes."""
+    clips: Path = Path("out/random")
+    """Folder of the clips."""
+    rigs: tuple[Literal["random", "wide"], ...] = ("random", "wide")
+    """Rigs of the clips."""
+    captures: tuple[Path, ...] = ()
+    """Further captures, which are reduced by eight."""
+    views: tuple[int, ...] = (3, 4, 6, 8, 12)
+    """Numbers of training views of the clips."""
+    points: tuple[Points, ...] = ("stereo",)
+    """Points that the first frame starts from: triangulated and from stereo, triangulated, or random."""
+    droppings: tuple[float, ...] = (0.0,)
+    """Probabilities of dropping."""
+    downscale: float = 2
+    """Factor by which the clips are reduced."""
+    steps: int = 800
+    """Steps of the first frame."""
+    gaussians: int = 8000
+    """Number of Gaussians."""
+
+
+def wide_capture(clips: Path, seed: int, downscale: float) -> Capture:
+    """Return the random scene of a seed on an arc of 120 degrees, which is made in `clips` if it is not there."""
+    clip = clips / f"wide-{seed}"
+    if not clip.exists():
+        scene = load_scene("random", seed)
+        objects = {name: item for name, item in scene.objects.items() if name not in ("left", "right")}
+        scene = replace(scene, objects=objects, rig=replace(scene.rig, spread=(60.0, 10.0)))
+        synthesize(scene, clip, num_cameras=13, num_frames=1, seed=seed)
+    return load_capture(clip, downscale)
+
+
+def spread_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
+    """Return the indices of `count` cameras that are far from each other."""
+    positions = np.array([camera.position for camera in cameras])
+    chosen = [int(np.argmax(np.linalg.norm(positions - positions.mean(axis=0), axis=1)))]
+    while len(chosen) < count:
+        distance = np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(axis=1)
+        chosen.append(int(np.argmax(distance)))
+    return tuple(sorted(chosen))
+
+
+def cases(options: Options) -> Iterator[tuple[Capture, tuple[int, ...]]]:
+    """Yield each capture and the views to train on."""
+    for seed in options.seeds:
+        for rig in options.rigs:
+            make = random_capture if rig == "random" else wide_capture
+            capture = make(options.clips, seed, options.downscale)
+            others = capture.train_views
+            for count in (n for n in options.views if n <= len(others)):
+                train = tuple(others[k] for k in spread_views([capture.cameras[v] for v in others], count))
+                yield capture, train
+    for path in options.captures:
+        capture = load_capture(path, 8)
+        views = range(len(capture.cameras))
+        for held_out in views:
+            train = tuple(v for v in views if v != held_out)
+            yield capture, train
+
+
+def with_points(capture: Capture, train: Sequence[int], points: Points) -> Capture:
+    """Return the capture with the points that some of its views give."""
+    if points == "random":
+        return replace(capture, points=capture.points[:0], point_colors=capture.point_colors[:0])
+    cameras, masks, sources = (
+        tuple(of_view[v] for v in train) for of_view in (capture.cameras, capture.masks, capture._sources)
+    )
+    alone = replace(capture, cameras=cameras, masks=masks, _sources=sources, test_view=None)
+    find = dense_points if points == "stereo" else triangulate_points
+    found = find(alone, match_capture(alone))
+    return replace(capture, points=found.points, point_colors=found.point_colors)
+
+
+def measure(capture: Capture, train: Sequence[int], config: StreamConfig) -> dict[str, Any]:
+    """Return the PSNR of the training views and of each held-out one, with its angles to the training views."""
+    scores, report = first_frame(capture, train, config)
+    cameras = [capture.cameras[v] for v in train]
+    rig, held_out = forecast(cameras, capture.points), [v for v in range(len(capture.cameras)) if v not in train]
+    depths = scene_depths(capture.cameras, capture.points)
+    angles = {v: np.sort(angles_to(capture.cameras[v], depths[v], cameras)) for v in held_out}
+    return {
+        "train": list(train),
+        "points": len(capture.points),
+        "spacing": round(rig.spacing, 2),
+        "overlap": round(rig.overlap, 3),
+        "reach": round(rig.reach, 2),
+        "training": round(float(scores[list(train)].mean()), 2),
+        "held_out": [
+            {"view": v, "angles": angles[v][:3].round(2).tolist(), "psnr": round(float(scores[v]), 2)} for v in held_out
+        ],
+        "seconds": round(report.seconds, 1),
+    }
+
+
+def main(options: Options) -> None:
+    """Run the report."""
+    mi.set_variant("llvm_ad_rgb")
+    config, rows = StreamConfig(), []
+    for capture, train in cases(options):
+        for points, dropping in product(options.points, options.droppings):
+            fit = replace(config.fit, first_frame_steps=options.steps, num_gaussians=options.gaussians)
+            start, settings = with_points(capture, train, points), replace(config, fit=replace(fit, dropping=dropping))
+            row = measure(start, train, settings)
+            rows.append({"capture": capture.path.name, "start": points, "dropping": dropping, **row})
+            print(rows[-1], flush=True)
+    given = {"downscale": options.downscale, "steps": options.steps, "gaussians": options.gaussians}
+    options.write({**given, "fits": rows}, unprinted=["fits"])
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,0 +1,102 @@
+"""Forecast of views between the cameras, from the angles between neighbouring cameras and their overlap alone."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.fit.initialise import focus_point, scene_extent, seen_points
+
+__all__ = ["POOR_LOSS", "Forecast", "angles_to", "forecast", "scene_depths"]
+
+# dB below the training views above which views between the cameras look poor.
+POOR_LOSS = 8.0
+# Degrees of `Forecast.reach` up to which they are good, and above which they are poor, by the measurements in
+# `docs/experiments/generalise.md`: the loss is less than half of `POOR_LOSS`, or more than that.
+_GOOD, _POOR = 9.5, 18.0
+# Angle that stands for a point that no other camera sees, degrees.
+_UNSEEN = 90.0
+# Rows and columns of the points of each view.
+_GRID = 16
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What a rig lets expect of views between its cameras.
+
+    Attributes:
+        cameras: number of cameras.
+        spacing: mean angle from a camera to its nearest one, as seen from what they look at, degrees.
+        overlap: mean share of a camera's image that its nearest one sees as well.
+        reach: mean angle from a camera to the nearest one that sees the same point, degrees, 90 where there is none.
+    """
+
+    cameras: int
+    spacing: float
+    overlap: float
+    reach: float
+
+    @property
+    def sentence(self) -> str:
+        """What to expect of views between the cameras."""
+        quality = "good" if self.reach <= _GOOD else "fair" if self.reach <= _POOR else "poor"
+        return (
+            f"Views between the cameras will be {quality}: {self.cameras} cameras, {self.spacing:.0f} degrees apart, "
+            f"neighbours share {100 * self.overlap:.0f} % of what they see."
+        )
+
+
+def forecast(cameras: Sequence[Camera], points: np.ndarray) -> Forecast:
+    """Return the forecast for a rig.
+
+    Args:
+        cameras: those that are trained on, at least two.
+        points: [P, 3] of the scene, world units; without any, what the cameras look at is their `focus_point`.
+    """
+    measures = []
+    for view, (camera, depth) in enumerate(zip(cameras, scene_depths(cameras, points), strict=True)):
+        others = [*cameras[:view], *cameras[view + 1 :]]
+        angles, surface = angles_to(camera, depth, others), _surface(camera, depth)
+        seen = np.array([seen_points(other, surface)[0] for other in others])
+        to_each = np.array([_angles(surface, camera, other) for other in others])
+        nearest = np.where(seen, to_each, _UNSEEN).min(axis=0)
+        measures.append((angles.min(), seen[angles.argmin()].mean(), nearest.mean()))
+    spacing, overlap, reach = np.mean(measures, axis=0)
+    return Forecast(len(cameras), float(spacing), float(overlap), float(reach))
+
+
+def scene_depths(cameras: Sequence[Camera], points: np.ndarray) -> list[float]:
+    """Return the median depth of the points in each view, world units.
+
+    For a view without points it is that of the `focus_point`, or far away if that is not in front of the camera.
+    """
+    focus, far = focus_point(cameras), 1e6 * scene_extent(cameras)
+    depths = []
+    for camera in cameras:
+        _, _, seen = seen_points(camera, points)
+        middle = float(np.median(seen)) if len(seen) else float(camera.project(focus)[1])
+        depths.append(middle if middle > camera.near else far)
+    return depths
+
+
+def angles_to(camera: Camera, depth: float, others: Sequence[Camera]) -> np.ndarray:
+    """Return the angles to other cameras, as seen from the point at a depth in the middle of the image, degrees."""
+    middle = camera.unproject(np.array([[camera.width / 2, camera.height / 2]]), np.array([depth]))
+    return np.array([_angles(middle, camera, other)[0] for other in others])
+
+
+def _angles(points: np.ndarray, a: Camera, b: Camera) -> np.ndarray:
+    """Return the angle between two cameras as seen from each point, degrees."""
+    rays = [camera.position - points for camera in (a, b)]
+    x, y = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
+    return np.rad2deg(np.arccos(np.clip((x * y).sum(axis=1), -1, 1)))
+
+
+def _surface(camera: Camera, depth: float) -> np.ndarray:
+    """Return points that are evenly spread over the image, at one depth."""
+    steps = (np.arange(_GRID) + 0.5) / _GRID
+    pixels = np.stack(np.meshgrid(steps * camera.width, steps * camera.height), axis=-1).reshape(-1, 2)
+    return camera.unproject(pixels, np.full(len(pixels), depth))
