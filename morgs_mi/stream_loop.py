@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -22,10 +22,8 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_mask, check_points, check_type
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.threads import map_in_threads
-from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, dropping_by_noise, trial_steps
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
-from morgs_mi.fit.forecast import Forecast, forecast
+from morgs_mi.fit.first_settings import first_settings
 from morgs_mi.fit.initialise import fill_points, from_points, resample_points, scene_extent, seed_points
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.losses.ssim import Target
@@ -64,6 +62,7 @@ class FrameReport:
         active: what took part, as fractions of everything, by name: gaussians, views, pixels, epochs.
         validation: of the first frame, what cross-validation found (see `fit.cross_validation`), or else the forecast
             (see `fit.forecast`), with a `sentence` on views between the cameras; empty with a single view.
+        steps: number of optimisation steps, without those of cross-validation.
     """
 
     frame: int
@@ -75,6 +74,7 @@ class FrameReport:
     missing_views: tuple[str, ...] = ()
     active: dict[str, float] = field(default_factory=dict)
     validation: dict[str, Any] = field(default_factory=dict)
+    steps: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,6 +174,7 @@ def _later_step(
         "ok" if images else "no view has an image",
         _missing(setup, images),
         {**active.fractions, "epochs": fitted.epochs / config.fit.epochs},
+        steps=fitted.epochs * len(active.views),
     )
     return StreamState(state.frame + 1, coded, images, _references(setup, state, images, changes)), packet, report
 
@@ -186,9 +187,14 @@ def _first_step(
     rng = np.random.default_rng([config.seed, 0])
     cameras, masks = [setup.cameras[v] for v in images], [setup.masks[v] for v in images]
     gaussians, status = _first_gaussians(setup, images, rng)
-    fit, validation, tick = _validated(setup, gaussians, images, on_step)
+    given = gaussians, cameras, list(images.values()), masks, setup.points, setup.extent
+    chosen = first_settings(*given, config.fit, config.render, [config.seed, 0, 1], on_step)
+    steps = chosen.steps_before + chosen.config.first_frame_steps
+    tick = None if on_step is None else lambda done: on_step(chosen.steps_before + done, steps)
     targets = [Target(image, mask) for image, mask in zip(images.values(), masks, strict=True)]
-    gaussians, losses = fit_first_frame(gaussians, cameras, targets, setup.extent, fit, config.render, rng, tick)
+    gaussians, losses = fit_first_frame(
+        gaussians, cameras, targets, setup.extent, chosen.config, config.render, rng, tick
+    )
     packet = keyframe_packet(gaussians, 0, setup.cameras, config.codec)
     coded = decode(None, packet)
     report = FrameReport(
@@ -199,33 +205,10 @@ def _first_step(
         len(coded),
         status,
         _missing(setup, images),
-        validation={"sentence": validation.sentence, **asdict(validation)} if validation else {},
+        validation={"sentence": chosen.expected.sentence, **asdict(chosen.expected)} if chosen.expected else {},
+        steps=chosen.config.first_frame_steps,
     )
     return StreamState(1, coded, images, _references(setup, state, images, {})), packet, report
-
-
-def _validated(
-    setup: Setup, gaussians: Gaussians, images: Images, on_step: Callable[[int, int], None] | None
-) -> tuple[FitConfig, CrossValidation | Forecast | None, Callable[[int], None] | None]:
-    """Return the first frame's settings, what is known of views between the cameras, and what to call after each step.
-
-    Where cross-validation does not choose the settings, that is a forecast.
-    """
-    config, fit = setup.config, setup.config.fit
-    if fit.dropping is not None or len(images) < fit.cross_validation.min_views:
-        dropping = dropping_by_noise(list(images.values())) if fit.dropping is None else fit.dropping
-        fit = replace(fit, dropping=dropping)
-        expected = forecast([setup.cameras[v] for v in images], setup.points) if len(images) > 1 else None
-        return fit, expected, None if on_step is None else lambda done: on_step(done, fit.first_frame_steps)
-    before = trial_steps(fit) * len(fit.cross_validation.candidates)
-    steps = before + fit.first_frame_steps
-    cameras, masks = [setup.cameras[v] for v in images], [setup.masks[v] for v in images]
-    tick = None if on_step is None else lambda done: on_step(done, steps)
-    seed = [config.seed, 0, 1]
-    found = cross_validate(
-        gaussians, cameras, list(images.values()), masks, setup.extent, fit, config.render, seed, tick
-    )
-    return replace(fit, dropping=found.best.dropping), found, None if tick is None else lambda done: tick(before + done)
 
 
 def _first_gaussians(setup: Setup, seen: Images, rng: np.random.Generator) -> tuple[Gaussians, str]:

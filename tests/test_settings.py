@@ -37,6 +37,7 @@ VALUES: dict[str, Any] = {
     "motion.mask_method": "superpixels",
     "fit.early_stopping_tolerance": 0.5,
     "fit.dropping": 0.3,
+    "fit.first_frame_seconds": 0.01,
     "fit.density.later_views": 1,
     "fit.density.last_round": 0.3,
     "fit.density.later_round": 0.3,

@@ -214,6 +214,14 @@ def test_push__withholds_nothing_from_few_views(clip):
     assert ticks == [(done, 20) for done in range(1, 21)]
 
 
+def test_push__fits_the_first_frame_in_the_steps_that_a_time_allows(clip):
+    ticks = []
+    hardly_any = dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, first_frame_seconds=1e-3))
+    _, report = new_loop(hardly_any).push(clip[0][:4], lambda *tick: ticks.append(tick))
+    assert report.steps == 100
+    assert ticks[-1] == (100, 100)
+
+
 def without(images, *views):
     return [None if view in views else image for view, image in enumerate(images[:4])]
 

@@ -99,7 +99,7 @@ def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
     later = f", {sum(seconds) / len(seconds):.1f} s for each later one" if seconds else ""
     print_result(
         f"{stream}: {len(reports)} frames, {stream.stat().st_size / 1e6:.1f} MB, "
-        f"{reports[0].seconds:.1f} s for the first frame{later}."
+        f"{reports[0].seconds:.1f} s for the {reports[0].steps} steps of the first frame{later}."
     )
     if reports[0].validation:
         print_result(reports[0].validation["sentence"])

@@ -30,6 +30,7 @@ SETTINGS = {
     "seed": "seed",
     "num_gaussians": "fit.num_gaussians",
     "first_frame_steps": "fit.first_frame_steps",
+    "first_frame_seconds": "fit.first_frame_seconds",
     "epochs": "fit.epochs",
     "sh_degree": "fit.sh_degree",
     "key_views": "motion.key_views",
@@ -102,6 +103,8 @@ class Settings:
     """Gaussians of the first frame."""
     first_frame_steps: Annotated[int | None, setting("first_frame_steps")] = None
     """Optimisation steps of the first frame."""
+    first_frame_seconds: Annotated[float | None, optional("FLOAT")] = None
+    """Time of the first frame, which determines its steps."""
     epochs: Annotated[int | None, setting("epochs")] = None
     """Passes over the views for every later frame."""
     sh_degree: Annotated[int | None, setting("sh_degree")] = None

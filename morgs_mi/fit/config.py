@@ -148,6 +148,8 @@ class FitConfig:
     """Opacity of the Gaussians at the start of the first frame."""
     first_frame_steps: int = 1500
     """Steps of the first frame, one view each."""
+    first_frame_seconds: float | None = None
+    """Time of the first frame, from which the number of its steps follows; None: `first_frame_steps`."""
     cross_validation: CrossValidationConfig = field(default_factory=CrossValidationConfig)
     """Cross-validation of the first frame."""
     dropping: float | None = None
@@ -192,6 +194,10 @@ class FitConfig:
             raise ValueError(f"FitConfig(): `sh_degree` must be 0 to 3, got {self.sh_degree}.")
         if not 0 < self.initial_opacity < 1:
             raise ValueError(f"FitConfig(): `initial_opacity` must lie between 0 and 1, got {self.initial_opacity}.")
+        if self.first_frame_seconds is not None and not 0 < self.first_frame_seconds < inf:
+            raise ValueError(
+                f"FitConfig(): `first_frame_seconds` must be positive, or None, got {self.first_frame_seconds}."
+            )
         if self.dropping is not None and not 0 <= self.dropping < 1:
             raise ValueError(f"FitConfig(): `dropping` must be 0 to less than 1, or None, got {self.dropping}.")
         if not 0 < self.final_rate <= 1:

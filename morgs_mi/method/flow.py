@@ -37,10 +37,12 @@ class FlowObservation:
 
 
 def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
-    """Return the indices of `count` views spread over the rig.
+    """Return the indices of `count` views spread over the rig, or of all if there are fewer.
 
     The first is the most central one; each further one is the farthest from those chosen.
     """
+    if not cameras:
+        return ()
     positions = np.array([camera.position for camera in cameras])
     chosen = [int(np.argmin(np.linalg.norm(positions - positions.mean(0), axis=1)))]
     while len(chosen) < min(count, len(cameras)):
