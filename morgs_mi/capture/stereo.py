@@ -31,6 +31,8 @@ _BLIND = 3.0
 # px, largest difference between the disparities of both directions; largest difference of a colour.
 _MAX_DIFFERENCE, _MAX_COLOR = 1.0, 0.08
 _BLOCK = 5
+# Depth of a view's corners before the rectified plane, for depth 1 before the camera, below which they are too oblique.
+_LEAST_DEPTH = 0.2
 
 
 def stereo_points(
@@ -127,17 +129,20 @@ class _Rectified:
     size: tuple[int, int]
 
     @classmethod
-    def of(cls, a: Camera, b: Camera) -> _Rectified:
+    def of(cls, a: Camera, b: Camera) -> _Rectified | None:
+        """Return the rectification of two views, None if no plane shows both, as if one camera is before the other."""
         right = b.position - a.position
         baseline = float(np.linalg.norm(right))
         right, forward = right / baseline, a.viewmat[2, :3] + b.viewmat[2, :3]
         forward = forward - forward @ right * right
-        forward /= np.linalg.norm(forward)
+        forward /= max(float(np.linalg.norm(forward)), 1e-12)
         axes, focal = np.stack([right, np.cross(forward, right), forward]), float(a.K[0, 0] + b.K[0, 0]) / 2
         homographies, boxes = [], []
         for camera in (a, b):
             H = np.diag([focal, focal, 1]) @ axes @ camera.viewmat[:3, :3].T @ np.linalg.inv(camera.K)
             sides = np.array([[x, y, 1] for x in (0, camera.width) for y in (0, camera.height)]) @ H.T
+            if sides[:, 2].min() < _LEAST_DEPTH:
+                return None
             homographies.append(H)
             boxes.append([(sides[:, :2] / sides[:, 2:]).min(axis=0), (sides[:, :2] / sides[:, 2:]).max(axis=0)])
         (a0, a1), (b0, b1) = boxes
@@ -155,6 +160,8 @@ class _Rectified:
 def _matched(a: _View, b: _View, depths: tuple[float, float]) -> np.ndarray:
     """Return the points of a pair of views and their colours [P, 6], at depths in a range."""
     rig = _Rectified.of(a.camera, b.camera)
+    if rig is None:
+        return np.zeros((0, 6))
     width, height = rig.size
     product, shift = rig.focal * rig.baseline, rig.corners[1] - rig.corners[0]
     lowest = int(np.floor(product / depths[1] + shift))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -50,6 +52,16 @@ def test_stereo_points__leaves_out_pixels_that_are_not_valid(views) -> None:
     assert len(points) > 1000
     shown = [camera.project(points)[0][:, 0] < camera.width / 2 + 2 for camera in cameras]
     assert (np.sum(shown, axis=0) >= 2).all()
+
+
+def test_stereo_points__finds_none_if_one_camera_is_before_the_other(views) -> None:
+    (camera, *_), (image, *_) = views
+    for shift in ((0.1, 0, -0.5), (0, 0, -1)):
+        moved = np.eye(4)
+        moved[:3, 3] = shift
+        ahead = replace(camera, viewmat=moved @ camera.viewmat)
+        points, _ = stereo_points([camera, ahead], [image, image], [None] * 2, NO_POINTS, np.random.default_rng(0))
+        assert len(points) == 0
 
 
 def test_stereo_points__finds_none_between_distant_cameras(textured_capture: Capture) -> None:
