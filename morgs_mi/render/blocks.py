@@ -34,7 +34,7 @@ class BlockLists:
     """Depth-ordered lists, one per block of pixels, as bits over the entries of its tile.
 
     Attributes:
-        records: (mean_x, mean_y, a, b, c, log2_opacity, blended columns) of each rank, see `pack_records`.
+        records: (geometry, blended columns) of each rank, see `Splats.geometry` and `pack_records`.
         words: bit k of a block's i-th word is set if the block draws entry `first` + 32 i + k.
         entries: ranks, tile by tile.
         begin: place of each block's first word [A]; the next ones follow at steps of 32.
@@ -79,7 +79,7 @@ def build_lists(splats: Splats, columns: list[Float], region: Region, config: Re
     dr.eval(rectangles)
     tiles = _tile_lists([dr.gather(mi.UInt32, v, by_rank) for v in rectangles], region)
 
-    records = pack_records([*splats.shape, *columns], by_rank)
+    records = pack_records([*splats.geometry, *columns], by_rank)
     geometry = fetch_record(records, tiles.entries, 6, dr.width(records) // (4 * N))
     words, first_word, end_word = _block_bits(geometry, tiles, region, config)
     begin = dr.gather(mi.UInt32, first_word, region.tile) * 32 + region.bit
