@@ -67,7 +67,7 @@ def composite(
     color = []
     for k in range(3):
         L, E = view.image[:, :, k].array, behind[k]
-        # Both parts of a pixel have noise of their own, and add up to L where there are no splats.
+        # Rays of its own find the coverage. Without splats, the two parts add up to L whatever it is.
         surface = dr.maximum(L - (1 - f) * E, 0) / dr.select(covered, f, 1)
         rest = dr.maximum(L - f * surface, 0) / dr.select(f < 1, 1 - f, 1)
         beyond = encode(rest) + ground[k]

@@ -23,6 +23,9 @@ __all__ = ["SurfaceView", "surface_scene"]
 
 _log = logging.getLogger(__name__)
 
+# Rays along each axis of a pixel that find its coverage and depth.
+_GRID = 3
+
 
 def surface_scene(scene: Any) -> Any:
     """Return a scene of the surfaces and emitters of `scene`, or None if it has neither surfaces nor an environment.
@@ -149,7 +152,7 @@ class SurfaceView:
         spp = sampler.sample_count()  # some samplers round it up
         with dr.suspend_grad():
             image = mi.TensorXf(integrator.render(scene, sensor, seed=seed, spp=spp))
-            coverage, depth = _depth(scene, sensor, seed, spp)
+            coverage, depth = _depth(scene, sensor)
         dr.enable_grad(image)
         shown = scene.environment() is not None and not getattr(integrator, "hide_emitters", False)
         behind = _environment(scene, sensor) if shown else None
@@ -192,26 +195,22 @@ class SurfaceView:
         return np.array(self.coverage > 0).reshape(self.image.shape[:2])
 
 
-def _depth(scene: Any, sensor: Any, seed: int, spp: int) -> tuple[Float, Float]:
-    """Return the coverage and the mean depth z of the surfaces in every pixel.
-
-    Each ray is the first one of a sample of the nested integrator, so that coverage and radiance have the same noise.
-    """
-    width, height = (int(size) for size in sensor.film().crop_size())
-    sampler = sensor.sampler().clone()
-    sampler.set_sample_count(spp)
-    sampler.set_samples_per_wavefront(spp)
-    sampler.seed(seed, width * height * spp)
-    pixel = dr.arange(mi.UInt32, width * height * spp) // dr.opaque(mi.UInt32, spp)
-    rays = _rays(sensor, pixel, sampler.next_2d())
-    found = scene.ray_intersect_preliminary(rays, coherent=True)
+def _depth(scene: Any, sensor: Any) -> tuple[Float, Float]:
+    """Return the coverage and the mean depth z of the surfaces in every pixel, by rays through a regular grid."""
+    pixel = dr.arange(mi.UInt32, int(dr.prod(sensor.film().crop_size())))
     params: Any = mi.traverse(sensor)
-    hit, to_camera = found.is_valid(), params["to_world"].inverse()
-    z = (to_camera @ rays(dr.select(hit, found.t, 0))).z
-    count, total = (dr.zeros(mi.Float, width * height) for _ in range(2))
-    dr.scatter_add(count, mi.Float(1), pixel, active=hit)
-    dr.scatter_add(total, z, pixel, active=hit)
-    coverage, depth = count / spp, dr.select(count > 0, total / count, dr.inf)
+    to_camera = params["to_world"].inverse()
+
+    def cast(k: UInt32, count: Float, total: Float) -> tuple[UInt32, Float, Float]:
+        rays = _rays(sensor, pixel, (mi.Vector2f(k % _GRID, k // _GRID) + 0.5) / _GRID)
+        found = scene.ray_intersect_preliminary(rays, coherent=True)
+        hit = found.is_valid()
+        z = (to_camera @ rays(dr.select(hit, found.t, 0))).z
+        return k + 1, count + dr.select(hit, mi.Float(1), 0), total + dr.select(hit, z, 0)
+
+    state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
+    _, count, total = dr.while_loop(state, lambda k, *_: k < _GRID**2, cast, label="coverage")
+    coverage, depth = count / _GRID**2, dr.select(count > 0, total / count, dr.inf)
     dr.eval(coverage, depth)
     return coverage, depth
 
