@@ -19,7 +19,7 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.types import Float, Tensor, UInt32
 
-__all__ = ["SurfaceView", "surface_scene"]
+__all__ = ["SurfaceView", "lights", "shared_scene", "surface_scene"]
 
 _log = logging.getLogger(__name__)
 
@@ -54,9 +54,16 @@ def surface_scene(scene: Any) -> Any:
                 f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have a BSDF, got none; set `bsdf` "
                 "where the shape is defined."
             )
-    # Those on a surface come with it.
-    lights = [emitter for emitter in scene.emitters() if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
-    parts = [*surfaces, *lights]
+    return shared_scene([*surfaces, *lights(scene)])
+
+
+def lights(scene: Any) -> list[Any]:
+    """Return the emitters of a scene that are not on one of its surfaces, which come with those."""
+    return [emitter for emitter in scene.emitters() if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
+
+
+def shared_scene(parts: list[Any]) -> Any:
+    """Return a scene of objects that belong to another scene, which still finds their parameters."""
     names = [part.id() for part in parts]
     result = mi.load_dict({"type": "scene", **{f"part{i}": part for i, part in enumerate(parts)}})
     # A scene names what it is given; the parameters of the whole scene are found by the names that they had.
