@@ -49,7 +49,7 @@ class Render:
     def run(self) -> None:
         from morgs_mi.export.clips import frame_numbers
         from morgs_mi.export.frames import is_layered, write_frames, write_images
-        from morgs_mi.export.insert import load_insert, render_inserted, selected
+        from morgs_mi.export.insert import inserted_channels, load_insert, render_inserted, selected
         from morgs_mi.playback.player import find_camera, open_stream
 
         stream = open_stream(self.out)
@@ -66,8 +66,8 @@ class Render:
             if self.insert is None:
                 write_frames(stream, camera, output, self.channels, done)
             else:
-                channels = self.channels or (("color", "alpha", "depth") if is_layered(output) else ("color",))
-                build = load_insert(self.insert)
+                layers = inserted_channels(stream) if is_layered(output) else ("color",)
+                channels, build = self.channels or layers, load_insert(self.insert)
                 images = render_inserted(stream, camera, build, frames, channels, self.samples, self.shadows)
                 write_images(images, stream.fps, output, done)
         print_result(f"{output}: {len(frames)} frames of camera {camera.name}, {camera.width}x{camera.height}.")

@@ -107,6 +107,8 @@ def _exr_names(channel: str, components: int) -> list[str]:
         return ["R", "G", "B"]
     if channel == "alpha":
         return ["A"]
+    if channel in ("splats", "surfaces", "shadow"):  # layers of an inserted scene, see `insert`
+        return [f"{channel}.{letter}" for letter in "RGBA"[:components]]
     suffixes = "Y" if components == 1 else "XYZW"[:components] if components <= 4 else map(str, range(components))
     return [f"{channel}.{suffix}" for suffix in suffixes]
 

@@ -21,17 +21,23 @@ import numpy as np
 from morgs_mi.codec.packets import play
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.color_space import linear_to_srgb
+from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.export.clips import frame_numbers
 from morgs_mi.gaussian_integrator import ellipsoids
+from morgs_mi.playback.player import available_channels
+from morgs_mi.render.channels import exr_names
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.surfaces.light_probe import light_probe
 from morgs_mi.surfaces.shadows import shadow_ratio, shadowed
 from morgs_mi.surfaces.surface_view import lights
 from morgs_mi.synth.scene import failures_in
 
-__all__ = ["captured_light", "load_insert", "render_inserted", "selected"]
+__all__ = ["LAYERS", "captured_light", "inserted_channels", "load_insert", "render_inserted", "selected"]
+
+LAYERS = ("splats", "surfaces", "shadow")
+"""Further channels, for compositing: the splats alone and the surfaces alone, in linear light with alpha, and the
+shadow of the surfaces on the splats, a factor of their linear light."""
 
 Build = Callable[[int, float], dict[str, Any]]
 
@@ -73,6 +79,17 @@ def load_insert(path: str | Path) -> Build:
     return checked
 
 
+def inserted_channels(stream: StreamReader) -> tuple[str, ...]:
+    """Return all channels of a stream with an inserted scene, for EXR files.
+
+    Raises:
+        ValueError: a broken packet, or no frame.
+    """
+    frame_numbers(stream)
+    _, gaussians = next(iter(play(stream)))
+    return ("color", "alpha", *(name for name in available_channels(gaussians) if name != "color"), *LAYERS)
+
+
 def selected(stream: StreamReader, frames: Sequence[int]) -> list[int]:
     """Return `frames` in ascending order, each once.
 
@@ -106,7 +123,7 @@ def render_inserted(
         camera: any view.
         build: see `load_insert`.
         frames: indices of the frames to render; None: all.
-        channels: out of ``color``, ``alpha``, and the AOVs of `gaussian_splat`.
+        channels: out of ``color``, ``alpha``, the AOVs of `gaussian_splat`, and `LAYERS`.
         samples: samples per pixel of the inserted surfaces.
         shadows: whether they throw shadows on the Gaussians, see `shadow_ratio`.
 
@@ -138,35 +155,55 @@ def _render(
     samples: int,
     shadows: bool,
 ) -> dict[str, np.ndarray]:
-    aovs = [name for name in channels if name not in ("color", "alpha")]
     entries = {name: value for name, value in entries.items() if name not in ("type", "sensor")}
     nested = entries.pop("integrator", {"type": "path"})
+    nested = mi.load_dict(nested) if isinstance(nested, dict) else nested
+    ratio = np.ones(len(gaussians), np.float32)
     try:
         inserted: Any = mi.load_dict({"type": "scene", **entries})
         if not inserted.emitters():
             light = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel())
             inserted = mi.load_dict({"type": "scene", **entries, "captured light": light})
         if shadows and lights(inserted):
-            gaussians = shadowed(gaussians, shadow_ratio(gaussians, inserted, camera.position))
-        parts = {f"part{i}": part for i, part in enumerate(_parts(inserted))}
-        scene = mi.load_dict(
-            {
-                "type": "scene",
-                "gaussians": ellipsoids(gaussians),
-                "sensor": camera.sensor(pixel_format="rgba"),
-                "integrator": {"type": "gaussian_splat", "surfaces": nested, "aovs": ",".join(aovs)},
-                **parts,
-            }
-        )
-        image = np.asarray(scene.integrator().render(scene, spp=samples))
+            ratio = shadow_ratio(gaussians, inserted, camera.position)
+        images = _plugin_images(shadowed(gaussians, ratio), camera, inserted, nested, channels, samples)
+        if "surfaces" in channels:
+            images["surfaces"] = np.asarray(nested.render(inserted, _sensor(camera), spp=samples))
     except RuntimeError as error:
         raise ValueError(f"The inserted scene: {str(error).strip().splitlines()[0]}") from error
+    if {"splats", "shadow"} & set(channels):
+        alone, dark = (rasterize(part, camera) for part in (gaussians, shadowed(gaussians, ratio)))
+        light, less = (srgb_to_linear(np.asarray(image.color)) for image in (alone, dark))
+        images["splats"] = np.concatenate([light, np.asarray(alone.alpha)], axis=2)
+        images["shadow"] = np.where(light > 0, less / np.maximum(light, 1e-6), 1)
+    return {name: images[name].astype(np.float32) for name in channels}
+
+
+def _plugin_images(
+    gaussians: Gaussians, camera: Camera, inserted: Any, nested: Any, channels: Sequence[str], samples: int
+) -> dict[str, np.ndarray]:
+    """Return the colour, alpha and AOVs of `gaussian_splat` with an inserted scene."""
+    aovs = [name for name in channels if name not in ("color", "alpha", *LAYERS)]
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "gaussians": ellipsoids(gaussians),
+            "sensor": _sensor(camera),
+            "integrator": {"type": "gaussian_splat", "surfaces": nested, "aovs": ",".join(aovs)},
+            **{f"part{i}": part for i, part in enumerate(_parts(inserted))},
+        }
+    )
+    image = np.asarray(scene.integrator().render(scene, spp=samples))
     images, first = {"color": linear_to_srgb(image[..., :3]), "alpha": image[..., 3:4]}, 4
     for name in aovs:
-        size = sum(channel.startswith(f"{name}.") for channel in scene.integrator().aov_names())
+        size = len(exr_names(name))
         images[name] = image[..., first : first + size]
         first += size
-    return {name: images[name].astype(np.float32) for name in channels}
+    return images
+
+
+def _sensor(camera: Camera) -> Any:
+    return mi.load_dict(camera.sensor(pixel_format="rgba"))
 
 
 def _xml_entries(path: Path) -> dict[str, Any]:

@@ -88,20 +88,20 @@ def shadowed(gaussians: Gaussians, ratio: np.ndarray) -> Gaussians:
     factor = linear_to_srgb(ratio[:, None, None] * srgb_to_linear(mean)) / mean
     shift = np.zeros((1, int(gaussians.sh_coeffs.shape[1]), 1))
     shift[:, 0] = 0.5 / SH_C0  # factor (0.5 + SH) = 0.5 + SH of the new coefficients
-    scale = mi.TensorXf(np.float32(np.broadcast_to(factor, gaussians.sh_coeffs.shape)))
-    return replace(gaussians, sh_coeffs=gaussians.sh_coeffs * scale + mi.TensorXf(np.float32((factor - 1) * shift)))
+    scale = from_numpy(mi.TensorXf, np.broadcast_to(factor, gaussians.sh_coeffs.shape))
+    return replace(gaussians, sh_coeffs=gaussians.sh_coeffs * scale + from_numpy(mi.TensorXf, (factor - 1) * shift))
 
 
 class _Receivers:
     """Centres and orientation of the Gaussians: `flat` is 0 in a round neighbourhood and 1 on a plane."""
 
     def __init__(self, gaussians: Gaussians, eye: np.ndarray) -> None:
-        means = np.array(dr.detach(gaussians.means), np.float64)
+        means: np.ndarray = np.array(dr.detach(gaussians.means), np.float64)
         normals, flat = _orientation(gaussians, means)
         behind = np.sum(normals * (eye - means), axis=1) < 0
         facing = np.where(behind[:, None], -normals, normals)
-        self.centers = mi.Point3f(*(from_numpy(mi.Float, column) for column in means.T))
-        self.normals = mi.Vector3f(*(from_numpy(mi.Float, column) for column in facing.T))
+        self.centers = mi.Point3f([from_numpy(mi.Float, means[:, k]) for k in range(3)])
+        self.normals = mi.Vector3f([from_numpy(mi.Float, facing[:, k]) for k in range(3)])
         self.flat = from_numpy(mi.Float, flat)
 
     def response(self, direction: Any) -> Float:

@@ -10,7 +10,9 @@ import pytest
 from morgs_mi import open_stream
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
-from morgs_mi.export.insert import load_insert, render_inserted, selected
+from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.export.frames import exr_channels
+from morgs_mi.export.insert import inserted_channels, load_insert, render_inserted, selected
 from morgs_mi.playback.player import render_stream
 from tests.scenes.surfaces import camera, cloud
 
@@ -59,6 +61,23 @@ def test_render_inserted__lights_a_scene_without_emitters_by_the_stream(stream, 
     (tmp_path / "ball.py").write_text('def build(frame, time):\n    return {"ball": {"type": "sphere"}}\n')
     images = dict(render_inserted(stream, camera(), load_insert(tmp_path / "ball.py"), [0]))
     assert images[0]["color"][12, 16].min() > 0.05
+
+
+def test_render_inserted__layers_compose_to_the_image_where_surfaces_cover_nothing(stream, tmp_path):
+    (tmp_path / "ball.py").write_text(
+        "def build(frame, time):\n"
+        '    return {"ball": {"type": "sphere", "center": [0, -0.5, -0.3], "radius": 0.4},\n'
+        '            "sun": {"type": "directional", "direction": [0, 0.8, 0.8], "irradiance": 2.0}}\n'
+    )
+    channels = inserted_channels(stream)
+    assert channels == ("color", "alpha", "motion", "depth", "splats", "surfaces", "shadow")
+    images = dict(render_inserted(stream, camera(), load_insert(tmp_path / "ball.py"), [0], channels))[0]
+    outside = images["surfaces"][..., 3] == 0
+    assert images["shadow"].min() < 0.7 < images["shadow"].max() == pytest.approx(1)
+    shadowed = images["splats"][..., :3] * images["shadow"]
+    np.testing.assert_allclose(srgb_to_linear(images["color"])[outside], shadowed[outside], atol=1e-4)
+    names = exr_channels(images)
+    assert {"R", "A", "depth.Y", "splats.R", "surfaces.A", "shadow.R", "motion.X"} <= names.keys()
 
 
 def test_selected__refuses_missing_frames(stream):
