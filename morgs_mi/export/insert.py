@@ -164,7 +164,7 @@ def _render(
         if not inserted.emitters():
             light = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel())
             inserted = mi.load_dict({"type": "scene", **entries, "captured light": light})
-        if shadows and lights(inserted):
+        if shadows:
             ratio = shadow_ratio(gaussians, inserted, camera.position)
         images = _plugin_images(shadowed(gaussians, ratio), camera, inserted, nested, channels, samples)
         if "surfaces" in channels:

@@ -22,7 +22,7 @@ from morgs_mi.core.color_space import SH_C0, linear_to_srgb, srgb_to_linear
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, UInt32
-from morgs_mi.surfaces.surface_view import lights, shared_scene
+from morgs_mi.surfaces.surface_view import shared_scene
 
 __all__ = ["shadow_ratio", "shadowed"]
 
@@ -39,13 +39,13 @@ def shadow_ratio(gaussians: Gaussians, scene: Any, viewpoint: ArrayLike, samples
 
     Args:
         gaussians: N Gaussians.
-        scene: Mitsuba scene with the surfaces and with lights that are not on them, such as a `light_probe`; its
+        scene: Mitsuba scene with the surfaces and the lights of the recording, such as a `light_probe`; its
             `ellipsoids` are ignored.
         viewpoint: a point [3] from which the captured surfaces are seen, world units: a camera's position.
         samples: directions per light, the same for all Gaussians, so that shadows have no noise.
 
     Raises:
-        ValueError: a bad argument, or a scene without such a light.
+        ValueError: a bad argument, or a scene without an emitter.
     """
     place = "shadow_ratio()"
     check_type(place, "gaussians", gaussians, Gaussians)
@@ -53,11 +53,11 @@ def shadow_ratio(gaussians: Gaussians, scene: Any, viewpoint: ArrayLike, samples
     eye = numbers(place, "viewpoint", viewpoint)
     if eye.shape != (3,) or not np.isfinite(eye).all():
         raise ValueError(f"{place}: `viewpoint` must be [3] and finite, got {eye.tolist()}; pass a camera's position.")
-    emitters, shapes = lights(scene), [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
+    emitters, shapes = scene.emitters(), [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
     if not emitters:
         raise ValueError(
-            f"{place}: expected a light that is not on a surface, got none; add one to the scene, such as an `envmap` "
-            "of morgs_mi.light_probe()."
+            f"{place}: expected a scene with an emitter, got none; add one, such as an `envmap` of "
+            "morgs_mi.light_probe()."
         )
     if not len(gaussians) or not shapes:
         return np.ones(len(gaussians), np.float32)

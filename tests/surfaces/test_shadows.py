@@ -74,6 +74,18 @@ def test_shadow_ratio__weighs_lights_by_their_irradiance():
     assert found[0] == pytest.approx(sky / (np.pi + 0.25), abs=2e-3)
 
 
+def test_shadow_ratio__of_an_area_light_is_the_hidden_part_of_it():
+    """A disk at half the height of a small lamp hides that part of it which it covers, seen from the floor."""
+    down = mi.ScalarTransform4f().translate([0, 2, 0]).rotate([1, 0, 0], 90).scale([0.1, 0.1, 1])
+    lamp = {"type": "rectangle", "to_world": down, "emitter": {"type": "area", "radiance": 1.0}}
+    edge = {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([1, 1, 0]).rotate([1, 0, 0], 90)}
+    found = shadow_ratio(
+        floor(np.array([[0.0, 0], [-0.05, 0], [-1, 0], [1, 0]])), scene(lamp=lamp, edge=edge), EYE, 4096
+    )
+    # From x, the edge at x = 0 is seen on the lamp at -x.
+    assert_close(found, np.array([0.5, 0.75, 1, 0]), atol=0.01)
+
+
 def test_shadow_ratio__ends_at_the_light():
     behind = {"type": "sphere", "center": [0, 4, 0], "radius": 1.0}
     assert shadow_ratio(floor(np.zeros((1, 2))), scene(bulb=BULB, ball=behind), EYE)[0] == 1
@@ -104,7 +116,7 @@ def test_shadowed__scales_all_directions_alike_and_one_changes_nothing():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda g: shadow_ratio(g, scene(disk=disk(1)), EYE), "expected a light that is not on a surface, got none"),
+        (lambda g: shadow_ratio(g, scene(disk=disk(1)), EYE), "expected a scene with an emitter, got none"),
         (lambda g: shadow_ratio(g, scene(sky=SKY, disk=disk(1)), (0, 0)), r"`viewpoint` must be \[3\]"),
         (lambda g: shadow_ratio(g, scene(sky=SKY, disk=disk(1)), EYE, 0), "`samples` must be"),
         (lambda g: shadow_ratio("g", scene(sky=SKY), EYE), "`gaussians` must be"),
