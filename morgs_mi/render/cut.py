@@ -20,15 +20,15 @@ import mitsuba as mi
 from morgs_mi.core.types import Float
 from morgs_mi.render.exp2 import exp2
 
-__all__ = ["PROFILE", "Cut", "CutAlpha"]
+__all__ = ["FARTHEST_CUT", "PROFILE", "Cut", "CutAlpha"]
 
 PROFILE = 4  # z, gx, gy, 1 / sigma
 
 _LN2 = log(2.0)
 _SLOPE = 2 * sqrt(2 / pi) * log2(2.718281828459045)
 _CUBIC = 0.044715
-# Standard deviations. Beyond, Phi is 0 or 1 in float32.
-_FARTHEST = 6.0
+FARTHEST_CUT = 6.0
+"""Standard deviations between depth and limit beyond which Phi counts as 0 or 1."""
 
 
 @dataclass(frozen=True)
@@ -62,8 +62,8 @@ class Cut:
         j, i = divmod(k, len(self.dx))
         behind = self.limits[k] - (self.columns[i] + self.rows[j])
         q = behind * self.r_sigma
-        near = dr.abs(q) < _FARTHEST
-        q = dr.select(near, q, dr.copysign(mi.Float(_FARTHEST), q))
+        near = dr.abs(q) < FARTHEST_CUT
+        q = dr.select(near, q, dr.copysign(mi.Float(FARTHEST_CUT), q))
         qq = q * q
         fraction = dr.rcp(1 + exp2(-_SLOPE * q * dr.fma(_CUBIC, qq, 1)))
         log_transmitted = dr.log2(1 - alpha)

@@ -168,7 +168,7 @@ def rasterize(
     _check_finite(splats.finite, gaussians, camera, features)
     values = [splats.channels[name] for name in blended]
     with dr.suspend_grad():
-        lists = build_lists(splats, [column for columns in values for column in columns], region, config)
+        lists = build_lists(splats, [column for columns in values for column in columns], region, config, limits)
     layout = _layout(channels, sizes, background, detach_weights, config, cut)
     outputs = blend(splats.geometry, values, region, lists, layout, limits)
     images = dict(zip((*blended, "alpha", "coverage"), outputs, strict=False))
