@@ -21,6 +21,7 @@ import numpy as np
 from morgs_mi.codec.packets import play
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import check_number
 from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.export.clips import frame_numbers
@@ -133,6 +134,7 @@ def render_inserted(
     Raises:
         ValueError: a broken packet, or a scene that Mitsuba or `gaussian_splat` refuses.
     """
+    check_number("render_inserted()", "samples", samples, "[1, inf)")
     for frame, gaussians in play(stream):
         if frames is None or frame in frames:
             yield frame, _render(gaussians, camera, build(frame, frame / stream.fps), channels, samples, shadows)
@@ -161,6 +163,8 @@ def _render(
     ratio = np.ones(len(gaussians), np.float32)
     try:
         inserted: Any = mi.load_dict({"type": "scene", **entries})
+        if not (inserted.shapes() or inserted.emitters()):
+            raise ValueError("The inserted scene: expected at least one shape, got none; add one.")
         if not inserted.emitters():
             light = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel())
             inserted = mi.load_dict({"type": "scene", **entries, "captured light": light})

@@ -62,7 +62,7 @@ def shadow_ratio(gaussians: Gaussians, scene: Any, viewpoint: ArrayLike, samples
     if not len(gaussians) or not shapes:
         return np.ones(len(gaussians), np.float32)
     with dr.suspend_grad():
-        receivers, blockers = _Receivers(gaussians, eye), shared_scene(shapes)
+        receivers, blockers = _Receivers(gaussians, eye), shared_scene(shapes, scene)
         blocked, total = (mi.Float(0) for _ in range(2))
         for emitter in emitters:
             some, every = _irradiance(emitter, receivers, blockers, int(samples))

@@ -54,7 +54,7 @@ def surface_scene(scene: Any) -> Any:
                 f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have a BSDF, got none; set `bsdf` "
                 "where the shape is defined."
             )
-    return shared_scene([*surfaces, *lights(scene)])
+    return shared_scene([*surfaces, *lights(scene)], scene)
 
 
 def lights(scene: Any) -> list[Any]:
@@ -62,14 +62,18 @@ def lights(scene: Any) -> list[Any]:
     return [emitter for emitter in scene.emitters() if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
 
 
-def shared_scene(parts: list[Any]) -> Any:
-    """Return a scene of objects that belong to another scene, which still finds their parameters."""
+def shared_scene(parts: list[Any], whole: Any) -> Any:
+    """Return a scene of some shapes and emitters of a whole scene, which stays as it is.
+
+    A new scene names its parts, and sets the extent of an environment to its own; both are set back.
+    """
     names = [part.id() for part in parts]
-    result = mi.load_dict({"type": "scene", **{f"part{i}": part for i, part in enumerate(parts)}})
-    # A scene names what it is given; the parameters of the whole scene are found by the names that they had.
+    scene = mi.load_dict({"type": "scene", **{f"part{i}": part for i, part in enumerate(parts)}})
     for part, name in zip(parts, names, strict=True):
         part.set_id(name)
-    return result
+        if isinstance(part, mi.Emitter):
+            part.set_scene(whole)
+    return scene
 
 
 @contextmanager

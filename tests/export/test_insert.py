@@ -94,6 +94,7 @@ BAD = {
     "none.py": ("def build(frame, time):\n    pass\n", "`build` must return a dict, got a NoneType"),
     "fails.py": ("def build(frame, time):\n    return 1 / 0\n", "fails.py, line 2: ZeroDivisionError"),
     "plugin.py": ("def build(frame, time):\n    return {'a': {'type': 'bal'}}\n", "The inserted scene: .*bal"),
+    "bare.py": ("def build(frame, time):\n    return {}\n", "expected at least one shape, got none"),
     "broken.xml": ("<scene", "broken.xml: "),
 }
 

@@ -137,6 +137,20 @@ def test_surfaces__of_an_environment_alone_are_its_light():
     assert_close(found, over(gaussians, 0.3), atol=tol.IMAGE_ABS)
 
 
+def test_surfaces__leave_the_whole_scene_as_it_is():
+    """Its parameters keep their names, and its environment its extent."""
+    whole = scene(cloud(), ball={"type": "sphere"}, sky={"type": "constant"}, wall=wall(90))
+    it, names = dr.zeros(mi.Interaction3f), list(mi.traverse(whole).keys())
+
+    def distance() -> float:
+        return float(whole.environment().sample_direction(it, mi.Point2f(0.5))[0].dist[0])
+
+    before = distance()
+    render(whole, spp=1)
+    assert distance() == before > 90
+    assert list(mi.traverse(whole).keys()) == names
+
+
 # --------------------------------------------------------------------------------------------------
 #  Derivatives
 # --------------------------------------------------------------------------------------------------
