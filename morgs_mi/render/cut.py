@@ -70,8 +70,8 @@ class Cut:
         transmitted = exp2(fraction * log_transmitted)
         slope = fraction * (1 - fraction) * (_SLOPE * _LN2) * dr.fma(3 * _CUBIC, qq, 1)
         return CutAlpha(
-            # All or nothing without rounding where the limit is far away.
-            dr.select(near, 1 - transmitted, dr.select(behind > 0, alpha, 0)),
+            # All or nothing without rounding where the limit is far away; a Gaussian that is not drawn stays so.
+            dr.select(near & (alpha > 0), 1 - transmitted, dr.select(behind > 0, alpha, 0)),
             fraction * transmitted * dr.rcp(1 - alpha),
             dr.select(near, -_LN2 * transmitted * log_transmitted * slope, 0),
             behind,

@@ -89,6 +89,16 @@ def test_depth_limit__in_front_of_everything_leaves_nothing(scene):
     assert not np.array(rasterize(to_gaussians(raw), camera, ("alpha",), depth_limit=limit).alpha).any()
 
 
+def test_depth_limit__draws_nothing_where_the_gaussian_is_too_faint(scene):
+    raw, camera = scene
+    faint = to_gaussians({**raw, "log_scales": np.full_like(raw["log_scales"], np.log(0.1))})
+    limit = np.full((camera.height, camera.width), np.linalg.norm(camera.position))
+    uncut = np.array(rasterize(faint, camera, ("alpha",)).alpha)
+    found = np.array(rasterize(faint, camera, ("alpha",), depth_limit=limit).alpha)
+    assert (uncut == 0).any()
+    assert not found[uncut == 0].any()
+
+
 def test_depth_limit__inside_equals_the_list_cut_at_that_depth():
     """Between two layers of small Gaussians, the image is that of the nearer layer."""
     (camera,) = look_at_cameras([(0, 0, -4)], 45)
