@@ -117,15 +117,18 @@ def _orientation(gaussians: Gaussians, means: np.ndarray) -> tuple[np.ndarray, n
     scales, quats = np.array(dr.detach(gaussians.scales)), np.array(dr.detach(gaussians.quats), np.float64)
     quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1, 0, 0, 0])
     axes = Rotation.from_quat(quats, scalar_first=True).as_matrix() * scales[:, None]
-    _, near = KDTree(means).query(means, min(_NEIGHBOURS, len(means)))
+    _, near = KDTree(means).query(means, min(_NEIGHBOURS, len(means)), workers=-1)
     near = near.reshape(len(means), -1)
-    # The covariance of the mixture: that of its means, and the mean of its covariances.
-    weights = np.array(dr.detach(gaussians.opacities))[near]
-    weights = (weights / weights.sum(1, keepdims=True))[..., None, None]
-    offsets = means[near] - means[:, None]
-    offsets = offsets - np.sum(weights[..., 0] * offsets, axis=1, keepdims=True)
-    spread = offsets[..., None] * offsets[..., None, :]
-    covariance = np.sum(weights * (spread + (axes @ axes.transpose(0, 2, 1))[near]), axis=1)
+    weights = np.array(dr.detach(gaussians.opacities))[near] + 1e-9  # an opacity may be 0 in float32
+    weights = weights / weights.sum(1, keepdims=True)
+    center = np.einsum("nk,nki->ni", weights, means[near])
+    # The covariance of the mixture: that of its means, and the mean of its covariances; by neighbour, to save memory.
+    covariances = axes @ axes.transpose(0, 2, 1)
+    covariance = np.zeros_like(covariances)
+    for k in range(near.shape[1]):
+        offset = means[near[:, k]] - center
+        spread = offset[:, :, None] * offset[:, None, :]
+        covariance += weights[:, k, None, None] * (spread + covariances[near[:, k]])
     variances, directions = np.linalg.eigh(covariance)
     return directions[:, :, 0], 1 - variances[:, 0] / np.maximum(variances[:, 1], 1e-30)
 
