@@ -28,6 +28,8 @@ from morgs_mi.render.config import RenderConfig  # noqa: E402
 from morgs_mi.render.rasterize import Image, rasterize  # noqa: E402
 from morgs_mi.render.recording import render_lock  # noqa: E402
 from morgs_mi.stream_loop import FrameReport, StreamLoop  # noqa: E402
+from morgs_mi.surfaces.light_probe import light_probe  # noqa: E402
+from morgs_mi.surfaces.shadows import shadow_ratio, shadowed  # noqa: E402
 from morgs_mi.synth.ground_truth import load_tracks, load_truth  # noqa: E402
 from morgs_mi.synth.synthesize import synthesize  # noqa: E402
 
@@ -55,6 +57,7 @@ __all__ = [
     "ellipsoids",
     "evaluate_stream",
     "extract_tracks",
+    "light_probe",
     "live_frames",
     "load_capture",
     "load_tracks",
@@ -64,6 +67,8 @@ __all__ = [
     "rasterize",
     "render_lock",
     "render_stream",
+    "shadow_ratio",
+    "shadowed",
     "stream_capture",
     "synthesize",
     "track_points",

@@ -14,7 +14,12 @@ K = (degree + 1)^2:
 
 Every attribute of the table of attributes with a `channel` is rendered in the same way as `confidence`.
 
-`mi.render(scene, params)` is differentiable, in both modes, in these attributes and in the sensor's `to_world`.
+With an integrator for `surfaces`, the other shapes of the scene are drawn among the Gaussians:
+
+    "integrator": {"type": "gaussian_splat", "surfaces": {"type": "path"}}
+
+`mi.render(scene, params)` is differentiable, in both modes, in these attributes and in the sensor's `to_world`; with
+surfaces rendered by `prb` or similar also in their materials and lights.
 
 Importing this module registers the plugin with the active variant and with every variant set later.
 """
@@ -36,6 +41,8 @@ from morgs_mi.core.types import Float, Tensor, UInt32
 from morgs_mi.render.channels import attribute_channels, exr_names
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.recording import render_lock
+from morgs_mi.surfaces.composite import composite, cropped
+from morgs_mi.surfaces.surface_view import SurfaceView
 
 __all__ = ["ellipsoids"]
 
@@ -106,14 +113,14 @@ class _SceneGaussians:
         return tensor_rows(getattr(self, name), index)
 
 
-def _scene_gaussians(scene: Any, attributes: list[str]) -> _SceneGaussians:
+def _scene_gaussians(scene: Any, attributes: list[str], with_surfaces: bool) -> _SceneGaussians:
     """Return the Gaussians of all shapes; those with fewer SH coefficients are padded with zeros."""
-    shapes = scene.shapes()
-    for shape in shapes:
-        if not shape.is_ellipsoids():
+    shapes = [shape for shape in scene.shapes() if shape.is_ellipsoids()]
+    for shape in scene.shapes():
+        if not (with_surfaces or shape.is_ellipsoids()):
             raise ValueError(
                 f"gaussian_splat: expected `ellipsoids` shapes only, got {shape.class_name()} {shape.id()!r}; "
-                "remove it from the scene, or use an integrator for surfaces, such as `path`."
+                "remove it from the scene, or set `surfaces` to an integrator that renders it, such as `path`."
             )
     if not shapes:
         raise ValueError("gaussian_splat: expected a scene with an `ellipsoids` shape, got none; add one.")
@@ -194,9 +201,18 @@ def _plugin() -> type:
              last frame, px), `depth` (`depth.Y`: expected z, world units) and the channels of attributes such as
              `confidence` (`confidence.Y`). Channels that are not listed are not computed. (Default: none)
 
+         * - surfaces
+           - |integrator|
+           - Integrator for the other shapes of the scene, which are blended among the splats. (Default: none, and other
+             shapes are refused)
+
         The film's size, crop, border, reconstruction filter and pixel format are honoured; every pixel gets one
         sample at its centre, so that `spp`, the seeds and the sampler have no effect. Emitters (with a warning), the
         sensor's far plane and shutter, and the shapes' `extent` are ignored. A crop saves no time.
+
+        With `surfaces`, that integrator renders the other shapes with `spp` samples, whose mean is the pixel's sample.
+        A pixel's splats end at the mean depth of the surfaces in it, and are blended twice if they cover it in part.
+        Surfaces get no light or shadow from splats, and none reaches the splats; docs/surfaces.md has what does that.
         """
 
         def __init__(self, props: Any) -> None:
@@ -211,6 +227,12 @@ def _plugin() -> type:
             self.background = None if background is None else np.broadcast_to(np.array(background, float), 3).tolist()
             names = (name.strip() for name in props.get("aovs", "").split(","))
             self.aovs = list(dict.fromkeys(name for name in names if name))
+            self.surfaces = props.get("surfaces", None)
+            if not (self.surfaces is None or isinstance(self.surfaces, mi.Integrator)):
+                raise ValueError(
+                    f"gaussian_splat: `surfaces` must be an integrator, got {self.surfaces!r}; pass one such as "
+                    "{'type': 'path'}."
+                )
             self.warned = False
             known = _aov_attributes()
             for name in self.aovs:
@@ -227,7 +249,7 @@ def _plugin() -> type:
             self, scene: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0, develop: bool = True, evaluate: bool = True
         ) -> Any:
             with dr.suspend_grad():
-                film = self._expose(scene, sensor)
+                film, _ = self._expose(scene, sensor, seed, spp)
                 image = film.develop() if develop else mi.TensorXf()
             film.schedule_storage()
             if evaluate:
@@ -237,7 +259,10 @@ def _plugin() -> type:
 
         def render_forward(self, scene: Any, params: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0) -> Any:
             with dr.resume_grad():
-                image = self._expose(scene, sensor).develop()
+                film, surfaces = self._expose(scene, sensor, seed, spp)
+                image = film.develop()
+                if surfaces is not None:
+                    surfaces.forward(params)
                 with render_lock:
                     dr.forward_to(image)
                 return dr.grad(image)
@@ -246,13 +271,16 @@ def _plugin() -> type:
             self, scene: Any, params: Any, grad_in: Any, sensor: Any = 0, seed: Any = 0, spp: int = 0
         ) -> None:
             with dr.resume_grad():
-                image = self._expose(scene, sensor).develop()
+                film, surfaces = self._expose(scene, sensor, seed, spp)
+                image = film.develop()
                 dr.set_grad(image, grad_in)
                 with render_lock:
                     dr.backward_from(image)
+                if surfaces is not None:
+                    surfaces.backward(params)
 
-        def _expose(self, scene: Any, sensor: Any) -> Any:
-            """Render the scene to the sensor's film and return the film."""
+        def _expose(self, scene: Any, sensor: Any, seed: Any, spp: int) -> tuple[Any, SurfaceView | None]:
+            """Render the scene to the sensor's film and return the film, and the surfaces if there are any."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             film = sensor.film()
             if mi.has_flag(film.flags(), mi.FilmFlags.Special):
@@ -260,40 +288,50 @@ def _plugin() -> type:
                     f"gaussian_splat: expected an `hdrfilm`, got {film.class_name()}; replace it, because only RGB is "
                     "drawn."
                 )
-            if scene.emitters() and not self.warned:
-                _log.warning("gaussian_splat ignores the scene's emitters; set its `background` colour instead.")
-                self.warned = True
-
             border = film.rfilter().border_size() if film.sample_border() else 0
+            camera = _sensor_camera(sensor, border)
             has_alpha = mi.has_flag(film.flags(), mi.FilmFlags.Alpha)
             required = (_aov_attributes()[name] for name in self.aovs)
             attributes = ["opacities", "sh_coeffs", *(name for name in required if name)]
-            image = rasterize(
-                _scene_gaussians(scene, attributes),
-                _sensor_camera(sensor, border),
-                ("color", *(["alpha"] if has_alpha else []), *self.aovs),
-                self.background,
-            )
+            gaussians = _scene_gaussians(scene, attributes, self.surfaces is not None)
+            channels = ("color", *(["alpha"] if has_alpha else []), *self.aovs)
             # Cropped after rendering: the projection's linearisation depends on the extent of the whole view.
             (x0, y0), (w, h) = film.crop_offset(), film.crop_size() + 2 * border
+            crop = (int(x0), int(y0), int(w), int(h))
 
-            def columns(tensor: Tensor) -> list[Float]:
-                return [tensor[y0 : y0 + h, x0 : x0 + w, i].array for i in range(tensor.shape[2])]
-
-            values = columns(image.color)
-            if self.srgb_primitives:
-                values = [mi.math.srgb_to_linear(value) for value in values]
-            values += columns(image.alpha) if has_alpha else []
+            surfaces = None
+            if self.surfaces is not None:
+                surfaces = SurfaceView.of(scene, self.surfaces, camera, crop, sensor, seed, spp)
+            if surfaces is None:
+                self._warn_about_emitters(scene)
+                columns = self._splats(gaussians, camera, channels, crop)
+            else:
+                columns = composite(gaussians, camera, channels, self.background, surfaces, crop, self.srgb_primitives)
+            values = [*columns["color"], *(columns["alpha"] if has_alpha else [])]
             values += [mi.Float(1)]  # the sample's weight
-            for name in self.aovs:
-                values += columns(image[name])
+            values += [value for name in self.aovs for value in columns[name]]
 
             film.prepare(self.aov_names())
             block, index = film.create_block(), dr.arange(mi.UInt32, w * h)
             block.set_coalesce(False)  # useful for many samples per pixel only
             block.put(mi.Point2f(index % w, index // w) + mi.Point2f(x0, y0) + (0.5 - border), values)
             film.put_block(block)
-            return film
+            return film, surfaces
+
+        def _splats(
+            self, gaussians: Any, camera: Camera, channels: tuple[str, ...], crop: tuple[int, int, int, int]
+        ) -> dict[str, list[Float]]:
+            """Return the channels of a scene without surfaces, colour in linear light."""
+            image = rasterize(gaussians, camera, channels, self.background)
+            columns = {name: cropped(image[name], crop) for name in channels}
+            if self.srgb_primitives:
+                columns["color"] = [mi.math.srgb_to_linear(value) for value in columns["color"]]
+            return columns
+
+        def _warn_about_emitters(self, scene: Any) -> None:
+            if scene.emitters() and not self.warned:
+                _log.warning("gaussian_splat ignores the scene's emitters; set its `background` colour instead.")
+                self.warned = True
 
         def to_string(self) -> str:
             return (

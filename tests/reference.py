@@ -67,8 +67,11 @@ def rasterize(
     eps2d: float = 0.3,
     alpha_min: float = 1 / 255,
     alpha_max: float = 0.99,
+    depth_limit: NDArray | None = None,
 ) -> dict[str, NDArray]:
     """Blend raw Gaussian attributes (as `Gaussians.numpy()` returns them) over every pixel, nearest first.
+
+    With a depth limit [H, W], only what lies in front of it.
 
     Returns all five channels [H, W, D], and `margin`: the smallest relative distance of any alpha to a cut-off.
     """
@@ -106,6 +109,14 @@ def rasterize(
         drawn, capped = full.real >= alpha_min, full.real > alpha_max
         margin = min(margin, np.abs(full.real / alpha_min - 1).min(), np.abs(full.real / alpha_max - 1).min())
         alpha = np.where(drawn, np.where(capped, alpha_max, full), 0)
+        if depth_limit is not None:
+            # The joint covariance of the filtered splat and of its depth, conditioned on the pixel.
+            M3 = np.vstack([M, (R @ rotation(quats[i]) @ np.diag(scales[i]))[2]])
+            joint = M3 @ M3.T + eps2d * np.diag([1, 1, 0])
+            slope = np.linalg.solve(joint[:2, :2], joint[:2, 2])
+            sigma = np.sqrt(joint[2, 2] - slope @ joint[:2, 2])
+            fraction = normal_cdf((np.minimum(depth_limit, 1e6) - (z + slope[0] * dx + slope[1] * dy)) / sigma)
+            alpha = 1 - (1 - alpha) ** fraction
 
         direction = means[i] - eye
         direction = direction / np.sqrt(np.sum(direction * direction))
@@ -129,16 +140,23 @@ def rasterize(
     return {**sums, "alpha": alpha, "margin": np.float64(margin)}
 
 
+def normal_cdf(q: NDArray) -> NDArray:
+    """Return the normal distribution function by Page's approximation (1977), which the renderer has too."""
+    q = np.where(np.abs(q.real) < 6, q, 6 * np.sign(q.real))
+    return 1 / (1 + np.exp(-2 * np.sqrt(2 / np.pi) * q * (1 + 0.044715 * q * q)))
+
+
 def rasterize_view(
     raw: dict[str, NDArray],
     camera: Camera,
     background: tuple[float, float, float] | None = None,
     viewmat: NDArray | None = None,
+    depth_limit: NDArray | None = None,
 ) -> dict[str, NDArray]:
     """Return `rasterize` for a camera rounded to float32, as the renderer reads it; `viewmat` replaces its pose."""
     viewmat = np.float32(camera.viewmat).astype(np.float64) if viewmat is None else viewmat
     K = np.float32(camera.K).astype(np.float64)
-    return rasterize(raw, K, viewmat, camera.width, camera.height, background)
+    return rasterize(raw, K, viewmat, camera.width, camera.height, background, depth_limit=depth_limit)
 
 
 def complex_step(function, inputs: dict[str, NDArray], names: list[str], step: float = 1e-30) -> dict[str, NDArray]:

@@ -14,6 +14,7 @@ SUBPACKAGES = (
     "core",
     "io",
     "render",
+    "surfaces",
     "gaussian_integrator",
     "losses",
     "method",

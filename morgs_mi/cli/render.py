@@ -22,6 +22,10 @@ _OUTPUT = (
     "FILE.mp4; a new folder whose name ends in png, for PNG files; or another new folder, for multichannel EXR files "
     "(R, G, B in linear light, motion.X and motion.Y in pixels, confidence.Y, depth.Y). By default OUT/CAMERA.mp4."
 )
+_INSERT = (
+    "Mitsuba scene whose objects stand among the Gaussians: FILE.xml, or FILE.py with a function build(frame, time) "
+    "that returns the entries of a scene. Without emitters it is lit by the stream."
+)
 
 
 @dataclass(frozen=True)
@@ -34,16 +38,36 @@ class Render:
     """Camera of the stream, by index or name; `morgs-mi info` lists those of a capture."""
     channels: Annotated[tuple[ChannelName, ...] | None, DisallowNone, optional("NAME ...", text=_CHANNELS)] = None
     output: Annotated[Path | None, DisallowNone, optional("PATH", text=_OUTPUT)] = None
+    insert: Annotated[Path | None, DisallowNone, optional("FILE", text=_INSERT)] = None
+    at: Annotated[tuple[int, ...] | None, DisallowNone, optional("FRAME ...", "(default: all)")] = None
+    """Frames to render with an inserted scene."""
+    samples: Annotated[int, arg(metavar="INT")] = 16
+    """Samples per pixel of an inserted scene."""
+    shadows: bool = True
+    """Whether an inserted scene throws shadows on the stream."""
 
     def run(self) -> None:
         from morgs_mi.export.clips import frame_numbers
-        from morgs_mi.export.frames import write_frames
+        from morgs_mi.export.frames import is_layered, write_frames, write_images
+        from morgs_mi.export.insert import inserted_channels, load_insert, render_inserted, selected
         from morgs_mi.playback.player import find_camera, open_stream
 
         stream = open_stream(self.out)
         camera = find_camera(stream, self.camera)
         output = check_output(self.output or stream.path.with_name(f"{camera.name}.mp4"))
-        total = len(frame_numbers(stream))
+        if self.insert is None and self.at is not None:
+            raise ValueError("--at selects frames of an inserted scene, got no scene; add --insert FILE.")
+        frames = frame_numbers(stream) if self.at is None else selected(stream, self.at)
         with progress() as report:
-            write_frames(stream, camera, output, self.channels, lambda done: report("Rendering", done, total))
-        print_result(f"{output}: {total} frames of camera {camera.name}, {camera.width}x{camera.height}.")
+
+            def done(count: int) -> None:
+                report("Rendering", count, len(frames))
+
+            if self.insert is None:
+                write_frames(stream, camera, output, self.channels, done)
+            else:
+                layers = inserted_channels(stream) if is_layered(output) else ("color",)
+                channels, build = self.channels or layers, load_insert(self.insert)
+                images = render_inserted(stream, camera, build, frames, channels, self.samples, self.shadows)
+                write_images(images, stream.fps, output, done)
+        print_result(f"{output}: {len(frames)} frames of camera {camera.name}, {camera.width}x{camera.height}.")

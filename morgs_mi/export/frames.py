@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from morgs_mi.io.video_writer import playable_format, write_video
 from morgs_mi.playback.player import channel_image, render_stream
 from morgs_mi.playback.visualise import side_by_side, write_png
 
-__all__ = ["exr_channels", "pad_to_even", "write_frames"]
+__all__ = ["exr_channels", "is_layered", "pad_to_even", "write_frames", "write_images"]
 
 
 def write_frames(
@@ -41,6 +41,29 @@ def write_frames(
             that is truncated, broken or has no frame.
         OSError: the folder exists, or a file cannot be written.
     """
+    if not stream.index():
+        raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has only a header.")
+    channels = channels or (None if is_layered(output) else ("color",))
+    write_images(render_stream(stream, camera, channels), stream.fps, output, progress)
+
+
+def is_layered(output: str | Path) -> bool:
+    """Return whether an output of `write_images` is a folder of EXR files, which hold all channels of a stream."""
+    return not Path(output).name.lower().endswith((".mp4", "png"))
+
+
+def write_images(
+    rendered: Iterable[tuple[int, Mapping[str, np.ndarray]]],
+    fps: float,
+    output: str | Path,
+    progress: Callable[[int], None] | None = None,
+) -> None:
+    """Write rendered frames, pairs of index and channels [H, W, C] by name, into files as `write_frames` does.
+
+    Raises:
+        ValueError: another type of video.
+        OSError: the folder exists, or a file cannot be written.
+    """
     output = Path(output)
     name = output.name.lower()
     video, png = name.endswith(".mp4"), name.endswith("png")
@@ -48,9 +71,6 @@ def write_frames(
         raise ValueError(
             f"{output}: the output must be FILE.mp4, or a folder ending in png or exr, got {output.suffix!r}."
         )
-    if not stream.index():
-        raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has only a header.")
-    rendered = render_stream(stream, camera, channels or (("color",) if video or png else None))
 
     def frames() -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
         for done, (frame, images) in enumerate(rendered, start=1):
@@ -60,7 +80,7 @@ def write_frames(
 
     if video:
         padded = (pad_to_even(_combined_image(images)) for _, images in frames())
-        write_video(output, padded, stream.fps, playable_format()[1])
+        write_video(output, padded, fps, playable_format()[1])
         return
     with atomic_folder(output, "write_frames()") as folder:
         for frame, images in frames():
@@ -87,6 +107,8 @@ def _exr_names(channel: str, components: int) -> list[str]:
         return ["R", "G", "B"]
     if channel == "alpha":
         return ["A"]
+    if channel in ("splats", "surfaces", "shadow"):  # layers of an inserted scene, see `insert`
+        return [f"{channel}.{letter}" for letter in "RGBA"[:components]]
     suffixes = "Y" if components == 1 else "XYZW"[:components] if components <= 4 else map(str, range(components))
     return [f"{channel}.{suffix}" for suffix in suffixes]
 

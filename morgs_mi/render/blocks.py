@@ -20,8 +20,9 @@ import mitsuba as mi
 from morgs_mi.core.types import Bool, Float, UInt32
 from morgs_mi.render.backend import stable_order
 from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.cut import FARTHEST_CUT
 from morgs_mi.render.projection import Splats
-from morgs_mi.render.region import ACROSS, DOWN, NO_SLOT, Region
+from morgs_mi.render.region import ACROSS, DOWN, NO_SLOT, Region, quotient
 
 __all__ = ["BlockLists", "build_lists", "fetch_record", "next_entry", "pack_records", "sorted_buckets", "touches"]
 
@@ -34,7 +35,7 @@ class BlockLists:
     """Depth-ordered lists, one per block of pixels, as bits over the entries of its tile.
 
     Attributes:
-        records: (mean_x, mean_y, a, b, c, log2_opacity, blended columns) of each rank, see `pack_records`.
+        records: (geometry, blended columns) of each rank, see `Splats.geometry` and `pack_records`.
         words: bit k of a block's i-th word is set if the block draws entry `first` + 32 i + k.
         entries: ranks, tile by tile.
         begin: place of each block's first word [A]; the next ones follow at steps of 32.
@@ -58,7 +59,9 @@ class BlockLists:
     by_rank: UInt32
 
 
-def build_lists(splats: Splats, columns: list[Float], region: Region, config: RenderConfig) -> BlockLists:
+def build_lists(
+    splats: Splats, columns: list[Float], region: Region, config: RenderConfig, limits: Float | None = None
+) -> BlockLists:
     """List the splats (N > 0) that may touch each block of a region, nearest first.
 
     Args:
@@ -66,6 +69,7 @@ def build_lists(splats: Splats, columns: list[Float], region: Region, config: Re
         columns: the blended values, floats [N].
         region: the blocks.
         config: cut-offs.
+        limits: depth limit of every pixel of the view [H W], which the splats' profiles are compared with.
     """
     N = len(splats)
     depths = dr.select(splats.valid, splats.depths, dr.inf)
@@ -79,9 +83,10 @@ def build_lists(splats: Splats, columns: list[Float], region: Region, config: Re
     dr.eval(rectangles)
     tiles = _tile_lists([dr.gather(mi.UInt32, v, by_rank) for v in rectangles], region)
 
-    records = pack_records([*splats.shape, *columns], by_rank)
-    geometry = fetch_record(records, tiles.entries, 6, dr.width(records) // (4 * N))
-    words, first_word, end_word = _block_bits(geometry, tiles, region, config)
+    records = pack_records([*splats.geometry, *columns], by_rank)
+    geometry = fetch_record(records, tiles.entries, len(splats.geometry), dr.width(records) // (4 * N))
+    farthest = None if limits is None else _farthest_limits(limits, region)
+    words, first_word, end_word = _block_bits(geometry, tiles, region, config, farthest)
     begin = dr.gather(mi.UInt32, first_word, region.tile) * 32 + region.bit
     end = dr.gather(mi.UInt32, end_word, region.tile) * 32 + region.bit
     first = dr.gather(mi.UInt32, tiles.first, region.tile)
@@ -250,7 +255,7 @@ def sorted_buckets(keys: UInt32, buckets: int) -> tuple[UInt32, UInt32, UInt32, 
 
 
 def _block_bits(
-    geometry: list[Float], tiles: _Tiles, region: Region, config: RenderConfig
+    geometry: list[Float], tiles: _Tiles, region: Region, config: RenderConfig, farthest_limits: Float | None
 ) -> tuple[UInt32, UInt32, UInt32]:
     """Return (words, first word of each tile, end word of each tile) for the geometry of the entries.
 
@@ -265,7 +270,7 @@ def _block_bits(
     num_words = dr.width(tiles.entries) // 32 + num_tiles  # at most one word per tile is not full
 
     slot = tiles.slots
-    mx, my, a, b, c, log2_opacity = geometry
+    mx, my, a, b, c, log2_opacity, *profile = geometry
     # Slopes dx/dy and dy/dx along which p is largest for a given dy and for a given dx.
     tilt = b / dr.maximum(c, 1e-30)
     slope_x, slope_y = -b / dr.maximum(a, 1e-30), -a / dr.maximum(c, 1e-30) * tilt / dr.fma(tilt, tilt, 1)
@@ -288,13 +293,23 @@ def _block_bits(
             touches = (dr.fma(u1, u1, v * v) <= reach) | (dr.fma(u2, u2, v2 * v2) <= reach)
             mask |= dr.select(touches, mi.UInt32(1 << (j * ACROSS + i)), mi.UInt32(0))
 
+    x0, x1, y0, y1 = columns[0][0], columns[-1][1], py + 0.5, py + (DOWN * bh - 0.5)
+    if farthest_limits is not None:
+        # A limit in front hides what would hide later entries, so that none is left out for its transmittance.
+        nearest = (
+            profile[0] + dr.minimum(profile[1] * x0, profile[1] * x1) + dr.minimum(profile[2] * y0, profile[2] * y1)
+        )
+        ahead = (dr.gather(mi.Float, farthest_limits, slot) - nearest) * profile[3] > -FARTHEST_CUT
+        mask = dr.select(ahead, mask, 0)
+        dr.eval(mask)
+        return _transposed_words(mask, tiles, first_word, end_word, num_words)
+
     # Over the tile, u^2 + v^2 is largest at a corner: a lower bound of alpha, hence an upper bound of the transmittance
     # behind an entry. Entries below the stop in all blocks are not listed; they would not have been blended.
     def distance(x: Float, y: Float) -> Float:
         u, v = dr.fma(a, x, b * y), c * y
         return dr.fma(u, u, v * v)
 
-    x0, x1, y0, y1 = columns[0][0], columns[-1][1], py + 0.5, py + (DOWN * bh - 0.5)
     farthest = distance(x0, y0)
     for x, y in ((x0, y1), (x1, y0), (x1, y1)):
         farthest = dr.maximum(farthest, distance(x, y))
@@ -305,7 +320,28 @@ def _block_bits(
     log2_transmittance = behind - dr.gather(mi.Float64, behind, dr.gather(mi.UInt32, tiles.first, slot))
     # Half an octave exceeds the rounding error of the blend; a stop at 0 omits nothing.
     mask = dr.select(log2_transmittance < log2(max(config.stop_transmittance, 1e-38)) - 0.5, 0, mask)
+    return _transposed_words(mask, tiles, first_word, end_word, num_words)
 
+
+def _farthest_limits(limits: Float, region: Region) -> Float:
+    """Return the largest depth limit in each tile of the region."""
+    lane = dr.arange(mi.UInt32, region.width * region.height)
+    row = quotient(lane, region.width)
+    column = lane - row * dr.opaque(mi.UInt32, region.width)
+    across = dr.gather(mi.UInt32, region.grid, mi.UInt32(0))
+    tile = row // (DOWN * region.block[1]) * across + column // (ACROSS * region.block[0])
+    slot = tile if region.whole else dr.gather(mi.UInt32, region.slot_of, tile)
+    farthest = dr.full(mi.Float, -dr.inf, region.num_tiles)
+    dr.scatter_reduce(dr.ReduceOp.Max, farthest, limits, slot, active=slot != NO_SLOT)
+    dr.eval(farthest)
+    return farthest
+
+
+def _transposed_words(
+    mask: UInt32, tiles: _Tiles, first_word: UInt32, end_word: UInt32, num_words: int
+) -> tuple[UInt32, UInt32, UInt32]:
+    """Return (words, first word of each tile, end word of each tile) of the blocks' bits of every entry."""
+    slot = tiles.slots
     place = dr.gather(mi.UInt32, first_word, slot) * 32 + dr.arange(mi.UInt32, dr.width(slot))
     masks = dr.zeros(mi.UInt32, num_words * 32)
     dr.scatter(masks, mask, place - dr.gather(mi.UInt32, tiles.first, slot), mode=dr.ReduceMode.NoConflicts)

@@ -11,7 +11,6 @@ import mitsuba as mi
 from morgs_mi.core.types import Float
 from morgs_mi.render.blocks import BlockLists, pack_records, sorted_buckets
 from morgs_mi.render.loops import (
-    GEOMETRY,
     Blocks,
     Channel,
     Layout,
@@ -23,22 +22,28 @@ from morgs_mi.render.loops import (
     tangent,
 )
 from morgs_mi.render.recording import recorded
-from morgs_mi.render.region import Region, quotient
+from morgs_mi.render.region import Region, on_region, quotient
 
 __all__ = ["Channel", "Layout", "blend"]
 
 
 def blend(
-    geometry: tuple[Float, ...], channels: list[tuple[Float, ...]], region: Region, lists: BlockLists, layout: Layout
+    geometry: tuple[Float, ...],
+    channels: list[tuple[Float, ...]],
+    region: Region,
+    lists: BlockLists,
+    layout: Layout,
+    limits: Float | None = None,
 ) -> list[Float]:
     """Blend every channel's columns over a region.
 
     Args:
-        geometry: (mean_x, mean_y, a, b, c, log2_opacity), six floats [N].
+        geometry: see `Splats.geometry`, floats [N].
         channels: the columns of each channel, floats [N].
         region: the blocks that are drawn.
         lists: the splats that touch them, built from the same geometry and columns.
         layout: sizes of the channels, whether their gradients reach the weights, and cut-offs.
+        limits: depth limit of every pixel [H W] if the layout has them.
 
     Returns:
         The image of each channel on the region, flat; and, if the layout has it, alpha, twice: one for output, one to
@@ -46,13 +51,16 @@ def blend(
         `geometry` and `channels` by `dr.backward` and `dr.forward`.
     """
     columns = [column for channel in channels for column in channel]
-    return dr.custom(_Blend, [*geometry, *columns], region, lists, layout)
+    return dr.custom(_Blend, [*geometry, *columns], region, lists, layout, limits)
 
 
 class _Blend(dr.CustomOp):
-    def eval(self, values: list[Float], region: Region, lists: BlockLists, layout: Layout) -> list[Float]:
+    def eval(
+        self, values: list[Float], region: Region, lists: BlockLists, layout: Layout, limits: Float | None
+    ) -> list[Float]:
         # The lists' records contain the values already: they are arguments only to be differentiated.
-        self.region, self.lists, self.layout, self.blocks = region, lists, layout, Blocks.of(region, lists)
+        self.region, self.lists, self.layout = region, lists, layout
+        self.blocks = Blocks.of(region, lists, None if limits is None else on_region(limits, region))
         self.images = self._run(primal, layout, self.blocks, lists.records, self._allocated())
         return self._outputs(self.images)
 
@@ -69,8 +77,8 @@ class _Blend(dr.CustomOp):
             sums, stride = _summed_by_rank(pairs, N, layout), 4 * pair_packets(layout)
         else:
             sums = self._run(adjoint, layout, _rounded_up(N), *arrays)
-        lane, skipped = lists.rank_of * stride, 0 if layout.reaches_weights else GEOMETRY
-        columns = [dr.gather(mi.Float, sums, lane + k) for k in range(skipped, GEOMETRY + layout.columns)]
+        lane, skipped = lists.rank_of * stride, 0 if layout.reaches_weights else layout.geometry
+        columns = [dr.gather(mi.Float, sums, lane + k) for k in range(skipped, layout.geometry + layout.columns)]
         self.set_grad_in("values", [mi.Float(0)] * skipped + columns)
 
     def forward(self) -> None:
@@ -128,7 +136,7 @@ def _padded(image: Float, region: Region, size: int) -> Float:
 
 def _summed_by_rank(pairs: Float, N: int, layout: Layout) -> Float:
     """Return the sums of the records of all pairs of each rank, one lane per rank, in the order of the blocks."""
-    packets, place = pair_packets(layout), GEOMETRY + layout.columns
+    packets, place = pair_packets(layout), layout.geometry + layout.columns
     lane = dr.arange(mi.UInt32, dr.width(pairs) // (4 * packets)) * (4 * packets)
     rank = dr.reinterpret_array(mi.UInt32, dr.gather(mi.Float, pairs, lane + place))
     perm, _, first, end = sorted_buckets(dr.opaque(rank), N)

@@ -14,6 +14,9 @@ per pixel, the suffix S = <g, C_final> - sum_j<=i w_j <g, c_j>, and
 A channel is *attached* if its gradient reaches the weights w (geometry and opacity), detached if it reaches
 only the blended value itself. Alpha is blended as one more channel of ones.
 
+With depth limits, alpha' takes the place of alpha (see `cut`), and a record has the four numbers of the splat's profile
+after those of its shape. The limits are constants: they get no derivative.
+
 Every channel has its own image, rows of blocks times its columns (see `region`), so that a row of a block is a
 run of packets of 4 floats.
 """
@@ -31,10 +34,11 @@ from morgs_mi.core.types import Bool, Float, UInt32
 from morgs_mi.render.backend import add_mode, block_shape, on_aligned_stack
 from morgs_mi.render.blocks import BlockLists, fetch_record, next_entry
 from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.cut import PROFILE, Cut
+from morgs_mi.render.exp2 import exp2
 from morgs_mi.render.region import Region
 
 __all__ = [
-    "GEOMETRY",
     "Blocks",
     "Channel",
     "Layout",
@@ -47,7 +51,7 @@ __all__ = [
 ]
 
 _LN2 = log(2.0)
-GEOMETRY = 6  # mean_x, mean_y, a, b, c, log2_opacity
+_SHAPE = 6  # mean_x, mean_y, a, b, c, log2_opacity
 
 
 @dataclass(frozen=True)
@@ -67,12 +71,19 @@ class Layout:
         alpha: whether alpha is an output.
         alpha_attached: whether the gradient of alpha is wanted.
         config: cut-offs.
+        cut: whether every pixel has a depth limit.
     """
 
     channels: tuple[Channel, ...]
     alpha: bool
     alpha_attached: bool
     config: RenderConfig
+    cut: bool = False
+
+    @property
+    def geometry(self) -> int:
+        """The number of floats that decide alpha."""
+        return _SHAPE + (PROFILE if self.cut else 0)
 
     @property
     def columns(self) -> int:
@@ -97,7 +108,7 @@ class Layout:
 
 def record_packets(layout: Layout) -> int:
     """Return the number of packets of 4 floats of a Gaussian's record, which is also that of its gradient."""
-    return -(-(GEOMETRY + layout.columns) // 4)
+    return -(-(layout.geometry + layout.columns) // 4)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -107,7 +118,10 @@ def record_packets(layout: Layout) -> int:
 
 @dataclass(frozen=True)
 class Blocks:
-    """The arrays of a region and its lists that the loops read, see `Region` and `BlockLists`; one entry per block."""
+    """The arrays of a region and its lists that the loops read, see `Region` and `BlockLists`; one entry per block.
+
+    `limits` is an image on the region, the depth limit of every pixel, or None.
+    """
 
     x: UInt32
     y: UInt32
@@ -120,12 +134,13 @@ class Blocks:
     end: UInt32
     first: UInt32
     order: UInt32
+    limits: Float | None = None
 
     @staticmethod
-    def of(region: Region, lists: BlockLists) -> Blocks:
-        """Return the arrays of a region and its lists."""
+    def of(region: Region, lists: BlockLists, limits: Float | None) -> Blocks:
+        """Return the arrays of a region, its lists and its depth limits."""
         geometry = (region.x, region.y, region.place, region.rows, region.pitch)
-        return Blocks(*geometry, lists.words, lists.entries, lists.begin, lists.end, lists.first, lists.order)
+        return Blocks(*geometry, lists.words, lists.entries, lists.begin, lists.end, lists.first, lists.order, limits)
 
 
 class _Block:
@@ -142,6 +157,8 @@ class _Block:
         # Centre of the first pixel.
         self.x, self.y = (mi.Float(dr.gather(mi.UInt32, v, order)) + 0.5 for v in (blocks.x, blocks.y))
         begin, first = dr.gather(mi.UInt32, blocks.begin, order), dr.gather(mi.UInt32, blocks.first, order)
+        # One depth limit per pixel, row by row; none without depth limits.
+        self.limits = [] if blocks.limits is None else [v for (v,) in _load_image(self, 1, blocks.limits)]
         self.end = on_aligned_stack(dr.gather(mi.UInt32, blocks.end, order))
         # One word before the block's first, as `next_entry` expects.
         self.walk = next_entry(begin, mi.UInt32(0), first - 32, self.end, blocks.words)
@@ -166,7 +183,7 @@ class _Block:
 
     def powers(self, dx: list[Float], dy: list[Float], geometry: list[Float]) -> list[tuple[Float, Float]]:
         """Return (p, u) of every pixel, row by row."""
-        _, _, a, b, c, log2_opacity = geometry
+        _, _, a, b, c, log2_opacity = geometry[:_SHAPE]
         ax, rows = [a * x for x in dx], []
         for y in dy:
             v, by = c * y, b * y
@@ -178,7 +195,7 @@ class _Block:
 
     def alpha(self, p: Float) -> tuple[Float, Float]:
         """Return (alpha, alpha before the cap and the cut-off)."""
-        full = _exp2(p)
+        full = exp2(p)
         # One instruction; `dr.minimum` takes three to handle NaN.
         capped = dr.select(full < self.alpha_max, full, self.alpha_max)
         return dr.select(p >= self.log_min, capped, 0), full
@@ -191,25 +208,6 @@ def _advance(
     place, word, base = walk
     rank = dr.gather(mi.UInt32, entries, base + dr.tzcnt(word))
     return rank, next_entry(place, word & (word - 1), base, end, words)
-
-
-# Minimax over [-1/2, 1/2], highest power first: relative error 2.7e-6 in float32, like Taylor's fifth degree.
-_EXP2 = (0.009570102207362652, 0.05591786280274391, 0.240247443318367, 0.6931217908859253, 0.9999992847442627)
-
-
-def _exp2(p: Float) -> Float:
-    """Return 2^p for |p| < 126, relative error 3e-6; out of that range the result is undefined, without a trap.
-
-    Adding 1.5 * 2^23 rounds to an integer in the low mantissa bits, which is then shifted into the exponent.
-    """
-    shifted = p + 12582912.0
-    f = p - (shifted - 12582912.0)
-    value = mi.Float(_EXP2[0])
-    for coefficient in _EXP2[1:]:
-        value = dr.fma(value, f, coefficient)
-    exponent = dr.reinterpret_array(mi.Int32, shifted) << 23  # pyright: ignore[reportOperatorIssue]
-    bits = dr.reinterpret_array(mi.Int32, value) + exponent
-    return dr.reinterpret_array(mi.Float, bits)
 
 
 def _floats(count: int, value: float = 0.0) -> list[Float]:
@@ -232,13 +230,15 @@ def _store(
 
 def _load(block: _Block, layout: Layout, images: list[Float]) -> list[list[Float]]:
     """Return every pixel's columns, and alpha if it is an output; zeros outside the image."""
-    pixels: list[list[Float]] = [[] for _ in range(block.area)]
-    for image, size in zip(images, layout.sizes, strict=True):
-        packets = (dr.gather(mi.Vector4f, image, place, active=inside) for place, inside in block.packets(size))
-        values = [value for packet in packets for value in packet]
-        for k, pixel in enumerate(pixels):
-            pixel += values[k * size : (k + 1) * size]
-    return pixels
+    loaded = (_load_image(block, size, image) for image, size in zip(images, layout.sizes, strict=True))
+    return [[value for values in pixel for value in values] for pixel in zip(*loaded, strict=True)]
+
+
+def _load_image(block: _Block, size: int, image: Float) -> list[list[Float]]:
+    """Return the `size` floats of every pixel in an image."""
+    packets = (dr.gather(mi.Vector4f, image, place, active=inside) for place, inside in block.packets(size))
+    values = [value for packet in packets for value in packet]
+    return [values[k : k + size] for k in range(0, len(values), size)]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -248,23 +248,27 @@ def _load(block: _Block, layout: Layout, images: list[Float]) -> list[list[Float
 
 def primal(layout: Layout, blocks: Blocks, records: Float, images: list[Float]) -> list[Float]:
     """Blend the records' columns into the channels' images, whose contents are overwritten."""
-    block, C = _Block(layout, blocks), layout.columns
+    block, G, C = _Block(layout, blocks), layout.geometry, layout.columns
 
-    def body(walk, end, x, y, T, sums, records, words, entries):
+    def body(walk, end, x, y, limits, T, sums, records, words, entries):
         rank, walk = _advance(walk, end, words, entries)
-        record = fetch_record(records, rank, GEOMETRY + C)
-        geometry, values = record[:GEOMETRY], record[GEOMETRY:]
+        record = fetch_record(records, rank, G + C)
+        geometry, values = record[:G], record[G:]
+        dx, dy = block.offsets(x, y, geometry)
+        cut = Cut(geometry[_SHAPE:], dx, dy, limits) if layout.cut else None
         T_next, sums_next = [], []
-        for k, (p, _) in enumerate(block.powers(*block.offsets(x, y, geometry), geometry)):
-            w = block.alpha(p)[0] * T[k]
+        for k, (p, _) in enumerate(block.powers(dx, dy, geometry)):
+            alpha, _ = block.alpha(p)
+            w = (cut.alpha(k, alpha).alpha if cut else alpha) * T[k]
             T_next.append(T[k] - w)
             sums_next.append([dr.fma(w, c, total) for c, total in zip(values, sums[k], strict=True)])
-        return walk, end, x, y, T_next, sums_next, records, words, entries
+        return walk, end, x, y, limits, T_next, sums_next, records, words, entries
 
     T, sums = _floats(block.area, 1.0), [_floats(C) for _ in range(block.area)]
-    state = (block.walk, block.end, block.x, block.y, T, sums, records, blocks.words, blocks.entries)
+    walk = (block.walk, block.end, block.x, block.y, block.limits)
+    state = (*walk, T, sums, records, blocks.words, blocks.entries)
     *_, T, sums, _, _, _ = dr.while_loop(
-        state, lambda walk, end, x, y, T, *_: block.continues(walk, T), body, label="blend"
+        state, lambda walk, end, x, y, limits, T, *_: block.continues(walk, T), body, label="blend"
     )
     return _store(block, layout, sums, [1 - t for t in T], images)
 
@@ -279,7 +283,7 @@ def primal(layout: Layout, blocks: Blocks, records: Float, images: list[Float]) 
 def adjoint(
     layout: Layout, ranks: int, blocks: Blocks, records: Float, images: list[Float], image_grads: list[Float]
 ) -> Float:
-    """Return dL/d(record) of `ranks` ranks, one record each: the six geometry floats, the columns, padding.
+    """Return dL/d(record) of `ranks` ranks, one record each: the geometry's floats, the columns, padding.
 
     Args:
         layout: description of the blend.
@@ -330,7 +334,7 @@ def adjoint_of_pairs(
 
 def pair_packets(layout: Layout) -> int:
     """Return the number of packets of 4 floats of a pair's gradient and rank."""
-    return (GEOMETRY + layout.columns) // 4 + 1
+    return (layout.geometry + layout.columns) // 4 + 1
 
 
 def _adjoint(
@@ -343,40 +347,52 @@ def _adjoint(
     target: Float,
     add: Callable[[Float, list[Float], UInt32, UInt32], None],
 ) -> Float:
-    block, C, geometric = _Block(layout, blocks), layout.columns, layout.reaches_weights
+    block, geometric = _Block(layout, blocks), layout.reaches_weights
+    G, C = layout.geometry, layout.columns
     gradients = _load(block, layout, image_grads)
     suffix = [
         _inner(g, v, layout, v[C] if layout.alpha else None)
         for g, v in zip(gradients, _load(block, layout, images), strict=True)
     ]
 
-    def body(walk, pair, end, x, y, T, S, g, records, words, entries, target):
+    def body(walk, pair, end, x, y, limits, T, S, g, records, words, entries, target):
         rank, walk = _advance(walk, end, words, entries)
-        record = fetch_record(records, rank, GEOMETRY + C)
-        geometry, values = record[:GEOMETRY], record[GEOMETRY:]
+        record = fetch_record(records, rank, G + C)
+        geometry, values = record[:G], record[G:]
         dx, dy = block.offsets(x, y, geometry)
+        cut = Cut(geometry[_SHAPE:], dx, dy, limits) if layout.cut else None
         T_next, S_next, value_grads = [], [], _floats(C)
         moments = _Moments(block)
         for k, (p, u) in enumerate(block.powers(dx, dy, geometry)):
             alpha, full = block.alpha(p)
-            w = alpha * T[k]
+            part = cut.alpha(k, alpha) if cut else None
+            w = (part.alpha if part else alpha) * T[k]
             value_grads = [dr.fma(w, g_c, total) for g_c, total in zip(g[k], value_grads, strict=False)]
             T_next.append(T[k] - w)
             if geometric:
                 gc = _inner(g[k], values, layout, None)
                 s = dr.fma(-w, gc, S[k])
                 S_next.append(s)
-                d = dr.fma(w, gc, -alpha * s * dr.rcp(1 - alpha))
+                if cut and part:
+                    d_alpha = dr.fma(T[k], gc, -s * dr.rcp(1 - part.alpha))
+                    cut.add(k, part, d_alpha)
+                    d = alpha * part.by_alpha * d_alpha
+                else:
+                    d = dr.fma(w, gc, -alpha * s * dr.rcp(1 - alpha))
                 moments.add(k, dr.select(full <= block.alpha_max, d, 0), u)
-        geometry_grads = moments.gradients(dx[0], dy[0], geometry) if geometric else _floats(GEOMETRY)
+        geometry_grads = moments.gradients(dx[0], dy[0], geometry) if geometric else _floats(G)
+        if cut and geometric:
+            mean_grads, profile_grads = cut.gradients()
+            moved = [a + b for a, b in zip(geometry_grads, mean_grads, strict=False)]
+            geometry_grads = [*moved, *geometry_grads[2:], *profile_grads]
         add(target, [*geometry_grads, *value_grads], rank, pair)
-        return walk, pair + 1, end, x, y, T_next, S_next, g, records, words, entries, target
+        return walk, pair + 1, end, x, y, limits, T_next, S_next, g, records, words, entries, target
 
     T, suffix = _floats(block.area, 1.0), suffix if geometric else []
-    walk = (block.walk, pair, block.end, block.x, block.y)
+    walk = (block.walk, pair, block.end, block.x, block.y, block.limits)
     state = (*walk, T, suffix, gradients, records, blocks.words, blocks.entries, target)
     *_, target = dr.while_loop(
-        state, lambda walk, pair, end, x, y, T, *_: block.continues(walk, T), body, label="blend (adjoint)"
+        state, lambda walk, pair, end, x, y, limits, T, *_: block.continues(walk, T), body, label="blend (adjoint)"
     )
     return target
 
@@ -416,7 +432,7 @@ class _Moments:
 
     def gradients(self, x0: Float, y0: Float, geometry: list[Float]) -> list[Float]:
         """Return the gradients of (mean_x, mean_y, a, b, c, log2_opacity); (x0, y0) is the first pixel's offset."""
-        _, _, a, b, c, _ = geometry
+        _, _, a, b, c, _ = geometry[:_SHAPE]
         du_dx, du_dy = dr.fma(self.du, x0, self.dui), dr.fma(self.du, y0, self.duj)
         d_dy = dr.fma(self.d, y0, self.dj)
         d_dy2 = dr.fma(y0, self.dj + d_dy, self.djj)
@@ -438,14 +454,15 @@ class _Moments:
 
 def tangent(layout: Layout, blocks: Blocks, records: Float, tangents: Float, images: list[Float]) -> list[Float]:
     """Write the directional derivative along the records' tangents to `images`, whose contents are overwritten."""
-    block, C = _Block(layout, blocks), layout.columns
+    block, G, C = _Block(layout, blocks), layout.geometry, layout.columns
 
-    def body(walk, end, x, y, T, dT, dsums, records, tangents, words, entries):
+    def body(walk, end, x, y, limits, T, dT, dsums, records, tangents, words, entries):
         rank, walk = _advance(walk, end, words, entries)
-        record, tangent = (fetch_record(r, rank, GEOMETRY + C) for r in (records, tangents))
-        geometry, values = record[:GEOMETRY], record[GEOMETRY:]
-        (a, b, c), (tx, ty, ta, tb, tc, t_log2) = geometry[2:5], tangent[:GEOMETRY]
+        record, tangent = (fetch_record(r, rank, G + C) for r in (records, tangents))
+        geometry, values = record[:G], record[G:]
+        (a, b, c), (tx, ty, ta, tb, tc, t_log2) = geometry[2:5], tangent[:_SHAPE]
         dx, dy = block.offsets(x, y, geometry)
+        cut = Cut(geometry[_SHAPE:], dx, dy, limits) if layout.cut else None
         T_next, dT_next, dsums_next = [], [], []
         for k, (p, u) in enumerate(block.powers(dx, dy, geometry)):
             px, py = dx[k % block.width], dy[k // block.width]
@@ -453,22 +470,26 @@ def tangent(layout: Layout, blocks: Blocks, records: Float, tangents: Float, ima
             tu, tv = ta * px + tb * py - a * tx - b * ty, tc * py - c * ty
             tp = t_log2 - 2 * (u * tu + c * py * tv)
             t_alpha = dr.select(full <= block.alpha_max, _LN2 * alpha * tp, 0)
+            if cut:
+                part = cut.alpha(k, alpha)
+                along = cut.tangent(k, part, [tx, ty], tangent[_SHAPE:G])
+                alpha, t_alpha = part.alpha, dr.fma(part.by_alpha, t_alpha, along)
             w, tw = alpha * T[k], dr.fma(t_alpha, T[k], alpha * dT[k])
             T_next.append(T[k] - w)
             dT_next.append(dT[k] - tw)
             dsums_next.append(
                 [
-                    dr.fma(w, tangent[GEOMETRY + i], dr.fma(tw, values[i], total) if attached else total)
+                    dr.fma(w, tangent[G + i], dr.fma(tw, values[i], total) if attached else total)
                     for i, (total, attached) in enumerate(zip(dsums[k], layout.attached, strict=True))
                 ]
             )
-        return walk, end, x, y, T_next, dT_next, dsums_next, records, tangents, words, entries
+        return walk, end, x, y, limits, T_next, dT_next, dsums_next, records, tangents, words, entries
 
     dsums = [_floats(C) for _ in range(block.area)]
     T, dT = _floats(block.area, 1.0), _floats(block.area)
-    walk = (block.walk, block.end, block.x, block.y)
+    walk = (block.walk, block.end, block.x, block.y, block.limits)
     state = (*walk, T, dT, dsums, records, tangents, blocks.words, blocks.entries)
-    _, _, _, _, _, dT, dsums, *_ = dr.while_loop(
-        state, lambda walk, end, x, y, T, *_: block.continues(walk, T), body, label="blend (tangent)"
+    _, _, _, _, _, _, dT, dsums, *_ = dr.while_loop(
+        state, lambda walk, end, x, y, limits, T, *_: block.continues(walk, T), body, label="blend (tangent)"
     )
     return _store(block, layout, dsums, [-t if layout.alpha_attached else mi.Float(0) for t in dT], images)

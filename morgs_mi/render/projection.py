@@ -9,6 +9,10 @@ A pixel at offset d = (dx, dy) from the splat's centre gets alpha = 2^p with
 where [a b; 0 c] is the Cholesky factor of the conic times log2(e) / 2. In this form p never exceeds
 log2(opacity), however thin the needle, and the only exponential in the pixel loop is 2^p.
 
+In screen coordinates and depth, the Gaussian has the covariance [UU' + eps2d I, U w'; w U', w w'] where w is the last
+row of R Q diag(s). Along the ray of a pixel it is a Gaussian in depth, with mean z + gx dx + gy dy where (gx, gy) =
+w U' (U U' + eps2d I)^-1, and a variance that is the same for all pixels: the ratio of the two determinants.
+
 No intermediate value overflows: U is computed in units of the splat's own size, and a Gaussian that the camera cannot
 see is projected from a substitute position, so that 0 * inf does not reach a gradient. x is summed in double precision:
 for scenes far from the origin, and cameras far from the scene, single precision would lose the digits that cancel.
@@ -29,12 +33,12 @@ from morgs_mi.core.types import Bool, Float, Jit, Tensor, UInt32
 from morgs_mi.render.channels import attribute_channels
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["Splats", "concatenated", "project"]
+__all__ = ["FARTHEST", "Splats", "concatenated", "project"]
 
 _HALF_LOG2E = 0.5 * log2(2.718281828459045)
 
 # World units; squares of what is farther overflow.
-_FARTHEST = 1e18
+FARTHEST = 1e18
 # A float32 rotation orients a needle to 1e-7 of its length at best: aspects below this are clamped.
 _THINNEST = 1e-6
 
@@ -51,6 +55,8 @@ class Splats:
         valid: False where culled: behind the near plane, too faint, or not finite.
         finite: False where an attribute, or a value computed from it, is not finite.
         order: splats in the order in which equal depths are blended; None: that of the input.
+        profile: (z, gx, gy, 1 / sigma), the Gaussian in depth along the ray of a pixel (see module docstring), world
+            units, differentiable; empty if no depth limit cuts the splats.
     """
 
     shape: tuple[Float, ...]
@@ -60,9 +66,15 @@ class Splats:
     valid: Bool
     finite: Bool
     order: UInt32 | None = None
+    profile: tuple[Float, ...] = ()
 
     def __len__(self) -> int:
         return dr.width(self.depths)
+
+    @property
+    def geometry(self) -> tuple[Float, ...]:
+        """The differentiable numbers that decide a splat's alpha at a pixel: `shape` and `profile`."""
+        return self.shape + self.profile
 
     def concatenated_with(self, other: Splats, order: UInt32 | None) -> Splats:
         """Return these splats followed by the others, blended in `order` where depths are equal."""
@@ -74,6 +86,7 @@ class Splats:
             concatenated(self.valid, other.valid),
             concatenated(self.finite, other.finite),
             order,
+            concatenated(self.profile, other.profile),
         )
 
 
@@ -95,6 +108,7 @@ def project(
     config: RenderConfig,
     rows: UInt32 | None = None,
     features: Tensor | None = None,
+    profile: bool = False,
 ) -> Splats:
     """Project Gaussians to the screen of `camera` and evaluate the requested channels.
 
@@ -105,6 +119,7 @@ def project(
         config: cut-offs.
         rows: indices of the Gaussians [M], without repetition; None: all N, in order.
         features: tensor [N, F] that the channel ``features`` blends.
+        profile: whether the splats get a `profile`.
 
     Returns:
         Splats of length M, differentiable in every attribute and in the camera's pose.
@@ -119,12 +134,13 @@ def project(
     world = [mi.Float64(v) for v in means]
     x, y, z = (mi.Float(dr.fma(a, world[0], dr.fma(b, world[1], dr.fma(c, world[2], t)))) for a, b, c, t in pose)
     probe = dr.detach(x + y + z)
-    front = dr.detach((z >= near) & (dr.maximum(dr.maximum(dr.abs(x), dr.abs(y)), z) < _FARTHEST))
+    front = dr.detach((z >= near) & (dr.maximum(dr.maximum(dr.abs(x), dr.abs(y)), z) < FARTHEST))
     x, y, z = dr.select(front, x, 0), dr.select(front, y, 0), dr.select(front, z, 1)
     rz = dr.rcp(z)
     mean_x, mean_y = dr.fma(fx, x * rz, cx), dr.fma(fy, y * rz, cy)
 
-    u0, u1, r_size = _screen_axes(x * rz, y * rz, fx * rz, fy * rz, R, quats, scales, limits)
+    u0, u1, w, r_focal, r_scale = _screen_axes(x * rz, y * rz, fx * rz, fy * rz, R, quats, scales, limits)
+    r_size = r_focal * r_scale
     eps = dr.maximum(config.eps2d * dr.square(r_size), _THINNEST**2)
     xx, yy, xy = dr.dot(u0, u0), dr.dot(u1, u1), dr.dot(u0, u1)
     # Lagrange's identity: det(U U' + eps I) without the cancellation that xx yy - xy^2 has for needles.
@@ -134,6 +150,7 @@ def project(
     a, b, c = s * yy * r_yy * r_det, -s * xy * r_yy * r_det, s * r_yy
     log2_opacity = dr.log2(dr.maximum(opacities, 1e-9))
     shape = (mean_x, mean_y, a, b, c, log2_opacity)
+    line = _depth_profile(z, (u0, u1, w), (xx, xy, yy), det, eps, r_focal, r_scale) if profile else ()
 
     blended: dict[str, tuple[Float, ...]] = {}
     attributes = attribute_channels()
@@ -154,11 +171,11 @@ def project(
     reach = dr.maximum(dr.detach(log2_opacity) - log2(config.alpha_min), 0)
     xx, yy = dr.detach(xx), dr.detach(yy)
     # Not finite where any of these values is not.
-    probe += sum(dr.detach(v) for v in (*shape, *(v for values in blended.values() for v in values)))
+    probe += sum(dr.detach(v) for v in (*shape, *line, *(v for values in blended.values() for v in values)))
     finite = dr.isfinite(probe)  # pyright: ignore[reportArgumentType, reportCallIssue]
     valid = front & (reach > 0) & finite  # pyright: ignore[reportOperatorIssue]
     extent = (dr.sqrt(reach * xx) / s, dr.sqrt(reach * yy) / s)
-    return Splats(shape, blended, dr.detach(z), extent, valid, finite)
+    return Splats(shape, blended, dr.detach(z), extent, valid, finite, profile=line)
 
 
 def _pose(viewmat: Tensor) -> tuple[list[list[Float]], list[list[Float]], list[Float]]:
@@ -203,10 +220,11 @@ def _rotation(quats: Jit) -> list[Jit]:
 
 def _screen_axes(
     tan_x: Float, tan_y: Float, jx: Float, jy: Float, R: list[list[Float]], quats: Jit, scales: Jit, limits: list[Float]
-) -> tuple[Jit, Jit, Float]:
-    """Return the rows of U = J R Q diag(s), two vectors [3] in units of the splat's size, and 1 / size in 1/px.
+) -> tuple[Jit, Jit, Jit, Float, Float]:
+    """Return the rows of U = J R Q diag(s) and w = R_z Q diag(s), three vectors [3], and their units.
 
-    The size, at least one pixel, is of the order of the largest entry of U.
+    U is in units of the splat's size on the screen, at least one pixel and of the order of the largest entry of U; w in
+    units of its size in the world. The units are returned as world units per px and 1 / world units.
     """
     # Outside the view the linearisation diverges: its point is clamped to 1.3 times the half view, as in 3DGS.
     lo_x, hi_x, lo_y, hi_y = limits
@@ -217,8 +235,33 @@ def _screen_axes(
     J0 = mi.Vector3f(*(jx * (R[0][k] - tan_x * R[2][k]) for k in range(3)))
     J1 = mi.Vector3f(*(jy * (R[1][k] - tan_y * R[2][k]) for k in range(3)))
     Q = _rotation(quats)
-    u0, u1 = (mi.Vector3f(*(dr.dot(J, Q[k]) * scales[k] for k in range(3))) for J in (J0, J1))
-    return u0, u1, r_focal * r_scale
+    z_axis = mi.Vector3f(*R[2])
+    u0, u1, w = (mi.Vector3f(*(dr.dot(J, Q[k]) * scales[k] for k in range(3))) for J in (J0, J1, z_axis))
+    return u0, u1, w, r_focal, r_scale
+
+
+def _depth_profile(
+    z: Float,
+    rows: tuple[Jit, Jit, Jit],
+    covariance: tuple[Float, Float, Float],
+    det: Float,
+    eps: Float,
+    r_focal: Float,
+    r_scale: Float,
+) -> tuple[Float, Float, Float, Float]:
+    """Return the depth z + gx dx + gy dy and the inverse standard deviation along rays, as (z, gx, gy, 1 / sigma).
+
+    The depth is that of the largest response along the ray in the affine approximation (RaDe-GS, Zhang et al. 2024).
+    """
+    (u0, u1, w), (xx, xy, yy) = rows, covariance
+    zx, zy = dr.dot(u0, w), dr.dot(u1, w)
+    slope = r_focal / det
+    # The determinant with the third row and column, as a sum of squares: differences would cancel for thin Gaussians.
+    across = dr.cross(u0, u1)
+    minors = dr.squared_norm(dr.cross(u0, w)) + dr.squared_norm(dr.cross(u1, w))
+    det3 = dr.square(dr.dot(across, w)) + eps * minors + eps * eps * dr.squared_norm(w)
+    r_sigma = r_scale * dr.rsqrt(dr.maximum(det3 / det, _THINNEST**2))
+    return z, slope * (yy * zx - xy * zy), slope * (xx * zy - xy * zx), r_sigma
 
 
 def _colors(direction: Jit, coeffs: list[Float]) -> tuple[Float, ...]:

@@ -21,7 +21,7 @@ from morgs_mi.render.blocks import build_lists, touches
 from morgs_mi.render.channels import NORMALISED, attribute_channels, channel_sizes
 from morgs_mi.render.compositing import Channel, Layout, blend
 from morgs_mi.render.config import RenderConfig
-from morgs_mi.render.projection import Splats, concatenated, project
+from morgs_mi.render.projection import FARTHEST, Splats, concatenated, project
 from morgs_mi.render.recording import with_render_lock
 from morgs_mi.render.region import Region, full_view
 
@@ -96,6 +96,7 @@ def rasterize(
     features: Tensor | np.ndarray | None = None,
     static_splats: Splats | None = None,
     config: RenderConfig | None = None,
+    depth_limit: Tensor | np.ndarray | None = None,
 ) -> Image:
     """Render Gaussians by depth-ordered alpha blending (eq. 1), differentiably.
 
@@ -116,6 +117,9 @@ def rasterize(
         features: [N, F], further values to blend like a colour, returned as `Image.features`; F is at most 12.
         static_splats: further splats of this view that are drawn and get no gradients; they must have the channels.
         config: cut-offs and block shape.
+        depth_limit: [H, W], the camera-space z of every pixel at which an opaque surface ends its ray, world units; inf
+            where there is none. Of a Gaussian around that depth, the part in front is drawn: the fraction of its
+            optical depth that the ray has passed. It gets no gradient. None: no limit, and no cost.
 
     Example:
         >>> image = morgs_mi.rasterize(gaussians, camera, channels=("color", "depth"))
@@ -127,7 +131,8 @@ def rasterize(
 
     Raises:
         ValueError: an unknown channel, a channel whose attribute is missing, NaN or infinite attributes or poses, a
-            region of another view or block shape, or a call inside a function under `dr.freeze`.
+            region of another view or block shape, `static_splats` together with a depth limit, a depth limit with
+            gradients enabled, or a call inside a function under `dr.freeze`.
 
     Equal depths are blended in the order of the input. A quaternion of length 0 is the identity. Gaussians nearer than
     the camera's near plane or beyond 1e18 units, and those that overflow float32 once projected, are not drawn.
@@ -144,26 +149,28 @@ def rasterize(
     if features is not None:
         features, sizes["features"] = _checked_features(features, gaussians)
         channels = (*channels, "features")
+    limits = None if depth_limit is None else _checked_limits(depth_limit, camera, static_splats)
     region = region or full_view(camera.width, camera.height, config)
     _check_region(region, camera, config)
     blended = tuple(c for c in channels if c != "alpha")
     if dr.prod(gaussians.means.shape[:1]) == 0:
         return _empty(channels, sizes, background, region)
+    cut = limits is not None
     if static_splats is not None:
         splats = project(gaussians, camera, blended, config, features=features).concatenated_with(static_splats, None)
     elif region.whole and active is None:
-        splats = project(gaussians, camera, blended, config, features=features)
+        splats = project(gaussians, camera, blended, config, features=features, profile=cut)
     else:
-        splats = _project_region(gaussians, camera, blended, region, active, features, config)
+        splats = _project_region(gaussians, camera, blended, region, active, features, config, cut)
     if splats is None:
         return _empty(channels, sizes, background, region)
-    dr.schedule(splats.shape, splats.channels, splats.depths, splats.extent, splats.valid)
+    dr.schedule(splats.geometry, splats.channels, splats.depths, splats.extent, splats.valid)
     _check_finite(splats.finite, gaussians, camera, features)
     values = [splats.channels[name] for name in blended]
     with dr.suspend_grad():
-        lists = build_lists(splats, [column for columns in values for column in columns], region, config)
-    layout = _layout(channels, sizes, background, detach_weights, config)
-    outputs = blend(splats.shape, values, region, lists, layout)
+        lists = build_lists(splats, [column for columns in values for column in columns], region, config, limits)
+    layout = _layout(channels, sizes, background, detach_weights, config, cut)
+    outputs = blend(splats.geometry, values, region, lists, layout, limits)
     images = dict(zip((*blended, "alpha", "coverage"), outputs, strict=False))
     coverage = images.pop("coverage", None)
     for name in blended:
@@ -195,6 +202,7 @@ def _project_region(
     active: Bool | np.ndarray | None,
     features: Tensor | None,
     config: RenderConfig,
+    profile: bool,
 ) -> Splats | None:
     """Project the Gaussians that touch the region; only those that are active are attached to the gradient graph."""
     detached, detached_features = dr.detach(gaussians), None if features is None else dr.detach(features)
@@ -209,7 +217,7 @@ def _project_region(
             chosen = _checked_active(active, int(gaussians.means.shape[0]))
             rows = [dr.compress(visible & chosen), dr.compress(visible & ~chosen)]
     parts = [
-        project(some, camera, channels, config, index, blended)
+        project(some, camera, channels, config, index, blended, profile)
         for some, blended, index in zip((gaussians, detached), (features, detached_features), rows, strict=False)
         if dr.width(index)
     ]
@@ -224,6 +232,7 @@ def _layout(
     background: Sequence[float] | None,
     detach_weights: Sequence[str],
     config: RenderConfig,
+    cut: bool,
 ) -> Layout:
     """Return the layout of the blend: its channels, and where their gradients go."""
     # Alpha itself, the channels that are divided by it, and the colour that is composited over the background.
@@ -233,7 +242,7 @@ def _layout(
         if name == "alpha" or name in NORMALISED or (name == "color" and background is not None)
     ]
     blended = tuple(Channel(sizes[name], name not in detach_weights) for name in channels if name != "alpha")
-    return Layout(blended, bool(read_alpha), any(name not in detach_weights for name in read_alpha), config)
+    return Layout(blended, bool(read_alpha), any(name not in detach_weights for name in read_alpha), config, cut)
 
 
 def _tensor(values: Float, region: Region, size: int) -> Tensor:
@@ -336,6 +345,29 @@ def _checked_features(features: Tensor | np.ndarray, gaussians: ActivatedGaussia
             "blend more in several calls."
         )
     return features, shape[1]
+
+
+def _checked_limits(depth_limit: Tensor | np.ndarray, camera: Camera, static_splats: Splats | None) -> Float:
+    """Return the depth limits [H W], finite: a limit at infinity is one beyond all Gaussians."""
+    limits: Tensor = float_tensor("rasterize()", "depth_limit", depth_limit)
+    expected = (camera.height, camera.width)
+    if tuple(limits.shape) != expected or dr.any(dr.isnan(limits.array)):
+        found = list(limits.shape) if tuple(limits.shape) != expected else "NaN"
+        raise ValueError(
+            f"rasterize(): `depth_limit` must be one depth per pixel, {list(expected)}, got {found}; use inf where "
+            "there is no surface."
+        )
+    if static_splats is not None:
+        raise ValueError(
+            "rasterize(): `depth_limit` must be None where `static_splats` are given, got both; their depth along a "
+            "ray is not stored."
+        )
+    if dr.grad_enabled(limits):
+        raise ValueError(
+            "rasterize(): `depth_limit` must not be attached to a gradient graph, because it gets no gradient, got "
+            "one with gradients enabled; pass dr.detach(depth_limit)."
+        )
+    return dr.clip(limits.array, -FARTHEST, FARTHEST)
 
 
 def _checked_active(active: Bool | np.ndarray, N: int) -> Bool:

@@ -18,7 +18,7 @@ from morgs_mi.core.types import Float, UInt32
 from morgs_mi.render.backend import block_shape
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["ACROSS", "DOWN", "NO_SLOT", "Region", "full_view", "quotient"]
+__all__ = ["ACROSS", "DOWN", "NO_SLOT", "Region", "full_view", "on_region", "quotient"]
 
 # Blocks of a tile, across and down: one for each bit of a word.
 ACROSS, DOWN = 4, 8
@@ -173,6 +173,23 @@ def quotient(lane: UInt32, divisor: int) -> UInt32:
     Adding half a step before the product rounds down correctly: it exceeds the rounding error of a double.
     """
     return mi.UInt32((mi.Float64(lane) + 0.5) * dr.opaque(mi.Float64, 1 / divisor))
+
+
+def on_region(values: Float, region: Region) -> Float:
+    """Return an image [H W] of one float per pixel as an image on the region, 0 outside the view."""
+    lane = dr.arange(mi.UInt32, region.num_pixels)
+    if region.whole:
+        row = quotient(lane, region.row)
+        x, y = lane - row * dr.opaque(mi.UInt32, region.row), row
+    else:
+        block = lane // (region.block[0] * region.block[1])
+        within = lane - block * (region.block[0] * region.block[1])
+        x = dr.gather(mi.UInt32, region.x, block) + within % region.block[0]
+        y = dr.gather(mi.UInt32, region.y, block) + within // region.block[0]
+    width, height = dr.opaque(mi.UInt32, region.width), dr.opaque(mi.UInt32, region.height)
+    image = dr.gather(mi.Float, values, y * width + x, active=(x < width) & (y < height))
+    dr.eval(image)
+    return image
 
 
 def full_view(width: int, height: int, config: RenderConfig) -> Region:

@@ -29,6 +29,7 @@ __all__ = [
     "Rig",
     "Scene",
     "check_scene",
+    "failures_in",
     "item_ids",
     "load_scene",
     "rotate",
@@ -152,13 +153,13 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
     module = importlib.util.module_from_spec(spec)
     # Dataclasses look up the names of their postponed annotations there.
     sys.modules[spec.name] = module
-    with _failures_in(path):
+    with failures_in(path):
         spec.loader.exec_module(module)
     build = getattr(module, "build", None)
     if not callable(build):
         raise ValueError(f"load_scene(): {path} must define `build(seed) -> Scene`; add that function.")
     _check_signature(path, build)
-    with _failures_in(path):
+    with failures_in(path):
         built = build(seed)
     if not isinstance(built, Scene):
         got = "None" if built is None else f"a {type(built).__name__}"
@@ -167,7 +168,7 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
 
 
 @contextmanager
-def _failures_in(path: Path) -> Iterator[None]:
+def failures_in(path: Path) -> Iterator[None]:
     """Raise `ValueError` with the line of the file at `path` for any error of the code in it."""
     try:
         yield

@@ -26,6 +26,8 @@ from tests.scenes.noise_capture import rig
             ("channel 'confidence' requires Gaussians with `logit_confidence`",),
         ),
         (["--camera", "0", "--output", "a.gif"], ("must be FILE.mp4, or a folder", "'.gif'")),
+        (["--camera", "0", "--insert", "no.xml"], ("no.xml", "expected a scene to insert")),
+        (["--camera", "0", "--at", "1"], ("--at selects frames of an inserted scene", "add --insert FILE")),
     ],
 )
 def test_render__rejects_bad_input_in_one_sentence(stream: Path, tmp_path: Path, run, args, parts) -> None:
@@ -39,6 +41,14 @@ def test_render__draws_a_stream_without_gaussians_black(tmp_path: Path, run) -> 
         writer.write(keyframe_packet(empty, 0))
     assert run("render", tmp_path / "s.morgs", "--camera", 0, "--output", tmp_path / "exr")[0] == 0
     assert not any(channel.any() for channel in read_exr(tmp_path / "exr" / "0000.exr").values())
+
+
+def test_render__inserts_a_scene_into_some_frames(stream: Path, tmp_path: Path, run) -> None:
+    (tmp_path / "ball.py").write_text('def build(frame, time):\n    return {"ball": {"type": "sphere"}}\n')
+    args = ("--camera", 0, "--insert", tmp_path / "ball.py", "--at", 1, "--samples", 1)
+    assert run("render", stream, *args, "--output", tmp_path / "exr")[0] == 0
+    assert [path.name for path in (tmp_path / "exr").iterdir()] == ["0001.exr"]
+    assert {"R", "A", "depth.Y"} <= read_exr(tmp_path / "exr" / "0001.exr").keys()
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "exr", "png"])

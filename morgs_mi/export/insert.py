@@ -1,0 +1,224 @@
+"""A Mitsuba scene inserted into a stream: its objects stand among the Gaussians of every frame.
+
+A scene is an XML file, which is the same in all frames, or a Python file with a function
+
+    build(frame: int, time: float) -> dict
+
+that returns the entries of a Mitsuba scene: shapes, emitters, and optionally an `integrator` for them. The time is in
+seconds. World space and its units are those of the stream.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.codec.packets import play
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import check_number
+from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.export.clips import frame_numbers
+from morgs_mi.gaussian_integrator import ellipsoids
+from morgs_mi.playback.player import available_channels
+from morgs_mi.render.channels import exr_names
+from morgs_mi.render.rasterize import rasterize
+from morgs_mi.surfaces.light_probe import light_probe
+from morgs_mi.surfaces.shadows import shadow_ratio, shadowed
+from morgs_mi.surfaces.surface_view import lights
+from morgs_mi.synth.scene import failures_in
+
+__all__ = ["LAYERS", "captured_light", "inserted_channels", "load_insert", "render_inserted", "selected"]
+
+LAYERS = ("splats", "surfaces", "shadow")
+"""Further channels, for compositing: the splats alone and the surfaces alone, in linear light with alpha, and the
+shadow of the surfaces on the splats, a factor of their linear light."""
+
+Build = Callable[[int, float], dict[str, Any]]
+
+
+def load_insert(path: str | Path) -> Build:
+    """Return the function (frame, seconds) -> entries of a Mitsuba scene of an XML or Python file.
+
+    Raises:
+        ValueError: there is no such file, it is of another type, or it fails; the sentence names the file, and the line
+            of a Python file.
+    """
+    path = Path(path)
+    if path.suffix not in (".xml", ".py") or not path.is_file():
+        found = f"{path.suffix!r}" if path.is_file() else "none"
+        raise ValueError(f"{path}: expected a scene to insert, FILE.xml or FILE.py, got {found}; check the path.")
+    if path.suffix == ".xml":
+        entries = _xml_entries(path)
+        return lambda frame, time: entries
+    spec = importlib.util.spec_from_file_location(f"morgs_mi_insert_{path.stem}", path)
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    with failures_in(path):
+        spec.loader.exec_module(module)
+    build = getattr(module, "build", None)
+    if not callable(build):
+        raise ValueError(
+            f"{path}: expected a function `build(frame, time)` that returns the entries of a Mitsuba scene, found "
+            "none; add it."
+        )
+
+    def checked(frame: int, time: float) -> dict[str, Any]:
+        with failures_in(path):
+            entries = build(frame, time)
+            if not isinstance(entries, dict):
+                raise TypeError(f"`build` must return a dict, got a {type(entries).__name__}")
+            return entries
+
+    return checked
+
+
+def inserted_channels(stream: StreamReader) -> tuple[str, ...]:
+    """Return all channels of a stream with an inserted scene, for EXR files.
+
+    Raises:
+        ValueError: a broken packet, or no frame.
+    """
+    frame_numbers(stream)
+    _, gaussians = next(iter(play(stream)))
+    return ("color", "alpha", *(name for name in available_channels(gaussians) if name != "color"), *LAYERS)
+
+
+def selected(stream: StreamReader, frames: Sequence[int]) -> list[int]:
+    """Return `frames` in ascending order, each once.
+
+    Raises:
+        ValueError: the stream does not have one of them.
+    """
+    numbers = frame_numbers(stream)
+    missing = sorted(set(frames) - set(numbers))
+    if missing:
+        raise ValueError(
+            f"{stream.path}: the frames must be out of {numbers[0]} to {numbers[-1]}, got {missing[0]}; choose others."
+        )
+    return sorted(set(frames))
+
+
+def render_inserted(
+    stream: StreamReader,
+    camera: Camera,
+    build: Build,
+    frames: Sequence[int] | None = None,
+    channels: Sequence[str] = ("color",),
+    samples: int = 16,
+    shadows: bool = True,
+) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    """Render frames of a stream for one camera with a Mitsuba scene inserted.
+
+    An inserted scene without emitters is lit by the Gaussians, see `captured_light`.
+
+    Args:
+        stream: the file.
+        camera: any view.
+        build: see `load_insert`.
+        frames: indices of the frames to render; None: all.
+        channels: out of ``color``, ``alpha``, the AOVs of `gaussian_splat`, and `LAYERS`.
+        samples: samples per pixel of the inserted surfaces.
+        shadows: whether they throw shadows on the Gaussians, see `shadow_ratio`.
+
+    Yields:
+        (frame, images) as `render_stream` does.
+
+    Raises:
+        ValueError: a broken packet, or a scene that Mitsuba or `gaussian_splat` refuses.
+    """
+    check_number("render_inserted()", "samples", samples, "[1, inf)")
+    for frame, gaussians in play(stream):
+        if frames is None or frame in frames:
+            yield frame, _render(gaussians, camera, build(frame, frame / stream.fps), channels, samples, shadows)
+
+
+def captured_light(gaussians: Gaussians, camera: Camera, position: np.ndarray) -> dict[str, Any]:
+    """Return the `light_probe` at a point, where directions without Gaussians have the mean colour of a view.
+
+    A capture rarely shows what is behind the cameras; black there would take half of the light away.
+    """
+    color = np.asarray(rasterize(gaussians, camera, ("color",)).color)
+    return light_probe(gaussians, position, background=np.clip(color, 0, 1).mean((0, 1)).tolist())
+
+
+def _render(
+    gaussians: Gaussians,
+    camera: Camera,
+    entries: dict[str, Any],
+    channels: Sequence[str],
+    samples: int,
+    shadows: bool,
+) -> dict[str, np.ndarray]:
+    entries = {name: value for name, value in entries.items() if name not in ("type", "sensor")}
+    nested = entries.pop("integrator", {"type": "path"})
+    nested = mi.load_dict(nested) if isinstance(nested, dict) else nested
+    ratio = np.ones(len(gaussians), np.float32)
+    try:
+        inserted: Any = mi.load_dict({"type": "scene", **entries})
+        if not (inserted.shapes() or inserted.emitters()):
+            raise ValueError("The inserted scene: expected at least one shape, got none; add one.")
+        if not inserted.emitters():
+            light = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel())
+            inserted = mi.load_dict({"type": "scene", **entries, "captured light": light})
+        if shadows:
+            ratio = shadow_ratio(gaussians, inserted, camera.position)
+        images = _plugin_images(shadowed(gaussians, ratio), camera, inserted, nested, channels, samples)
+        if "surfaces" in channels:
+            images["surfaces"] = np.asarray(nested.render(inserted, _sensor(camera), spp=samples))
+    except RuntimeError as error:
+        raise ValueError(f"The inserted scene: {str(error).strip().splitlines()[0]}") from error
+    if {"splats", "shadow"} & set(channels):
+        alone, dark = (rasterize(part, camera) for part in (gaussians, shadowed(gaussians, ratio)))
+        light, less = (srgb_to_linear(np.asarray(image.color)) for image in (alone, dark))
+        images["splats"] = np.concatenate([light, np.asarray(alone.alpha)], axis=2)
+        images["shadow"] = np.where(light > 0, less / np.maximum(light, 1e-6), 1)
+    return {name: images[name].astype(np.float32) for name in channels}
+
+
+def _plugin_images(
+    gaussians: Gaussians, camera: Camera, inserted: Any, nested: Any, channels: Sequence[str], samples: int
+) -> dict[str, np.ndarray]:
+    """Return the colour, alpha and AOVs of `gaussian_splat` with an inserted scene."""
+    aovs = [name for name in channels if name not in ("color", "alpha", *LAYERS)]
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "gaussians": ellipsoids(gaussians),
+            "sensor": _sensor(camera),
+            "integrator": {"type": "gaussian_splat", "surfaces": nested, "aovs": ",".join(aovs)},
+            **{f"part{i}": part for i, part in enumerate(_parts(inserted))},
+        }
+    )
+    image = np.asarray(scene.integrator().render(scene, spp=samples))
+    images, first = {"color": linear_to_srgb(image[..., :3]), "alpha": image[..., 3:4]}, 4
+    for name in aovs:
+        size = len(exr_names(name))
+        images[name] = image[..., first : first + size]
+        first += size
+    return images
+
+
+def _sensor(camera: Camera) -> Any:
+    return mi.load_dict(camera.sensor(pixel_format="rgba"))
+
+
+def _xml_entries(path: Path) -> dict[str, Any]:
+    """Return the shapes, lights and integrator of a scene file."""
+    try:
+        scene: Any = mi.load_file(str(path))
+    except RuntimeError as error:
+        raise ValueError(f"{path}: {str(error).strip().splitlines()[0]}; correct the scene file.") from error
+    return {**{f"part{i}": part for i, part in enumerate(_parts(scene))}, "integrator": scene.integrator()}
+
+
+def _parts(scene: Any) -> list[Any]:
+    """Return the shapes of a scene, and its emitters that are not on one."""
+    return [*scene.shapes(), *lights(scene)]

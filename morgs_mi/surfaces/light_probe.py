@@ -1,0 +1,129 @@
+"""The light of a captured scene at a point, as an environment map (image-based lighting, Debevec 1998).
+
+The Gaussians around the point are rendered into the six faces of a cube, decoded to linear light and resampled to
+latitude and longitude. Display-referred video stores at most 1: what was brighter is guessed, see `light_probe`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import cv2
+import mitsuba as mi
+import numpy as np
+from numpy.typing import ArrayLike
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import check_number, numbers
+from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.core.gaussians import ActivatedGaussians
+from morgs_mi.render.rasterize import rasterize
+
+__all__ = ["light_probe"]
+
+# Direction and up of the faces of the cube.
+_FACES = [
+    ((1, 0, 0), (0, 1, 0)),
+    ((-1, 0, 0), (0, 1, 0)),
+    ((0, 1, 0), (0, 0, 1)),
+    ((0, -1, 0), (0, 0, 1)),
+    ((0, 0, 1), (0, 1, 0)),
+    ((0, 0, -1), (0, 1, 0)),
+]
+# Pixels beyond each edge of a face, for interpolation.
+_MARGIN = 2
+# Display-referred value above which a colour counts as clipped in part; at 1 it does entirely.
+_KNEE = 0.95
+
+
+def light_probe(
+    gaussians: ActivatedGaussians,
+    position: ArrayLike,
+    height: int = 256,
+    background: Sequence[float] | None = None,
+    clipped: float = 4.0,
+    near: float = 0.01,
+) -> dict[str, Any]:
+    """Return the dictionary of a Mitsuba `envmap` emitter with the light that Gaussians send to a point.
+
+    It stands for a scene at infinity: the light is that of `position` everywhere. Place it in the middle of the object
+    that it lights, and make one for every frame.
+
+    Args:
+        gaussians: N Gaussians, whose colours are sRGB-encoded.
+        position: the point [3], world units.
+        height: rows of the map, which has twice as many columns.
+        background: display-referred colour [3] behind all Gaussians; None: black.
+        clipped: radiance of colours that the video clipped at 1. The default of two stops above white is a guess; 1
+            takes the video as it is. Between display-referred 0.95 and 1, the radiance rises to this.
+        near: Gaussians nearer to the point than this are left out, world units: those inside the object.
+
+    Example:
+        >>> scene = mi.load_dict({"type": "scene", "gaussians": morgs_mi.ellipsoids(gaussians),
+        ...                       "light": morgs_mi.light_probe(gaussians, (0, 1, 0)), "ball": ball,
+        ...                       "sensor": camera.sensor(),
+        ...                       "integrator": {"type": "gaussian_splat", "surfaces": {"type": "path"}}})
+
+    Raises:
+        ValueError: a position that is not [3] and finite, and numbers out of range.
+    """
+    place = "light_probe()"
+    check_number(place, "height", height, "[4, 8192]")
+    check_number(place, "clipped", clipped, "[1, inf)")
+    center = numbers(place, "position", position).astype(np.float64)
+    if center.shape != (3,) or not np.isfinite(center).all():
+        raise ValueError(f"{place}: `position` must be [3] and finite, got {center.tolist()}; pass x, y and z.")
+    directions = _directions(int(height))
+    # A face has as many pixels per degree as the map.
+    size = max(int(height) // 2, 4)
+    faces = [_face(gaussians, center, face, size, background, near) for face in _FACES]
+    color = _resampled(faces, directions)
+    return {"type": "envmap", "bitmap": mi.Bitmap(_radiance(color, clipped))}
+
+
+def _directions(height: int) -> np.ndarray:
+    """Return the directions [H, 2 H, 3] of the texels of an `envmap`, whose first and last rows are the poles."""
+    theta = np.pi * np.arange(height)[:, None] / (height - 1)
+    phi = 2 * np.pi * (np.arange(2 * height) + 0.5) / (2 * height)
+    x, z = np.sin(theta) * np.sin(phi), -np.sin(theta) * np.cos(phi)
+    return np.stack([x, np.broadcast_to(np.cos(theta), x.shape), z], axis=-1)
+
+
+def _face(
+    gaussians: ActivatedGaussians,
+    center: np.ndarray,
+    axes: tuple[tuple[int, ...], tuple[int, ...]],
+    size: int,
+    background: Sequence[float] | None,
+    near: float,
+) -> tuple[Camera, np.ndarray]:
+    """Return the camera of a face of the cube, with a margin, and its display-referred colour."""
+    forward, up = (np.array(axis, float) for axis in axes)
+    width = size + 2 * _MARGIN
+    fov = np.rad2deg(2 * np.arctan(width / size))
+    camera = Camera.look_at(center, center + forward, up, fov, width, width, near=near)
+    return camera, np.asarray(rasterize(gaussians, camera, ("color",), background).color)
+
+
+def _resampled(faces: list[tuple[Camera, np.ndarray]], directions: np.ndarray) -> np.ndarray:
+    """Return the colour [H, W, 3] in every direction, interpolated on the face that it meets."""
+    axis = np.abs(directions).argmax(-1)
+    largest = np.take_along_axis(directions, axis[..., None], axis=-1)[..., 0]
+    face_of = 2 * axis + (largest < 0)
+    result = np.zeros((*directions.shape[:2], 3), np.float32)
+    for k, (camera, color) in enumerate(faces):
+        # What other faces show may be behind this camera.
+        on_face = (face_of == k)[..., None]
+        forward = np.asarray(camera.viewmat)[2, :3]
+        pixels, _ = camera.project(camera.position + np.where(on_face, directions, forward))
+        x, y = (pixels[..., i].astype(np.float32) - 0.5 for i in range(2))
+        result = np.where(on_face, cv2.remap(color, x, y, cv2.INTER_LINEAR), result)
+    return result
+
+
+def _radiance(color: np.ndarray, clipped: float) -> np.ndarray:
+    """Return the linear light of display-referred colours, those that are clipped scaled up to `clipped`."""
+    position = np.clip((color.max(-1, keepdims=True) - _KNEE) / (1 - _KNEE), 0, 1)
+    radiance = srgb_to_linear(color) * (1 + (clipped - 1) * position**2 * (3 - 2 * position))
+    return radiance.astype(np.float32)

@@ -1,0 +1,243 @@
+"""The surfaces of a Mitsuba scene as one camera sees them, rendered by one of Mitsuba's own integrators.
+
+The scene's shapes that are no Gaussians are put into a scene of their own, which shares the objects: gradients of a
+nested integrator such as `prb` reach the parameters of the whole scene.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.types import Float, Tensor, UInt32
+
+__all__ = ["SurfaceView", "lights", "shared_scene", "surface_scene"]
+
+_log = logging.getLogger(__name__)
+
+# Rays along each axis of a pixel that find its coverage and depth.
+_GRID = 3
+
+
+def surface_scene(scene: Any) -> Any:
+    """Return a scene of the surfaces and emitters of `scene`, or None if it has neither surfaces nor an environment.
+
+    It shares the shapes, emitters and materials with `scene`, and is built for their current state.
+
+    Raises:
+        ValueError: there is no emitter, or a surface has no BSDF or is the boundary of a volume.
+    """
+    surfaces = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
+    if not surfaces and scene.environment() is None:
+        return None
+    if not scene.emitters():
+        raise ValueError(
+            "gaussian_splat: expected an emitter that lights the surfaces, got none; add one to the scene, such as an "
+            "`envmap` of morgs_mi.light_probe()."
+        )
+    for shape in surfaces:
+        if shape.is_medium_transition():
+            raise ValueError(
+                f"gaussian_splat: expected surfaces, got {shape.class_name()} {shape.id()!r}, the boundary of a "
+                "medium; remove the medium, because splats have no place in the order of a volume's light."
+            )
+        if shape.bsdf() is None:
+            raise ValueError(
+                f"gaussian_splat: the {shape.class_name()} {shape.id()!r} must have a BSDF, got none; set `bsdf` "
+                "where the shape is defined."
+            )
+    return shared_scene([*surfaces, *lights(scene)], scene)
+
+
+def lights(scene: Any) -> list[Any]:
+    """Return the emitters of a scene that are not on one of its surfaces, which come with those."""
+    return [emitter for emitter in scene.emitters() if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
+
+
+def shared_scene(parts: list[Any], whole: Any) -> Any:
+    """Return a scene of some shapes and emitters of a whole scene, which stays as it is.
+
+    A new scene names its parts, and sets the extent of an environment to its own; both are set back.
+    """
+    names = [part.id() for part in parts]
+    scene = mi.load_dict({"type": "scene", **{f"part{i}": part for i, part in enumerate(parts)}})
+    for part, name in zip(parts, names, strict=True):
+        part.set_id(name)
+        if isinstance(part, mi.Emitter):
+            part.set_scene(whole)
+    return scene
+
+
+@contextmanager
+def _detached(shapes: list[Any]) -> Iterator[None]:
+    """Detach the parameters of shapes meanwhile.
+
+    Calls of Mitsuba's virtual functions are traced for all shapes that exist, of any scene. In forward mode `prb` would
+    depend on shapes that its scene does not have, and fail.
+    """
+    attached = []
+    for shape in shapes:
+        params: Any = mi.traverse(shape)
+        attached += [(params, key, params[key]) for key in params.keys() if dr.grad_enabled(params[key])]  # noqa: SIM118
+    for params, key, value in attached:
+        params[key] = dr.detach(value)
+    try:
+        yield
+    finally:
+        for params, key, value in attached:
+            params[key] = value
+
+
+@dataclass(frozen=True)
+class SurfaceView:
+    """Surfaces as seen by one camera, P pixels row by row.
+
+    Attributes:
+        scene: the surfaces, see `surface_scene`.
+        gaussians: the other shapes.
+        integrator: renders them.
+        sensor: the camera, with a film of those pixels.
+        seed: of the integrator's samples.
+        spp: samples per pixel.
+        image: radiance and alpha of the nested integrator [h, w, 4], in linear light, a leaf of the gradient graph.
+        coverage: fraction of each pixel in which a surface is seen [P], in [0, 1].
+        depth: mean camera-space z of what is seen there [P], world units; inf where there is no surface.
+        behind: radiance of the environment at the pixels' centres, three floats [P], differentiable; None if there is
+            none, or the integrator hides it.
+    """
+
+    scene: Any
+    gaussians: list[Any]
+    integrator: Any
+    sensor: Any
+    seed: int
+    spp: int
+    image: Tensor
+    coverage: Float
+    depth: Float
+    behind: list[Float] | None
+
+    @staticmethod
+    def of(
+        whole: Any,
+        integrator: Any,
+        camera: Camera,
+        crop: tuple[int, int, int, int],
+        template: Any,
+        seed: int,
+        spp: int,
+    ) -> SurfaceView | None:
+        """Render the surfaces of a scene, or return None if it has neither surfaces nor an environment.
+
+        Args:
+            whole: scene of Gaussians and surfaces.
+            integrator: renders them.
+            camera: the view.
+            crop: its pixels that are rendered, (x, y, width, height).
+            template: sensor with the sampler and the far plane.
+            seed: of the integrator's samples.
+            spp: its samples per pixel; 0: those of the sampler.
+
+        Raises:
+            ValueError: as for `surface_scene`.
+        """
+        scene = surface_scene(whole)
+        if scene is None:
+            return None
+        gaussians = [shape for shape in whole.shapes() if shape.is_ellipsoids()]
+        x, y, width, height = crop
+        area = {"crop_offset_x": x, "crop_offset_y": y, "crop_width": width, "crop_height": height}
+        params: Any = mi.traverse(template)
+        more = {"far_clip": float(params["far_clip"]), "sampler": template.sampler()}
+        sensor = mi.load_dict({**camera.sensor(pixel_format="rgba", **area), **more})
+        sampler = template.sampler().clone()
+        sampler.set_sample_count(spp or sampler.sample_count())
+        spp = sampler.sample_count()  # some samplers round it up
+        with dr.suspend_grad():
+            image = mi.TensorXf(integrator.render(scene, sensor, seed=seed, spp=spp))
+            coverage, depth = _depth(scene, sensor)
+        dr.enable_grad(image)
+        shown = scene.environment() is not None and not getattr(integrator, "hide_emitters", False)
+        behind = _environment(scene, sensor) if shown else None
+        return SurfaceView(scene, gaussians, integrator, sensor, seed, spp, image, coverage, depth, behind)
+
+    def forward(self, params: Any) -> None:
+        """Set the tangents of `image` from those of the surfaces' parameters."""
+        if self._differentiates():
+            with _detached(self.gaussians):
+                tangent = self.integrator.render_forward(self.scene, params, self.sensor, seed=self.seed, spp=self.spp)
+            dr.set_grad(self.image, tangent)
+
+    def backward(self, params: Any) -> None:
+        """Add to the gradients of the surfaces' parameters those that follow from the gradient of `image`.
+
+        Its samples are others than those of `image`: where an image is no linear function of the radiance, the product
+        of two noisy factors would be biased.
+        """
+        if self._differentiates():
+            seed, _ = mi.sample_tea_32(self.seed, 1)
+            grad = dr.grad(self.image)
+            self.integrator.render_backward(self.scene, params, grad, self.sensor, seed=seed, spp=self.spp)
+
+    def _differentiates(self) -> bool:
+        """Return whether any parameter of the surfaces is differentiated."""
+        params: Any = mi.traverse(self.scene)
+        attached = [key for key in params.keys() if dr.grad_enabled(params[key])]  # noqa: SIM118
+        moving = [key for key in attached if params.flags(key) & mi.ParamFlags.Discontinuous]
+        if moving:
+            _log.warning(
+                "gaussian_splat: gradients of the surfaces' positions lack what changes with their silhouettes and "
+                "depth; do not optimise `%s` with it.",
+                "`, `".join(moving),
+            )
+        return bool(attached)
+
+    @property
+    def mask(self) -> np.ndarray:
+        """The pixels in which a surface is seen, bool [h, w]."""
+        return np.array(self.coverage > 0).reshape(self.image.shape[:2])
+
+
+def _depth(scene: Any, sensor: Any) -> tuple[Float, Float]:
+    """Return the coverage and the mean depth z of the surfaces in every pixel, by rays through a regular grid."""
+    pixel = dr.arange(mi.UInt32, int(dr.prod(sensor.film().crop_size())))
+    params: Any = mi.traverse(sensor)
+    to_camera = params["to_world"].inverse()
+
+    def cast(k: UInt32, count: Float, total: Float) -> tuple[UInt32, Float, Float]:
+        rays = _rays(sensor, pixel, (mi.Vector2f(k % _GRID, k // _GRID) + 0.5) / _GRID)
+        found = scene.ray_intersect_preliminary(rays, coherent=True)
+        hit = found.is_valid()
+        z = (to_camera @ rays(dr.select(hit, found.t, 0))).z
+        return k + 1, count + dr.select(hit, mi.Float(1), 0), total + dr.select(hit, z, 0)
+
+    state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
+    _, count, total = dr.while_loop(state, lambda k, *_: k < _GRID**2, cast, label="coverage")
+    coverage, depth = count / _GRID**2, dr.select(count > 0, total / count, dr.inf)
+    dr.eval(coverage, depth)
+    return coverage, depth
+
+
+def _environment(scene: Any, sensor: Any) -> list[Float]:
+    """Return the radiance of the environment behind every pixel's centre."""
+    pixel = dr.arange(mi.UInt32, int(dr.prod(sensor.film().crop_size())))
+    rays = _rays(sensor, pixel, mi.Point2f(0.5))
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(pixel))
+    si.wi, si.wavelengths = -rays.d, rays.wavelengths
+    return list(mi.unpolarized_spectrum(scene.environment().eval(si)))
+
+
+def _rays(sensor: Any, pixel: UInt32, inside: Any) -> Any:
+    """Return rays through the positions `inside` [0, 1]^2 of pixels of a sensor's film, numbered row by row."""
+    width, height = (dr.opaque(mi.UInt32, int(size)) for size in sensor.film().crop_size())
+    row = pixel // width
+    position = (mi.Vector2f(pixel - row * width, row) + inside) / mi.Vector2f(width, height)
+    return sensor.sample_ray(0.0, 0.5, position, mi.Point2f(0.5))[0]

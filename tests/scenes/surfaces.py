@@ -1,0 +1,67 @@
+"""Mitsuba scenes of Gaussians among surfaces, seen along +z from z = -4."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi import Camera, Gaussians, ellipsoids
+from tests.scenes.cameras import look_at_cameras
+from tests.scenes.gaussians import isotropic
+
+COLOR = (0.6, 0.3, 0.1)
+
+
+def camera(width: int = 32, height: int = 24, fov: float = 45.0) -> Camera:
+    """Return the camera of these scenes."""
+    return look_at_cameras([(0, 0, -4)], fov, width, height)[0]
+
+
+def cloud(z: float = 0.0, n: int = 40, seed: int = 3, opacity: float = 0.7) -> Gaussians:
+    """Return small Gaussians of random colours in a square at depth z."""
+    rng = np.random.default_rng(seed)
+    means = np.stack([*rng.uniform(-1.2, 1.2, (2, n)), np.full(n, z)], axis=1)
+    return isotropic(means, 0.1, opacity, rng.uniform(-1, 1, (n, 1, 3)))
+
+
+def wall(z: float, size: float = 5.0, **entries: Any) -> dict[str, Any]:
+    """Return a square of half width `size` at depth z that faces the camera."""
+    transform = mi.ScalarTransform4f().translate([0, 0, z]).rotate([0, 1, 0], 180).scale(size)
+    return {"type": "rectangle", "to_world": transform, **(entries or {"bsdf": {"type": "diffuse"}})}
+
+
+def glowing(color: Any = COLOR) -> dict[str, Any]:
+    """Return the entries of a black shape that emits linear light of a colour, without noise."""
+    emitter = {"type": "area", "radiance": {"type": "rgb", "value": list(color)}}
+    return {"bsdf": {"type": "diffuse", "reflectance": 0.0}, "emitter": emitter}
+
+
+LAMP = {"type": "point", "position": [1.0, -2.0, -3.0], "intensity": {"type": "rgb", "value": [20.0, 18.0, 16.0]}}
+
+
+def scene(
+    gaussians: Gaussians,
+    surfaces: str | dict = "path",
+    film: dict | None = None,
+    view: Camera | None = None,
+    **more: Any,
+) -> Any:
+    """Return the scene of Gaussians and `more`, with the plugin's nested integrator `surfaces`, and its `props`."""
+    props = more.pop("props", {})
+    nested = {"type": surfaces, "max_depth": 2} if isinstance(surfaces, str) else surfaces
+    return mi.load_dict(
+        {
+            "type": "scene",
+            "gaussians": ellipsoids(gaussians),
+            "sensor": (view or camera()).sensor(**(film or {})),
+            "integrator": {"type": "gaussian_splat", "surfaces": nested, **props},
+            **more,
+        }
+    )
+
+
+def render(scene: Any, spp: int = 4, **more: Any) -> np.ndarray:
+    """Return the image of a scene in float64."""
+    return np.asarray(mi.render(scene, spp=spp, **more), np.float64)

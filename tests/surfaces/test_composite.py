@@ -1,0 +1,276 @@
+"""Gaussians among surfaces: closed forms of the image, its derivatives, and bad scenes."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi import Gaussians, rasterize
+from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
+from tests import tolerances as tol
+from tests.assertions import assert_close
+from tests.scenes.gaussians import isotropic
+from tests.scenes.surfaces import COLOR, LAMP, camera, cloud, glowing, render, scene, wall
+
+
+def splats(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+    """Return the display-referred colour and the transmittance of Gaussians alone."""
+    image = rasterize(gaussians, camera())
+    return np.asarray(image.color, np.float64), 1 - np.asarray(image.alpha, np.float64)
+
+
+def over(gaussians: Gaussians, linear: Any) -> np.ndarray:
+    """Return Gaussians over linear light, blended display-referred, as linear light."""
+    color, transmittance = splats(gaussians)
+    return srgb_to_linear(color + transmittance * linear_to_srgb(np.asarray(linear)))
+
+
+def test_surfaces__in_front_equal_themselves_alone():
+    wanted = mi.load_dict(
+        {
+            "type": "scene",
+            "sensor": camera().sensor(),
+            "integrator": {"type": "path", "max_depth": 3},
+            "ball": {"type": "sphere", "center": [0.2, 0, -1], "radius": 0.6, "bsdf": {"type": "diffuse"}},
+            "wall": wall(-0.2),
+            "lamp": LAMP,
+        }
+    )
+    path = {"type": "path", "max_depth": 3}
+    shapes = {f"shape{i}": shape for i, shape in enumerate(wanted.shapes())}
+    found = scene(cloud(0.3), path, lamp=LAMP, **shapes)
+    assert_close(render(found, seed=1), render(wanted, seed=1), atol=tol.IMAGE_ABS)
+
+
+def test_surfaces__alone_keep_their_antialiased_outline():
+    """Where there are no splats, the image is the nested integrator's, also in pixels that it covers in part."""
+    shapes = {
+        "ball": {"type": "sphere", "center": [0, 0, 0], "radius": 0.7},
+        "sky": {"type": "constant", "radiance": 0.4},
+    }
+    wanted = mi.load_dict({"type": "scene", "sensor": camera().sensor(), "integrator": {"type": "path"}, **shapes})
+    found = scene(isotropic([(0, 0, -90)], 0.1, 0.5), {"type": "path"}, **shapes)
+    assert_close(render(found, seed=1), render(wanted, seed=1), atol=tol.IMAGE_ABS)
+
+
+def test_surfaces__behind_show_through_the_splats():
+    gaussians = cloud(0.0)
+    assert_close(render(scene(gaussians, wall=wall(1, **glowing()))), over(gaussians, COLOR), atol=tol.IMAGE_ABS)
+    black = {"bsdf": {"type": "diffuse", "reflectance": 0.0}}
+    found = render(scene(gaussians, wall=wall(1, **black), lamp=LAMP))
+    assert_close(found, srgb_to_linear(splats(gaussians)[0]), atol=tol.IMAGE_ABS)
+
+
+def test_surfaces__between_splats_hide_those_behind():
+    near, far = cloud(-0.5, seed=1), cloud(0.5, seed=2)
+    found = render(scene(Gaussians.concatenate([near, far]), wall=wall(0, **glowing())))
+    assert_close(found, over(near, COLOR), atol=tol.IMAGE_ABS)
+
+
+def test_surfaces__blend_linear_splats_in_linear_light():
+    gaussians = cloud(0.0)
+    found = render(scene(gaussians, wall=wall(1, **glowing()), props={"srgb_primitives": False}))
+    color, transmittance = splats(gaussians)
+    assert_close(found, color + transmittance * COLOR, atol=tol.IMAGE_ABS)
+
+
+def test_surfaces__white_splats_around_a_white_ball_in_white_light_are_a_furnace():
+    white = isotropic(np.random.default_rng(0).uniform(-1.5, 1.5, (80, 3)), 0.15, 0.6, 0.5 / 0.28209479177387814)
+    ball = {"type": "sphere", "radius": 0.8, "bsdf": {"type": "diffuse", "reflectance": 1.0}}
+    # Rays by the material alone, without noise.
+    integrator = {"type": "direct", "emitter_samples": 0, "bsdf_samples": 1}
+    found = render(scene(white, integrator, ball=ball, sky={"type": "constant", "radiance": 1.0}))
+    assert_close(found, 1, atol=tol.IMAGE_ABS)
+
+
+def test_surfaces__cover_a_pixel_by_the_fraction_that_they_fill():
+    """A bright rectangle before an opaque splat: pixels on its edge mix both in linear light."""
+    splat = Gaussians.from_activated([(0, 0, 1)], [(50, 50, 0.01)], [(1, 0, 0, 0)], [0.999], np.full((1, 1, 3), 0.2))
+    half = 0.61
+    image = render(scene(splat, card=wall(0, half, **glowing((0.9, 0.9, 0.9)))), spp=1024)
+    color = srgb_to_linear(splats(splat)[0])
+    f = camera().K[0, 0]
+    edge = 16 + f * half / 4  # in px
+    column = int(edge)
+    fraction = (image[12, column, 0] - color[12, column, 0]) / (image[12, 16, 0] - color[12, column, 0])
+    assert image[12, 16, 0] == pytest.approx(0.9, rel=1e-4)
+    assert fraction == pytest.approx(edge - column, abs=0.17)  # half a step of the 3 x 3 rays
+
+
+def test_surfaces__background_is_behind_all():
+    gaussians, background = cloud(0.0), (0.1, 0.4, 0.8)
+    found = render(scene(gaussians, card=wall(1, 0.5, **glowing()), props={"background": list(background)}))
+    expected = over(gaussians, srgb_to_linear(np.array(background)))
+    outside = np.hypot(*np.meshgrid(np.arange(32) - 15.5, np.arange(24) - 11.5)) > 10
+    assert_close(found, expected, atol=tol.IMAGE_ABS, where=outside[..., None])
+
+
+def test_surfaces__channels_include_them():
+    props = {"aovs": "depth,confidence"}
+    near = cloud(-0.5)
+    both = Gaussians.concatenate([near, cloud(0.5)])
+    both = Gaussians(**both.numpy(), logit_confidence=np.full(len(both), 9.0))
+    image = render(scene(both, film={"pixel_format": "rgba"}, wall=wall(0, **glowing()), props=props))
+    alone = rasterize(near, camera(), ("alpha", "depth"))
+    alpha, depth = (np.asarray(v, np.float64)[..., 0] for v in (alone.alpha, alone.depth))
+    assert_close(image[..., 3], 1, atol=tol.IMAGE_ABS)
+    assert_close(image[..., 4], alpha * depth + (1 - alpha) * 4, atol=1e-4)
+    assert_close(image[..., 5], alpha / (1 + np.exp(-9)), atol=tol.IMAGE_ABS)
+
+
+def test_surfaces__crop_equals_that_of_the_full_image():
+    shapes = {"ball": {"type": "sphere", "radius": 0.7, **glowing()}}
+    full = render(scene(cloud(0.0), **shapes), spp=256)
+    crop = {"crop_offset_x": 8, "crop_offset_y": 6, "crop_width": 13, "crop_height": 9}
+    # The samples differ: noise in the pixels of the outline.
+    assert_close(render(scene(cloud(0.0), film=crop, **shapes), spp=256), full[6:15, 8:21], atol=0.06)
+
+
+def test_surfaces__of_an_environment_alone_are_its_light():
+    gaussians = cloud(0.0)
+    found = render(scene(gaussians, sky={"type": "constant", "radiance": 0.3}))
+    assert_close(found, over(gaussians, 0.3), atol=tol.IMAGE_ABS)
+
+
+def test_surfaces__leave_the_whole_scene_as_it_is():
+    """Its parameters keep their names, and its environment its extent."""
+    whole = scene(cloud(), ball={"type": "sphere"}, sky={"type": "constant"}, wall=wall(90))
+    it, names = dr.zeros(mi.Interaction3f), list(mi.traverse(whole).keys())
+
+    def distance() -> float:
+        return float(whole.environment().sample_direction(it, mi.Point2f(0.5))[0].dist[0])
+
+    before = distance()
+    render(whole, spp=1)
+    assert distance() == before > 90
+    assert list(mi.traverse(whole).keys()) == names
+
+
+# --------------------------------------------------------------------------------------------------
+#  Derivatives
+# --------------------------------------------------------------------------------------------------
+
+# A lit wall through the splats, and a ball that emits light among them.
+DIFFERENTIATED = {
+    "gaussians.data": 1e-3,
+    "gaussians.opacities": 1e-3,
+    "gaussians.sh_coeffs": 1e-3,
+    "wall.bsdf.reflectance.value": 1e-2,
+    "ball.emitter.radiance.value": 1e-2,
+    "lamp.intensity.value": 1e-1,
+}
+
+
+@pytest.fixture(scope="module")
+def differentiated() -> Any:
+    # No two depths are equal: their order would change with the parameters.
+    gaussians = Gaussians.concatenate([cloud(z, 1, seed) for seed, z in enumerate(np.linspace(-0.8, 0.6, 40))])
+    ball = {"type": "sphere", "center": [0.4, 0.3, -0.4], "radius": 0.4, **glowing()}
+    board = wall(0.05, 2, bsdf={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.3, 0.6, 0.5]}})
+    return scene(gaussians, "prb", wall=board, ball=ball, lamp=LAMP, sky={"type": "constant", "radiance": 0.2})
+
+
+@pytest.fixture(scope="module")
+def target(differentiated) -> Any:
+    return mi.TensorXf(np.float32(np.random.default_rng(0).uniform(size=(24, 32, 3))))
+
+
+def loss(image, target):
+    return dr.mean(dr.square(image - target), axis=None)
+
+
+@pytest.mark.parametrize("name", DIFFERENTIATED)
+def test_surfaces__backward_agrees_with_central_differences(differentiated, target, name):
+    spp = 64
+    params = mi.traverse(differentiated)
+    start = dr.detach(params[name])
+    dr.enable_grad(params[name])
+    params.update()
+    dr.backward(loss(mi.render(differentiated, params, spp=spp, seed=1, seed_grad=2), target))
+    gradient = np.array(dr.grad(params[name]), np.float64)
+    direction = np.sign(gradient) * np.random.default_rng(4).uniform(0.5, 1, gradient.shape)
+    losses, h = [], DIFFERENTIATED[name]
+    for step in (h, -h):
+        params[name] = start + type(start)(np.float32(step * direction))
+        params.update()
+        losses.append(float(np.asarray(loss(mi.render(differentiated, spp=spp, seed=1), target)).item()))
+    params[name] = start
+    params.update()
+    slope = (losses[0] - losses[1]) / (2 * h)
+    assert slope == pytest.approx(np.vdot(gradient, direction), rel=2 * tol.CENTRAL_DIFFERENCE_REL)
+
+
+def test_surfaces__forward_mode_is_dual_to_reverse_mode(differentiated, target):
+    params = mi.traverse(differentiated)
+    slopes = []
+    for mode in ("reverse", "forward"):
+        for name in DIFFERENTIATED:
+            params[name] = dr.detach(params[name])
+            dr.enable_grad(params[name])
+        params.update()
+        image = mi.render(differentiated, params, spp=64, seed=1, seed_grad=2)
+        if mode == "reverse":
+            dr.backward(dr.sum(image * target, axis=None))
+            slopes.append(sum(np.sum(np.array(dr.grad(params[name]), np.float64)) for name in DIFFERENTIATED))
+        else:
+            for name in DIFFERENTIATED:
+                dr.set_grad(params[name], 1)
+            dr.forward_to(image)
+            slopes.append(float(np.vdot(np.array(dr.grad(image), np.float64), np.array(target))))
+    assert slopes[1] == pytest.approx(slopes[0], rel=1e-2)
+
+
+def test_surfaces__gradients_of_positions_warn(target, caplog):
+    card = scene(cloud(0.0), "prb", card=wall(0.5, **glowing()))
+    params = mi.traverse(card)
+    dr.enable_grad(params["card.to_world"])
+    params.update()
+    with caplog.at_level(logging.WARNING, logger="morgs_mi"):
+        dr.backward(loss(mi.render(card, params, spp=1), target))
+    assert "lack what changes with their silhouettes" in caplog.text
+    assert "`card.to_world`" in caplog.text
+
+
+# --------------------------------------------------------------------------------------------------
+#  Bad scenes
+# --------------------------------------------------------------------------------------------------
+
+
+FOG = {"type": "homogeneous", "albedo": 0.5, "sigma_t": 1.0}
+BAD_SCENES = {
+    "no emitter": ({"ball": {"type": "sphere"}}, {}, "expected an emitter that lights the surfaces, got none"),
+    "volume": (
+        {"ball": {"type": "sphere", "interior": FOG}, "lamp": LAMP},
+        {},
+        "Sphere 'ball', the boundary of a medium",
+    ),
+    "not set": ({"ball": {"type": "sphere"}}, {"surfaces": None}, "or set `surfaces` to an integrator"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_SCENES)
+def test_surfaces__refuse_bad_scenes(case):
+    more, props, message = BAD_SCENES[case]
+    bad = scene(cloud(), **more)
+    integrator = bad.integrator()
+    if "surfaces" in props:
+        integrator = mi.load_dict({"type": "gaussian_splat"})
+    with pytest.raises(ValueError, match=message):
+        integrator.render(bad)
+
+
+def test_surfaces__refuse_sensors_without_a_pinhole():
+    bad = scene(cloud(), ball={"type": "sphere"}, lamp=LAMP)
+    sensor = mi.load_dict({"type": "thinlens", "aperture_radius": 0.1})
+    with pytest.raises(ValueError, match="expected a `perspective` sensor"):
+        bad.integrator().render(bad, sensor)
+
+
+def test_surfaces__refuse_what_is_no_integrator():
+    with pytest.raises(RuntimeError, match="`surfaces` must be an integrator"):
+        mi.load_dict({"type": "gaussian_splat", "surfaces": {"type": "diffuse"}})

@@ -1,0 +1,95 @@
+"""`light_probe`: directions, radiance, a plane mirror, bad input."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi import Camera, Gaussians, light_probe, rasterize
+from morgs_mi.core.color_space import SH_C0, srgb_to_linear
+from tests.assertions import assert_close
+from tests.scenes.gaussians import isotropic
+from tests.scenes.surfaces import render, scene
+
+CENTER = np.array([0.3, -0.2, 0.1])
+
+
+def radiance(probe: dict, directions: np.ndarray) -> np.ndarray:
+    """Return the radiance of an environment map in directions [M, 3]."""
+    si = dr.zeros(mi.SurfaceInteraction3f, len(directions))
+    si.wi = -mi.Vector3f(np.float32(directions.T))
+    return np.array(mi.load_dict(probe).eval(si)).T
+
+
+def shell(color: float = 0.0, n: int = 2000) -> Gaussians:
+    """Return opaque Gaussians on a sphere around CENTER; colour 0.5 + SH_C0 `color`."""
+    directions = np.random.default_rng(0).normal(size=(n, 3))
+    means = CENTER + 3 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return isotropic(means, 0.3, 0.99, color)
+
+
+def test_light_probe__shows_every_direction_where_it_is():
+    rng = np.random.default_rng(1)
+    corners = np.stack(np.meshgrid([-1, 1], [-1, 1], [-1, 1]), axis=-1).reshape(-1, 3)
+    axes = np.concatenate([np.eye(3), -np.eye(3), corners])
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    colors = rng.uniform(0.1, 0.9, (len(axes), 3))
+    lamps = isotropic(CENTER + 5 * axes, 0.6, 0.99, ((colors - 0.5) / SH_C0)[:, None])
+    probe = light_probe(lamps, CENTER)
+    assert_close(radiance(probe, axes), srgb_to_linear(0.99 * colors), atol=0.02)
+
+
+def test_light_probe__of_a_uniform_shell_is_uniform():
+    rng = np.random.default_rng(2)
+    found = radiance(light_probe(shell(), CENTER, height=32), rng.normal(size=(100, 3)))
+    assert_close(found, srgb_to_linear(np.array(0.5)), atol=2e-3)
+
+
+def test_light_probe__assigns_a_radiance_to_what_is_clipped():
+    white = shell(0.5 / SH_C0)
+    directions = np.random.default_rng(2).normal(size=(100, 3))
+    assert_close(radiance(light_probe(white, CENTER, height=32, clipped=8.0), directions), 8.0, atol=0.05)
+    assert_close(radiance(light_probe(white, CENTER, height=32, clipped=1.0), directions), 1.0, atol=0.01)
+
+
+def test_light_probe__leaves_out_what_is_near_and_shows_the_background():
+    near = isotropic([CENTER + np.array([0, 0, 0.2])], 0.05, 0.9)
+    probe = light_probe(near, CENTER, height=16, background=(0.5, 0.5, 0.5), near=0.5)
+    assert_close(np.array(probe["bitmap"]), srgb_to_linear(np.array(0.5)), atol=1e-5)
+
+
+def test_light_probe__in_a_plane_mirror_is_the_view_of_the_mirrored_camera():
+    """A probe at the mirrored camera is exact for a plane mirror."""
+    rng = np.random.default_rng(3)
+    means = np.stack([*rng.uniform(-1.5, 1.5, (2, 30)), rng.uniform(-6, -5, 30)], axis=1)
+    gaussians = isotropic(means, 0.3, 0.8, rng.uniform(-1, 1, (30, 1, 3)))
+    view = Camera.look_at((0, 0, -3), (0, 0, 0), (0, -1, 0), 40, 48, 36)
+    mirrored = Camera.look_at((0, 0, 3), (0, 0, 0), (0, -1, 0), 40, 48, 36)
+    mirror = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 180).scale(4),
+        "bsdf": {"type": "conductor", "material": "none"},
+    }
+    # The mirror hides what is behind it from the camera; the Gaussians are behind the camera.
+    light = light_probe(gaussians, mirrored.position, height=512, clipped=1.0)
+    image = render(scene(gaussians, view=view, mirror=mirror, light=light), spp=16)
+    expected = srgb_to_linear(np.asarray(rasterize(gaussians, mirrored).color, np.float64))[:, ::-1]
+    assert np.abs(image - expected).mean() < 0.004
+    assert np.corrcoef(image.ravel(), expected.ravel())[0, 1] > 0.998
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"position": (0, 0)}, r"`position` must be \[3\] and finite, got \[0.0, 0.0\]"),
+        ({"position": (0, 0, np.inf)}, "`position` must be"),
+        ({"height": 1}, r"`height` must be a number in \[4, 8192\]"),
+        ({"clipped": 0.5}, "`clipped` must be"),
+        ({"near": 0.0}, "`near` must be"),
+    ],
+)
+def test_light_probe__refuses_bad_input(values, message):
+    with pytest.raises(ValueError, match=message):
+        light_probe(shell(n=5), **{"position": (0, 0, 0), **values})
