@@ -9,9 +9,8 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.types import Float
 from morgs_mi.render.blocks import build_lists, touches
-from morgs_mi.render.compositing import Channel, Layout, blend
+from morgs_mi.render.compositing import Channel, Layout, padded, weighted_sums
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.projection import Splats, project
 from morgs_mi.render.recording import with_render_lock
@@ -69,13 +68,8 @@ def backproject(
             splats = splats.concatenated_with(static_splats, None)
         columns = [dr.zeros(mi.Float, len(splats)) for _ in range(C)]
         lists = build_lists(splats, columns, region, config)
-    dr.enable_grad(columns)
-    layout = Layout((Channel(C, False),), False, False, config)
-    (blended,) = blend(splats.shape, [tuple(columns)], region, lists, layout)
-    dr.set_grad(blended, from_numpy(mi.Float, image))
-    dr.enqueue(dr.ADMode.Backward, blended)
-    dr.traverse(dr.ADMode.Backward)
-    grads: list[Float] = [dr.grad(column) for column in columns]
-    dr.eval(grads)
+        layout = Layout((Channel(C, False),), False, False, config)
+        grads = weighted_sums([padded(from_numpy(mi.Float, image), region, C)], region, lists, layout)
+        dr.eval(grads)
     sums[np.asarray(rows)] = np.stack([np.asarray(grad)[:N] for grad in grads], axis=1)
     return sums

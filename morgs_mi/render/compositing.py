@@ -24,7 +24,7 @@ from morgs_mi.render.loops import (
 from morgs_mi.render.recording import recorded
 from morgs_mi.render.region import Region, on_region, quotient
 
-__all__ = ["Channel", "Layout", "blend"]
+__all__ = ["Channel", "Layout", "blend", "padded", "weighted_sums"]
 
 
 def blend(
@@ -61,35 +61,20 @@ class _Blend(dr.CustomOp):
         # The lists' records contain the values already: they are arguments only to be differentiated.
         self.region, self.lists, self.layout = region, lists, layout
         self.blocks = Blocks.of(region, lists, None if limits is None else on_region(limits, region))
-        self.images = self._run(primal, layout, self.blocks, lists.records, self._allocated())
+        self.images = _run(primal, layout, self.blocks, lists.records, self._allocated())
         return self._outputs(self.images)
 
     def backward(self) -> None:
-        lists, layout = self.lists, self.layout
-        N, grads = dr.width(lists.by_rank), self._image_grads(cast(list[Float], self.grad_out()))
-        arrays, stride = (self.blocks, self.lists.records, self.images, grads), 4 * record_packets(layout)
-        if layout.config.reproducible:
-            end = dr.cumsum(lists.count)
-            first = end - lists.count
-            dr.eval(first)
-            pairs = dr.opaque(mi.Float, 0, max(int(end[-1]), 1) * 4 * pair_packets(layout))
-            pairs = self._run(adjoint_of_pairs, layout, *arrays, first, pairs)
-            sums, stride = _summed_by_rank(pairs, N, layout), 4 * pair_packets(layout)
-        else:
-            sums = self._run(adjoint, layout, _rounded_up(N), *arrays)
-        lane, skipped = lists.rank_of * stride, 0 if layout.reaches_weights else layout.geometry
-        columns = [dr.gather(mi.Float, sums, lane + k) for k in range(skipped, layout.geometry + layout.columns)]
-        self.set_grad_in("values", [mi.Float(0)] * skipped + columns)
+        layout, grads = self.layout, self._image_grads(cast(list[Float], self.grad_out()))
+        columns = _gradients(self.blocks, self.lists, layout, self.images, grads)
+        missing = layout.geometry + layout.columns - len(columns)
+        self.set_grad_in("values", [mi.Float(0)] * missing + columns)
 
     def forward(self) -> None:
         grads = [dr.zeros(mi.Float, 1) + g for g in cast(list[Float], self.grad_in("values"))]
         tangents = pack_records(grads, self.lists.by_rank)
-        images = self._run(tangent, self.layout, self.blocks, self.lists.records, tangents, self._allocated())
+        images = _run(tangent, self.layout, self.blocks, self.lists.records, tangents, self._allocated())
         self.set_grad_out(self._outputs(images))
-
-    def _run(self, loop: Callable[..., Any], *arguments: Any) -> Any:
-        static = [v for v in arguments if isinstance(v, (Layout, int))]
-        return recorded(loop, *static)(*arguments[len(static) :])
 
     def _allocated(self) -> list[Float]:
         """Return memory for the images: a frozen function cannot allocate arrays of a size of its own."""
@@ -105,10 +90,51 @@ class _Blend(dr.CustomOp):
         if self.layout.alpha:
             *grads, alpha, coverage = grads
             grads = [*grads, alpha + coverage]
-        return [_padded(v, self.region, size) for v, size in zip(grads, self.layout.sizes, strict=True)]
+        return [padded(v, self.region, size) for v, size in zip(grads, self.layout.sizes, strict=True)]
 
     def name(self) -> str:
         return "morgs_mi.blend"
+
+
+def weighted_sums(images: list[Float], region: Region, lists: BlockLists, layout: Layout) -> list[Float]:
+    """Return the sums of images' pixels, weighted by each splat's blend weights.
+
+    They are the gradients of the columns where the images are those of the blended image. A layout whose channels do
+    not reach the weights does without the blended image itself.
+
+    Args:
+        images: flat image of each channel on the region.
+        region: the pixels that are summed over.
+        lists: the splats that touch them.
+        layout: channels that do not reach the weights.
+
+    Returns:
+        Floats [N] of each column of the channels.
+    """
+    return _gradients(Blocks.of(region, lists, None), lists, layout, images, images)
+
+
+def _gradients(
+    blocks: Blocks, lists: BlockLists, layout: Layout, images: list[Float], grads: list[Float]
+) -> list[Float]:
+    """Return the gradients of the geometry, if the layout reaches it, and of the columns, from those of the images."""
+    N, arrays, stride = dr.width(lists.by_rank), (blocks, lists.records, images, grads), 4 * record_packets(layout)
+    if layout.config.reproducible:
+        end = dr.cumsum(lists.count)
+        first = end - lists.count
+        dr.eval(first)
+        pairs = dr.opaque(mi.Float, 0, max(int(end[-1]), 1) * 4 * pair_packets(layout))
+        pairs = _run(adjoint_of_pairs, layout, *arrays, first, pairs)
+        sums, stride = _summed_by_rank(pairs, N, layout), 4 * pair_packets(layout)
+    else:
+        sums = _run(adjoint, layout, _rounded_up(N), *arrays)
+    lane, skipped = lists.rank_of * stride, 0 if layout.reaches_weights else layout.geometry
+    return [dr.gather(mi.Float, sums, lane + k) for k in range(skipped, layout.geometry + layout.columns)]
+
+
+def _run(loop: Callable[..., Any], *arguments: Any) -> Any:
+    static = [v for v in arguments if isinstance(v, (Layout, int))]
+    return recorded(loop, *static)(*arguments[len(static) :])
 
 
 def _cropped(image: Float, region: Region, size: int) -> Float:
@@ -120,7 +146,7 @@ def _cropped(image: Float, region: Region, size: int) -> Float:
     return dr.gather(mi.Float, image, lane + row * dr.opaque(mi.UInt32, (region.row - region.width) * size))
 
 
-def _padded(image: Float, region: Region, size: int) -> Float:
+def padded(image: Float, region: Region, size: int) -> Float:
     """Return a flat image padded to whole blocks, or zeros for a literal 0: the transpose of `_cropped`."""
     total = region.num_pixels * size
     if dr.width(image) != dr.prod(region.shape(size)):
