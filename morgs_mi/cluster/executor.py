@@ -12,8 +12,9 @@ import multiprocessing
 import os
 import signal
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine, Iterator
-from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any, TypeVar
@@ -22,39 +23,29 @@ __all__ = ["Workers", "cores", "open_workers", "share_of_machine", "wait_for"]
 
 Result = TypeVar("Result")
 
-_RETRIES = 2
+_ATTEMPTS = 3
+_POLL = 0.02  # seconds between two looks for a process that is free
 # Seconds after which a scheduler that does not answer counts as lost.
 _TIMEOUT = 10
 # Cores and bytes of this process as a worker on one machine, by name; set when it starts.
 _SHARE: dict[str, int] = {}
 
 
-class Workers:
+class Workers(ABC):
     """Workers that run tasks.
 
-    Args:
-        executor: runs the tasks.
-        count: returns the number of workers, which may grow.
+    Attributes:
         place: where they are, for messages.
-        renew: returns a new executor of some processes in place of one that broke; None: the executor renews its
-            workers itself.
     """
 
-    def __init__(
-        self,
-        executor: Executor,
-        count: Callable[[], int],
-        place: str,
-        renew: Callable[[int], ProcessPoolExecutor] | None = None,
-    ) -> None:
-        self.place, self._count = place, count
-        self._executor, self._renew, self._alone = executor, renew, asyncio.Lock()
+    place: str
 
     @property
+    @abstractmethod
     def count(self) -> int:
-        """Number of workers."""
-        return self._count()
+        """Number of workers, which may grow."""
 
+    @abstractmethod
     async def run(self, function: Callable[..., Result], *args: Any) -> Result:
         """Return the result of a task.
 
@@ -63,48 +54,67 @@ class Workers:
             ConnectionError: the scheduler was lost.
             Exception: what the task raised.
         """
-        executor = self._executor
+
+
+class _Processes(Workers):
+    """Processes of this machine, each in a pool of its own, so that only the task of a process dies with it."""
+
+    place = "this machine"
+
+    def __init__(self, count: int) -> None:
+        self._share = {"threads": max(1, cores() // count), "memory": _memory() // count}
+        self._free = [self._pool() for _ in range(count)]
+        self._all = list(self._free)
+
+    @property
+    def count(self) -> int:
+        return len(self._all)
+
+    async def run(self, function: Callable[..., Result], *args: Any) -> Result:
+        while not self._free:
+            await asyncio.sleep(_POLL)
+        pool = self._free.pop()  # the last one that was at work, which may continue its loop
         try:
-            return await self._result(executor, function, *args)
-        except BrokenProcessPool:
-            assert self._renew is not None
-            if self._executor is executor:
-                self._executor = self._renew(self.count)
-        # All tasks of a broken pool fail with it. Each is repeated in a process of its own, so that a task that kills
-        # its worker is not confused with others.
-        async with self._alone:
-            for _ in range(_RETRIES):
-                executor = self._renew(1)
+            for _ in range(_ATTEMPTS):
                 try:
-                    return await self._result(executor, function, *args)
+                    return await asyncio.wrap_future(pool.submit(function, *args))
                 except BrokenProcessPool:
-                    continue
-                finally:
-                    _end(executor)
-        raise ChildProcessError(_died(f"{_RETRIES + 1} processes"))
+                    self._all.remove(pool)
+                    _end(pool)
+                    pool = self._pool()
+                    self._all.append(pool)
+        finally:
+            self._free.append(pool)
+        raise ChildProcessError(_died(f"{_ATTEMPTS} processes"))
 
     def close(self) -> None:
         """End the processes, also those that are at work."""
-        if isinstance(self._executor, ProcessPoolExecutor):
-            _end(self._executor)
+        for pool in self._all:
+            _end(pool)
 
-    async def _result(self, executor: Executor, function: Callable[..., Result], *args: Any) -> Result:
-        """Return the result of a task that is run once."""
+    def _pool(self) -> ProcessPoolExecutor:
+        # Dr.Jit and forked processes do not go together.
+        return ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin, (self._share,))
+
+
+class _DaskWorkers(Workers):
+    """Workers of a Dask cluster, which repeats the tasks of those that die."""
+
+    def __init__(self, client: Any, place: str) -> None:
+        self.place, self._client, self._executor = place, client, client.get_executor(pure=False)
+
+    @property
+    def count(self) -> int:
+        return len(self._client.scheduler_info(n_workers=-1)["workers"])
+
+    async def run(self, function: Callable[..., Result], *args: Any) -> Result:
         try:
-            future = executor.submit(function, *args)
-        except OSError as error:
-            if isinstance(executor, ProcessPoolExecutor):  # a pool that is just breaking has closed its pipe
-                raise BrokenProcessPool from error
-            raise
-        try:
-            return await asyncio.wrap_future(future)
+            return await asyncio.wrap_future(self._executor.submit(function, *args))
         except asyncio.CancelledError:
             task = asyncio.current_task()
             if task is None or task.cancelling():
                 raise
             raise ConnectionError(_lost(self.place)) from None  # Dask cancels what a lost scheduler ran
-        except BrokenProcessPool:
-            raise
         except Exception as error:
             if type(error).__name__ == "KilledWorker":
                 raise ChildProcessError(_died("the workers")) from None
@@ -159,9 +169,7 @@ def open_workers(scheduler: str | None = None, count: int | None = None) -> Iter
     if count is not None and count < 1:
         raise ValueError(f"open_workers(): `workers` must be at least 1, got {count}.")
     if scheduler is None:
-        count = count or cores()
-        renew = _process_pool(count)
-        workers = Workers(renew(count), lambda: count, "this machine", renew)
+        workers = _Processes(count or cores())
         try:
             yield workers
         finally:
@@ -169,18 +177,6 @@ def open_workers(scheduler: str | None = None, count: int | None = None) -> Iter
         return
     with ExitStack() as stack:
         yield _dask_workers(scheduler, count, stack)
-
-
-def _process_pool(workers: int) -> Callable[[int], ProcessPoolExecutor]:
-    """Return a function that returns a pool of some processes, each with the share of one of `workers`."""
-    share = {"threads": max(1, cores() // workers), "memory": _memory() // workers}
-
-    def pool(count: int) -> ProcessPoolExecutor:
-        # Dr.Jit and forked processes do not go together.
-        context = multiprocessing.get_context("spawn")
-        return ProcessPoolExecutor(count, context, _begin, (share,))
-
-    return pool
 
 
 def _begin(share: dict[str, int]) -> None:
@@ -227,11 +223,7 @@ def _dask_workers(scheduler: str, count: int | None, stack: ExitStack) -> Worker
         client.wait_for_workers(1, timeout=_TIMEOUT)
     except (OSError, ValueError):
         raise ConnectionError(f"{scheduler}: expected a scheduler with workers, got {found}; start it first.") from None
-
-    def number() -> int:
-        return len(client.scheduler_info(n_workers=-1)["workers"])
-
-    return Workers(client.get_executor(pure=False), number, scheduler)
+    return _DaskWorkers(client, scheduler)
 
 
 def cores() -> int:

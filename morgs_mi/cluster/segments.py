@@ -54,6 +54,7 @@ FOLDER = "segments"
 # Frames of a task: a few tasks are lost if a worker dies, and the progress is known that finely.
 TASK_FRAMES = 10
 _MIN_FRAMES = 2  # of a segment
+_POLL = 0.1  # seconds between two looks for a worker that is free; their number may grow
 
 
 @dataclass(frozen=True)
@@ -172,6 +173,7 @@ class _Run:
         if len(starts) > 2:
             self.metadata["segments"] = {"starts": list(starts[:-1]), **asdict(seams)}
         self.peaks: dict[str, int] = {}
+        self.active = 0  # segments whose later frames are being fitted
 
     async def fit(self, resume: bool) -> SegmentedFit:
         """Fit, or continue, all segments and join them."""
@@ -282,10 +284,14 @@ class _Segment:
             self.run.base.set_result(Following(0, reemitted_keyframe(coded).encoded, coded.next_id))
         first = next(iter(StreamReader(self.path)))
         self.run.begun[self.number].set_result(first.encoded)
+        while self.run.active >= self.run.workers.count:  # a worker continues the loop of one segment, not of many
+            await asyncio.sleep(_POLL)
+        self.run.active += 1
         while (at := self.start + self.num_fitted) < self.stop:
             stop = min(at + TASK_FRAMES, self.stop)
             frames, following = FrameRange(self.start, at, stop), await self._following(stop)
             self._add(await self.run.run(fit_frames, frames, self.restart, following))
+        self.run.active -= 1
 
     async def _following(self, stop: int) -> Following | None:
         """Return the next segment if a task up to a frame approaches it."""

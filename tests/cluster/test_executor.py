@@ -45,7 +45,7 @@ async def all_of(workers, *calls) -> list:
 
 def test_workers__repeat_what_a_dead_process_was_doing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One task dies each time; it alone fails, and the workers go on."""
-    monkeypatch.setattr("morgs_mi.cluster.executor._RETRIES", 1)
+    monkeypatch.setattr("morgs_mi.cluster.executor._ATTEMPTS", 2)
     with open_workers(count=2) as workers:
         calls = [(die,), (add, 1, 2), (die_once, str(tmp_path / "mark")), (fail,)]
         dead, total, pid, failed = asyncio.run(all_of(workers, *calls))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import shutil
 import signal
@@ -157,7 +158,7 @@ def test_stream_segments__with_a_killed_process_is_the_same(
     with open_workers(count=2) as workers:
 
         def kill() -> None:
-            os.kill(min(workers._executor._processes), signal.SIGKILL)  # pyright: ignore[reportAttributeAccessIssue]
+            os.kill(min(multiprocessing.active_children(), key=lambda child: child.pid).pid, signal.SIGKILL)
 
         fit(capture, tmp_path, workers, on_stage=when_fitted(count, kill))
     assert stream_of(tmp_path) == stream_of(whole)
