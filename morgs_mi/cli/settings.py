@@ -33,7 +33,6 @@ SETTINGS = {
     "first_frame_seconds": "fit.first_frame_seconds",
     "epochs": "fit.epochs",
     "sh_degree": "fit.sh_degree",
-    "key_views": "motion.key_views",
     "flow": "motion.flow_method",
     "masks": "motion.mask_method",
     "quality": "codec.quality",
@@ -109,8 +108,6 @@ class Settings:
     """Passes over the views for every later frame."""
     sh_degree: Annotated[int | None, setting("sh_degree")] = None
     """Degree of the spherical harmonics, 0 to 3."""
-    key_views: Annotated[int | None, setting("key_views")] = None
-    """Cameras with optical flow and masks."""
     flow: Annotated[str | None, setting("flow")] = None
     """Optical flow: a method, files:FOLDER or onnx:FILE (docs/flow.md)."""
     masks: Annotated[str | None, setting("masks")] = None

@@ -61,8 +61,6 @@ def test_fit__overrides_defaults_by_preset_by_file_by_options(tmp_path: Path, ru
             *(
                 "--sh-degree",
                 2,
-                "--key-views",
-                3,
                 "--flow",
                 "farneback",
                 "--masks",
