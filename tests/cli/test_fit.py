@@ -98,7 +98,6 @@ def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
         (["--num-gaussians", "0"], ("--num-gaussians must be at least 1, got 0",)),
         (["--epochs", "0", "--preset", "s"], ("--epochs must be at least 1, got 0",)),
         (["--sh-degree", "4"], ("--sh-degree must be 0 to 3, got 4",)),
-        (["--num-gaussians", "0"], ("--num-gaussians must be at least 1, got 0",)),
         (["--quality", "nan"], ("--quality must be positive and finite, got nan",)),
         (["--target-size", "-1"], ("--target-size must not be negative, got -1",)),
         (["--flow", "none"], ("--flow must be one of dis,", "got 'none'")),
