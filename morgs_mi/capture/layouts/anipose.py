@@ -22,7 +22,14 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from morgs_mi.capture.layouts.calibration import Calibration, Layout, match_clips, required_clips
+from morgs_mi.capture.layouts.calibration import (
+    Calibration,
+    Layout,
+    calibration_files,
+    match_clips,
+    only_calibration,
+    required_clips,
+)
 from morgs_mi.capture.layouts.clips import clip_of_camera
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
@@ -104,8 +111,7 @@ def _lens(where: str, entry: Mapping[str, Any]) -> Lens:
 
 def _calibration_files(path: Path) -> list[Path]:
     """Return the calibrations of a capture, in it or in its folder `calibration`."""
-    files = [file for folder in (path, path / "calibration") for file in sorted(folder.glob("*.toml"))]
-    return [file for file in files if _is_calibration(file)]
+    return [file for file in calibration_files(path, "*.toml") if _is_calibration(file)]
 
 
 def _is_calibration(file: Path) -> bool:
@@ -117,12 +123,7 @@ def _is_calibration(file: Path) -> bool:
 
 
 def _read_calibration(path: Path) -> Calibration:
-    source, *others = _calibration_files(path)
-    if others:
-        raise ValueError(
-            f"{path}: expected one calibration in TOML, got {', '.join(file.name for file in (source, *others))}; keep "
-            "the one of this recording."
-        )
+    source = only_calibration(path, _calibration_files(path), "one calibration in TOML")
     cameras, lenses = read_anipose(source)
     clips = required_clips(path)
     named = [replace(camera, name=clip_of_camera(clips, camera.name) or camera.name) for camera in cameras]

@@ -26,7 +26,16 @@ from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video import VIDEO_SUFFIXES, Clip, natural_key
 
-__all__ = ["NO_POINTS", "Calibration", "Layout", "PoseConvention", "match_clips", "required_clips"]
+__all__ = [
+    "NO_POINTS",
+    "Calibration",
+    "Layout",
+    "PoseConvention",
+    "calibration_files",
+    "match_clips",
+    "only_calibration",
+    "required_clips",
+]
 
 _LOG = logging.getLogger(__name__)
 
@@ -87,6 +96,24 @@ class Layout:
     find: Callable[[Path], bool]
     read: Callable[[Path], Calibration]
     poses: PoseConvention | None = PoseConvention()
+
+
+def calibration_files(path: Path, pattern: str) -> list[Path]:
+    """Return the files of a capture whose names match a pattern, in it or in its folder `calibration`."""
+    return [file for folder in (path, path / "calibration") for file in sorted(folder.glob(pattern))]
+
+
+def only_calibration(path: Path, files: Sequence[Path], expected: str) -> Path:
+    """Return the only calibration of a capture.
+
+    Raises:
+        ValueError: there are several.
+    """
+    if len(files) > 1:
+        raise ValueError(
+            f"{path}: expected {expected}, got {', '.join(file.name for file in files)}; keep the one of this recording."
+        )
+    return files[0]
 
 
 def required_clips(path: Path) -> Mapping[str, Clip]:

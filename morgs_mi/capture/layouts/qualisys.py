@@ -23,7 +23,15 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from morgs_mi.capture.layouts.calibration import Calibration, Layout, PoseConvention, match_clips, required_clips
+from morgs_mi.capture.layouts.calibration import (
+    Calibration,
+    Layout,
+    PoseConvention,
+    calibration_files,
+    match_clips,
+    only_calibration,
+    required_clips,
+)
 from morgs_mi.capture.layouts.clips import clip_of_camera, clips_by_frame
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
@@ -32,6 +40,7 @@ __all__ = ["LAYOUT", "read_qualisys"]
 
 _LOG = logging.getLogger(__name__)
 
+_PATTERN = "*.qca.txt"
 _SUBPIXELS = 64
 _METRES = 1e-3
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -110,19 +119,9 @@ def _numbers(where: str, camera: Element, name: str, *keys: str) -> list[float]:
     return numbers
 
 
-def _calibration_files(path: Path) -> list[Path]:
-    """Return the calibrations of a capture, in it or in its folder `calibration`."""
-    return [file for folder in (path, path / "calibration") for file in sorted(folder.glob("*.qca.txt"))]
-
-
 def _read_calibration(path: Path) -> Calibration:
     """Return the cameras that have a clip; marker cameras have none."""
-    source, *others = _calibration_files(path)
-    if others:
-        raise ValueError(
-            f"{path}: expected one file *.qca.txt, got {', '.join(file.name for file in (source, *others))}; keep the "
-            "one of this recording."
-        )
+    source = only_calibration(path, calibration_files(path, _PATTERN), "one file *.qca.txt")
     cameras, lenses = read_qualisys(source)
     clips = required_clips(path)
     names = {camera.name: clip_of_camera([*clips, *clips_by_frame(path)], camera.name) for camera in cameras}
@@ -140,7 +139,7 @@ def _read_calibration(path: Path) -> Calibration:
 LAYOUT = Layout(
     "Qualisys",
     ("*.qca.txt",),
-    lambda path: bool(_calibration_files(path)),
+    lambda path: bool(calibration_files(path, _PATTERN)),
     _read_calibration,
     PoseConvention("camera to world", "OpenGL"),
 )
