@@ -110,9 +110,8 @@ def only_calibration(path: Path, files: Sequence[Path], expected: str) -> Path:
         ValueError: there are several.
     """
     if len(files) > 1:
-        raise ValueError(
-            f"{path}: expected {expected}, got {', '.join(file.name for file in files)}; keep the one of this recording."
-        )
+        names = ", ".join(file.name for file in files)
+        raise ValueError(f"{path}: expected {expected}, got {names}; keep the one of this recording.")
     return files[0]
 
 
