@@ -9,10 +9,10 @@ The scene is that of `frame_speed`. With T_n seconds on n threads, the share tha
 from __future__ import annotations
 
 import os
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
 
-import cv2
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import tyro
@@ -39,11 +39,18 @@ class Options(Output):
     """Seed of scene and noise."""
 
 
-def use_threads(count: int, cores: list[int]) -> None:
-    """Restrict Dr.Jit, OpenCV and threads that are started from now on to the first `count` cores."""
-    os.sched_setaffinity(0, cores[:count])
-    dr.set_thread_count(count)
-    cv2.setNumThreads(count)
+def fit_on(count: int, options: Options) -> dict[str, float]:
+    """Return the seconds of a later frame and of its stages on `count` cores; called in a process of its own."""
+    # Before Dr.Jit and OpenCV start their threads, one per usable core.
+    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
+    mi.set_variant("llvm_ad_rgb")
+    size = SIZES[options.size]
+    scene, rng = Scene(size, options.seed), np.random.default_rng(options.seed)
+    recorded = [film(scene.at(frame), scene.cameras(), rng) for frame in range(options.frames + 1)]
+    density = DensityConfig(max_gaussians=round(1.1 * size.gaussians))
+    config = StreamConfig(FitConfig(sh_degree=0, density=density, epochs=options.epochs))
+    row = measure(size, config, recorded, scene)
+    return {name: value for name, value in row.items() if name == "seconds" or name.endswith("_s")}
 
 
 def serial_shares(seconds: dict[int, dict[str, float]]) -> dict[str, float]:
@@ -55,22 +62,16 @@ def serial_shares(seconds: dict[int, dict[str, float]]) -> dict[str, float]:
 
 def main(options: Options) -> None:
     """Run the benchmark."""
-    mi.set_variant("llvm_ad_rgb")
-    cores = sorted(os.sched_getaffinity(0))
-    if options.threads[0] != 1 or not 1 < max(options.threads) <= len(cores):
-        raise SystemExit(f"--threads: expected 1 and numbers up to {len(cores)}, got {options.threads}.")
-    size = SIZES[options.size]
-    scene, rng = Scene(size, options.seed), np.random.default_rng(options.seed)
-    recorded = [film(scene.at(frame), scene.cameras(), rng) for frame in range(options.frames + 1)]
-    density = DensityConfig(max_gaussians=round(1.1 * size.gaussians))
-    config = StreamConfig(FitConfig(sh_degree=0, density=density, epochs=options.epochs))
+    available = len(os.sched_getaffinity(0))
+    if options.threads[0] != 1 or not 1 < max(options.threads) <= available:
+        raise SystemExit(f"--threads: expected 1 and numbers up to {available}, got {options.threads}.")
     seconds = {}
     for count in options.threads:
-        use_threads(count, cores)
-        row = measure(size, config, recorded, scene)
-        seconds[count] = {name: value for name, value in row.items() if name == "seconds" or name.endswith("_s")}
+        with ProcessPoolExecutor(1, get_context("spawn")) as process:
+            seconds[count] = process.submit(fit_on, count, options).result()
         print(f"{count:3d} threads: {seconds[count]['seconds']:.2f} s", flush=True)
-    figures = {"size": vars(size), "epochs": options.epochs, "seconds": seconds}
+    mi.set_variant("llvm_ad_rgb")
+    figures = {"size": vars(SIZES[options.size]), "epochs": options.epochs, "seconds": seconds}
     options.write({**figures, "serial_share": serial_shares(seconds)}, unprinted=["size"])
 
 
