@@ -95,7 +95,7 @@ def walk_counts(lists: BlockLists, blocks: loops.Blocks, layout: loops.Layout) -
 
     def body(walk, end, x, y, T, walked, reached, records, words, entries):
         rank, walk = loops._advance(walk, end, words, entries)
-        geometry, T_next, hits = fetch_record(records, rank, loops.GEOMETRY, packets), [], mi.UInt32(0)
+        geometry, T_next, hits = fetch_record(records, rank, layout.geometry, packets), [], mi.UInt32(0)
         for light, (p, _) in zip(T, block.powers(*block.offsets(x, y, geometry), geometry), strict=True):
             alpha = block.alpha(p)[0]
             T_next.append(light - alpha * light)

@@ -111,7 +111,7 @@ def weighted_sums(images: list[Float], region: Region, lists: BlockLists, layout
     Returns:
         Floats [N] of each column of the channels.
     """
-    return _gradients(Blocks.of(region, lists, None), lists, layout, images, images)
+    return _gradients(Blocks.of(region, lists), lists, layout, images, images)
 
 
 def _gradients(

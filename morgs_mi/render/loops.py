@@ -137,7 +137,7 @@ class Blocks:
     limits: Float | None = None
 
     @staticmethod
-    def of(region: Region, lists: BlockLists, limits: Float | None) -> Blocks:
+    def of(region: Region, lists: BlockLists, limits: Float | None = None) -> Blocks:
         """Return the arrays of a region, its lists and its depth limits."""
         geometry = (region.x, region.y, region.place, region.rows, region.pitch)
         return Blocks(*geometry, lists.words, lists.entries, lists.begin, lists.end, lists.first, lists.order, limits)
