@@ -66,6 +66,7 @@ ELSEWHERE: dict[str, str] = {
     "motion.flow.farneback": "a method that is not the default: tests/method/flow_sources",
     "motion.active_set.min_explained": "no change here is unexplained: tests/method/test_active_set.py",
     "motion.active_set.min_cluster": "no change here is unexplained: tests/method/test_active_set.py",
+    "motion.active_set.quiet_responsibility": "fewer views here than `quiet_views`: tests/method/test_active_set.py",
     "motion.masks": "tests/method/test_confidence.py and tests/method/mask_refiners",
     "codec.keyframe_interval": "keyframes are written by the recorder: tests/test_recorder.py",
 }
