@@ -23,12 +23,8 @@ from morgs_mi.losses.ssim import Target
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 
-__all__ = ["CrossValidation", "Trial", "cross_validate", "dropping_by_noise", "trial_steps", "withheld_views"]
+__all__ = ["CrossValidation", "Trial", "cross_validate", "trial_steps", "withheld_views"]
 
-# Noise from which few views are fitted with dropping, standard deviation relative to white, and its probability.
-_NOISY, _NOISY_DROPPING = 0.015, 0.2
-# The difference of two Laplacians, which is zero on gradients and edges, with unit gain for noise (Immerkaer 1996).
-_NOISE_FILTER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
 _MIN_SIDE = 32  # px
 _POOR = 22.0  # dB, PSNR of withheld views below which they look poor
 _View = tuple[Camera, np.ndarray, np.ndarray | None]
@@ -124,21 +120,6 @@ def cross_validate(
             break
     spacing = forecast(cameras, np.asarray(start.means)).spacing
     return CrossValidation(tuple(cameras[v].name for v in withheld), spacing, tuple(trials))
-
-
-def dropping_by_noise(images: Sequence[np.ndarray]) -> float:
-    """Return the probability of dropping for views that are too few for cross-validation, from their noise.
-
-    Args:
-        images: [H, W, 3], uint8.
-    """
-    return _NOISY_DROPPING if np.mean([_noise(image) for image in images]) >= _NOISY else 0.0
-
-
-def _noise(image: np.ndarray) -> float:
-    """Return the standard deviation of an image's noise relative to white; texture on less than half does not count."""
-    filtered = cv2.filter2D(image.astype(np.float32) / 255, -1, _NOISE_FILTER)
-    return float(np.median(np.abs(filtered)) / 0.6745)
 
 
 def trial_steps(config: FitConfig) -> int:

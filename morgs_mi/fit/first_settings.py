@@ -11,7 +11,8 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.budget import steps_within
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, dropping_by_noise, trial_steps
+from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, trial_steps
+from morgs_mi.fit.dropping import dropping_by_noise
 from morgs_mi.fit.forecast import Forecast, forecast
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.config import RenderConfig

@@ -13,7 +13,6 @@ from morgs_mi.fit.cross_validation import (
     CrossValidation,
     Trial,
     cross_validate,
-    dropping_by_noise,
     trial_steps,
     withheld_views,
 )
@@ -39,13 +38,6 @@ def test_withheld_views__lie_in_the_inner_half_of_the_rig():
     assert len(chosen) == 2
     assert all(3 <= view <= 9 for view in chosen)
     assert len(withheld_views(cameras[:3], 6)) == 1
-
-
-def test_dropping_by_noise__drops_only_where_images_are_noisy():
-    clean = images_of(opaque_ball())
-    assert dropping_by_noise(bytes_of(clean)) == 0
-    assert dropping_by_noise(bytes_of(clean, 0.008)) == 0
-    assert dropping_by_noise(bytes_of([0.2 + 0.6 * image for image in clean], 0.02)) == 0.2
 
 
 def test_cross_validate__tries_candidates_until_one_is_no_better():

@@ -7,7 +7,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi.fit.dropping import dropped
+from morgs_mi.fit.dropping import dropped, dropping_by_noise
+from tests.scenes.ball import images_of, opaque_ball
 from tests.scenes.gaussians import isotropic
 
 COUNT = 4000
@@ -43,3 +44,13 @@ def test_dropped__passes_gradients_to_the_kept_alone():
 
 def test_dropped__returns_the_same_without_probability():
     assert dropped(GAUSSIANS, 0.0, np.random.default_rng(0)) is GAUSSIANS
+
+
+def test_dropping_by_noise__drops_only_where_images_are_noisy():
+    clean, rng = [0.2 + 0.6 * image for image in images_of(opaque_ball())], np.random.default_rng(0)
+
+    def dropping(noise: float) -> float:
+        noisy = [255 * (image + rng.normal(0, noise, image.shape)) for image in clean]
+        return dropping_by_noise([np.uint8(np.clip(image + 0.5, 0, 255)) for image in noisy])
+
+    assert [dropping(noise) for noise in (0.0, 0.008, 0.02)] == [0, 0, 0.2]
