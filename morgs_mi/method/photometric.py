@@ -51,6 +51,11 @@ class PhotometricConfig:
     half_color_pixels: float = 10.0
     """Covered pixels at which the colour changes by half of the mean error: that of few pixels is noise."""
 
+    def __post_init__(self) -> None:
+        for name, low in (("rounds", 0), ("neighbours", 1)):
+            if not getattr(self, name) >= low:
+                raise ValueError(f"PhotometricConfig(): `{name}` must be at least {low}, got {getattr(self, name)}.")
+
 
 def refine_displacement(
     previous: Gaussians,

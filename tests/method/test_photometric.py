@@ -104,3 +104,9 @@ def test_mean_color_error__trusts_few_pixels_less(scene):
 
 def test_mean_color_error__is_zero_without_views(scene):
     assert not mean_color_error(scene[0], {}, {}).any()
+
+
+@pytest.mark.parametrize("settings", [{"rounds": -1}, {"neighbours": 0}])
+def test_PhotometricConfig__refuses_numbers_out_of_range(settings):
+    with pytest.raises(ValueError, match=f"`{next(iter(settings))}` must be at least"):
+        PhotometricConfig(**settings)
