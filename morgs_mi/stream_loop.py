@@ -187,11 +187,11 @@ def _first_step(
     rng = np.random.default_rng([config.seed, 0])
     cameras, masks = [setup.cameras[v] for v in images], [setup.masks[v] for v in images]
     gaussians, status = _first_gaussians(setup, images, rng)
-    given = gaussians, cameras, list(images.values()), masks, setup.points, setup.extent
+    targets = [Target(image, mask) for image, mask in zip(images.values(), masks, strict=True)]
+    given = gaussians, cameras, list(images.values()), masks, targets, setup.points, setup.extent
     chosen = first_settings(*given, config.fit, config.render, [config.seed, 0, 1], on_step)
     steps = chosen.steps_before + chosen.config.first_frame_steps
     tick = None if on_step is None else lambda done: on_step(chosen.steps_before + done, steps)
-    targets = [Target(image, mask) for image, mask in zip(images.values(), masks, strict=True)]
     gaussians, losses = fit_first_frame(
         gaussians, cameras, targets, setup.extent, chosen.config, config.render, rng, tick
     )

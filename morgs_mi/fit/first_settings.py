@@ -40,6 +40,7 @@ def first_settings(
     cameras: Sequence[Camera],
     images: Sequence[np.ndarray],
     masks: Sequence[np.ndarray | None],
+    targets: Sequence[Target],
     points: np.ndarray,
     extent: float,
     config: FitConfig,
@@ -56,6 +57,7 @@ def first_settings(
         cameras: V views.
         images: their images [H, W, 3], uint8.
         masks: valid pixels of each [H, W], or None.
+        targets: both, as the first frame is fitted to them.
         points: [P, 3] of the capture, world units.
         extent: of the scene in world units.
         config: settings of the fit.
@@ -64,7 +66,6 @@ def first_settings(
         on_step: called with (steps of the trials done, steps of trials and first frame).
     """
     if config.first_frame_seconds is not None:
-        targets = [Target(image, mask) for image, mask in zip(images, masks, strict=True)]
         steps = steps_within(
             config.first_frame_seconds, gaussians, cameras, targets, extent, config, render, [*seed, 1]
         )
