@@ -90,6 +90,7 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
         "motion": {
             "lift_flow": False,
             "propagate_motion": False,
+            "search_motion": False,
             "refine_start": False,
             "lift_confidence": False,
             "two_gates": False,

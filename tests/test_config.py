@@ -97,7 +97,8 @@ def test_apply_preset__gives_the_rows_of_the_paper(name, epochs, modules, lifted
     assert fit == FitConfig(num_gaussians=77, epochs=epochs, decay_means_rate=lifted)
     assert (motion.learn_motion, motion.learn_offset, motion.learn_confidence) == modules
     assert (motion.lift_flow, motion.propagate_motion, motion.key_views) == (lifted, lifted, 12)
-    assert (motion.refine_start, motion.lift_confidence, motion.two_gates) == (lifted, lifted, lifted)
+    assert (motion.refine_start, motion.search_motion) == (lifted, lifted)
+    assert (motion.lift_confidence, motion.two_gates) == (lifted, lifted)
     assert (config.render, config.codec, config.seed) == (given.render, given.codec, 3)
 
 

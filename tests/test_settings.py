@@ -68,6 +68,8 @@ ELSEWHERE: dict[str, str] = {
     "motion.active_set.min_cluster": "no change here is unexplained: tests/method/test_active_set.py",
     "motion.active_set.quiet_responsibility": "fewer views here than `quiet_views`: tests/method/test_active_set.py",
     "motion.masks": "tests/method/test_confidence.py and tests/method/mask_refiners",
+    "motion.search": "flow explains all parts here: tests/method/test_search.py",
+    "motion.search_motion": "flow explains all parts here: tests/method/test_search.py",
     "codec.keyframe_interval": "keyframes are written by the recorder: tests/test_recorder.py",
 }
 

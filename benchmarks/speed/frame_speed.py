@@ -42,6 +42,7 @@ STAGES = {
     "targets": ("losses/ssim.py", "__init__"),
     "lift": ("method/lift.py", "lift_flow"),
     "propagation": ("method/propagation.py", "propagate_motion"),
+    "search": ("method/search.py", "search_motion"),
     "refinement": ("method/photometric.py", "refine_displacement"),
     "colour": ("method/photometric.py", "mean_color_error"),
     "steps": ("fit/optimise.py", "optimise"),

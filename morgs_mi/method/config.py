@@ -12,6 +12,7 @@ from morgs_mi.method.lift import LiftConfig
 from morgs_mi.method.mask_refiners.config import MaskConfig
 from morgs_mi.method.photometric import PhotometricConfig
 from morgs_mi.method.propagation import PropagationConfig
+from morgs_mi.method.search import SearchConfig
 
 __all__ = ["MotionConfig"]
 
@@ -38,6 +39,8 @@ class MotionConfig:
     """Start each Gaussian's motion from lifted flow; False: from zero, as in the paper."""
     propagate_motion: bool = True
     """Also try the motion of the previous frame and of neighbours as starts; needs `lift_flow`."""
+    search_motion: bool = True
+    """Search for parts that neither flow nor proposals explain; needs `lift_flow`."""
     refine_start: bool = True
     """Refine the start of motion and colour by the images of the key views; needs `lift_flow` and `two_gates`."""
     lift_confidence: bool = True
@@ -66,6 +69,8 @@ class MotionConfig:
     """Confidence that neighbours share."""
     propagation: PropagationConfig = field(default_factory=PropagationConfig)
     """Motion proposals."""
+    search: SearchConfig = field(default_factory=SearchConfig)
+    """Coarse search."""
     photometric: PhotometricConfig = field(default_factory=PhotometricConfig)
     """Refinement by the images."""
     active_set: ActiveSetConfig = field(default_factory=ActiveSetConfig)

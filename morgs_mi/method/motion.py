@@ -1,4 +1,4 @@
-"""The start of each Gaussian's motion (eq. 5): lifted flow, then motion proposals, then the images themselves."""
+"""The start of each Gaussian's motion (eq. 5): lifted flow, proposals, search, refinement."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.lift import Lift, lift_flow
 from morgs_mi.method.photometric import mean_color_error, refine_displacement
 from morgs_mi.method.propagation import propagate_motion
+from morgs_mi.method.search import search_motion
 
 __all__ = ["initial_motion"]
 
@@ -47,6 +48,8 @@ def initial_motion(
     views = {v: active.views[v] for v in sorted(flows.keys() & active.views.keys())}
     if config.propagate_motion:
         start = propagate_motion(gaussians, start, views, targets, rng, config.propagation)
+    if config.search_motion:
+        start = search_motion(gaussians, start, views, targets, config.search)
     if config.refine_start and config.two_gates:
         start = refine_displacement(gaussians, start, views, targets, config.photometric)
         moved = replace(gaussians, means=np.asarray(gaussians.means) + start.displacement)

@@ -1,0 +1,250 @@
+"""Coarse search: the motion of parts that neither flow nor motion proposals explain.
+
+Beyond the paper. A part that is thin and moves farther than it is wide leaves flow nothing to follow, and no neighbour
+knows its motion. It shows as connected Gaussians whose pixels no longer have their colours. Such a part is searched for
+as a whole: with the image I_{t-1} that the previous Gaussians have in a key view v, and with the blend weight m_v of
+the part there, a displacement d of the part costs
+
+    C(d) = sum_v sum_x m_v(x) |I_t(x + s_v(d)) - I_{t-1}(x)|^2,    s_v(d) its projected shift in px.
+
+Masked template matching gives the inner sums for all shifts of a view at once; the sum over the views is then looked up
+on a grid of displacements in 3D. The best one is accepted if the image with the displaced part is closer to the target.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from scipy.ndimage import map_coordinates
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import SH_C0
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.losses.ssim import Target
+from morgs_mi.method.lift import Lift
+from morgs_mi.method.propagation import narrowed_views, nearest_neighbours
+from morgs_mi.render.active_view import ActiveView
+
+__all__ = ["SearchConfig", "search_motion"]
+
+_GRID = 16  # steps of the grid from 0 to its end, in each direction of each axis
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """Settings of the coarse search."""
+
+    reach: float = 0.1
+    """Longest displacement along each axis, as a fraction of the image width."""
+    error_ratio: float = 3.0
+    """Error of a Gaussian, in medians of all active ones, or in grey levels if the median is less, above which it is
+    not explained."""
+    neighbours: int = 8
+    """Nearest Gaussians that it forms a part with if they are not explained either."""
+    min_size: int = 4
+    """Fewest Gaussians of a part."""
+    max_parts: int = 3
+    """Most parts of a frame, those with the largest errors first."""
+    max_cost_ratio: float = 0.3
+    """Cost of a displacement, as a fraction of that of no displacement, up to which it is tested."""
+    max_error_ratio: float = 0.8
+    """Error of the images around a part, as a fraction of that without the displacement, up to which it is accepted."""
+    min_logit: float = 0.3
+    """Logit of the confidence of a Gaussian that was found, see `propagation`."""
+
+    def __post_init__(self) -> None:
+        for name, low in (("neighbours", 1), ("min_size", 1), ("max_parts", 0)):
+            if not getattr(self, name) >= low:
+                raise ValueError(f"SearchConfig(): `{name}` must be at least {low}, got {getattr(self, name)}.")
+        if not 0 < self.reach <= 1:
+            raise ValueError(f"SearchConfig(): `reach` must be in (0, 1], got {self.reach}.")
+
+
+def search_motion(
+    previous: Gaussians,
+    start: Lift,
+    views: Mapping[int, ActiveView],
+    targets: Mapping[int, Target],
+    config: SearchConfig | None = None,
+) -> Lift:
+    """Return a start of the motion in which parts that were not explained move to where they are found.
+
+    If nothing is found, it is `start` itself.
+
+    Args:
+        previous: N Gaussians of the previous frame, detached.
+        start: of their motion.
+        views: active views of the key views, by view index.
+        targets: their images, by view index.
+        config: settings.
+    """
+    config = config or SearchConfig()
+    started = _displaced(previous, start.displacement)
+    errors = _errors(started, views, targets)
+    parts = _unexplained_parts(started, errors, views, config)
+    displacement, logit = start.displacement, start.logit_confidence
+    for part, d in _find(previous, parts, views, targets, config):
+        proposal = np.where(part[:, None], d, displacement).astype(np.float32)
+        around = narrowed_views(views, previous, part, [displacement, proposal])
+        new_errors = _errors(_displaced(previous, proposal), around, targets)
+        if _total(new_errors, around) < config.max_error_ratio * _total(errors, around):
+            displacement, logit = proposal, np.where(part, np.maximum(logit, config.min_logit), logit)
+            errors = {**errors, **{v: np.where(_drawn(around[v]), new_errors[v], errors[v]) for v in around}}
+    if displacement is start.displacement:
+        return start
+    return replace(start, displacement=displacement, logit_confidence=logit.astype(np.float32))
+
+
+def _displaced(gaussians: Gaussians, d: np.ndarray) -> Gaussians:
+    return replace(gaussians, means=np.asarray(gaussians.means) + d)
+
+
+def _errors(
+    gaussians: Gaussians, views: Mapping[int, ActiveView], targets: Mapping[int, Target]
+) -> dict[int, np.ndarray]:
+    """Return the mean absolute error of each pixel [H, W] by view index, 0 where nothing is drawn."""
+    return {
+        v: _uncropped(np.abs(targets[v].difference(view.render(gaussians).color, view.region)).mean(axis=-1), view)
+        for v, view in views.items()
+    }
+
+
+def _total(errors: Mapping[int, np.ndarray], views: Mapping[int, ActiveView]) -> float:
+    """Return the sum of the errors [H, W] over the drawn pixels of the views."""
+    return sum(float(errors[v][_drawn(view)].sum()) for v, view in views.items())
+
+
+def _unexplained_parts(
+    gaussians: Gaussians, errors: Mapping[int, np.ndarray], views: Mapping[int, ActiveView], config: SearchConfig
+) -> list[np.ndarray]:
+    """Return the parts that are not explained, each as a mask [N]."""
+    sums = np.zeros((len(gaussians), 2), np.float32)
+    for v, view in views.items():
+        image = view.crop(errors[v])
+        sums += view.backproject(gaussians, np.stack([image, np.ones_like(image)], axis=-1))
+    error, seen = sums[:, 0] / (sums[:, 1] + 1), sums[:, 1] > 1
+    if not seen.any():
+        return []
+    unexplained = seen & (error > config.error_ratio * max(float(np.median(error[seen])), 1 / 255))
+    near = nearest_neighbours(np.asarray(gaussians.means), config.neighbours)
+    ends = unexplained[:, None] & unexplained[near]
+    rows = np.broadcast_to(np.arange(len(near))[:, None], near.shape)[ends]
+    graph = coo_array((np.ones(len(rows), bool), (rows, near[ends])), (len(near), len(near)))
+    label = connected_components(graph, directed=False)[1]
+    size, total = np.bincount(label, unexplained), np.bincount(label, np.where(unexplained, sums[:, 0], 0))
+    largest = np.argsort(-total, kind="stable")[: config.max_parts]
+    return [label == part for part in largest if size[part] >= config.min_size]
+
+
+def _find(
+    previous: Gaussians,
+    parts: Sequence[np.ndarray],
+    views: Mapping[int, ActiveView],
+    targets: Mapping[int, Target],
+    config: SearchConfig,
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return those parts that are found elsewhere, each with its displacement [3]."""
+    if not parts:
+        return []
+    before = {v: _uncropped(np.asarray(view.render(previous).color), view) for v, view in views.items()}
+    found = []
+    for first in range(0, len(parts), 3):
+        few = parts[first : first + 3]
+        weights = {v: _blend_weights(previous, few, before[v], view) for v, view in views.items()}
+        for k, part in enumerate(few):
+            surfaces = [
+                _CostSurface.of(before[v], weights[v][..., k], targets[v].image(), view.camera, config.reach)
+                for v, view in views.items()
+                if weights[v][..., k].sum() > 1
+            ]
+            d = _best_displacement(np.asarray(previous.means)[part].mean(axis=0), surfaces, config)
+            if d.any():
+                found.append((part, d))
+    return found
+
+
+def _best_displacement(center: np.ndarray, surfaces: Sequence[_CostSurface], config: SearchConfig) -> np.ndarray:
+    """Return the displacement d [3] that costs a part around `center` least; 0 if it hardly saves anything."""
+    if not surfaces:
+        return np.zeros(3)
+
+    def cost_of(d: np.ndarray) -> np.ndarray:
+        return np.sum([surface.at(center, d) for surface in surfaces], axis=0)
+
+    camera = surfaces[0].camera
+    unit = config.reach * camera.width / _GRID / np.linalg.norm(camera.projection_jacobian(center[None])[0, 0])
+    coarse = np.stack(np.meshgrid(*[np.arange(-_GRID, _GRID + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    fine = coarse[np.abs(coarse).max(axis=1) <= 4] / 4
+    d = np.zeros(3)
+    for grid in (coarse, fine):
+        steps = d + unit * grid
+        d = steps[np.argmin(cost_of(steps))]
+    at_d, at_rest = cost_of(np.stack([d, np.zeros(3)]))
+    return d if at_d < config.max_cost_ratio * at_rest else np.zeros(3)
+
+
+@dataclass(frozen=True, eq=False)
+class _CostSurface:
+    """The inner sums of C(d) in one view, for all shifts up to its margin.
+
+    Attributes:
+        cost: [2 M + 1, 2 M + 1], by shift along y and x, in reduced pixels.
+        camera: the view.
+        scale: reduced pixels per pixel.
+    """
+
+    cost: np.ndarray
+    camera: Camera
+    scale: float
+
+    @classmethod
+    def of(
+        cls, before: np.ndarray, weight: np.ndarray, after: np.ndarray, camera: Camera, reach: float
+    ) -> _CostSurface:
+        """Match `before` [H, W, 3], weighted by `weight` [H, W], with `after`, on images with 2 px per grid step."""
+        margin = 4 * _GRID  # in reduced pixels: twice the grid along an axis, as its corners are farther
+        scale = min(1.0, 2 * _GRID / (reach * camera.width))
+        size = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
+        before, after, weight = (cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (before, after, weight))
+        rows, columns = np.nonzero(weight > 0.01 * weight.max())
+        box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+        around = cv2.copyMakeBorder(after, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
+        around = around[box[0].start : box[0].stop + 2 * margin, box[1].start : box[1].stop + 2 * margin]
+        mask = np.repeat(np.sqrt(weight[box])[..., None], 3, axis=2)  # squared by OpenCV
+        cost = cv2.matchTemplate(around, before[box], cv2.TM_SQDIFF, mask=mask)
+        return cls(np.maximum(cost, 0) / scale**2, camera, scale)
+
+    def at(self, center: np.ndarray, d: np.ndarray) -> np.ndarray:
+        """Return the costs [K] of displacements d [K, 3] of a part around `center` [3]."""
+        pixels, _ = self.camera.project(np.concatenate([center[None], center + d]))
+        shift = (pixels[1:] - pixels[0]) * self.scale + len(self.cost) // 2
+        return map_coordinates(self.cost, shift[:, ::-1].T, order=1, mode="nearest")
+
+
+def _blend_weights(
+    previous: Gaussians, parts: Sequence[np.ndarray], before: np.ndarray, view: ActiveView
+) -> np.ndarray:
+    """Return the blend weights m [H, W, 3] of up to three parts: what each colour gains if that of a part grows by 1."""
+    change = np.zeros_like(np.asarray(previous.sh_coeffs))
+    for k, part in enumerate(parts):
+        change[part, 0, k] = 1 / SH_C0
+    brighter = replace(previous, sh_coeffs=np.asarray(previous.sh_coeffs) + change)
+    return np.clip(_uncropped(np.asarray(view.render(brighter).color), view) - before, 0, 1)
+
+
+def _uncropped(image: np.ndarray, view: ActiveView) -> np.ndarray:
+    """Return an image [H, W, ...] of which the view's region is drawn; the rest is 0."""
+    if view.region is None:
+        return image
+    nothing = np.zeros((view.camera.height, view.camera.width, *image.shape[3:]), np.float32)
+    return view.region.paste(image, nothing)
+
+
+def _drawn(view: ActiveView) -> np.ndarray:
+    """Return the drawn pixels of a view, bool [H, W]."""
+    return np.ones((view.camera.height, view.camera.width), bool) if view.region is None else view.region.mask

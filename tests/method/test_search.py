@@ -1,0 +1,141 @@
+"""Coarse search: parts that move farther than they are wide."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morgs_mi.losses.ssim import Target
+from morgs_mi.method.active_set import ActiveSet
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.flow import FlowObservation
+from morgs_mi.method.lift import Lift
+from morgs_mi.method.motion import initial_motion
+from morgs_mi.method.search import SearchConfig, _CostSurface, search_motion
+from morgs_mi.render.active_view import ActiveView
+from tests.scenes.cameras import look_at_cameras
+from tests.scenes.gaussians import isotropic, random_sheet
+
+SHIFT = np.float32([0.15, 0.05, 0.08])  # 12 px; the rod is 6 px wide
+ROD, WALL = 24, 1500
+MOVES = np.arange(ROD + WALL) < ROD
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A bright thin rod, of a few Gaussians, in front of a textured wall, in three views."""
+    rng = np.random.default_rng(0)
+    heights = np.repeat(np.linspace(-0.4, 0.4, ROD // 2), 2) + np.tile([-0.01, 0.01], ROD // 2)
+    rod = np.stack([np.zeros(ROD), heights, np.full(ROD, -0.4)], axis=1)
+    colors = np.concatenate([rng.uniform(0.8, 1.5, (ROD, 1, 3)), rng.uniform(-1.5, -0.5, (WALL, 1, 3))])
+    before = isotropic(np.concatenate([rod, random_sheet(rng, WALL, 1.2, 0.6)]), 0.04, 0.95, colors)
+    places = [(x, 0.3, -3) for x in (-1, 0.1, 1.2)]
+    return before, dict(enumerate(map(ActiveView, look_at_cameras(places, 45, 160, 120))))
+
+
+def targets(gaussians, views):
+    return {v: Target(np.asarray(view.render(gaussians).color)) for v, view in views.items()}
+
+
+def moved(gaussians, shift=SHIFT):
+    return replace(gaussians, means=np.asarray(gaussians.means) + shift * MOVES[:, None])
+
+
+def still():
+    return Lift(np.zeros((ROD + WALL, 3), np.float32), np.full(ROD + WALL, -2, np.float32))
+
+
+@pytest.mark.parametrize("shift", [SHIFT, -SHIFT, SHIFT * [1, 1, -2]])
+def test_search_motion__finds_a_fast_thin_part(scene, shift):
+    before, views = scene
+    seen = targets(moved(before, shift), views)
+    found = search_motion(before, still(), views, seen)
+    distance = np.linalg.norm(found.displacement[MOVES] - shift, axis=1)
+    assert np.all(distance < 0.1 * np.linalg.norm(shift))
+    assert not found.displacement[~MOVES].any()
+    assert np.all(found.logit_confidence[MOVES] > 0)
+    assert np.all(found.logit_confidence[~MOVES] == -2)
+
+
+def test_search_motion__corrects_a_wrong_start(scene):
+    before, views = scene
+    wrong = Lift((-SHIFT * MOVES[:, None]).astype(np.float32), np.where(MOVES, 1, -2).astype(np.float32))
+    found = search_motion(before, wrong, views, targets(moved(before), views))
+    assert np.all(np.linalg.norm(found.displacement[MOVES] - SHIFT, axis=1) < 0.1 * np.linalg.norm(SHIFT))
+    assert np.all(found.logit_confidence[MOVES] == 1)
+
+
+def test_search_motion__keeps_a_start_that_explains_the_images(scene):
+    before, views = scene
+    right = Lift((SHIFT * MOVES[:, None]).astype(np.float32), np.where(MOVES, 1, -2).astype(np.float32))
+    assert search_motion(before, right, views, targets(moved(before), views)) is right
+    assert search_motion(before, right, {}, {}) is right
+
+
+def test_search_motion__keeps_a_part_that_vanished(scene):
+    before, views = scene
+    gone, start = before.select(np.flatnonzero(~MOVES)), still()
+    assert search_motion(before, start, views, targets(gone, views)) is start
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"reach": 0.03},
+        {"error_ratio": 1e3},
+        {"neighbours": 1},  # the rod is a row of pairs
+        {"min_size": ROD + 1},
+        {"max_parts": 0},
+        {"max_cost_ratio": 0.0},
+        {"max_error_ratio": 0.0},
+    ],
+    ids=lambda setting: next(iter(setting)),
+)
+def test_search_config__each_setting_can_prevent_a_finding(scene, setting):
+    before, views = scene
+    start = still()
+    assert search_motion(before, start, views, targets(moved(before), views), SearchConfig(**setting)) is start
+
+
+def test_search_config__min_logit_is_the_confidence_of_what_is_found(scene):
+    before, views = scene
+    found = search_motion(before, still(), views, targets(moved(before), views), SearchConfig(min_logit=1.5))
+    assert np.all(found.logit_confidence[MOVES] == 1.5)
+
+
+def test_initial_motion__searches_where_flow_sees_nothing(scene):
+    before, views = scene
+    flow = np.zeros((120, 160, 2), np.float32), np.ones((120, 160), bool)
+    flows = {v: FlowObservation(*flow, *flow) for v in views}
+    active = ActiveSet(np.arange(len(MOVES)), len(MOVES), views, len(views))
+    for searches in (True, False):
+        config, rng = MotionConfig(search_motion=searches), np.random.default_rng(0)
+        initial = initial_motion(before, active, flows, targets(moved(before), views), config, rng)
+        assert initial.displacement[MOVES].any() == searches
+
+
+def test_cost_surface__is_the_weighted_squared_difference():
+    rng = np.random.default_rng(0)
+    camera = look_at_cameras([(0, 0, -3)], 45, 64, 48)[0]
+    before, after = rng.random((2, 48, 64, 3)).astype(np.float32)
+    weight = np.zeros((48, 64), np.float32)
+    weight[20:26, 30:35] = rng.random((6, 5))
+    surface = _CostSurface.of(before, weight, after, camera, 0.5)
+    shifts = np.array([(0, 0), (4, -3), (-11, 9)])
+    expected = [
+        np.sum(weight[..., None].astype(float) * (np.roll(after, (-y, -x), (0, 1)).astype(float) - before) ** 2)
+        for x, y in shifts
+    ]
+    origin, depth = np.array([[32.0, 24.0]]), np.array([3.0])
+    center = camera.unproject(origin, depth)[0]
+    d = camera.unproject(origin + shifts, np.full(3, 3.0)) - center
+    assert np.allclose(surface.at(center, d), expected, rtol=1e-3)
+
+
+def test_search_config__refuses_settings_out_of_range():
+    with pytest.raises(ValueError, match="`reach` must be in"):
+        SearchConfig(reach=0)
+    with pytest.raises(ValueError, match="`neighbours` must be at least 1, got 0"):
+        SearchConfig(neighbours=0)
