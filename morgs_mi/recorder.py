@@ -45,6 +45,7 @@ __all__ = [
     "read_reports",
     "stream_capture",
     "stream_metadata",
+    "with_next",
     "with_points",
 ]
 
@@ -135,9 +136,9 @@ def _stream(
         if interrupted is not None and interrupted.index[-1][0] == PacketKind.RESIDUAL:
             for packet in due_keyframe(interrupted.coded, interval):
                 writer.write(packet)
-        for frame in frames:
+        for frame, upcoming in with_next(frames):
             tick = None if on_step is None else _frame_ticker(on_step, frame.index)
-            packet, report = push_frame(loop, frame, train, tick)
+            packet, report = push_frame(loop, frame, train, tick, upcoming)
             reports.append(report)
             _check_in_place(path, written)
             write_json(out / "report.json", {**metadata, "frames": [asdict(r) for r in reports]})
@@ -157,12 +158,34 @@ def with_points(capture: Capture, seed: int, on_stage: Callable[[str, int, int],
 
 
 def push_frame(
-    loop: StreamLoop, frame: PartialFrame, train: Sequence[int], on_step: Callable[[int, int], None] | None = None
+    loop: StreamLoop,
+    frame: PartialFrame,
+    train: Sequence[int],
+    on_step: Callable[[int, int], None] | None = None,
+    upcoming: PartialFrame | None = None,
 ) -> tuple[Packet, FrameReport]:
     """Fit the next frame of a loop on the views `train`; the report's status names the images that are missing."""
-    packet, report = loop.push([frame.images[v] for v in train], on_step)
+    images, ahead = (None if f is None else [f.images[v] for v in train] for f in (frame, upcoming))
+    assert images is not None
+    packet, report = loop.push(images, on_step, ahead)
     status = "; ".join([*([report.status] if report.status != "ok" else []), *frame.problems]) or "ok"
     return packet, replace(report, status=status)
+
+
+def with_next(frames: Iterable[PartialFrame]) -> Iterator[tuple[PartialFrame, PartialFrame | None]]:
+    """Yield each frame with the one after it, which is None for the last; raise what reading that one raised after."""
+    frames = iter(frames)
+    frame = next(frames, None)
+    while frame is not None:
+        upcoming, problem = None, None
+        try:
+            upcoming = next(frames, None)
+        except Exception as error:
+            problem = error
+        yield frame, upcoming
+        if problem is not None:
+            raise problem
+        frame = upcoming
 
 
 def _reported(frames: Iterable[PartialFrame], report: Callable[[int, int], None], count: int) -> Iterator[PartialFrame]:

@@ -21,6 +21,7 @@ SUBPACKAGES = (
     "fit",
     "codec",
     "config",
+    "observation",
     "stream_loop",
     "capture",
     "calibration",

@@ -20,7 +20,7 @@ from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import PAYLOAD, TRAILER, StreamWriter
 from morgs_mi.codec.packets import CodedFrame, coded_frames, play, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.recorder import _without_folder, stream_capture, stream_metadata
+from morgs_mi.recorder import _without_folder, stream_capture, stream_metadata, with_next
 from morgs_mi.stream_loop import StreamLoop
 from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
 from tests.scenes.captures import colmap
@@ -345,3 +345,19 @@ def test_stream_capture__does_not_write_into_a_capture(tmp_path: Path, link: str
         stream_capture(recording(), out, CONFIG)
     assert sorted(capture.rglob("*")) == before
     assert (capture / "capture.json").read_text() == "{}"
+
+
+def test_with_next__pairs_each_frame_with_its_successor() -> None:
+    assert list(with_next(iter("abc"))) == [("a", "b"), ("b", "c"), ("c", None)]
+    assert list(with_next([])) == []
+
+
+def test_with_next__yields_the_frames_before_one_that_cannot_be_read() -> None:
+    def frames():
+        yield from "ab"
+        raise OSError("the video ends here")
+
+    seen = []
+    with pytest.raises(OSError, match="the video ends here"):
+        seen.extend(with_next(frames()))
+    assert seen == [("a", "b"), ("b", None)]

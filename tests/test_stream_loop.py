@@ -5,12 +5,13 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import json
+import threading
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, Gaussians, RenderConfig, rasterize, stream_loop
+from morgs_mi import Camera, Gaussians, RenderConfig, observation, rasterize, stream_loop
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.codec.container import PacketKind, encode_packet
 from morgs_mi.codec.packets import coded_frames, decode, play
@@ -229,9 +230,9 @@ def without(images, *views):
 def test_push__without_an_image_of_one_view(clip, monkeypatch):
     """Flow on two key views out of those that have both images: not of the missing view, nor when it is back."""
     flow_views = []
-    observe = stream_loop.observe_key_views
+    observe = observation.observe_key_views
     monkeypatch.setattr(
-        stream_loop,
+        observation,
         "observe_key_views",
         lambda pairs, *more: flow_views.append({p.camera for p in pairs.values()}) or observe(pairs, *more),
     )
@@ -385,7 +386,7 @@ def test_push__skipping_static_views_costs_no_quality(clip):
 
 def test_step__is_pure_and_complete(clip):
     """With default settings, called twice in a row and again from the same state; the caller's images may be reused."""
-    setup = stream_loop.prepare(cameras()[:4], *points_and_colors(), StreamConfig(fit=QUICK.fit))
+    setup = observation.prepare(cameras()[:4], *points_and_colors(), StreamConfig(fit=QUICK.fit))
     start = stream_loop.StreamState()
     buffers = [image.copy() for image in clip[0][:4]]
     first, keyframe, _ = stream_loop.step(setup, start, buffers)
@@ -410,6 +411,49 @@ def test_resume__copies_its_images_and_refuses_those_of_another_size(clip, full)
     loop.resume(coded, [buffers])
     for buffer in buffers:
         buffer[:] = 0
-    assert all(np.array_equal(loop.state.images[view], clip[0][view]) for view in range(4))
+    assert all(np.array_equal(loop.state.seen.images[view], clip[0][view]) for view in range(4))
     with pytest.raises(ValueError, match=r"must be uint8 \[72, 96, 3\]"):
         loop.resume(coded, [[image[:50] for image in buffers]])
+
+
+def pushed_ahead(clip, upcoming):
+    """Return the packets of three frames, pushed with the images that `upcoming` makes of those of the next frame."""
+    loop = new_loop(dataclasses.replace(QUICK, render=RenderConfig(reproducible=True)))
+    packets = []
+    for images, following in pairwise(clip):
+        ahead = upcoming(following[:4])
+        packets.append(loop.push(images[:4], upcoming=ahead)[0])
+        for image in ahead or ():
+            image[:] = 0  # it belongs to the caller again
+    return packets
+
+
+@pytest.fixture(scope="module")
+def plain(clip):
+    return [packet.encoded for packet in pushed_ahead(clip, lambda images: None)]
+
+
+def test_push__observes_the_upcoming_frame_in_another_thread_and_changes_nothing(clip, plain, monkeypatch):
+    threads, observe = [], stream_loop.observe_frame
+    monkeypatch.setattr(
+        stream_loop, "observe_frame", lambda *given: threads.append(threading.current_thread()) or observe(*given)
+    )
+    ahead = pushed_ahead(clip, lambda images: [image.copy() for image in images])
+    assert threads[0] is threading.main_thread()
+    assert len(threads) == 4
+    assert threading.main_thread() not in threads[1:]
+    assert [packet.encoded for packet in ahead] == plain
+
+
+def test_push__uses_no_observation_of_other_images(clip, plain):
+    wrong = pushed_ahead(clip, lambda images: [image // 2 for image in images])
+    assert [packet.encoded for packet in wrong] == plain
+
+
+def test_push__refuses_upcoming_images_of_another_size_in_their_turn(clip):
+    loop, small = new_loop(), [image[:50] for image in clip[1][:4]]
+    loop.push(clip[0][:4], upcoming=small)
+    with pytest.raises(ValueError, match=r"frame 1 of view 'cam00' must be uint8 \[72, 96, 3\]"):
+        loop.push(small)
+    loop.push(clip[1][:4])
+    assert loop.state.frame == 2

@@ -36,8 +36,8 @@ from morgs_mi.stream_loop import StreamLoop
 
 # Stages of a frame: file and function that are timed.
 STAGES = {
-    "change": ("stream_loop.py", "_changes"),
-    "flow": ("stream_loop.py", "_observe"),
+    "change": ("observation.py", "see_frame"),
+    "flow": ("observation.py", "_flows"),
     "part": ("stream_loop.py", "_active_set"),
     "targets": ("losses/ssim.py", "__init__"),
     "lift": ("method/lift.py", "lift_flow"),

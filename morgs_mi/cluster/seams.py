@@ -28,9 +28,10 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.evaluate.results import VariationScores
 from morgs_mi.evaluate.temporal import StillVariation, recorded_change
+from morgs_mi.observation import Images, Seen, Setup
 from morgs_mi.playback.player import render, render_config, truth_for_camera
 from morgs_mi.playback.visualise import to_uint8
-from morgs_mi.stream_loop import FrameReport, Images, Setup, StreamState, step
+from morgs_mi.stream_loop import FrameReport, StreamState, step
 
 __all__ = ["COMMON_FRAMES", "SeamConfig", "SeamScores", "approached", "changed_packet", "fit_seam_frame", "score_seam"]
 
@@ -120,7 +121,7 @@ def fit_seam_frame(
     coded, last, seconds = base, earlier, 0.0
     for number in range(config.passes):
         repeated = replace(setup, config=config.fit_config(setup.config, number))
-        state = StreamState(frame, replace(coded, frame=frame - 1), last, earlier)
+        state = StreamState(frame, replace(coded, frame=frame - 1), Seen(last, earlier))
         state, _, report = step(repeated, state, [images.get(view) for view in range(len(setup.cameras))], on_step)
         assert state.coded is not None
         coded, last, seconds = state.coded, images, seconds + report.seconds

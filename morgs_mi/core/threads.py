@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
-__all__ = ["map_in_threads"]
+__all__ = ["in_background", "map_in_threads"]
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -20,6 +20,14 @@ def map_in_threads(function: Callable[[Item], Result], items: Iterable[Item]) ->
     """
     with ThreadPoolExecutor(_usable_cores()) as pool:
         return list(pool.map(function, items))
+
+
+def in_background(function: Callable[[], Result]) -> Future[Result]:
+    """Return the future result of a function that runs in a thread of its own."""
+    pool = ThreadPoolExecutor(1)
+    future = pool.submit(function)
+    pool.shutdown(wait=False)
+    return future
 
 
 def _usable_cores() -> int:

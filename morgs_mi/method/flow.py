@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.threads import map_in_threads
 from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.flow_sources.config import FlowConfig
 from morgs_mi.method.flow_sources.consistency import consistency_mask
-from morgs_mi.method.flow_sources.registry import FramePair, flow_source
+from morgs_mi.method.flow_sources.registry import FlowSource, FramePair, flow_source
 from morgs_mi.method.mask_refiners.config import MaskConfig
 
 __all__ = ["FlowObservation", "choose_key_views", "observe_flow", "observe_key_views"]
@@ -95,18 +96,26 @@ def observe_key_views(
         ValueError: as `flow_source` and `mask_refiner`.
     """
     source = flow_source(method, flow)
+    flows = map_in_threads(lambda pair: _checked_flow(source, pair, flow), pairs.values())
     observations = {}
-    for view, pair in pairs.items():
-        backward, forward = source(pair)  # eq. 4
-        reliable, forward_reliable = _reliable(pair, backward, forward, flow)
-        if pair.region is not None:
-            # Flow bleeds over the edges of what moves; what has not changed has not moved.
-            backward, forward = (np.where(pair.region[..., None], f, 0) for f in (backward, forward))
-            still = ~pair.region if pair.valid is None else ~pair.region & pair.valid
-            reliable, forward_reliable = reliable | still, forward_reliable | still
+    for (view, pair), (backward, forward, reliable, forward_reliable) in zip(pairs.items(), flows, strict=True):
         mask = motion_mask(pair.image, -backward, reliable, mask_method, masks) if mask_method else None  # eqs. 9, 10
         observations[view] = FlowObservation(-backward, reliable, forward, forward_reliable, mask)
     return observations
+
+
+def _checked_flow(
+    source: FlowSource, pair: FramePair, config: FlowConfig | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return the backward flow (eq. 4), the forward flow, and where each is reliable."""
+    backward, forward = source(pair)
+    reliable, forward_reliable = _reliable(pair, backward, forward, config)
+    if pair.region is not None:
+        # Flow bleeds over the edges of what moves; what has not changed has not moved.
+        backward, forward = (np.where(pair.region[..., None], f, 0) for f in (backward, forward))
+        still = ~pair.region if pair.valid is None else ~pair.region & pair.valid
+        reliable, forward_reliable = reliable | still, forward_reliable | still
+    return backward, forward, reliable, forward_reliable
 
 
 def _reliable(

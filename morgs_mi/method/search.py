@@ -229,7 +229,7 @@ class _CostSurface:
 def _blend_weights(
     previous: Gaussians, parts: Sequence[np.ndarray], before: np.ndarray, view: ActiveView
 ) -> np.ndarray:
-    """Return the blend weights m [H, W, 3] of up to three parts: what each colour gains if that of a part grows by 1."""
+    """Return the blend weights m [H, W, 3] of up to three parts: what a colour gains if that of a part grows by 1."""
     change = np.zeros_like(np.asarray(previous.sh_coeffs))
     for k, part in enumerate(parts):
         change[part, 0, k] = 1 / SH_C0

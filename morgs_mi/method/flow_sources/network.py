@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from threading import Lock
 
 import cv2
 import numpy as np
@@ -59,6 +60,7 @@ class FlowNetwork:
 
     def __init__(self, path: str | Path, low: float = 0.0, high: float = 255.0) -> None:
         self.path, self.low, self.high = Path(path), low, high
+        self._lock = Lock()  # several views are run from several threads
         self.signature = read_signature(path)
         shapes = list(self.signature.inputs.values())
         images = all(len(s) == 4 and s[0] in (1, None) and s[1] in (3, None) for s in shapes)
@@ -113,9 +115,10 @@ class FlowNetwork:
     def _run(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
         height, width = image.shape[:2]
         try:
-            for name, each in zip(self.signature.inputs, (image, other), strict=True):
-                self._net.setInput(self._blob(each), name)
-            outputs = self._net.forward(list(self.signature.outputs))
+            with self._lock:
+                for name, each in zip(self.signature.inputs, (image, other), strict=True):
+                    self._net.setInput(self._blob(each), name)
+                outputs = self._net.forward(list(self.signature.outputs))
         except cv2.error as error:
             raise ValueError(
                 f"{self.path}: OpenCV {cv2.__version__} cannot run this network on {width}x{height} pixels "
