@@ -9,6 +9,7 @@ to 2. Scores are means over the later frames of the held-out view, against the e
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import tyro
 
 from benchmarks.speed.output import Output
 from morgs_mi import Gaussians, StreamLoop, rasterize
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import Capture, PartialFrame, load_capture
 from morgs_mi.config import StreamConfig
 from morgs_mi.evaluate.metrics import iou, psnr
 from morgs_mi.synth.ground_truth import load_truth
@@ -48,23 +49,24 @@ def random_capture(clips: Path, seed: int, downscale: float = 1) -> Capture:
     return load_capture(clip, downscale)
 
 
-def measure(capture: Capture, config: StreamConfig, num_frames: int) -> dict[str, float]:
-    """Fit the frames of a capture and return the means over the later ones."""
-    train, test = capture.train_views, capture.test_view
-    assert test is not None
+def new_loop(capture: Capture, config: StreamConfig) -> StreamLoop:
+    """Return the loop over a capture's training views."""
+    train = capture.train_views
     masks = [capture.masks[v] for v in train]
-    loop = StreamLoop([capture.cameras[v] for v in train], capture.points, capture.point_colors, config, masks)
-    rows = []
-    for frame in capture.partial_frames(0, num_frames):
+    return StreamLoop([capture.cameras[v] for v in train], capture.points, capture.point_colors, config, masks)
+
+
+def later_scores(loop: StreamLoop, capture: Capture, frames: Sequence[PartialFrame]) -> dict[str, float]:
+    """Fit frames after the first one and return the means of their scores."""
+    test, rows = capture.test_view, []
+    assert test is not None
+    for frame in frames:
         start = time.process_time()
-        _, report = loop.push([frame.images[v] for v in train])
-        seconds = time.process_time() - start
-        recorded = frame.images[test]
-        if frame.index == 0 or recorded is None:
-            continue
-        assert loop.gaussians is not None
-        scores = scores_of(loop.gaussians, capture, test, frame.index, recorded)
-        rows.append({**scores, "bytes": report.num_bytes, "cpu_s": seconds, **report.active})
+        _, report = loop.push([frame.images[v] for v in capture.train_views])
+        seconds, recorded = time.process_time() - start, frame.images[test]
+        if recorded is not None and loop.gaussians is not None:
+            scores = scores_of(loop.gaussians, capture, test, frame.index, recorded)
+            rows.append({**scores, "bytes": report.num_bytes, "cpu_s": seconds, **report.active})
     return {name: float(f"{np.nanmean([row[name] for row in rows]):.4g}") for name in rows[0]}
 
 
@@ -92,7 +94,11 @@ def main(options: Options) -> None:
     config = replace(config, fit=replace(config.fit, epochs=options.epochs))
     rows: dict[str, Any] = {}
     for seed in options.seeds:
-        rows[str(seed)] = measure(random_capture(options.clips, seed), config, options.frames)
+        capture = random_capture(options.clips, seed)
+        first, *later = capture.partial_frames(0, options.frames)
+        loop = new_loop(capture, config)
+        loop.push([first.images[v] for v in capture.train_views])
+        rows[str(seed)] = later_scores(loop, capture, later)
         print(f"seed {seed}", rows[str(seed)], flush=True)
     options.write({"seeds": rows}, unprinted=["seeds"])
 
