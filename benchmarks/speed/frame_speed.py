@@ -15,6 +15,7 @@ import cProfile
 import json
 import pstats
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -152,17 +153,23 @@ def film(gaussians: Gaussians, cameras: list[Camera], rng: np.random.Generator) 
     return images
 
 
-def measure(size: Size, config: StreamConfig, recorded: list[list[np.ndarray]], scene: Scene) -> dict[str, Any]:
-    """Fit the later frames; return seconds by stage, shares of the processed parts, bytes and held-out PSNR."""
+def measure(
+    size: Size, config: StreamConfig, recorded: list[list[np.ndarray]], scene: Scene, live: bool = True
+) -> dict[str, Any]:
+    """Fit the later frames but the last; return seconds by stage, shares of what is processed, bytes, held-out PSNR.
+
+    Unless they arrive `live`, the next frame is observed while one is fitted, in another thread, whose stages are not
+    timed.
+    """
     cameras = scene.cameras()
     loop = StreamLoop(cameras[1:], np.zeros((200, 3)), np.zeros((200, 3)), config)
     start = scene.gaussians(np.asarray(scene.at(0).means), 0.02)
     loop.resume(decode(None, keyframe_packet(start, 0, cameras, config.codec)), [recorded[0][1:]])
     rows = []
-    for images in recorded[1:]:
+    for images, upcoming in pairwise(recorded[1:]):
         profile = cProfile.Profile()
         dr.sync_thread()
-        _, report = profile.runcall(loop.push, images[1:])
+        _, report = profile.runcall(loop.push, images[1:], upcoming=None if live else upcoming[1:])
         assert loop.gaussians is not None
         found = np.asarray(rasterize(loop.gaussians, cameras[0], ("color",)).color)
         squares = (np.clip(found, 0, 1) - images[0] / 255.0) ** 2
@@ -211,13 +218,15 @@ def main(options: Options) -> None:
     for name in options.sizes:
         size = SIZES[name]
         scene, rng = Scene(size, options.seed), np.random.default_rng(options.seed)
-        recorded = [film(scene.at(t), scene.cameras(), rng) for t in range(options.frames + 1)]
+        recorded = [film(scene.at(t), scene.cameras(), rng) for t in range(options.frames + 2)]
         density = DensityConfig(max_gaussians=round(1.1 * size.gaussians))
         base = StreamConfig(FitConfig(sh_degree=0, density=density), MotionConfig(), codec=CodecConfig())
         rows = {}
         for label, config in settings(options, name, base).items():
-            rows[label] = measure(size, config, recorded, scene)
-            print(f"{name:6s} {label:28s}", json.dumps(rows[label]), flush=True)
+            for live in (False, True) if label.startswith("default") else (True,):
+                row = f"{label}, live" if live and label.startswith("default") else label
+                rows[row] = measure(size, config, recorded, scene, live)
+                print(f"{name:6s} {row:28s}", json.dumps(rows[row]), flush=True)
         result[name] = {"size": vars(size), "runs": rows}
     if options.json is not None:
         write_json(options.json, result)

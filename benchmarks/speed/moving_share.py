@@ -68,7 +68,7 @@ def changed_share(scene: Scene) -> float:
 def fits(scene: Scene, size: Size, options: Options) -> dict[str, Any]:
     """Return the figures of a scene, with and without leaving out what is static."""
     rng = np.random.default_rng(options.seed)
-    recorded = [film(scene.at(frame), scene.cameras(), rng) for frame in range(options.frames + 1)]
+    recorded = [film(scene.at(frame), scene.cameras(), rng) for frame in range(options.frames + 2)]
     density = DensityConfig(max_gaussians=round(1.1 * size.gaussians))
     fit = FitConfig(sh_degree=0, density=density, epochs=options.epochs)
     runs = {

@@ -46,7 +46,7 @@ def fit_on(count: int, options: Options) -> dict[str, float]:
     mi.set_variant("llvm_ad_rgb")
     size = SIZES[options.size]
     scene, rng = Scene(size, options.seed), np.random.default_rng(options.seed)
-    recorded = [film(scene.at(frame), scene.cameras(), rng) for frame in range(options.frames + 1)]
+    recorded = [film(scene.at(frame), scene.cameras(), rng) for frame in range(options.frames + 2)]
     density = DensityConfig(max_gaussians=round(1.1 * size.gaussians))
     config = StreamConfig(FitConfig(sh_degree=0, density=density, epochs=options.epochs))
     row = measure(size, config, recorded, scene)
