@@ -17,7 +17,9 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.types import Float, Tensor, UInt32
+from morgs_mi.surfaces.splat_path import splats_of
 
 __all__ = ["SurfaceView", "lights", "shared_scene", "surface_scene"]
 
@@ -76,6 +78,12 @@ def shared_scene(parts: list[Any], whole: Any) -> Any:
     return scene
 
 
+def _attached(thing: Any) -> list[str]:
+    """Return the names of the parameters of a scene or shape that are attached to the gradient graph."""
+    params: Any = mi.traverse(thing)
+    return [key for key in params.keys() if dr.grad_enabled(params[key])]  # noqa: SIM118
+
+
 @contextmanager
 def _detached(shapes: list[Any]) -> Iterator[None]:
     """Detach the parameters of shapes meanwhile.
@@ -86,7 +94,7 @@ def _detached(shapes: list[Any]) -> Iterator[None]:
     attached = []
     for shape in shapes:
         params: Any = mi.traverse(shape)
-        attached += [(params, key, params[key]) for key in params.keys() if dr.grad_enabled(params[key])]  # noqa: SIM118
+        attached += [(params, key, params[key]) for key in _attached(shape)]
     for params, key, value in attached:
         params[key] = dr.detach(value)
     try:
@@ -110,8 +118,10 @@ class SurfaceView:
         image: radiance and alpha of the nested integrator [h, w, 4], in linear light, a leaf of the gradient graph.
         coverage: fraction of each pixel in which a surface is seen [P], in [0, 1].
         depth: mean camera-space z of what is seen there [P], world units; inf where there is no surface.
-        behind: radiance of the environment at the pixels' centres, three floats [P], differentiable; None if there is
-            none, or the integrator hides it.
+        behind: radiance of the environment at the pixels' centres, `mi.Color3f` [P], a leaf of the gradient graph; None
+            if there is none, or the integrator hides it.
+        splats: the Gaussians, detached.
+        srgb: whether their colours are sRGB-encoded.
     """
 
     scene: Any
@@ -123,7 +133,9 @@ class SurfaceView:
     image: Tensor
     coverage: Float
     depth: Float
-    behind: list[Float] | None
+    behind: Any
+    splats: ActivatedGaussians
+    srgb: bool
 
     @staticmethod
     def of(
@@ -134,6 +146,8 @@ class SurfaceView:
         template: Any,
         seed: int,
         spp: int,
+        splats: ActivatedGaussians,
+        srgb: bool,
     ) -> SurfaceView | None:
         """Render the surfaces of a scene, or return None if it has neither surfaces nor an environment.
 
@@ -145,6 +159,8 @@ class SurfaceView:
             template: sensor with the sampler and the far plane.
             seed: of the integrator's samples.
             spp: its samples per pixel; 0: those of the sampler.
+            splats: the Gaussians of the scene.
+            srgb: whether their colours are sRGB-encoded.
 
         Raises:
             ValueError: as for `surface_scene`.
@@ -161,42 +177,56 @@ class SurfaceView:
         sampler = template.sampler().clone()
         sampler.set_sample_count(spp or sampler.sample_count())
         spp = sampler.sample_count()  # some samplers round it up
-        with dr.suspend_grad():
+        with dr.suspend_grad(), splats_of(integrator, splats, srgb):
             image = mi.TensorXf(integrator.render(scene, sensor, seed=seed, spp=spp))
             coverage, depth = _depth(scene, sensor)
-        dr.enable_grad(image)
-        shown = scene.environment() is not None and not getattr(integrator, "hide_emitters", False)
-        behind = _environment(scene, sensor) if shown else None
-        return SurfaceView(scene, gaussians, integrator, sensor, seed, spp, image, coverage, depth, behind)
+            shown = scene.environment() is not None and not getattr(integrator, "hide_emitters", False)
+            behind = _environment(scene, sensor) if shown else None
+        dr.enable_grad(image, behind)
+        return SurfaceView(
+            scene, gaussians, integrator, sensor, seed, spp, image, coverage, depth, behind, dr.detach(splats), srgb
+        )
 
     def forward(self, params: Any) -> None:
-        """Set the tangents of `image` from those of the surfaces' parameters."""
-        if self._differentiates():
-            with _detached(self.gaussians):
-                tangent = self.integrator.render_forward(self.scene, params, self.sensor, seed=self.seed, spp=self.spp)
-            dr.set_grad(self.image, tangent)
+        """Set the tangents of `image` and `behind` from those of the surfaces' parameters."""
+        if not self._differentiates():
+            return
+        with _detached(self.gaussians), splats_of(self.integrator, self.splats, self.srgb):
+            tangent = self.integrator.render_forward(self.scene, params, self.sensor, seed=self.seed, spp=self.spp)
+        dr.set_grad(self.image, tangent)
+        if self.behind is not None and dr.grad_enabled(values := _environment(self.scene, self.sensor)):
+            dr.set_grad(self.behind, dr.forward_to(values))
 
     def backward(self, params: Any) -> None:
-        """Add to the gradients of the surfaces' parameters those that follow from the gradient of `image`.
+        """Add to the gradients of the surfaces' parameters those that follow from those of `image` and `behind`.
 
         Its samples are others than those of `image`: where an image is no linear function of the radiance, the product
         of two noisy factors would be biased.
         """
-        if self._differentiates():
-            seed, _ = mi.sample_tea_32(self.seed, 1)
-            grad = dr.grad(self.image)
+        if not self._differentiates():
+            return
+        seed, _ = mi.sample_tea_32(self.seed, 1)
+        grad = dr.grad(self.image)
+        with splats_of(self.integrator, self.splats, self.srgb):
             self.integrator.render_backward(self.scene, params, grad, self.sensor, seed=seed, spp=self.spp)
+        if self.behind is not None and dr.grad_enabled(values := _environment(self.scene, self.sensor)):
+            # `values` may be a parameter itself, whose gradient is added to.
+            dr.backward(dr.sum(dr.dot(values, dr.grad(self.behind))))
 
     def _differentiates(self) -> bool:
         """Return whether any parameter of the surfaces is differentiated."""
-        params: Any = mi.traverse(self.scene)
-        attached = [key for key in params.keys() if dr.grad_enabled(params[key])]  # noqa: SIM118
+        params, attached = mi.traverse(self.scene), _attached(self.scene)
         moving = [key for key in attached if params.flags(key) & mi.ParamFlags.Discontinuous]
         if moving:
             _log.warning(
                 "gaussian_splat: gradients of the surfaces' positions lack what changes with their silhouettes and "
                 "depth; do not optimise `%s` with it.",
                 "`, `".join(moving),
+            )
+        if hasattr(self.integrator, "splats") and any(_attached(shape) for shape in self.gaussians):
+            _log.warning(
+                "splat_path: gradients of the Gaussians are those of the splats that the camera sees; they lack what "
+                "the Gaussians send to the surfaces and take from their light."
             )
         return bool(attached)
 
@@ -226,13 +256,13 @@ def _depth(scene: Any, sensor: Any) -> tuple[Float, Float]:
     return coverage, depth
 
 
-def _environment(scene: Any, sensor: Any) -> list[Float]:
+def _environment(scene: Any, sensor: Any) -> Any:
     """Return the radiance of the environment behind every pixel's centre."""
     pixel = dr.arange(mi.UInt32, int(dr.prod(sensor.film().crop_size())))
     rays = _rays(sensor, pixel, mi.Point2f(0.5))
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(pixel))
     si.wi, si.wavelengths = -rays.d, rays.wavelengths
-    return list(mi.unpolarized_spectrum(scene.environment().eval(si)))
+    return mi.Color3f(mi.unpolarized_spectrum(scene.environment().eval(si)))
 
 
 def _rays(sensor: Any, pixel: UInt32, inside: Any) -> Any:

@@ -163,6 +163,7 @@ DIFFERENTIATED = {
     "wall.bsdf.reflectance.value": 1e-2,
     "ball.emitter.radiance.value": 1e-2,
     "lamp.intensity.value": 1e-1,
+    "sky.radiance.value": 1e-2,
 }
 
 
