@@ -84,8 +84,7 @@ def light_probe(
     faces = [_face(gaussians, center, face, size, background, near) for face in _FACES]
     color = from_numpy(mi.Float, _resampled(faces, directions))
     light = radiance(dr.unravel(mi.Color3f, color), clipped)
-    bitmap = mi.TensorXf(dr.ravel(light), (*directions.shape[:2], 3))
-    return {"type": "envmap", "bitmap": mi.Bitmap(bitmap)}
+    return {"type": "envmap", "bitmap": mi.Bitmap(np.array(light).T.reshape(directions.shape))}
 
 
 def _directions(height: int) -> np.ndarray:

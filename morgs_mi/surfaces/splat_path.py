@@ -198,7 +198,7 @@ def _plugin() -> type:
                 mi.Bool(True),
             )
             end = dr.while_loop(state, lambda active, *_: active, bounce, label=f"splat_path ({mode.name})")
-            _, _, _, depth, L, δL, *_ = end
+            depth, L, δL = end[3:6]
             return L if primal else δL, depth != 0, [], L
 
         def _layer(self, ray: Any, active: Bool) -> tuple[Any, Float]:

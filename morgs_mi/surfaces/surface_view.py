@@ -21,7 +21,7 @@ from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.types import Float, Tensor, UInt32
 from morgs_mi.surfaces.splat_path import splats_of
 
-__all__ = ["SurfaceView", "lights", "shared_scene", "surface_scene"]
+__all__ = ["SurfaceView", "coverage_and_depth", "lights", "shared_scene", "surface_scene"]
 
 _log = logging.getLogger(__name__)
 
@@ -179,7 +179,7 @@ class SurfaceView:
         spp = sampler.sample_count()  # some samplers round it up
         with dr.suspend_grad(), splats_of(integrator, splats, srgb):
             image = mi.TensorXf(integrator.render(scene, sensor, seed=seed, spp=spp))
-            coverage, depth = _depth(scene, sensor)
+            coverage, depth = coverage_and_depth(scene, sensor)
             shown = scene.environment() is not None and not getattr(integrator, "hide_emitters", False)
             behind = _environment(scene, sensor) if shown else None
         dr.enable_grad(image, behind)
@@ -236,8 +236,14 @@ class SurfaceView:
         return np.array(self.coverage > 0).reshape(self.image.shape[:2])
 
 
-def _depth(scene: Any, sensor: Any) -> tuple[Float, Float]:
-    """Return the coverage and the mean depth z of the surfaces in every pixel, by rays through a regular grid."""
+def coverage_and_depth(scene: Any, sensor: Any, shape: Any = None) -> tuple[Float, Float]:
+    """Return the coverage and the mean depth z of surfaces in every pixel [P], by rays through a regular grid.
+
+    Args:
+        scene: the surfaces.
+        sensor: a `perspective` camera.
+        shape: the surface that counts, where the others do not hide it; None: all.
+    """
     pixel = dr.arange(mi.UInt32, int(dr.prod(sensor.film().crop_size())))
     params: Any = mi.traverse(sensor)
     to_camera = params["to_world"].inverse()
@@ -245,7 +251,7 @@ def _depth(scene: Any, sensor: Any) -> tuple[Float, Float]:
     def cast(k: UInt32, count: Float, total: Float) -> tuple[UInt32, Float, Float]:
         rays = _rays(sensor, pixel, (mi.Vector2f(k % _GRID, k // _GRID) + 0.5) / _GRID)
         found = scene.ray_intersect_preliminary(rays, coherent=True)
-        hit = found.is_valid()
+        hit = found.is_valid() if shape is None else found.is_valid() & (found.shape == mi.ShapePtr(shape))
         z = (to_camera @ rays(dr.select(hit, found.t, 0))).z
         return k + 1, count + dr.select(hit, mi.Float(1), 0), total + dr.select(hit, z, 0)
 
