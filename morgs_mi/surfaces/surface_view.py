@@ -179,7 +179,7 @@ class SurfaceView:
         spp = sampler.sample_count()  # some samplers round it up
         with dr.suspend_grad(), splats_of(integrator, splats, srgb):
             image = mi.TensorXf(integrator.render(scene, sensor, seed=seed, spp=spp))
-            coverage, depth = coverage_and_depth(scene, sensor)
+            coverage, depth = coverage_and_depth(scene, sensor, camera, crop)
             shown = scene.environment() is not None and not getattr(integrator, "hide_emitters", False)
             behind = _environment(scene, sensor) if shown else None
         dr.enable_grad(image, behind)
@@ -236,15 +236,22 @@ class SurfaceView:
         return np.array(self.coverage > 0).reshape(self.image.shape[:2])
 
 
-def coverage_and_depth(scene: Any, sensor: Any, shape: Any = None) -> tuple[Float, Float]:
+def coverage_and_depth(
+    scene: Any, sensor: Any, camera: Camera, crop: tuple[int, int, int, int], shape: Any = None
+) -> tuple[Float, Float]:
     """Return the coverage and the mean depth z of surfaces in every pixel [P], by rays through a regular grid.
 
     Args:
         scene: the surfaces.
-        sensor: a `perspective` camera.
+        sensor: a camera's sensor, with a film of the pixels of `crop`.
+        camera: the same camera.
+        crop: pixels of the camera's image, (x, y, width, height), P in all.
         shape: the surface that counts, where the others do not hide it; None: all.
     """
-    pixel = dr.arange(mi.UInt32, int(dr.prod(sensor.film().crop_size())))
+    first, (across, down) = _rectangle(scene.bbox() if shape is None else shape.bbox(), camera, crop)
+    lane, columns = dr.arange(mi.UInt32, across * down), dr.opaque(mi.UInt32, max(across, 1))
+    row = lane // columns
+    pixel = (row + int(first[1])) * dr.opaque(mi.UInt32, crop[2]) + lane - row * columns + int(first[0])
     params: Any = mi.traverse(sensor)
     to_camera = params["to_world"].inverse()
 
@@ -255,11 +262,28 @@ def coverage_and_depth(scene: Any, sensor: Any, shape: Any = None) -> tuple[Floa
         z = (to_camera @ rays(dr.select(hit, found.t, 0))).z
         return k + 1, count + dr.select(hit, mi.Float(1), 0), total + dr.select(hit, z, 0)
 
-    state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
-    _, count, total = dr.while_loop(state, lambda k, *_: k < _GRID**2, cast, label="coverage")
-    coverage, depth = count / _GRID**2, dr.select(count > 0, total / count, dr.inf)
+    coverage, depth = dr.zeros(mi.Float, crop[2] * crop[3]), dr.full(mi.Float, dr.inf, crop[2] * crop[3])
+    if across * down:
+        state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
+        _, count, total = dr.while_loop(state, lambda k, *_: k < _GRID**2, cast, label="coverage")
+        dr.scatter(coverage, count / _GRID**2, pixel, mode=dr.ReduceMode.Permute)
+        dr.scatter(depth, dr.select(count > 0, total / count, dr.inf), pixel, mode=dr.ReduceMode.Permute)
     dr.eval(coverage, depth)
     return coverage, depth
+
+
+def _rectangle(box: Any, camera: Camera, crop: tuple[int, int, int, int]) -> tuple[np.ndarray, list[int]]:
+    """Return the first pixel (x, y) of a crop that a bounding box may reach, and how many from there, (x, y)."""
+    ends = np.stack([np.ravel(box.min), np.ravel(box.max)])
+    corners = np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    pixels, depth = camera.project(corners)
+    low, high = np.zeros(2), np.array(crop[2:])
+    if (depth >= camera.near).all():
+        low, high = (
+            np.clip(end - np.array(crop[:2]), 0, high)
+            for end in (np.floor(pixels.min(0)) - 1, np.ceil(pixels.max(0)) + 1)
+        )
+    return low.astype(int), (high - low).astype(int).tolist()
 
 
 def _environment(scene: Any, sensor: Any) -> Any:
