@@ -34,7 +34,7 @@ from morgs_mi.render.rasterize import rasterize
 from morgs_mi.surfaces.light_probe import light_probe
 from morgs_mi.surfaces.mattes import mattes
 from morgs_mi.surfaces.shadows import shadow_ratio, shadowed
-from morgs_mi.surfaces.splat_path import splats_of
+from morgs_mi.surfaces.splat_path import rays_for, traced
 from morgs_mi.surfaces.surface_view import lights
 from morgs_mi.synth.scene import failures_in
 
@@ -215,7 +215,7 @@ def _render(
         dark = shadowed(gaussians, ratio)
         images = _plugin_images(dark, camera, inserted, nested, channels, samples)
         if "surfaces" in channels:
-            with splats_of(nested, dark, srgb=True):
+            with traced(nested, rays_for(nested, dark), srgb=True):
                 images["surfaces"] = np.asarray(nested.render(inserted, _sensor(camera), spp=samples))
     except RuntimeError as error:
         raise ValueError(f"The inserted scene: {str(error).strip().splitlines()[0]}") from error

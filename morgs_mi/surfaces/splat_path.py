@@ -28,22 +28,27 @@ from morgs_mi.core.types import Bool, Float, Jit
 from morgs_mi.surfaces.light_probe import CLIPPED, radiance
 from morgs_mi.surfaces.splat_rays import SplatRays
 
-__all__ = ["splats_of"]
+__all__ = ["rays_for", "traced"]
+
+
+def rays_for(integrator: Any, gaussians: ActivatedGaussians) -> SplatRays | None:
+    """Return N Gaussians prepared for a `splat_path`, and None for other integrators."""
+    return SplatRays(gaussians) if hasattr(integrator, "splats") else None
 
 
 @contextmanager
-def splats_of(integrator: Any, gaussians: ActivatedGaussians, srgb: bool) -> Iterator[None]:
-    """Let a `splat_path` trace rays through N Gaussians meanwhile; other integrators are left as they are.
+def traced(integrator: Any, splats: SplatRays | None, srgb: bool) -> Iterator[None]:
+    """Let an integrator trace rays through Gaussians meanwhile.
 
     Args:
         integrator: any integrator.
-        gaussians: N Gaussians.
+        splats: the Gaussians, see `rays_for`; None: the integrator is left as it is.
         srgb: whether their colours are sRGB-encoded.
     """
-    if not hasattr(integrator, "splats"):
+    if splats is None:
         yield
         return
-    integrator.splats, integrator.srgb = SplatRays(gaussians), srgb
+    integrator.splats, integrator.srgb = splats, srgb
     try:
         yield
     finally:
@@ -80,6 +85,11 @@ def _plugin() -> type:
 
         def __init__(self, props: Any) -> None:
             super().__init__(props)
+            if not mi.is_rgb:
+                raise ValueError(
+                    f"splat_path: expected a variant such as 'llvm_ad_rgb', got {mi.variant()!r}; call "
+                    "mi.set_variant() before the scene is loaded, because Gaussians have RGB colours."
+                )
             self.clipped = float(props.get("clipped", CLIPPED))
             if not 1 <= self.clipped < float("inf"):
                 raise ValueError(

@@ -19,7 +19,8 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.types import Float, Tensor, UInt32
-from morgs_mi.surfaces.splat_path import splats_of
+from morgs_mi.surfaces.splat_path import rays_for, traced
+from morgs_mi.surfaces.splat_rays import SplatRays
 
 __all__ = ["SurfaceView", "coverage_and_depth", "lights", "shared_scene", "surface_scene"]
 
@@ -120,7 +121,7 @@ class SurfaceView:
         depth: mean camera-space z of what is seen there [P], world units; inf where there is no surface.
         behind: radiance of the environment at the pixels' centres, `mi.Color3f` [P], a leaf of the gradient graph; None
             if there is none, or the integrator hides it.
-        splats: the Gaussians, detached.
+        splats: the Gaussians, for an integrator that traces rays through them; None for others.
         srgb: whether their colours are sRGB-encoded.
     """
 
@@ -134,7 +135,7 @@ class SurfaceView:
     coverage: Float
     depth: Float
     behind: Any
-    splats: ActivatedGaussians
+    splats: SplatRays | None
     srgb: bool
 
     @staticmethod
@@ -177,21 +178,20 @@ class SurfaceView:
         sampler = template.sampler().clone()
         sampler.set_sample_count(spp or sampler.sample_count())
         spp = sampler.sample_count()  # some samplers round it up
-        with dr.suspend_grad(), splats_of(integrator, splats, srgb):
+        rays = rays_for(integrator, splats)
+        with dr.suspend_grad(), traced(integrator, rays, srgb):
             image = mi.TensorXf(integrator.render(scene, sensor, seed=seed, spp=spp))
             coverage, depth = coverage_and_depth(scene, sensor, camera, crop)
             shown = scene.environment() is not None and not getattr(integrator, "hide_emitters", False)
             behind = _environment(scene, sensor) if shown else None
         dr.enable_grad(image, behind)
-        return SurfaceView(
-            scene, gaussians, integrator, sensor, seed, spp, image, coverage, depth, behind, dr.detach(splats), srgb
-        )
+        return SurfaceView(scene, gaussians, integrator, sensor, seed, spp, image, coverage, depth, behind, rays, srgb)
 
     def forward(self, params: Any) -> None:
         """Set the tangents of `image` and `behind` from those of the surfaces' parameters."""
         if not self._differentiates():
             return
-        with _detached(self.gaussians), splats_of(self.integrator, self.splats, self.srgb):
+        with _detached(self.gaussians), traced(self.integrator, self.splats, self.srgb):
             tangent = self.integrator.render_forward(self.scene, params, self.sensor, seed=self.seed, spp=self.spp)
         dr.set_grad(self.image, tangent)
         if self.behind is not None and dr.grad_enabled(values := _environment(self.scene, self.sensor)):
@@ -207,7 +207,7 @@ class SurfaceView:
             return
         seed, _ = mi.sample_tea_32(self.seed, 1)
         grad = dr.grad(self.image)
-        with splats_of(self.integrator, self.splats, self.srgb):
+        with traced(self.integrator, self.splats, self.srgb):
             self.integrator.render_backward(self.scene, params, grad, self.sensor, seed=seed, spp=self.spp)
         if self.behind is not None and dr.grad_enabled(values := _environment(self.scene, self.sensor)):
             # `values` may be a parameter itself, whose gradient is added to.
@@ -223,7 +223,7 @@ class SurfaceView:
                 "depth; do not optimise `%s` with it.",
                 "`, `".join(moving),
             )
-        if hasattr(self.integrator, "splats") and any(_attached(shape) for shape in self.gaussians):
+        if self.splats is not None and any(_attached(shape) for shape in self.gaussians):
             _log.warning(
                 "splat_path: gradients of the Gaussians are those of the splats that the camera sees; they lack what "
                 "the Gaussians send to the surfaces and take from their light."
