@@ -25,7 +25,7 @@ from morgs_mi import Camera, Gaussians, SplatRays, ellipsoids, light_probe, shad
 
 CENTER, RADIUS = (0.2, 0.0, -0.9), 0.4
 # Gaussians, width and height in px.
-SCENES = ((20_000, 800, 600), (100_000, 640, 480), (200_000, 1280, 960))
+SCENES = ((20_000, 800, 600), (100_000, 640, 480), (200_000, 800, 600))
 
 
 @dataclass(frozen=True)
@@ -34,9 +34,9 @@ class Options(Output):
 
     samples: int = 16
     """Samples per pixel of the surfaces."""
-    repeats: int = 7
+    repeats: int = 5
     """Runs of which the median is reported."""
-    rays: int = 50_000
+    rays: int = 20_000
     """Rays that are traced through the Gaussians."""
 
 

@@ -249,7 +249,10 @@ def coverage_and_depth(
         shape: the surface that counts, where the others do not hide it; None: all.
     """
     first, (across, down) = _rectangle(scene.bbox() if shape is None else shape.bbox(), camera, crop)
-    lane, columns = dr.arange(mi.UInt32, across * down), dr.opaque(mi.UInt32, max(across, 1))
+    coverage, depth = dr.zeros(mi.Float, crop[2] * crop[3]), dr.full(mi.Float, dr.inf, crop[2] * crop[3])
+    if not across * down:
+        return coverage, depth
+    lane, columns = dr.arange(mi.UInt32, across * down), dr.opaque(mi.UInt32, across)
     row = lane // columns
     pixel = (row + int(first[1])) * dr.opaque(mi.UInt32, crop[2]) + lane - row * columns + int(first[0])
     params: Any = mi.traverse(sensor)
@@ -262,18 +265,18 @@ def coverage_and_depth(
         z = (to_camera @ rays(dr.select(hit, found.t, 0))).z
         return k + 1, count + dr.select(hit, mi.Float(1), 0), total + dr.select(hit, z, 0)
 
-    coverage, depth = dr.zeros(mi.Float, crop[2] * crop[3]), dr.full(mi.Float, dr.inf, crop[2] * crop[3])
-    if across * down:
-        state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
-        _, count, total = dr.while_loop(state, lambda k, *_: k < _GRID**2, cast, label="coverage")
-        dr.scatter(coverage, count / _GRID**2, pixel, mode=dr.ReduceMode.Permute)
-        dr.scatter(depth, dr.select(count > 0, total / count, dr.inf), pixel, mode=dr.ReduceMode.Permute)
+    state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
+    _, count, total = dr.while_loop(state, lambda k, *_: k < _GRID**2, cast, label="coverage")
+    dr.scatter(coverage, count / _GRID**2, pixel, mode=dr.ReduceMode.Permute)
+    dr.scatter(depth, dr.select(count > 0, total / count, dr.inf), pixel, mode=dr.ReduceMode.Permute)
     dr.eval(coverage, depth)
     return coverage, depth
 
 
 def _rectangle(box: Any, camera: Camera, crop: tuple[int, int, int, int]) -> tuple[np.ndarray, list[int]]:
     """Return the first pixel (x, y) of a crop that a bounding box may reach, and how many from there, (x, y)."""
+    if not box.valid():  # no surface
+        return np.zeros(2, int), [0, 0]
     ends = np.stack([np.ravel(box.min), np.ravel(box.max)])
     corners = np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     pixels, depth = camera.project(corners)

@@ -239,5 +239,5 @@ def test_splat_path__refuses_scenes_without_a_gaussian_splat_integrator():
 
 
 def test_splat_path__refuses_a_radiance_below_white():
-    with pytest.raises(RuntimeError, match="`clipped` must be in"):
+    with pytest.raises(RuntimeError, match="`clipped` must be a number in"):
         mi.load_dict({"type": "splat_path", "clipped": 0.5})
