@@ -149,19 +149,18 @@ class SplatRays:
         >>> color, transmittance = rays.trace(mi.Ray3f((0, 0, -3), (0, 0, 1)))
 
     Raises:
-        ValueError: `gaussians` are none.
+        ValueError: `gaussians` are none, or have numbers that are not finite.
     """
 
     def __init__(self, gaussians: ActivatedGaussians, config: RenderConfig | None = None) -> None:
-        if not hasattr(gaussians, "means"):
+        if not hasattr(gaussians, "means") or not int(gaussians.means.shape[0]):
             raise ValueError(
-                f"SplatRays(): `gaussians` must be Gaussians, got a {type(gaussians).__name__}; pass some."
+                "SplatRays(): `gaussians` must be at least one Gaussian, got a "
+                f"{type(gaussians).__name__} without any; pass some."
             )
         self._config = config or RenderConfig()
-        means, scales, quats, opacities = (
-            np.array(dr.detach(getattr(gaussians, name)), np.float64)
-            for name in ("means", "scales", "quats", "opacities")
-        )
+        values = {name: _finite(gaussians, name) for name in ("means", "scales", "quats", "opacities", "sh_coeffs")}
+        means, scales, quats, opacities, coeffs = values.values()
         scales = np.maximum(scales, np.maximum(_THINNEST * scales.max(1, keepdims=True), 1e-30))
         quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1, 0, 0, 0])
         axes = Rotation.from_quat(quats, scalar_first=True).as_matrix()
@@ -171,10 +170,10 @@ class SplatRays:
         self._tree, order = _Tree.of(means[drawn], halves[drawn])
         index = np.concatenate([drawn, [0]])[order]
         # Four floats each, which are read as one packet.
-        rows, coeffs = np.zeros((len(index), 4, 4)), np.array(dr.detach(gaussians.sh_coeffs))
+        rows = np.zeros((len(index), 4, 4))
         rows[:, :3, :3], rows[:, :3, 3] = (axes / scales[:, None]).transpose(0, 2, 1)[index], means[index]
         rows[:, 3, 0] = np.where(order < len(drawn), opacities.ravel()[index], 0)
-        padded = np.zeros((*coeffs.shape[:2], 4), np.float32)
+        padded = np.zeros((*coeffs.shape[:2], 4))
         padded[..., :3] = coeffs
         self._rows, self._coeffs = from_numpy(mi.Float, rows), from_numpy(mi.Float, padded[index])
         self._degree = round(sqrt(coeffs.shape[1])) - 1
@@ -279,6 +278,18 @@ class SplatRays:
             c = dr.gather(mi.Vector4f, self._coeffs, K * row + k)
             total += value * mi.Color3f(c.x, c.y, c.z)
         return dr.maximum(total, 0)
+
+
+def _finite(gaussians: ActivatedGaussians, name: str) -> np.ndarray:
+    """Return an attribute in float64, detached."""
+    values = np.array(dr.detach(getattr(gaussians, name)), np.float64)
+    bad = np.argwhere(~np.isfinite(values))
+    if len(bad):
+        raise ValueError(
+            f"SplatRays(): `{name}` must be finite, got {values[tuple(bad[0])]} at {bad[0].tolist()} ({len(bad)} such "
+            "values); remove these Gaussians."
+        )
+    return values
 
 
 def _longest_axis(points: np.ndarray) -> int:

@@ -140,6 +140,15 @@ def test_splat_rays__of_gaussians_that_are_too_faint_or_too_thin_to_draw():
     assert SplatRays(disc).transmittance(ray)[0] == pytest.approx(0.5, abs=1e-5)
 
 
-def test_splat_rays__refuse_what_are_no_gaussians():
-    with pytest.raises(ValueError, match=r"SplatRays\(\): `gaussians` must be Gaussians, got a str"):
-        SplatRays("a")
+@pytest.mark.parametrize("make", [lambda: "text", lambda: cloud(0)], ids=["no Gaussians", "none of them"])
+def test_splat_rays__refuse_what_are_no_gaussians(make):
+    with pytest.raises(ValueError, match=r"SplatRays\(\): `gaussians` must be at least one Gaussian, got a"):
+        SplatRays(make())
+
+
+def test_splat_rays__refuse_numbers_that_are_not_finite():
+    gaussians = cloud(5)
+    means = gaussians.numpy()["means"]
+    means[3, 1] = np.nan
+    with pytest.raises(ValueError, match=r"`means` must be finite, got nan at \[3, 1\] \(1 such values\)"):
+        SplatRays(Gaussians(**{**gaussians.numpy(), "means": means}))
