@@ -28,6 +28,8 @@ _log = logging.getLogger(__name__)
 
 # Rays along each axis of a pixel that find its coverage and depth.
 _GRID = 3
+# Those of the grid that are cast in every pixel, and the others, row by row.
+_FIRST, _OTHERS = (1, 5, 6), (0, 2, 3, 4, 7, 8)
 
 
 def surface_scene(scene: Any) -> Any:
@@ -241,6 +243,8 @@ def coverage_and_depth(
 ) -> tuple[Float, Float]:
     """Return the coverage and the mean depth z of surfaces in every pixel [P], by rays through a regular grid.
 
+    Three rays, one in each row and column of the grid, decide where all are cast: where they or the next pixels differ.
+
     Args:
         scene: the surfaces.
         sensor: a camera's sensor, with a film of the pixels of `crop`.
@@ -258,16 +262,37 @@ def coverage_and_depth(
     params: Any = mi.traverse(sensor)
     to_camera = params["to_world"].inverse()
 
-    def cast(k: UInt32, count: Float, total: Float) -> tuple[UInt32, Float, Float]:
-        rays = _rays(sensor, pixel, (mi.Vector2f(k % _GRID, k // _GRID) + 0.5) / _GRID)
-        found = scene.ray_intersect_preliminary(rays, coherent=True)
-        hit = found.is_valid() if shape is None else found.is_valid() & (found.shape == mi.ShapePtr(shape))
-        z = (to_camera @ rays(dr.select(hit, found.t, 0))).z
-        return k + 1, count + dr.select(hit, mi.Float(1), 0), total + dr.select(hit, z, 0)
+    def cast(pixel: UInt32, grid: tuple[int, ...]) -> tuple[Float, Float]:
+        """Return the number of hits of some rays of the grid in pixels, and the sum of their depths."""
+        cells, end = mi.UInt32(grid), dr.opaque(mi.UInt32, len(grid))
 
-    state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
-    _, count, total = dr.while_loop(state, lambda k, *_: k < _GRID**2, cast, label="coverage")
-    dr.scatter(coverage, count / _GRID**2, pixel, mode=dr.ReduceMode.Permute)
+        def step(i: UInt32, count: Float, total: Float) -> tuple[UInt32, Float, Float]:
+            k = dr.gather(mi.UInt32, cells, i)
+            rays = _rays(sensor, pixel, (mi.Vector2f(k % _GRID, k // _GRID) + 0.5) / _GRID)
+            found = scene.ray_intersect_preliminary(rays, coherent=True)
+            hit = found.is_valid() if shape is None else found.is_valid() & (found.shape == mi.ShapePtr(shape))
+            z = (to_camera @ rays(dr.select(hit, found.t, 0))).z
+            return i + 1, count + dr.select(hit, mi.Float(1), 0), total + dr.select(hit, z, 0)
+
+        state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
+        return dr.while_loop(state, lambda i, *_: i < end, step, label="coverage")[1:]
+
+    count, total = cast(pixel, _FIRST)
+    rays = dr.full(mi.Float, len(_FIRST), across * down)
+    dr.eval(count, total, rays)
+    column = lane - row * columns
+    neighbours = ((lane - 1, column > 0), (lane + 1, column + 1 < columns), (lane - columns, row > 0))
+    neighbours = (*neighbours, (lane + columns, lane + columns < across * down))
+    mixed = (count > 0) & (count < len(_FIRST))
+    for place, inside in neighbours:
+        mixed |= dr.gather(mi.Float, count, place, active=inside) != count
+    edge = dr.compress(mixed)
+    if dr.width(edge):
+        more, deeper = cast(dr.gather(mi.UInt32, pixel, edge), _OTHERS)
+        more, deeper = more + dr.gather(mi.Float, count, edge), deeper + dr.gather(mi.Float, total, edge)
+        for target, values in ((count, more), (total, deeper), (rays, mi.Float(_GRID**2))):
+            dr.scatter(target, values, edge, mode=dr.ReduceMode.Permute)
+    dr.scatter(coverage, count / rays, pixel, mode=dr.ReduceMode.Permute)
     dr.scatter(depth, dr.select(count > 0, total / count, dr.inf), pixel, mode=dr.ReduceMode.Permute)
     dr.eval(coverage, depth)
     return coverage, depth
