@@ -18,7 +18,7 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
-from morgs_mi.core.types import Float, Tensor, UInt32
+from morgs_mi.core.types import Bool, Float, Tensor, UInt32
 from morgs_mi.surfaces.splat_path import rays_for, traced
 from morgs_mi.surfaces.splat_rays import SplatRays
 
@@ -256,7 +256,8 @@ def coverage_and_depth(
     coverage, depth = dr.zeros(mi.Float, crop[2] * crop[3]), dr.full(mi.Float, dr.inf, crop[2] * crop[3])
     if not across * down:
         return coverage, depth
-    lane, columns = dr.arange(mi.UInt32, across * down), dr.opaque(mi.UInt32, across)
+    lane: UInt32 = dr.arange(mi.UInt32, across * down)
+    columns: UInt32 = dr.opaque(mi.UInt32, across)
     row = lane // columns
     pixel = (row + int(first[1])) * dr.opaque(mi.UInt32, crop[2]) + lane - row * columns + int(first[0])
     params: Any = mi.traverse(sensor)
@@ -283,10 +284,10 @@ def coverage_and_depth(
     column = lane - row * columns
     neighbours = ((lane - 1, column > 0), (lane + 1, column + 1 < columns), (lane - columns, row > 0))
     neighbours = (*neighbours, (lane + columns, lane + columns < across * down))
-    mixed = (count > 0) & (count < len(_FIRST))
+    mixed: Bool = (count > 0) & (count < len(_FIRST))
     for place, inside in neighbours:
         mixed |= dr.gather(mi.Float, count, place, active=inside) != count
-    edge = dr.compress(mixed)
+    edge: Any = dr.compress(mixed)
     if dr.width(edge):
         more, deeper = cast(dr.gather(mi.UInt32, pixel, edge), _OTHERS)
         more, deeper = more + dr.gather(mi.Float, count, edge), deeper + dr.gather(mi.Float, total, edge)
