@@ -30,6 +30,7 @@ from morgs_mi.render.recording import render_lock  # noqa: E402
 from morgs_mi.stream_loop import FrameReport, StreamLoop  # noqa: E402
 from morgs_mi.surfaces.light_probe import light_probe  # noqa: E402
 from morgs_mi.surfaces.shadows import shadow_ratio, shadowed  # noqa: E402
+from morgs_mi.surfaces.splat_rays import SplatRays  # noqa: E402
 from morgs_mi.synth.ground_truth import load_tracks, load_truth  # noqa: E402
 from morgs_mi.synth.synthesize import synthesize  # noqa: E402
 
@@ -49,6 +50,7 @@ __all__ = [
     "PointTracks",
     "ProgressBar",
     "RenderConfig",
+    "SplatRays",
     "StreamConfig",
     "StreamLoop",
     "channel_image",

@@ -301,7 +301,9 @@ def _plugin() -> type:
 
             surfaces = None
             if self.surfaces is not None:
-                surfaces = SurfaceView.of(scene, self.surfaces, camera, crop, sensor, seed, spp)
+                surfaces = SurfaceView.of(
+                    scene, self.surfaces, camera, crop, sensor, seed, spp, gaussians, self.srgb_primitives
+                )
             if surfaces is None:
                 self._warn_about_emitters(scene)
                 columns = self._splats(gaussians, camera, channels, crop)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import DisallowNone, Positional, arg
 
@@ -46,6 +46,10 @@ class Render:
     shadows: bool = True
     """Whether an inserted scene throws shadows on the stream."""
 
+    light: Literal["probe", "traced"] = "probe"
+    """Light of an inserted scene: an environment map at its middle, or rays traced through the Gaussians, for their
+    shadows and reflections."""
+
     def run(self) -> None:
         from morgs_mi.export.clips import frame_numbers
         from morgs_mi.export.frames import is_layered, write_frames, write_images
@@ -68,6 +72,8 @@ class Render:
             else:
                 layers = inserted_channels(stream) if is_layered(output) else ("color",)
                 channels, build = self.channels or layers, load_insert(self.insert)
-                images = render_inserted(stream, camera, build, frames, channels, self.samples, self.shadows)
+                images = render_inserted(
+                    stream, camera, build, frames, channels, self.samples, self.shadows, self.light
+                )
                 write_images(images, stream.fps, output, done)
         print_result(f"{output}: {len(frames)} frames of camera {camera.name}, {camera.width}x{camera.height}.")

@@ -13,7 +13,8 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+from xml.etree import ElementTree
 
 import mitsuba as mi
 import numpy as np
@@ -25,20 +26,25 @@ from morgs_mi.core.checks import check_number
 from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.export.clips import frame_numbers
+from morgs_mi.export.frames import MATTE
 from morgs_mi.gaussian_integrator import ellipsoids
 from morgs_mi.playback.player import available_channels
 from morgs_mi.render.channels import exr_names
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.surfaces.light_probe import light_probe
+from morgs_mi.surfaces.mattes import mattes
 from morgs_mi.surfaces.shadows import shadow_ratio, shadowed
+from morgs_mi.surfaces.splat_path import rays_for, traced
 from morgs_mi.surfaces.surface_view import lights
 from morgs_mi.synth.scene import failures_in
 
-__all__ = ["LAYERS", "captured_light", "inserted_channels", "load_insert", "render_inserted", "selected"]
+__all__ = ["LAYERS", "Light", "captured_light", "inserted_channels", "load_insert", "render_inserted", "selected"]
 
-LAYERS = ("splats", "surfaces", "shadow")
-"""Further channels, for compositing: the splats alone and the surfaces alone, in linear light with alpha, and the
-shadow of the surfaces on the splats, a factor of their linear light."""
+LAYERS = ("splats", "surfaces", "shadow", "mattes")
+"""Further channels, for compositing: the splats alone and the surfaces alone, in linear light with alpha, the shadow of
+the surfaces on the splats, a factor of their linear light, and ``matte:NAME`` for every shape and the splats."""
+
+Light = Literal["probe", "traced"]
 
 Build = Callable[[int, float], dict[str, Any]]
 
@@ -114,6 +120,7 @@ def render_inserted(
     channels: Sequence[str] = ("color",),
     samples: int = 16,
     shadows: bool = True,
+    light: Light = "probe",
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """Render frames of a stream for one camera with a Mitsuba scene inserted.
 
@@ -127,9 +134,11 @@ def render_inserted(
         channels: out of ``color``, ``alpha``, the AOVs of `gaussian_splat`, and `LAYERS`.
         samples: samples per pixel of the inserted surfaces.
         shadows: whether they throw shadows on the Gaussians, see `shadow_ratio`.
+        light: ``probe`` lights them by an environment map, see `captured_light`; ``traced`` traces rays through the
+            Gaussians (`splat_path`), which also throw shadows on them.
 
     Yields:
-        (frame, images) as `render_stream` does.
+        (frame, images) as `render_stream` does; the layer ``mattes`` is one image per name.
 
     Raises:
         ValueError: a broken packet, or a scene that Mitsuba or `gaussian_splat` refuses.
@@ -137,7 +146,8 @@ def render_inserted(
     check_number("render_inserted()", "samples", samples, "[1, inf)")
     for frame, gaussians in play(stream):
         if frames is None or frame in frames:
-            yield frame, _render(gaussians, camera, build(frame, frame / stream.fps), channels, samples, shadows)
+            entries = build(frame, frame / stream.fps)
+            yield frame, _render(gaussians, camera, entries, channels, samples, shadows, light)
 
 
 def captured_light(gaussians: Gaussians, camera: Camera, position: np.ndarray) -> dict[str, Any]:
@@ -145,8 +155,35 @@ def captured_light(gaussians: Gaussians, camera: Camera, position: np.ndarray) -
 
     A capture rarely shows what is behind the cameras; black there would take half of the light away.
     """
-    color = np.asarray(rasterize(gaussians, camera, ("color",)).color)
-    return light_probe(gaussians, position, background=np.clip(color, 0, 1).mean((0, 1)).tolist())
+    return light_probe(gaussians, position, background=_mean_color(gaussians, camera))
+
+
+def _mean_color(gaussians: Gaussians, camera: Camera) -> list[float]:
+    return np.clip(np.asarray(rasterize(gaussians, camera, ("color",)).color), 0, 1).mean((0, 1)).tolist()
+
+
+def _in_background_light(entries: dict[str, Any], gaussians: Gaussians, camera: Camera) -> Any:
+    """Return the inserted scene with the light that comes from behind all Gaussians, as for `captured_light`."""
+    radiance = srgb_to_linear(np.array(_mean_color(gaussians, camera))).tolist()
+    lamp = {"type": "constant", "radiance": {"type": "rgb", "value": radiance}}
+    return mi.load_dict({"type": "scene", **entries, "captured light": lamp})
+
+
+def _integrator(chosen: Any, light: Light) -> Any:
+    """Return the integrator of the surfaces, that of the inserted scene if it has one.
+
+    Raises:
+        ValueError: it does not light them as the option demands.
+    """
+    chosen = chosen or {"type": "splat_path" if light == "traced" else "path"}
+    nested = mi.load_dict(chosen) if isinstance(chosen, dict) else chosen
+    if hasattr(nested, "splats") != (light == "traced"):
+        found = type(nested).__name__ if hasattr(nested, "splats") else nested.class_name()
+        raise ValueError(
+            f"The inserted scene: with light {light!r}, expected {'an' if light == 'traced' else 'no'} integrator "
+            f"`splat_path`, got {found}; remove `integrator` from the scene, or choose the other light."
+        )
+    return nested
 
 
 def _render(
@@ -156,31 +193,40 @@ def _render(
     channels: Sequence[str],
     samples: int,
     shadows: bool,
+    light: Light,
 ) -> dict[str, np.ndarray]:
     entries = {name: value for name, value in entries.items() if name not in ("type", "sensor")}
-    nested = entries.pop("integrator", {"type": "path"})
-    nested = mi.load_dict(nested) if isinstance(nested, dict) else nested
-    ratio = np.ones(len(gaussians), np.float32)
+    nested = _integrator(entries.pop("integrator", None), light)
+    ratio, found = np.ones(len(gaussians), np.float32), {}
     try:
         inserted: Any = mi.load_dict({"type": "scene", **entries})
         if not (inserted.shapes() or inserted.emitters()):
             raise ValueError("The inserted scene: expected at least one shape, got none; add one.")
+        lit = inserted
         if not inserted.emitters():
-            light = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel())
-            inserted = mi.load_dict({"type": "scene", **entries, "captured light": light})
+            lamp = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel())
+            lit = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
+            inserted = lit if light == "probe" else _in_background_light(entries, gaussians, camera)
+        if "mattes" in channels:
+            # Before other scenes rename the shapes.
+            found = mattes(gaussians, camera, inserted)
         if shadows:
-            ratio = shadow_ratio(gaussians, inserted, camera.position)
-        images = _plugin_images(shadowed(gaussians, ratio), camera, inserted, nested, channels, samples)
+            ratio = shadow_ratio(gaussians, lit, camera.position)
+        dark = shadowed(gaussians, ratio)
+        images = _plugin_images(dark, camera, inserted, nested, channels, samples)
         if "surfaces" in channels:
-            images["surfaces"] = np.asarray(nested.render(inserted, _sensor(camera), spp=samples))
+            with traced(nested, rays_for(nested, dark), srgb=True):
+                images["surfaces"] = np.asarray(nested.render(inserted, _sensor(camera), spp=samples))
     except RuntimeError as error:
         raise ValueError(f"The inserted scene: {str(error).strip().splitlines()[0]}") from error
     if {"splats", "shadow"} & set(channels):
-        alone, dark = (rasterize(part, camera) for part in (gaussians, shadowed(gaussians, ratio)))
-        light, less = (srgb_to_linear(np.asarray(image.color)) for image in (alone, dark))
-        images["splats"] = np.concatenate([light, np.asarray(alone.alpha)], axis=2)
-        images["shadow"] = np.where(light > 0, less / np.maximum(light, 1e-6), 1)
-    return {name: images[name].astype(np.float32) for name in channels}
+        alone, less = (rasterize(part, camera) for part in (gaussians, dark))
+        bright, less = (srgb_to_linear(np.asarray(image.color)) for image in (alone, less))
+        images["splats"] = np.concatenate([bright, np.asarray(alone.alpha)], axis=2)
+        images["shadow"] = np.where(bright > 0, less / np.maximum(bright, 1e-6), 1)
+    images |= {f"{MATTE}{name}": part[..., None] for name, part in found.items()}
+    names = [name for name in channels if name != "mattes"] + [f"{MATTE}{name}" for name in found]
+    return {name: images[name].astype(np.float32) for name in names}
 
 
 def _plugin_images(
@@ -216,7 +262,10 @@ def _xml_entries(path: Path) -> dict[str, Any]:
         scene: Any = mi.load_file(str(path))
     except RuntimeError as error:
         raise ValueError(f"{path}: {str(error).strip().splitlines()[0]}; correct the scene file.") from error
-    return {**{f"part{i}": part for i, part in enumerate(_parts(scene))}, "integrator": scene.integrator()}
+    parts = {part.id() or f"part{i}": part for i, part in enumerate(_parts(scene))}
+    # Mitsuba adds an integrator to files without one.
+    chosen = ElementTree.parse(path).find("integrator") is not None
+    return {**parts, "integrator": scene.integrator()} if chosen else parts
 
 
 def _parts(scene: Any) -> list[Any]:

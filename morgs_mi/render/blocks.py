@@ -281,9 +281,16 @@ def _block_bits(
         x0, x1 = px + (i * bw + 0.5), px + (i * bw + bw - 0.5)
         x = _clipped(0, x0, x1)
         columns.append((x0, x1, a * x, slope_y * x))
+    left, right, top, bottom = columns[0][0], columns[-1][1], py + 0.5, py + (DOWN * bh - 0.5)
+    if farthest_limits is not None:
+        z, gx, gy, r_sigma = profile
+        nearest = [z + dr.minimum(gx * x0, gx * x1) for x0, x1, *_ in columns]
     mask = mi.UInt32(0)
     for j in range(DOWN):
         y0, y1 = py + (j * bh + 0.5), py + (j * bh + bh - 0.5)
+        if farthest_limits is not None:
+            row, farthest = dr.minimum(gy * y0, gy * y1), dr.gather(mi.Vector4f, farthest_limits, slot * DOWN + j)
+            ahead = [(limit - z - row) * r_sigma > -FARTHEST_CUT for limit, z in zip(farthest, nearest, strict=True)]
         y = _clipped(0, y0, y1)
         by, v, best_x = b * y, c * y, slope_x * y
         for i, (x0, x1, ax, best_y) in enumerate(columns):
@@ -291,16 +298,12 @@ def _block_bits(
             u1, y_edge = dr.fma(a, _clipped(best_x, x0, x1), by), _clipped(best_y, y0, y1)
             u2, v2 = dr.fma(b, y_edge, ax), c * y_edge
             touches = (dr.fma(u1, u1, v * v) <= reach) | (dr.fma(u2, u2, v2 * v2) <= reach)
+            if farthest_limits is not None:
+                touches &= ahead[i]
             mask |= dr.select(touches, mi.UInt32(1 << (j * ACROSS + i)), mi.UInt32(0))
 
-    x0, x1, y0, y1 = columns[0][0], columns[-1][1], py + 0.5, py + (DOWN * bh - 0.5)
     if farthest_limits is not None:
         # A limit in front hides what would hide later entries, so that none is left out for its transmittance.
-        nearest = (
-            profile[0] + dr.minimum(profile[1] * x0, profile[1] * x1) + dr.minimum(profile[2] * y0, profile[2] * y1)
-        )
-        ahead = (dr.gather(mi.Float, farthest_limits, slot) - nearest) * profile[3] > -FARTHEST_CUT
-        mask = dr.select(ahead, mask, 0)
         dr.eval(mask)
         return _transposed_words(mask, tiles, first_word, end_word, num_words)
 
@@ -310,8 +313,8 @@ def _block_bits(
         u, v = dr.fma(a, x, b * y), c * y
         return dr.fma(u, u, v * v)
 
-    farthest = distance(x0, y0)
-    for x, y in ((x0, y1), (x1, y0), (x1, y1)):
+    farthest = distance(left, top)
+    for x, y in ((left, bottom), (right, top), (right, bottom)):
         farthest = dr.maximum(farthest, distance(x, y))
     alpha = dr.select(farthest < reach - 2 * _TEST_SLACK, dr.exp2(log2_opacity - farthest), 0)
     log2_transmitted = dr.log2(1 - dr.minimum(alpha, config.alpha_max))
@@ -324,15 +327,17 @@ def _block_bits(
 
 
 def _farthest_limits(limits: Float, region: Region) -> Float:
-    """Return the largest depth limit in each tile of the region."""
+    """Return the largest depth limit in each block of the region's tiles [tiles * ACROSS * DOWN]."""
     lane = dr.arange(mi.UInt32, region.width * region.height)
     row = quotient(lane, region.width)
     column = lane - row * dr.opaque(mi.UInt32, region.width)
     across = dr.gather(mi.UInt32, region.grid, mi.UInt32(0))
-    tile = row // (DOWN * region.block[1]) * across + column // (ACROSS * region.block[0])
+    x, y = column // region.block[0], row // region.block[1]
+    tile = y // DOWN * across + x // ACROSS
     slot = tile if region.whole else dr.gather(mi.UInt32, region.slot_of, tile)
-    farthest = dr.full(mi.Float, -dr.inf, region.num_tiles)
-    dr.scatter_reduce(dr.ReduceOp.Max, farthest, limits, slot, active=slot != NO_SLOT)
+    farthest = dr.full(mi.Float, -dr.inf, region.num_tiles * ACROSS * DOWN)
+    bit = y % DOWN * ACROSS + x % ACROSS
+    dr.scatter_reduce(dr.ReduceOp.Max, farthest, limits, slot * (ACROSS * DOWN) + bit, active=slot != NO_SLOT)
     dr.eval(farthest)
     return farthest
 

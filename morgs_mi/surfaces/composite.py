@@ -62,8 +62,9 @@ def composite(
     f, covered = view.coverage, view.coverage > 0
     t_front, t_whole = (1 - part["alpha"][0] for part in (front, whole))
 
-    behind = view.behind or [mi.Float(0)] * 3
-    ground = [0.0] * 3 if background is None or view.behind else background
+    shown = view.behind is not None
+    behind = view.behind if shown else mi.Color3f(0)
+    ground = [0.0] * 3 if background is None or shown else background
     color = []
     for k in range(3):
         L, E = view.image[:, :, k].array, behind[k]
@@ -82,7 +83,7 @@ def composite(
         splats["depth"] = _ratio([depth + f * t_front * dr.select(covered, view.depth, 0)], weight)
     if "motion" in channels:
         splats["motion"] = _ratio(splats["motion"], alpha)
-    opaque = mi.Float(1) if view.behind else dr.fma(f, t_whole, 1 - t_whole)
+    opaque = mi.Float(1) if shown else dr.fma(f, t_whole, 1 - t_whole)
     return {**splats, "color": color, "alpha": [opaque]}
 
 

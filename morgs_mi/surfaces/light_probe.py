@@ -10,17 +10,21 @@ from collections.abc import Sequence
 from typing import Any
 
 import cv2
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number, numbers
-from morgs_mi.core.color_space import srgb_to_linear
 from morgs_mi.core.gaussians import ActivatedGaussians
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.render.rasterize import rasterize
 
-__all__ = ["light_probe"]
+__all__ = ["CLIPPED", "light_probe", "radiance"]
+
+CLIPPED = 4.0
+"""Radiance of colours that the video clipped at 1: a guess of two stops above white."""
 
 # Direction and up of the faces of the cube.
 _FACES = [
@@ -42,7 +46,7 @@ def light_probe(
     position: ArrayLike,
     height: int = 256,
     background: Sequence[float] | None = None,
-    clipped: float = 4.0,
+    clipped: float = CLIPPED,
     near: float = 0.01,
 ) -> dict[str, Any]:
     """Return the dictionary of a Mitsuba `envmap` emitter with the light that Gaussians send to a point.
@@ -78,8 +82,9 @@ def light_probe(
     # A face has as many pixels per degree as the map.
     size = max(int(height) // 2, 4)
     faces = [_face(gaussians, center, face, size, background, near) for face in _FACES]
-    color = _resampled(faces, directions)
-    return {"type": "envmap", "bitmap": mi.Bitmap(_radiance(color, clipped))}
+    color = from_numpy(mi.Float, _resampled(faces, directions))
+    light = radiance(dr.unravel(mi.Color3f, color), clipped)
+    return {"type": "envmap", "bitmap": mi.Bitmap(np.array(light).T.reshape(directions.shape))}
 
 
 def _directions(height: int) -> np.ndarray:
@@ -122,8 +127,15 @@ def _resampled(faces: list[tuple[Camera, np.ndarray]], directions: np.ndarray) -
     return result
 
 
-def _radiance(color: np.ndarray, clipped: float) -> np.ndarray:
-    """Return the linear light of display-referred colours, those that are clipped scaled up to `clipped`."""
-    position = np.clip((color.max(-1, keepdims=True) - _KNEE) / (1 - _KNEE), 0, 1)
-    radiance = srgb_to_linear(color) * (1 + (clipped - 1) * position**2 * (3 - 2 * position))
-    return radiance.astype(np.float32)
+def radiance(color: Any, clipped: float, srgb: bool = True) -> Any:
+    """Return the linear light of display-referred colours (`mi.Color3f` [M]), those that are clipped up to `clipped`.
+
+    Args:
+        color: blended colours of Gaussians.
+        clipped: radiance of what was clipped at 1; between display-referred 0.95 and 1, it rises to this.
+        srgb: whether the colours are sRGB-encoded; others are linear light already, and were not clipped.
+    """
+    if not srgb:
+        return color
+    position = dr.clip((dr.max(color) - _KNEE) / (1 - _KNEE), 0, 1)
+    return mi.math.srgb_to_linear(color) * (1 + (clipped - 1) * dr.square(position) * (3 - 2 * position))

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
@@ -119,16 +120,15 @@ def _orientation(gaussians: Gaussians, means: np.ndarray) -> tuple[np.ndarray, n
     axes = Rotation.from_quat(quats, scalar_first=True).as_matrix() * scales[:, None]
     _, near = KDTree(means).query(means, min(_NEIGHBOURS, len(means)), workers=-1)
     near = near.reshape(len(means), -1)
-    weights = np.array(dr.detach(gaussians.opacities))[near] + 1e-9  # an opacity may be 0 in float32
-    weights = weights / weights.sum(1, keepdims=True)
-    center = np.einsum("nk,nki->ni", weights, means[near])
-    # The covariance of the mixture: that of its means, and the mean of its covariances; by neighbour, to save memory.
-    covariances = axes @ axes.transpose(0, 2, 1)
-    covariance = np.zeros_like(covariances)
-    for k in range(near.shape[1]):
-        offset = means[near[:, k]] - center
-        spread = offset[:, :, None] * offset[:, None, :]
-        covariance += weights[:, k, None, None] * (spread + covariances[near[:, k]])
+    weights = np.array(dr.detach(gaussians.opacities), np.float64)[near] + 1e-9  # an opacity may be 0 in float32
+    weights /= weights.sum(1, keepdims=True)
+    ends = np.arange(0, near.size + 1, near.shape[1])
+    mixture = csr_array((weights.ravel(), near.ravel(), ends), shape=(len(means), len(means)))
+    # The covariance of the mixture: the mean of its second moments, less that of its centre.
+    centered = means - means.mean(0)
+    moments = axes @ axes.transpose(0, 2, 1) + centered[:, :, None] * centered[:, None, :]
+    center = mixture @ centered
+    covariance = (mixture @ moments.reshape(-1, 9)).reshape(-1, 3, 3) - center[:, :, None] * center[:, None, :]
     variances, directions = np.linalg.eigh(covariance)
     return directions[:, :, 0], 1 - variances[:, 0] / np.maximum(variances[:, 1], 1e-30)
 

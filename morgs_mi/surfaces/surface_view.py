@@ -17,14 +17,19 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.types import Float, Tensor, UInt32
+from morgs_mi.core.gaussians import ActivatedGaussians
+from morgs_mi.core.types import Bool, Float, Tensor, UInt32
+from morgs_mi.surfaces.splat_path import rays_for, traced
+from morgs_mi.surfaces.splat_rays import SplatRays
 
-__all__ = ["SurfaceView", "lights", "shared_scene", "surface_scene"]
+__all__ = ["SurfaceView", "coverage_and_depth", "lights", "shared_scene", "surface_scene"]
 
 _log = logging.getLogger(__name__)
 
 # Rays along each axis of a pixel that find its coverage and depth.
 _GRID = 3
+# Those of the grid that are cast in every pixel, and the others, row by row.
+_FIRST, _OTHERS = (1, 5, 6), (0, 2, 3, 4, 7, 8)
 
 
 def surface_scene(scene: Any) -> Any:
@@ -76,6 +81,12 @@ def shared_scene(parts: list[Any], whole: Any) -> Any:
     return scene
 
 
+def _attached(thing: Any) -> list[str]:
+    """Return the names of the parameters of a scene or shape that are attached to the gradient graph."""
+    params: Any = mi.traverse(thing)
+    return [key for key in params.keys() if dr.grad_enabled(params[key])]  # noqa: SIM118
+
+
 @contextmanager
 def _detached(shapes: list[Any]) -> Iterator[None]:
     """Detach the parameters of shapes meanwhile.
@@ -86,7 +97,7 @@ def _detached(shapes: list[Any]) -> Iterator[None]:
     attached = []
     for shape in shapes:
         params: Any = mi.traverse(shape)
-        attached += [(params, key, params[key]) for key in params.keys() if dr.grad_enabled(params[key])]  # noqa: SIM118
+        attached += [(params, key, params[key]) for key in _attached(shape)]
     for params, key, value in attached:
         params[key] = dr.detach(value)
     try:
@@ -110,8 +121,10 @@ class SurfaceView:
         image: radiance and alpha of the nested integrator [h, w, 4], in linear light, a leaf of the gradient graph.
         coverage: fraction of each pixel in which a surface is seen [P], in [0, 1].
         depth: mean camera-space z of what is seen there [P], world units; inf where there is no surface.
-        behind: radiance of the environment at the pixels' centres, three floats [P], differentiable; None if there is
-            none, or the integrator hides it.
+        behind: radiance of the environment at the pixels' centres, `mi.Color3f` [P], a leaf of the gradient graph; None
+            if there is none, or the integrator hides it.
+        splats: the Gaussians, for an integrator that traces rays through them; None for others.
+        srgb: whether their colours are sRGB-encoded.
     """
 
     scene: Any
@@ -123,7 +136,9 @@ class SurfaceView:
     image: Tensor
     coverage: Float
     depth: Float
-    behind: list[Float] | None
+    behind: Any
+    splats: SplatRays | None
+    srgb: bool
 
     @staticmethod
     def of(
@@ -134,6 +149,8 @@ class SurfaceView:
         template: Any,
         seed: int,
         spp: int,
+        splats: ActivatedGaussians,
+        srgb: bool,
     ) -> SurfaceView | None:
         """Render the surfaces of a scene, or return None if it has neither surfaces nor an environment.
 
@@ -145,6 +162,8 @@ class SurfaceView:
             template: sensor with the sampler and the far plane.
             seed: of the integrator's samples.
             spp: its samples per pixel; 0: those of the sampler.
+            splats: the Gaussians of the scene.
+            srgb: whether their colours are sRGB-encoded.
 
         Raises:
             ValueError: as for `surface_scene`.
@@ -161,42 +180,55 @@ class SurfaceView:
         sampler = template.sampler().clone()
         sampler.set_sample_count(spp or sampler.sample_count())
         spp = sampler.sample_count()  # some samplers round it up
-        with dr.suspend_grad():
+        rays = rays_for(integrator, splats)
+        with dr.suspend_grad(), traced(integrator, rays, srgb):
             image = mi.TensorXf(integrator.render(scene, sensor, seed=seed, spp=spp))
-            coverage, depth = _depth(scene, sensor)
-        dr.enable_grad(image)
-        shown = scene.environment() is not None and not getattr(integrator, "hide_emitters", False)
-        behind = _environment(scene, sensor) if shown else None
-        return SurfaceView(scene, gaussians, integrator, sensor, seed, spp, image, coverage, depth, behind)
+            coverage, depth = coverage_and_depth(scene, sensor, camera, crop)
+            shown = scene.environment() is not None and not getattr(integrator, "hide_emitters", False)
+            behind = _environment(scene, sensor) if shown else None
+        dr.enable_grad(image, behind)
+        return SurfaceView(scene, gaussians, integrator, sensor, seed, spp, image, coverage, depth, behind, rays, srgb)
 
     def forward(self, params: Any) -> None:
-        """Set the tangents of `image` from those of the surfaces' parameters."""
-        if self._differentiates():
-            with _detached(self.gaussians):
-                tangent = self.integrator.render_forward(self.scene, params, self.sensor, seed=self.seed, spp=self.spp)
-            dr.set_grad(self.image, tangent)
+        """Set the tangents of `image` and `behind` from those of the surfaces' parameters."""
+        if not self._differentiates():
+            return
+        with _detached(self.gaussians), traced(self.integrator, self.splats, self.srgb):
+            tangent = self.integrator.render_forward(self.scene, params, self.sensor, seed=self.seed, spp=self.spp)
+        dr.set_grad(self.image, tangent)
+        if self.behind is not None and dr.grad_enabled(values := _environment(self.scene, self.sensor)):
+            dr.set_grad(self.behind, dr.forward_to(values))
 
     def backward(self, params: Any) -> None:
-        """Add to the gradients of the surfaces' parameters those that follow from the gradient of `image`.
+        """Add to the gradients of the surfaces' parameters those that follow from those of `image` and `behind`.
 
         Its samples are others than those of `image`: where an image is no linear function of the radiance, the product
         of two noisy factors would be biased.
         """
-        if self._differentiates():
-            seed, _ = mi.sample_tea_32(self.seed, 1)
-            grad = dr.grad(self.image)
+        if not self._differentiates():
+            return
+        seed, _ = mi.sample_tea_32(self.seed, 1)
+        grad = dr.grad(self.image)
+        with traced(self.integrator, self.splats, self.srgb):
             self.integrator.render_backward(self.scene, params, grad, self.sensor, seed=seed, spp=self.spp)
+        if self.behind is not None and dr.grad_enabled(values := _environment(self.scene, self.sensor)):
+            # `values` may be a parameter itself, whose gradient is added to.
+            dr.backward(dr.sum(dr.dot(values, dr.grad(self.behind))))
 
     def _differentiates(self) -> bool:
         """Return whether any parameter of the surfaces is differentiated."""
-        params: Any = mi.traverse(self.scene)
-        attached = [key for key in params.keys() if dr.grad_enabled(params[key])]  # noqa: SIM118
+        params, attached = mi.traverse(self.scene), _attached(self.scene)
         moving = [key for key in attached if params.flags(key) & mi.ParamFlags.Discontinuous]
         if moving:
             _log.warning(
                 "gaussian_splat: gradients of the surfaces' positions lack what changes with their silhouettes and "
                 "depth; do not optimise `%s` with it.",
                 "`, `".join(moving),
+            )
+        if self.splats is not None and any(_attached(shape) for shape in self.gaussians):
+            _log.warning(
+                "splat_path: gradients of the Gaussians are those of the splats that the camera sees; they lack what "
+                "the Gaussians send to the surfaces and take from their light."
             )
         return bool(attached)
 
@@ -206,33 +238,90 @@ class SurfaceView:
         return np.array(self.coverage > 0).reshape(self.image.shape[:2])
 
 
-def _depth(scene: Any, sensor: Any) -> tuple[Float, Float]:
-    """Return the coverage and the mean depth z of the surfaces in every pixel, by rays through a regular grid."""
-    pixel = dr.arange(mi.UInt32, int(dr.prod(sensor.film().crop_size())))
+def coverage_and_depth(
+    scene: Any, sensor: Any, camera: Camera, crop: tuple[int, int, int, int], shape: Any = None
+) -> tuple[Float, Float]:
+    """Return the coverage and the mean depth z of surfaces in every pixel [P], by rays through a regular grid.
+
+    Three rays, one in each row and column of the grid, decide where all are cast: where they or the next pixels differ.
+
+    Args:
+        scene: the surfaces.
+        sensor: a camera's sensor, with a film of the pixels of `crop`.
+        camera: the same camera.
+        crop: pixels of the camera's image, (x, y, width, height), P in all.
+        shape: the surface that counts, where the others do not hide it; None: all.
+    """
+    first, (across, down) = _rectangle(scene.bbox() if shape is None else shape.bbox(), camera, crop)
+    coverage, depth = dr.zeros(mi.Float, crop[2] * crop[3]), dr.full(mi.Float, dr.inf, crop[2] * crop[3])
+    if not across * down:
+        return coverage, depth
+    lane: UInt32 = dr.arange(mi.UInt32, across * down)
+    columns: UInt32 = dr.opaque(mi.UInt32, across)
+    row = lane // columns
+    pixel = (row + int(first[1])) * dr.opaque(mi.UInt32, crop[2]) + lane - row * columns + int(first[0])
     params: Any = mi.traverse(sensor)
     to_camera = params["to_world"].inverse()
 
-    def cast(k: UInt32, count: Float, total: Float) -> tuple[UInt32, Float, Float]:
-        rays = _rays(sensor, pixel, (mi.Vector2f(k % _GRID, k // _GRID) + 0.5) / _GRID)
-        found = scene.ray_intersect_preliminary(rays, coherent=True)
-        hit = found.is_valid()
-        z = (to_camera @ rays(dr.select(hit, found.t, 0))).z
-        return k + 1, count + dr.select(hit, mi.Float(1), 0), total + dr.select(hit, z, 0)
+    def cast(pixel: UInt32, grid: tuple[int, ...]) -> tuple[Float, Float]:
+        """Return the number of hits of some rays of the grid in pixels, and the sum of their depths."""
+        cells, end = mi.UInt32(grid), dr.opaque(mi.UInt32, len(grid))
 
-    state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
-    _, count, total = dr.while_loop(state, lambda k, *_: k < _GRID**2, cast, label="coverage")
-    coverage, depth = count / _GRID**2, dr.select(count > 0, total / count, dr.inf)
+        def step(i: UInt32, count: Float, total: Float) -> tuple[UInt32, Float, Float]:
+            k = dr.gather(mi.UInt32, cells, i)
+            rays = _rays(sensor, pixel, (mi.Vector2f(k % _GRID, k // _GRID) + 0.5) / _GRID)
+            found = scene.ray_intersect_preliminary(rays, coherent=True)
+            hit = found.is_valid() if shape is None else found.is_valid() & (found.shape == mi.ShapePtr(shape))
+            z = (to_camera @ rays(dr.select(hit, found.t, 0))).z
+            return i + 1, count + dr.select(hit, mi.Float(1), 0), total + dr.select(hit, z, 0)
+
+        state = (mi.UInt32(0), mi.Float(0), mi.Float(0))
+        return dr.while_loop(state, lambda i, *_: i < end, step, label="coverage")[1:]
+
+    count, total = cast(pixel, _FIRST)
+    rays = dr.full(mi.Float, len(_FIRST), across * down)
+    dr.eval(count, total, rays)
+    column = lane - row * columns
+    neighbours = ((lane - 1, column > 0), (lane + 1, column + 1 < columns), (lane - columns, row > 0))
+    neighbours = (*neighbours, (lane + columns, lane + columns < across * down))
+    mixed: Bool = (count > 0) & (count < len(_FIRST))
+    for place, inside in neighbours:
+        mixed |= dr.gather(mi.Float, count, place, active=inside) != count
+    edge: Any = dr.compress(mixed)
+    if dr.width(edge):
+        more, deeper = cast(dr.gather(mi.UInt32, pixel, edge), _OTHERS)
+        more, deeper = more + dr.gather(mi.Float, count, edge), deeper + dr.gather(mi.Float, total, edge)
+        for target, values in ((count, more), (total, deeper), (rays, mi.Float(_GRID**2))):
+            dr.scatter(target, values, edge, mode=dr.ReduceMode.Permute)
+    dr.scatter(coverage, count / rays, pixel, mode=dr.ReduceMode.Permute)
+    dr.scatter(depth, dr.select(count > 0, total / count, dr.inf), pixel, mode=dr.ReduceMode.Permute)
     dr.eval(coverage, depth)
     return coverage, depth
 
 
-def _environment(scene: Any, sensor: Any) -> list[Float]:
+def _rectangle(box: Any, camera: Camera, crop: tuple[int, int, int, int]) -> tuple[np.ndarray, list[int]]:
+    """Return the first pixel (x, y) of a crop that a bounding box may reach, and how many from there, (x, y)."""
+    if not box.valid():  # no surface
+        return np.zeros(2, int), [0, 0]
+    ends = np.stack([np.ravel(box.min), np.ravel(box.max)])
+    corners = np.array([[ends[i, 0], ends[j, 1], ends[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    pixels, depth = camera.project(corners)
+    low, high = np.zeros(2), np.array(crop[2:])
+    if (depth >= camera.near).all():
+        low, high = (
+            np.clip(end - np.array(crop[:2]), 0, high)
+            for end in (np.floor(pixels.min(0)) - 1, np.ceil(pixels.max(0)) + 1)
+        )
+    return low.astype(int), (high - low).astype(int).tolist()
+
+
+def _environment(scene: Any, sensor: Any) -> Any:
     """Return the radiance of the environment behind every pixel's centre."""
     pixel = dr.arange(mi.UInt32, int(dr.prod(sensor.film().crop_size())))
     rays = _rays(sensor, pixel, mi.Point2f(0.5))
     si = dr.zeros(mi.SurfaceInteraction3f, dr.width(pixel))
     si.wi, si.wavelengths = -rays.d, rays.wavelengths
-    return list(mi.unpolarized_spectrum(scene.environment().eval(si)))
+    return mi.Color3f(mi.unpolarized_spectrum(scene.environment().eval(si)))
 
 
 def _rays(sensor: Any, pixel: UInt32, inside: Any) -> Any:

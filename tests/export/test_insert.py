@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import pytest
 
 from morgs_mi import open_stream
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.core.color_space import srgb_to_linear
-from morgs_mi.export.frames import exr_channels
+from morgs_mi.export.frames import exr_layers, write_images
 from morgs_mi.export.insert import inserted_channels, load_insert, render_inserted, selected
 from morgs_mi.playback.player import render_stream
 from tests.scenes.surfaces import camera, cloud
@@ -63,6 +65,30 @@ def test_render_inserted__lights_a_scene_without_emitters_by_the_stream(stream, 
     assert images[0]["color"][12, 16].min() > 0.05
 
 
+def test_render_inserted__traces_rays_through_the_stream(stream, tmp_path):
+    (tmp_path / "mirror.py").write_text(
+        "def build(frame, time):\n"
+        '    mirror = {"type": "conductor", "material": "none"}\n'
+        '    return {"ball": {"type": "sphere", "center": [0, 0, 1.3], "radius": 0.5, "bsdf": mirror}}\n'
+    )
+    build = load_insert(tmp_path / "mirror.py")
+    found = [
+        dict(render_inserted(stream, camera(), build, [0], ("color", "surfaces"), light=light))[0]
+        for light in ("probe", "traced")
+    ]
+    assert np.abs(found[0]["color"] - found[1]["color"]).max() > 0.05
+    assert np.abs(found[0]["color"] - found[1]["color"]).mean() < 0.05
+    assert found[1]["surfaces"][..., 3].max() == 1
+
+
+def test_render_inserted__refuses_an_integrator_that_does_not_trace_the_light(stream):
+    def build(frame, time):
+        return {"ball": {"type": "sphere"}, "integrator": {"type": "direct"}}
+
+    with pytest.raises(ValueError, match="with light 'traced', expected an integrator `splat_path`, got"):
+        next(render_inserted(stream, camera(), build, light="traced"))
+
+
 def test_render_inserted__layers_compose_to_the_image_where_surfaces_cover_nothing(stream, tmp_path):
     (tmp_path / "ball.py").write_text(
         "def build(frame, time):\n"
@@ -70,14 +96,53 @@ def test_render_inserted__layers_compose_to_the_image_where_surfaces_cover_nothi
         '            "sun": {"type": "directional", "direction": [0, 0.8, 0.8], "irradiance": 2.0}}\n'
     )
     channels = inserted_channels(stream)
-    assert channels == ("color", "alpha", "motion", "depth", "splats", "surfaces", "shadow")
+    assert channels == ("color", "alpha", "motion", "depth", "splats", "surfaces", "shadow", "mattes")
     images = dict(render_inserted(stream, camera(), load_insert(tmp_path / "ball.py"), [0], channels))[0]
     outside = images["surfaces"][..., 3] == 0
     assert images["shadow"].min() < 0.7 < images["shadow"].max() == pytest.approx(1)
     shadowed = images["splats"][..., :3] * images["shadow"]
     np.testing.assert_allclose(srgb_to_linear(images["color"])[outside], shadowed[outside], atol=1e-4)
-    names = exr_channels(images)
-    assert {"R", "A", "depth.Y", "splats.R", "surfaces.A", "shadow.R", "motion.X"} <= names.keys()
+    names, _ = exr_layers(images)
+    assert {"R", "A", "depth.Y", "splats.R", "surfaces.A", "shadow.R", "motion.X", "crypto_object00.R"} <= names.keys()
+
+
+def test_render_inserted__mattes_are_read_back_by_the_names_of_the_shapes(stream, tmp_path):
+    """Of the mattes in an EXR file, each name selects its shape, behind or beside which the splats have the rest."""
+    (tmp_path / "two.py").write_text(
+        "def build(frame, time):\n"
+        '    left, right = ({"type": "sphere", "center": [x, 0, 0], "radius": 0.5} for x in (-0.8, 0.8))\n'
+        '    return {"left ball": left, "rechts": right, "sun": {"type": "directional"}}\n'
+    )
+    images = render_inserted(stream, camera(), load_insert(tmp_path / "two.py"), [0], ("color", "mattes"))
+    write_images(images, 10, tmp_path / "exr")
+    found = read_mattes(tmp_path / "exr" / "0000.exr")
+    assert found.keys() == {"splats", "left ball", "rechts"}
+    centers = {"left ball": 10, "rechts": 21}
+    for name, column in centers.items():
+        assert found[name][12, column] == 1
+        assert found[name].sum() == pytest.approx(np.pi * (0.5 * 0.25 * camera().K[0, 0]) ** 2, rel=0.1)
+    assert found["splats"].max() > 0.5
+    assert found["splats"][12, list(centers.values())].max() == 0
+    total = sum(found.values())
+    assert total.max() <= 1 + 1e-5
+    np.testing.assert_allclose(total[found["splats"] == 0].max(), 1, atol=1e-5)
+
+
+def read_mattes(path: Path) -> dict[str, np.ndarray]:
+    """Return the mattes of a Cryptomatte file [H, W] by name, as a compositing program finds them."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        header = dict(file.header())
+        planes = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
+    (key,) = (name.removesuffix("/manifest") for name in header if name.endswith("/manifest"))
+    assert header[f"{key}/hash"] == "MurmurHash3_32"
+    assert header[f"{key}/conversion"] == "uint32_to_float32"
+    result, layer = {}, header[f"{key}/name"]
+    for name, code in json.loads(header[f"{key}/manifest"]).items():
+        ranks = [(f"{layer}{i:02d}.{a}", f"{layer}{i:02d}.{b}") for i in range(3) for a, b in ("RG", "BA")]
+        wanted = np.uint32(int(code, 16))
+        parts = [(planes[i].view(np.uint32) == wanted) * planes[c] for i, c in ranks if i in planes]
+        result[name] = np.sum(parts, axis=0)
+    return result
 
 
 def test_selected__refuses_missing_frames(stream):

@@ -66,6 +66,13 @@ def test_surfaces__behind_show_through_the_splats():
     assert_close(found, srgb_to_linear(splats(gaussians)[0]), atol=tol.IMAGE_ABS)
 
 
+def test_surfaces__around_the_camera_are_behind_all_splats():
+    """A part of their bounding box is behind the camera."""
+    gaussians = cloud(0.0)
+    room = {"type": "sphere", "radius": 20.0, "flip_normals": True, **glowing()}
+    assert_close(render(scene(gaussians, room=room)), over(gaussians, COLOR), atol=tol.IMAGE_ABS)
+
+
 def test_surfaces__between_splats_hide_those_behind():
     near, far = cloud(-0.5, seed=1), cloud(0.5, seed=2)
     found = render(scene(Gaussians.concatenate([near, far]), wall=wall(0, **glowing())))
@@ -163,6 +170,7 @@ DIFFERENTIATED = {
     "wall.bsdf.reflectance.value": 1e-2,
     "ball.emitter.radiance.value": 1e-2,
     "lamp.intensity.value": 1e-1,
+    "sky.radiance.value": 1e-2,
 }
 
 

@@ -1,0 +1,243 @@
+"""`splat_path`: closed forms of the shadows, reflections and light of Gaussians, derivatives, and bad input."""
+
+from __future__ import annotations
+
+import logging
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
+from morgs_mi.core.color_space import SH_C0, srgb_to_linear
+from morgs_mi.evaluate.metrics import psnr
+from tests.assertions import assert_close
+from tests.scenes.gaussians import isotropic
+from tests.scenes.surfaces import LAMP, camera, cloud, glowing, render, scene, wall
+
+# Light that falls on the middle of the wall at z = 1 from a place that the camera does not see.
+ASIDE, TO_WALL = np.array([3.0, 0, -1]), np.array([-3.0, 0, 2]) / np.sqrt(13)
+SUN = {"type": "directional", "direction": TO_WALL.tolist(), "irradiance": 2.0}
+TRACED = {"type": "splat_path", "max_depth": 2, "clipped": 1.0}
+WHITE, BLACK = 0.5 / SH_C0, -0.5 / SH_C0
+
+
+def ratio(gaussians: Gaussians, integrator: dict = TRACED, spp: int = 128, **more: Any) -> np.ndarray:
+    """Return the image of the lit wall with Gaussians beside the view, over that without them."""
+    far = isotropic([(0, 0, -90)], 0.1, 0.5)
+    shapes = {"wall": wall(1), "sun": SUN}
+    found, alone = (
+        render(scene(g, integrator, **shapes, **entries), spp=spp) for g, entries in ((gaussians, more), (far, {}))
+    )
+    return (found / alone)[..., 0]
+
+
+def points_on_wall() -> np.ndarray:
+    """Return the points [H, W, 3] of the wall at the centres of the pixels."""
+    view = camera()
+    y, x = np.mgrid[: view.height, : view.width] + 0.5
+    K = view.K
+    return np.stack([5 * (x - K[0, 2]) / K[0, 0], 5 * (y - K[1, 2]) / K[1, 1], np.ones_like(x)], axis=-1)
+
+
+def distance_to_aside() -> np.ndarray:
+    """Return the distance [H, W] of ASIDE from the light that falls on each pixel."""
+    return np.linalg.norm(np.cross(points_on_wall() - ASIDE, TO_WALL), axis=-1)
+
+
+# --------------------------------------------------------------------------------------------------
+#  Shadows
+# --------------------------------------------------------------------------------------------------
+
+
+def test_splat_path__shadow_of_one_gaussian_is_its_transmittance():
+    found = ratio(isotropic([ASIDE], 0.3, 0.8, BLACK))
+    alpha = 0.8 * np.exp(-0.5 * (distance_to_aside() / 0.3) ** 2)
+    assert found.min() < 0.25
+    assert_close(found, 1 - np.where(alpha < 1 / 255, 0, alpha), atol=0.02)
+
+
+def test_splat_path__shadow_of_a_dense_shell_is_that_of_the_mesh():
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(3000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    x, y, z = directions.T
+    quats = np.stack([1 + z, -y, x, np.zeros_like(x)], axis=1)  # from the z axis to the normal
+    black = np.full((3000, 1, 3), BLACK)
+    shell = Gaussians.from_activated(
+        ASIDE + 0.6 * directions, np.tile([0.03, 0.03, 1e-3], (3000, 1)), quats, np.full(3000, 0.95), black
+    )
+    mesh = {"type": "sphere", "center": ASIDE.tolist(), "radius": 0.6}
+    found, expected = ratio(shell), ratio(isotropic([(0, 0, -90)], 0.1, 0.5), {"type": "direct"}, ball=mesh)
+    inside, outside = distance_to_aside() < 0.45, distance_to_aside() > 0.7
+    for region, value in ((inside, 0), (outside, 1)):
+        assert_close(expected[region], value, atol=1e-5)
+        assert_close(found[region], value, atol=5e-3)
+    assert found.mean() == pytest.approx(expected.mean(), abs=0.015)
+
+
+def test_splat_path__shadow_of_a_point_light_ends_at_the_light():
+    """Gaussians behind the light cast no shadow; one that is cut by the light's position casts half its depth."""
+    bulb = {"type": "point", "position": ASIDE.tolist(), "intensity": 9.0}
+    shapes = {"wall": wall(1), "bulb": bulb}
+    behind, cut, far = (isotropic([place], 0.3, 0.75, BLACK) for place in (ASIDE - 2 * TO_WALL, ASIDE, (0, 0, -90)))
+    images = [render(scene(gaussians, TRACED, **shapes), spp=1) for gaussians in (behind, cut, far)]
+    assert_close(images[0], images[2], atol=1e-5)
+    assert_close((images[1] / images[2])[12, 16], 0.5, atol=1e-3)
+
+
+# --------------------------------------------------------------------------------------------------
+#  Reflections
+# --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("srgb", [True, False])
+def test_splat_path__mirror_shows_the_view_of_the_mirrored_camera(srgb):
+    rng = np.random.default_rng(3)
+    means = np.stack([*rng.uniform(-1.5, 1.5, (2, 60)), rng.uniform(-6, -5, 60)], axis=1)
+    gaussians = isotropic(means, 0.4, 0.8, rng.normal(size=(60, 4, 3)) * [[0.8], *[[0.1]] * 3])
+    view, mirrored = (Camera.look_at((0, 0, z), (0, 0, 0), (0, -1, 0), 40, 48, 36) for z in (-3, 3))
+    mirror = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().rotate([0, 1, 0], 180).scale(4),
+        "bsdf": {"type": "conductor", "material": "none"},
+    }
+    dark = {"type": "constant", "radiance": 0.0}
+    props = {"srgb_primitives": srgb}
+    image = render(scene(gaussians, TRACED, view=view, mirror=mirror, dark=dark, props=props), spp=64)
+    # A pixel averages over a square of variance 1 / 12 px^2 in each direction.
+    expected = rasterize(gaussians, mirrored, ("color", "alpha"), config=RenderConfig(eps2d=1 / 12))
+    color, alpha = (np.asarray(value, np.float64)[:, ::-1] for value in (expected.color, expected.alpha))
+    layer = alpha * srgb_to_linear(color / np.maximum(alpha, 1e-6)) if srgb else color
+    assert psnr(image, layer) > 36
+
+
+def test_splat_path__glass_without_refraction_shows_what_is_behind_it():
+    behind = cloud(1.0)
+    pane = wall(0, bsdf={"type": "dielectric", "int_ior": 1.0001, "ext_ior": 1.0})
+    dark = {"type": "constant", "radiance": 0.0}
+    image = render(scene(behind, {**TRACED, "max_depth": 4}, pane=pane, dark=dark), spp=256)
+    expected = rasterize(behind, camera(), ("color", "alpha"), config=RenderConfig(eps2d=1 / 12))
+    color, alpha = (np.asarray(value, np.float64) for value in (expected.color, expected.alpha))
+    assert psnr(image, alpha * srgb_to_linear(color / np.maximum(alpha, 1e-6))) > 35
+
+
+def test_splat_path__camera_sees_the_splats_in_front_of_surfaces_as_before():
+    """Gaussians between the camera and a glowing wall are blended by the rasteriser alone."""
+    images = [render(scene(cloud(0.0), kind, wall=wall(1, **glowing())), spp=4) for kind in (TRACED, "path")]
+    assert_close(images[0], images[1], atol=1e-5)
+
+
+def test_splat_path__clipped_colours_are_brighter_than_white():
+    """An opaque white shell lights a white ball inside it with the radiance of what was clipped."""
+    directions = np.random.default_rng(0).normal(size=(2000, 3))
+    shell = isotropic(6 * directions / np.linalg.norm(directions, axis=1, keepdims=True), 0.5, 0.98, WHITE)
+    ball = {"type": "sphere", "radius": 0.8, "bsdf": {"type": "conductor", "material": "none"}}
+    dark = {"type": "constant", "radiance": 0.0}
+    image = render(scene(shell, {**TRACED, "clipped": 3.0}, ball=ball, dark=dark), spp=4)
+    assert image[12, 16, 0] == pytest.approx(3, abs=0.01)
+
+
+def test_splat_path__white_splats_around_a_white_ball_in_white_light_are_a_furnace():
+    white = isotropic(np.random.default_rng(0).uniform(-1.5, 1.5, (80, 3)), 0.15, 0.6, WHITE)
+    ball = {"type": "sphere", "radius": 0.8, "bsdf": {"type": "diffuse", "reflectance": 1.0}}
+    endless = {**TRACED, "max_depth": -1, "rr_depth": 100}
+    found = render(scene(white, endless, ball=ball, sky={"type": "constant", "radiance": 1.0}), spp=128)
+    assert found.mean() == pytest.approx(1, abs=1e-3)
+    assert_close(found, 1, atol=0.06)
+
+
+# --------------------------------------------------------------------------------------------------
+#  Derivatives
+# --------------------------------------------------------------------------------------------------
+
+DIFFERENTIATED = {
+    "wall.bsdf.reflectance.value": 1e-2,
+    "ball.emitter.radiance.value": 1e-2,
+    "lamp.intensity.value": 1e-1,
+    "sky.radiance.value": 1e-2,
+}
+
+
+@pytest.fixture(scope="module")
+def differentiated() -> Any:
+    ball = {"type": "sphere", "center": [0.4, 0.3, -0.4], "radius": 0.4}
+    ball |= {"bsdf": {"type": "diffuse"}, "emitter": {"type": "area", "radiance": 0.7}}
+    board = wall(0.5, 2, bsdf={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.3, 0.6, 0.5]}})
+    sky = {"type": "constant", "radiance": 0.2}
+    traced = {**TRACED, "max_depth": 4}
+    return scene(cloud(-0.2), traced, wall=board, ball=ball, lamp=LAMP, sky=sky)
+
+
+def loss(image: Any) -> Any:
+    """Return a linear loss: noise in the image biases neither its derivative nor differences."""
+    weights = mi.TensorXf(np.float32(np.random.default_rng(0).uniform(size=(24, 32, 3))))
+    return dr.mean(image * weights, axis=None)
+
+
+@pytest.mark.parametrize("name", DIFFERENTIATED)
+def test_splat_path__gradients_agree_with_central_differences(differentiated, name):
+    params = mi.traverse(differentiated)
+    start, h = dr.detach(params[name]), DIFFERENTIATED[name]
+    dr.enable_grad(params[name])
+    params.update()
+    dr.backward(loss(mi.render(differentiated, params, spp=128, seed=1, seed_grad=2)))
+    gradient, values = np.array(dr.grad(params[name]), np.float64).sum(), []
+    for step in (h, -h):
+        params[name] = start + step
+        params.update()
+        values.append(float(loss(mi.render(differentiated, params, spp=128, seed=1)).array[0]))
+    params[name] = start
+    params.update()
+    assert gradient == pytest.approx((values[0] - values[1]) / (2 * h), rel=3e-2)
+
+
+def test_splat_path__forward_mode_is_dual_to_reverse_mode(differentiated):
+    params, slopes = mi.traverse(differentiated), []
+    for forward in (False, True):
+        for name in DIFFERENTIATED:
+            params[name] = dr.detach(params[name])
+            dr.enable_grad(params[name])
+        params.update()
+        image = mi.render(differentiated, params, spp=64, seed=1, seed_grad=2)
+        if forward:
+            for name in DIFFERENTIATED:
+                dr.set_grad(params[name], 1)
+            dr.forward_to(image)
+            slopes.append(float(loss(dr.grad(image)).array[0]))
+        else:
+            dr.backward(loss(image))
+            slopes.append(sum(np.array(dr.grad(params[name]), np.float64).sum() for name in DIFFERENTIATED))
+    for name in DIFFERENTIATED:
+        params[name] = dr.detach(params[name])
+    params.update()
+    assert slopes[1] == pytest.approx(slopes[0], rel=1e-2)
+
+
+def test_splat_path__gradients_of_gaussians_warn(caplog):
+    whole = scene(cloud(-0.2), TRACED, wall=wall(0.5), lamp=LAMP)
+    params = mi.traverse(whole)
+    dr.enable_grad(params["gaussians.sh_coeffs"])
+    params.update()
+    with caplog.at_level(logging.WARNING, logger="morgs_mi"):
+        dr.backward(loss(mi.render(whole, params, spp=1)))
+    assert "they lack what the Gaussians send to the surfaces" in caplog.text
+    assert (np.array(dr.grad(params["gaussians.sh_coeffs"])) != 0).any()
+
+
+# --------------------------------------------------------------------------------------------------
+#  Bad input
+# --------------------------------------------------------------------------------------------------
+
+
+def test_splat_path__refuses_scenes_without_a_gaussian_splat_integrator():
+    alone = mi.load_dict({"type": "scene", "integrator": TRACED, "ball": {"type": "sphere"}, "lamp": LAMP})
+    with pytest.raises(ValueError, match="splat_path: expected Gaussians, got none"):
+        alone.integrator().render(alone, mi.load_dict(camera().sensor()))
+
+
+def test_splat_path__refuses_a_radiance_below_white():
+    with pytest.raises(RuntimeError, match="`clipped` must be a number in"):
+        mi.load_dict({"type": "splat_path", "clipped": 0.5})
