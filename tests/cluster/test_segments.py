@@ -28,9 +28,9 @@ from tests.scenes.coded_clip import history
 from tests.scenes.recording import CONFIG, write_recording
 
 FRAMES, STARTS = 10, (0, 3, 7)
-# A keyframe that is re-emitted in the handover, and one that falls on a seam.
+# A keyframe that is re-emitted in the cross-fade, and one that falls on a seam.
 SETTINGS = replace(CONFIG, codec=replace(CONFIG.codec, keyframe_interval=3))
-SEAMS = SeamConfig(passes=2, epochs=1, warm_up=1, handover=2)
+SEAMS = SeamConfig(passes=2, epochs=1, overlap=2)
 
 
 @pytest.fixture(scope="module")
