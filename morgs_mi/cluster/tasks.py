@@ -33,6 +33,7 @@ from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, reemitted_k
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.environment import versions
+from morgs_mi.io.remote import url_of
 from morgs_mi.recorder import due_keyframe, push_frame
 from morgs_mi.stream_loop import FrameReport, StreamLoop
 
@@ -44,7 +45,7 @@ class Source:
     """A capture as every worker opens it.
 
     Attributes:
-        path: its folder, absolute.
+        path: its folder, absolute, or its URL.
         downscale, test_view, num_frames, reading: as `load_capture` takes them.
     """
 
@@ -57,7 +58,7 @@ class Source:
     @classmethod
     def of(cls, capture: Capture) -> Source:
         """Return the source of an open capture."""
-        path = str(capture.path.resolve())
+        path = url_of(capture.path) or str(capture.path.resolve())
         return cls(path, capture.downscale, capture.test_view, capture.num_frames, capture.reading)
 
     def open(self) -> Capture:

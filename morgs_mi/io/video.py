@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.io.bounded import check_claim
+from morgs_mi.io.remote import fetched
 
 __all__ = [
     "Clip",
@@ -292,7 +293,7 @@ def _video_header(path: Path) -> tuple[tuple[int, int], int, float]:
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a video file, found none; check the path.")
-    if path.stat().st_size == 0:
+    if fetched(path).stat().st_size == 0:
         raise ValueError(f"{path}: expected a video, got an empty file; copy or record it again.")
     stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
@@ -392,7 +393,7 @@ def _read_image(file: Path) -> np.ndarray:
 
 
 def _decoded(file: Path, mode: int) -> np.ndarray:
-    data = np.fromfile(file, np.uint8)
+    data = np.fromfile(fetched(file), np.uint8)
     width, height = _claimed_size(data[:_MAX_HEADER].tobytes())
     check_claim(file, _BYTES_PER_PIXEL * width * height, f"{width}x{height} pixels")
     image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
@@ -404,7 +405,7 @@ def _decoded(file: Path, mode: int) -> np.ndarray:
 def _opaque(file: Path) -> np.ndarray | None:
     """Return the mask of an image's opaque pixels [H, W], None if it has no alpha channel or is not readable."""
     try:
-        with file.open("rb") as opened:
+        with fetched(file).open("rb") as opened:
             header = opened.read(26)
         # Its type of colours: with a palette, grey and alpha, or RGB and alpha.
         if not header.startswith(b"\x89PNG") or header[25:] not in (b"\3", b"\4", b"\6"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import multiprocessing
 import os
@@ -148,6 +149,21 @@ def test_stream_segments__resumes_after_a_cut_packet(
         os.truncate(path, path.stat().st_size - 200)
     fit(capture, tmp_path, workers, resume=True)
     assert stream_of(tmp_path) == stream_of(whole)
+
+
+@pytest.mark.slow
+def test_stream_segments__of_a_url_is_the_same(
+    capture: Capture, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("fsspec", reason="comes with the extra `cluster`")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "worker"))
+    with open_workers(count=1) as workers:
+        asyncio.run(workers.run(os.getpid))  # it has begun, with a cache of its own
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "client"))
+        fit(load_capture(f"file://{capture.path}"), tmp_path / "out", workers)
+    assert len(list((tmp_path / "worker").rglob("cam1"))) == 1
+    packets = ([p.encoded for p in StreamReader(out / "stream.morgs")] for out in (tmp_path / "out", whole))
+    assert next(packets) == next(packets)
 
 
 @pytest.mark.slow
