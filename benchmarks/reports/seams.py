@@ -2,8 +2,8 @@
 
     python -m benchmarks.reports.seams --json benchmarks/results/seams.json
 
-A clip is the name of a scene of `morgs-mi synth`, with a seed. The settings of the seams were chosen on the first 32
-frames of `arm`, `spheres`, `thin` and `flicker` with seed 0; nothing was chosen on the others.
+The settings of the seams were chosen on `arm`, `spheres`, `thin` and `flicker` with seed 0; nothing was chosen on
+others.
 """
 
 from __future__ import annotations
@@ -31,21 +31,18 @@ from morgs_mi.synth.synthesize import synthesize
 class Options(Output):
     """Clips and work."""
 
-    clips: tuple[tuple[str, int], ...] = (
-        ("arm", 0),
-        ("spheres", 0),
-        ("thin", 0),
-        ("flicker", 0),
-        ("arm", 1),
-        ("random", 5),
+    clips: tuple[tuple[str, int, int], ...] = (
+        ("arm", 0, 48),
+        ("random", 5, 32),
+        ("spheres", 0, 32),
+        ("thin", 0, 32),
+        ("flicker", 0, 32),
     )
-    """Scenes and seeds."""
+    """Scenes, seeds and numbers of frames."""
     folder: Path = Path("out/seams")
     """Folder of the clips, which are made if missing."""
     cameras: int = 6
     """Cameras of a clip, one of them held out."""
-    frames: int = 48
-    """Frames of a clip."""
     width: int = 160
     """Width of its images, px; the height is three quarters of it."""
     gaussians: int = 4000
@@ -54,22 +51,22 @@ class Options(Output):
     """Steps of the first frame."""
     epochs: int = 3
     """Epochs of a later frame."""
-    segments: int = 3
-    """Segments of a clip."""
+    segment_frames: int = 16
+    """Frames of a segment."""
     workers: int = 1
     """Processes."""
 
 
-def clip(name: str, seed: int, options: Options) -> Capture:
+def clip(name: str, seed: int, frames: int, options: Options) -> Capture:
     """Return a clip, which is made if it is missing."""
-    path = options.folder / f"{name}-{seed}-{options.cameras}x{options.frames}x{options.width}"
+    path = options.folder / f"{name}-{seed}-{options.cameras}x{frames}x{options.width}"
     if not path.exists():
         width, height = options.width, options.width * 3 // 4
         synthesize(
             name,
             path,
             num_cameras=options.cameras,
-            num_frames=options.frames,
+            num_frames=frames,
             width=width,
             height=height,
             seed=seed,
@@ -81,7 +78,8 @@ def measure(capture: Capture, config: StreamConfig, options: Options) -> dict[st
     """Return the scores of the seams, those of a fit in one piece at the same frames, and the sizes of both."""
     with TemporaryDirectory() as name, open_workers(count=options.workers) as workers:
         segments, whole = (Path(name) / part for part in ("segments", "whole"))
-        fit = stream_segments(capture, segments, workers, config, options.segments)
+        count = capture.num_frames // options.segment_frames
+        fit = stream_segments(capture, segments, workers, config, count)
         stream_segments(capture, whole, workers, config)
         streams = [folder / "stream.morgs" for folder in (segments, whole)]
         same = [score_seam(StreamReader(streams[1]), capture, seam.frame) for seam in fit.seams]
@@ -99,12 +97,11 @@ def main(options: Options) -> None:
         epochs=options.epochs,
         dropping=0.0,
     )
-    rows = []
-    for name, seed in options.clips:
-        found = measure(clip(name, seed, options), StreamConfig(fit=fit, seed=seed), options)
-        rows.append({"scene": name, "seed": seed, **found})
+    given, rows = {n: v for n, v in asdict(options).items() if n not in ("json", "folder")}, []
+    for name, seed, frames in options.clips:
+        found = measure(clip(name, seed, frames, options), StreamConfig(fit=fit, seed=seed), options)
+        rows.append({"scene": name, "seed": seed, "frames": frames, **found})
         print(rows[-1], flush=True)
-    given = {n: v for n, v in asdict(options).items() if n not in ("json", "folder")}
     options.write({"options": given, "clips": rows})
 
 

@@ -53,13 +53,13 @@ _ATTRIBUTES = ("means", "quats", "log_scales", "logit_opacities", "sh_coeffs")
 class SeamConfig:
     """Settings of the seams between segments."""
 
-    passes: int = 8
+    passes: int = 24
     """Fits of the first frame of the overlap, one after the other, each with a round of density control."""
-    epochs: int = 8
+    epochs: int = 4
     """Passes over all training views in each of them."""
     rates: float = 2.0
     """Factor on the learning rates: there is further to go than between two frames."""
-    births: float = 0.05
+    births: float = 0.1
     """Largest number of births in each of them, as a fraction of the Gaussians."""
     overlap: int = 10
     """Last frames of a segment that the next one fits too, and in which the stream fades to it."""
