@@ -37,7 +37,17 @@ from morgs_mi.io.remote import url_of
 from morgs_mi.recorder import due_keyframe, push_frame
 from morgs_mi.stream_loop import FrameReport, StreamLoop
 
-__all__ = ["Fit", "Following", "FrameRange", "Part", "Source", "fit_frames", "fit_segment_start", "installed"]
+__all__ = [
+    "Fit",
+    "Following",
+    "FrameRange",
+    "Part",
+    "Source",
+    "fit_frames",
+    "fit_segment_start",
+    "installed",
+    "prepared",
+]
 
 
 @dataclass(frozen=True)
@@ -155,7 +165,7 @@ def fit_frames(
         following: the next segment, if these frames are the last ones of their segment and fade to it.
         points: points and their colours in place of the capture's, where those have been triangulated.
     """
-    with _prepared(fit) as messages:
+    with prepared(fit.variant, fit.versions) as messages:
         loop, capture, recorded = _opened(fit, frames, restart, points)
         start = before = loop.state.coded
         packets, states, reports = list[Packet](), list[CodedFrame](), list[FrameReport]()
@@ -190,7 +200,7 @@ def fit_segment_start(fit: Fit, base: bytes, frame: int) -> Part:
     Returns:
         The packets of the overlap and of the frame, which ends with a keyframe, and the report of the frame.
     """
-    with _prepared(fit) as messages:
+    with prepared(fit.variant, fit.versions) as messages:
         capture, coded = fit.source.open(), decode(None, decode_packet(base))
         loop, first = _loop(capture, fit, None), max(frame - fit.seams.overlap, coded.frame + 1)
         earlier, now = (_images(capture, t) for t in (coded.frame, first))
@@ -228,13 +238,17 @@ def _part(packets: list[Packet], reports: list[FrameReport], restart: tuple[byte
 
 
 @contextmanager
-def _prepared(fit: Fit) -> Iterator[list[str]]:
+def prepared(variant: str, versions: tuple[tuple[str, str], ...]) -> Iterator[list[str]]:
     """Run a task alone in this process, with its variant and threads; the context is a list of its warnings.
+
+    Args:
+        variant: Mitsuba variant of the client.
+        versions: as `installed` returned them to the client.
 
     Raises:
         ValueError: the worker has other versions than the client.
     """
-    for (name, expected), (_, found) in zip(fit.versions, installed(), strict=True):
+    for (name, expected), (_, found) in zip(versions, installed(), strict=True):
         if expected != found:
             raise ValueError(
                 f"{socket.gethostname()}: expected a worker with {name} {expected} like the client, got {found}; "
@@ -242,8 +256,8 @@ def _prepared(fit: Fit) -> Iterator[list[str]]:
             )
     messages: list[str] = []
     with _BUSY, _logged(messages):
-        if mi.variant() != fit.variant:
-            mi.set_variant(fit.variant)
+        if mi.variant() != variant:
+            mi.set_variant(variant)
         threads, _ = share_of_machine()
         if dr.thread_count() != threads:
             dr.set_thread_count(threads)
