@@ -81,13 +81,3 @@ def test_cluster_page__commands_run(workplace: Path) -> None:
 def test_cluster_page__has_commands() -> None:
     kinds = ["run", "run", "file sweep.toml", "run", "run", "start", "start", "run", "run"]
     assert [kind for kind, _ in BLOCKS] == kinds
-        "run",
-        "run",
-        "file sweep.toml",
-        "run",
-        "run",
-        "start",
-        "start",
-        "run",
-        "run",
-    ]
