@@ -34,9 +34,9 @@ class Options(Output):
     clips: tuple[tuple[str, int, int], ...] = (
         ("arm", 0, 48),
         ("random", 5, 32),
-        ("spheres", 0, 32),
         ("thin", 0, 32),
         ("flicker", 0, 32),
+        ("spheres", 0, 32),
     )
     """Scenes, seeds and numbers of frames."""
     folder: Path = Path("out/seams")
@@ -49,7 +49,7 @@ class Options(Output):
     """Gaussians of the first frame."""
     first_frame_steps: int = 500
     """Steps of the first frame."""
-    epochs: int = 3
+    epochs: int = 2
     """Epochs of a later frame."""
     segment_frames: int = 16
     """Frames of a segment."""
@@ -102,7 +102,7 @@ def main(options: Options) -> None:
         found = measure(clip(name, seed, frames, options), StreamConfig(fit=fit, seed=seed), options)
         rows.append({"scene": name, "seed": seed, "frames": frames, **found})
         print(rows[-1], flush=True)
-    options.write({"options": given, "clips": rows})
+        options.write({"options": given, "clips": rows}, unprinted=["options", "clips"])
 
 
 if __name__ == "__main__":

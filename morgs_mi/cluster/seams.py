@@ -150,9 +150,11 @@ def cross_fade(
         beginning: states of the next segment, of the same frames.
         shared_ids: number of ids of the common model; below it, both segments have the same Gaussians.
         cameras: as for `residual_packet`.
-        config: tolerated errors.
+        config: tolerated errors; changes are as precise as births, because the state of the next segment is, and what
+            stayed a step behind it would appear at the seam.
         nearness: see `SeamConfig`.
     """
+    config = replace(config, quality=config.quality * config.birth_precision, birth_precision=1.0)
     near = [_near_ids(a, b, shared_ids, nearness) for a, b in zip(ending, beginning, strict=True)]
     common, keys = reduce(np.intersect1d, near), before.ids.astype(np.int64)
     for number, (a, b) in enumerate(zip(ending, beginning, strict=True), start=1):
