@@ -51,6 +51,18 @@ def test_cross_fade__interpolates_the_gaussians_of_both_segments() -> None:
         assert_close(coded.gaussians.numpy()["sh_coeffs"], old + share * (new - old), atol=0.02)
 
 
+def test_cross_fade__approaches_also_what_is_less_than_a_step_away() -> None:
+    """Which would otherwise appear at the seam."""
+    ending, config = reemitted(segment(0)[0]), CodecConfig()
+    step = config.birth_precision * ending.grid.steps("means")
+    means = ending.gaussians.numpy()["means"] + (0.7 * step).astype(np.float32)
+    beginning = replace(ending, gaussians=replace(ending.gaussians, means=means))
+    before, count = replace(ending, frame=-1), 20
+    found = cross_fade(before, count * [ending], count * [beginning], COUNT, CAMERAS, config, 1.0)
+    *_, (_, last) = found
+    assert np.all(np.abs(last.gaussians.numpy()["means"] - means) < 0.3 * step)
+
+
 def test_cross_fade__leaves_what_is_the_same_in_both_segments() -> None:
     same = [replace(reemitted(coded), frame=coded.frame) for coded in segment(0)]
     for coded in faded(same, same):

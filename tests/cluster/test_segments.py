@@ -151,6 +151,21 @@ def test_stream_segments__resumes_after_a_cut_packet(
     assert stream_of(tmp_path) == stream_of(whole)
 
 
+@pytest.mark.parametrize("frame", [2, 6])  # in the overlap before a segment or in its cross-fade, and after the overlap
+def test_stream_segments__resumes_within_a_beginning_or_a_cross_fade(
+    capture: Capture, workers: Workers, whole: Path, tmp_path: Path, frame: int
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        fit(capture, tmp_path, workers, on_stage=when_fitted(FRAMES, interrupt))
+    for path in (tmp_path / "segments").glob("*.morgs"):
+        offset = next((at for _, found, at in StreamReader(path).index() if found >= frame), None)
+        if offset is not None:
+            os.truncate(path, offset)
+    fit(capture, tmp_path, workers, resume=True)
+    assert stream_of(tmp_path) == stream_of(whole)
+    assert rows_of(tmp_path) == rows_of(whole)
+
+
 @pytest.mark.slow
 def test_stream_segments__of_a_url_is_the_same(
     capture: Capture, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
