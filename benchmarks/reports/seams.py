@@ -8,6 +8,7 @@ others.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,6 +17,7 @@ from typing import Any
 import mitsuba as mi
 import tyro
 
+from benchmarks.reports.plots import markdown
 from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.cluster.executor import open_workers
@@ -86,6 +88,26 @@ def measure(capture: Capture, config: StreamConfig, options: Options) -> dict[st
         sizes = [path.stat().st_size for path in streams]
     seams = [{**asdict(seam), "whole": asdict(other)} for seam, other in zip(fit.seams, same, strict=True)]
     return {"num_bytes": sizes[0], "num_bytes_whole": sizes[1], "seams": seams}
+
+
+def seam_table(clips: Sequence[Mapping[str, Any]]) -> str:
+    """Return the seams of the clips as a table: each beside the frames around, and beside the fit in one piece."""
+    titles = ("clip, seam", "PSNR before, at, around, dB", "in one piece", "mTV at, around", "in one piece", "kB")
+    rows = []
+    for clip in clips:
+        for seam in clip["seams"]:
+            whole, sizes = seam["whole"], (clip["num_bytes"], clip["num_bytes_whole"])
+            rows.append(
+                [
+                    f"`{clip['scene']}` {clip['seed']}, frame {seam['frame']}",
+                    ", ".join(f"{seam[name]:.2f}" for name in ("psnr_before", "psnr", "psnr_around")),
+                    f"{whole['psnr']:.2f}",
+                    f"{seam['mtv']:.3f}, {seam['mtv_around']:.3f}",
+                    f"{whole['mtv']:.3f}",
+                    " / ".join(f"{size / 1e3:.0f}" for size in sizes),
+                ]
+            )
+    return markdown(titles, rows)
 
 
 def main(options: Options) -> None:
