@@ -3,7 +3,7 @@
     python -m benchmarks.reports renderer --json out.json
     python -m benchmarks.reports flow CAPTURE... --json out.json
     python -m benchmarks.reports codec CAPTURE... --out out/codec
-    python -m benchmarks.reports method CAPTURE... --out out/method
+    python -m benchmarks.reports method CAPTURE... --out out/method --workers 2
 
 Without `--json` the figures are printed as tables. `morgs-mi synth` writes captures with ground truth.
 """
@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -30,6 +31,7 @@ from benchmarks.reports.method_results import MethodResult
 from benchmarks.reports.renderer import Errors, RendererReportConfig, RendererResult, RendererRow
 from morgs_mi.cli import Common, run
 from morgs_mi.cli.console import OUT, print_result, progress
+from morgs_mi.cluster.executor import Workers, open_workers
 from morgs_mi.core.files import json_finite, write_json
 from morgs_mi.evaluate.tables import figure
 
@@ -82,8 +84,27 @@ class FlowReport:
             plot_flow(result, self.plot)
 
 
+@dataclass(frozen=True, kw_only=True)
+class OnWorkers:
+    """Base of the reports whose fits other processes can do."""
+
+    workers: int | None = None
+    """Number of processes on this machine for the fits, which share its cores; default: this process fits alone."""
+    scheduler: str | None = None
+    """Dask scheduler whose workers do the fits, such as tcp://host:8786, or local."""
+
+    @contextmanager
+    def opened(self) -> Iterator[Workers | None]:
+        """Yield the workers, None where none were asked for."""
+        if self.workers is None and self.scheduler is None:
+            yield None
+            return
+        with open_workers(self.scheduler, self.workers) as workers:
+            yield workers
+
+
 @dataclass(frozen=True)
-class CodecReport:
+class CodecReport(OnWorkers):
     """Measure bytes, quality and time of the codec, compared with lzma over raw residuals."""
 
     captures: Positional[tuple[Path, ...]]
@@ -99,8 +120,8 @@ class CodecReport:
     def run(self) -> None:
         from benchmarks.reports.codec import markdown_table, plot_codec, report_codec
 
-        with progress() as report:
-            result = report_codec(self.captures, self.out, self.config, report)
+        with progress() as report, self.opened() as workers:
+            result = report_codec(self.captures, self.out, self.config, report, workers)
         if _in_tables(result.as_dict(), self.json):
             for clip in result.clips:
                 print_result(f"{clip.name}\n\n{markdown_table(clip)}")
@@ -109,7 +130,7 @@ class CodecReport:
 
 
 @dataclass(frozen=True)
-class MethodReport:
+class MethodReport(OnWorkers):
     """Measure the method's parts, key views, and quality over run time, with several seeds.
 
     Results stored in OUT are reused, so that an interrupted report continues.
@@ -131,8 +152,8 @@ class MethodReport:
             if find_spec("matplotlib"):
                 plot_method(result, self.out / "method.png")
 
-        with progress() as report:
-            result = report_method(self.captures, self.out, self.config, report, write)
+        with progress() as report, self.opened() as workers:
+            result = report_method(self.captures, self.out, self.config, report, write, workers)
         print_result(f"{method_page(result)}\nAll figures: {self.out / 'method.json'}")
 
 

@@ -6,6 +6,7 @@ differ by some hundredths of a dB; smaller differences are not significant.
 
 from __future__ import annotations
 
+import asyncio
 import lzma
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -18,6 +19,8 @@ import numpy as np
 from benchmarks.reports.plots import blank_figure, label_points, markdown, save_figure
 from benchmarks.reports.records import Record
 from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.cluster.executor import Workers, wait_for
+from morgs_mi.cluster.segments import fit_in_segments
 from morgs_mi.codec.entropy import column_bits
 from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, residual_packet
 from morgs_mi.codec.quantisation import step_sizes
@@ -131,6 +134,7 @@ def report_codec(
     out: str | Path,
     config: CodecReportConfig,
     progress: Callable[[str, float, float], None] = lambda stage, done, total: None,
+    workers: Workers | None = None,
 ) -> CodecResult:
     """Fit every capture with every quality and measure the streams, which stay in OUT/CLIP/QUALITY.
 
@@ -139,6 +143,8 @@ def report_codec(
         out: folder for the streams.
         config: settings.
         progress: called with (stage, done, total).
+        workers: from `open_workers`, which fit the qualities of a clip side by side; None: this process fits them, one
+            by one. It measures the streams in any case.
 
     Returns:
         One clip per capture, the settings, the machine and the versions.
@@ -149,7 +155,7 @@ def report_codec(
     if not captures:
         raise ValueError("report_codec(): `captures` must name at least one folder, got none.")
     recordings = (load_capture(path, max_frames=config.frames) for path in captures)
-    clips = tuple(_clip(recording, Path(out), config, progress) for recording in recordings)
+    clips = tuple(_clip(recording, Path(out), config, progress, workers) for recording in recordings)
     return CodecResult(clips, asdict(config), machine(), versions())
 
 
@@ -205,21 +211,36 @@ def plot_codec(result: CodecResult, path: str | Path) -> None:
 
 
 def _clip(
-    capture: Capture, out: Path, config: CodecReportConfig, progress: Callable[[str, float, float], None]
+    capture: Capture,
+    out: Path,
+    config: CodecReportConfig,
+    progress: Callable[[str, float, float], None],
+    workers: Workers | None,
 ) -> CodecClip:
     name = capture.path.resolve().name
     if capture.num_frames < 2:
         raise ValueError(f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}.")
     qualities, rows = (*config.qualities, config.reference), []
-    for done, quality in enumerate(qualities):
+    fits = {
+        out / name / f"{quality:g}": replace(config.stream, codec=replace(config.stream.codec, quality=quality))
+        for quality in qualities
+    }
+    if workers is not None:
+        progress(f"Fitting {name}", 0, len(qualities))
+        wait_for(_fit_all(capture, fits, workers, config.resume))
+    for done, (quality, (folder, settings)) in enumerate(zip(qualities, fits.items(), strict=True)):
         progress(f"Fitting {name}", done, len(qualities))
-        folder = out / name / f"{quality:g}"
-        settings = replace(config.stream, codec=replace(config.stream.codec, quality=quality))
-        stream_capture(capture, folder, settings, resume=config.resume)
+        stream_capture(capture, folder, settings, resume=config.resume or workers is not None)
         rows.append({"quality": quality, **_evaluated(folder, capture), **_measured(folder, settings)})
     progress(f"Fitting {name}", len(qualities), len(qualities))
     best = rows[-1]["psnr"].later
     return CodecClip(name, tuple(CodecRow(**row, loss=best - row["psnr"].later) for row in rows))
+
+
+async def _fit_all(capture: Capture, fits: Mapping[Path, StreamConfig], workers: Workers, resume: bool) -> None:
+    """Fit a capture into several folders, side by side."""
+    fit = (fit_in_segments(capture, folder, workers, config, resume=resume) for folder, config in fits.items())
+    await asyncio.gather(*fit)
 
 
 def _evaluated(folder: Path, capture: Capture) -> dict[str, Any]:

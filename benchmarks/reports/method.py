@@ -15,9 +15,19 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.reports.flow import FlowReportConfig, report_flow
-from benchmarks.reports.method_cells import DEFAULT, Cell, Clip, Scores, method_version, scores_of, scratch_scores
+from benchmarks.reports.method_cells import (
+    DEFAULT,
+    Cell,
+    Clip,
+    Scores,
+    fit_cells,
+    method_version,
+    scores_of,
+    scratch_scores,
+)
 from benchmarks.reports.method_results import FlowError, MethodClip, MethodResult, ScratchRow, SettingRow
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.cluster.executor import Workers
 from morgs_mi.config import PRESETS, StreamConfig
 from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.fit.config import FitConfig
@@ -89,6 +99,7 @@ def report_method(
     config: MethodReportConfig,
     progress: Callable[[str, float, float], None] = lambda *_: None,
     finished: Callable[[MethodResult], None] = lambda _: None,
+    workers: Workers | None = None,
 ) -> MethodResult:
     """Fit every clip with every setting and seed, reusing stored results.
 
@@ -98,6 +109,7 @@ def report_method(
         config: settings.
         progress: called with (stage, done, total).
         finished: called with the result so far after each clip.
+        workers: from `open_workers`, which fit the cells side by side; None: this process fits them, one by one.
 
     Returns:
         One clip per capture, the settings, the machine and the versions.
@@ -115,7 +127,7 @@ def report_method(
     version = config.version or method_version()
     result = MethodResult((), config.table_epochs, version, asdict(config), machine(), versions())
     for path in captures:
-        result = replace(result, clips=(*result.clips, _clip(path, Path(out), config, version, progress)))
+        result = replace(result, clips=(*result.clips, _clip(path, Path(out), config, version, progress, workers)))
         finished(result)
     return result
 
@@ -181,13 +193,14 @@ def _clip(
     config: MethodReportConfig,
     version: str,
     progress: Callable[[str, float, float], None],
+    workers: Workers | None,
 ) -> MethodClip:
     capture = load_capture(path, max_frames=config.frames)
     if capture.num_frames < 2:
         raise ValueError(f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}.")
     clip, base = Clip.read(capture), config.base
     presets, key_views = cells_of(config, len(capture.train_views))
-    found = _measured(clip, presets, key_views, config, version, out, progress)
+    found = _measured(clip, presets, key_views, config, version, out, progress, workers)
 
     def rows_of(cells: Sequence[Cell]) -> tuple[SettingRow, ...]:
         return aggregate({cell: scores for cell, scores in found.items() if replace(cell, seed=0) in cells})
@@ -221,13 +234,17 @@ def _measured(
     version: str,
     out: Path,
     progress: Callable[[str, float, float], None],
+    workers: Workers | None,
 ) -> dict[Cell, Scores]:
     """Return the scores of the first seed's cells, and of the others' at the best rates and all key views."""
     found: dict[Cell, Scores] = {}
 
     def measure(cells: Sequence[Cell], seed: int) -> None:
         stage = f"Fitting {clip.name}" + (f", seed {seed + 1} of {config.seeds}" if seed else "")
-        for done, cell in enumerate(replace(cell, seed=seed) for cell in cells):
+        cells = [replace(cell, seed=seed) for cell in cells]
+        if workers is not None:
+            fit_cells(clip, cells, config.base, version, out, workers, lambda done: progress(stage, done, len(cells)))
+        for done, cell in enumerate(cells):
             progress(stage, done, len(cells))
             found[cell] = scores_of(clip, cell, config.base, version, out)
         progress(stage, len(cells), len(cells))

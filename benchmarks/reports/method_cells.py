@@ -4,25 +4,31 @@ All cells of a clip and a seed continue from the same first frame, which depends
 of epochs. It is fitted once and stored as a stream of one keyframe. A cell's scores are stored as a small JSON file
 whose name contains a digest of everything that they depend on: the settings, the images, and the sources of the method
 (or a given version). If the file exists, the cell is not fitted again.
+
+Cells may be fitted by workers, side by side (`fit_cells`). Their files are written by this process.
 """
 
 from __future__ import annotations
 
 import ast
+import asyncio
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import mitsuba as mi
 import numpy as np
 
 import morgs_mi
 from benchmarks.reports.method_results import ScratchRow
 from benchmarks.reports.records import from_json
 from morgs_mi.capture.capture import Capture
+from morgs_mi.cluster.executor import Workers, wait_for
+from morgs_mi.cluster.tasks import Source, installed, prepared
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.config import StreamConfig, apply_preset
@@ -32,7 +38,7 @@ from morgs_mi.evaluate.results import Evaluation, known_mean
 from morgs_mi.playback.player import open_stream
 from morgs_mi.stream_loop import FrameReport, StreamLoop, StreamState
 
-__all__ = ["DEFAULT", "Cell", "Clip", "Scores", "method_version", "scores_of", "scratch_scores"]
+__all__ = ["DEFAULT", "Cell", "Clip", "Scores", "fit_cells", "method_version", "scores_of", "scratch_scores"]
 
 # Name of the settings without a preset.
 DEFAULT = "default"
@@ -41,6 +47,7 @@ _MEANS = ("psnr", "psnr_moving", "psnr_still", "ssim", "motion_error_moving", "m
 _MEANS += ("true_motion_moving", "confidence_iou")
 _BY_FRAME = ("psnr", "psnr_moving", "motion_error_moving")
 _MOTION_3D = ("error", "relative_error", "length_ratio", "angle")
+_OPEN: dict[str, Clip] = {}  # the clip of a worker's last task
 _EVALUATION = ("evaluate.py", "metrics.py", "motion3d.py", "results.py", "temporal.py")
 
 Scores = dict[str, Any]
@@ -174,12 +181,82 @@ def scores_of(clip: Clip, cell: Cell, base: StreamConfig, version: str, out: Pat
         length, ``_angle`` in degrees, ``num_bytes``; ``mtv`` and ``mtv_input`` (x100), ``psnr_slope`` in dB per frame,
         ``seconds``, the median of a later frame; ``by_frame``, lists of some of them. None if unknown.
     """
-    config = cell.config(base)
-    stored = out / clip.name / f"{cell}-{_digest(version, clip.digest, asdict(config))}.json"
+    stored = _file(clip, cell, base, version, out)
     if not stored.is_file():
         first = _first_frame(clip, replace(base, seed=cell.seed), version, out)
-        write_json(stored, {"cell": asdict(cell), "version": version, "scores": _fit(clip, config, first)})
+        _store(stored, cell, version, _fit(clip, cell.config(base), first))
     return _read(stored)
+
+
+def fit_cells(
+    clip: Clip,
+    cells: Sequence[Cell],
+    base: StreamConfig,
+    version: str,
+    out: Path,
+    workers: Workers,
+    progress: Callable[[int], None],
+) -> None:
+    """Fit those cells that are not stored on workers, and store them for `scores_of`.
+
+    Args:
+        clip: two frames or more, at a path that all workers see.
+        cells: cells.
+        base: settings that all cells share.
+        version: version of the method.
+        out: folder.
+        workers: from `open_workers`.
+        progress: called with the number of cells that are stored.
+
+    Raises:
+        OSError: a worker died several times, or the scheduler was lost. The finished cells stay.
+    """
+    files = {cell: _file(clip, cell, base, version, out) for cell in cells}
+    missing = [cell for cell, file in files.items() if not file.is_file()]
+    firsts = {seed: _first_frame(clip, replace(base, seed=seed), version, out) for seed in {c.seed for c in missing}}
+    about = Source.of(clip.capture), str(mi.variant()), installed()
+
+    async def fit(cell: Cell) -> None:
+        scores = await workers.run(_fit_on_worker, *about, cell.config(base), firsts[cell.seed].read_bytes())
+        _store(files[cell], cell, version, scores)
+        progress(sum(file.is_file() for file in files.values()))
+
+    async def fit_all() -> None:
+        async with asyncio.TaskGroup() as group:
+            for cell in missing:
+                group.create_task(fit(cell))
+
+    try:
+        wait_for(fit_all())
+    except BaseExceptionGroup as errors:
+        raise errors.exceptions[0] from None
+
+
+def _fit_on_worker(
+    source: Source, variant: str, versions: tuple[tuple[str, str], ...], config: StreamConfig, first: bytes
+) -> Scores:
+    """Return the scores of a cell; `first` is the stream with its first frame."""
+    with prepared(variant, versions), TemporaryDirectory() as folder:
+        path = Path(folder) / "first.morgs"
+        path.write_bytes(first)
+        return _fit(_clip_of(source), config, path)
+
+
+def _clip_of(source: Source) -> Clip:
+    """Return a clip, which the worker keeps for the next cell."""
+    if (key := repr(source)) not in _OPEN:
+        _OPEN.clear()
+        _OPEN[key] = Clip.read(source.open())
+    return _OPEN[key]
+
+
+def _file(clip: Clip, cell: Cell, base: StreamConfig, version: str, out: Path) -> Path:
+    """Return the file of a cell's scores."""
+    return out / clip.name / f"{cell}-{_digest(version, clip.digest, asdict(cell.config(base)))}.json"
+
+
+def _store(file: Path, cell: Cell, version: str, scores: Scores) -> None:
+    write_json(file, {"cell": asdict(cell), "version": version, "scores": scores})
 
 
 def scratch_scores(clip: Clip, frame: int, base: StreamConfig, steps: int, version: str, out: Path) -> ScratchRow:

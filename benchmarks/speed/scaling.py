@@ -12,7 +12,7 @@ another:
     start     processes start and import the package
     first     common model: two frames on one worker
     seam      first frames of the segments, one per worker
-    reading   each worker reads up to the last frame of its segment, from the first frame of the clip
+    reading   each worker reads the frames of its segment
     frames    later frames of a segment, with the measured efficiency
     tasks     round trips of a segment's tasks
     client    packets through the client's link, their files and the join, one after the other
@@ -50,7 +50,7 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.synth.synthesize import synthesize
 
-_SHORTENED = {"frames", "tasks"}
+_SHORTENED = {"reading", "frames", "tasks"}
 
 
 @dataclass(frozen=True)
@@ -213,7 +213,7 @@ def stages(workers: int, run: Run, costs: Costs, efficiency: float, views: float
         "start": run.start,
         "first": views * run.common,
         "seam": views * run.seam / efficiency,
-        "reading": views * costs.read * options.long_frames,
+        "reading": views * costs.read * share,
         "frames": views * run.later * share / efficiency,
         "tasks": costs.trip * share / TASK_FRAMES,
         "client": (run.num_bytes / options.link + costs.client) * options.long_frames,

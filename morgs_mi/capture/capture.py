@@ -24,6 +24,7 @@ from morgs_mi.capture.timeline import ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points
 from morgs_mi.io.prefetch import prefetched
+from morgs_mi.io.remote import is_url, mirrored
 from morgs_mi.io.video import Clip, FolderReader, FrameReader, ImageOrError, open_clips
 
 __all__ = ["Capture", "Frame", "PartialFrame", "load_capture", "opaque_pixels"]
@@ -212,7 +213,7 @@ def load_capture(
     """Open a capture folder: read the calibration and the header of every clip.
 
     Args:
-        path: the folder; `layouts/registry.py` lists the supported layouts.
+        path: the folder, or its URL (see `io.remote`); `layouts/registry.py` lists the supported layouts.
         downscale: factor by which images are downscaled (area averages, rounded to the nearest whole size).
         test_view: index or name of the held-out camera, None for none; "auto" uses the value in `capture.json`, then
             the layout's own, then 0 as N3DV does, or none with fewer than six cameras.
@@ -229,7 +230,7 @@ def load_capture(
         ValueError: calibration and clips disagree (number, size, length, frame rate), a file is broken, or
             an argument is out of range.
     """
-    path = Path(path)
+    path = mirrored(str(path)) if is_url(path) else Path(path)
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: expected a capture folder, found none; check the path.")
     if not downscale >= 1:

@@ -29,8 +29,8 @@ class Fit:
     both.
     """
 
-    capture: Annotated[Positional[Path | None], arg(help_behavior_hint="")] = None
-    """Folder of the capture."""
+    capture: Annotated[Positional[str | None], arg(help_behavior_hint="", metavar="[CAPTURE]")] = None
+    """Folder of the capture, or its URL (docs/cluster.md)."""
     out: Annotated[Positional[Path | None], arg(help_behavior_hint="")] = None
     """Folder for stream.morgs, capture.json and report.json; an earlier stream there is replaced without --resume."""
     frames: Annotated[int | None, DisallowNone, optional("INT", "(default: all)")] = None

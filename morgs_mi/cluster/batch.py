@@ -1,6 +1,6 @@
 """Batches: many captures, settings and seeds, each a fit with its own folder and log.
 
-    out = "sweep"                       # folder of all fits, relative to this file as are all paths
+    out = "sweep"                       # folder of all fits, relative to this file as are all paths without a protocol
     captures = ["clips/walk", "clips/dance"]
     seeds = [0, 1]
     segments = 4                        # of each fit; downscale, frames and test_view likewise
@@ -29,6 +29,7 @@ from morgs_mi.cluster.executor import Workers, wait_for
 from morgs_mi.cluster.segments import SegmentedFit, fit_in_segments
 from morgs_mi.cluster.tasks import Part
 from morgs_mi.config import StreamConfig, apply_preset, apply_values, read_config
+from morgs_mi.io.remote import is_url
 
 __all__ = ["BatchConfig", "Job", "JobState", "read_jobs", "run_batch"]
 
@@ -41,7 +42,7 @@ class BatchConfig:
     """What the jobs of a batch share."""
 
     captures: tuple[str, ...] = ()
-    """Folders of the captures, with distinct names."""
+    """Folders or URLs of the captures, with distinct names."""
     out: str = "out/batch"
     """Folder of the fits."""
     seeds: tuple[int, ...] = (0,)
@@ -62,14 +63,14 @@ class Job:
 
     Attributes:
         name: of its capture, settings and seed.
-        capture: folder.
+        capture: folder or URL.
         out: folder of the fit.
         config: settings.
         batch: what all jobs share.
     """
 
     name: str
-    capture: Path
+    capture: str | Path
     out: Path
     config: StreamConfig
     batch: BatchConfig
@@ -138,7 +139,8 @@ def read_jobs(path: str | Path) -> list[Job]:
     for capture, (name, config), seed in product(batch.captures, configs.items(), batch.seeds):
         title = f"{Path(capture).name}-{name}-s{seed}"
         out = folder / batch.out / title
-        jobs.append(Job(title, folder / capture, out, replace(config, seed=seed), batch))
+        source = capture if is_url(capture) else folder / capture
+        jobs.append(Job(title, source, out, replace(config, seed=seed), batch))
     return jobs
 
 

@@ -1,26 +1,33 @@
 """Seams: where a segment of a recording begins, and the stream continues with other Gaussians.
 
-All segments start from one common model, the first two frames of the recording. A frame shortly before the segment is
-fitted like a later frame of that model, several times over, so that Gaussians that have travelled far since then
-arrive. The frames up to the segment follow as usual (*warm-up*), and are discarded. What has not changed since the
-first frames stays as it is, to the bit, and every other Gaussian keeps the number that it has in the common model.
+All segments start from one common model, the first two frames of the recording. A segment is fitted from some frames
+before its first one (*overlap*). The first of these is fitted like a later frame of the common model, several times
+over, so that Gaussians that have travelled far since then arrive; the others follow as usual. What has not changed
+since the first frames stays as it is, to the bit, and every other Gaussian keeps the number that it has in the common
+model.
 
-The segment before ends elsewhere: it has followed the recording for many frames. In its last frames, each Gaussian that
-is in both models at nearly the same place is moved towards its state in the next segment, by an equal share per frame
-(*handover*). So the difference does not appear within one frame, as a flicker.
+The segment before has followed the recording for many frames, and ends elsewhere. In the overlap, the stream fades from
+its Gaussians to those of the next segment (*cross-fade*), so that the difference does not appear within one frame, as a
+flicker. With the share s of the next segment, which grows from 0 to 1 with a slope of zero at both ends:
+
+- A Gaussian that both have inherited from the common model, and have at nearly the same place, is interpolated.
+- Any other is drawn beside those of the other segment, with a part of its optical depth: its opacity o becomes
+  1 - (1 - o)^s if it belongs to the next segment, and 1 - (1 - o)^(1 - s) otherwise. Two that coincide are then as
+  opaque together as each alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import reduce
 
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import Packet
-from morgs_mi.codec.packets import CodedFrame, frames_near, residual_packet
+from morgs_mi.codec.packets import CodedFrame, decode, frames_near, residual_packet
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
@@ -33,12 +40,13 @@ from morgs_mi.playback.player import render, render_config, truth_for_camera
 from morgs_mi.playback.visualise import to_uint8
 from morgs_mi.stream_loop import FrameReport, StreamState, step
 
-__all__ = ["COMMON_FRAMES", "SeamConfig", "SeamScores", "approached", "changed_packet", "fit_seam_frame", "score_seam"]
+__all__ = ["COMMON_FRAMES", "SeamConfig", "SeamScores", "cross_fade", "fit_seam_frame", "score_seam"]
 
 COMMON_FRAMES = 2
 """Frames of the common model: the second one determines the confidence."""
 
 _AROUND = 8  # frames before and after a seam, with which it is compared
+_MIN_ODDS = 1e-4  # of a faded opacity, o / (1 - o); less is invisible, and nothing has no logarithm
 _ATTRIBUTES = ("means", "quats", "log_scales", "logit_opacities", "sh_coeffs")
 
 
@@ -46,20 +54,18 @@ _ATTRIBUTES = ("means", "quats", "log_scales", "logit_opacities", "sh_coeffs")
 class SeamConfig:
     """Settings of the seams between segments."""
 
-    passes: int = 8
-    """Fits of the frame before the warm-up, one after the other, each with a round of density control."""
-    epochs: int = 8
+    passes: int = 24
+    """Fits of the first frame of the overlap, one after the other, each with a round of density control."""
+    epochs: int = 4
     """Passes over all training views in each of them."""
     rates: float = 2.0
     """Factor on the learning rates: there is further to go than between two frames."""
-    births: float = 0.05
+    births: float = 0.1
     """Largest number of births in each of them, as a fraction of the Gaussians."""
-    warm_up: int = 10
-    """Frames before a segment that are fitted first and discarded: the model follows the motion and improves."""
-    handover: int = 12
-    """Last frames of a segment, in which it approaches the next one."""
-    nearness: float = 0.3
-    """Distance, in largest scales of the Gaussian, up to which it counts as the same in both segments."""
+    overlap: int = 10
+    """Last frames of a segment that the next one fits too, and in which the stream fades to it."""
+    nearness: float = 1.0
+    """Distance, in largest scales of the Gaussian, up to which it is interpolated in the cross-fade."""
 
     def fit_config(self, config: StreamConfig, number: int) -> StreamConfig:
         """Return the settings of one of these fits."""
@@ -128,38 +134,76 @@ def fit_seam_frame(
     return coded, replace(report, seconds=seconds)
 
 
-def approached(now: CodedFrame, following: CodedFrame, shared_ids: int, share: float, config: SeamConfig) -> Gaussians:
-    """Return the Gaussians of a frame a share of the way closer to those of the next segment.
+def cross_fade(
+    before: CodedFrame,
+    ending: Sequence[CodedFrame],
+    beginning: Sequence[CodedFrame],
+    shared_ids: int,
+    cameras: Sequence[Camera],
+    config: CodecConfig,
+    nearness: float,
+) -> Iterator[tuple[Packet, CodedFrame]]:
+    """Yield the packets of the frames of an overlap, with the states after them.
 
     Args:
-        now: state of the frame.
-        following: state of the next segment's first frame.
-        shared_ids: number of ids of the common model; below it, both states have the same Gaussians.
-        share: share of the way, in (0, 1].
-        config: settings.
+        before: state of the stream before the overlap.
+        ending: states of the segment that ends, of each frame of the overlap.
+        beginning: states of the next segment, of the same frames.
+        shared_ids: number of ids of the common model; below it, both segments have the same Gaussians.
+        cameras: as for `residual_packet`.
+        config: tolerated errors; changes are as precise as births, because the state of the next segment is, and what
+            stayed a step behind it would appear at the seam.
+        nearness: see `SeamConfig`.
     """
-    raw, goal = now.gaussians.numpy(), following.gaussians.numpy()
-    ids, here, there = np.intersect1d(now.ids, following.ids, return_indices=True)
-    distance = np.linalg.norm(raw["means"][here] - goal["means"][there], axis=1)
-    near = (distance <= config.nearness * np.exp(raw["log_scales"][here]).max(axis=1)) & (ids < shared_ids)
-    here, there = here[near], there[near]
-    values = {name: raw[name] for name in _ATTRIBUTES}
-    for name, value in values.items():
-        end = goal[name][there]
+    config = replace(config, quality=config.quality * config.birth_precision, birth_precision=1.0)
+    near = [_near_ids(a, b, shared_ids, nearness) for a, b in zip(ending, beginning, strict=True)]
+    common, keys = reduce(np.intersect1d, near), before.ids.astype(np.int64)
+    for number, (a, b) in enumerate(zip(ending, beginning, strict=True), start=1):
+        time = number / (len(ending) + 1)
+        gaussians, drawn = _blended(a, b, common, time * time * (3 - 2 * time))
+        source = np.full(len(drawn), len(keys))
+        _, here, there = np.intersect1d(drawn, keys, return_indices=True)
+        source[here] = there
+        order = np.argsort(source, kind="stable")  # births come last
+        source = np.where(source < len(keys), source, -1)
+        packet = residual_packet(before, gaussians.select(order), source[order], cameras, config)
+        before, keys = decode(before, packet), drawn[order]
+        yield packet, before
+
+
+def _near_ids(a: CodedFrame, b: CodedFrame, shared_ids: int, nearness: float) -> np.ndarray:
+    """Return the ids of the common model's Gaussians that are at nearly the same place in two states."""
+    ids, here, there = np.intersect1d(a.ids, b.ids, return_indices=True)
+    means = (np.asarray(coded.gaussians.means) for coded in (a, b))
+    distance = np.linalg.norm(np.subtract(*(m[rows] for m, rows in zip(means, (here, there), strict=True))), axis=1)
+    largest = np.asarray(a.gaussians.scales).max(axis=1)[here]
+    return ids[(distance <= nearness * largest) & (ids < shared_ids)]
+
+
+def _blended(a: CodedFrame, b: CodedFrame, common: np.ndarray, share: float) -> tuple[Gaussians, np.ndarray]:
+    """Return the Gaussians of two states with a share of the second, and a key of each.
+
+    A key is an id of the first state, or -1 - id for a Gaussian that is in the second state only.
+    """
+    raw, goal = a.gaussians.numpy(), b.gaussians.numpy()
+    here, there = np.isin(a.ids, common), np.isin(b.ids, common)
+    for name in _ATTRIBUTES:
+        start, end = raw[name][here], goal[name][there]
         if name == "quats":  # a quaternion and its negative are one rotation
-            end = end * np.where((end * value[here]).sum(axis=1, keepdims=True) < 0, -1, 1)
-        value[here] += share * (end - value[here])
-    return replace(now.gaussians, **values)
+            end = end * np.where((end * start).sum(axis=1, keepdims=True) < 0, -1, 1)
+        raw[name][here] = start + np.float32(share) * (end - start)
+    raw["logit_opacities"][~here] = _faded(raw["logit_opacities"][~here], 1 - share)
+    goal["logit_opacities"][~there] = _faded(goal["logit_opacities"][~there], share)
+    # A keyframe has neither motion nor offset.
+    added = {n: goal[n][~there] if n in goal else np.zeros_like(v, shape=((~there).sum(), 3)) for n, v in raw.items()}
+    gaussians = Gaussians(**{name: np.concatenate([value, added[name]]) for name, value in raw.items()})
+    return gaussians, np.concatenate([a.ids.astype(np.int64), -1 - b.ids[~there].astype(np.int64)])
 
 
-def changed_packet(
-    before: CodedFrame, now: CodedFrame, gaussians: Gaussians, cameras: Sequence[Camera], config: CodecConfig
-) -> Packet:
-    """Return the residual from the frame before to `gaussians`, which have the ids of the frame."""
-    source = np.full(len(now), -1)
-    _, earlier, later = np.intersect1d(before.ids, now.ids, return_indices=True)
-    source[later] = earlier
-    return residual_packet(before, gaussians, source, cameras, config)
+def _faded(logit_opacities: np.ndarray, share: float) -> np.ndarray:
+    """Return the logits of opacities with a share of the optical depth -log(1 - o)."""
+    depth = np.logaddexp(0, logit_opacities.astype(np.float64))
+    return np.log(np.maximum(np.expm1(share * depth), _MIN_ODDS)).astype(np.float32)
 
 
 def score_seam(stream: StreamReader, capture: Capture, frame: int) -> SeamScores:

@@ -11,6 +11,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
+from itertools import dropwhile, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from morgs_mi.cluster.tasks import (
     fit_segment_start,
     installed,
 )
-from morgs_mi.codec.container import PacketKind, StreamWriter, TruncatedStreamError, decode_packet
+from morgs_mi.codec.container import Packet, PacketKind, StreamWriter, TruncatedStreamError, decode_packet
 from morgs_mi.codec.packets import decode, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
@@ -72,6 +73,8 @@ class SegmentedFit:
     workers: Mapping[str, int] = field(default_factory=dict)
 
 
+Entry = tuple[int, int, int]
+"""(kind, frame, offset) of a packet."""
 OnStage = Callable[[str, float, float], None]
 OnPart = Callable[[Part], None]
 
@@ -114,10 +117,17 @@ def noting_segments(out: Path) -> Iterator[None]:
     except (KeyboardInterrupt, OSError, MemoryError) as error:
         streams = sorted((out / FOLDER).glob("*.morgs"))
         with suppress(OSError, ValueError):
-            count = sum(len({frame for _, frame, _ in StreamReader(path).index()}) for path in streams)
+            count = sum(map(_num_finished, streams))
             if count:
                 error.add_note(f"{out / FOLDER} holds {count} frames; continue with `--resume`.")
         raise
+
+
+def _num_finished(path: Path) -> int:
+    """Return the number of frames in the stream of a segment, without those of the overlap before it."""
+    stream = StreamReader(path)
+    start = stream.metadata.get("segments", {"starts": [0]})["starts"][int(path.stem)]
+    return len({frame for _, frame, _ in stream.index() if frame >= start})
 
 
 async def fit_in_segments(
@@ -198,8 +208,8 @@ class _Run:
             capture = with_points(self.capture, self.task.config.seed, self.on_stage)
             points = None if capture is self.capture else (capture.points, capture.point_colors)
         loop = asyncio.get_running_loop()
-        self.base: asyncio.Future[Following] = loop.create_future()
-        self.begun: list[asyncio.Future[bytes]] = [loop.create_future() for _ in self.segments]
+        self.base: asyncio.Future[tuple[bytes, int]] = loop.create_future()  # common model and number of its ids
+        self.begun: list[asyncio.Future[tuple[bytes, ...]]] = [loop.create_future() for _ in self.segments]
         self.show_progress()
         try:
             async with asyncio.TaskGroup() as group:
@@ -238,7 +248,7 @@ class _Run:
         with atomic_path(path, "stream_segments()") as partial:
             with StreamWriter(partial, self.capture.cameras, self.capture.fps, self.metadata) as writer:
                 for segment in self.segments:
-                    for packet in StreamReader(segment.path):
+                    for packet in segment.packets():
                         writer.write(packet)
             scores = []
             for done, frame in enumerate(self.starts[1:-1]):
@@ -270,47 +280,54 @@ class _Segment:
         """Number of frames that are fitted."""
         return len(self.reports)
 
+    @property
+    def fade(self) -> int:
+        """First of the frames in which the stream fades to the next segment; the end of the last segment."""
+        if self.stop == self.run.starts[-1]:
+            return self.stop
+        first = self.start + 1 if self.number else COMMON_FRAMES
+        return min(max(self.stop - self.run.seams.overlap, first), self.stop)
+
     async def fit(self, points: Points | None) -> None:
         """Fit what is missing of the segment, task after task."""
         common = min(COMMON_FRAMES, self.stop)
         if self.number and not self.reports:
-            base = await self.run.base
-            self._add(await self.run.run(fit_segment_start, base.keyframe, self.start))
+            keyframe, _ = await self.run.base
+            self._add(await self.run.run(fit_segment_start, keyframe, self.start))
         elif not self.number:
             if self.num_fitted < common:
                 frames = FrameRange(0, self.num_fitted, common)
                 self._add(await self.run.run(fit_frames, frames, self.restart, None, points))
             coded = seek(StreamReader(self.path), common - 1)
-            self.run.base.set_result(Following(0, reemitted_keyframe(coded).encoded, coded.next_id))
-        first = next(iter(StreamReader(self.path)))
-        self.run.begun[self.number].set_result(first.encoded)
+            self.run.base.set_result((reemitted_keyframe(coded).encoded, coded.next_id))
+        overlap = takewhile(lambda packet: packet.frame < self.start, StreamReader(self.path))
+        self.run.begun[self.number].set_result(tuple(packet.encoded for packet in overlap))
         while self.run.active >= self.run.workers.count:  # a worker continues the loop of one segment, not of many
             await asyncio.sleep(_POLL)
         self.run.active += 1
         while (at := self.start + self.num_fitted) < self.stop:
-            stop = min(at + TASK_FRAMES, self.stop)
-            frames, following = FrameRange(self.start, at, stop), await self._following(stop)
+            stop, following = min(at + TASK_FRAMES, self.fade), None
+            if at == self.fade:  # one task, which alone knows both the faded Gaussians and those that it fits
+                _, shared_ids = await self.run.base
+                stop, following = self.stop, Following(await self.run.begun[self.number + 1], shared_ids)
+            frames = FrameRange(self.start, at, stop)
             self._add(await self.run.run(fit_frames, frames, self.restart, following))
         self.run.active -= 1
 
-    async def _following(self, stop: int) -> Following | None:
-        """Return the next segment if a task up to a frame approaches it."""
-        last = self.stop == self.run.starts[-1]
-        if last or stop <= self.stop - self.run.seams.handover:
-            return None
-        base = await self.run.base
-        return Following(self.stop, await self.run.begun[self.number + 1], base.shared_ids)
+    def packets(self) -> Iterator[Packet]:
+        """Yield the packets of the segment, without those of the overlap before it."""
+        return dropwhile(lambda p: (p.kind, p.frame) != (PacketKind.KEYFRAME, self.start), StreamReader(self.path))
 
     def _read(self) -> None:
         """Read an earlier fit of the segment."""
         stream = StreamReader(self.path)
         check_same_fit(stream, self.run.capture, self.run.metadata)
-        index, end = stream.check()
+        index, end = self._finished(*stream.check())
         if not index:
             return
         coded = before = last = None
         with suppress(TruncatedStreamError):
-            for packet in stream:
+            for packet in takewhile(lambda packet: packet.frame <= index[-1][1], stream):
                 if coded is None or packet.frame > coded.frame:
                     before, coded, last = coded, decode(coded, packet), packet
         assert coded is not None
@@ -321,6 +338,15 @@ class _Segment:
         if index[-1][0] == PacketKind.RESIDUAL:
             for packet in due_keyframe(coded, self.run.task.config.codec.keyframe_interval):
                 self.writer.write(packet)
+
+    def _finished(self, index: Sequence[Entry], end: int) -> tuple[Sequence[Entry], int]:
+        """Return the index and the end of the file without a beginning or a cross-fade that is incomplete."""
+        if (PacketKind.KEYFRAME, self.start) not in {(kind, frame) for kind, frame, _ in index}:
+            return [], 0
+        if not self.fade <= index[-1][1] < self.stop - 1:
+            return index, end
+        kept = [entry for entry in index if entry[1] < self.fade]
+        return kept, index[len(kept)][2]
 
     def _add(self, part: Part) -> None:
         """Add the frames of a task: first to the report, then to the stream."""

@@ -13,7 +13,7 @@ import platform
 import resource
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -27,15 +27,27 @@ import numpy as np
 from morgs_mi.capture.capture import Capture, PartialFrame, load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cluster.executor import share_of_machine
-from morgs_mi.cluster.seams import SeamConfig, approached, changed_packet, fit_seam_frame
+from morgs_mi.cluster.seams import SeamConfig, cross_fade, fit_seam_frame
 from morgs_mi.codec.container import Packet, decode_packet
-from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
+from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, reemitted_keyframe
 from morgs_mi.config import StreamConfig
+from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.environment import versions
+from morgs_mi.io.remote import url_of
 from morgs_mi.recorder import due_keyframe, push_frame
 from morgs_mi.stream_loop import FrameReport, StreamLoop
 
-__all__ = ["Fit", "Following", "FrameRange", "Part", "Source", "fit_frames", "fit_segment_start", "installed"]
+__all__ = [
+    "Fit",
+    "Following",
+    "FrameRange",
+    "Part",
+    "Source",
+    "fit_frames",
+    "fit_segment_start",
+    "installed",
+    "prepared",
+]
 
 
 @dataclass(frozen=True)
@@ -43,7 +55,7 @@ class Source:
     """A capture as every worker opens it.
 
     Attributes:
-        path: its folder, absolute.
+        path: its folder, absolute, or its URL.
         downscale, test_view, num_frames, reading: as `load_capture` takes them.
     """
 
@@ -56,7 +68,7 @@ class Source:
     @classmethod
     def of(cls, capture: Capture) -> Source:
         """Return the source of an open capture."""
-        path = str(capture.path.resolve())
+        path = url_of(capture.path) or str(capture.path.resolve())
         return cls(path, capture.downscale, capture.test_view, capture.num_frames, capture.reading)
 
     def open(self) -> Capture:
@@ -99,16 +111,14 @@ class FrameRange:
 
 @dataclass(frozen=True)
 class Following:
-    """The next segment.
+    """The next segment, to which the last frames of a segment fade.
 
     Attributes:
-        frame: its first frame.
-        keyframe: state after that frame, an encoded packet.
+        packets: encoded packets of its frames before its first one, the overlap.
         shared_ids: number of ids of the common model.
     """
 
-    frame: int
-    keyframe: bytes
+    packets: tuple[bytes, ...]
     shared_ids: int
 
 
@@ -152,49 +162,73 @@ def fit_frames(
         fit: what all tasks of the fit share.
         frames: the frames.
         restart: state before them, as in `Part`; empty before the first frame of the recording.
-        following: the next segment, if these frames approach it.
+        following: the next segment, if these frames are the last ones of their segment and fade to it.
         points: points and their colours in place of the capture's, where those have been triangulated.
     """
-    with _prepared(fit) as messages:
+    with prepared(fit.variant, fit.versions) as messages:
         loop, capture, recorded = _opened(fit, frames, restart, points)
-        packets, reports = [], []
-        before = packet = None
+        start = before = loop.state.coded
+        packets, states, reports = list[Packet](), list[CodedFrame](), list[FrameReport]()
         for frame in islice(recorded, frames.stop - frames.start):
             before = loop.state.coded
             packet, report = push_frame(loop, frame, capture.train_views, _check_memory)
-            if following is not None and frame.index >= following.frame - fit.seams.handover:
-                packet = _hand_over(loop, before, following, fit)
-                report = replace(report, num_bytes=packet.num_bytes)
-            packets += [packet, *due_keyframe(loop.state.coded, fit.config.codec.keyframe_interval)]
+            assert loop.state.coded is not None
+            packets.append(packet)
+            states.append(loop.state.coded)
             reports.append(report)
-        assert packet is not None
-        after = (packet.encoded,) if before is None else (reemitted_keyframe(before).encoded, packet.encoded)
-        _OPEN[_key(fit, frames.segment, frames.stop, after)] = loop, capture, recorded
-        return _part(packets, reports, after, messages)
+        restart = _restart(before, packets[-1])
+        if following is None:
+            _OPEN[_key(fit, frames.segment, frames.stop, restart)] = loop, capture, recorded
+        else:
+            assert start is not None
+            packets, states = _faded(start, states, following, loop.setup.cameras, fit)
+            sizes = zip(reports, packets, states, strict=True)
+            reports = [replace(r, num_bytes=p.num_bytes, num_gaussians=len(s)) for r, p, s in sizes]
+        interval = fit.config.codec.keyframe_interval
+        stored = [q for p, s in zip(packets, states, strict=True) for q in (p, *due_keyframe(s, interval))]
+        return _part(stored, reports, restart, messages)
 
 
 def fit_segment_start(fit: Fit, base: bytes, frame: int) -> Part:
-    """Fit the first frame of a segment; `base` is a keyframe of the common model, as an encoded packet."""
-    with _prepared(fit) as messages:
+    """Fit the overlap before a segment, and its first frame.
+
+    Args:
+        fit: what all tasks of the fit share.
+        base: a keyframe of the common model, as an encoded packet.
+        frame: first frame of the segment.
+
+    Returns:
+        The packets of the overlap and of the frame, which ends with a keyframe, and the report of the frame.
+    """
+    with prepared(fit.variant, fit.versions) as messages:
         capture, coded = fit.source.open(), decode(None, decode_packet(base))
-        loop, first = _loop(capture, fit, None), max(frame - fit.seams.warm_up, coded.frame + 1)
+        loop, first = _loop(capture, fit, None), max(frame - fit.seams.overlap, coded.frame + 1)
         earlier, now = (_images(capture, t) for t in (coded.frame, first))
         coded, report = fit_seam_frame(loop.setup, coded, earlier, first, now, fit.seams, _check_memory)
         loop.resume(coded, [[now.get(view) for view in range(len(loop.setup.cameras))]])
-        seconds = report.seconds
+        before, packets, seconds = None, [reemitted_keyframe(coded)], report.seconds
         for recorded in capture.partial_frames(first + 1, frame + 1):
-            _, report = push_frame(loop, recorded, capture.train_views, _check_memory)
+            before = loop.state.coded
+            packet, report = push_frame(loop, recorded, capture.train_views, _check_memory)
+            packets.append(packet)
             seconds += report.seconds
-        assert loop.state.coded is not None
-        packet = reemitted_keyframe(loop.state.coded)
-        report = replace(report, seconds=seconds, num_bytes=packet.num_bytes)
-        return _part([packet], [report], (packet.encoded,), messages)
+        restart = _restart(before, packets[-1])
+        if before is not None:
+            assert loop.state.coded is not None
+            packets.append(reemitted_keyframe(loop.state.coded))
+        report = replace(report, seconds=seconds, num_bytes=packets[-1].num_bytes)
+        return _part(packets, [report], restart, messages)
 
 
 def installed() -> tuple[tuple[str, str], ...]:
     """Return the versions that must be the same in client and workers."""
     python = ".".join(platform.python_version_tuple()[:2])
     return tuple(({**versions(), "python": python}).items())
+
+
+def _restart(before: CodedFrame | None, packet: Packet) -> tuple[bytes, ...]:
+    """Return the packets that lead a decoder to the state after a packet, see `Part`."""
+    return (packet.encoded,) if before is None else (reemitted_keyframe(before).encoded, packet.encoded)
 
 
 def _part(packets: list[Packet], reports: list[FrameReport], restart: tuple[bytes, ...], messages: list[str]) -> Part:
@@ -204,13 +238,17 @@ def _part(packets: list[Packet], reports: list[FrameReport], restart: tuple[byte
 
 
 @contextmanager
-def _prepared(fit: Fit) -> Iterator[list[str]]:
+def prepared(variant: str, versions: tuple[tuple[str, str], ...]) -> Iterator[list[str]]:
     """Run a task alone in this process, with its variant and threads; the context is a list of its warnings.
+
+    Args:
+        variant: Mitsuba variant of the client.
+        versions: as `installed` returned them to the client.
 
     Raises:
         ValueError: the worker has other versions than the client.
     """
-    for (name, expected), (_, found) in zip(fit.versions, installed(), strict=True):
+    for (name, expected), (_, found) in zip(versions, installed(), strict=True):
         if expected != found:
             raise ValueError(
                 f"{socket.gethostname()}: expected a worker with {name} {expected} like the client, got {found}; "
@@ -218,8 +256,8 @@ def _prepared(fit: Fit) -> Iterator[list[str]]:
             )
     messages: list[str] = []
     with _BUSY, _logged(messages):
-        if mi.variant() != fit.variant:
-            mi.set_variant(fit.variant)
+        if mi.variant() != variant:
+            mi.set_variant(variant)
         threads, _ = share_of_machine()
         if dr.thread_count() != threads:
             dr.set_thread_count(threads)
@@ -298,13 +336,12 @@ def _images(capture: Capture, frame: int) -> dict[int, np.ndarray]:
     return {view: image for view, image in found.items() if image is not None}
 
 
-def _hand_over(loop: StreamLoop, before: CodedFrame | None, following: Following, fit: Fit) -> Packet:
-    """Return the packet of the loop's last frame after a step of the handover, and set the loop's state to it."""
-    now, goal = loop.state.coded, decode(None, decode_packet(following.keyframe))
-    assert now is not None
-    assert before is not None
-    share = 1 / (following.frame - now.frame)
-    gaussians = approached(now, goal, following.shared_ids, share, fit.seams)
-    packet = changed_packet(before, now, gaussians, loop.setup.cameras, fit.config.codec)
-    loop.state = replace(loop.state, coded=decode(before, packet))
-    return packet
+def _faded(
+    before: CodedFrame, states: Sequence[CodedFrame], following: Following, cameras: Sequence[Camera], fit: Fit
+) -> tuple[list[Packet], list[CodedFrame]]:
+    """Return packets and states of the last frames of a segment in the cross-fade to the next one."""
+    frames = {state.frame for state in states}
+    beginning = [coded for coded in coded_frames(map(decode_packet, following.packets)) if coded.frame in frames]
+    found = cross_fade(before, states, beginning, following.shared_ids, cameras, fit.config.codec, fit.seams.nearness)
+    packets, faded = zip(*found, strict=True)
+    return list(packets), list(faded)

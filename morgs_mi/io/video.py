@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.io.bounded import check_claim
+from morgs_mi.io.remote import fetched
 
 __all__ = [
     "Clip",
@@ -40,6 +41,10 @@ _JITTER, _ROUNDING_SECONDS = 0.1, 1e-3
 _SAME_RATE = 0.01
 # Bytes of an image file in which its size is searched, and of memory that a pixel takes, in BGR and RGB.
 _MAX_HEADER, _BYTES_PER_PIXEL = 1_000_000, 6
+# First frame that is worth a search, and the frames before it at which the search aims: those shown right after a
+# keyframe may refer to frames before it, and a file may be indexed by the times of decoding.
+_FAR, _BEFORE = 100, 32
+_SAME_TIME = 1e-6
 # Frames that a clip may pause; the instants of the pause are listed.
 _MAX_PAUSE = 1_000_000
 
@@ -61,7 +66,9 @@ def numbering_gap(names: Sequence[str]) -> int | None:
 
 @dataclass(frozen=True)
 class VideoReader:
-    """Reader of a video file, which each call of `frames` decodes from the start.
+    """Reader of a video file.
+
+    Each call of `frames` or `pick` decodes from the start, or far from there from the last keyframe before, see `pick`.
 
     Attributes:
         path: the file.
@@ -72,6 +79,7 @@ class VideoReader:
         num_held: number of frames in the file; less than `num_frames` if it was truncated.
         positions: times of the frames in the file, in frames of a regular clock of rate `fps`, which shows position k
             at the time of frame k of a clip of constant rate [num_held]; None at a constant rate.
+        times: times of the frames in the file, ascending, s [num_held]; None if it does not store them.
     """
 
     path: Path
@@ -81,6 +89,7 @@ class VideoReader:
     height: int
     num_held: int
     positions: np.ndarray | None = field(default=None, compare=False)
+    times: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     @classmethod
     def open(cls, path: str | Path) -> VideoReader:
@@ -93,11 +102,13 @@ class VideoReader:
         path = Path(path)
         (height, width), num_frames, fps = _video_header(path)
         times = _frame_times(path)
-        held, clock = len(times), None if path.suffix.lower() in _WITHOUT_TIMES else _clock(times)
+        held = len(times)
+        stored = None if path.suffix.lower() in _WITHOUT_TIMES or not (np.diff(times) > 0).all() else times
+        clock = None if stored is None else _clock(stored)
         # Some containers do not store the number, and a frame takes more than a byte.
         declared = num_frames if 0 < num_frames <= path.stat().st_size else held
         if clock is None:
-            return cls(path, declared, fps if fps > 0 else None, width, height, held)
+            return cls(path, declared, fps if fps > 0 else None, width, height, held, times=stored)
         positions, rate = clock
         if positions[-1] > 10 * held + _MAX_PAUSE:
             raise ValueError(
@@ -109,7 +120,7 @@ class VideoReader:
             declared = held
         if abs(fps / rate - 1) < _SAME_RATE:
             rate = fps
-        return cls(path, declared, rate, width, height, held, positions)
+        return cls(path, declared, rate, width, height, held, positions, times)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
         """Yield frames start..stop-1, by default up to `num_frames`.
@@ -122,10 +133,12 @@ class VideoReader:
     def pick(self, indices: Sequence[int]) -> Generator[ImageOrError, None, None]:
         """Yield the frames of ascending `indices`, with an error in place of each that cannot be decoded.
 
-        The frames between are decoded too, because seeking is inexact.
+        The frames between are decoded too. Those before the first are skipped if the time stamps of the frames that are
+        decoded instead prove which ones they are. Its pixels are those of decoding from the start, except in streams
+        that refresh their images gradually instead of with keyframes.
         """
-        stream = cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
-        done, ok = 0, True
+        stream, done = self._opened_before(indices[0]) if len(indices) else (self._opened(), 0)
+        ok = True
         try:
             for index in indices:
                 while ok and done <= index:
@@ -135,6 +148,26 @@ class VideoReader:
                 yield self._missing(index if ok else done) if frame is None else cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
         finally:
             stream.release()
+
+    def _opened(self) -> cv2.VideoCapture:
+        return cv2.VideoCapture(str(self.path), cv2.CAP_FFMPEG)
+
+    def _opened_before(self, index: int) -> tuple[cv2.VideoCapture, int]:
+        """Return the decoder of the file, and the number of frames that it has passed: none, or all up to `index`."""
+        if self.times is None or not _FAR <= index < len(self.times):
+            return self._opened(), 0
+        stream = self._opened()
+        stream.set(cv2.CAP_PROP_POS_MSEC, 1000 * self.times[index - _BEFORE])
+        if stream.grab():
+            at = int(np.argmin(np.abs(self.times - _seconds(stream))))
+            while at <= index and abs(self.times[at] - _seconds(stream)) < _SAME_TIME:
+                if at == index:
+                    return stream, index + 1
+                at += 1
+                if not stream.grab():
+                    break
+        stream.release()
+        return self._opened(), 0
 
     def _missing(self, index: int) -> ValueError:
         if index >= self.num_frames:
@@ -292,7 +325,7 @@ def _video_header(path: Path) -> tuple[tuple[int, int], int, float]:
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a video file, found none; check the path.")
-    if path.stat().st_size == 0:
+    if fetched(path).stat().st_size == 0:
         raise ValueError(f"{path}: expected a video, got an empty file; copy or record it again.")
     stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
@@ -318,9 +351,14 @@ def _frame_times(path: Path) -> np.ndarray:
     stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
     times = []
     while stream.grab():
-        times.append(stream.get(cv2.CAP_PROP_POS_MSEC) / 1000)
+        times.append(_seconds(stream))
     stream.release()
     return np.sort(times)
+
+
+def _seconds(stream: cv2.VideoCapture) -> float:
+    """Return the time of the frame or packet that a decoder has just passed."""
+    return stream.get(cv2.CAP_PROP_POS_MSEC) / 1000
 
 
 def _clock(times: np.ndarray) -> tuple[np.ndarray, float] | None:
@@ -392,7 +430,7 @@ def _read_image(file: Path) -> np.ndarray:
 
 
 def _decoded(file: Path, mode: int) -> np.ndarray:
-    data = np.fromfile(file, np.uint8)
+    data = np.fromfile(fetched(file), np.uint8)
     width, height = _claimed_size(data[:_MAX_HEADER].tobytes())
     check_claim(file, _BYTES_PER_PIXEL * width * height, f"{width}x{height} pixels")
     image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
@@ -404,7 +442,7 @@ def _decoded(file: Path, mode: int) -> np.ndarray:
 def _opaque(file: Path) -> np.ndarray | None:
     """Return the mask of an image's opaque pixels [H, W], None if it has no alpha channel or is not readable."""
     try:
-        with file.open("rb") as opened:
+        with fetched(file).open("rb") as opened:
             header = opened.read(26)
         # Its type of colours: with a palette, grey and alpha, or RGB and alpha.
         if not header.startswith(b"\x89PNG") or header[25:] not in (b"\3", b"\4", b"\6"):

@@ -43,6 +43,11 @@ def test_read_jobs__combines_captures_settings_and_seeds(tmp_path: Path) -> None
     assert (jobs[-1].config.fit.num_gaussians, jobs[-1].config.seed, jobs[-1].batch.segments) == (40000, 4, 2)
 
 
+def test_read_jobs__leaves_urls_as_they_are(tmp_path: Path) -> None:
+    (job,) = read_jobs(written(tmp_path, 'captures = ["s3://bucket/clips/walk"]'))
+    assert (job.name, job.capture) == ("walk-default-s0", "s3://bucket/clips/walk")
+
+
 def test_read_jobs__has_default_settings_and_one_seed(tmp_path: Path) -> None:
     assert [job.name for job in read_jobs(written(tmp_path, 'captures = ["walk"]'))] == ["walk-default-s0"]
 

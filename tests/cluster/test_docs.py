@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.reports import __main__ as reports
 from morgs_mi import cli
 from morgs_mi.codec.reader import StreamReader
 from tests.cli.commands import QUICK
@@ -22,6 +23,7 @@ ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"<!-- (run|start|file [^ ]+) -->\n```\w+\n(.*?)```", TEXT, re.DOTALL)
 FRAMES = 4
+REPORT = ("--stream.fit.num-gaussians", "80", "--stream.fit.first-frame-steps", "8", "--stream.fit.epochs", "1")
 
 
 def started(command: str) -> subprocess.Popen[str]:
@@ -40,6 +42,8 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a small capture where the demo writes its own."""
     write_recording(tmp_path / "out/demo/capture", FRAMES)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PWD", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setattr("morgs_mi.cluster.batch.StreamConfig", lambda: CONFIG)
     return tmp_path
 
@@ -58,17 +62,22 @@ def test_cluster_page__commands_run(workplace: Path) -> None:
                 stack.callback(process.wait)
                 stack.callback(process.terminate)
             elif kind == "run":
-                program, *args = shlex.split(command)
+                program, *args = shlex.split(os.path.expandvars(command))
+                if program == "python":
+                    assert reports.main([*args[2:], *REPORT]) == 0, command
+                    continue
                 assert program == "morgs-mi"
                 assert cli.main([*args, *(QUICK if args[0] == "fit" else [])]) == 0, command
             else:
                 (workplace / kind.removeprefix("file ")).write_text(command)
     streams = sorted(str(path.parent.relative_to("out")) for path in Path("out").rglob("stream.morgs"))
     jobs = [f"sweep/capture-{name}-s{seed}" for name in ("detailed", "small") for seed in (0, 1)]
-    assert streams == ["cluster", "dask", "segments", *jobs]
+    qualities = [f"codec/capture/{quality}" for quality in (1, 1000)]
+    assert streams == ["cluster", *qualities, "dask", "segments", *jobs, "url"]
     for name in streams:
         assert {frame for _, frame, _ in StreamReader(f"out/{name}/stream.morgs").index()} == set(range(FRAMES))
 
 
 def test_cluster_page__has_commands() -> None:
-    assert [kind for kind, _ in BLOCKS] == ["run", "file sweep.toml", "run", "run", "start", "start", "run"]
+    kinds = ["run", "run", "file sweep.toml", "run", "run", "start", "start", "run", "run"]
+    assert [kind for kind, _ in BLOCKS] == kinds

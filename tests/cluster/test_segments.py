@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import multiprocessing
 import os
@@ -28,9 +29,9 @@ from tests.scenes.coded_clip import history
 from tests.scenes.recording import CONFIG, write_recording
 
 FRAMES, STARTS = 10, (0, 3, 7)
-# A keyframe that is re-emitted in the handover, and one that falls on a seam.
+# A keyframe that is re-emitted in the cross-fade, and one that falls on a seam.
 SETTINGS = replace(CONFIG, codec=replace(CONFIG.codec, keyframe_interval=3))
-SEAMS = SeamConfig(passes=2, epochs=1, warm_up=1, handover=2)
+SEAMS = SeamConfig(passes=2, epochs=1, overlap=2)
 
 
 @pytest.fixture(scope="module")
@@ -148,6 +149,36 @@ def test_stream_segments__resumes_after_a_cut_packet(
         os.truncate(path, path.stat().st_size - 200)
     fit(capture, tmp_path, workers, resume=True)
     assert stream_of(tmp_path) == stream_of(whole)
+
+
+@pytest.mark.parametrize("frame", [2, 6])  # in the overlap before a segment or in its cross-fade, and after the overlap
+def test_stream_segments__resumes_within_a_beginning_or_a_cross_fade(
+    capture: Capture, workers: Workers, whole: Path, tmp_path: Path, frame: int
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        fit(capture, tmp_path, workers, on_stage=when_fitted(FRAMES, interrupt))
+    for path in (tmp_path / "segments").glob("*.morgs"):
+        offset = next((at for _, found, at in StreamReader(path).index() if found >= frame), None)
+        if offset is not None:
+            os.truncate(path, offset)
+    fit(capture, tmp_path, workers, resume=True)
+    assert stream_of(tmp_path) == stream_of(whole)
+    assert rows_of(tmp_path) == rows_of(whole)
+
+
+@pytest.mark.slow
+def test_stream_segments__of_a_url_is_the_same(
+    capture: Capture, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("fsspec", reason="comes with the extra `cluster`")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "worker"))
+    with open_workers(count=1) as workers:
+        asyncio.run(workers.run(os.getpid))  # it has begun, with a cache of its own
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "client"))
+        fit(load_capture(f"file://{capture.path}"), tmp_path / "out", workers)
+    assert len(list((tmp_path / "worker").rglob("cam1"))) == 1
+    packets = ([p.encoded for p in StreamReader(out / "stream.morgs")] for out in (tmp_path / "out", whole))
+    assert next(packets) == next(packets)
 
 
 @pytest.mark.slow

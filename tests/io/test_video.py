@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -55,6 +56,41 @@ def test_playable_format__is_vp9_and_otherwise_lossless(monkeypatch: pytest.Monk
 def test_natural_key__sorts_names_by_their_numbers() -> None:
     names = ["cam_10", "cam_2", "cam_0", "2", "b", "10", "cam"]
     assert sorted(names, key=natural_key) == ["2", "10", "b", "cam", "cam_0", "cam_2", "cam_10"]
+
+
+def long_video(path: Path, codec: str, count: int = 160) -> Path:
+    """Write a clip in which every frame differs; with the codec mpg2 it has frames that refer to later ones."""
+    y, x = np.mgrid[:HEIGHT, :WIDTH]
+    red = (np.uint8(120 + 80 * np.sin((x + 3 * t) / 9)) for t in range(count))
+    write_video(path, (np.stack([r, 100 + 2 * y, 90 + x], -1).astype(np.uint8) for r in red), 29.97, codec)
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.mp4 mpg2", "a.mkv mpg2", "a.mp4 vp09", "a.mp4 mp4v", "a.mkv FFV1", "a.avi mpg2"])
+def test_pick__searches_the_frames_that_decoding_from_the_start_reaches(tmp_path: Path, name: str) -> None:
+    file, codec = name.split()
+    reader = VideoReader.open(long_video(tmp_path / file, codec))
+    whole = list(reader.frames())
+    for start in (*range(98, 125, 2), 159):
+        np.testing.assert_array_equal(list(reader.frames(start, start + 3)), whole[start : start + 3])
+    near, far = (reader._opened_before(index) for index in (99, 150))
+    assert [done for _, done in (near, far)] == [0, 0 if file.endswith("avi") else 151]
+    late = list(reader.pick([155, 158, 160]))
+    np.testing.assert_array_equal(late[:2], [whole[155], whole[158]])
+    assert isinstance(late[2], ValueError)
+
+
+def test_pick__decodes_from_the_start_where_time_stamps_disagree(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader = VideoReader.open(long_video(tmp_path / "a.mkv", "mpg2"))
+    (expected,) = reader.pick([150])
+    assert reader.times is not None
+    wrong = replace(reader, times=np.where(np.arange(160) == 140, reader.times - 0.01, reader.times))
+    assert wrong._opened_before(150)[1] == 0
+    np.testing.assert_array_equal(next(wrong.pick([150])), expected)
+    monkeypatch.setattr("morgs_mi.io.video._FAR", 1000)
+    np.testing.assert_array_equal(next(reader.pick([150])), expected)
 
 
 def test_folder_reader__reads_in_numerical_order(tmp_path: Path) -> None:

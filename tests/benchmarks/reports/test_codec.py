@@ -15,6 +15,8 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import json_finite
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.method.config import MotionConfig
+from morgs_mi.render.config import RenderConfig
+from tests.benchmarks.reports.here import Here
 from tests.benchmarks.reports.pages import ROOT, page
 
 QUICK = CodecReportConfig(
@@ -75,6 +77,18 @@ def test_markdown_table_and_plot_codec__show_every_row(reported, tmp_path: Path)
     assert len(table) == 2 + len(result.clips[0].rows)
     plot_codec(result, tmp_path / "codec.png")
     assert (tmp_path / "codec.png").stat().st_size > 10_000
+
+
+def test_report_codec__of_workers_is_that_of_one_process(fitted_clip: Path, tmp_path: Path) -> None:
+    stream = replace(QUICK.stream, render=RenderConfig(reproducible=True))
+    config = replace(QUICK, qualities=(4,), frames=2, stream=stream)
+    for name, workers in (("alone", None), ("workers", Here())):
+        report_codec([fitted_clip / "capture"], tmp_path / name, config, workers=workers)
+    alone, found = (
+        {path.relative_to(folder): path.read_bytes() for path in folder.rglob("stream.morgs")}
+        for folder in (tmp_path / "alone", tmp_path / "workers")
+    )
+    assert found == alone
 
 
 def test_report_codec__refuses_bad_settings(fitted_clip: Path, tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import morgs_mi
 from benchmarks.reports import __main__ as cli
 from benchmarks.reports import method, method_cells
 from benchmarks.reports.method import MethodReportConfig, aggregate, cells_of, report_method
-from benchmarks.reports.method_cells import Cell, Clip, method_version, scores_of
+from benchmarks.reports.method_cells import Cell, Clip, fit_cells, method_version, scores_of
 from benchmarks.reports.method_results import FlowError, MethodClip, MethodResult, ScratchRow, SettingRow
 from benchmarks.reports.method_tables import (
     ablation_table,
@@ -26,10 +26,13 @@ from benchmarks.reports.method_tables import (
     method_page,
 )
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.cluster.executor import open_workers
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import json_finite
 from morgs_mi.fit.config import FitConfig
+from morgs_mi.render.config import RenderConfig
 from morgs_mi.synth.synthesize import synthesize
+from tests.benchmarks.reports.here import Here
 from tests.benchmarks.reports.pages import ROOT, page
 
 TINY = MethodReportConfig(
@@ -214,6 +217,37 @@ def test_scores_of__fits_another_version_or_setting_again(clip, tmp_path, monkey
     stored.write_text("{")
     with pytest.raises(ValueError, match="expected a cell's scores"):
         scores_of(*calls[2], tmp_path)
+
+
+def test_report_method__of_workers_is_that_of_one_process(clip, tmp_path, monkeypatch):
+    """Also if a worker dies, and the report is started again."""
+    monkeypatch.setattr(method_cells, "_fit", made_up_scores)
+    monkeypatch.setattr(method, "_SCRATCH", 1)
+    alone = report_method([clip], tmp_path / "alone", replace(TINY, seeds=2))
+    with pytest.raises(ChildProcessError):
+        report_method([clip], tmp_path / "workers", replace(TINY, seeds=2), workers=Here(dies_at=4))
+    before = set((tmp_path / "workers").rglob("*-s0-*.json"))
+    assert len(before) > 2
+    workers = Here()
+    found = report_method([clip], tmp_path / "workers", replace(TINY, seeds=2), workers=workers)
+    files = [{path.name for path in (tmp_path / name).rglob("*.*")} for name in ("alone", "workers")]
+    assert files[0] == files[1]
+    assert 99 - workers.left == len(list((tmp_path / "workers").rglob("*e-*k-*.json"))) - len(before)
+    ours, theirs = (json_finite(result.as_dict())["clips"][0] for result in (found, alone))
+    assert all(ours[name] == theirs[name] for name in ("rows", "key_view_rows"))
+
+
+@pytest.mark.slow
+def test_fit_cells__gives_the_scores_of_one_process(clip, tmp_path):
+    base = replace(TINY.base, render=RenderConfig(reproducible=True))
+    recording, cells = Clip.read(load_capture(clip)), [Cell("default", epochs, 1, 1.0, 0) for epochs in (1, 2)]
+    with open_workers(count=2) as workers:
+        fit_cells(recording, cells, base, "test", tmp_path / "workers", workers, lambda _: None)
+    for cell in cells:
+        ours, theirs = (scores_of(recording, cell, base, "test", tmp_path / name) for name in ("workers", "alone"))
+        for scores in (ours, theirs):
+            scores.pop("seconds")
+        assert json_finite(ours) == json_finite(theirs)
 
 
 def write_package(folder: Path, **changed: str) -> Path:

@@ -1,0 +1,131 @@
+"""PSNR and flicker at the seams of fits in segments, compared with the frames around and with fits in one piece.
+
+    python -m benchmarks.reports.seams --json benchmarks/results/seams.json
+
+The settings of the seams were chosen on `arm`, `spheres`, `thin` and `flicker` with seed 0; nothing was chosen on
+others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import mitsuba as mi
+import tyro
+
+from benchmarks.reports.plots import markdown
+from benchmarks.speed.output import Output
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.cluster.executor import open_workers
+from morgs_mi.cluster.seams import score_seam
+from morgs_mi.cluster.segments import stream_segments
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.config import StreamConfig
+from morgs_mi.fit.config import FitConfig
+from morgs_mi.synth.synthesize import synthesize
+
+
+@dataclass(frozen=True)
+class Options(Output):
+    """Clips and work."""
+
+    clips: tuple[tuple[str, int, int], ...] = (
+        ("arm", 0, 48),
+        ("random", 5, 32),
+        ("thin", 0, 32),
+        ("flicker", 0, 32),
+        ("spheres", 0, 32),
+    )
+    """Scenes, seeds and numbers of frames."""
+    folder: Path = Path("out/seams")
+    """Folder of the clips, which are made if missing."""
+    cameras: int = 6
+    """Cameras of a clip, one of them held out."""
+    width: int = 160
+    """Width of its images, px; the height is three quarters of it."""
+    gaussians: int = 4000
+    """Gaussians of the first frame."""
+    first_frame_steps: int = 500
+    """Steps of the first frame."""
+    epochs: int = 2
+    """Epochs of a later frame."""
+    segment_frames: int = 16
+    """Frames of a segment."""
+    workers: int = 1
+    """Processes."""
+
+
+def clip(name: str, seed: int, frames: int, options: Options) -> Capture:
+    """Return a clip, which is made if it is missing."""
+    path = options.folder / f"{name}-{seed}-{options.cameras}x{frames}x{options.width}"
+    if not path.exists():
+        width, height = options.width, options.width * 3 // 4
+        synthesize(
+            name,
+            path,
+            num_cameras=options.cameras,
+            num_frames=frames,
+            width=width,
+            height=height,
+            seed=seed,
+        )
+    return load_capture(path)
+
+
+def measure(capture: Capture, config: StreamConfig, options: Options) -> dict[str, Any]:
+    """Return the scores of the seams, those of a fit in one piece at the same frames, and the sizes of both."""
+    with TemporaryDirectory() as name, open_workers(count=options.workers) as workers:
+        segments, whole = (Path(name) / part for part in ("segments", "whole"))
+        count = capture.num_frames // options.segment_frames
+        fit = stream_segments(capture, segments, workers, config, count)
+        stream_segments(capture, whole, workers, config)
+        streams = [folder / "stream.morgs" for folder in (segments, whole)]
+        same = [score_seam(StreamReader(streams[1]), capture, seam.frame) for seam in fit.seams]
+        sizes = [path.stat().st_size for path in streams]
+    seams = [{**asdict(seam), "whole": asdict(other)} for seam, other in zip(fit.seams, same, strict=True)]
+    return {"num_bytes": sizes[0], "num_bytes_whole": sizes[1], "seams": seams}
+
+
+def seam_table(clips: Sequence[Mapping[str, Any]]) -> str:
+    """Return the seams of the clips as a table: each beside the frames around, and beside the fit in one piece."""
+    titles = ("clip, seam", "PSNR before, at, around, dB", "in one piece", "mTV at, around", "in one piece", "kB")
+    rows = []
+    for clip in clips:
+        for seam in clip["seams"]:
+            whole, sizes = seam["whole"], (clip["num_bytes"], clip["num_bytes_whole"])
+            rows.append(
+                [
+                    f"`{clip['scene']}` {clip['seed']}, frame {seam['frame']}",
+                    ", ".join(f"{seam[name]:.2f}" for name in ("psnr_before", "psnr", "psnr_around")),
+                    f"{whole['psnr']:.2f}",
+                    f"{seam['mtv']:.3f}, {seam['mtv_around']:.3f}",
+                    f"{whole['mtv']:.3f}",
+                    " / ".join(f"{size / 1e3:.0f}" for size in sizes),
+                ]
+            )
+    return markdown(titles, rows)
+
+
+def main(options: Options) -> None:
+    """Run the report."""
+    mi.set_variant("llvm_ad_rgb")
+    fit = FitConfig(
+        num_gaussians=options.gaussians,
+        first_frame_steps=options.first_frame_steps,
+        epochs=options.epochs,
+        dropping=0.0,
+    )
+    given, rows = {n: v for n, v in asdict(options).items() if n not in ("json", "folder")}, []
+    for name, seed, frames in options.clips:
+        found = measure(clip(name, seed, frames, options), StreamConfig(fit=fit, seed=seed), options)
+        rows.append({"scene": name, "seed": seed, "frames": frames, **found})
+        print(rows[-1], flush=True)
+        options.write({"options": given, "clips": rows}, unprinted=["options", "clips"])
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

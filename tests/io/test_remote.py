@@ -1,0 +1,125 @@
+"""Captures at URLs: they read like a folder, and only what is decoded is fetched."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi import cli
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.io.remote import fetched, is_url, mirrored, url_of
+from tests.scenes.recording import write_recording
+
+fsspec = pytest.importorskip("fsspec", reason="comes with the extra `cluster`")
+URL = "memory://bucket/clip"
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Iterator[Path]:
+    """A capture in a folder, which is also at the URL."""
+    folder, system = write_recording(tmp_path / "clip", 8), fsspec.filesystem("memory")
+    (folder / "truth").mkdir()
+    (folder / "truth" / "much.npz").write_bytes(bytes(10))
+    system.put(str(folder), "/bucket/clip", recursive=True)
+    yield folder
+    system.rm("/bucket", recursive=True)
+
+
+def test_load_capture__reads_a_url_like_a_folder(folder: Path) -> None:
+    local, remote = load_capture(folder), load_capture(URL)
+    assert (remote.names, remote.num_frames, remote.path.name) == (local.names, local.num_frames, "clip")
+    np.testing.assert_array_equal(remote.points, local.points)
+    for ours, theirs in zip(remote.frames(), local.frames(), strict=True):
+        np.testing.assert_array_equal(ours.images, theirs.images)
+
+
+def test_load_capture__fetches_only_the_images_that_it_decodes(folder: Path) -> None:
+    capture = load_capture(URL)
+    list(capture.frames(2, 4))
+    files = sorted((capture.path / capture.names[0]).glob("*.png"))
+    # Those at the start, in the middle and at the end are looked at for transparent pixels.
+    assert [k for k, file in enumerate(files) if file.stat().st_size] == [0, 2, 3, 4, 7]
+    assert not (capture.path / "truth").exists()
+
+
+def test_mirrored__fetches_nothing_twice_until_the_capture_changes(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = load_capture(URL)
+    with monkeypatch.context() as broken:
+        broken.setattr(type(fsspec.filesystem("memory")), "get_file", None)
+        assert load_capture(URL).path == first.path
+    with fsspec.open(f"{URL}/capture.json", "w") as file:
+        file.write('{"fps": 5}')
+    assert load_capture(URL).fps == 5
+
+
+def test_url_of__is_that_of_a_mirrored_folder(folder: Path) -> None:
+    assert url_of(mirrored(URL)) == URL
+    assert url_of(folder) is None
+    assert is_url(URL)
+    assert not is_url(str(folder))
+
+
+def test_fetched__leaves_empty_files_elsewhere(tmp_path: Path) -> None:
+    (tmp_path / "0.png").touch()
+    assert fetched(tmp_path / "0.png").stat().st_size == 0
+
+
+class Refusing(fsspec.AbstractFileSystem):
+    """A file system that refuses to list its files."""
+
+    protocol, error = "refusing", PermissionError("Access Denied")
+
+    def find(self, path, **options):
+        raise self.error
+
+
+class Silent(Refusing):
+    protocol, error = "silent", TimeoutError()
+
+
+@pytest.mark.parametrize(
+    ("url", "kind", "message"),
+    [
+        ("nothing://a/b", ValueError, r"nothing://a/b: expected a URL that fsspec can open, .*not known: nothing"),
+        ("s3://a/b", ValueError, r"s3://a/b: reading it needs another package: Install s3fs"),
+        ("memory://none", FileNotFoundError, r"memory://none: expected a capture folder, found no files"),
+        ("refusing://a", PermissionError, r"refusing://a: expected to be allowed to read it, got Access Denied"),
+        ("silent://a", ConnectionError, r"silent://a: expected to read it, got TimeoutError"),
+    ],
+)
+def test_mirrored__refuses_in_one_sentence(url, kind, message, monkeypatch: pytest.MonkeyPatch) -> None:
+    for system in (Refusing, Silent):
+        fsspec.register_implementation(system.protocol, system, clobber=True)
+    monkeypatch.setitem(sys.modules, "s3fs", None)
+    with pytest.raises(kind, match=message):
+        mirrored(url)
+
+
+def test_mirrored__names_the_extra_that_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fsspec.core", None)
+    with pytest.raises(ValueError, match=r"memory://a: reading it needs the package fsspec; pip .*morgs-mi\[cluster\]"):
+        mirrored("memory://a")
+
+
+def test_fetched__names_a_file_that_has_gone(folder: Path) -> None:
+    capture = load_capture(URL)
+    fsspec.filesystem("memory").rm("/bucket/clip/cam1/0002.png")
+    with pytest.raises(FileNotFoundError, match=r"memory://bucket/clip: /bucket/clip/cam1/0002\.png: expected a file"):
+        list(capture.frames(2, 3))
+
+
+def test_fit__names_an_unknown_protocol(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["fit", "nothing://a/b", str(tmp_path / "out")]) == 1
+    assert "nothing://a/b: expected a URL that fsspec can open" in " ".join(capsys.readouterr().err.split())
