@@ -64,8 +64,14 @@ class SeamConfig:
     """Largest number of births in each of them, as a fraction of the Gaussians."""
     overlap: int = 10
     """Last frames of a segment that the next one fits too, and in which the stream fades to it."""
+    overlap_epochs: int = 2
+    """Factor on the epochs of its other frames: the fit is not yet as good as one that followed from the beginning."""
     nearness: float = 1.0
     """Distance, in largest scales of the Gaussian, up to which it is interpolated in the cross-fade."""
+
+    def overlap_config(self, config: StreamConfig) -> StreamConfig:
+        """Return the settings of the other frames of the overlap."""
+        return replace(config, fit=replace(config.fit, epochs=self.overlap_epochs * config.fit.epochs))
 
     def fit_config(self, config: StreamConfig, number: int) -> StreamConfig:
         """Return the settings of one of these fits."""

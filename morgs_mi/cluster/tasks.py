@@ -202,7 +202,8 @@ def fit_segment_start(fit: Fit, base: bytes, frame: int) -> Part:
     """
     with prepared(fit.variant, fit.versions) as messages:
         capture, coded = fit.source.open(), decode(None, decode_packet(base))
-        loop, first = _loop(capture, fit, None), max(frame - fit.seams.overlap, coded.frame + 1)
+        loop = _loop(capture, replace(fit, config=fit.seams.overlap_config(fit.config)), None)
+        first = max(frame - fit.seams.overlap, coded.frame + 1)
         earlier, now = (_images(capture, t) for t in (coded.frame, first))
         coded, report = fit_seam_frame(loop.setup, coded, earlier, first, now, fit.seams, _check_memory)
         loop.resume(coded, [[now.get(view) for view in range(len(loop.setup.cameras))]])
