@@ -220,7 +220,7 @@ def _first_gaussians(setup: Setup, seen: Images, rng: np.random.Generator) -> tu
     if len(points) < _MIN_POINTS:
         status = f"the capture has {len(points)} points, too few: seeded {count} random ones inside the views"
         _LOG.warning("frame 0: %s", status)
-        points, colors = seed_points(cameras, images, count, rng)
+        points, colors = seed_points(cameras, images, masks, count, rng)
     elif len(points) < _MANY_POINTS:
         points, colors = fill_points(points, colors, cameras, images, masks, count, rng)
     points, colors = resample_points(points, colors, count, rng)

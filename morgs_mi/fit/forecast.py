@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.fit.initialise import focus_point, scene_extent, seen_points
+from morgs_mi.fit.initialise import focus_depths, scene_extent, seen_points
 
 __all__ = ["POOR_LOSS", "Forecast", "angles_to", "forecast", "scene_depths"]
 
@@ -73,11 +73,10 @@ def scene_depths(cameras: Sequence[Camera], points: np.ndarray) -> list[float]:
 
     For a view without points it is that of the `focus_point`, or far away if that is not in front of the camera.
     """
-    focus, far = focus_point(cameras), 1e6 * scene_extent(cameras)
-    depths = []
-    for camera in cameras:
+    far, depths = 1e6 * scene_extent(cameras), []
+    for camera, focus in zip(cameras, focus_depths(cameras), strict=True):
         _, _, seen = seen_points(camera, points)
-        middle = float(np.median(seen)) if len(seen) else float(camera.project(focus)[1])
+        middle = float(np.median(seen)) if len(seen) else min(float(focus), far)
         depths.append(middle if middle > camera.near else far)
     return depths
 
