@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,8 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_mask, check_points, check_type
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.threads import map_in_threads
+from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.detail import gaussians_for
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.first_settings import first_settings
 from morgs_mi.fit.initialise import fill_points, from_points, resample_points, scene_extent, seed_points
@@ -186,34 +188,36 @@ def _first_step(
     start, config = time.perf_counter(), setup.config
     rng = np.random.default_rng([config.seed, 0])
     cameras, masks = [setup.cameras[v] for v in images], [setup.masks[v] for v in images]
-    gaussians, status = _first_gaussians(setup, images, rng)
+    fit = config.fit
+    if fit.num_gaussians is None:
+        count = gaussians_for(cameras, list(images.values()), masks, setup.points, fit.detail)
+        fit = replace(fit, num_gaussians=count)
+    gaussians, status = _first_gaussians(setup, images, fit, rng)
     targets = [Target(image, mask) for image, mask in zip(images.values(), masks, strict=True)]
     given = gaussians, cameras, list(images.values()), masks, targets, setup.points, setup.extent
-    chosen = first_settings(*given, config.fit, config.render, [config.seed, 0, 1], on_step)
-    steps = chosen.steps_before + chosen.config.first_frame_steps
-    tick = None if on_step is None else lambda done: on_step(chosen.steps_before + done, steps)
-    gaussians, losses = fit_first_frame(
-        gaussians, cameras, targets, setup.extent, chosen.config, config.render, rng, tick
-    )
-    packet = keyframe_packet(gaussians, 0, setup.cameras, config.codec)
+    chosen = first_settings(*given, fit, config.render, [config.seed, 0, 1], on_step)
+    before = chosen.steps_before
+    tick = None if on_step is None else lambda done, steps: on_step(before + done, before + steps)
+    fitted = fit_first_frame(gaussians, cameras, targets, setup.extent, chosen.config, config.render, rng, tick)
+    packet = keyframe_packet(fitted.gaussians, 0, setup.cameras, config.codec)
     coded = decode(None, packet)
     report = FrameReport(
         0,
         time.perf_counter() - start,
         packet.num_bytes,
-        losses,
+        fitted.losses,
         len(coded),
         status,
         _missing(setup, images),
         validation={"sentence": chosen.expected.sentence, **asdict(chosen.expected)} if chosen.expected else {},
-        steps=chosen.config.first_frame_steps,
+        steps=fitted.steps,
     )
     return StreamState(1, coded, images, _references(setup, state, images, {})), packet, report
 
 
-def _first_gaussians(setup: Setup, seen: Images, rng: np.random.Generator) -> tuple[Gaussians, str]:
+def _first_gaussians(setup: Setup, seen: Images, config: FitConfig, rng: np.random.Generator) -> tuple[Gaussians, str]:
     """Return the initial Gaussians, and a status about where they lie."""
-    config, status = setup.config.fit, "ok"
+    status = "ok"
     count, images = config.first_count, list(seen.values())
     cameras, masks = [setup.cameras[v] for v in seen], [setup.masks[v] for v in seen]
     points, colors = setup.points, setup.point_colors

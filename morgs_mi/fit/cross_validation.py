@@ -114,7 +114,7 @@ def cross_validate(
         trial, rng = replace(config, dropping=dropping, first_frame_steps=steps), np.random.default_rng(seed)
         tick = None if on_step is None else _shifted(on_step, len(trials) * steps)
         views = [view[0] for view in trained]
-        fitted, _ = fit_first_frame(start, views, targets, extent, trial, render, rng, tick)
+        fitted = fit_first_frame(start, views, targets, extent, trial, render, rng, tick).gaussians
         trials.append(Trial(dropping, _psnr(fitted, judged, render), _psnr(fitted, trained, render)))
         if len(trials) > 1 and trials[-1].withheld_psnr <= trials[-2].withheld_psnr:
             break
@@ -124,7 +124,7 @@ def cross_validate(
 
 def trial_steps(config: FitConfig) -> int:
     """Return the number of steps of one fit."""
-    return max(1, round(config.cross_validation.steps * config.first_frame_steps))
+    return max(1, round(config.cross_validation.steps * config.planned_steps))
 
 
 def withheld_views(cameras: Sequence[Camera], share: int) -> tuple[int, ...]:
@@ -142,8 +142,8 @@ def withheld_views(cameras: Sequence[Camera], share: int) -> tuple[int, ...]:
     return tuple(sorted(chosen))
 
 
-def _shifted(on_step: Callable[[int], None], done: int) -> Callable[[int], None]:
-    return lambda step: on_step(done + step)
+def _shifted(on_step: Callable[[int], None], done: int) -> Callable[[int, int], None]:
+    return lambda step, _: on_step(done + step)
 
 
 def _reduced(camera: Camera, image: np.ndarray, mask: np.ndarray | None, width: int) -> _View:

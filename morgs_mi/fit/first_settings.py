@@ -75,6 +75,6 @@ def first_settings(
         expected = forecast(cameras, points) if len(cameras) > 1 else None
         return FirstSettings(replace(config, dropping=dropping), expected)
     before = trial_steps(config) * len(config.cross_validation.candidates)
-    tick = None if on_step is None else lambda done: on_step(done, before + config.first_frame_steps)
+    tick = None if on_step is None else lambda done: on_step(done, before + config.planned_steps)
     found = cross_validate(gaussians, cameras, images, masks, extent, config, render, seed, tick)
     return FirstSettings(replace(config, dropping=found.best.dropping), found, before)

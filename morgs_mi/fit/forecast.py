@@ -10,7 +10,7 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.fit.initialise import focus_depths, scene_extent, seen_points
 
-__all__ = ["POOR_LOSS", "Forecast", "angles_to", "forecast", "scene_depths"]
+__all__ = ["POOR_LOSS", "Forecast", "angles_to", "forecast", "mean_views", "scene_depths"]
 
 # dB below the training views above which views between the cameras look poor.
 POOR_LOSS = 8.0
@@ -66,6 +66,18 @@ def forecast(cameras: Sequence[Camera], points: np.ndarray) -> Forecast:
         measures.append((angles.min(), seen[angles.argmin()].mean(), nearest.mean()))
     spacing, overlap, reach = np.mean(measures, axis=0)
     return Forecast(len(cameras), float(spacing), float(overlap), float(reach))
+
+
+def mean_views(cameras: Sequence[Camera], points: np.ndarray) -> float:
+    """Return the mean number of views that see a surface of the scene, at least 1, as far as their frustums tell.
+
+    Args:
+        cameras: at least one.
+        points: [P, 3] of the scene, world units, or none.
+    """
+    surfaces = [_surface(*view) for view in zip(cameras, scene_depths(cameras, points), strict=True)]
+    seen = [[np.mean(seen_points(other, surface)[0]) for other in cameras] for surface in surfaces]
+    return max(1.0, float(np.sum(seen, axis=1).mean()))
 
 
 def scene_depths(cameras: Sequence[Camera], points: np.ndarray) -> list[float]:
