@@ -205,13 +205,22 @@ def test_push__reports_what_cross_validation_of_the_first_frame_found(clip):
     assert "trials" not in new_loop(given).push(clip[0][:4])[1].validation
 
 
-def test_push__withholds_nothing_from_few_views(clip):
+def test_push__compares_two_fits_of_few_views(clip):
     ticks = []
     config = dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, first_frame_steps=20))
     _, report = new_loop(config).push(clip[0][:4], lambda *tick: ticks.append(tick))
-    assert report.validation["sentence"].startswith("Views between the cameras will be ")
+    assert report.validation["sentence"].startswith("Views between the cameras will ")
     assert report.validation["cameras"] == 4
-    assert ticks == [(done, 20) for done in range(1, 21)]
+    assert 0 < report.validation["expected_psnr"] < report.validation["training_psnr"]
+    total = 20 + 2 * 8
+    assert ticks == [(done, total) for done in range(1, total + 1)]
+
+
+def test_push__forecasts_other_views_without_trials(clip):
+    fit = dataclasses.replace(QUICK.fit, first_frame_steps=20, dropping=0.0)
+    _, report = new_loop(dataclasses.replace(QUICK, fit=fit)).push(clip[0][:4])
+    assert report.validation["sentence"].startswith("Views between the cameras will be ")
+    assert "reach" in report.validation
 
 
 def test_push__fits_the_first_frame_in_the_steps_that_a_time_allows(clip):
@@ -219,7 +228,7 @@ def test_push__fits_the_first_frame_in_the_steps_that_a_time_allows(clip):
     hardly_any = dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, first_frame_seconds=1e-3))
     _, report = new_loop(hardly_any).push(clip[0][:4], lambda *tick: ticks.append(tick))
     assert report.steps == 100
-    assert ticks[-1] == (100, 100)
+    assert ticks[-1] == (180, 180)  # with two trials of 40 steps
 
 
 def without(images, *views):

@@ -40,6 +40,8 @@ class Options(Output):
     """Fixed number of Gaussians."""
     steps: int = 1500
     """Fixed number of steps."""
+    compare: bool = True
+    """Whether to fit with the fixed numbers too."""
     dropping: tuple[float, ...] = ()
     """Probability of dropping of each clip; none: chosen."""
 
@@ -72,7 +74,7 @@ def main(options: Options) -> None:
         fixed = replace(chosen, num_gaussians=options.gaussians, first_frame_steps=options.steps)
         name = capture.path.name
         rows[name] = {"views": len(capture.train_views)}
-        for how, fit in (("chosen", chosen), ("fixed", fixed)):
+        for how, fit in {"chosen": chosen, **({"fixed": fixed} if options.compare else {})}.items():
             rows[name][how] = measure(capture, fit)
             print(name, how, rows[name][how], flush=True)
     options.write({"fits": rows}, unprinted=["fits"])

@@ -10,6 +10,7 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.fit.agreement import NUM_FITS
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.losses.ssim import Target
@@ -35,7 +36,7 @@ def steps_within(
 ) -> int:
     """Return the number of steps of the first frame, at least 100, that this machine makes in a time.
 
-    The time of the measurement and of cross-validation is part of it. The same number as `first_frame_steps` gives the
+    The time of the measurement and of the trials is part of it. The same number as `first_frame_steps` gives the
     same result on any machine.
 
     Args:
@@ -58,6 +59,8 @@ def steps_within(
         fit_first_frame(gaussians, cameras, targets, extent, timed, render, np.random.default_rng(seed))
         took = time.perf_counter() - start
     validation = config.cross_validation
-    validated = config.dropping is None and len(cameras) >= validation.min_views
-    per_step = _GROWTH * took / _TIMED * (1 + validated * validation.steps * len(validation.candidates))
+    trials = 0
+    if config.dropping is None and len(cameras) > 1:
+        trials = len(validation.candidates) if len(cameras) >= validation.min_views else NUM_FITS
+    per_step = _GROWTH * took / _TIMED * (1 + trials * validation.steps)
     return max(_LEAST, int((seconds - (time.perf_counter() - begin)) / per_step))

@@ -23,10 +23,22 @@ from morgs_mi.losses.ssim import Target
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 
-__all__ = ["CrossValidation", "Trial", "cross_validate", "trial_steps", "withheld_views"]
+__all__ = [
+    "POOR_PSNR",
+    "CrossValidation",
+    "Trial",
+    "cross_validate",
+    "mean_decibels",
+    "reduced",
+    "rendered",
+    "squared_errors",
+    "trial_steps",
+    "withheld_views",
+]
 
 _MIN_SIDE = 32  # px
-_POOR = 22.0  # dB, PSNR of withheld views below which they look poor
+POOR_PSNR = 22.0
+"""PSNR in dB below which views between the cameras look poor."""
 _View = tuple[Camera, np.ndarray, np.ndarray | None]
 
 
@@ -72,7 +84,7 @@ class CrossValidation:
         measured = f"about {best.withheld_psnr:.1f} dB, measured on {', '.join(self.withheld)} in a trial without it"
         if len(self.withheld) > 1:
             measured = measured.removesuffix("it") + "them"
-        if best.withheld_psnr >= _POOR and gap <= POOR_LOSS:
+        if best.withheld_psnr >= POOR_PSNR and gap <= POOR_LOSS:
             return f"Views between the cameras will have {measured}."
         return (
             f"Views between the cameras will be poor: {measured}, {gap:.1f} dB below the other views; the cameras are "
@@ -106,7 +118,7 @@ def cross_validate(
     """
     how = config.cross_validation
     withheld, steps = withheld_views(cameras, how.share), trial_steps(config)
-    small = [_reduced(*view, how.width) for view in zip(cameras, images, masks, strict=True)]
+    small = [reduced(*view, how.width) for view in zip(cameras, images, masks, strict=True)]
     trained = [view for index, view in enumerate(small) if index not in withheld]
     judged, targets = [small[index] for index in withheld], [Target(image, mask) for _, image, mask in trained]
     trials: list[Trial] = []
@@ -146,7 +158,7 @@ def _shifted(on_step: Callable[[int], None], done: int) -> Callable[[int, int], 
     return lambda step, _: on_step(done + step)
 
 
-def _reduced(camera: Camera, image: np.ndarray, mask: np.ndarray | None, width: int) -> _View:
+def reduced(camera: Camera, image: np.ndarray, mask: np.ndarray | None, width: int) -> _View:
     """Return a view reduced by the largest whole factor that leaves a width.
 
     A pixel is valid if all that it covers is.
@@ -160,11 +172,25 @@ def _reduced(camera: Camera, image: np.ndarray, mask: np.ndarray | None, width: 
     return camera.resized(*size), smaller, valid
 
 
+def squared_errors(gaussians: Gaussians, views: Sequence[_View], render: RenderConfig) -> np.ndarray:
+    """Return the mean square error of each view [V], of its valid pixels."""
+    errors = []
+    for camera, image, mask in views:
+        squares = ((rendered(gaussians, camera, render) - image / 255.0) ** 2).mean(axis=-1)
+        errors.append(squares[slice(None) if mask is None else mask].mean())
+    return np.array(errors)
+
+
+def rendered(gaussians: Gaussians, camera: Camera, render: RenderConfig) -> np.ndarray:
+    """Return the image of a view [H, W, 3] in [0, 1]."""
+    return np.clip(np.asarray(rasterize(gaussians, camera, ("color",), config=render).color), 0, 1)
+
+
+def mean_decibels(squares: np.ndarray) -> float:
+    """Return the mean PSNR of mean square errors, dB."""
+    return float(np.mean(-10 * np.log10(np.maximum(squares, 1e-10))))
+
+
 def _psnr(gaussians: Gaussians, views: Sequence[_View], render: RenderConfig) -> float:
     """Return the mean PSNR of some views in dB, of their valid pixels."""
-    values = []
-    for camera, image, mask in views:
-        found = np.clip(np.asarray(rasterize(gaussians, camera, ("color",), config=render).color), 0, 1)
-        squares = ((found - image / 255.0) ** 2).mean(axis=-1)
-        values.append(-10 * np.log10(max(float(squares[slice(None) if mask is None else mask].mean()), 1e-10)))
-    return float(np.mean(values))
+    return mean_decibels(squared_errors(gaussians, views, render))

@@ -9,6 +9,7 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.fit.agreement import NUM_FITS, Agreement, compare_fits
 from morgs_mi.fit.budget import steps_within
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, trial_steps
@@ -27,11 +28,11 @@ class FirstSettings:
     Attributes:
         config: with a number of steps and a strength of dropping.
         expected: what to expect of views between the cameras; None for a single camera.
-        steps_before: number of steps that cross-validation has made.
+        steps_before: number of steps that trials have made.
     """
 
     config: FitConfig
-    expected: CrossValidation | Forecast | None
+    expected: CrossValidation | Agreement | Forecast | None
     steps_before: int = 0
 
 
@@ -50,7 +51,8 @@ def first_settings(
 ) -> FirstSettings:
     """Return the settings of the first frame.
 
-    Where cross-validation does not choose the strength of dropping, a forecast says what to expect of other views.
+    Cross-validation, or of few views the comparison of two fits, says what to expect of other views; where the strength
+    of dropping is given, a forecast does.
 
     Args:
         gaussians: the start.
@@ -70,11 +72,20 @@ def first_settings(
             config.first_frame_seconds, gaussians, cameras, targets, extent, config, render, [*seed, 1]
         )
         config = replace(config, first_frame_steps=steps)
-    if config.dropping is not None or len(images) < config.cross_validation.min_views:
+    how, steps, given = config.cross_validation, trial_steps(config), (cameras, images, masks, extent)
+    if config.dropping is None and len(cameras) >= how.min_views:
+        before = steps * len(how.candidates)
+        found = cross_validate(gaussians, *given, config, render, seed, _tick(on_step, before, config))
+        return FirstSettings(replace(config, dropping=found.best.dropping), found, before)
+    if config.dropping is not None or min(len(cameras), len(gaussians)) < NUM_FITS:
         dropping = dropping_by_noise(images) if config.dropping is None else config.dropping
         expected = forecast(cameras, points) if len(cameras) > 1 else None
         return FirstSettings(replace(config, dropping=dropping), expected)
-    before = trial_steps(config) * len(config.cross_validation.candidates)
-    tick = None if on_step is None else lambda done: on_step(done, before + config.planned_steps)
-    found = cross_validate(gaussians, cameras, images, masks, extent, config, render, seed, tick)
-    return FirstSettings(replace(config, dropping=found.best.dropping), found, before)
+    config, before = replace(config, dropping=dropping_by_noise(images)), steps * NUM_FITS
+    found = compare_fits(gaussians, *given, config, render, seed, _tick(on_step, before, config))
+    return FirstSettings(config, found, before)
+
+
+def _tick(on_step: Callable[[int, int], None] | None, before: int, config: FitConfig) -> Callable[[int], None] | None:
+    """Return the function that is called with the number of steps done, of the `before` steps of the trials."""
+    return None if on_step is None else lambda done: on_step(done, before + config.planned_steps)
