@@ -22,10 +22,12 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_mask, check_points, check_type
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.threads import map_in_threads
+from morgs_mi.fit.agreement import Agreement
 from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.cross_validation import mean_psnr
 from morgs_mi.fit.detail import gaussians_for
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
-from morgs_mi.fit.first_settings import first_settings
+from morgs_mi.fit.first_settings import Expected, first_settings
 from morgs_mi.fit.initialise import fill_points, from_points, resample_points, scene_extent, seed_points
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.losses.ssim import Target
@@ -62,9 +64,10 @@ class FrameReport:
         status: "ok", or a sentence about what was done instead.
         missing_views: names of the views without an image.
         active: what took part, as fractions of everything, by name: gaussians, views, pixels, epochs.
-        validation: of the first frame, what cross-validation found (see `fit.cross_validation`), or else the forecast
-            (see `fit.forecast`), with a `sentence` on views between the cameras; empty with a single view.
-        steps: number of optimisation steps, without those of cross-validation.
+        validation: of the first frame, a `sentence` on views between the cameras and their `expected_psnr` in dB, with
+            the results of cross-validation (see `fit.cross_validation`), the comparison of two fits (see
+            `fit.agreement`), or else the forecast (see `fit.forecast`), which has no number; empty with a single view.
+        steps: number of optimisation steps, without those of trials.
     """
 
     frame: int
@@ -199,6 +202,10 @@ def _first_step(
     before = chosen.steps_before
     tick = None if on_step is None else lambda done, steps: on_step(before + done, before + steps)
     fitted = fit_first_frame(gaussians, cameras, targets, setup.extent, chosen.config, config.render, rng, tick)
+    expected = chosen.expected
+    if isinstance(expected, Agreement):
+        views = list(zip(cameras, images.values(), masks, strict=True))
+        expected = replace(expected, training_psnr=mean_psnr(fitted.gaussians, views, config.render))
     packet = keyframe_packet(fitted.gaussians, 0, setup.cameras, config.codec)
     coded = decode(None, packet)
     report = FrameReport(
@@ -209,10 +216,15 @@ def _first_step(
         len(coded),
         status,
         _missing(setup, images),
-        validation={"sentence": chosen.expected.sentence, **asdict(chosen.expected)} if chosen.expected else {},
+        validation=_described(expected) if expected else {},
         steps=fitted.steps,
     )
     return StreamState(1, coded, images, _references(setup, state, images, {})), packet, report
+
+
+def _described(expected: Expected) -> dict[str, Any]:
+    """Return what to expect of views between the cameras, as in the report."""
+    return {"sentence": expected.sentence, "expected_psnr": expected.expected_psnr, **asdict(expected)}
 
 
 def _first_gaussians(setup: Setup, seen: Images, config: FitConfig, rng: np.random.Generator) -> tuple[Gaussians, str]:

@@ -1,9 +1,9 @@
 """Estimate of views between few cameras, of which none can be withheld: how far two fits differ there.
 
 Two short fits with other random numbers start from other halves of the initial Gaussians. Where the images determine
-the scene they agree; where they do not, each fills the gap in its own way, and is as far from the truth as from the
-other. The mean square error of a view between the cameras is estimated by their mean square difference and the error
-that they have in the training views, in proportions that were measured (see `docs/experiments/generalise.md`).
+the scene they agree; where they do not, each fills the gap in its own way. Of two independent fits with the same mean,
+the mean square difference is twice the variance. So the mean square error of a view between the cameras is estimated by
+half that difference and the error of the first frame in its training views (see `docs/experiments/generalise.md`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import (
     POOR_PSNR,
-    mean_decibels,
+    decibels,
     reduced,
     rendered,
     squared_errors,
@@ -34,8 +34,6 @@ __all__ = ["NUM_FITS", "Agreement", "compare_fits", "views_between"]
 
 NUM_FITS = 2
 """Number of fits that are compared."""
-# Weights of the difference of the fits and of their error in training views.
-_DIFFERENCE, _TRAINING = 1.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -45,16 +43,20 @@ class Agreement:
     Attributes:
         cameras: number of cameras.
         spacing: mean angle from a camera to its nearest one, as seen from what they look at, degrees.
-        difference: mean PSNR of one fit against the other in views between neighbouring cameras, dB.
-        training_psnr: mean PSNR of the fits in the training views, dB.
-        expected_psnr: estimate of the mean PSNR of views between neighbouring cameras, dB.
+        differences: PSNR of one fit against the other in each view between neighbouring cameras, dB.
+        training_psnr: mean PSNR in the training views, of the two fits or of a longer one, dB.
     """
 
     cameras: int
     spacing: float
-    difference: float
+    differences: tuple[float, ...]
     training_psnr: float
-    expected_psnr: float
+
+    @property
+    def expected_psnr(self) -> float:
+        """Estimate of the mean PSNR of views between neighbouring cameras, dB."""
+        variance, error = 10 ** (-np.array(self.differences) / 10) / 2, 10 ** (-self.training_psnr / 10)
+        return float(decibels(variance + error).mean())
 
     @property
     def sentence(self) -> str:
@@ -104,10 +106,9 @@ def compare_fits(
         fitted = fit_first_frame(*given, np.random.default_rng([*seed, k]), tick).gaussians
         errors.append(squared_errors(fitted, views, render))
         shown.append(np.stack([rendered(fitted, camera, render) for camera in between]))
-    differences = np.array([np.mean((a - b) ** 2) for a, b in zip(*shown, strict=True)])
-    expected = _DIFFERENCE * differences + _TRAINING * np.mean(errors)
-    decibels = [mean_decibels(squares) for squares in (differences, np.concatenate(errors), expected)]
-    return Agreement(len(cameras), float(angles.mean()), *decibels)
+    differences = decibels(np.array([np.mean((a - b) ** 2) for a, b in zip(*shown, strict=True)]))
+    training = float(decibels(np.concatenate(errors)).mean())
+    return Agreement(len(cameras), float(angles.mean()), tuple(differences.tolist()), training)
 
 
 def views_between(cameras: Sequence[Camera], points: np.ndarray) -> tuple[np.ndarray, list[Camera]]:

@@ -28,7 +28,8 @@ __all__ = [
     "CrossValidation",
     "Trial",
     "cross_validate",
-    "mean_decibels",
+    "decibels",
+    "mean_psnr",
     "reduced",
     "rendered",
     "squared_errors",
@@ -75,6 +76,11 @@ class CrossValidation:
     def best(self) -> Trial:
         """The fit with the best withheld views."""
         return max(self.trials, key=lambda trial: trial.withheld_psnr)
+
+    @property
+    def expected_psnr(self) -> float:
+        """Estimate of the mean PSNR of views between the cameras, dB."""
+        return self.best.withheld_psnr
 
     @property
     def sentence(self) -> str:
@@ -127,7 +133,7 @@ def cross_validate(
         tick = None if on_step is None else _shifted(on_step, len(trials) * steps)
         views = [view[0] for view in trained]
         fitted = fit_first_frame(start, views, targets, extent, trial, render, rng, tick).gaussians
-        trials.append(Trial(dropping, _psnr(fitted, judged, render), _psnr(fitted, trained, render)))
+        trials.append(Trial(dropping, mean_psnr(fitted, judged, render), mean_psnr(fitted, trained, render)))
         if len(trials) > 1 and trials[-1].withheld_psnr <= trials[-2].withheld_psnr:
             break
     spacing = forecast(cameras, np.asarray(start.means)).spacing
@@ -186,11 +192,11 @@ def rendered(gaussians: Gaussians, camera: Camera, render: RenderConfig) -> np.n
     return np.clip(np.asarray(rasterize(gaussians, camera, ("color",), config=render).color), 0, 1)
 
 
-def mean_decibels(squares: np.ndarray) -> float:
-    """Return the mean PSNR of mean square errors, dB."""
-    return float(np.mean(-10 * np.log10(np.maximum(squares, 1e-10))))
+def decibels(squares: np.ndarray) -> np.ndarray:
+    """Return the PSNR of mean square errors, dB."""
+    return -10 * np.log10(np.maximum(squares, 1e-10))
 
 
-def _psnr(gaussians: Gaussians, views: Sequence[_View], render: RenderConfig) -> float:
+def mean_psnr(gaussians: Gaussians, views: Sequence[_View], render: RenderConfig) -> float:
     """Return the mean PSNR of some views in dB, of their valid pixels."""
-    return mean_decibels(squared_errors(gaussians, views, render))
+    return float(decibels(squared_errors(gaussians, views, render)).mean())

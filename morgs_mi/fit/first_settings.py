@@ -18,7 +18,9 @@ from morgs_mi.fit.forecast import Forecast, forecast
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["FirstSettings", "first_settings"]
+__all__ = ["Expected", "FirstSettings", "first_settings"]
+
+Expected = CrossValidation | Agreement | Forecast
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,7 @@ class FirstSettings:
     """
 
     config: FitConfig
-    expected: CrossValidation | Agreement | Forecast | None
+    expected: Expected | None
     steps_before: int = 0
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -38,6 +39,7 @@ class Forecast:
     spacing: float
     overlap: float
     reach: float
+    expected_psnr: ClassVar[None] = None
 
     @property
     def sentence(self) -> str:
