@@ -24,7 +24,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.agreement import Agreement
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.cross_validation import mean_psnr
+from morgs_mi.fit.cross_validation import CrossValidation, mean_psnr
 from morgs_mi.fit.detail import gaussians_for
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.first_settings import Expected, first_settings
@@ -216,15 +216,16 @@ def _first_step(
         len(coded),
         status,
         _missing(setup, images),
-        validation=_described(expected) if expected else {},
+        validation=_described(expected, chosen.validation) if expected else {},
         steps=fitted.steps,
     )
     return StreamState(1, coded, images, _references(setup, state, images, {})), packet, report
 
 
-def _described(expected: Expected) -> dict[str, Any]:
-    """Return what to expect of views between the cameras, as in the report."""
-    return {"sentence": expected.sentence, "expected_psnr": expected.expected_psnr, **asdict(expected)}
+def _described(expected: Expected, validation: CrossValidation | None) -> dict[str, Any]:
+    """Return what to expect of views between the cameras and what cross-validation found, as in the report."""
+    found = asdict(validation) if validation else {}
+    return {"sentence": expected.sentence, "expected_psnr": expected.expected_psnr, **found, **asdict(expected)}
 
 
 def _first_gaussians(setup: Setup, seen: Images, config: FitConfig, rng: np.random.Generator) -> tuple[Gaussians, str]:

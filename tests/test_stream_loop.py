@@ -191,7 +191,7 @@ def test_push__replaces_too_few_points_and_reports_it(clip):
 
 
 def test_push__reports_what_cross_validation_of_the_first_frame_found(clip):
-    how, ticks = CrossValidationConfig(min_views=4), []
+    how, ticks = CrossValidationConfig(min_views=4, compare_views=4), []
     fit = dataclasses.replace(QUICK.fit, first_frame_steps=20, cross_validation=how)
     given = dataclasses.replace(QUICK, fit=dataclasses.replace(fit, dropping=0.0))
     _, report = new_loop(dataclasses.replace(QUICK, fit=fit)).push(clip[0][:4], lambda *tick: ticks.append(tick))
@@ -213,6 +213,16 @@ def test_push__compares_two_fits_of_few_views(clip):
     assert report.validation["cameras"] == 4
     assert 0 < report.validation["expected_psnr"] < report.validation["training_psnr"]
     total = 20 + 2 * 8
+    assert ticks == [(done, total) for done in range(1, total + 1)]
+
+
+def test_push__compares_two_fits_besides_cross_validation(clip):
+    how, ticks = CrossValidationConfig(candidates=(0.0,), min_views=4, compare_views=5), []
+    fit = dataclasses.replace(QUICK.fit, first_frame_steps=20, cross_validation=how)
+    _, report = new_loop(dataclasses.replace(QUICK, fit=fit)).push(clip[0][:4], lambda *tick: ticks.append(tick))
+    assert "two fits" in report.validation["sentence"]
+    assert len(report.validation["trials"]) == 1
+    total = 20 + 3 * 8
     assert ticks == [(done, total) for done in range(1, total + 1)]
 
 

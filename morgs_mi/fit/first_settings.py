@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.agreement import NUM_FITS, Agreement, compare_fits
-from morgs_mi.fit.budget import steps_within
+from morgs_mi.fit.budget import planned_trials, steps_within
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, trial_steps
 from morgs_mi.fit.dropping import dropping_by_noise
@@ -30,11 +31,13 @@ class FirstSettings:
     Attributes:
         config: with a number of steps and a strength of dropping.
         expected: what to expect of views between the cameras; None for a single camera.
+        validation: what cross-validation found; None where there was none.
         steps_before: number of steps that trials have made.
     """
 
     config: FitConfig
     expected: Expected | None
+    validation: CrossValidation | None = None
     steps_before: int = 0
 
 
@@ -53,8 +56,8 @@ def first_settings(
 ) -> FirstSettings:
     """Return the settings of the first frame.
 
-    Cross-validation, or of few views the comparison of two fits, says what to expect of other views; where the strength
-    of dropping is given, a forecast does.
+    Of many views, cross-validation says what to expect of others; of fewer than `compare_views`, the comparison of two
+    fits does; where the strength of dropping is given, a forecast.
 
     Args:
         gaussians: the start.
@@ -74,20 +77,20 @@ def first_settings(
             config.first_frame_seconds, gaussians, cameras, targets, extent, config, render, [*seed, 1]
         )
         config = replace(config, first_frame_steps=steps)
-    how, steps, given = config.cross_validation, trial_steps(config), (cameras, images, masks, extent)
-    if config.dropping is None and len(cameras) >= how.min_views:
-        before = steps * len(how.candidates)
-        found = cross_validate(gaussians, *given, config, render, seed, _tick(on_step, before, config))
-        return FirstSettings(replace(config, dropping=found.best.dropping), found, before)
-    if config.dropping is not None or min(len(cameras), len(gaussians)) < NUM_FITS:
-        dropping = dropping_by_noise(images) if config.dropping is None else config.dropping
-        expected = forecast(cameras, points) if len(cameras) > 1 else None
-        return FirstSettings(replace(config, dropping=dropping), expected)
-    config, before = replace(config, dropping=dropping_by_noise(images)), steps * NUM_FITS
-    found = compare_fits(gaussians, *given, config, render, seed, _tick(on_step, before, config))
-    return FirstSettings(config, found, before)
+    if config.dropping is not None:
+        return FirstSettings(config, forecast(cameras, points) if len(cameras) > 1 else None)
+    planned, given, found = planned_trials(config, len(cameras)), (cameras, images, masks, extent), None
+    before = trial_steps(config) * sum(planned)
 
+    def tick(done: int, offset: int = 0) -> None:
+        if on_step is not None:
+            on_step(offset + done, before + config.planned_steps)
 
-def _tick(on_step: Callable[[int, int], None] | None, before: int, config: FitConfig) -> Callable[[int], None] | None:
-    """Return the function that is called with the number of steps done, of the `before` steps of the trials."""
-    return None if on_step is None else lambda done: on_step(done, before + config.planned_steps)
+    if planned.validation:
+        found = cross_validate(gaussians, *given, config, render, seed, tick)
+    config = replace(config, dropping=dropping_by_noise(images) if found is None else found.best.dropping)
+    expected = found
+    if planned.comparison and len(gaussians) >= NUM_FITS:
+        later = partial(tick, offset=trial_steps(config) * planned.validation)
+        expected = compare_fits(gaussians, *given, config, render, seed, later)
+    return FirstSettings(config, expected, found, before)
