@@ -22,12 +22,12 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_mask, check_points, check_type
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.threads import map_in_threads
-from morgs_mi.fit.agreement import Agreement
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.cross_validation import CrossValidation, mean_psnr
+from morgs_mi.fit.cross_validation import mean_psnr
 from morgs_mi.fit.detail import gaussians_for
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.first_settings import Expected, first_settings
+from morgs_mi.fit.forecast import Forecast
 from morgs_mi.fit.initialise import fill_points, from_points, resample_points, scene_extent, seed_points
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.losses.ssim import Target
@@ -65,7 +65,7 @@ class FrameReport:
         missing_views: names of the views without an image.
         active: what took part, as fractions of everything, by name: gaussians, views, pixels, epochs.
         validation: of the first frame, a `sentence` on views between the cameras and their `expected_psnr` in dB, with
-            the results of cross-validation (see `fit.cross_validation`), the comparison of two fits (see
+            the results of cross-validation (see `fit.cross_validation`) and the comparison of two fits (see
             `fit.agreement`), or else the forecast (see `fit.forecast`), which has no number; empty with a single view.
         steps: number of optimisation steps, without those of trials.
     """
@@ -202,10 +202,9 @@ def _first_step(
     before = chosen.steps_before
     tick = None if on_step is None else lambda done, steps: on_step(before + done, before + steps)
     fitted = fit_first_frame(gaussians, cameras, targets, setup.extent, chosen.config, config.render, rng, tick)
-    expected = chosen.expected
-    if isinstance(expected, Agreement):
-        views = list(zip(cameras, images.values(), masks, strict=True))
-        expected = replace(expected, training_psnr=mean_psnr(fitted.gaussians, views, config.render))
+    views = list(zip(cameras, images.values(), masks, strict=True))
+    own = mean_psnr(fitted.gaussians, views, config.render) if chosen.steps_before else 0.0
+    expected = [replace(e, training_psnr=own) if not isinstance(e, Forecast) else e for e in chosen.expected]
     packet = keyframe_packet(fitted.gaussians, 0, setup.cameras, config.codec)
     coded = decode(None, packet)
     report = FrameReport(
@@ -216,16 +215,21 @@ def _first_step(
         len(coded),
         status,
         _missing(setup, images),
-        validation=_described(expected, chosen.validation) if expected else {},
+        validation=_described(expected) if expected else {},
         steps=fitted.steps,
     )
     return StreamState(1, coded, images, _references(setup, state, images, {})), packet, report
 
 
-def _described(expected: Expected, validation: CrossValidation | None) -> dict[str, Any]:
-    """Return what to expect of views between the cameras and what cross-validation found, as in the report."""
-    found = asdict(validation) if validation else {}
-    return {"sentence": expected.sentence, "expected_psnr": expected.expected_psnr, **found, **asdict(expected)}
+def _described(expected: Sequence[Expected]) -> dict[str, Any]:
+    """Return what to expect of views between the cameras, as in the report.
+
+    An estimate errs on the low side, as a rig without some views is another rig and a short fit is less certain. So the
+    highest one counts.
+    """
+    best = max(expected, key=lambda found: found.expected_psnr or 0.0)
+    found = {name: value for each in expected for name, value in asdict(each).items()}
+    return {"sentence": best.sentence, "expected_psnr": best.expected_psnr, **found}
 
 
 def _first_gaussians(setup: Setup, seen: Images, config: FitConfig, rng: np.random.Generator) -> tuple[Gaussians, str]:

@@ -220,8 +220,11 @@ def test_push__compares_two_fits_besides_cross_validation(clip):
     how, ticks = CrossValidationConfig(candidates=(0.0,), min_views=4, compare_views=5), []
     fit = dataclasses.replace(QUICK.fit, first_frame_steps=20, cross_validation=how)
     _, report = new_loop(dataclasses.replace(QUICK, fit=fit)).push(clip[0][:4], lambda *tick: ticks.append(tick))
-    assert "two fits" in report.validation["sentence"]
-    assert len(report.validation["trials"]) == 1
+    found = report.validation
+    assert len(found["trials"]) == len(found["withheld"]) == 1
+    variance = 10 ** (-np.array(found["differences"]) / 10) / 2
+    by_two_fits = np.mean(-10 * np.log10(variance + 10 ** (-found["training_psnr"] / 10)))
+    assert found["expected_psnr"] >= by_two_fits - 1e-3
     total = 20 + 3 * 8
     assert ticks == [(done, total) for done in range(1, total + 1)]
 

@@ -3,7 +3,7 @@
 Two short fits with other random numbers start from other halves of the initial Gaussians. Where the images determine
 the scene they agree; where they do not, each fills the gap in its own way. Of two independent fits with the same mean,
 the mean square difference is twice the variance. So the mean square error of a view between the cameras is estimated by
-half that difference and the error of the first frame in its training views (see `docs/experiments/generalise.md`).
+half that difference and the error of the first frame in its training views (see `docs/experiments/first-frame.md`).
 """
 
 from __future__ import annotations

@@ -122,8 +122,9 @@ class CrossValidationConfig:
     """One view of that many is withheld, at least one."""
     min_views: int = 6
     """Number of views below which nothing is withheld: the others would be too few to stand for all."""
-    compare_views: int = 10
-    """Number of views below which two fits are compared to estimate other views (see `agreement`)."""
+    compare_views: int = 8
+    """Number of views below which two fits are compared to estimate other views (see `agreement`): a rig that lacks one
+    of fewer is too different."""
     width: int = 640
     """Images are reduced by the largest whole factor that leaves this width, in px."""
     steps: float = 0.4
@@ -181,7 +182,7 @@ class ConvergenceConfig:
     """Largest number of steps."""
     least_decrease: float = 0.15
     """Relative decrease of L_recon over the last third of the steps from which they are doubled. Captures that are
-    fitted, with noise or without it, decrease by 0.04 to 0.1 then; those with more detail by 0.2 to 0.4."""
+    fitted, with noise or without it, decrease by 0.02 to 0.12 then; one with much more detail by 0.3."""
 
     def __post_init__(self) -> None:
         if not 1 <= self.steps <= self.most_steps:

@@ -30,14 +30,12 @@ class FirstSettings:
 
     Attributes:
         config: with a number of steps and a strength of dropping.
-        expected: what to expect of views between the cameras; None for a single camera.
-        validation: what cross-validation found; None where there was none.
+        expected: what to expect of views between the cameras, by each way that was taken; none for a single camera.
         steps_before: number of steps that trials have made.
     """
 
     config: FitConfig
-    expected: Expected | None
-    validation: CrossValidation | None = None
+    expected: tuple[Expected, ...]
     steps_before: int = 0
 
 
@@ -56,8 +54,8 @@ def first_settings(
 ) -> FirstSettings:
     """Return the settings of the first frame.
 
-    Of many views, cross-validation says what to expect of others; of fewer than `compare_views`, the comparison of two
-    fits does; where the strength of dropping is given, a forecast.
+    What to expect of other views follows from cross-validation, of fewer than `compare_views` also from the comparison of
+    two fits, and where the strength of dropping is given from a forecast.
 
     Args:
         gaussians: the start.
@@ -78,19 +76,22 @@ def first_settings(
         )
         config = replace(config, first_frame_steps=steps)
     if config.dropping is not None:
-        return FirstSettings(config, forecast(cameras, points) if len(cameras) > 1 else None)
-    planned, given, found = planned_trials(config, len(cameras)), (cameras, images, masks, extent), None
+        return FirstSettings(config, (forecast(cameras, points),) if len(cameras) > 1 else ())
+    planned, given = planned_trials(config, len(cameras)), (cameras, images, masks, extent)
+    expected: list[Expected] = []
     before = trial_steps(config) * sum(planned)
 
     def tick(done: int, offset: int = 0) -> None:
         if on_step is not None:
             on_step(offset + done, before + config.planned_steps)
 
+    dropping = None
     if planned.validation:
         found = cross_validate(gaussians, *given, config, render, seed, tick)
-    config = replace(config, dropping=dropping_by_noise(images) if found is None else found.best.dropping)
-    expected = found
+        expected.append(found)
+        dropping = found.best.dropping
+    config = replace(config, dropping=dropping_by_noise(images) if dropping is None else dropping)
     if planned.comparison and len(gaussians) >= NUM_FITS:
         later = partial(tick, offset=trial_steps(config) * planned.validation)
-        expected = compare_fits(gaussians, *given, config, render, seed, later)
-    return FirstSettings(config, expected, found, before)
+        expected.append(compare_fits(gaussians, *given, config, render, seed, later))
+    return FirstSettings(config, tuple(expected), before)

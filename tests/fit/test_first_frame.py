@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 
 from morgs_mi import RenderConfig
 from morgs_mi.fit.config import ConvergenceConfig, DensityConfig, FitConfig
@@ -70,3 +71,16 @@ def test_density_rounds__lie_between_a_tenth_and_a_half():
     steps = density_rounds(FitConfig(first_frame_steps=1000, density=DensityConfig(rounds=5)))
     assert steps == [100, 200, 300, 400, 500]
     assert density_rounds(FitConfig(density=DensityConfig(rounds=0))) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"steps": 0}, "`steps` must be 1 to `most_steps` = 6000, got 0"),
+        ({"steps": 200, "most_steps": 100}, "`steps` must be 1 to `most_steps` = 100, got 200"),
+        ({"least_decrease": 0.0}, "`least_decrease` must be above 0 and at most 1, got 0.0"),
+    ],
+)
+def test_convergence_config__names_bad_values(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        ConvergenceConfig(**arguments)
