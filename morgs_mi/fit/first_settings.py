@@ -54,8 +54,8 @@ def first_settings(
 ) -> FirstSettings:
     """Return the settings of the first frame.
 
-    What to expect of other views follows from cross-validation, of fewer than `compare_views` also from the comparison of
-    two fits, and where the strength of dropping is given from a forecast.
+    What to expect of other views follows from cross-validation and, for fewer than `compare_views`, from the comparison
+    of two fits; where the strength of dropping is given, from a forecast.
 
     Args:
         gaussians: the start.
