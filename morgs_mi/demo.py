@@ -66,10 +66,10 @@ class DemoConfig:
     plain_frames: int = 5
     """Number of frames of the second fit, without learned motion, offset and confidence, for comparison."""
     stream: StreamConfig = field(
-        default_factory=lambda: StreamConfig(fit=FitConfig(first_frame_steps=600, dropping=0.0))
+        default_factory=lambda: StreamConfig(fit=FitConfig(num_gaussians=20_000, first_frame_steps=600, dropping=0.0))
     )
-    """The fit, with a shortened first frame, and without cross-validation, which chooses no dropping on a clip without
-    noise; its seed is also the clip's."""
+    """The fit, with a shortened, smaller first frame, and without cross-validation, which chooses no dropping on a clip
+    without noise; its seed is also the clip's."""
 
 
 @dataclass(frozen=True)

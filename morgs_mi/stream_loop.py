@@ -23,8 +23,12 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.threads import in_background
+from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.cross_validation import mean_psnr
+from morgs_mi.fit.detail import gaussians_for
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
-from morgs_mi.fit.first_settings import first_settings
+from morgs_mi.fit.first_settings import Expected, first_settings
+from morgs_mi.fit.forecast import Forecast
 from morgs_mi.fit.initialise import fill_points, from_points, resample_points, seed_points
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.losses.ssim import Target
@@ -57,9 +61,10 @@ class FrameReport:
         status: "ok", or a sentence about what was done instead.
         missing_views: names of the views without an image.
         active: what took part, as fractions of everything, by name: gaussians, views, pixels, epochs.
-        validation: of the first frame, what cross-validation found (see `fit.cross_validation`), or else the forecast
-            (see `fit.forecast`), with a `sentence` on views between the cameras; empty with a single view.
-        steps: number of optimisation steps, without those of cross-validation.
+        validation: of the first frame, a `sentence` on views between the cameras and their `expected_psnr` in dB, with
+            the results of cross-validation (see `fit.cross_validation`) and the comparison of two fits (see
+            `fit.agreement`), or else the forecast (see `fit.forecast`), which has no number; empty with a single view.
+        steps: number of optimisation steps, without those of trials.
     """
 
     frame: int
@@ -160,33 +165,49 @@ def _fit_first_frame(
     """Return the first frame's packet and what its report says."""
     config, images, rng = setup.config, observed.seen.images, np.random.default_rng([setup.config.seed, 0])
     cameras, masks = [setup.cameras[v] for v in images], [setup.masks[v] for v in images]
-    gaussians, status = _first_gaussians(setup, images, rng)
+    fit = config.fit
+    if fit.num_gaussians is None:
+        count = gaussians_for(cameras, list(images.values()), masks, setup.points, fit.detail)
+        fit = replace(fit, num_gaussians=count)
+    gaussians, status = _first_gaussians(setup, images, fit, rng)
     targets = [Target(image, mask) for image, mask in zip(images.values(), masks, strict=True)]
     given = gaussians, cameras, list(images.values()), masks, targets, setup.points, setup.extent
-    chosen = first_settings(*given, config.fit, config.render, [config.seed, 0, 1], on_step)
-    steps = chosen.steps_before + chosen.config.first_frame_steps
-    tick = None if on_step is None else lambda done: on_step(chosen.steps_before + done, steps)
-    gaussians, losses = fit_first_frame(
-        gaussians, cameras, targets, setup.extent, chosen.config, config.render, rng, tick
-    )
-    return keyframe_packet(gaussians, 0, setup.cameras, config.codec), {
-        "losses": losses,
+    chosen = first_settings(*given, fit, config.render, [config.seed, 0, 1], on_step)
+    before = chosen.steps_before
+    tick = None if on_step is None else lambda done, steps: on_step(before + done, before + steps)
+    fitted = fit_first_frame(gaussians, cameras, targets, setup.extent, chosen.config, config.render, rng, tick)
+    views = list(zip(cameras, images.values(), masks, strict=True))
+    own = mean_psnr(fitted.gaussians, views, config.render) if chosen.steps_before else 0.0
+    expected = [replace(e, training_psnr=own) if not isinstance(e, Forecast) else e for e in chosen.expected]
+    return keyframe_packet(fitted.gaussians, 0, setup.cameras, config.codec), {
+        "losses": fitted.losses,
         "status": status,
-        "validation": {"sentence": chosen.expected.sentence, **asdict(chosen.expected)} if chosen.expected else {},
-        "steps": chosen.config.first_frame_steps,
+        "validation": _described(expected) if expected else {},
+        "steps": fitted.steps,
     }
 
 
-def _first_gaussians(setup: Setup, seen: Images, rng: np.random.Generator) -> tuple[Gaussians, str]:
+def _described(expected: Sequence[Expected]) -> dict[str, Any]:
+    """Return what to expect of views between the cameras, as in the report.
+
+    An estimate errs on the low side, as a rig without some views is another rig and a short fit is less certain. So the
+    highest one counts.
+    """
+    best = max(expected, key=lambda found: found.expected_psnr or 0.0)
+    found = {name: value for each in expected for name, value in asdict(each).items()}
+    return {"sentence": best.sentence, "expected_psnr": best.expected_psnr, **found}
+
+
+def _first_gaussians(setup: Setup, seen: Images, config: FitConfig, rng: np.random.Generator) -> tuple[Gaussians, str]:
     """Return the initial Gaussians, and a status about where they lie."""
-    config, status = setup.config.fit, "ok"
+    status = "ok"
     count, images = config.first_count, list(seen.values())
     cameras, masks = [setup.cameras[v] for v in seen], [setup.masks[v] for v in seen]
     points, colors = setup.points, setup.point_colors
     if len(points) < _MIN_POINTS:
         status = f"the capture has {len(points)} points, too few: seeded {count} random ones inside the views"
         _LOG.warning("frame 0: %s", status)
-        points, colors = seed_points(cameras, images, count, rng)
+        points, colors = seed_points(cameras, images, masks, count, rng)
     elif len(points) < _MANY_POINTS:
         points, colors = fill_points(points, colors, cameras, images, masks, count, rng)
     points, colors = resample_points(points, colors, count, rng)

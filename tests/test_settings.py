@@ -62,6 +62,8 @@ VALUES: dict[str, Any] = {
 # Fields that cannot change this stream, each with the reason and the test that shows that it acts.
 ELSEWHERE: dict[str, str] = {
     "render.reproducible": "changes the order of sums only: tests/render",
+    "fit.detail": "the number of Gaussians is given here: tests/fit/test_detail.py",
+    "fit.convergence": "the number of steps is given here: tests/fit/test_first_frame.py",
     "fit.cross_validation": "chooses among few values: tests/fit/test_cross_validation.py",
     "motion.flow.farneback": "a method that is not the default: tests/method/flow_sources",
     "motion.active_set.min_explained": "no change here is unexplained: tests/method/test_active_set.py",

@@ -208,13 +208,14 @@ def _disparity(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> 
 
 
 def _confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
-    """Return which points with colours [P, 6] have their colour in another view that sees them."""
+    """Return which points with colours [P, 6] have their colour in a valid pixel of another view that sees them."""
     confirmed = np.zeros(len(points), bool)
     for view in others:
         seen, pixels, _ = seen_points(view.camera, points[:, :3])
         columns, rows = pixels.astype(int).T
         shown = cv2.blur(view.image, (3, 3))[rows, columns] / 255.0
-        confirmed[seen] |= np.abs(shown - points[seen, 3:]).max(axis=1) < _MAX_COLOR
+        same = np.abs(shown - points[seen, 3:]).max(axis=1) < _MAX_COLOR
+        confirmed[seen] |= same & (view.valid[rows, columns] > 0)
     return confirmed
 
 

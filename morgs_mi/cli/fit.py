@@ -95,14 +95,14 @@ class Fit:
 
 def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
     """Print the size of a stream and the time that its frames took."""
-    seconds = [row.seconds for row in reports[1:]]
+    first, seconds = reports[0], [row.seconds for row in reports[1:]]
     later = f", {sum(seconds) / len(seconds):.1f} s for each later one" if seconds else ""
     print_result(
         f"{stream}: {len(reports)} frames, {stream.stat().st_size / 1e6:.1f} MB, "
-        f"{reports[0].seconds:.1f} s for the {reports[0].steps} steps of the first frame{later}."
+        f"{first.seconds:.1f} s for the first one ({first.num_gaussians} Gaussians, {first.steps} steps){later}."
     )
-    if reports[0].validation:
-        print_result(reports[0].validation["sentence"])
+    if first.validation:
+        print_result(first.validation["sentence"])
 
 
 @contextmanager

@@ -98,9 +98,9 @@ class Settings:
     """File with any settings, as --print-config writes it."""
     seed: Annotated[int | None, setting("seed")] = None
     """Seed of every random choice."""
-    num_gaussians: Annotated[int | None, setting("num_gaussians")] = None
+    num_gaussians: Annotated[int | None, optional("INT", "(default: by the images' detail)")] = None
     """Gaussians of the first frame."""
-    first_frame_steps: Annotated[int | None, setting("first_frame_steps")] = None
+    first_frame_steps: Annotated[int | None, optional("INT", "(default: until it converges)")] = None
     """Optimisation steps of the first frame."""
     first_frame_seconds: Annotated[float | None, optional("FLOAT")] = None
     """Time of the first frame, which determines its steps."""

@@ -5,17 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.fit.agreement import NUM_FITS
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["steps_within"]
+__all__ = ["PlannedTrials", "planned_trials", "steps_within"]
 
 # Steps that are timed, and the least number that a first frame gets.
 _TIMED, _LEAST = 20, 100
@@ -35,7 +37,7 @@ def steps_within(
 ) -> int:
     """Return the number of steps of the first frame, at least 100, that this machine makes in a time.
 
-    The time of the measurement and of cross-validation is part of it. The same number as `first_frame_steps` gives the
+    The time of the measurement and of the trials is part of it. The same number as `first_frame_steps` gives the
     same result on any machine.
 
     Args:
@@ -57,7 +59,27 @@ def steps_within(
         start = time.perf_counter()
         fit_first_frame(gaussians, cameras, targets, extent, timed, render, np.random.default_rng(seed))
         took = time.perf_counter() - start
-    validation = config.cross_validation
-    validated = config.dropping is None and len(cameras) >= validation.min_views
-    per_step = _GROWTH * took / _TIMED * (1 + validated * validation.steps * len(validation.candidates))
+    per_step = _GROWTH * took / _TIMED * (1 + sum(planned_trials(config, len(cameras))) * config.cross_validation.steps)
     return max(_LEAST, int((seconds - (time.perf_counter() - begin)) / per_step))
+
+
+class PlannedTrials(NamedTuple):
+    """Number of trials before the first frame.
+
+    Attributes:
+        validation: of cross-validation, at most.
+        comparison: of the comparison of two fits.
+    """
+
+    validation: int
+    comparison: int
+
+
+def planned_trials(config: FitConfig, views: int) -> PlannedTrials:
+    """Return the number of trials before the first frame of some views."""
+    how = config.cross_validation
+    if config.dropping is not None:
+        return PlannedTrials(0, 0)
+    return PlannedTrials(
+        len(how.candidates) if views >= how.min_views else 0, NUM_FITS if 1 < views < how.compare_views else 0
+    )

@@ -9,7 +9,14 @@ from math import inf
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.method.objective import ObjectiveConfig
 
-__all__ = ["CrossValidationConfig", "DensityConfig", "FitConfig", "LearningRates"]
+__all__ = [
+    "ConvergenceConfig",
+    "CrossValidationConfig",
+    "DensityConfig",
+    "DetailConfig",
+    "FitConfig",
+    "LearningRates",
+]
 
 
 @dataclass(frozen=True)
@@ -70,7 +77,7 @@ class DensityConfig:
     """Views, spread over the rig, in which a later frame looks for what is missing."""
     births: float = 0.02
     """Largest number of births in a later frame, as a fraction of the Gaussians."""
-    max_gaussians: int = 30_000
+    max_gaussians: int = 60_000
     """Number of Gaussians beyond which a later frame adds none unless others are pruned."""
     birth_opacity: float = 0.1
     """Opacity of a Gaussian that is added in a later frame."""
@@ -115,6 +122,9 @@ class CrossValidationConfig:
     """One view of that many is withheld, at least one."""
     min_views: int = 6
     """Number of views below which nothing is withheld: the others would be too few to stand for all."""
+    compare_views: int = 8
+    """Number of views below which two fits are compared to estimate other views (see `agreement`): a rig that lacks one
+    of fewer is too different."""
     width: int = 640
     """Images are reduced by the largest whole factor that leaves this width, in px."""
     steps: float = 0.4
@@ -127,7 +137,7 @@ class CrossValidationConfig:
                 "CrossValidationConfig(): `candidates` must be rising numbers from 0 to less than 1, got "
                 f"{self.candidates}."
             )
-        for name, low in (("share", 2), ("min_views", 2), ("width", 1)):
+        for name, low in (("share", 2), ("min_views", 2), ("compare_views", 0), ("width", 1)):
             if not getattr(self, name) >= low:
                 raise ValueError(
                     f"CrossValidationConfig(): `{name}` must be at least {low}, got {getattr(self, name)}."
@@ -137,19 +147,73 @@ class CrossValidationConfig:
 
 
 @dataclass(frozen=True)
+class DetailConfig:
+    """Settings of the number of Gaussians of the first frame where none is given (see `detail`)."""
+
+    threshold: float = 0.02
+    """Difference from the mean of a block, relative to white, from which a value is a detail."""
+    noise_tolerance: float = 3.5
+    """The same in standard deviations of the noise."""
+    per_detail: float = 1.5
+    """Gaussians per detail that the views do not share."""
+    least_gaussians: int = 4_000
+    """Least number of Gaussians."""
+    most_gaussians: int = 40_000
+    """Largest number of Gaussians, for the time of all frames and the size of the stream."""
+
+    def __post_init__(self) -> None:
+        for name in ("threshold", "noise_tolerance", "per_detail"):
+            if not 0 < getattr(self, name) < inf:
+                raise ValueError(f"DetailConfig(): `{name}` must be positive, got {getattr(self, name)}.")
+        if not 1 <= self.least_gaussians <= self.most_gaussians:
+            raise ValueError(
+                f"DetailConfig(): `least_gaussians` must be 1 to `most_gaussians` = {self.most_gaussians}, got "
+                f"{self.least_gaussians}."
+            )
+
+
+@dataclass(frozen=True)
+class ConvergenceConfig:
+    """Settings of the number of steps of the first frame where none is given (see `first_frame`)."""
+
+    steps: int = 1500
+    """Steps that every first frame gets."""
+    most_steps: int = 6000
+    """Largest number of steps."""
+    least_decrease: float = 0.15
+    """Relative decrease of L_recon over the last third of the steps from which they are doubled. Captures that are
+    fitted, with noise or without it, decrease by 0.02 to 0.12 then; one with much more detail by 0.3."""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.steps <= self.most_steps:
+            raise ValueError(
+                f"ConvergenceConfig(): `steps` must be 1 to `most_steps` = {self.most_steps}, got {self.steps}."
+            )
+        if not 0 < self.least_decrease <= 1:
+            raise ValueError(
+                f"ConvergenceConfig(): `least_decrease` must be above 0 and at most 1, got {self.least_decrease}."
+            )
+
+
+@dataclass(frozen=True)
 class FitConfig:
     """Settings of the optimisation."""
 
     sh_degree: int = 1
     """Degree of the spherical harmonics, 0 to 3; 0 is enough where no surface is glossy."""
-    num_gaussians: int = 20_000
-    """Number of Gaussians of the first frame; see `first_count` for the number that it starts from."""
+    num_gaussians: int | None = None
+    """Number of Gaussians of the first frame; None: from the detail of its images (see `detail`). It starts from
+    `first_count`."""
+    detail: DetailConfig = field(default_factory=DetailConfig)
+    """Number of Gaussians where none is given."""
     initial_opacity: float = 0.3
     """Opacity of the Gaussians at the start of the first frame."""
-    first_frame_steps: int = 1500
-    """Steps of the first frame, one view each."""
+    first_frame_steps: int | None = None
+    """Steps of the first frame, one view each; None: until it has converged."""
     first_frame_seconds: float | None = None
     """Time of the first frame, from which the number of its steps follows; None: `first_frame_steps`."""
+    convergence: ConvergenceConfig = field(default_factory=ConvergenceConfig)
+    """Convergence of the first frame."""
     cross_validation: CrossValidationConfig = field(default_factory=CrossValidationConfig)
     """Cross-validation of the first frame."""
     dropping: float | None = None
@@ -188,7 +252,7 @@ class FitConfig:
         lowest = {"first_frame_steps": 1, "epochs": 1, "num_gaussians": 1, "confidence_steps": 0}
         lowest |= {"means_rate_epochs": 1, "rates_epochs": 1, "early_stopping_tolerance": 0}
         for name, low in lowest.items():
-            if not getattr(self, name) >= low:
+            if getattr(self, name) is not None and not getattr(self, name) >= low:
                 raise ValueError(f"FitConfig(): `{name}` must be at least {low}, got {getattr(self, name)}.")
         if self.sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"FitConfig(): `sh_degree` must be 0 to 3, got {self.sh_degree}.")
@@ -216,6 +280,16 @@ class FitConfig:
         return LearningRates(**scaled)
 
     @property
+    def planned_steps(self) -> int:
+        """Number of steps that the first frame is planned with."""
+        return self.convergence.steps if self.first_frame_steps is None else self.first_frame_steps
+
+    @property
+    def planned_gaussians(self) -> int:
+        """Largest number of Gaussians of the first frame."""
+        return self.detail.most_gaussians if self.num_gaussians is None else self.num_gaussians
+
+    @property
     def first_count(self) -> int:
         """Number of Gaussians that the first frame starts from."""
-        return -(-self.num_gaussians // 2) if self.density.rounds else self.num_gaussians
+        return -(-self.planned_gaussians // 2) if self.density.rounds else self.planned_gaussians

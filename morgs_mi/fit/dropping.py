@@ -19,7 +19,7 @@ from morgs_mi.core.attributes import sigmoid
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 
-__all__ = ["dropped", "dropping_by_noise"]
+__all__ = ["dropped", "dropping_by_noise", "noise_of"]
 
 # Logit of an opacity that no cut-off of the renderer lets pass, and the largest opacity.
 _INVISIBLE, _MOST = -30.0, 0.999
@@ -51,10 +51,10 @@ def dropping_by_noise(images: Sequence[np.ndarray]) -> float:
     Args:
         images: [H, W, 3], uint8.
     """
-    return _NOISY_DROPPING if np.mean([_noise(image) for image in images]) >= _NOISY else 0.0
+    return _NOISY_DROPPING if np.mean([noise_of(image) for image in images]) >= _NOISY else 0.0
 
 
-def _noise(image: np.ndarray) -> float:
+def noise_of(image: np.ndarray) -> float:
     """Return the standard deviation of an image's noise relative to white; texture on less than half does not count."""
     filtered = cv2.filter2D(image.astype(np.float32) / 255, -1, _NOISE_FILTER)
     return float(np.median(np.abs(filtered)) / 0.6745)

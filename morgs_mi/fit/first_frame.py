@@ -1,10 +1,17 @@
-"""The first frame: all attributes from its images, then the confidence from its masks."""
+"""The first frame: all attributes from its images, then the confidence from its masks.
+
+Where the number of steps is not given, it follows from the images. A capture with much detail still improves when
+others have converged: if L_recon falls by more than `ConvergenceConfig.least_decrease` in the last third of the steps,
+they are doubled, and the learning rates continue on the schedule of twice as many steps. Noise, which no step removes,
+is part of the loss, so that noisy captures end early.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from itertools import pairwise
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import islice, pairwise
 
 import drjit as dr
 import mitsuba as mi
@@ -16,7 +23,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
-from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.config import ConvergenceConfig, FitConfig
 from morgs_mi.fit.density import plan_growth, resize_optimizer
 from morgs_mi.fit.dropping import dropped
 from morgs_mi.fit.optimise import adam, optimise, replace_parameter, values_of, view_order
@@ -27,7 +34,25 @@ from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 
-__all__ = ["fit_confidence", "fit_first_frame"]
+__all__ = ["FirstFrame", "fit_confidence", "fit_first_frame"]
+
+# Passes over all views of which the loss is averaged, and the least number of steps.
+_PASSES, _LEAST = 4, 8
+
+
+@dataclass(frozen=True, eq=False)
+class FirstFrame:
+    """Result of fitting the first frame.
+
+    Attributes:
+        gaussians: the fitted Gaussians.
+        losses: by name, means over the last steps.
+        steps: number of steps.
+    """
+
+    gaussians: Gaussians
+    losses: dict[str, float]
+    steps: int
 
 
 def fit_first_frame(
@@ -38,12 +63,13 @@ def fit_first_frame(
     config: FitConfig,
     render: RenderConfig,
     rng: np.random.Generator,
-    on_step: Callable[[int], None] | None = None,
-) -> tuple[Gaussians, dict[str, float]]:
+    on_step: Callable[[int, int], None] | None = None,
+) -> FirstFrame:
     """Fit Gaussians to the images of one instant by L_recon alone (eq. 2); the confidence stays unchanged.
 
     As in 3DGS, the bands of the spherical harmonics are added one after the other. Between a tenth and a half of the
-    steps, rounds of density control (see `density`) let the Gaussians grow to `num_gaussians`, if so many are needed.
+    planned steps, rounds of density control (see `density`) let the Gaussians grow to `num_gaussians`, if so many are
+    needed.
 
     Args:
         gaussians: the start, e.g. from SfM points.
@@ -53,50 +79,83 @@ def fit_first_frame(
         config: steps and rates.
         render: cut-offs.
         rng: draws the views and the means of births.
-        on_step: called with the number of steps done.
-
-    Returns:
-        The fitted Gaussians, and the losses by name, means over the last steps.
+        on_step: called with (steps done, steps in all).
     """
-    steps, degree, losses = config.first_frame_steps, gaussians.sh_degree, {}
-    band_steps = [int(band * steps * config.sh_band_fraction + 1e-9) for band in range(1, degree + 1)]
-    rounds = density_rounds(config)
+    steps, bands = config.planned_steps, range(1, gaussians.sh_degree + 1)
+    band_steps, rounds = [int(b * steps * config.sh_band_fraction + 1e-9) for b in bands], density_rounds(config)
     rates = config.first_frame_rates.by_parameter(extent)
-    order = view_order(len(cameras), steps, rng)
     optimizer = adam(_start(gaussians))
     views = [ActiveView(camera, render) for camera in cameras]
-    for start, stop in pairwise(sorted({0, *band_steps, *rounds, steps})):
-        for _ in range(band_steps.count(start)):
-            _add_band(optimizer, gaussians)
-        if start in rounds:
-            now = gaussians.with_parameters(values_of(optimizer))
-            scores = densification_scores(now, views, targets)
-            births = -(-max(config.num_gaussians - len(now), 0) // (len(rounds) - rounds.index(start)))
-            plan = plan_growth(now, scores, births, config.num_gaussians, extent, config.density, rng)
-            gaussians = gaussians.select(plan.parent)
-            resize_optimizer(optimizer, plan, plan.edits)
 
-        def losses_at(values: Mapping[str, Tensor], view: int, base: Gaussians = gaussians) -> dict[str, Tensor]:
-            image = views[view].render(dropped(base.with_parameters(values), config.dropping or 0.0, rng))
-            return {"recon": recon_loss(image.color, targets[view], config.objective.dssim_weight)}
+    def losses_at(values: Mapping[str, Tensor], view: int) -> dict[str, Tensor]:
+        image = views[view].render(dropped(gaussians.with_parameters(values), config.dropping or 0.0, rng))
+        return {"recon": recon_loss(image.color, targets[view], config.objective.dssim_weight)}
 
-        losses = optimise(
-            optimizer,
-            rates,
-            order[start:stop],
-            losses_at,
-            {},
-            lambda step: config.final_rate ** (step / steps),
-            on_step,
-            start,
-        )
-    return gaussians.with_parameters(values_of(optimizer)), losses
+    done, losses = 0, {}
+    while done < steps:
+        order = iter(view_order(len(views), steps - done, rng))
+        stops = {*band_steps, *rounds, 2 * steps // 3, steps}
+        for start, stop in pairwise([done, *sorted(stop for stop in stops if stop > done)]):
+            for _ in range(band_steps.count(start)):
+                _add_band(optimizer, gaussians)
+            if start in rounds:
+                share = len(rounds) - rounds.index(start)
+                gaussians = _grown(gaussians, optimizer, views, targets, share, extent, config, rng)
+            before = losses
+            losses = optimise(
+                optimizer,
+                rates,
+                islice(order, stop - start),
+                losses_at,
+                {},
+                partial(_decay, config.final_rate, steps),
+                None if on_step is None else partial(_with_total, on_step, steps),
+                start,
+                max(_LEAST, _PASSES * len(views)),
+            )
+        done = steps
+        if config.first_frame_steps is None and _still_falls(before, losses, config.convergence):
+            steps = min(2 * steps, config.convergence.most_steps)
+    return FirstFrame(gaussians.with_parameters(values_of(optimizer)), losses, steps)
+
+
+def _grown(
+    gaussians: Gaussians,
+    optimizer: Adam,
+    views: Sequence[ActiveView],
+    targets: Sequence[Target],
+    rounds: int,
+    extent: float,
+    config: FitConfig,
+    rng: np.random.Generator,
+) -> Gaussians:
+    """Return the Gaussians after a round of density control, and resize the optimiser; `rounds` are left, with this."""
+    now = gaussians.with_parameters(values_of(optimizer))
+    births = -(-max(config.planned_gaussians - len(now), 0) // rounds)
+    scores = densification_scores(now, views, targets)
+    plan = plan_growth(now, scores, births, config.planned_gaussians, extent, config.density, rng)
+    resize_optimizer(optimizer, plan, plan.edits)
+    return gaussians.select(plan.parent)
+
+
+def _decay(final: float, steps: int, step: int) -> float:
+    """Return the factor on the learning rates at a step of `steps`."""
+    return final ** (step / steps)
+
+
+def _with_total(on_step: Callable[[int, int], None], steps: int, done: int) -> None:
+    on_step(done, steps)
+
+
+def _still_falls(before: Mapping[str, float], losses: Mapping[str, float], config: ConvergenceConfig) -> bool:
+    """Return whether the losses before and after the last third of the steps show that they are too few."""
+    return "recon" in before and losses["recon"] < (1 - config.least_decrease) * before["recon"]
 
 
 def density_rounds(config: FitConfig) -> list[int]:
     """Return the steps of the first frame before which density control acts."""
     density = config.density
-    steps = np.linspace(density.first_round, density.last_round, density.rounds) * config.first_frame_steps
+    steps = np.linspace(density.first_round, density.last_round, density.rounds) * config.planned_steps
     return sorted(set(steps.astype(int).tolist()))
 
 

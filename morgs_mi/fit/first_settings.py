@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.fit.budget import steps_within
+from morgs_mi.fit.agreement import NUM_FITS, Agreement, compare_fits
+from morgs_mi.fit.budget import planned_trials, steps_within
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, trial_steps
 from morgs_mi.fit.dropping import dropping_by_noise
@@ -17,7 +19,9 @@ from morgs_mi.fit.forecast import Forecast, forecast
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["FirstSettings", "first_settings"]
+__all__ = ["Expected", "FirstSettings", "first_settings"]
+
+Expected = CrossValidation | Agreement | Forecast
 
 
 @dataclass(frozen=True)
@@ -26,12 +30,12 @@ class FirstSettings:
 
     Attributes:
         config: with a number of steps and a strength of dropping.
-        expected: what to expect of views between the cameras; None for a single camera.
-        steps_before: number of steps that cross-validation has made.
+        expected: what to expect of views between the cameras, by each way that was taken; none for a single camera.
+        steps_before: number of steps that trials have made.
     """
 
     config: FitConfig
-    expected: CrossValidation | Forecast | None
+    expected: tuple[Expected, ...]
     steps_before: int = 0
 
 
@@ -50,7 +54,8 @@ def first_settings(
 ) -> FirstSettings:
     """Return the settings of the first frame.
 
-    Where cross-validation does not choose the strength of dropping, a forecast says what to expect of other views.
+    What to expect of other views follows from cross-validation and, for fewer than `compare_views`, from the comparison
+    of two fits; where the strength of dropping is given, from a forecast.
 
     Args:
         gaussians: the start.
@@ -70,11 +75,23 @@ def first_settings(
             config.first_frame_seconds, gaussians, cameras, targets, extent, config, render, [*seed, 1]
         )
         config = replace(config, first_frame_steps=steps)
-    if config.dropping is not None or len(images) < config.cross_validation.min_views:
-        dropping = dropping_by_noise(images) if config.dropping is None else config.dropping
-        expected = forecast(cameras, points) if len(cameras) > 1 else None
-        return FirstSettings(replace(config, dropping=dropping), expected)
-    before = trial_steps(config) * len(config.cross_validation.candidates)
-    tick = None if on_step is None else lambda done: on_step(done, before + config.first_frame_steps)
-    found = cross_validate(gaussians, cameras, images, masks, extent, config, render, seed, tick)
-    return FirstSettings(replace(config, dropping=found.best.dropping), found, before)
+    if config.dropping is not None:
+        return FirstSettings(config, (forecast(cameras, points),) if len(cameras) > 1 else ())
+    planned, given = planned_trials(config, len(cameras)), (cameras, images, masks, extent)
+    expected: list[Expected] = []
+    before = trial_steps(config) * sum(planned)
+
+    def tick(done: int, offset: int = 0) -> None:
+        if on_step is not None:
+            on_step(offset + done, before + config.planned_steps)
+
+    dropping = None
+    if planned.validation:
+        found = cross_validate(gaussians, *given, config, render, seed, tick)
+        expected.append(found)
+        dropping = found.best.dropping
+    config = replace(config, dropping=dropping_by_noise(images) if dropping is None else dropping)
+    if planned.comparison and len(gaussians) >= NUM_FITS:
+        later = partial(tick, offset=trial_steps(config) * planned.validation)
+        expected.append(compare_fits(gaussians, *given, config, render, seed, later))
+    return FirstSettings(config, tuple(expected), before)

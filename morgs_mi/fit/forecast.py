@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.fit.initialise import focus_point, scene_extent, seen_points
+from morgs_mi.fit.initialise import focus_depths, scene_extent, seen_points
 
-__all__ = ["POOR_LOSS", "Forecast", "angles_to", "forecast", "scene_depths"]
+__all__ = ["POOR_LOSS", "Forecast", "angles_to", "forecast", "mean_views", "scene_depths"]
 
 # dB below the training views above which views between the cameras look poor.
 POOR_LOSS = 8.0
@@ -38,6 +39,7 @@ class Forecast:
     spacing: float
     overlap: float
     reach: float
+    expected_psnr: ClassVar[None] = None
 
     @property
     def sentence(self) -> str:
@@ -68,16 +70,27 @@ def forecast(cameras: Sequence[Camera], points: np.ndarray) -> Forecast:
     return Forecast(len(cameras), float(spacing), float(overlap), float(reach))
 
 
+def mean_views(cameras: Sequence[Camera], points: np.ndarray) -> float:
+    """Return the mean number of views that see a surface of the scene, at least 1, as far as their frustums tell.
+
+    Args:
+        cameras: at least one.
+        points: [P, 3] of the scene, world units, or none.
+    """
+    surfaces = [_surface(*view) for view in zip(cameras, scene_depths(cameras, points), strict=True)]
+    seen = [[np.mean(seen_points(other, surface)[0]) for other in cameras] for surface in surfaces]
+    return max(1.0, float(np.sum(seen, axis=1).mean()))
+
+
 def scene_depths(cameras: Sequence[Camera], points: np.ndarray) -> list[float]:
     """Return the median depth of the points in each view, world units.
 
     For a view without points it is that of the `focus_point`, or far away if that is not in front of the camera.
     """
-    focus, far = focus_point(cameras), 1e6 * scene_extent(cameras)
-    depths = []
-    for camera in cameras:
+    far, depths = 1e6 * scene_extent(cameras), []
+    for camera, focus in zip(cameras, focus_depths(cameras), strict=True):
         _, _, seen = seen_points(camera, points)
-        middle = float(np.median(seen)) if len(seen) else float(camera.project(focus)[1])
+        middle = float(np.median(seen)) if len(seen) else min(float(focus), far)
         depths.append(middle if middle > camera.near else far)
     return depths
 

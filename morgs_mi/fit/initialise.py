@@ -13,10 +13,21 @@ from morgs_mi.core.checks import check_points
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 
-__all__ = ["fill_points", "focus_point", "from_points", "resample_points", "scene_extent", "seed_points", "seen_points"]
+__all__ = [
+    "fill_points",
+    "focus_depths",
+    "focus_point",
+    "from_points",
+    "resample_points",
+    "scene_extent",
+    "seed_points",
+    "seen_points",
+]
 
 # Rows and columns into which a view is divided to find where it shows no points.
 _CELLS = 8
+# Distance of random points from cameras with parallel axes, scene extents.
+_PARALLEL = 10.0
 # Points in a view that a random one gets its depth from, and how far it may be off, as a fraction.
 _NEIGHBOURS, _SPREAD = 3, 0.1
 
@@ -85,38 +96,59 @@ def resample_points(
 
 
 def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the point [3] that is nearest to all optical axes in the least-squares sense."""
+    """Return the point [3] that is nearest to all optical axes in the least-squares sense.
+
+    Along a direction that all axes share it is that of the mean camera position.
+    """
+    middle = np.mean([camera.position for camera in cameras], axis=0)
     system, right = 1e-9 * np.eye(3), np.zeros(3)
     for camera in cameras:
         axis = np.asarray(camera.viewmat, float)[2, :3]
         across = np.eye(3) - np.outer(axis, axis)
-        system, right = system + across, right + across @ camera.position
-    return np.linalg.solve(system, right)
+        system, right = system + across, right + across @ (camera.position - middle)
+    return middle + np.linalg.solve(system, right)
+
+
+def focus_depths(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the depth of the `focus_point` in each view [V], world units; infinite where it is not in front."""
+    focus, least = np.append(focus_point(cameras), 1), 1e-3 * scene_extent(cameras)
+    depths = np.array([np.asarray(camera.viewmat, float)[2] @ focus for camera in cameras])
+    return np.where(depths > least, depths, np.inf)
 
 
 def seed_points(
-    cameras: Sequence[Camera], images: Sequence[np.ndarray], count: int, rng: np.random.Generator
+    cameras: Sequence[Camera],
+    images: Sequence[np.ndarray],
+    masks: Sequence[np.ndarray | None],
+    count: int,
+    rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return random points [count, 3] inside the views, and their colours [count, 3] in [0, 1].
 
-    Each view gets the same number of points: random pixels at random depths, uniform in 1 / depth between a third and
-    three times the distance of the `focus_point`, in the colours of these pixels.
+    Each view with valid pixels gets the same number of points: random ones of these pixels at random depths, uniform in
+    1 / depth between a third and three times the distance of the `focus_point`, in their colours. Where the
+    focus point is not in front of the camera, as with parallel axes, the distance is ten scene extents.
 
     Args:
         cameras: C views.
         images: per view uint8 [H, W, 3], RGB.
+        masks: per view [H, W] bool of valid pixels, or None.
         count: number of points.
         rng: draws pixels and depths.
     """
-    focus = focus_point(cameras)
-    points, colors = [], []
-    for view, (camera, image) in enumerate(zip(cameras, images, strict=True)):
-        n = _share(count, view, len(cameras))
-        distance = max(camera.project(focus)[1], 10 * camera.near)
-        depth = distance / rng.uniform(1 / 3, 3, n)
-        x, y = rng.uniform(0, camera.width, n), rng.uniform(0, camera.height, n)
-        points.append(camera.unproject(np.stack([x, y], axis=1), depth))
-        colors.append(image[y.astype(int), x.astype(int)] / 255.0)
+    depths = focus_depths(cameras)
+    depths[np.isinf(depths)] = _PARALLEL * scene_extent(cameras)
+    views = [v for v in zip(cameras, images, masks, depths, strict=True) if v[2] is None or v[2].any()]
+    points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for view, (camera, image, mask, depth) in enumerate(views):
+        n = _share(count, view, len(views))
+        distance = max(depth, 10 * camera.near)
+        rows, columns = np.nonzero(np.ones(image.shape[:2], bool) if mask is None else mask)
+        pixels = rng.integers(0, len(rows), n)
+        rows, columns = rows[pixels], columns[pixels]
+        within = np.stack([columns, rows], axis=1) + rng.uniform(0, 1, (n, 2))
+        points.append(camera.unproject(within, distance / rng.uniform(1 / 3, 3, n)))
+        colors.append(image[rows, columns] / 255.0)
     return np.concatenate(points), np.concatenate(colors)
 
 

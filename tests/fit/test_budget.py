@@ -26,14 +26,16 @@ def steps(monkeypatch):
 
 
 def test_steps_within__fill_the_time_that_the_measurement_leaves(steps):
-    assert steps(15.4) == pytest.approx(1000, abs=1)  # 0.4 s were measured
-    assert steps(30.4) == pytest.approx(2000, abs=1)
+    assert steps(15.4, dropping=0.0) == pytest.approx(1000, abs=1)  # 0.4 s were measured
+    assert steps(30.4, dropping=0.0) == pytest.approx(2000, abs=1)
 
 
-def test_steps_within__leave_time_for_cross_validation(steps):
-    trials = CrossValidationConfig(candidates=(0.0, 0.2), steps=0.5, min_views=4)
-    assert steps(30.4, cross_validation=trials) == pytest.approx(1000, abs=1)
-    assert steps(30.4, views=3, cross_validation=trials) == pytest.approx(2000, abs=1)
+def test_steps_within__leave_time_for_the_trials(steps):
+    trials = CrossValidationConfig(candidates=(0.0, 0.2, 0.3, 0.4), steps=0.5, min_views=4)
+    assert steps(60.4, cross_validation=trials) == pytest.approx(1000, abs=1)
+    assert steps(45.4, views=8, cross_validation=trials) == pytest.approx(1000, abs=1)
+    assert steps(30.4, views=3, cross_validation=trials) == pytest.approx(1000, abs=1)
+    assert steps(30.4, views=1, cross_validation=trials) == pytest.approx(2000, abs=1)
     assert steps(30.4, dropping=0.2, cross_validation=trials) == pytest.approx(2000, abs=1)
 
 

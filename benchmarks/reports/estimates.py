@@ -1,0 +1,91 @@
+"""Estimate of views between the cameras, as `fit` prints it, against the PSNR of held-out views.
+
+    python -m benchmarks.reports.estimates --seeds 3 4 5 6 7 8 --json out.json
+
+Each clip is `morgs-mi synth random --seed SEED`, as in `random_scenes`, reduced by `--downscale`. Some cameras that are
+spread over the rig are trained on, and all others are held out. Two fits are compared for every number of views.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import tyro
+
+from benchmarks.reports.few_views import spread_views
+from benchmarks.reports.generalise import first_frame
+from benchmarks.reports.random_scenes import random_capture
+from benchmarks.speed.output import Output
+from morgs_mi.config import StreamConfig
+from morgs_mi.fit.agreement import Agreement
+from morgs_mi.fit.cross_validation import CrossValidation, Trial
+from morgs_mi.fit.first_settings import Expected
+
+
+@dataclass(frozen=True)
+class Options(Output):
+    """Clips, work and output."""
+
+    seeds: tuple[int, ...] = (3, 4, 5, 6, 7, 8)
+    """Seeds of the scenes."""
+    views: tuple[int, ...] = (4, 6, 8, 10)
+    """Numbers of training views; those that a clip has not are skipped."""
+    clips: Path = Path("out/random")
+    """Folder of the clips."""
+    downscale: float = 2
+    """Factor by which the clips are reduced."""
+    steps: int = 600
+    """Steps of the first frame."""
+    gaussians: int = 5000
+    """Number of Gaussians."""
+
+
+def estimates(found: dict[str, Any]) -> dict[str, float]:
+    """Return the PSNR that each way expects, from the report of a first frame."""
+    training = found["training_psnr"]
+    expected: dict[str, Expected] = {"two_fits": Agreement(0, 0.0, tuple(found["differences"]), training)}
+    if "trials" in found:
+        trials = tuple(Trial(**trial) for trial in found["trials"])
+        expected["withheld_views"] = CrossValidation((), 0.0, trials, training)
+    return {name: round(each.expected_psnr or 0.0, 2) for name, each in expected.items()}
+
+
+def main(options: Options) -> None:
+    """Run the report."""
+    mi.set_variant("llvm_ad_rgb")
+    config = StreamConfig()
+    compare_views = config.fit.cross_validation.compare_views
+    trials = replace(config.fit.cross_validation, compare_views=1000)
+    fit = replace(config.fit, first_frame_steps=options.steps, num_gaussians=options.gaussians, cross_validation=trials)
+    rows = []
+    for seed in options.seeds:
+        capture = random_capture(options.clips, seed, options.downscale)
+        others = capture.train_views
+        for count in (n for n in options.views if n < len(capture.cameras) - 1):
+            train = [others[k] for k in spread_views([capture.cameras[v] for v in others], count)]
+            scores, report = first_frame(capture, train, replace(config, fit=fit))
+            held_out, expected = np.delete(scores, train), estimates(report.validation)
+            printed = [psnr for how, psnr in expected.items() if how != "two_fits" or count < compare_views]
+            rows.append(
+                {
+                    "seed": seed,
+                    "views": count,
+                    "training": round(float(scores[train].mean()), 2),
+                    "held_out": round(float(held_out.mean()), 2),
+                    "worst": round(float(held_out.min()), 2),
+                    **expected,
+                    "estimate": max(printed),
+                    "seconds": round(report.seconds, 1),
+                }
+            )
+            print(rows[-1], flush=True)
+    given = {"downscale": options.downscale, "steps": options.steps, "gaussians": options.gaussians}
+    options.write({**given, "fits": rows}, unprinted=["fits"])
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,0 +1,66 @@
+"""The number of Gaussians of the first frame, from the detail of its images.
+
+An image is averaged over blocks of 2x2 pixels, again and again. A value that differs from the mean of its block by more
+than a threshold and the noise is a detail. Flat areas and noise have none, edges have some at every level. What several
+views see is counted once: the details of all views are divided by the mean number of views that see a point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.fit.config import DetailConfig
+from morgs_mi.fit.dropping import noise_of
+from morgs_mi.fit.forecast import mean_views
+
+__all__ = ["count_details", "gaussians_for"]
+
+# A value of a block follows from its mean and the other three.
+_INDEPENDENT = 3 / 4
+
+
+def gaussians_for(
+    cameras: Sequence[Camera],
+    images: Sequence[np.ndarray],
+    masks: Sequence[np.ndarray | None],
+    points: np.ndarray,
+    config: DetailConfig,
+) -> int:
+    """Return the number of Gaussians for a first frame.
+
+    Args:
+        cameras: V views.
+        images: their images [H, W, 3], uint8.
+        masks: valid pixels of each [H, W], or None.
+        points: [P, 3] of the scene, world units, or none.
+        config: threshold and limits.
+    """
+    details = sum(count_details(image, mask, config) for image, mask in zip(images, masks, strict=True))
+    wanted = config.per_detail * details / mean_views(cameras, points)
+    return int(np.clip(round(wanted), config.least_gaussians, config.most_gaussians))
+
+
+def count_details(image: np.ndarray, mask: np.ndarray | None, config: DetailConfig) -> float:
+    """Return the number of details of an image.
+
+    Args:
+        image: [H, W, 3], uint8.
+        mask: valid pixels [H, W], or None; a block with others has no detail.
+        config: threshold.
+    """
+    values = image.astype(np.float32) / 255
+    valid = np.ones(image.shape[:2], np.float32) if mask is None else mask.astype(np.float32)
+    noise, count = config.noise_tolerance * noise_of(image), 0
+    while min(values.shape[:2]) > 1:
+        height, width = (size // 2 for size in values.shape[:2])
+        values, valid = values[: 2 * height, : 2 * width], valid[: 2 * height, : 2 * width]
+        means, fractions = (cv2.resize(v, (width, height), interpolation=cv2.INTER_AREA) for v in (values, valid))
+        differences = np.abs(values - means.repeat(2, axis=0).repeat(2, axis=1)).max(axis=-1)
+        whole = (fractions == 1).repeat(2, axis=0).repeat(2, axis=1)
+        count += np.count_nonzero((differences > max(config.threshold, noise)) & whole)
+        values, valid, noise = means, fractions, noise / 2
+    return _INDEPENDENT * count

@@ -1,0 +1,74 @@
+"""The number of Gaussians from the detail of images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morgs_mi.fit.config import DetailConfig
+from morgs_mi.fit.detail import count_details, gaussians_for
+from morgs_mi.fit.forecast import mean_views
+from tests.scenes.cameras import arc, look_at_cameras
+
+CONFIG = DetailConfig(per_detail=1.0, least_gaussians=10, most_gaussians=10**6)
+POINTS = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
+
+
+def texture(width: int = 64, height: int = 48, cell: int = 4, amplitude: float = 80, noise: float = 0) -> np.ndarray:
+    """Return cells of random brightness with noise; both in 8-bit units."""
+    rng = np.random.default_rng(1)
+    cells = rng.uniform(-amplitude, amplitude, (height // cell, width // cell, 1))
+    image = 128 + cells.repeat(cell, axis=0).repeat(cell, axis=1) + rng.normal(0, noise, (height, width, 3))
+    return np.clip(image + 0.5, 0, 255).astype(np.uint8)
+
+
+def test_count_details__has_none_in_flat_or_noisy_images():
+    assert count_details(texture(amplitude=0), None, CONFIG) == 0
+    assert count_details(texture(amplitude=0, noise=6), None, CONFIG) < 30
+
+
+def test_count_details__counts_the_cells_of_a_texture():
+    cells = (64 // 4) * (48 // 4)
+    for image in (texture(), texture(noise=6)):
+        assert 0.7 * cells < count_details(image, None, CONFIG) < 1.1 * cells
+    assert count_details(texture(cell=2), None, CONFIG) > 2 * count_details(texture(), None, CONFIG)
+
+
+def test_count_details__counts_valid_pixels_only():
+    image, mask = texture(), np.zeros((48, 64), bool)
+    assert count_details(image, mask, CONFIG) == 0
+    mask[:, :32] = True
+    assert count_details(image, mask, CONFIG) == pytest.approx(count_details(image, None, CONFIG) / 2, rel=0.1)
+
+
+def test_gaussians_for__counts_what_several_views_see_once():
+    (camera,), image = look_at_cameras([(0, 0, -4)], 40), texture()
+    one = gaussians_for([camera], [image], [None], POINTS, CONFIG)
+    assert gaussians_for([camera] * 3, [image] * 3, [None] * 3, POINTS, CONFIG) == pytest.approx(one, abs=1)
+    beside = [c for x in (0, 9) for c in look_at_cameras([(x, 0, -4)], 40, target=(x, 0, 0))]
+    points = np.concatenate([POINTS, POINTS + np.array([9, 0, 0])])
+    assert mean_views(beside, points) == 1
+    assert gaussians_for(beside, [image] * 2, [None] * 2, points, CONFIG) == 2 * one
+
+
+def test_gaussians_for__stays_within_its_limits():
+    cameras, image = look_at_cameras(arc((-0.2, 0, 0.2), 3), 60), texture()
+    for limit in ({"least_gaussians": 5000}, {"most_gaussians": 20}):
+        found = gaussians_for(cameras, [image] * 3, [None] * 3, POINTS, replace(CONFIG, **limit))
+        assert found == next(iter(limit.values()))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"per_detail": 0.0}, "`per_detail` must be positive"),
+        ({"threshold": -1.0}, "`threshold` must be positive"),
+        ({"least_gaussians": 0}, "`least_gaussians` must be 1 to `most_gaussians` = 40000, got 0"),
+        ({"most_gaussians": 10}, "`least_gaussians` must be 1 to `most_gaussians` = 10, got 4000"),
+    ],
+)
+def test_detail_config__names_bad_values(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        DetailConfig(**arguments)
