@@ -34,7 +34,7 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.environment import versions
 from morgs_mi.io.remote import url_of
-from morgs_mi.recorder import due_keyframe, push_frame
+from morgs_mi.recorder import due_keyframe, push_frame, with_next
 from morgs_mi.stream_loop import FrameReport, StreamLoop
 
 __all__ = [
@@ -169,9 +169,9 @@ def fit_frames(
         loop, capture, recorded = _opened(fit, frames, restart, points)
         start = before = loop.state.coded
         packets, states, reports = list[Packet](), list[CodedFrame](), list[FrameReport]()
-        for frame in islice(recorded, frames.stop - frames.start):
+        for frame, upcoming in with_next(islice(recorded, frames.stop - frames.start)):
             before = loop.state.coded
-            packet, report = push_frame(loop, frame, capture.train_views, _check_memory)
+            packet, report = push_frame(loop, frame, capture.train_views, _check_memory, upcoming)
             assert loop.state.coded is not None
             packets.append(packet)
             states.append(loop.state.coded)
@@ -208,9 +208,9 @@ def fit_segment_start(fit: Fit, base: bytes, frame: int) -> Part:
         coded, report = fit_seam_frame(loop.setup, coded, earlier, first, now, fit.seams, _check_memory)
         loop.resume(coded, [[now.get(view) for view in range(len(loop.setup.cameras))]])
         before, packets, seconds = None, [reemitted_keyframe(coded)], report.seconds
-        for recorded in capture.partial_frames(first + 1, frame + 1):
+        for recorded, upcoming in with_next(capture.partial_frames(first + 1, frame + 1)):
             before = loop.state.coded
-            packet, report = push_frame(loop, recorded, capture.train_views, _check_memory)
+            packet, report = push_frame(loop, recorded, capture.train_views, _check_memory, upcoming)
             packets.append(packet)
             seconds += report.seconds
         restart = _restart(before, packets[-1])
