@@ -38,8 +38,8 @@ __all__ = ["PhotometricConfig", "mean_color_error", "refine_displacement"]
 class PhotometricConfig:
     """Settings of the refinement."""
 
-    rounds: int = 3
-    """Steps of the displacement; more change little."""
+    rounds: int = 1
+    """Steps of the displacement; more gain nothing before the fit."""
     neighbours: int = 8
     """Nearest Gaussians whose pixels count, too, if they move: a small one alone may see one straight edge."""
     prior_pixels: float = 1e-3
