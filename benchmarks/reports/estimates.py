@@ -69,7 +69,6 @@ def measure(source: Source, train: Sequence[int], config: StreamConfig, compare_
     held_out, expected = np.delete(scores, train), estimates(report.validation)
     printed = [psnr for how, psnr in expected.items() if how != "two_fits" or len(train) < compare_views]
     return {
-        "views": len(train),
         "training": round(float(scores[train].mean()), 2),
         "held_out": round(float(held_out.mean()), 2),
         "worst": round(float(held_out.min()), 2),
@@ -86,15 +85,15 @@ def main(options: Options) -> None:
     compare_views = config.fit.cross_validation.compare_views
     trials = replace(config.fit.cross_validation, compare_views=1000)
     fit = replace(config.fit, first_frame_steps=options.steps, num_gaussians=options.gaussians, cross_validation=trials)
-    seeds, cells = list[int](), {}
+    about, cells = {}, {}
     for seed in options.seeds:
         capture = random_capture(options.clips, seed, options.downscale)
         for count in (n for n in options.views if n < len(capture.cameras) - 1):
             train = spread_views(capture.cameras, count, capture.train_views)
-            cells[f"{seed} {count}"] = Source.of(capture), train, replace(config, fit=fit), compare_views
-            seeds.append(seed)
-    found = options.run(measure, cells).values()
-    rows = [{"seed": seed, **row} for seed, row in zip(seeds, found, strict=True)]
+            name = f"seed {seed}, {count} views"
+            cells[name] = Source.of(capture), train, replace(config, fit=fit), compare_views
+            about[name] = {"seed": seed, "views": count}
+    rows = [{**about[name], **row} for name, row in options.run(measure, cells).items()]
     given = {"downscale": options.downscale, "steps": options.steps, "gaussians": options.gaussians}
     options.write({**given, "fits": rows}, unprinted=["fits"])
 

@@ -136,13 +136,13 @@ def measure(source: Source, train: Sequence[int], points: Points, config: Stream
 def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
-    config, about, cells = StreamConfig(), list[dict[str, Any]](), {}
+    config, about, cells = StreamConfig(), {}, {}
     fit = replace(config.fit, first_frame_steps=options.steps, num_gaussians=options.gaussians)
     for (capture, train), points, dropping in product(cases(options), options.points, options.droppings):
-        name = f"{capture.path.name} {train} {points} {dropping:g}"
+        name = f"{capture.path} {train} {points} {dropping:g}"
         cells[name] = Source.of(capture), train, points, replace(config, fit=replace(fit, dropping=dropping))
-        about.append({"capture": capture.path.name, "start": points, "dropping": dropping})
-    rows = [{**each, **row} for each, row in zip(about, options.run(measure, cells).values(), strict=True)]
+        about[name] = {"capture": capture.path.name, "start": points, "dropping": dropping}
+    rows = [{**about[name], **row} for name, row in options.run(measure, cells).items()]
     given = {"downscale": options.downscale, "steps": options.steps, "gaussians": options.gaussians}
     options.write({**given, "fits": rows}, unprinted=["fits"])
 
