@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,6 +23,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from tyro.conf import Positional, arg
 
+from benchmarks.reports.cells import OnWorkers
 from benchmarks.reports.codec import CodecReportConfig
 from benchmarks.reports.flow import FlowReportConfig
 from benchmarks.reports.method import MethodReportConfig
@@ -31,7 +31,6 @@ from benchmarks.reports.method_results import MethodResult
 from benchmarks.reports.renderer import Errors, RendererReportConfig, RendererResult, RendererRow
 from morgs_mi.cli import Common, run
 from morgs_mi.cli.console import OUT, print_result, progress
-from morgs_mi.cluster.executor import Workers, open_workers
 from morgs_mi.core.files import json_finite, write_json
 from morgs_mi.evaluate.tables import figure
 
@@ -82,25 +81,6 @@ class FlowReport:
                 print_result(f"{title}, motion of {figure(clip.motion, 1)} px\n\n{markdown_table(clip)}")
         if self.plot is not None:
             plot_flow(result, self.plot)
-
-
-@dataclass(frozen=True, kw_only=True)
-class OnWorkers:
-    """Base of the reports whose fits other processes can do."""
-
-    workers: int | None = None
-    """Number of processes on this machine for the fits, which share its cores; default: this process fits alone."""
-    scheduler: str | None = None
-    """Dask scheduler whose workers do the fits, such as tcp://host:8786, or local."""
-
-    @contextmanager
-    def opened(self) -> Iterator[Workers | None]:
-        """Yield the workers, None where none were asked for."""
-        if self.workers is None and self.scheduler is None:
-            yield None
-            return
-        with open_workers(self.scheduler, self.workers) as workers:
-            yield workers
 
 
 @dataclass(frozen=True)

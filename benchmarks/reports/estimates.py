@@ -8,6 +8,7 @@ spread over the rig are trained on, and all others are held out. Two fits are co
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,10 @@ import mitsuba as mi
 import numpy as np
 import tyro
 
+from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.few_views import spread_views
-from benchmarks.reports.generalise import first_frame
-from benchmarks.reports.random_scenes import random_capture
-from benchmarks.speed.output import Output
+from benchmarks.reports.fits import first_frame, random_capture
+from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 from morgs_mi.fit.agreement import Agreement
 from morgs_mi.fit.cross_validation import CrossValidation, Trial
@@ -27,7 +28,7 @@ from morgs_mi.fit.first_settings import Expected
 
 
 @dataclass(frozen=True)
-class Options(Output):
+class Options(CellOptions):
     """Clips, work and output."""
 
     seeds: tuple[int, ...] = (3, 4, 5, 6, 7, 8)
@@ -54,6 +55,29 @@ def estimates(found: dict[str, Any]) -> dict[str, float]:
     return {name: round(each.expected_psnr or 0.0, 2) for name, each in expected.items()}
 
 
+def measure(source: Source, train: Sequence[int], config: StreamConfig, compare_views: int) -> dict[str, float]:
+    """Return the PSNR of training and held-out views, and the estimates.
+
+    Args:
+        source: the capture.
+        train: indices of the training views.
+        config: settings.
+        compare_views: number of views from which on `fit` does not compare two fits.
+    """
+    train = list(train)
+    scores, report = first_frame(source.open(), train, config)
+    held_out, expected = np.delete(scores, train), estimates(report.validation)
+    printed = [psnr for how, psnr in expected.items() if how != "two_fits" or len(train) < compare_views]
+    return {
+        "training": round(float(scores[train].mean()), 2),
+        "held_out": round(float(held_out.mean()), 2),
+        "worst": round(float(held_out.min()), 2),
+        **expected,
+        "estimate": max(printed),
+        "seconds": round(report.seconds, 1),
+    }
+
+
 def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
@@ -61,28 +85,15 @@ def main(options: Options) -> None:
     compare_views = config.fit.cross_validation.compare_views
     trials = replace(config.fit.cross_validation, compare_views=1000)
     fit = replace(config.fit, first_frame_steps=options.steps, num_gaussians=options.gaussians, cross_validation=trials)
-    rows = []
+    about, cells = {}, {}
     for seed in options.seeds:
         capture = random_capture(options.clips, seed, options.downscale)
-        others = capture.train_views
         for count in (n for n in options.views if n < len(capture.cameras) - 1):
-            train = [others[k] for k in spread_views([capture.cameras[v] for v in others], count)]
-            scores, report = first_frame(capture, train, replace(config, fit=fit))
-            held_out, expected = np.delete(scores, train), estimates(report.validation)
-            printed = [psnr for how, psnr in expected.items() if how != "two_fits" or count < compare_views]
-            rows.append(
-                {
-                    "seed": seed,
-                    "views": count,
-                    "training": round(float(scores[train].mean()), 2),
-                    "held_out": round(float(held_out.mean()), 2),
-                    "worst": round(float(held_out.min()), 2),
-                    **expected,
-                    "estimate": max(printed),
-                    "seconds": round(report.seconds, 1),
-                }
-            )
-            print(rows[-1], flush=True)
+            train = spread_views(capture.cameras, count, capture.train_views)
+            name = f"seed {seed}, {count} views"
+            cells[name] = Source.of(capture), train, replace(config, fit=fit), compare_views
+            about[name] = {"seed": seed, "views": count}
+    rows = [{**about[name], **row} for name, row in options.run(measure, cells).items()]
     given = {"downscale": options.downscale, "steps": options.steps, "gaussians": options.gaussians}
     options.write({**given, "fits": rows}, unprinted=["fits"])
 

@@ -9,14 +9,16 @@ view.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import mitsuba as mi
 import tyro
 
 from benchmarks.reports import random_scenes
-from benchmarks.reports.random_scenes import later_scores, new_loop, random_capture
+from benchmarks.reports.fits import new_loop
+from benchmarks.reports.random_scenes import later_scores
+from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 
 
@@ -28,28 +30,30 @@ class Options(random_scenes.Options):
     """Frames from one that is fitted to the next."""
 
 
+def measure(
+    source: Source, config: StreamConfig, num_frames: int, strides: Sequence[int]
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Fit a clip and return the means of the scores of its later frames, by stride, without and with the search."""
+    capture, rows = source.open(), {}
+    frames = list(capture.partial_frames(0, num_frames))
+    before = [frames[0].images[v] for v in capture.train_views]
+    first = new_loop(capture, config)
+    first.push(before)
+    assert first.state.coded is not None
+    for stride in strides:
+        for name, searches in (("without", False), ("search", True)):
+            loop = new_loop(capture, replace(config, motion=replace(config.motion, search_motion=searches)))
+            loop.resume(first.state.coded, [before])
+            scores = later_scores(loop, capture, frames[stride::stride])
+            rows.setdefault(f"stride_{stride}", {})[name] = scores
+    return rows
+
+
 def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
-    config = StreamConfig()
-    config = replace(config, fit=replace(config.fit, epochs=options.epochs))
-    rows: dict[str, Any] = {}
-    for seed in options.seeds:
-        capture = random_capture(options.clips, seed)
-        frames = list(capture.partial_frames(0, options.frames))
-        before = [frames[0].images[v] for v in capture.train_views]
-        first = new_loop(capture, config)
-        first.push(before)
-        assert first.state.coded is not None
-        for stride in options.strides:
-            for name, searches in (("without", False), ("search", True)):
-                motion = replace(config.motion, search_motion=searches)
-                loop = new_loop(capture, replace(config, motion=motion))
-                loop.resume(first.state.coded, [before])
-                scores = later_scores(loop, capture, frames[stride::stride])
-                rows.setdefault(str(seed), {}).setdefault(f"stride_{stride}", {})[name] = scores
-        print(f"seed {seed}", rows[str(seed)], flush=True)
-    options.write({"seeds": rows}, unprinted=["seeds"])
+    cells = {seed: (*cell, options.strides) for seed, cell in options.cells().items()}
+    options.write({"seeds": options.run(measure, cells)}, unprinted=["seeds"])
 
 
 if __name__ == "__main__":

@@ -20,11 +20,11 @@ import mitsuba as mi
 import numpy as np
 import tyro
 
-from benchmarks.reports.generalise import first_frame
-from benchmarks.reports.random_scenes import random_capture
-from benchmarks.speed.output import Output
+from benchmarks.reports.cells import CellOptions
+from benchmarks.reports.fits import first_frame, random_capture
 from morgs_mi.calibration.rig_check import dense_points, match_capture, triangulate_points
 from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.fit.forecast import angles_to, forecast, scene_depths
@@ -35,7 +35,7 @@ Points = Literal["stereo", "triangulated", "random"]
 
 
 @dataclass(frozen=True)
-class Options(Output):
+class Options(CellOptions):
     """Clips, work and output."""
 
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
@@ -71,14 +71,14 @@ def wide_capture(clips: Path, seed: int, downscale: float) -> Capture:
     return load_capture(clip, downscale)
 
 
-def spread_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
-    """Return the indices of `count` cameras that are far from each other."""
-    positions = np.array([camera.position for camera in cameras])
+def spread_views(cameras: Sequence[Camera], count: int, among: Sequence[int]) -> tuple[int, ...]:
+    """Return the indices of `count` of the cameras `among` all that are far from each other."""
+    positions = np.array([cameras[v].position for v in among])
     chosen = [int(np.argmax(np.linalg.norm(positions - positions.mean(axis=0), axis=1)))]
     while len(chosen) < count:
         distance = np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(axis=1)
         chosen.append(int(np.argmax(distance)))
-    return tuple(sorted(chosen))
+    return tuple(sorted(among[k] for k in chosen))
 
 
 def cases(options: Options) -> Iterator[tuple[Capture, tuple[int, ...]]]:
@@ -89,8 +89,7 @@ def cases(options: Options) -> Iterator[tuple[Capture, tuple[int, ...]]]:
             capture = make(options.clips, seed, options.downscale)
             others = capture.train_views
             for count in (n for n in options.views if n <= len(others)):
-                train = tuple(others[k] for k in spread_views([capture.cameras[v] for v in others], count))
-                yield capture, train
+                yield capture, spread_views(capture.cameras, count, others)
     for path in options.captures:
         capture = load_capture(path, 8)
         views = range(len(capture.cameras))
@@ -112,8 +111,9 @@ def with_points(capture: Capture, train: Sequence[int], points: Points) -> Captu
     return replace(capture, points=found.points, point_colors=found.point_colors)
 
 
-def measure(capture: Capture, train: Sequence[int], config: StreamConfig) -> dict[str, Any]:
+def measure(source: Source, train: Sequence[int], points: Points, config: StreamConfig) -> dict[str, Any]:
     """Return the PSNR of the training views and of each held-out one, with its angles to the training views."""
+    capture = with_points(source.open(), train, points)
     scores, report = first_frame(capture, train, config)
     cameras = [capture.cameras[v] for v in train]
     rig, held_out = forecast(cameras, capture.points), [v for v in range(len(capture.cameras)) if v not in train]
@@ -136,14 +136,13 @@ def measure(capture: Capture, train: Sequence[int], config: StreamConfig) -> dic
 def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
-    config, rows = StreamConfig(), []
-    for capture, train in cases(options):
-        for points, dropping in product(options.points, options.droppings):
-            fit = replace(config.fit, first_frame_steps=options.steps, num_gaussians=options.gaussians)
-            start, settings = with_points(capture, train, points), replace(config, fit=replace(fit, dropping=dropping))
-            row = measure(start, train, settings)
-            rows.append({"capture": capture.path.name, "start": points, "dropping": dropping, **row})
-            print(rows[-1], flush=True)
+    config, about, cells = StreamConfig(), {}, {}
+    fit = replace(config.fit, first_frame_steps=options.steps, num_gaussians=options.gaussians)
+    for (capture, train), points, dropping in product(cases(options), options.points, options.droppings):
+        name = f"{capture.path} {train} {points} {dropping:g}"
+        cells[name] = Source.of(capture), train, points, replace(config, fit=replace(fit, dropping=dropping))
+        about[name] = {"capture": capture.path.name, "start": points, "dropping": dropping}
+    rows = [{**about[name], **row} for name, row in options.run(measure, cells).items()]
     given = {"downscale": options.downscale, "steps": options.steps, "gaussians": options.gaussians}
     options.write({**given, "fits": rows}, unprinted=["fits"])
 

@@ -15,17 +15,17 @@ from typing import Any
 import mitsuba as mi
 import tyro
 
-from benchmarks.reports.generalise import first_frame
-from benchmarks.reports.random_scenes import random_capture
-from benchmarks.speed.output import Output
-from morgs_mi.calibration.rig_check import dense_points, match_capture
-from morgs_mi.capture.capture import Capture, load_capture
+from benchmarks.reports.cells import CellOptions
+from benchmarks.reports.few_views import with_points
+from benchmarks.reports.fits import first_frame, random_capture
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 from morgs_mi.fit.config import FitConfig
 
 
 @dataclass(frozen=True)
-class Options(Output):
+class Options(CellOptions):
     """Clips and output."""
 
     seeds: tuple[int, ...] = (6, 7, 8)
@@ -46,9 +46,18 @@ class Options(Output):
     """Probability of dropping of each clip; none: chosen."""
 
 
-def measure(capture: Capture, fit: FitConfig) -> dict[str, float]:
-    """Fit the first frame and return its size, its steps, its time, and the PSNR of trained and held-out views."""
+def measure(source: Source, stereo: bool, fit: FitConfig) -> dict[str, float]:
+    """Fit the first frame and return its size, its steps, its time, and the PSNR of trained and held-out views.
+
+    Args:
+        source: the capture.
+        stereo: whether to start from points from stereo in place of the capture's own.
+        fit: settings.
+    """
+    capture = source.open()
     train = capture.train_views
+    if stereo:
+        capture = with_points(capture, train, "stereo")
     scores, report = first_frame(capture, train, replace(StreamConfig(), fit=fit))
     figures = {
         "gaussians": report.num_gaussians,
@@ -64,19 +73,19 @@ def measure(capture: Capture, fit: FitConfig) -> dict[str, float]:
 def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
-    captures = [random_capture(options.clips, seed) for seed in options.seeds]
-    for path in options.captures:
-        capture = load_capture(path, options.downscale, None, 1)
-        captures.append(dense_points(capture, match_capture(capture)))
-    rows: dict[str, Any] = {}
-    for k, capture in enumerate(captures):
+    captures = [(random_capture(options.clips, seed), False) for seed in options.seeds]
+    captures += [(load_capture(path, options.downscale, None, 1), True) for path in options.captures]
+    rows, cells = dict[str, dict[str, Any]](), {}
+    for k, (capture, stereo) in enumerate(captures):
         chosen = FitConfig(dropping=options.dropping[k] if options.dropping else None)
         fixed = replace(chosen, num_gaussians=options.gaussians, first_frame_steps=options.steps)
         name = capture.path.name
         rows[name] = {"views": len(capture.train_views)}
         for how, fit in {"chosen": chosen, **({"fixed": fixed} if options.compare else {})}.items():
-            rows[name][how] = measure(capture, fit)
-            print(name, how, rows[name][how], flush=True)
+            cells[f"{name} {how}"] = Source.of(capture), stereo, fit
+    for cell, found in options.run(measure, cells).items():
+        name, _, how = cell.rpartition(" ")
+        rows[name][how] = found
     options.write({"fits": rows}, unprinted=["fits"])
 
 

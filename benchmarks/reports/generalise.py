@@ -8,27 +8,20 @@ cross-validation chooses the probability of dropping, and without dropping.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
-import numpy as np
 import tyro
 
-from benchmarks.reports.random_scenes import random_capture
-from benchmarks.speed.output import Output
-from morgs_mi import StreamLoop, rasterize
-from morgs_mi.capture.capture import Capture
+from benchmarks.reports.cells import CellOptions
+from benchmarks.reports.fits import first_frame, random_capture
+from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
-from morgs_mi.core.camera import Camera
-from morgs_mi.evaluate.metrics import psnr
-from morgs_mi.stream_loop import FrameReport
 
 
 @dataclass(frozen=True)
-class Options(Output):
+class Options(CellOptions):
     """Clips and output."""
 
     seeds: tuple[int, ...] = (3, 4, 5, 6, 7, 8)
@@ -39,24 +32,9 @@ class Options(Output):
     """Steps of the first frame."""
 
 
-def first_frame(capture: Capture, train: Sequence[int], config: StreamConfig) -> tuple[np.ndarray, FrameReport]:
-    """Fit the first frame to the views `train`; return the PSNR of each view of the capture [C], and the report."""
-    cameras, masks = [capture.cameras[v] for v in train], [capture.masks[v] for v in train]
-    loop = StreamLoop(cameras, capture.points, capture.point_colors, config, masks)
-    images = next(capture.frames(0, 1)).images
-    _, report = loop.push([images[v] for v in train])
-    gaussians = loop.gaussians
-    assert gaussians is not None
-
-    def score(camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> float:
-        found, valid = np.asarray(rasterize(gaussians, camera, ("color",)).color), slice(None) if mask is None else mask
-        return psnr(np.clip(found, 0, 1)[valid], image[valid] / 255.0)
-
-    return np.array([score(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]), report
-
-
-def measure(capture: Capture, config: StreamConfig) -> dict[str, float]:
+def measure(source: Source, config: StreamConfig) -> dict[str, float]:
     """Fit the first frame; return PSNR of the held-out view and of the training views, seconds, and the estimate."""
+    capture = source.open()
     train, test = capture.train_views, capture.test_view
     assert test is not None
     scores, report = first_frame(capture, train, config)
@@ -76,16 +54,18 @@ def main(options: Options) -> None:
     mi.set_variant("llvm_ad_rgb")
     config = StreamConfig()
     config = replace(config, fit=replace(config.fit, first_frame_steps=options.steps))
-    rows: dict[str, Any] = {}
-    for seed in options.seeds:
-        capture = random_capture(options.clips, seed)
-        without = replace(config, fit=replace(config.fit, dropping=0.0))
-        rows[str(seed)] = {
-            "views": len(capture.train_views),
-            "without": measure(capture, without),
-            "chosen": measure(capture, config),
-        }
-        print(f"seed {seed}", rows[str(seed)], flush=True)
+    settings = {"without": replace(config, fit=replace(config.fit, dropping=0.0)), "chosen": config}
+    captures = {seed: random_capture(options.clips, seed) for seed in options.seeds}
+    cells = {
+        f"{seed} {how}": (Source.of(capture), each)
+        for seed, capture in captures.items()
+        for how, each in settings.items()
+    }
+    found = options.run(measure, cells)
+    rows = {
+        str(seed): {"views": len(capture.train_views), **{how: found[f"{seed} {how}"] for how in settings}}
+        for seed, capture in captures.items()
+    }
     options.write({"steps": options.steps, "seeds": rows}, unprinted=["seeds"])
 
 

@@ -16,7 +16,6 @@ The overlap of a mask is its IoU, the share of the true mask that is `found` and
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -27,12 +26,12 @@ import mitsuba as mi
 import numpy as np
 import tyro
 
+from benchmarks.reports.cells import CellOptions
+from benchmarks.reports.fits import new_loop
 from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.codec.packets import CodedFrame
 from morgs_mi.config import StreamConfig
-from morgs_mi.core.files import write_json
-from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.evaluate.metrics import iou, psnr
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.method.active_set import full_active_set
@@ -46,14 +45,12 @@ from morgs_mi.stream_loop import StreamLoop
 from morgs_mi.synth.ground_truth import load_truth
 
 
-@dataclass(frozen=True)
-class Options:
+@dataclass(frozen=True, kw_only=True)
+class Options(CellOptions):
     """Measure the overlap of motion masks with the truth."""
 
     captures: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of captures with ground truth."""
-    json: Path | None = None
-    """JSON file for the figures, which are also printed."""
     frames: int = 4
     """Number of later frames of each clip."""
     first_frame_steps: int = 600
@@ -124,9 +121,7 @@ class Clip:
         return [self.frames[t].images[v] for v in self.views]
 
     def _loop(self, motion: MotionConfig) -> StreamLoop:
-        masks = [self.capture.masks[v] for v in self.views]
-        config = StreamConfig(fit=self.fit, motion=motion)
-        return StreamLoop(self.cameras, self.capture.points, self.capture.point_colors, config, masks)
+        return new_loop(self.capture, StreamConfig(fit=self.fit, motion=motion))
 
     def _truth(self, camera: Camera, t: int) -> np.ndarray:
         return load_truth(self.truth, camera.name, t).mask
@@ -184,13 +179,11 @@ def measure(path: Path, options: Options) -> dict[str, Any]:
 def main(options: Options) -> None:
     """Print the figures and write them."""
     mi.set_variant("llvm_ad_rgb")
-    result: dict[str, Any] = {"clips": []}
-    settings = {name: value for name, value in asdict(options).items() if name not in ("captures", "json")}
-    for path in options.captures:
-        result["clips"].append(measure(path, options))
-        print(json.dumps(result["clips"][-1]), flush=True)
-        if options.json:
-            write_json(options.json, {**result, "settings": settings, "machine": machine(), "versions": versions()})
+    cells = {str(path): (path.resolve(), options) for path in options.captures}
+    clips = list(options.run(measure, cells).values())
+    unused = ("captures", "json", "workers", "scheduler")
+    settings = {name: value for name, value in asdict(options).items() if name not in unused}
+    options.write({"clips": clips, "settings": settings}, unprinted=["clips"])
 
 
 if __name__ == "__main__":

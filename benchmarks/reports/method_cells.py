@@ -11,7 +11,6 @@ Cells may be fitted by workers, side by side (`fit_cells`). Their files are writ
 from __future__ import annotations
 
 import ast
-import asyncio
 import hashlib
 import json
 from collections.abc import Callable, Sequence
@@ -20,15 +19,16 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 
 import morgs_mi
+from benchmarks.reports.cells import run_cells
+from benchmarks.reports.fits import new_loop
 from benchmarks.reports.method_results import ScratchRow
 from benchmarks.reports.records import from_json
 from morgs_mi.capture.capture import Capture
-from morgs_mi.cluster.executor import Workers, wait_for
-from morgs_mi.cluster.tasks import Source, installed, prepared
+from morgs_mi.cluster.executor import Workers
+from morgs_mi.cluster.tasks import Source
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.config import StreamConfig, apply_preset
@@ -113,9 +113,7 @@ class Clip:
 
     def loop(self, config: StreamConfig) -> StreamLoop:
         """Return a loop on the training views, before its first frame."""
-        capture, train = self.capture, self.capture.train_views
-        cameras, masks = [capture.cameras[v] for v in train], [capture.masks[v] for v in train]
-        return StreamLoop(cameras, capture.points, capture.point_colors, config, masks)
+        return new_loop(self.capture, config)
 
     def writer(self, path: Path, config: StreamConfig) -> StreamWriter:
         """Return a writer of a new stream of this clip."""
@@ -214,29 +212,19 @@ def fit_cells(
     files = {cell: _file(clip, cell, base, version, out) for cell in cells}
     missing = [cell for cell, file in files.items() if not file.is_file()]
     firsts = {seed: _first_frame(clip, replace(base, seed=seed), version, out) for seed in {c.seed for c in missing}}
-    about = Source.of(clip.capture), str(mi.variant()), installed()
+    source = Source.of(clip.capture)
 
-    async def fit(cell: Cell) -> None:
-        scores = await workers.run(_fit_on_worker, *about, cell.config(base), firsts[cell.seed].read_bytes())
+    def store(cell: Cell, scores: Scores) -> None:
         _store(files[cell], cell, version, scores)
         progress(sum(file.is_file() for file in files.values()))
 
-    async def fit_all() -> None:
-        async with asyncio.TaskGroup() as group:
-            for cell in missing:
-                group.create_task(fit(cell))
-
-    try:
-        wait_for(fit_all())
-    except BaseExceptionGroup as errors:
-        raise errors.exceptions[0] from None
+    args = {cell: (source, cell.config(base), firsts[cell.seed].read_bytes()) for cell in missing}
+    run_cells(_fit_on_worker, args, workers, store)
 
 
-def _fit_on_worker(
-    source: Source, variant: str, versions: tuple[tuple[str, str], ...], config: StreamConfig, first: bytes
-) -> Scores:
+def _fit_on_worker(source: Source, config: StreamConfig, first: bytes) -> Scores:
     """Return the scores of a cell; `first` is the stream with its first frame."""
-    with prepared(variant, versions), TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder:
         path = Path(folder) / "first.morgs"
         path.write_bytes(first)
         return _fit(_clip_of(source), config, path)

@@ -9,26 +9,26 @@ to 2. Scores are means over the later frames of the held-out view, against the e
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import tyro
 
-from benchmarks.speed.output import Output
+from benchmarks.reports.cells import CellOptions
+from benchmarks.reports.fits import new_loop, random_capture
 from morgs_mi import Gaussians, StreamLoop, rasterize
-from morgs_mi.capture.capture import Capture, PartialFrame, load_capture
+from morgs_mi.capture.capture import Capture, PartialFrame
+from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 from morgs_mi.evaluate.metrics import iou, psnr
 from morgs_mi.synth.ground_truth import load_truth
-from morgs_mi.synth.synthesize import synthesize
 
 
 @dataclass(frozen=True)
-class Options(Output):
+class Options(CellOptions):
     """Clips, work and output."""
 
     seeds: tuple[int, ...] = (3, 4, 5, 6, 7, 8)
@@ -40,25 +40,32 @@ class Options(Output):
     epochs: int = 2
     """Epochs of a later frame."""
 
-
-def random_capture(clips: Path, seed: int, downscale: float = 1) -> Capture:
-    """Return the random scene of a seed, which is made in the folder `clips` if it is not there."""
-    clip = clips / f"random-{seed}"
-    if not clip.exists():
-        synthesize("random", clip, num_frames=8, seed=seed)
-    return load_capture(clip, downscale)
-
-
-def new_loop(capture: Capture, config: StreamConfig) -> StreamLoop:
-    """Return the loop over a capture's training views."""
-    train = capture.train_views
-    masks = [capture.masks[v] for v in train]
-    return StreamLoop([capture.cameras[v] for v in train], capture.points, capture.point_colors, config, masks)
+    def cells(self) -> dict[str, tuple[Source, StreamConfig, int]]:
+        """Return clip, settings and number of frames of each seed; clips that are missing are made."""
+        config = StreamConfig()
+        config = replace(config, fit=replace(config.fit, epochs=self.epochs))
+        clips = {str(seed): Source.of(random_capture(self.clips, seed)) for seed in self.seeds}
+        return {seed: (clip, config, self.frames) for seed, clip in clips.items()}
 
 
-def later_scores(loop: StreamLoop, capture: Capture, frames: Sequence[PartialFrame]) -> dict[str, float]:
+def measure(source: Source, config: StreamConfig, num_frames: int) -> dict[str, float]:
+    """Fit a clip and return the means of the scores of its later frames."""
+    capture = source.open()
+    first, *later = capture.partial_frames(0, num_frames)
+    loop = new_loop(capture, config)
+    loop.push([first.images[v] for v in capture.train_views])
+    return later_scores(loop, capture, later)
+
+
+def later_scores(loop: StreamLoop, capture: Capture, frames: Iterable[PartialFrame]) -> dict[str, float]:
     """Fit frames after the first one and return the means of their scores."""
-    test, rows = capture.test_view, []
+    rows = list(fitted_frames(loop, capture, frames))
+    return {name: float(f"{np.nanmean([row[name] for row in rows]):.4g}") for name in rows[0]}
+
+
+def fitted_frames(loop: StreamLoop, capture: Capture, frames: Iterable[PartialFrame]) -> Iterator[dict[str, float]]:
+    """Fit frames after the first one, and yield the scores of those that the held-out view has recorded."""
+    test = capture.test_view
     assert test is not None
     for frame in frames:
         start = time.process_time()
@@ -66,8 +73,8 @@ def later_scores(loop: StreamLoop, capture: Capture, frames: Sequence[PartialFra
         seconds, recorded = time.process_time() - start, frame.images[test]
         if recorded is not None and loop.gaussians is not None:
             scores = scores_of(loop.gaussians, capture, test, frame.index, recorded)
-            rows.append({**scores, "bytes": report.num_bytes, "cpu_s": seconds, **report.active})
-    return {name: float(f"{np.nanmean([row[name] for row in rows]):.4g}") for name in rows[0]}
+            sizes = {"bytes": report.num_bytes, "num_gaussians": report.num_gaussians}
+            yield {**scores, **sizes, "cpu_s": seconds, **report.active}
 
 
 def scores_of(gaussians: Gaussians, capture: Capture, view: int, frame: int, recorded: np.ndarray) -> dict[str, float]:
@@ -90,17 +97,7 @@ def scores_of(gaussians: Gaussians, capture: Capture, view: int, frame: int, rec
 def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
-    config = StreamConfig()
-    config = replace(config, fit=replace(config.fit, epochs=options.epochs))
-    rows: dict[str, Any] = {}
-    for seed in options.seeds:
-        capture = random_capture(options.clips, seed)
-        first, *later = capture.partial_frames(0, options.frames)
-        loop = new_loop(capture, config)
-        loop.push([first.images[v] for v in capture.train_views])
-        rows[str(seed)] = later_scores(loop, capture, later)
-        print(f"seed {seed}", rows[str(seed)], flush=True)
-    options.write({"seeds": rows}, unprinted=["seeds"])
+    options.write({"seeds": options.run(measure, options.cells())}, unprinted=["seeds"])
 
 
 if __name__ == "__main__":

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import pickle
+
 from morgs_mi.cluster.executor import Workers
 
 
 class Here(Workers):
-    """A worker that is this process; it dies at a task with a number."""
+    """A worker that is this process, and gets its tasks as bytes; it dies at a task with a number."""
 
-    place, count = "here", 1
+    place = "here"
+    count = 1  # pyright: ignore[reportAssignmentType]
 
     def __init__(self, dies_at: int = 99) -> None:
         self.left = dies_at
@@ -17,4 +20,5 @@ class Here(Workers):
         self.left -= 1
         if not self.left:
             raise ChildProcessError("it died.")
+        function, args = pickle.loads(pickle.dumps((function, args)))
         return function(*args)

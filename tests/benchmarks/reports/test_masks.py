@@ -28,13 +28,13 @@ def test_measure__refuses_a_capture_without_truth(fitted_clip: Path, tmp_path: P
         if path.name != "truth":
             (tmp_path / "capture" / path.name).symlink_to(path)
     with pytest.raises(ValueError, match="expected a capture with a held-out view and ground truth"):
-        measure(tmp_path / "capture", Options(()))
+        measure(tmp_path / "capture", Options(captures=()))
 
 
 @pytest.mark.slow
 def test_measure__compares_masks_and_confidence_with_the_truth(tmp_path: Path):
     clip = synthesize("spheres", tmp_path / "clip", num_cameras=6, num_frames=3, width=64, height=48, spp=4)
-    options = Options((clip,), frames=2, first_frame_steps=20, num_gaussians=300, loops=("none",))
+    options = Options(captures=(clip,), frames=2, first_frame_steps=20, num_gaussians=300, loops=("none",))
     result = measure(clip, options)
     assert result["masks"].keys() == {*MASK_REFINERS.names, "lifted"}
     assert set(result["processor_ms"]) == set(MASK_REFINERS.names)

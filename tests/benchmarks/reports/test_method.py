@@ -31,7 +31,6 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import json_finite
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.render.config import RenderConfig
-from morgs_mi.synth.synthesize import synthesize
 from tests.benchmarks.reports.here import Here
 from tests.benchmarks.reports.pages import ROOT, page
 
@@ -47,13 +46,6 @@ TINY = MethodReportConfig(
     version="test",
     stream=StreamConfig(fit=FitConfig(sh_degree=0, first_frame_steps=10, confidence_steps=2)),
 )
-
-
-@pytest.fixture(scope="module")
-def clip(tmp_path_factory):
-    """The balls from 4 cameras in 3 tiny frames."""
-    folder = tmp_path_factory.mktemp("clip") / "spheres"
-    return synthesize("spheres", folder, num_cameras=4, num_frames=3, width=48, height=36, spp=1)
 
 
 def made_up_scores(clip, config, first):
