@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from onnx import helper
 
-from morgs_mi import RenderConfig, rasterize
+from morgs_mi import RenderConfig, StreamConfig, StreamLoop, rasterize
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.depth_prior import DepthNetwork, depth_prior, fit_line, fit_line_robustly
 from morgs_mi.fit.first_frame import fit_first_frame
+from morgs_mi.fit.initialise import from_points
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from tests.assertions import assert_close
-from tests.scenes.ball import ball, images_of, opaque_ball, views
-from tests.scenes.cameras import look_at_cameras
+from tests.scenes.cameras import QUAD, look_at_cameras
 from tests.scenes.tiny_network import write
 
 MEAN, DEVIATION = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225])
@@ -109,78 +109,81 @@ def test_fit_line_robustly__ignores_outliers():
     assert abs(fit_line(x, y, np.ones(200))[0] - 0.3) > 0.05
 
 
-def depth_maps(cameras):
-    """Return the inverse depth of the opaque ball in views, each with a scale and a shift of its own."""
-    maps = []
-    for k, camera in enumerate(cameras):
-        image = rasterize(opaque_ball(), camera, ("depth", "alpha"))
-        depth, alpha = (np.asarray(image[name])[..., 0] for name in ("depth", "alpha"))
-        maps.append(np.where(alpha > 0.5, (2 + k) / np.maximum(depth, 1e-3) + 0.5 * k, np.nan))
-    return maps
+VIEWS = look_at_cameras(QUAD[:3])
+HELD_OUT = look_at_cameras([(0, 0, -3.5), (1.5, 0, -3.3), (-1.5, 0, -3.3), (0, 1.1, -3.4)])
 
 
-def surface_points(cameras):
-    """Return a point on the ball's rendered surface for every fourth pixel of the views."""
-    found = []
-    for camera, relative in zip(cameras, depth_maps(cameras), strict=True):
-        depth = np.asarray(rasterize(opaque_ball(), camera, ("depth",)).depth)[..., 0]
-        rows, columns = (each[::4] for each in np.nonzero(np.isfinite(relative)))
-        found.append(camera.unproject(np.stack([columns, rows], axis=-1) + 0.5, depth[rows, columns]))
-    return np.concatenate(found)
+def card(camera):
+    """Return the image [H, W, 3] of a plain card in front of a wall of smooth colours, and its points [H, W, 3]."""
+    y, x = np.mgrid[: camera.height, : camera.width] + 0.5
+    origin, rays = camera.rays(np.stack([x, y], axis=-1))
+    near, far = (origin + rays * ((z - origin[2]) / rays[..., 2:]) for z in (-0.6, 0.8))
+    on_card = (np.abs(near[..., :2]) < 0.5).all(axis=-1, keepdims=True)
+    wall = 0.5 + 0.2 * np.sin(1.2 * far[..., :1] + np.array([0, 2, 4]))
+    return np.where(on_card, (0.8, 0.3, 0.2), wall), np.where(on_card, near, far)
 
 
 def inverse_depth(camera):
-    return 1 / np.maximum(np.asarray(rasterize(opaque_ball(), camera, ("depth",)).depth)[..., 0], 1e-3)
+    return 1 / camera.project(card(camera)[1])[1]
 
 
-def check_aligned(prior):
-    for camera, aligned in zip(views(), prior.aligned, strict=True):
-        known = np.asarray(aligned.known) > 0
-        assert known.mean() > 0.9
-        assert_close(np.asarray(aligned.inverse)[known], inverse_depth(camera)[known], rtol=0.02)
+def depth_maps():
+    """Return the exact inverse depth of the views, each with a scale and a shift of its own."""
+    return [(2 + k) * inverse_depth(camera) + 0.5 * k for k, camera in enumerate(VIEWS)]
+
+
+def surface_points():
+    """Return every sixth point of the views [P, 3], hidden ones among them, the rays to them, and their colours."""
+    found = [(card(camera)[1], card(camera)[1] - camera.position, card(camera)[0]) for camera in VIEWS]
+    return tuple(
+        np.concatenate([each[::6, ::6].reshape(-1, 3) for each in parts]) for parts in zip(*found, strict=True)
+    )
 
 
 def test_depth_prior__is_aligned_to_points():
-    cameras = views()
-    check_aligned(depth_prior(depth_maps(cameras), cameras, surface_points(cameras)))
+    prior = depth_prior(depth_maps(), VIEWS, surface_points()[0])
+    for camera, aligned in zip(VIEWS, prior.aligned, strict=True):
+        assert_close(aligned.inverse, inverse_depth(camera), atol=2e-3)
+        assert np.asarray(aligned.known).all()
 
 
 def test_depth_prior__without_points_is_aligned_to_the_fit():
-    cameras = views()
-    prior = depth_prior(depth_maps(cameras), cameras, np.zeros((0, 3)))
-    assert prior.aligned == (None,) * 4
-    check_aligned(prior.completed(opaque_ball(), [ActiveView(camera) for camera in cameras]))
+    prior = depth_prior(depth_maps(), VIEWS, np.zeros((0, 3)))
+    assert prior.aligned == (None,) * 3
+    points, _, colors = surface_points()
+    fitted_so_far = dataclasses.replace(from_points(points, colors, 0), logit_opacities=np.full(len(points), 2.0))
+    completed = prior.completed(fitted_so_far, [ActiveView(camera) for camera in VIEWS])
+    for camera, aligned in zip(VIEWS, completed.aligned, strict=True):
+        # Large Gaussians are less exact than points.
+        assert_close(aligned.inverse, inverse_depth(camera), atol=0.03)
 
 
 def test_depth_prior__leaves_masked_pixels_out():
-    cameras = views()
-    masks = [None, *(np.arange(48)[:, None] < np.full(64, 24) for _ in range(3))]
-    prior = depth_prior(depth_maps(cameras), cameras, surface_points(cameras), masks)
-    assert np.asarray(prior.aligned[0].known)[24:].any()
-    assert not np.asarray(prior.aligned[1].known)[24:].any()
+    upper = np.repeat(np.arange(48)[:, None] < 24, 64, axis=1)
+    prior = depth_prior(depth_maps(), VIEWS, surface_points()[0], [None, upper, upper])
+    assert np.asarray(prior.aligned[0].known).all()
+    assert np.array_equal(np.asarray(prior.aligned[1].known), upper)
 
 
 def test_depth_prior__that_contradicts_the_points_is_not_used():
-    cameras = views()
-    prior = depth_prior([-relative for relative in depth_maps(cameras)], cameras, surface_points(cameras))
-    assert prior.aligned == (None,) * 4
+    prior = depth_prior([-relative for relative in depth_maps()], VIEWS, surface_points()[0])
+    assert prior.aligned == (None,) * 3
 
 
-CONFIG = FitConfig(sh_degree=0, num_gaussians=200, first_frame_steps=80)
+CONFIG = FitConfig(sh_degree=0, num_gaussians=500, first_frame_steps=100)
 
 
-def fitted(prior, config=CONFIG, start=None):
-    targets = [Target(image) for image in images_of(opaque_ball())]
-    render = RenderConfig(reproducible=True)
-    rng = np.random.default_rng(0)
-    return fit_first_frame(start or ball(100), views(), targets, 3.0, config, render, rng, prior=prior)
+def fitted(prior, config=CONFIG):
+    """Fit Gaussians that start from points whose distance from a camera is wrong by a tenth."""
+    rng, (points, rays, colors) = np.random.default_rng(0), surface_points()
+    start = from_points(points + 0.1 * rng.normal(size=(len(points), 1)) * rays, colors, 0)
+    targets, render = [Target(card(camera)[0]) for camera in VIEWS], RenderConfig(reproducible=True)
+    return fit_first_frame(start, VIEWS, targets, 3.0, config, render, np.random.default_rng(0), prior=prior)
 
 
 def held_out_psnr(gaussians):
     """Return the mean PSNR of views between and beside the training views, dB."""
-    cameras = look_at_cameras([(0, 0, -3.5), (1.6, 0, -3.2), (-1.6, 0, -3.2), (0, 1.2, -3.3)], 40)
-    shown = ([np.asarray(rasterize(each, c).color) for c in cameras] for each in (gaussians, opaque_ball()))
-    return float(np.mean([psnr(*pair) for pair in zip(*shown, strict=True)]))
+    return np.mean([psnr(np.asarray(rasterize(gaussians, c).color).clip(0, 1), card(c)[0]) for c in HELD_OUT])
 
 
 @pytest.fixture(scope="module")
@@ -190,17 +193,14 @@ def unguided():
 
 @pytest.mark.parametrize("with_points", [True, False])
 def test_fit_first_frame__has_better_held_out_views_with_depth(unguided, with_points):
-    cameras = views()
-    prior = depth_prior(depth_maps(cameras), cameras, surface_points(cameras)[:: 1 if with_points else 10**6])
+    prior = depth_prior(depth_maps(), VIEWS, surface_points()[0] if with_points else np.zeros((0, 3)))
     guided = fitted(prior)
-    print(held_out_psnr(unguided), held_out_psnr(guided.gaussians))
-    assert held_out_psnr(guided.gaussians) > held_out_psnr(unguided) + 0.2
+    assert held_out_psnr(guided.gaussians) > held_out_psnr(unguided) + 0.5
     assert {*guided.losses} == {"recon", "depth"}
 
 
 def test_fit_first_frame__without_weight_is_the_same_to_the_bit(monkeypatch):
-    cameras, rendered = views(), []
-    prior = depth_prior(depth_maps(cameras), cameras, surface_points(cameras))
+    rendered, prior = [], depth_prior(depth_maps(), VIEWS, surface_points()[0])
     config = dataclasses.replace(CONFIG, first_frame_steps=12)
     plain = fitted(None, config)
     render = ActiveView.render
@@ -219,3 +219,21 @@ def test_fit_first_frame__without_weight_is_the_same_to_the_bit(monkeypatch):
 def test_fit_config__rejects_a_negative_depth_weight():
     with pytest.raises(ValueError, match="`depth_weight` must be finite and not negative, got -1"):
         FitConfig(depth_weight=-1.0)
+
+
+def test_step__runs_the_network_of_the_settings(tmp_path):
+    """A network that returns exact colours in place of depth is still a network: its term is part of the report."""
+    fit = dataclasses.replace(
+        CONFIG, first_frame_steps=8, dropping=0.0, depth_model=str(export(tmp_path / "tiny.onnx"))
+    )
+    images = [np.rint(255 * card(camera)[0]).astype(np.uint8) for camera in VIEWS]
+    points, _, colors = surface_points()
+    reports = [
+        StreamLoop(VIEWS, points, colors, StreamConfig(fit=each)).push(images)[1]
+        for each in (fit, dataclasses.replace(fit, depth_model=None))
+    ]
+    assert [set(report.losses) for report in reports] == [{"recon", "depth"}, {"recon"}]
+    with pytest.raises(FileNotFoundError, match=r"missing\.onnx: expected an ONNX file"):
+        StreamLoop(VIEWS, points, colors, StreamConfig(fit=dataclasses.replace(fit, depth_model="missing.onnx"))).push(
+            images
+        )
