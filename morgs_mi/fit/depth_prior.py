@@ -3,7 +3,7 @@
 Few views leave open where a surface without texture lies. A network that was trained on other images estimates it, as
 relative inverse depth: what it returns is a / z + b, with an unknown scale and shift in every view. They follow from
 the capture's points in the view, by least absolute deviations, as points that other surfaces hide are outliers. A view
-with too few points is aligned later, to the depth of the Gaussians that have been fitted by then.
+with too few points is aligned several times in the course of the fit, to the depth of the Gaussians at that time.
 
 The network is an ONNX file with the signature of Depth Anything (Yang et al., CVPR 2024, and V2, NeurIPS 2024): an
 image [1, 3, H, W], normalised by ImageNet's colours, and the inverse depth [1, H, W] or [1, 1, H, W]. The package
@@ -102,11 +102,13 @@ class AlignedDepth:
         inverse: [H, W], 1 / world units.
         known: [H, W], 1 where it is known and 0 elsewhere.
         unit: inverse depth by which errors are divided, the median of what it is aligned to, 1 / world units.
+        final: whether it is aligned to points, and not to Gaussians that are still fitted.
     """
 
     inverse: Tensor
     known: Tensor
     unit: float
+    final: bool
 
     def loss(self, image: Image) -> Tensor:
         """Return the depth term of an image of the view, with depth and alpha; no gradient passes through alpha."""
@@ -126,15 +128,15 @@ class DepthPrior:
     relative: tuple[np.ndarray, ...]
     aligned: tuple[AlignedDepth | None, ...]
 
-    def completed(self, gaussians: Gaussians, views: Sequence[ActiveView]) -> DepthPrior:
-        """Return the prior with all views aligned, those without enough points to the depth of Gaussians.
+    def realigned(self, gaussians: Gaussians, views: Sequence[ActiveView]) -> DepthPrior:
+        """Return the prior with the views that have too few points aligned to the depth of Gaussians.
 
         Args:
             gaussians: that have been fitted for some steps.
             views: all views.
         """
         aligned = (
-            _aligned_to_render(relative, view, gaussians) if found is None else found
+            found if found is not None and found.final else _aligned_to_render(relative, view, gaussians)
             for found, relative, view in zip(self.aligned, self.relative, views, strict=True)
         )
         return replace(self, aligned=tuple(aligned))
@@ -197,7 +199,7 @@ def _aligned_to_points(relative: np.ndarray, camera: Camera, points: np.ndarray)
     """Return the inverse depth of a view by the points that it shows; None if they are too few."""
     _, pixels, depths = seen_points(camera, points)
     columns, rows = pixels.astype(int).T
-    return _aligned(relative, relative[rows, columns], 1 / depths)
+    return _aligned(relative, relative[rows, columns], 1 / depths, final=True)
 
 
 def _aligned_to_render(relative: np.ndarray, view: ActiveView, gaussians: Gaussians) -> AlignedDepth | None:
@@ -206,10 +208,10 @@ def _aligned_to_render(relative: np.ndarray, view: ActiveView, gaussians: Gaussi
         image = view.render(gaussians, ("depth", "alpha"))
     depth, alpha = (np.asarray(image[name], np.float64)[..., 0] for name in ("depth", "alpha"))
     drawn = (alpha > _OPAQUE) & (depth > 0)
-    return _aligned(relative, relative[drawn], 1 / depth[drawn])
+    return _aligned(relative, relative[drawn], 1 / depth[drawn], final=False)
 
 
-def _aligned(relative: np.ndarray, samples: np.ndarray, inverse: np.ndarray) -> AlignedDepth | None:
+def _aligned(relative: np.ndarray, samples: np.ndarray, inverse: np.ndarray, final: bool) -> AlignedDepth | None:
     """Return a x + b of the relative inverse depth x, with those of the samples; None if they do not determine it.
 
     A scale that is not positive means that the network and the samples contradict each other.
@@ -223,7 +225,7 @@ def _aligned(relative: np.ndarray, samples: np.ndarray, inverse: np.ndarray) -> 
         return None
     # Beyond infinity, as the sky can be where all samples are near, is infinity.
     whole, valid = np.maximum(scale * relative + shift, 0), np.isfinite(relative)
-    return AlignedDepth(_tensor(np.where(valid, whole, 0)), _tensor(valid), float(np.median(y)))
+    return AlignedDepth(_tensor(np.where(valid, whole, 0)), _tensor(valid), float(np.median(y)), final)
 
 
 def _tensor(values: np.ndarray) -> Tensor:

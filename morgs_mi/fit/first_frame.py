@@ -115,7 +115,7 @@ def fit_first_frame(
                 share = len(rounds) - rounds.index(start)
                 gaussians = _grown(gaussians, optimizer, views, targets, share, extent, config, rng)
             if start and prior is not None:
-                prior = prior.completed(gaussians.with_parameters(values_of(optimizer)), views)
+                prior = prior.realigned(gaussians.with_parameters(values_of(optimizer)), views)
             before = losses
             losses = optimise(
                 optimizer,

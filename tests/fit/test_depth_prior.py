@@ -152,8 +152,9 @@ def test_depth_prior__without_points_is_aligned_to_the_fit():
     assert prior.aligned == (None,) * 3
     points, _, colors = surface_points()
     fitted_so_far = dataclasses.replace(from_points(points, colors, 0), logit_opacities=np.full(len(points), 2.0))
-    completed = prior.completed(fitted_so_far, [ActiveView(camera) for camera in VIEWS])
-    for camera, aligned in zip(VIEWS, completed.aligned, strict=True):
+    realigned = prior.realigned(fitted_so_far, [ActiveView(camera) for camera in VIEWS])
+    for camera, aligned in zip(VIEWS, realigned.aligned, strict=True):
+        assert not aligned.final
         # Large Gaussians are less exact than points.
         assert_close(aligned.inverse, inverse_depth(camera), atol=0.03)
 
