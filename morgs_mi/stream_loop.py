@@ -25,6 +25,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.threads import in_background
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import mean_psnr
+from morgs_mi.fit.depth_prior import DepthNetwork, depth_prior
 from morgs_mi.fit.detail import gaussians_for
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.first_settings import Expected, first_settings
@@ -169,13 +170,18 @@ def _fit_first_frame(
     if fit.num_gaussians is None:
         count = gaussians_for(cameras, list(images.values()), masks, setup.points, fit.detail)
         fit = replace(fit, num_gaussians=count)
+    prior = None
+    if fit.depth_model is not None and fit.depth_weight:
+        network = DepthNetwork(fit.depth_model)
+        prior = depth_prior([network(image) for image in images.values()], cameras, setup.points, masks)
     gaussians, status = _first_gaussians(setup, images, fit, rng)
     targets = [Target(image, mask) for image, mask in zip(images.values(), masks, strict=True)]
     given = gaussians, cameras, list(images.values()), masks, targets, setup.points, setup.extent
     chosen = first_settings(*given, fit, config.render, [config.seed, 0, 1], on_step)
     before = chosen.steps_before
     tick = None if on_step is None else lambda done, steps: on_step(before + done, before + steps)
-    fitted = fit_first_frame(gaussians, cameras, targets, setup.extent, chosen.config, config.render, rng, tick)
+    start = gaussians, cameras, targets, setup.extent, chosen.config, config.render, rng, tick
+    fitted = fit_first_frame(*start, prior)
     views = list(zip(cameras, images.values(), masks, strict=True))
     own = mean_psnr(fitted.gaussians, views, config.render) if chosen.steps_before else 0.0
     expected = [replace(e, training_psnr=own) if not isinstance(e, Forecast) else e for e in chosen.expected]

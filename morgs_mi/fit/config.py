@@ -219,6 +219,11 @@ class FitConfig:
     dropping: float | None = None
     """Probability with which each step of the first frame leaves a Gaussian out (see `dropping`); None: chosen by
     cross-validation, or by the noise of fewer than `min_views` views."""
+    depth_model: str | None = None
+    """ONNX file of a network that estimates depth from one image (see `depth_prior`), as a prior of the first frame;
+    None: no prior."""
+    depth_weight: float = 0.1
+    """Weight of that prior at the start of the first frame; it falls to 0 over the planned steps."""
     sh_band_fraction: float = 1 / 30
     """Fraction of the first frame's steps after which another SH band is added, as in 3DGS."""
     confidence_steps: int = 40
@@ -264,6 +269,8 @@ class FitConfig:
             )
         if self.dropping is not None and not 0 <= self.dropping < 1:
             raise ValueError(f"FitConfig(): `dropping` must be 0 to less than 1, or None, got {self.dropping}.")
+        if not 0 <= self.depth_weight < inf:
+            raise ValueError(f"FitConfig(): `depth_weight` must be finite and not negative, got {self.depth_weight}.")
         if not 0 < self.final_rate <= 1:
             raise ValueError(f"FitConfig(): `final_rate` must be above 0 and at most 1, got {self.final_rate}.")
 

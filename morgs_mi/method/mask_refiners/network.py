@@ -22,14 +22,13 @@ from typing import Any
 import cv2
 import numpy as np
 
+from morgs_mi.io.onnx_file import imagenet_blob
 from morgs_mi.method.mask_refiners.config import MaskConfig, PromptConfig
 from morgs_mi.method.mask_refiners.opencv import clean_mask
 from morgs_mi.method.mask_refiners.registry import MASK_REFINERS, MaskRefiner
 
 __all__ = ["SegmentNetwork", "prompts"]
 
-_MEAN = np.array([0.485, 0.456, 0.406], np.float32)
-_DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
 # SAM2's own size, for an encoder that leaves it open.
 _SIZE = 1024
 # The decoder's optional mask input, which is left empty here, has a quarter of the image's side.
@@ -87,17 +86,10 @@ class SegmentNetwork:
         components = _components(mask, self._config.objects)
         if not components:
             return objects
-        features = self._encoder.run({next(iter(self._encoder.inputs)): self._blob(image)})
+        features = self._encoder.run({next(iter(self._encoder.inputs)): imagenet_blob(image, *self._size)})
         for component in components:
             objects |= self._segment(features, component)
         return objects
-
-    def _blob(self, image: np.ndarray) -> np.ndarray:
-        """Return an image as the encoder's input, [1, 3, H, W] float32."""
-        unit = image.astype(np.float32) / (255 if image.dtype == np.uint8 else 1)
-        shrinks = image.shape[1] > self._size[0]
-        unit = cv2.resize(unit, self._size, interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-        return np.ascontiguousarray(np.moveaxis((unit - _MEAN) / _DEVIATION, 2, 0)[None])
 
     def _segment(self, features: Mapping[str, np.ndarray], component: np.ndarray) -> np.ndarray:
         """Return the object [H, W] under one component: the decoder's mask with the highest predicted IoU."""

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.method.flow_sources.network import FlowNetwork, read_signature
+from morgs_mi.method.flow_sources.network import FlowNetwork
 from morgs_mi.method.flow_sources.registry import FramePair, flow_source
 from tests.assertions import assert_close
-from tests.method.flow_sources.tiny_network import export, export_lookup, known_flow
+from tests.scenes.tiny_network import export, export_lookup, known_flow
 
 # Float32 sums of six products of up to 255 each.
 TOLERANCE = 1e-3
@@ -52,12 +52,6 @@ def test_flow_network__of_fixed_size_resizes_images_and_flow(tmp_path):
     expected = known_flow(image, other) * (100 / 40, 60 / 32)
     assert flow.shape == (60, 100, 2)
     assert_close(flow[5:-5, 5:-5], expected[5:-5, 5:-5], atol=0.01)
-
-
-def test_read_signature__returns_names_and_shapes(tmp_path, network):
-    assert read_signature(network).inputs == {"image1": (1, 3, None, None), "image2": (1, 3, None, None)}
-    assert read_signature(network).outputs == ("flow_low", "flow_up")
-    assert read_signature(export(tmp_path / "fixed.onnx", 64, 96)).inputs["image2"] == (1, 3, 64, 96)
 
 
 def bad(tmp_path, name):

@@ -12,8 +12,8 @@ from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.mask_refiners.config import MaskConfig, PromptConfig
 from morgs_mi.method.mask_refiners.network import SegmentNetwork, prompts
 from morgs_mi.method.mask_refiners.registry import mask_refiner
-from tests.method.flow_sources.tiny_network import export as export_flow
 from tests.method.mask_refiners.tiny_segmenter import export_decoder, export_encoder
+from tests.scenes.tiny_network import export as export_flow
 
 pytest.importorskip("onnxruntime")
 

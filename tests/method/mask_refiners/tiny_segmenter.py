@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from onnx import helper
 
-from tests.method.flow_sources.tiny_network import write
+from tests.scenes.tiny_network import write
 
 SIZE, CELL = 1024, 4
 # Radius around a point on the object within which pixels are segmented, in pixels of the network's image.
