@@ -20,7 +20,7 @@ from morgs_mi.method.flow import FlowObservation, choose_key_views, observe_key_
 from morgs_mi.method.flow_sources.registry import FramePair
 from morgs_mi.method.objective import KeyView
 
-__all__ = ["Images", "Observation", "Seen", "Setup", "observe_frame", "prepare", "see_frame"]
+__all__ = ["FrameObservation", "Images", "Seen", "Setup", "observe_frame", "prepare", "see_frame"]
 
 # By view index: the images of those views that have one.
 Images = Mapping[int, np.ndarray]
@@ -40,7 +40,7 @@ class Seen:
 
 
 @dataclass(frozen=True, eq=False)
-class Observation:
+class FrameObservation:
     """What the images of a frame say without the Gaussians.
 
     Attributes:
@@ -131,7 +131,7 @@ def prepare(
     return Setup(tuple(cameras), copies, points.copy(), point_colors.copy(), key_views, extent, config)
 
 
-def observe_frame(setup: Setup, frame: int, before: Seen, images: Sequence[np.ndarray | None]) -> Observation:
+def observe_frame(setup: Setup, frame: int, before: Seen, images: Sequence[np.ndarray | None]) -> FrameObservation:
     """Return what the images of a frame say: changes, flow (eq. 4) and masks (eqs. 9, 10).
 
     Args:
@@ -144,7 +144,7 @@ def observe_frame(setup: Setup, frame: int, before: Seen, images: Sequence[np.nd
         ValueError: an image has another size or type than its camera, or the first frame has no image at all.
     """
     seen, changes = see_frame(setup, frame, before, images)
-    return Observation(seen, changes, *_flows(setup, frame, before.images, seen.images, changes))
+    return FrameObservation(seen, changes, *_flows(setup, frame, before.images, seen.images, changes))
 
 
 def see_frame(

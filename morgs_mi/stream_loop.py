@@ -38,7 +38,7 @@ from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.objective import Observations, channels_of, observe
-from morgs_mi.observation import Images, Observation, Seen, Setup, observe_frame, prepare, see_frame
+from morgs_mi.observation import FrameObservation, Images, Seen, Setup, observe_frame, prepare, see_frame
 
 __all__ = ["FrameReport", "StreamLoop", "StreamState", "step"]
 
@@ -105,7 +105,7 @@ class StreamState:
 def step(
     setup: Setup,
     state: StreamState,
-    images: Sequence[np.ndarray | None] | Observation,
+    images: Sequence[np.ndarray | None] | FrameObservation,
     on_step: Callable[[int, int], None] | None = None,
 ) -> tuple[StreamState, Packet, FrameReport]:
     """Fit one frame and return (state, packet, report). The function is pure: all state is in what it returns.
@@ -121,7 +121,7 @@ def step(
         ValueError: an image has another size or type than its camera, or the first frame has no image at all.
     """
     start, observed = time.perf_counter(), images
-    if not isinstance(observed, Observation):
+    if not isinstance(observed, FrameObservation):
         observed = observe_frame(setup, state.frame, state.seen, observed)
     fit = _fit_first_frame if state.coded is None else _fit_later_frame
     packet, about = fit(setup, state, observed, on_step)
@@ -138,7 +138,7 @@ def step(
 
 
 def _fit_later_frame(
-    setup: Setup, state: StreamState, observed: Observation, on_step: Callable[[int, int], None] | None
+    setup: Setup, state: StreamState, observed: FrameObservation, on_step: Callable[[int, int], None] | None
 ) -> tuple[Packet, dict[str, Any]]:
     """Return a later frame's packet and what its report says; the numbers are those of the paper's equations."""
     assert state.coded is not None
@@ -161,7 +161,7 @@ def _fit_later_frame(
 
 
 def _fit_first_frame(
-    setup: Setup, state: StreamState, observed: Observation, on_step: Callable[[int, int], None] | None
+    setup: Setup, state: StreamState, observed: FrameObservation, on_step: Callable[[int, int], None] | None
 ) -> tuple[Packet, dict[str, Any]]:
     """Return the first frame's packet and what its report says."""
     config, images, rng = setup.config, observed.seen.images, np.random.default_rng([setup.config.seed, 0])
@@ -284,7 +284,7 @@ class StreamLoop:
     ) -> None:
         self.setup = prepare(cameras, points, point_colors, config, masks)
         self.state = StreamState()
-        self._ahead: tuple[int, Future[Observation]] | None = None  # of the next frame, with its index
+        self._ahead: tuple[int, Future[FrameObservation]] | None = None  # of the next frame, with its index
 
     @property
     def gaussians(self) -> Gaussians | None:
@@ -313,7 +313,7 @@ class StreamLoop:
         self.state, packet, report = step(self.setup, self.state, observed, on_step)
         return packet, replace(report, seconds=time.perf_counter() - start)
 
-    def _observed_ahead(self, images: Sequence[np.ndarray | None]) -> Observation | None:
+    def _observed_ahead(self, images: Sequence[np.ndarray | None]) -> FrameObservation | None:
         """Return what was observed ahead of time, if it was in the same images."""
         ahead, self._ahead = self._ahead, None
         if ahead is None or ahead[0] != self.state.frame:

@@ -91,10 +91,12 @@ def search_motion(
     for part, d in _find(previous, parts, views, targets, config):
         proposal = np.where(part[:, None], d, displacement).astype(np.float32)
         around = narrowed_views(views, previous, part, [displacement, proposal])
-        new_errors = _errors(_displaced(previous, proposal), around, targets)
-        if _total(new_errors, around) < config.max_error_ratio * _total(errors, around):
+        moved = _displaced(previous, proposal)
+        before = sum(float(errors[v][views[v].crop(_drawn(view))].sum()) for v, view in around.items())
+        after = sum(float(error.sum()) for error in _errors(moved, around, targets).values())
+        if after < config.max_error_ratio * before:
             displacement, logit = proposal, np.where(part, np.maximum(logit, config.min_logit), logit)
-            errors = {**errors, **{v: np.where(_drawn(around[v]), new_errors[v], errors[v]) for v in around}}
+            errors = _errors(moved, views, targets)
     if displacement is start.displacement:
         return start
     return replace(start, displacement=displacement, logit_confidence=logit.astype(np.float32))
@@ -107,16 +109,12 @@ def _displaced(gaussians: Gaussians, d: np.ndarray) -> Gaussians:
 def _errors(
     gaussians: Gaussians, views: Mapping[int, ActiveView], targets: Mapping[int, Target]
 ) -> dict[int, np.ndarray]:
-    """Return the mean absolute error of each pixel [H, W] by view index, 0 where nothing is drawn."""
+    """Return the mean absolute error of each drawn pixel by view index, laid out as by `ActiveView.crop`."""
     return {
-        v: _uncropped(np.abs(targets[v].difference(view.render(gaussians).color, view.region)).mean(axis=-1), view)
+        v: np.abs(targets[v].difference(view.render(gaussians).color, view.region)).mean(axis=-1)
+        * view.crop(np.ones((view.camera.height, view.camera.width), np.float32))
         for v, view in views.items()
     }
-
-
-def _total(errors: Mapping[int, np.ndarray], views: Mapping[int, ActiveView]) -> float:
-    """Return the sum of the errors [H, W] over the drawn pixels of the views."""
-    return sum(float(errors[v][_drawn(view)].sum()) for v, view in views.items())
 
 
 def _unexplained_parts(
@@ -125,8 +123,7 @@ def _unexplained_parts(
     """Return the parts that are not explained, each as a mask [N]."""
     sums = np.zeros((len(gaussians), 2), np.float32)
     for v, view in views.items():
-        image = view.crop(errors[v])
-        sums += view.backproject(gaussians, np.stack([image, np.ones_like(image)], axis=-1))
+        sums += view.backproject(gaussians, np.stack([errors[v], np.ones_like(errors[v])], axis=-1))
     error, seen = sums[:, 0] / (sums[:, 1] + 1), sums[:, 1] > 1
     if not seen.any():
         return []
@@ -151,17 +148,13 @@ def _find(
     """Return those parts that are found elsewhere, each with its displacement [3]."""
     if not parts:
         return []
-    before = {v: _uncropped(np.asarray(view.render(previous).color), view) for v, view in views.items()}
+    matched = {v: _MatchedView.of(previous, view, targets[v], config.reach) for v, view in views.items()}
     found = []
     for first in range(0, len(parts), 3):
         few = parts[first : first + 3]
-        weights = {v: _blend_weights(previous, few, before[v], view) for v, view in views.items()}
+        weights = {v: view.blend_weights(previous, few) for v, view in matched.items()}
         for k, part in enumerate(few):
-            surfaces = [
-                _CostSurface.of(before[v], weights[v][..., k], targets[v].image(), view.camera, config.reach)
-                for v, view in views.items()
-                if weights[v][..., k].sum() > 1
-            ]
+            surfaces = [matched[v].cost_surface(weights[v][..., k]) for v in views if weights[v][..., k].any()]
             d = _best_displacement(np.asarray(previous.means)[part].mean(axis=0), surfaces, config)
             if d.any():
                 found.append((part, d))
@@ -202,23 +195,6 @@ class _CostSurface:
     camera: Camera
     scale: float
 
-    @classmethod
-    def of(
-        cls, before: np.ndarray, weight: np.ndarray, after: np.ndarray, camera: Camera, reach: float
-    ) -> _CostSurface:
-        """Match `before` [H, W, 3], weighted by `weight` [H, W], with `after`, on images with 2 px per grid step."""
-        margin = 4 * _GRID  # in reduced pixels: twice the grid along an axis, as its corners are farther
-        scale = min(1.0, 2 * _GRID / (reach * camera.width))
-        size = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-        before, after, weight = (cv2.resize(i, size, interpolation=cv2.INTER_AREA) for i in (before, after, weight))
-        rows, columns = np.nonzero(weight > 0.01 * weight.max())
-        box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
-        around = cv2.copyMakeBorder(after, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
-        around = around[box[0].start : box[0].stop + 2 * margin, box[1].start : box[1].stop + 2 * margin]
-        mask = np.repeat(np.sqrt(weight[box])[..., None], 3, axis=2)  # squared by OpenCV
-        cost = cv2.matchTemplate(around, before[box], cv2.TM_SQDIFF, mask=mask)
-        return cls(np.maximum(cost, 0) / scale**2, camera, scale)
-
     def at(self, center: np.ndarray, d: np.ndarray) -> np.ndarray:
         """Return the costs [K] of displacements d [K, 3] of a part around `center` [3]."""
         pixels, _ = self.camera.project(np.concatenate([center[None], center + d]))
@@ -226,23 +202,62 @@ class _CostSurface:
         return map_coordinates(self.cost, shift[:, ::-1].T, order=1, mode="nearest")
 
 
-def _blend_weights(
-    previous: Gaussians, parts: Sequence[np.ndarray], before: np.ndarray, view: ActiveView
-) -> np.ndarray:
-    """Return the blend weights m [H, W, 3] of up to three parts: what a colour gains if that of a part grows by 1."""
-    change = np.zeros_like(np.asarray(previous.sh_coeffs))
-    for k, part in enumerate(parts):
-        change[part, 0, k] = 1 / SH_C0
-    brighter = replace(previous, sh_coeffs=np.asarray(previous.sh_coeffs) + change)
-    return np.clip(_uncropped(np.asarray(view.render(brighter).color), view) - before, 0, 1)
+@dataclass(frozen=True, eq=False)
+class _MatchedView:
+    """A view in which parts are looked for, with images reduced to 2 px per step of the grid.
+
+    Attributes:
+        view: the view.
+        color: what the previous Gaussians look like where it is drawn, laid out as by `ActiveView.crop`.
+        before: the same, reduced [h, w, 3].
+        after: the target, reduced [h, w, 3].
+        scale: reduced pixels per pixel.
+    """
+
+    view: ActiveView
+    color: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    scale: float
+
+    @classmethod
+    def of(cls, previous: Gaussians, view: ActiveView, target: Target, reach: float) -> _MatchedView:
+        """Return the view with its images."""
+        scale = min(1.0, 2 * _GRID / (reach * view.camera.width))
+        color = np.asarray(view.render(previous).color)
+        return cls(view, color, _reduced(_uncropped(color, view), scale), _reduced(target.image(), scale), scale)
+
+    def blend_weights(self, previous: Gaussians, parts: Sequence[np.ndarray]) -> np.ndarray:
+        """Return m [h, w, 3] of up to three parts: what a colour gains if that of a part grows by 1."""
+        sh_coeffs = np.array(previous.sh_coeffs)
+        for k, part in enumerate(parts):
+            sh_coeffs[part, 0, k] += 1 / np.float32(SH_C0)
+        brighter = np.asarray(self.view.render(replace(previous, sh_coeffs=sh_coeffs)).color)
+        return _reduced(_uncropped(np.clip(brighter - self.color, 0, 1), self.view), self.scale)
+
+    def cost_surface(self, weight: np.ndarray) -> _CostSurface:
+        """Match the pixels of a part with the weight m [h, w], not all 0."""
+        margin = 4 * _GRID  # in reduced pixels: twice the grid along an axis, as its corners are farther
+        rows, columns = np.nonzero(weight > 0.01 * weight.max())
+        box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
+        around = cv2.copyMakeBorder(self.after, margin, margin, margin, margin, cv2.BORDER_REPLICATE)
+        around = around[box[0].start : box[0].stop + 2 * margin, box[1].start : box[1].stop + 2 * margin]
+        mask = np.repeat(np.sqrt(weight[box])[..., None], 3, axis=2)  # squared by OpenCV
+        cost = cv2.matchTemplate(around, self.before[box], cv2.TM_SQDIFF, mask=mask)
+        return _CostSurface(np.maximum(cost, 0) / self.scale**2, self.view.camera, self.scale)
+
+
+def _reduced(image: np.ndarray, scale: float) -> np.ndarray:
+    """Return an image [H, W, C], made smaller by a factor in (0, 1]."""
+    size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
+    return image if scale == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def _uncropped(image: np.ndarray, view: ActiveView) -> np.ndarray:
     """Return an image [H, W, ...] of which the view's region is drawn; the rest is 0."""
     if view.region is None:
         return image
-    nothing = np.zeros((view.camera.height, view.camera.width, *image.shape[3:]), np.float32)
-    return view.region.paste(image, nothing)
+    return view.region.paste(image, np.zeros((view.camera.height, view.camera.width, *image.shape[3:]), np.float32))
 
 
 def _drawn(view: ActiveView) -> np.ndarray:

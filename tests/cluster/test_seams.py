@@ -10,6 +10,8 @@ import pytest
 from morgs_mi.cluster.seams import SeamConfig, cross_fade, fit_seam_frame
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, reemitted_keyframe
+from morgs_mi.config import StreamConfig
+from morgs_mi.fit.config import FitConfig
 from morgs_mi.stream_loop import StreamLoop
 from tests.assertions import assert_close
 from tests.scenes.coded_clip import CAMERAS, cloud
@@ -109,3 +111,10 @@ def test_fit_config__has_other_seeds_and_rates_for_each_pass() -> None:
     first, second = (SeamConfig(rates=3).fit_config(CONFIG, number) for number in (0, 1))
     assert first.seed != second.seed
     assert first.fit.rates.scales == pytest.approx(3 * CONFIG.fit.rates.scales)
+
+
+def test_overlap_config__has_more_epochs_and_the_same_other_settings() -> None:
+    given = StreamConfig(fit=FitConfig(epochs=3))
+    found = SeamConfig(overlap_epochs=2).overlap_config(given)
+    assert found.fit.epochs == 6
+    assert replace(found, fit=given.fit) == given
