@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -18,15 +17,16 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import (
-    POOR_PSNR,
     decibels,
     reduced,
     rendered,
+    shifted,
     squared_errors,
     trial_steps,
+    verdict,
 )
 from morgs_mi.fit.first_frame import fit_first_frame
-from morgs_mi.fit.forecast import POOR_LOSS, angles_to, scene_depths
+from morgs_mi.fit.forecast import angles_to, scene_depths
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.config import RenderConfig
 
@@ -63,12 +63,7 @@ class Agreement:
         """What to expect of views between the cameras."""
         loss = self.training_psnr - self.expected_psnr
         estimate = f"about {self.expected_psnr:.0f} dB, estimated from two fits that differ there"
-        if self.expected_psnr >= POOR_PSNR and loss <= POOR_LOSS:
-            return f"Views between the cameras will have {estimate}."
-        return (
-            f"Views between the cameras will be poor: {estimate}, {loss:.0f} dB below the other views; the cameras are "
-            f"{self.spacing:.0f} degrees apart."
-        )
+        return verdict(self.expected_psnr, loss, estimate, self.spacing)
 
 
 def compare_fits(
@@ -102,7 +97,7 @@ def compare_fits(
     errors, shown = [], []
     for k, rows in enumerate(np.array_split(np.random.default_rng(seed).permutation(len(start)), NUM_FITS)):
         given = start.select(np.sort(rows)), small, targets, extent, replace(config, first_frame_steps=steps), render
-        tick = None if on_step is None else partial(_shifted, on_step, k * steps)
+        tick = None if on_step is None else shifted(on_step, k * steps)
         fitted = fit_first_frame(*given, np.random.default_rng([*seed, k]), tick).gaussians
         errors.append(squared_errors(fitted, views, render))
         shown.append(np.stack([rendered(fitted, camera, render) for camera in between]))
@@ -132,7 +127,3 @@ def _halfway(a: Camera, b: Camera) -> Camera:
     viewmat[:3, :3] = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
     viewmat[:3, 3] = -viewmat[:3, :3] @ (a.position + b.position) / 2
     return replace(a, viewmat=viewmat)
-
-
-def _shifted(on_step: Callable[[int], None], before: int, step: int, _: int) -> None:
-    on_step(before + step)

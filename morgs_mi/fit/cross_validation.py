@@ -24,7 +24,6 @@ from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 
 __all__ = [
-    "POOR_PSNR",
     "CrossValidation",
     "Trial",
     "cross_validate",
@@ -32,8 +31,10 @@ __all__ = [
     "mean_psnr",
     "reduced",
     "rendered",
+    "shifted",
     "squared_errors",
     "trial_steps",
+    "verdict",
     "withheld_views",
 ]
 
@@ -101,12 +102,7 @@ class CrossValidation:
         estimate = f"about {self.expected_psnr:.0f} dB, estimated from {', '.join(self.withheld)} in a trial without it"
         if len(self.withheld) > 1:
             estimate = estimate.removesuffix("it") + "them"
-        if self.expected_psnr >= POOR_PSNR and gap <= POOR_LOSS:
-            return f"Views between the cameras will have {estimate}."
-        return (
-            f"Views between the cameras will be poor: {estimate}, {gap:.0f} dB below the other views; the cameras are "
-            f"{self.spacing:.0f} degrees apart."
-        )
+        return verdict(self.expected_psnr, gap, estimate, self.spacing)
 
 
 def cross_validate(
@@ -141,7 +137,7 @@ def cross_validate(
     trials: list[Trial] = []
     for dropping in how.candidates:
         trial, rng = replace(config, dropping=dropping, first_frame_steps=steps), np.random.default_rng(seed)
-        tick = None if on_step is None else _shifted(on_step, len(trials) * steps)
+        tick = None if on_step is None else shifted(on_step, len(trials) * steps)
         views = [view[0] for view in trained]
         fitted = fit_first_frame(start, views, targets, extent, trial, render, rng, tick).gaussians
         trials.append(Trial(dropping, mean_psnr(fitted, judged, render), mean_psnr(fitted, trained, render)))
@@ -149,6 +145,28 @@ def cross_validate(
             break
     spacing = forecast(cameras, np.asarray(start.means)).spacing
     return CrossValidation(tuple(cameras[v].name for v in withheld), spacing, tuple(trials))
+
+
+def verdict(expected_psnr: float, loss: float, estimate: str, spacing: float) -> str:
+    """Return the sentence on views between the cameras.
+
+    Args:
+        expected_psnr: of these views, dB.
+        loss: what they have less than the training views, dB.
+        estimate: their PSNR and how it was estimated, in words.
+        spacing: mean angle from a camera to its nearest one, degrees.
+    """
+    if expected_psnr >= POOR_PSNR and loss <= POOR_LOSS:
+        return f"Views between the cameras will have {estimate}."
+    return (
+        f"Views between the cameras will be poor: {estimate}, {loss:.0f} dB below the other views; the cameras are "
+        f"{spacing:.0f} degrees apart."
+    )
+
+
+def shifted(on_step: Callable[[int], None], done: int) -> Callable[[int, int], None]:
+    """Return what a fit calls with (steps, steps in all), after `done` steps of other fits."""
+    return lambda step, _: on_step(done + step)
 
 
 def trial_steps(config: FitConfig) -> int:
@@ -169,10 +187,6 @@ def withheld_views(cameras: Sequence[Camera], share: int) -> tuple[int, ...]:
         distance = np.linalg.norm(positions[inner][:, None] - positions[chosen], axis=-1).min(axis=1)
         chosen.append(int(inner[np.argmax(distance)]))
     return tuple(sorted(chosen))
-
-
-def _shifted(on_step: Callable[[int], None], done: int) -> Callable[[int, int], None]:
-    return lambda step, _: on_step(done + step)
 
 
 def reduced(camera: Camera, image: np.ndarray, mask: np.ndarray | None, width: int) -> _View:
