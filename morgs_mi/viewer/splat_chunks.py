@@ -52,9 +52,9 @@ def packed_splats(
 class SplatChunks:
     """The Gaussians of a page.
 
-    The first change of some Gaussians distributes all over several chunks. Where later changes are scattered over the
-    chunks, Gaussians are distributed again, in the order of how often they have changed. That sends all of them once, so
-    it waits until as many rows have been sent in vain.
+    The first change of some Gaussians distributes all over several chunks. Where later changes are scattered over them,
+    Gaussians are distributed again, in the order of how often they have changed. That sends all of them once, so it
+    waits until as many rows have been sent in vain.
 
     Args:
         scene: viser's `SceneApi`.
