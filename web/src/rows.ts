@@ -109,16 +109,20 @@ function fillGeometry(state: State, rows: Uint32Array, geometry: Float32Array): 
 
 function fillCoefficients(state: State, rows: Uint32Array, K: number, sh: Uint16Array): void {
   const { values, exponents } = state;
-  const columns = values.slice(10, 10 + 3 * K);
-  const [ofBase, ofRest] = [exponents[6], exponents[7]];
-  const numbers = new Float32Array(columns.length);
-  const bits = new Uint32Array(numbers.buffer);
-  for (let k = 0, to = 0; k < rows.length; k++) {
-    const row = rows[k];
-    const [base, rest] = [TO_HALF * step(ofBase[row]), TO_HALF * step(ofRest[row])];
-    for (let c = 0; c < columns.length; c++) numbers[c] = columns[c][row] * (c < 3 ? base : rest);
-    for (let c = 0; c < columns.length; c += 3, to += COEFFICIENT) {
-      for (let i = 0; i < 3; i++) sh[to + i] = half(bits[c + i]);
+  const words = new Uint32Array(sh.buffer);
+  const color = new Float32Array(3);
+  const bits = new Uint32Array(color.buffer);
+  for (let c = 0; c < K; c++) {
+    const [red, green, blue] = values.slice(10 + 3 * c, 13 + 3 * c);
+    const exponent = exponents[c === 0 ? 6 : 7];
+    for (let k = 0, to = 2 * c; k < rows.length; k++, to += 2 * K) {
+      const row = rows[k];
+      const unit = TO_HALF * step(exponent[row]);
+      color[0] = red[row] * unit;
+      color[1] = green[row] * unit;
+      color[2] = blue[row] * unit;
+      words[to] = half(bits[0]) | (half(bits[1]) << 16);
+      words[to + 1] = half(bits[2]);
     }
   }
 }
