@@ -1,8 +1,10 @@
 """Frames of other tools as a stream: one file with Gaussians per frame, without a capture.
 
-Files do not name their Gaussians. If a frame has as many as the frame before, and nearly every row resembles the same
-row there more than the next one, the rows are taken for the same Gaussians: the frame becomes a residual, and they keep
-their ids. Otherwise it becomes a keyframe with a new set of Gaussians.
+Files do not name their Gaussians, so identities follow from the order of the rows. If a frame has as many as the frame
+before, and nearly every row resembles the same row there more than the next one, the rows are taken for the same
+Gaussians. Otherwise rows may have been removed and added: each row is matched with the most similar one of the frame
+before, and the longest sequence of matches in the order of both frames survives. If that is most of the Gaussians, the
+frame becomes a residual, and the survivors keep their ids; otherwise it becomes a keyframe with a new set of Gaussians.
 
 The header of a stream has at least one camera, on whose screen the codec measures its errors and with which players
 begin. An imported stream has one that sees the Gaussians of several frames.
@@ -11,12 +13,14 @@ begin. An imported stream has one that sees the Gaussians of several frames.
 from __future__ import annotations
 
 import re
+from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import PacketKind, StreamWriter
@@ -27,7 +31,7 @@ from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.splats import SUFFIXES, read_splats, suffix_of
 
-__all__ = ["Axes", "Imported", "default_camera", "find_frames", "import_frames", "same_gaussians"]
+__all__ = ["Axes", "Imported", "default_camera", "find_frames", "import_frames", "matched_rows", "same_gaussians"]
 
 Axes = Literal["y-down", "y-up", "z-up"]
 """Direction that is up in the files, by axis. The layout of 3D Gaussian Splatting mostly has y down."""
@@ -44,6 +48,8 @@ _MARGIN = 1.1
 _PERCENT_OUTSIDE = 2.0  # of the centres, on each side: floaters far from the scene
 # With rows of other Gaussians the share is about a half; with the same ones, only near-duplicates reduce it.
 _LEAST_SHARE = 0.95
+# Share of the smaller frame that survives at least. Of n matches in random order, about 2 sqrt(n) are a sequence.
+_LEAST_SURVIVORS = 0.8
 
 
 @dataclass(frozen=True)
@@ -98,15 +104,19 @@ def import_frames(
     in_view = np.unique(np.linspace(0, len(paths) - 1, _FRAMES_IN_VIEW).astype(int))
     cameras = [default_camera([read_splats(paths[t]) for t in in_view], axes)]
     path.parent.mkdir(parents=True, exist_ok=True)
-    coded, keyframes = None, 0
+    coded, order, keyframes = None, np.zeros(0, np.int64), 0
     metadata = {"num_frames": len(paths), "config": {"codec": asdict(config)}}
     with atomic_path(path, "import_frames()") as partial, StreamWriter(partial, cameras, fps, metadata) as writer:
         for frame, source in enumerate(paths):
             gaussians = read_splats(source)
-            if coded is not None and same_gaussians(coded.gaussians, gaussians):
-                packet = residual_packet(coded, gaussians, None, cameras, config)
-            else:
+            rows = None if coded is None else matched_rows(coded.gaussians.select(np.argsort(order)), gaussians)
+            if coded is None or rows is None:
+                order = np.arange(len(gaussians))
                 packet = keyframe_packet(gaussians, frame, cameras, config)
+            else:
+                rows = np.where(rows < 0, -1, np.argsort(order)[rows])  # of the state, where births are last
+                order = np.argsort(np.where(rows < 0, len(coded), rows), kind="stable")
+                packet = residual_packet(coded, gaussians.select(order), rows[order], cameras, config)
             coded = decode(coded, packet)
             writer.write(packet)
             keyframes += packet.kind == PacketKind.KEYFRAME
@@ -159,12 +169,45 @@ def same_gaussians(before: Gaussians, now: Gaussians) -> bool:
     """Return whether the rows of two frames are the same Gaussians, by centre, size, opacity and base colour."""
     if len(before) != len(now) or before.sh_degree != now.sh_degree or not len(now):
         return False
-    old, new = _features(before), _features(now)
-    spread = old.std(axis=0)
-    old, new = (values[:, spread > 0] / spread[spread > 0] for values in (old, new))
+    old, new = _scaled_features(before, now)
     own = np.square(new - old).sum(axis=1)
     other = np.square(new - np.roll(old, -1, axis=0)).sum(axis=1)
     return bool(np.mean(own <= other) >= _LEAST_SHARE)
+
+
+def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
+    """Return the row in the frame before of each Gaussian, -1 for births; None if the frames have other Gaussians.
+
+    Args:
+        before: N Gaussians.
+        now: M Gaussians.
+
+    Returns:
+        int64 [M]: ascending apart from the births.
+    """
+    if same_gaussians(before, now):
+        return np.arange(len(now))
+    fewer = min(len(before), len(now))
+    if before.sh_degree != now.sh_degree or not fewer:
+        return None
+    old, new = _scaled_features(before, now)
+    if not old.shape[1] or not np.isfinite(new).all():
+        return None
+    # The search takes forever among many that are equal.
+    distinct, first = np.unique(old, axis=0, return_index=True)
+    nearest = first[KDTree(distinct).query(new)[1]]
+    kept = _increasing(nearest)
+    if len(kept) < _LEAST_SURVIVORS * fewer:
+        return None
+    rows = np.full(len(now), -1)
+    rows[kept] = nearest[kept]
+    # Between two survivors with as many rows between them in both frames, those are the same ones, too.
+    ends = np.concatenate([[[-1, -1]], np.stack([kept, nearest[kept]], axis=1), [[len(now), len(before)]]])
+    gap, gap_before = np.diff(ends, axis=0).T
+    for k in np.flatnonzero((gap == gap_before) & (gap > 1)):
+        row, row_before = ends[k] + 1
+        rows[row : row + gap[k] - 1] = np.arange(row_before, row_before + gap[k] - 1)
+    return rows
 
 
 def default_camera(frames: Sequence[Gaussians], axes: Axes = "y-down") -> Camera:
@@ -190,6 +233,29 @@ def default_camera(frames: Sequence[Gaussians], axes: Axes = "y-down") -> Camera
     center = (low + high) / 2
     origin = center - distance * forward
     return Camera.look_at(origin, center, up, _FOV_X, _WIDTH, _HEIGHT, "front", near=min(0.01, float(distance) / 1000))
+
+
+def _scaled_features(before: Gaussians, now: Gaussians) -> tuple[np.ndarray, np.ndarray]:
+    """Return the features of two frames in units of their spread in the first, without those that are equal there."""
+    old, new = _features(before), _features(now)
+    spread = old.std(axis=0)
+    return old[:, spread > 0] / spread[spread > 0], new[:, spread > 0] / spread[spread > 0]
+
+
+def _increasing(numbers: np.ndarray) -> np.ndarray:
+    """Return the indices of a longest strictly increasing subsequence of integers [n]."""
+    ends: list[int] = []  # least last number of a subsequence of each length
+    lasts: list[int] = []  # its index
+    previous = np.full(len(numbers), -1)
+    for index, number in enumerate(numbers.tolist()):
+        length = bisect_left(ends, number)
+        previous[index] = lasts[length - 1] if length else -1
+        ends[length : length + 1], lasts[length : length + 1] = [number], [index]
+    found = np.empty(len(ends), np.int64)
+    index = lasts[-1] if lasts else -1
+    for place in reversed(range(len(found))):
+        found[place], index = index, previous[index]
+    return found
 
 
 def _features(gaussians: Gaussians) -> np.ndarray:

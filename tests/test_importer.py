@@ -14,7 +14,7 @@ from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.packets import coded_frames, play, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.importer import default_camera, find_frames, import_frames, same_gaussians
+from morgs_mi.importer import default_camera, find_frames, import_frames, matched_rows, same_gaussians
 from morgs_mi.io.ply import write_ply
 from tests.assertions import assert_close
 from tests.scenes.changing_splats import splats
@@ -69,7 +69,7 @@ def coded_frame(stream: StreamReader, frame: int) -> Gaussians:
     return next(gaussians for t, gaussians in play(stream) if t == frame)
 
 
-@pytest.mark.parametrize("later", [shuffled(moving(1)), moving(1).select(np.arange(N - 1)), splats(N, 0), splats(0)])
+@pytest.mark.parametrize("later", [shuffled(moving(1)), splats(N, 0), splats(0)])
 def test_import_frames__begins_a_new_set_of_other_gaussians(tmp_path, later):
     clip = write_frames(tmp_path / "clip", [moving(0), later, moving(2)])
     result = import_frames([clip], tmp_path / "s.morgs")
@@ -77,6 +77,55 @@ def test_import_frames__begins_a_new_set_of_other_gaussians(tmp_path, later):
     frames = [gaussians for _, gaussians in play(StreamReader(tmp_path / "s.morgs"))]
     assert [len(gaussians) for gaussians in frames] == [N, len(later), N]
     assert_close(frames[1].numpy()["means"], later.numpy()["means"], atol=2e-3)
+
+
+def test_import_frames__keeps_ids_where_gaussians_are_added_and_removed(tmp_path):
+    def part(frame: int, rows: np.ndarray) -> Gaussians:
+        return moving(frame).select(rows)
+
+    everything, even = np.arange(N), np.arange(0, N, 2)
+    # The rows of each frame: it grows at the end, loses rows, and gets some back in the middle.
+    shown = [everything[:200], everything[:260], everything, np.setdiff1d(everything, even[5:25])]
+    shown.append(np.union1d(shown[3], even[10:20]))
+    clip = write_frames(tmp_path / "clip", [part(t, rows) for t, rows in enumerate(shown)])
+    assert import_frames([clip], tmp_path / "s.morgs").num_keyframes == 1
+    number: dict[int, int] = {}  # id by row of `moving`
+    for coded, rows in zip(coded_frames(StreamReader(tmp_path / "s.morgs")), shown, strict=True):
+        assert len(coded) == len(rows)
+        raw, expected = coded.gaussians.numpy(), moving(coded.frame).numpy()
+        distances = np.linalg.norm(raw["means"][:, None] - expected["means"][rows], axis=2)
+        assert distances.min(axis=1).max() < 2e-3
+        nearest = rows[distances.argmin(axis=1)]
+        found = {int(row): int(number) for row, number in zip(nearest, coded.ids, strict=True)}
+        lasting = found.keys() & number.keys()
+        assert {row: found[row] for row in lasting} == {row: number[row] for row in lasting}
+        assert len(lasting) == min(len(number), len(rows) - (10 if coded.frame == 4 else 0))
+        number = found
+
+
+@pytest.mark.parametrize(
+    ("rows", "expected"),
+    [
+        (np.arange(100), np.arange(100)),
+        (np.arange(120), np.r_[0:100, [-1] * 20]),
+        (np.r_[0:40, 41:100], np.r_[0:40, 41:100]),
+        (np.r_[0:40, 45:100, 100:110], np.r_[0:40, 45:100, [-1] * 10]),
+        (np.r_[0:30, 105:110, 30:100], np.r_[0:30, [-1] * 5, 30:100]),
+        (np.r_[0:60], np.r_[0:60]),
+        (np.random.default_rng(3).permutation(100), None),
+        (np.r_[100:200], None),
+        (np.r_[0:0], None),
+    ],
+    ids=["same", "grows", "loses one", "loses and grows", "grows inside", "loses many", "shuffled", "others", "none"],
+)
+def test_matched_rows__follow_the_order_of_both_frames(rows, expected):
+    found = matched_rows(moving(0).select(np.arange(100)), moving(1).select(rows))
+    np.testing.assert_array_equal(np.array(found), np.array(expected))
+
+
+def test_matched_rows__finds_none_among_equal_gaussians():
+    copies = splats(1).select(np.zeros(50, int))
+    assert matched_rows(copies, copies.select(np.arange(49))) is None
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import re
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,56 @@ pytest.importorskip("ipykernel", reason="comes with the extra `notebooks`")
 
 ROOT = Path(__file__).parents[1]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+
+
+LONG_CALLS = {
+    "Fitting": "morgs_mi.stream_capture(capture, out, CONFIG, on_step=Bar('Fitting', 2).on_step)",
+    "Evaluating": "morgs_mi.evaluate_stream(out, progress=Bar('Evaluating'))",
+    "Tracking": "morgs_mi.track_points(stream(), [(0, 0, 0)], 0, progress=Bar('Tracking', 2))",
+    "Extracting": "morgs_mi.extract_tracks(stream(), Bar('Extracting', 2))",
+    "Writing": "write_web_page(stream(), out / 'page.html', progress=Bar('Writing', 2))",
+    "Exporting": "write_each(play(stream()), out / 'ply', '.ply', write_ply, [0, 1], Bar('Exporting'))",
+    "Importing": "import_frames([out / 'ply'], out / 'again', progress=Bar('Importing'))",
+}
+SET_UP = """
+from pathlib import Path
+from tempfile import TemporaryDirectory
+import mitsuba as mi
+mi.set_variant("llvm_ad_rgb")
+import morgs_mi
+from morgs_mi import ProgressBar as Bar
+from morgs_mi.codec.packets import play
+from morgs_mi.export.clips import write_each
+from morgs_mi.export.web import write_web_page
+from morgs_mi.importer import import_frames
+from morgs_mi.io.ply import write_ply
+from tests.scenes.changing_splats import rig, splats
+from tests.scenes.recording import CONFIG, write_recording
+folder = TemporaryDirectory()
+out = Path(folder.name) / "out"
+capture = morgs_mi.load_capture(write_recording(Path(folder.name) / "capture", 2))
+stream = lambda: morgs_mi.open_stream(out)
+"""
+
+
+def shown(cell) -> dict[str, str]:
+    """Return what a cell shows by MIME type, of several elements the last one."""
+    return {kind: data for output in cell.outputs for kind, data in output.get("data", {}).items()}
+
+
+@pytest.mark.slow
+def test_cells__show_images_streams_and_progress():
+    cells = [SET_UP, "morgs_mi.rasterize(splats(), rig()[0])", *(f"_ = {call}" for call in LONG_CALLS.values())]
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in [*cells, "stream()"]])
+    client = nbclient.NotebookClient(notebook, timeout=120, resources={"metadata": {"path": str(ROOT)}})
+    client.execute()
+    _, image, *bars, stream = notebook.cells
+    assert base64.b64decode(shown(image)["image/png"]).startswith(b"\x89PNG")
+    assert "<iframe sandbox=" in shown(stream)["text/html"]
+    for title, bar in zip(LONG_CALLS, bars, strict=True):
+        found = re.fullmatch(r'<div>(\w+) <progress value="([\d.]+)" max="([\d.]+)".*', shown(bar)["text/html"])
+        assert found is not None
+        assert (found[1], float(found[2])) == (title, float(found[3]))
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ alive, the point stays where it was and is marked as lost.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,7 +57,11 @@ class PointTracks:
 
 
 def track_points(
-    stream: StreamReader, points: ArrayLike, frame: int | ArrayLike, num_gaussians: int = 8
+    stream: StreamReader,
+    points: ArrayLike,
+    frame: int | ArrayLike,
+    num_gaussians: int = 8,
+    progress: Callable[[int], None] | None = None,
 ) -> PointTracks:
     """Return the tracks of points on the surfaces of a scene, forward and backward from the frames of their queries.
 
@@ -66,6 +70,7 @@ def track_points(
         points: query points [P, 3], world units.
         frame: the frame of each query, one for all or [P].
         num_gaussians: largest number of Gaussians to which a point is bound; 1: the one of the largest response.
+        progress: called with the number of frames done.
 
     Example:
         >>> stream = morgs_mi.open_stream("out/arm_fit")
@@ -97,6 +102,8 @@ def track_points(
         positions.append(np.einsum("pk,pki->pi", weight / np.where(total > 0, total, 1), carried))
         alive.append(total[:, 0] > 0)
         frames.append(t)
+        if progress is not None:
+            progress(len(frames))
     order = np.asarray(frames)
     tracks, living = np.stack(positions, 1), np.stack(alive, 1)
     at_query = order == queries[:, None]

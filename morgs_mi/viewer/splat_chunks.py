@@ -3,6 +3,8 @@
 viser sends the whole buffer of a splat object, but it sorts and blends the Gaussians of all objects together. So the
 Gaussians are distributed over the rows of several objects, the chunks, and a frame sends the chunks that differ. A
 Gaussian keeps its row as long as it is shown. Neighbours share a chunk, because neighbours move together.
+
+The page shows one large chunk sooner than many small ones, so there is only one until some Gaussians change.
 """
 
 from __future__ import annotations
@@ -50,8 +52,9 @@ def packed_splats(
 class SplatChunks:
     """The Gaussians of a page.
 
-    Where the changes are scattered over the chunks, Gaussians are distributed again, in the order of how often they
-    have changed. That sends all of them once, so it waits until as many rows have been sent in vain.
+    The first change of some Gaussians distributes all over several chunks. Where later changes are scattered over them,
+    Gaussians are distributed again, in the order of how often they have changed. That sends all of them once, so it
+    waits until as many rows have been sent in vain.
 
     Args:
         scene: viser's `SceneApi`.
@@ -65,6 +68,7 @@ class SplatChunks:
         self._shown = np.zeros((0, 8), np.uint32)
         self._changes = np.zeros(0, np.int64)  # how often the Gaussian in each row has changed
         self._sent_in_vain = 0
+        self._is_whole = True  # whether all are in one chunk
 
     def show(self, ids: np.ndarray, splats: np.ndarray) -> None:
         """Show Gaussians, and no others.
@@ -76,9 +80,10 @@ class SplatChunks:
         rows = self._rows_of(ids)
         if rows is None or self._sent_in_vain > len(ids):
             rows = self._distribute(ids, splats)
-        buffer = np.tile(self._empty, (len(self._ids), 1))
-        buffer[rows] = splats
-        changed = (buffer != self._shown).any(axis=1)
+        buffer, changed = self._compared(rows, splats)
+        if self._is_whole and 0 < changed.mean() < _NEARLY_ALL:
+            self._changes += changed
+            buffer, changed = self._compared(self._distribute(ids, splats), splats)
         self._shown = buffer
         per_chunk = len(buffer) // max(len(self._chunks), 1)
         sent = np.flatnonzero(changed.reshape(len(self._chunks), -1).any(axis=1))
@@ -92,6 +97,12 @@ class SplatChunks:
         """Show or hide the Gaussians."""
         for chunk in self._chunks:
             chunk.visible = visible
+
+    def _compared(self, rows: np.ndarray, splats: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the buffer with Gaussians in `rows` [N], and the mask of its rows that the page does not show."""
+        buffer = np.tile(self._empty, (len(self._ids), 1))
+        buffer[rows] = splats
+        return buffer, (buffer != self._shown).any(axis=1)
 
     def _rows_of(self, ids: np.ndarray) -> np.ndarray | None:
         """Return the row [N] of each Gaussian, free ones for those without a row; None if there are too few."""
@@ -112,16 +123,17 @@ class SplatChunks:
         return rows
 
     def _distribute(self, ids: np.ndarray, splats: np.ndarray) -> np.ndarray:
-        """Distribute Gaussians over new rows and return the row [N] of each."""
+        """Distribute Gaussians over new rows, of one chunk at first, and return the row [N] of each."""
+        self._is_whole = not self._chunks
         centers = np.ascontiguousarray(splats[:, :3]).view(np.float32)
         changes = np.zeros(len(ids), np.int64)
         _, here, before = np.intersect1d(ids, self._ids, return_indices=True)
         changes[here] = self._changes[before]
-        place = z_order(centers, equal_cells(centers)) if len(ids) else np.zeros(0, np.int64)
-        rows = np.empty(len(ids), np.int64)
-        rows[np.lexsort((place, -changes))] = np.arange(len(ids))
-        size = int(np.clip(len(ids) // _CHUNKS, _LEAST_ROWS, _MOST_ROWS))
-        count = int(np.ceil(max(len(ids) * (1 + _SPARE), 1) / size))
+        rows, needed = np.arange(len(ids)), int(np.ceil(max(len(ids) * (1 + _SPARE), 1)))
+        if len(ids) and not self._is_whole:
+            rows[np.lexsort((z_order(centers, equal_cells(centers)), -changes))] = np.arange(len(ids))
+        size = needed if self._is_whole else int(np.clip(len(ids) // _CHUNKS, _LEAST_ROWS, _MOST_ROWS))
+        count = int(np.ceil(needed / size))
         self._ids = np.full(count * size, _FREE, np.int64)
         self._ids[rows] = ids
         self._shown = np.zeros((count * size, 8), np.uint32)  # differs from every row, so that all are sent

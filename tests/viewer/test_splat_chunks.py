@@ -89,6 +89,7 @@ def test_splat_chunks__send_what_changes(scattered):
     scene, splats, ids = Scene(), random_splats(COUNT), np.arange(COUNT)
     chunks = SplatChunks(scene)
     chunks.show(ids, splats)
+    assert len(scene.chunks) == 1
     assert scene.received() < 1.15 * COUNT
     nearest = np.argsort(np.linalg.norm(splats[:, :3].view(np.float32) - 1, axis=1))
     moving = np.random.default_rng(2).permutation(COUNT)[:MOVING] if scattered else nearest[:MOVING]
@@ -98,9 +99,24 @@ def test_splat_chunks__send_what_changes(scattered):
         chunks.show(ids, splats)
         received.append(scene.received())
         np.testing.assert_array_equal(scene.splats(), in_order(splats))
-    # Scattered ones are gathered once the rows that did not change outnumber the Gaussians.
-    assert max(received[4:]) < 4 * MOVING
-    assert sum(received) < (3.5 if scattered else 2) * COUNT
+    # The first change sends all Gaussians in chunks, those that have changed in the first ones.
+    assert max(received[1:]) < 2 * MOVING
+    assert sum(received) < 2 * COUNT
+
+
+def test_splat_chunks__gather_changes_that_are_scattered_later():
+    scene, splats, ids = Scene(), random_splats(COUNT), np.arange(COUNT)
+    chunks, received = SplatChunks(scene), []
+    chunks.show(ids, splats)
+    for seed in (2, 3):
+        moving = np.random.default_rng(seed).permutation(COUNT)[:MOVING]
+        for _ in range(6):
+            splats = moved(splats, moving)
+            chunks.show(ids, splats)
+            received.append(scene.received())
+            np.testing.assert_array_equal(scene.splats(), in_order(splats))
+    # The rows that did not change outnumber the Gaussians twice, then all are sent again.
+    assert max(received[-2:]) < 4 * MOVING
 
 
 def test_splat_chunks__send_nothing_for_the_same_gaussians_and_all_for_other_colours():

@@ -7,10 +7,12 @@ interface Exports {
   heap(): number;
   open(words: number, count: number): void;
   take(n: number, column: number): number;
+  takeFlags(n: number, flags: number): number;
 }
 
-const { memory, heap, open, take } = new WebAssembly.Instance(new WebAssembly.Module(wasm)).exports as unknown as Exports;
+const { memory, heap, open, take, takeFlags } = new WebAssembly.Instance(new WebAssembly.Module(wasm)).exports as unknown as Exports;
 const PAGE = 2 ** 16;
+const BROKEN = "the range code is broken";
 
 function reserve(end: number): void {
   const missing = end - memory.buffer.byteLength;
@@ -32,7 +34,19 @@ export class ColumnReader {
   /** Decode a column of `n` integers, which are valid until the next one is decoded. */
   take(n: number): Int32Array {
     reserve(this.column + 4 * n);
-    if (!take(n, this.column)) throw new Error("the range code is broken");
+    if (!take(n, this.column)) throw new Error(BROKEN);
     return new Int32Array(memory.buffer, this.column, n);
+  }
+
+  /**
+   * Decode the flags of `n` Gaussians and return the places of those that change or die, with their flags: the first
+   * column in bits 0 to 3, the second or third one in the others. They are valid until the next column is decoded.
+   */
+  takeFlags(n: number): { places: Int32Array; flags: Int32Array } {
+    reserve(this.column + 12 * n);
+    const count = takeFlags(n, this.column);
+    if (count < 0) throw new Error(BROKEN);
+    const { buffer } = memory;
+    return { flags: new Int32Array(buffer, this.column, count), places: new Int32Array(buffer, this.column + 8 * n, count) };
   }
 }

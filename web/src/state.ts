@@ -130,11 +130,10 @@ export function applyResidual(state: State, frame: number, arrays: Arrays): Chan
   if (PER_WORD * code.length < births || coarseness > COARSEST) throw new Error("its head does not fit its code");
   const reader = new ColumnReader(code);
   const factor = quarterOctaves(coarseness);
-  const dead = new Uint8Array(state.ids.length);
-  const changes: Change[] = [];
-  for (const members of classes(state)) changes.push(applyClass(state, members, reader, factor, dead));
+  const changes = classes(state).map((members) => applyClass(state, members, reader, factor));
 
-  const freed = removeDead(state, dead);
+  const freed = changes.flatMap(({ freed }) => freed);
+  if (freed.length > 0) remove(state, freed);
   const born = births > 0 ? addBirths(state, reader, births) : new Uint32Array(0);
   state.frame = frame;
   const reused = new Set(born);
@@ -146,18 +145,14 @@ export function applyResidual(state: State, frame: number, arrays: Arrays): Chan
   };
 }
 
-/** Remove the dead from the order and return their rows, which are now free. */
-function removeDead(state: State, dead: Uint8Array): number[] {
-  const { order, free } = state;
-  const freed: number[] = [];
-  let count = 0;
-  for (let i = 0; i < order.length; i++) {
-    if (dead[order[i]] === 1) freed.push(order[i]);
-    else order[count++] = order[i];
+/** Remove Gaussians from the order; their rows are now free. */
+function remove(state: State, rows: number[]): void {
+  const dead = new Uint8Array(state.ids.length);
+  for (const row of rows) {
+    dead[row] = 1;
+    state.free.push(row);
   }
-  if (freed.length > 0) state.order = order.slice(0, count);
-  for (const row of freed) free.push(row);
-  return freed;
+  state.order = state.order.filter((row) => dead[row] === 0);
 }
 
 const buffers: Uint32Array[] = [];
@@ -170,41 +165,39 @@ function scratch(which: number, length: number): Uint32Array {
 
 /** Return the rows of the Gaussians with a confidence of at most 1/2, and of the others. */
 function classes({ order, confidence, values }: State): Uint32Array[] {
+  const still = scratch(0, order.length);
+  if (!confidence) {
+    still.set(order);
+    return [still.subarray(0, order.length), still.subarray(0, 0)];
+  }
   const logits = values[values.length - 1];
-  const still = scratch(2, order.length);
-  const moving = scratch(3, order.length);
+  const moving = scratch(1, order.length);
   let count = 0;
+  // Both are written, because a branch would often be mispredicted.
   for (let i = 0; i < order.length; i++) {
     const row = order[i];
-    if (confidence && logits[row] > 0) moving[i - count] = row;
-    else still[count++] = row;
+    still[count] = row;
+    moving[i - count] = row;
+    count += logits[row] > 0 ? 0 : 1;
   }
   return [still.subarray(0, count), moving.subarray(0, order.length - count)];
 }
 
-function applyClass(state: State, members: Uint32Array, reader: ColumnReader, factor: number, dead: Uint8Array): Change {
-  // Bits 0 to 3: the first column of flags. Bits 4 and above: the second and third one, of which each has one.
-  const flags = reader.take(members.length).slice();
-  const still = scratch(0, members.length);
-  const others = scratch(1, members.length);
-  let stillCount = 0;
-  let otherCount = 0;
-  for (let k = 0; k < flags.length; k++) {
-    if (flags[k] === 0) still[stillCount++] = k;
-    else if (flags[k] < DIED) others[otherCount++] = k;
-    else dead[members[k]] = 1;
-  }
-  addFlags(flags, still, reader.take(stillCount));
-  addFlags(flags, others, reader.take(otherCount));
-  const changed = scratch(0, members.length);
+function applyClass(state: State, members: Uint32Array, reader: ColumnReader, factor: number): Change {
+  const { places, flags } = reader.takeFlags(members.length);
+  const rows = new Uint32Array(places.length);
+  const changes = new Int32Array(places.length);
+  const freed: number[] = [];
   let count = 0;
-  for (let k = 0; k < flags.length; k++) if ((flags[k] & ~DIED) !== 0) changed[count++] = k;
-  const listed = new Uint32Array(count);
-  const changes = new Int32Array(count);
-  for (let j = 0; j < count; j++) {
-    listed[j] = members[changed[j]];
-    changes[j] = flags[changed[j]];
+  for (let j = 0; j < places.length; j++) {
+    const row = members[places[j]];
+    if (flags[j] === DIED) freed.push(row);
+    else {
+      rows[count] = row;
+      changes[count++] = flags[j];
+    }
   }
+  const listed = rows.subarray(0, count);
 
   const moved = withBit(listed, changes, 1);
   const displacements = new Float32Array(3 * moved.length);
@@ -219,11 +212,7 @@ function applyClass(state: State, members: Uint32Array, reader: ColumnReader, fa
       else add(values, touched, r, factor);
     }
   }
-  return { rows: listed, freed: [], moved, displacements };
-}
-
-function addFlags(flags: Int32Array, list: Uint32Array, more: Int32Array): void {
-  for (let j = 0; j < more.length; j++) if (more[j] !== 0) flags[list[j]] |= more[j] << 4;
+  return { rows: listed, freed, moved, displacements };
 }
 
 /** Change the means along one axis and store the displacements, in float32. */

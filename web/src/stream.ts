@@ -87,13 +87,29 @@ export function openArrays(payload: Uint8Array): Record<string, Uint8Array | Uin
   return found;
 }
 
-const CRC_TABLE = Uint32Array.from({ length: 256 }, (_, n) => {
-  for (let k = 0; k < 8; k++) n = n & 1 ? 0xedb88320 ^ (n >>> 1) : n >>> 1;
-  return n;
-});
+/** Contribution of a byte to the CRC, with 0 to 3 further bytes behind it. */
+const CRC_TABLES = Array.from({ length: 4 }, () => new Uint32Array(256));
+for (let n = 0; n < 256; n++) {
+  let crc = n;
+  for (let k = 0; k < 8; k++) crc = crc & 1 ? 0xedb88320 ^ (crc >>> 1) : crc >>> 1;
+  CRC_TABLES[0][n] = crc;
+}
+for (let n = 0; n < 256; n++) {
+  for (let k = 1; k < 4; k++) {
+    const before = CRC_TABLES[k - 1][n];
+    CRC_TABLES[k][n] = CRC_TABLES[0][before & 0xff] ^ (before >>> 8);
+  }
+}
 
+/** CRC-32 of zlib, four bytes at a time. */
 function crc32(bytes: Uint8Array, before = 0): number {
+  const [last, third, second, first] = CRC_TABLES;
   let crc = ~before;
-  for (let i = 0; i < bytes.length; i++) crc = CRC_TABLE[(crc ^ bytes[i]) & 0xff] ^ (crc >>> 8);
+  let i = 0;
+  for (; i + 4 <= bytes.length; i += 4) {
+    crc ^= bytes[i] | (bytes[i + 1] << 8) | (bytes[i + 2] << 16) | (bytes[i + 3] << 24);
+    crc = first[crc & 0xff] ^ second[(crc >>> 8) & 0xff] ^ third[(crc >>> 16) & 0xff] ^ last[crc >>> 24];
+  }
+  for (; i < bytes.length; i++) crc = last[(crc ^ bytes[i]) & 0xff] ^ (crc >>> 8);
   return ~crc >>> 0;
 }
