@@ -79,27 +79,6 @@ class Setup:
     config: StreamConfig
 
 
-@dataclass(frozen=True, eq=False)
-class Observed:
-    """What the images alone say about a later frame; made by `observe_frame`.
-
-    Attributes:
-        frame: index of the frame.
-        images: of the views that have one, by view index.
-        changes: masks of changed pixels [H, W], by view index; None: all pixels may have changed.
-        flows: optical flow of the key views that changed, by view index.
-        key_views: these views for the terms of the objective, by view index.
-        references: images that the next frame is compared with to detect changes, by view index.
-    """
-
-    frame: int
-    images: Images
-    changes: Mapping[int, np.ndarray] | None
-    flows: Mapping[int, FlowObservation]
-    key_views: Mapping[int, KeyView]
-    references: Images
-
-
 def prepare(
     cameras: Sequence[Camera],
     points: np.ndarray,

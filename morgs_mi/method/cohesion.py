@@ -5,10 +5,13 @@ beside the object it bleeds onto the background, where shadows have flow, too. B
 their surroundings in space or in colour. So the logit u_i of the confidence of each active Gaussian is replaced by z_i,
 an approximate solution of
 
-    z_i = (u_i + lambda sum_j a_ij z_j / sum_j a_ij) / (1 + lambda),    a_ij = exp(-|c_i - c_j|^2 / (2 s^2)),
+    z_i = (u_i + lambda sum_j a_ij z_j) / (1 + lambda sum_j a_ij),    a_ij = o_j exp(-|c_i - c_j|^2 / (2 s^2)),
 
-over its nearest neighbours j, where c is chromaticity, which shadows hardly change. All other Gaussians stand still.
-(A random walk on the graph of neighbours; Grady 2006 segments images so.)
+over its nearest neighbours j, where o is opacity and c is chromaticity, which shadows hardly change. All other
+Gaussians stand still. (A random walk on the graph of neighbours; Grady 2006 segments images so.)
+
+A Gaussian that resembles none of its neighbours follows its own evidence, and one that is transparent does not pull
+others along: such Gaussians gather over many frames, and all of them seem to stand still.
 """
 
 from __future__ import annotations
@@ -34,8 +37,9 @@ class CohesionConfig:
 
     neighbours: int = 12
     """Number of nearest Gaussians."""
-    weight: float = 100.0
-    """Weight lambda of the neighbours against the evidence of the Gaussian alone; 0: no cohesion."""
+    weight: float = 50.0
+    """Weight lambda of an opaque neighbour of the same colour against the evidence of the Gaussian alone; 0: no
+    cohesion."""
     chroma_scale: float = 0.03
     """Difference of chromaticity s at which the affinity has fallen to 0.61."""
     rounds: int = 150
@@ -61,15 +65,16 @@ def share_confidence(
         return logit
     _, near = KDTree(means).query(means[chosen], count, workers=-1)
     near = np.asarray(near)[:, 1:]  # the first is the Gaussian itself
-    chroma = _chromaticity(gaussians)
+    chroma, opacity = _chromaticity(gaussians), np.asarray(gaussians.opacities)
     affinity = np.exp(-np.sum((chroma[chosen][:, None] - chroma[near]) ** 2, axis=2) / (2 * config.chroma_scale**2))
-    affinity /= np.maximum(affinity.sum(axis=1, keepdims=True), 1e-6)
+    affinity = config.weight * (opacity[near] * affinity).astype(np.float32)
     starts = np.arange(0, near.size + 1, near.shape[1])
-    average = csr_array((affinity.astype(np.float32).ravel(), near.ravel(), starts), (len(chosen), len(means)))
+    neighbours = csr_array((affinity.ravel(), near.ravel(), starts), (len(chosen), len(means)))
+    total = 1 + affinity.sum(axis=1)
     everywhere = np.full(len(means), still, np.float32)
     everywhere[chosen] = logit
     for _ in range(config.rounds):
-        everywhere[chosen] = (logit + config.weight * (average @ everywhere)) / (1 + config.weight)
+        everywhere[chosen] = (logit + neighbours @ everywhere) / total
     return everywhere[chosen]
 
 

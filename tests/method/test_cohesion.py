@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from morgs_mi.core.color_space import SH_C0
+from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.cohesion import CohesionConfig, share_confidence
 from tests.scenes.gaussians import isotropic, random_sheet
 
@@ -50,18 +51,37 @@ def test_share_confidence__rejects_evidence_on_a_part_of_a_static_surface():
     assert (found < 0).mean() > 0.98
 
 
+def test_share_confidence__is_not_stopped_by_transparent_neighbours():
+    gaussians = wall_and_object(1.0, GREY)
+    rng = np.random.default_rng(2)
+    ghosts = isotropic(random_sheet(rng, 100, 0.3, 1.0), 0.05, 0.01)
+    everything = Gaussians.concatenate([gaussians, ghosts])
+    logit = np.concatenate([moving(0.7), np.full(100, STILL, np.float32)])
+    found = share_confidence(everything, np.arange(800), logit, STILL)
+    assert (found[:700][~WALL] > 0).all()
+
+
+def test_share_confidence__leaves_a_gaussian_unlike_its_neighbours_alone():
+    wall = wall_and_object(0.0, GREY)
+    red = isotropic([[0, 0, 0]], 0.05, 0.9, ((np.array([RED]) - 0.5) / SH_C0)[:, None])
+    logit = np.full(701, STILL, np.float32)
+    logit[-1] = 2.0
+    found = share_confidence(Gaussians.concatenate([wall, red]), np.arange(701), logit, STILL)
+    assert found[-1] > 1.9
+
+
 def test_share_confidence__solves_its_equation():
     gaussians = wall_and_object(0.3, RED)
-    few, many = (shared(gaussians, moving(0.5), CohesionConfig(weight=2, rounds=rounds)) for rounds in (60, 61))
+    few, many = (shared(gaussians, moving(0.5), CohesionConfig(weight=0.2, rounds=rounds)) for rounds in (60, 61))
     np.testing.assert_allclose(few, many, atol=1e-5)
     means = np.asarray(gaussians.means)
     i = 650
     near = np.argsort(np.linalg.norm(means - means[i], axis=1))[1:13]
     color = 0.5 + SH_C0 * np.asarray(gaussians.sh_coeffs)[:, 0]
     chroma = color / color.sum(axis=1, keepdims=True)
-    affinity = np.exp(-np.sum((chroma[near] - chroma[i]) ** 2, axis=1) / (2 * 0.03**2))
-    average = np.average(many[near], weights=affinity)
-    np.testing.assert_allclose(many[i], (moving(0.5)[i] + 2 * average) / 3, atol=1e-4)
+    affinity = 0.2 * 0.9 * np.exp(-np.sum((chroma[near] - chroma[i]) ** 2, axis=1) / (2 * 0.03**2))
+    expected = (moving(0.5)[i] + affinity @ many[near]) / (1 + affinity.sum())
+    np.testing.assert_allclose(many[i], expected, atol=1e-4)
 
 
 def test_share_confidence__counts_all_but_the_chosen_as_still():
