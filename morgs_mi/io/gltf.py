@@ -199,7 +199,7 @@ def read_gltf(path: str | Path) -> Gltf:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"read_gltf(): expected a glTF file, {path} does not exist; check the path.")
+        raise FileNotFoundError(f"{path}: expected a glTF file, got none; check the path.")
     try:
         reader = _Reader(path)
         reader.check()

@@ -50,8 +50,8 @@ class GltfData:
         item = self.all("accessors")[index]
         if index < 0 or (kind or item["type"]) != item["type"] or (count or item["count"]) != item["count"]:
             raise self.refused(
-                f"accessor {index}: expected {count or 'some'} elements {kind or ''}, got {item['count']} of "
-                f"{item['type']}; export it again"
+                f"accessor {index}: expected {count or item['count']} elements of {kind or item['type']}, got "
+                f"{item['count']} of {item['type']}; export it again"
             )
         columns, dtype = _COLUMNS[item["type"]], np.dtype(_TYPES[item["componentType"]])
         check_claim(self.path, 8 * item["count"] * columns, f"an accessor of {item['count']} elements")

@@ -66,10 +66,6 @@ class Disturbances:
     jpeg_quality: int = 0
     """Quality from 1 to 100 of the JPEG compression of every image; 0: none."""
 
-    def __post_init__(self) -> None:
-        for name, interval in _INTERVALS.items():
-            check_number("Disturbances()", name, getattr(self, name), interval)
-
 
 @dataclass(frozen=True)
 class CameraDisturbance:
@@ -103,7 +99,13 @@ class CameraDisturbance:
 def draw_disturbances(
     disturbances: Disturbances, num_cameras: int, num_frames: int, seed: int
 ) -> tuple[CameraDisturbance, ...]:
-    """Return the disturbance of each camera; a setting changes nothing but its own draws."""
+    """Return the disturbance of each camera; a setting changes nothing but its own draws.
+
+    Raises:
+        ValueError: a setting is out of range.
+    """
+    for name, interval in _INTERVALS.items():
+        check_number("draw_disturbances()", name, getattr(disturbances, name), interval)
     d, shape = disturbances, (num_cameras, num_frames)
     offsets, gains, drifts, flicker, lenses = (np.random.default_rng([seed, 3, kind]) for kind in range(5))
     offset = d.time_offset * offsets.uniform(-1, 1, num_cameras)

@@ -44,7 +44,7 @@ def gltf_scene(path: str | Path, animation: str | None = None, seed: int = 0) ->
     """
     path = Path(path)
     model = read_gltf(path)
-    drawn = [i for i in model.order if model.nodes[i].drawn and model.nodes[i].mesh >= 0]
+    drawn = [i for i, node in enumerate(model.nodes) if node.drawn and node.mesh >= 0]
     if not drawn:
         raise ValueError(f"{path}: expected a mesh in the scene, got none; export the objects with the animation.")
     played = _chosen(path, model, animation)
@@ -71,7 +71,7 @@ def _chosen(path: Path, model: Gltf, name: str | None) -> Animation:
         if animation.name == name:
             return animation
     known = ", ".join(repr(animation.name) for animation in model.animations)
-    raise ValueError(f"{path}: `animation` must be one of {known}, got {name!r}.")
+    raise ValueError(f"gltf_scene(): `animation` must be one of {known} of {path}, got {name!r}; choose one of them.")
 
 
 def _placement(

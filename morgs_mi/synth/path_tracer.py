@@ -196,6 +196,7 @@ class PathTracer:
             lens: its distortion; None for a pinhole.
         """
         sampler: Any = mi.load_dict({"type": "multijitter", "sample_count": spp})
+        spp = sampler.sample_count()  # which it has rounded up
         sampler.set_samples_per_wavefront(spp)
         sampler.seed(seed, len(rows) * camera.width * spp)
         # The samples of a pixel follow one another.
