@@ -34,6 +34,7 @@ from morgs_mi.synth.disturbances import (
 from morgs_mi.synth.gltf_scene import gltf_scene
 from morgs_mi.synth.ground_truth import Tracks, compute_ground_truth, move_with_objects, save_tracks, save_truth
 from morgs_mi.synth.path_tracer import PathTracer, developed
+from morgs_mi.synth.recording import check_lenses, record_light
 from morgs_mi.synth.scene import DeformingObject, Scene, check_scene, load_scene
 
 __all__ = ["synthesize"]
@@ -41,8 +42,6 @@ __all__ = ["synthesize"]
 _LOG = logging.getLogger(__name__)
 _NUM_SFM_POINTS = 8000
 _NUM_TRACKS = 2000
-# Rows that a rolling shutter reads at one time; at 10 pixels a frame, objects move by 0.2 pixels meanwhile.
-_BAND = 4
 
 
 def synthesize(
@@ -106,22 +105,7 @@ def synthesize(
             f"synthesize(): a vectorised variant is needed, got {mi.variant()!r}; "
             'call mitsuba.set_variant("llvm_ad_rgb") first.'
         )
-    lowest = {
-        "num_cameras": (num_cameras, 2),
-        "num_frames": (num_frames, 1),
-        "spp": (spp, 1),
-        "seed": (seed, 0),
-    }
-    for name, (value, least) in lowest.items():
-        if value is not None and value < least:
-            raise ValueError(f"synthesize(): `{name}` must be at least {least}, got {value}.")
-    if min(width, height) < 2 or width % 2 or height % 2:
-        raise ValueError(f"synthesize(): `width` and `height` must be even, got {width}x{height}.")
-    if not (np.isfinite(fps) and fps > 0):
-        raise ValueError(f"synthesize(): `fps` must be positive, got {fps}.")
-    if noise is not None and not 0 <= noise < 1:
-        raise ValueError(f"synthesize(): `noise` must be at least 0 and below 1, got {noise}.")
-
+    _check_arguments(num_cameras, num_frames, width, height, spp, noise, fps, seed)
     scene = _loaded(scene, animation, seed)
     num_cameras = scene.recording.num_cameras if num_cameras is None else num_cameras
     spp = scene.recording.spp if spp is None else spp
@@ -129,9 +113,15 @@ def synthesize(
     cameras = scene.rig.cameras(num_cameras, width, height)
     disturbances = disturbances or Disturbances()
     disturbed = draw_disturbances(disturbances, num_cameras, num_frames, seed)
-    _check_lenses(cameras, disturbed)
+    check_lenses(cameras, disturbed)
     frames = np.arange(num_frames + 1)
-    check_scene(scene, sorted({float(f + d.time_offset) / fps for f in frames for d in disturbed}))
+    read = {
+        t
+        for f in range(num_frames + 1)
+        for d in disturbed
+        for t in (f + d.time_offset, *d.row_times(f, height)[[0, -1]])
+    }
+    check_scene(scene, [float(time) / fps for time in sorted(read)])
     _check_folder(Path(out), overwrite)
     check_output(Path(out).resolve().parent)
     with atomic_path(out, "synthesize()") as folder:
@@ -145,7 +135,7 @@ def synthesize(
             for frame in range(num_frames):
                 # The noise must differ between views and frames; otherwise it would look like a moving texture.
                 noise_seed = int(np.random.SeedSequence([seed, index, frame]).generate_state(1)[0])
-                light = _record(tracer, cameras[index], disturbed[index], frame, fps, spp, noise_seed)
+                light = record_light(tracer, cameras[index], disturbed[index], frame, fps, spp, noise_seed)
                 image = developed(disturbed[index].gains[frame] * light, noise, noise_seed)
                 yield compressed(image, disturbed[index].jpeg_quality)
                 done += 1
@@ -186,6 +176,33 @@ def synthesize(
     return Path(out)
 
 
+def _check_arguments(
+    num_cameras: int | None,
+    num_frames: int,
+    width: int,
+    height: int,
+    spp: int | None,
+    noise: float | None,
+    fps: float,
+    seed: int,
+) -> None:
+    lowest = {
+        "num_cameras": (num_cameras, 2),
+        "num_frames": (num_frames, 1),
+        "spp": (spp, 1),
+        "seed": (seed, 0),
+    }
+    for name, (value, least) in lowest.items():
+        if value is not None and value < least:
+            raise ValueError(f"synthesize(): `{name}` must be at least {least}, got {value}.")
+    if min(width, height) < 2 or width % 2 or height % 2:
+        raise ValueError(f"synthesize(): `width` and `height` must be even, got {width}x{height}.")
+    if not (np.isfinite(fps) and fps > 0):
+        raise ValueError(f"synthesize(): `fps` must be positive, got {fps}.")
+    if noise is not None and not 0 <= noise < 1:
+        raise ValueError(f"synthesize(): `noise` must be at least 0 and below 1, got {noise}.")
+
+
 def _loaded(scene: str | Path | Scene, animation: str | None, seed: int) -> Scene:
     """Return a scene, or load that of a file or a name."""
     if not isinstance(scene, Scene) and Path(scene).suffix.lower() in (".glb", ".gltf"):
@@ -193,37 +210,6 @@ def _loaded(scene: str | Path | Scene, animation: str | None, seed: int) -> Scen
     if animation is not None:
         raise ValueError("synthesize(): `animation` is for glTF files, got another scene; leave it out.")
     return scene if isinstance(scene, Scene) else load_scene(scene, seed)
-
-
-def _check_lenses(cameras: Sequence[Camera], disturbed: Sequence[CameraDisturbance]) -> None:
-    """Raise `ValueError` if a lens shows no point of the scene in the corners of its image."""
-    for camera, own in zip(cameras, disturbed, strict=True):
-        if own.distortion < 0:
-            corner = np.linalg.norm(camera.K[:2, 2] / np.diag(camera.K)[:2])
-            # r (1 + k r^2) grows up to r = 1 / sqrt(-3 k).
-            largest = 2 / (3 * np.sqrt(-3 * own.distortion))
-            if not corner < 0.98 * largest:
-                raise ValueError(
-                    f"synthesize(): `distortion` must be small enough for the field of view, got {own.distortion:.3g} "
-                    f"with corners at the radius {corner:.3g}, which must be below {largest:.3g}; set a smaller one."
-                )
-
-
-def _record(
-    tracer: PathTracer, camera: Camera, own: CameraDisturbance, frame: int, fps: float, spp: int, seed: int
-) -> np.ndarray:
-    """Return the light of a frame, linear [H, W, 3], as a camera with its clock, shutter and lens records it."""
-    if not own.rolling_shutter and not own.distortion:
-        tracer.set_time((frame + own.time_offset) / fps)
-        return tracer.light(camera, spp, seed)
-    bands = np.arange(camera.height), own.row_times(frame, camera.height)
-    count = -(-camera.height // _BAND) if own.rolling_shutter else 1
-    light = []
-    for band, (rows, times) in enumerate(zip(*(np.array_split(values, count) for values in bands), strict=True)):
-        tracer.set_time(times.mean() / fps)
-        band_seed = int(np.random.SeedSequence([seed, band]).generate_state(1)[0])
-        light.append(tracer.light_of_rows(camera, rows, spp, band_seed, own.lens))
-    return np.concatenate(light)
 
 
 def _check_views(tracer: PathTracer, cameras: Sequence[Camera]) -> None:
