@@ -228,5 +228,5 @@ def test_synthesize__checks_a_scene_at_all_times_that_are_recorded(tmp_path: Pat
     """A pose that fails before 0 s, when a rolling shutter reads the first rows of the first frame."""
     late = bar_scene(0.0).objects["bar"].shapes
     scene = Scene("late", {"bar": Object(late, lambda t: translate(1 / (t >= 0), 0, 0))}, {}, Rig())
-    with pytest.raises(ValueError, match="object 'bar': its pose at -0.0083.* s fails with ZeroDivisionError"):
+    with pytest.raises(ValueError, match=r"object 'bar': its pose at -0\.0083.* s fails with ZeroDivisionError"):
         synthesize(scene, tmp_path / "clip", **{**SIZE, "height": 1000}, disturbances=Disturbances(rolling_shutter=0.5))
