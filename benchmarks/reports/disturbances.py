@@ -2,8 +2,8 @@
 
     python -m benchmarks.reports.disturbances fox.glb --json out.json
 
-Each cell is the same animation from the same cameras with one kind of disturbance. Scores are means over the later frames
-of the held-out view, which is the reference: it has no time offset, and the right exposure.
+Each cell is the same animation from the same cameras with one kind of disturbance. Scores are means over the later
+frames of the held-out view, which is the reference: it has no time offset, and the right exposure.
 """
 
 from __future__ import annotations

@@ -203,7 +203,9 @@ class PathTracer:
         corners = np.stack(np.meshgrid(np.arange(camera.width), rows), axis=-1).reshape(-1, 1, 2)
         pixels = corners + np.array(sampler.next_2d()).T.reshape(len(corners), -1, 2)
         origin, directions = camera.rays(undistorted(camera, lens, pixels.reshape(-1, 2)))
-        ray: Any = mi.RayDifferential3f(mi.Point3f(*map(float, origin)), mi.Vector3f(directions.T))
+        # As an array, because a literal would be compiled into a kernel of its own for every camera.
+        origins = np.repeat(origin[:, None], len(directions), axis=1)
+        ray: Any = mi.RayDifferential3f(mi.Point3f(origins), mi.Vector3f(directions.T))
         light = np.array(self._integrator.sample(self._scene, sampler, ray, None, mi.Bool(True))[0])
         return self._exposure * light.T.reshape(len(rows), camera.width, -1, 3).mean(axis=2)
 
