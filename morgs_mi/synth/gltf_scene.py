@@ -101,6 +101,8 @@ def _object(
     starts = np.cumsum([0, *counts])
     meshes = {f"mesh{i}": _mesh(p, int(starts[i]), uvs, materials) for i, p in enumerate(primitives)}
 
+    # The ground truth of a frame needs its vertices several times, and those of its neighbours.
+    @lru_cache(maxsize=4)
     def shape(time: float) -> Deformed:
         return deform(model, index, posed(time), placed)
 

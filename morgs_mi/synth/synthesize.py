@@ -115,13 +115,9 @@ def synthesize(
     disturbed = draw_disturbances(disturbances, num_cameras, num_frames, seed)
     check_lenses(cameras, disturbed)
     frames = np.arange(num_frames + 1)
-    read = {
-        t
-        for f in range(num_frames + 1)
-        for d in disturbed
-        for t in (f + d.time_offset, *d.row_times(f, height)[[0, -1]])
-    }
-    check_scene(scene, [float(time) / fps for time in sorted(read)])
+    # Each frame and the one after the last, and the first and the last row that any camera reads.
+    read = [d.row_times(f, height)[row] for d in disturbed for f, row in ((0, 0), (num_frames, -1))]
+    check_scene(scene, [float(frame) / fps for frame in sorted({*frames.tolist(), min(read), max(read)})])
     _check_folder(Path(out), overwrite)
     check_output(Path(out).resolve().parent)
     with atomic_path(out, "synthesize()") as folder:
