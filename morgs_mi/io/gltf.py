@@ -275,7 +275,16 @@ class _Reader(GltfData):
         )
 
     def check_node(self, index: int, node: Node, meshes: Sequence[Sequence[Primitive]], skins: Sequence[Skin]) -> None:
-        if node.mesh < 0 or node.skin < 0:
+        self.check_rotations(f"node {index}", node.rotation)
+        if node.mesh < 0:
+            return
+        counts = {len(primitive.targets) for primitive in meshes[node.mesh]}
+        if len(counts) > 1:
+            raise self.refused(
+                f"mesh {node.mesh}: expected as many morph targets in all its primitives, got {sorted(counts)}; export "
+                "it again"
+            )
+        if node.skin < 0:
             return
         for primitive in meshes[node.mesh]:
             if primitive.joints is None or primitive.joints.max(initial=0) >= len(skins[node.skin].joints):
@@ -301,6 +310,8 @@ class _Reader(GltfData):
             raise self.refused(
                 f"mesh {mesh}: expected triangles, got primitives of mode {item['mode']}; export triangles only"
             )
+        if (material := item.get("material", -1)) not in range(-1, len(self.all("materials"))):
+            raise self.refused(f"mesh {mesh}: expected a material of the file, got {material}; export it again")
         attributes = item["attributes"]
         positions = self.accessor(attributes["POSITION"], "VEC3")
         count = len(positions)
@@ -325,7 +336,7 @@ class _Reader(GltfData):
             _normalized(np.concatenate(weights, axis=1)) if sets else None,
             self.displacements(targets, "POSITION", count),
             self.displacements(targets, "NORMAL", count),
-            item.get("material", -1),
+            int(material),
         )
 
     def displacements(self, targets: list[dict[str, int]], name: str, count: int) -> np.ndarray:
@@ -353,7 +364,15 @@ class _Reader(GltfData):
                 f"animation {name!r}, {path} of node {node}: expected ascending times with a value of {columns} "
                 f"numbers each, got {len(times)} times, {values.size} numbers and {interpolation}; export it again"
             )
-        return Channel(node, path, times, values.reshape(shape), interpolation)
+        values = values.reshape(shape)
+        if path == "rotation":
+            self.check_rotations(f"animation {name!r}", values[:, 1] if interpolation == "CUBICSPLINE" else values)
+        return Channel(node, path, times, values, interpolation)
+
+    def check_rotations(self, where: str, quaternions: np.ndarray) -> None:
+        """Raise `ValueError` if quaternions [..., 4] are zero, which no rotation is."""
+        if not np.linalg.norm(quaternions, axis=-1).all():
+            raise self.refused(f"{where}: expected quaternions of length 1 as rotations, got zeros; export it again")
 
     def material(self, item: dict[str, Any]) -> Material:
         surface = item.get("pbrMetallicRoughness", {})

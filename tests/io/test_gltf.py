@@ -85,6 +85,22 @@ WRONG: dict[str, tuple[Callable[[Builder], object], str]] = {
     ),
     "version": (lambda b: b.document.update(asset={"version": "1.0"}), "expected glTF 2.0, got 1.0"),
     "lines": (lambda b: primitive(b).update(mode=1), "mesh 0: expected triangles, got primitives of mode 1"),
+    "rotations": (
+        lambda b: b.document["animations"][0]["samplers"][0].update(output=b.array(np.zeros((2, 4)))),
+        "animation 'bend': expected quaternions of length 1 as rotations, got zeros",
+    ),
+    "rotation": (
+        lambda b: b.document["nodes"][1].update(rotation=[0, 0, 0, 0]),
+        "node 1: expected quaternions of length 1",
+    ),
+    "targets": (
+        lambda b: b.document["meshes"][1]["primitives"].append(b.document["meshes"][2]["primitives"][0]),
+        r"mesh 1: expected as many morph targets in all its primitives, got \[0, 1\]",
+    ),
+    "material": (
+        lambda b: primitive(b).update(material=2),
+        "mesh 0: expected a material of the file, got 2",
+    ),
     "vertices": (
         lambda b: primitive(b)["attributes"].update(TEXCOORD_0=0),
         "accessor 0: expected 24 elements of VEC2, got 24 of VEC3",
