@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, ClassVar
 
-from tyro.conf import DisallowNone, Positional
+from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
-from morgs_mi.cli.settings import Flag
+from morgs_mi.cli.settings import Flag, optional
+from morgs_mi.synth.disturbances import Disturbances
 
 __all__ = ["Synth"]
 
@@ -20,7 +21,8 @@ class Synth:
     """Path-trace a moving scene into a multi-view capture with exact ground truth."""
 
     scene: Positional[str]
-    """Name of a scene (spheres, arm, thin, flicker, random), or path of a Python file with a function build(seed)."""
+    """Name of a scene (spheres, arm, thin, flicker, random), or path of an animated glTF file (.glb, .gltf) or of a
+    Python file with a function build(seed)."""
     out: Positional[Path]
     """New folder for the capture."""
     cameras: Annotated[int | None, DisallowNone] = None
@@ -40,8 +42,12 @@ class Synth:
     """Frames per second."""
     lossless: bool = True
     """Also write the frames as PNG files, which are read in place of the compressed videos."""
+    animation: Annotated[str | None, optional("NAME")] = None
+    """Animation of a glTF file; its first, if not given."""
+    disturbances: Annotated[Disturbances, arg(name="")] = field(default_factory=Disturbances)
+    """Disturbances of the recording."""
     seed: int = 0
-    """Seed of textures, sampling noise and the choice of points; of everything in the scene random."""
+    """Seed of textures, sampling noise, disturbances and the choice of points; of everything in the scene random."""
     overwrite: Flag = False
     """Replace an earlier synthetic capture in OUT."""
 
@@ -62,6 +68,8 @@ class Synth:
                 noise=self.noise,
                 fps=self.fps,
                 lossless=self.lossless,
+                disturbances=self.disturbances,
+                animation=self.animation,
                 seed=self.seed,
                 overwrite=self.overwrite,
                 progress=lambda done, total: report("Path-tracing", done, total),

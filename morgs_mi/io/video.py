@@ -26,6 +26,7 @@ __all__ = [
     "FrameReader",
     "ImageOrError",
     "VideoReader",
+    "decode_image",
     "natural_key",
     "numbering_gap",
     "open_clips",
@@ -430,7 +431,20 @@ def _read_image(file: Path) -> np.ndarray:
 
 
 def _decoded(file: Path, mode: int) -> np.ndarray:
-    data = np.fromfile(fetched(file), np.uint8)
+    return decode_image(file, np.fromfile(fetched(file), np.uint8), mode)
+
+
+def decode_image(file: Path, data: np.ndarray, mode: int) -> np.ndarray:
+    """Return the image in the bytes of a file, or of a part of it, decoded by OpenCV with `mode`.
+
+    Args:
+        file: the file, for messages and its size.
+        data: uint8 [N].
+        mode: of `cv2.imdecode`.
+
+    Raises:
+        ValueError: the bytes are no image, or claim more pixels than the file may hold.
+    """
     width, height = _claimed_size(data[:_MAX_HEADER].tobytes())
     check_claim(file, _BYTES_PER_PIXEL * width * height, f"{width}x{height} pixels")
     image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None

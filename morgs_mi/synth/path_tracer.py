@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import linear_to_srgb
-from morgs_mi.synth.scene import Scene
+from morgs_mi.synth.disturbances import undistorted
+from morgs_mi.synth.ground_truth import SurfacePoints
+from morgs_mi.synth.scene import Deformed, DeformingObject, Mesh, Object, Scene
 
-__all__ = ["PathTracer", "srgb_bytes"]
+__all__ = ["PathTracer", "developed", "srgb_bytes"]
 
 # Share of a point's distance in which a hit is its own surface: intersections are single-precision.
 _OWN_SURFACE = 1e-4
@@ -27,6 +31,19 @@ def srgb_bytes(linear: np.ndarray, noise: np.ndarray | float = 0.0) -> np.ndarra
     return np.rint(255 * np.clip(encoded + noise, 0, 1)).astype(np.uint8)
 
 
+def developed(linear: np.ndarray, noise: float, seed: int) -> np.ndarray:
+    """Return exposed light [H, W, 3] as an image, sRGB-encoded [H, W, 3], uint8.
+
+    Args:
+        linear: the light, of which 1 is white.
+        noise: standard deviation of the sensor noise per channel, relative to white. It does not depend on the
+            brightness: photon noise grows with the square root of the light, which the sRGB encoding approximates.
+        seed: of the noise.
+    """
+    grain = noise * np.random.default_rng([seed, 1]).standard_normal(linear.shape) if noise else 0.0
+    return srgb_bytes(linear, grain)
+
+
 def _load(name: str, content: dict[str, Any]) -> Any:
     try:
         return mi.load_dict(content, optimize=False)
@@ -36,11 +53,41 @@ def _load(name: str, content: dict[str, Any]) -> Any:
         raise ValueError(f"scene {name!r}: Mitsuba cannot load it: {reason}; correct the dictionary.") from error
 
 
+def _mesh(place: str, name: str, mesh: Mesh, used: np.ndarray, faces: np.ndarray) -> Any:
+    """Return a Mitsuba mesh of the vertices `used` of an object; `faces` [F, 3] index into these."""
+    props = mi.Properties()
+    props["bsdf"] = _load(place, mesh.bsdf)
+    props["face_normals"] = not mesh.smooth
+    loaded: Any = mi.Mesh(name, len(used), len(faces), props, mesh.smooth, mesh.uvs is not None)
+    params: Any = mi.traverse(loaded)
+    params["faces"] = mi.UInt32(faces.ravel())
+    if mesh.uvs is not None:
+        params["vertex_texcoords"] = mi.Float(mesh.uvs[used].ravel())
+    params.update()
+    return loaded
+
+
+def _pose_of(item: Object | DeformingObject, time: float) -> np.ndarray | Deformed:
+    if isinstance(item, DeformingObject):
+        return item.shape(time)
+    return np.eye(4) if item.pose is None else item.pose(time)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A mesh of a deforming object in Mitsuba: its name, its object, and the object's vertices that it has [V]."""
+
+    name: str
+    owner: str
+    used: np.ndarray
+    smooth: bool
+
+
 class PathTracer:
     """Path tracer of a scene at one time.
 
-    The scene is loaded once. Moving objects are instances of which only the transforms change, so all views and frames
-    run the same kernels.
+    The scene is loaded once. Moving objects are instances of which only the transforms change, or meshes of which only
+    the vertices do, so all views and frames run the same kernels.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -52,8 +99,18 @@ class PathTracer:
         self.scene = scene
         content: dict[str, Any] = {"type": "scene", **{name: light.shape for name, light in scene.lights.items()}}
         owners: dict[str, int] = {}
+        faces: dict[str, np.ndarray] = {}
+        self._parts: list[_Part] = []
         for index, (name, item) in enumerate(scene.objects.items()):
-            if item.pose is None:
+            if isinstance(item, DeformingObject):
+                shapes = {}
+                for part, mesh in item.meshes.items():
+                    used, own = np.unique(mesh.faces, return_inverse=True)
+                    known = f"{name}_{part}"
+                    self._parts.append(_Part(known, name, used, mesh.smooth))
+                    faces[known] = mesh.faces
+                    shapes[known] = _mesh(scene.name, known, mesh, used, own.reshape(-1, 3))
+            elif item.pose is None:
                 shapes = {f"{name}_{part}": shape for part, shape in item.shapes.items()}
             else:
                 content[f"{name}_group"] = {"type": "shapegroup", **item.shapes}
@@ -62,7 +119,8 @@ class PathTracer:
             owners |= dict.fromkeys(shapes, index)
         # The optimisation would merge meshes that share a material, even those of different objects.
         self._scene: Any = _load(scene.name, content)
-        self._owners = [(mi.ShapePtr(s), owners[s.id()]) for s in self._scene.shapes() if s.id() in owners]
+        shapes = [shape for shape in self._scene.shapes() if shape.id() in owners]
+        self._owners = [(mi.ShapePtr(shape), owners[shape.id()], faces.get(shape.id())) for shape in shapes]
         self._params: Any = mi.traverse(self._scene)
         moving = {name: light.pose for name, light in scene.lights.items() if light.pose is not None}
         self._lamps = {f"{name}.to_world": (pose, self._lamp_transform(name)) for name, pose in moving.items()}
@@ -85,19 +143,28 @@ class PathTracer:
             )
         return np.array(self._params[f"{light}.to_world"].matrix, float).reshape(4, 4)
 
-    def poses(self, time: float) -> list[np.ndarray]:
-        """Return each object's pose [4, 4] at `time` in seconds."""
-        return [np.eye(4) if item.pose is None else item.pose(time) for item in self.scene.objects.values()]
+    def poses(self, time: float) -> list[np.ndarray | Deformed]:
+        """Return each object's pose [4, 4], or its vertices, at `time` in seconds."""
+        return [_pose_of(item, time) for item in self.scene.objects.values()]
 
     def set_time(self, time: float) -> None:
         """Set the poses of all objects and lamps, and the exposure, to those at `time` in seconds."""
         for name, item in self.scene.objects.items():
-            if item.pose is not None:
+            if isinstance(item, DeformingObject):
+                self._set_shape(name, item.shape(time))
+            elif item.pose is not None:
                 self._params[f"{name}.to_world"] = mi.Transform4f(item.pose(time))
         for name, (pose, transform) in self._lamps.items():
             self._params[name] = mi.Transform4f(pose(time) @ transform)
         self._params.update()
         self._exposure = 1.0 if self.scene.exposure is None else self.scene.exposure(time)
+
+    def _set_shape(self, name: str, shape: Deformed) -> None:
+        for part in self._parts:
+            if part.owner == name:
+                self._params[f"{part.name}.vertex_positions"] = mi.Float(shape.vertices[part.used].ravel())
+                if part.smooth and shape.normals is not None:
+                    self._params[f"{part.name}.vertex_normals"] = mi.Float(shape.normals[part.used].ravel())
 
     def render(self, camera: Camera, spp: int, seed: int, noise: float = 0.0) -> np.ndarray:
         """Return the path-traced view, sRGB-encoded [H, W, 3], uint8.
@@ -106,31 +173,59 @@ class PathTracer:
             camera: the view.
             spp: samples per pixel.
             seed: of the samples and the noise.
-            noise: standard deviation of the sensor noise per channel, relative to white. It does not depend on the
-                brightness: photon noise grows with the square root of the light, which the sRGB encoding approximates.
+            noise: standard deviation of the sensor noise per channel, as for `developed`.
         """
+        return developed(self.light(camera, spp, seed), noise, seed)
+
+    def light(self, camera: Camera, spp: int, seed: int) -> np.ndarray:
+        """Return the exposed light of a view, linear [H, W, 3]."""
         sampler = {"type": "multijitter", "sample_count": spp}
         sensor: Any = mi.load_dict({**camera.sensor(), "sampler": sampler})
         render: Any = mi.render  # annotated with Dr.Jit's types, called with Python's
         linear = render(self._scene, sensor=sensor, integrator=self._integrator, spp=spp, seed=seed)
-        linear = self._exposure * np.array(linear)[..., :3]
-        grain = noise * np.random.default_rng([seed, 1]).standard_normal(linear.shape) if noise else 0.0
-        return srgb_bytes(linear, grain)
+        return self._exposure * np.array(linear)[..., :3]
 
-    def surface_points(self, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-        """Return the surface points [H, W, 3] at the pixel centres, and the ids of their objects [H, W].
+    def light_of_rows(self, camera: Camera, rows: np.ndarray, spp: int, seed: int, lens: Lens | None) -> np.ndarray:
+        """Return the exposed light of some rows of an image that a lens has distorted, linear [R, W, 3].
 
-        Where there is no surface, or a lamp, the id is -1 and the point is meaningless.
+        Args:
+            camera: the view without distortion.
+            rows: their indices [R].
+            spp: samples per pixel.
+            seed: of the samples.
+            lens: its distortion; None for a pinhole.
         """
+        sampler: Any = mi.load_dict({"type": "multijitter", "sample_count": spp})
+        spp = sampler.sample_count()  # which it has rounded up
+        sampler.set_samples_per_wavefront(spp)
+        sampler.seed(seed, len(rows) * camera.width * spp)
+        # The samples of a pixel follow one another.
+        corners = np.stack(np.meshgrid(np.arange(camera.width), rows), axis=-1).reshape(-1, 1, 2)
+        pixels = corners + np.array(sampler.next_2d()).T.reshape(len(corners), -1, 2)
+        origin, directions = camera.rays(undistorted(camera, lens, pixels.reshape(-1, 2)))
+        # As an array, because a literal would be compiled into a kernel of its own for every camera.
+        origins = np.repeat(origin[:, None], len(directions), axis=1)
+        ray: Any = mi.RayDifferential3f(mi.Point3f(origins), mi.Vector3f(directions.T))
+        light = np.array(self._integrator.sample(self._scene, sampler, ray, None, mi.Bool(True))[0])
+        return self._exposure * light.T.reshape(len(rows), camera.width, -1, 3).mean(axis=2)
+
+    def surface_points(self, camera: Camera) -> SurfacePoints:
+        """Return the surface points at the pixel centres [H, W]."""
         pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1) + 0.5
         position, directions = camera.rays(pixels.reshape(-1, 2))
         origins = np.repeat(position[:, None], len(directions), axis=1)
-        hit = self._scene.ray_intersect(mi.Ray3f(mi.Point3f(origins), mi.Vector3f(directions.T)))
-        ids = np.full(len(directions), -1, np.int32)
-        for pointer, index in self._owners:
-            ids[np.array((hit.shape == pointer) | (hit.instance == pointer))] = index
-        shape = camera.height, camera.width
-        return np.array(hit.p, float).T.reshape(*shape, 3), ids.reshape(shape)
+        ray = mi.Ray3f(mi.Point3f(origins), mi.Vector3f(directions.T))
+        found: Any = self._scene.ray_intersect_preliminary(ray)
+        hit = found.compute_surface_interaction(ray)
+        triangles, (u, v) = np.array(found.prim_index), np.array(found.prim_uv, float)
+        points = SurfacePoints.rigid(np.array(hit.p, float).T.copy(), np.full(len(directions), -1, np.int32))
+        for pointer, index, faces in self._owners:
+            own = np.array((hit.shape == pointer) | (hit.instance == pointer))
+            points.ids[own] = index
+            if faces is not None:
+                points.corners[own] = faces[triangles[own]]
+                points.weights[own] = np.stack([1 - u - v, u, v], axis=1)[own]
+        return points.reshaped(camera.height, camera.width)
 
     def sees(self, camera: Camera, points: np.ndarray) -> np.ndarray:
         """Return the mask of the surface points [P, 3] that a camera sees: inside its image, with nothing in front."""

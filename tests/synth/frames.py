@@ -19,6 +19,6 @@ def render_frame(tracer: PathTracer, camera: Camera, frame: int) -> tuple[np.nda
     """Return the image and the ground truth of a frame."""
     time = frame / FPS
     tracer.set_time(time)
-    points, ids = tracer.surface_points(camera)
+    surface = tracer.surface_points(camera)
     poses = [tracer.poses(time + step / FPS) for step in (0, -1, 1)]
-    return tracer.render(camera, 16, frame), compute_ground_truth(camera, points, ids, *poses)
+    return tracer.render(camera, 16, frame), compute_ground_truth(camera, surface, *poses)

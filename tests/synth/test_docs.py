@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,9 @@ import pytest
 
 from morgs_mi import cli
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.synth.ground_truth import load_truth
+from tests.scenes.animated_gltf import model, write_glb
 
 TEXT = (Path(__file__).parents[2] / "docs" / "scenes.md").read_text(encoding="utf-8")
 BLOCK = re.compile(r"<!-- (file [^ ]+|run) -->\n```\w+\n(.*?)```", re.DOTALL)
@@ -43,10 +46,31 @@ def test_scenes_page__example_is_rendered_with_its_mesh_and_texture(
     assert image[load_truth("out/truth", "cam00", 0).ids == 4].std(0).min() > 10, "the tiles are visible"
 
 
+SMALL = ("--cameras", "2", "--frames", "2", "--width", "32", "--height", "24", "--spp", "1")
+COMMANDS = [line.split() for line in re.findall(r"^    morgs-mi (synth .+)", TEXT, re.MULTILINE)]
+
+
+@pytest.mark.parametrize("command", [c for c in COMMANDS if "gem.py" not in c[1]], ids=" ".join)
+def test_scenes_page__commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]) -> None:
+    monkeypatch.chdir(tmp_path)
+    fox = model()
+    fox.document["animations"] = [{**fox.document["animations"][0], "name": name} for name in ("Run", "Walk")]
+    write_glb(tmp_path / "fox.glb", fox)
+    (tmp_path / "out").mkdir()
+    assert cli.main([*command, *SMALL]) == 0
+    assert load_disturbances(Path(command[2]) / "truth")
+
+
+def test_scenes_page__lists_every_disturbance() -> None:
+    listed = re.findall(r"^\| `--(.+?)` \|", TEXT, re.MULTILINE)
+    assert listed == ["noise", *(field.name.replace("_", "-") for field in fields(Disturbances))]
+
+
 def test_scenes_page__lists_the_files_of_a_capture(clip: Path) -> None:
     listed = {
         name.split("/")[0]
         for name in re.findall(r"^\| (.+?) \|", TEXT, re.MULTILINE)
         for name in re.findall(r"`([^`]+)`", name)
     }
-    assert listed - {"cam00.mp4"} == {f.name for f in clip.iterdir() if f.suffix != ".mp4"}
+    files = {name for name in listed if not name.startswith("--")}
+    assert files - {"cam00.mp4"} == {f.name for f in clip.iterdir() if f.suffix != ".mp4"}

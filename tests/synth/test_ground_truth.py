@@ -87,8 +87,7 @@ def test_compute_ground_truth__marks_pixels_without_a_surface():
     scene = Scene("square", {"square": Object({"square": square}, lambda t: translate(t, 0.8, 0))}, {})
     tracer = PathTracer(scene)
     camera = scene.rig.cameras(2, 64, 48)[0]
-    points, ids = tracer.surface_points(camera)
-    truth = compute_ground_truth(camera, points, ids, tracer.poses(0), None, tracer.poses(1))
+    truth = compute_ground_truth(camera, tracer.surface_points(camera), tracer.poses(0), None, tracer.poses(1))
     assert set(np.unique(truth.ids)) == {-1, 0}
     nothing = truth.ids < 0
     assert (truth.depth[nothing] == 0).all()

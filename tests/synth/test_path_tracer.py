@@ -20,7 +20,8 @@ def test_surface_points__agree_with_rays_of_the_mitsuba_sensor(tracer):
     K = camera.K.copy()
     K[:2, 2] += 7, -5
     camera = replace(camera, K=K)
-    points, ids = tracer.surface_points(camera)
+    surface = tracer.surface_points(camera)
+    points = surface.positions
     y, x = np.mgrid[:48, :64].reshape(2, -1) + 0.5
     rays, _ = mi.load_dict(camera.sensor()).sample_ray(0, 0, mi.Point2f(x / 64, y / 48), 0)
     hit = tracer._scene.ray_intersect(mi.Ray3f(rays.o, rays.d))
@@ -28,7 +29,7 @@ def test_surface_points__agree_with_rays_of_the_mitsuba_sensor(tracer):
     pixels, depth = camera.project(points)
     assert_close(pixels, np.stack([x, y], axis=-1).reshape(48, 64, 2), atol=1e-3)
     poses = tracer.poses(0)
-    np.testing.assert_allclose(compute_ground_truth(camera, points, ids, poses, None, poses).depth, depth, rtol=1e-6)
+    np.testing.assert_allclose(compute_ground_truth(camera, surface, poses, None, poses).depth, depth, rtol=1e-6)
 
 
 @pytest.mark.parametrize("radiance", [0.001, 0.18, 0.6, 3.0])

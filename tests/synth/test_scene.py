@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.synth.ground_truth import move_with_objects
+from morgs_mi.synth.ground_truth import SurfacePoints, move_with_objects
 from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import load_scene
 from tests.assertions import assert_close
@@ -47,9 +47,8 @@ def test_spheres__balls_roll_without_slipping(name, radius):
     for time in (0.0, 0.4, 2.0):
         here = pose(time)
         contact = here[:3, 3] - [0, radius, 0]
-        ahead, behind = (
-            move_with_objects(contact[None], np.zeros(1, int), [here], [pose(time + s)])[0] for s in (step, -step)
-        )
+        point = SurfacePoints.rigid(contact[None], np.zeros(1, int))
+        ahead, behind = (move_with_objects(point, [here], [pose(time + s)])[0] for s in (step, -step))
         assert abs(contact[1]) < 1e-12
         assert np.linalg.norm(ahead - behind) / (2 * step) < 1e-6
         assert np.linalg.norm(pose(time + step)[:3, 3] - here[:3, 3]) / step > 0.1

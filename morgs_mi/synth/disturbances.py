@@ -1,0 +1,180 @@
+"""What makes a recording hard: clocks that are apart, rolling shutters, changes of exposure, lenses, and compression.
+
+Frame k of a camera with the time offset o is exposed at (k + o) / fps, and its row r of H at
+(k + o + s ((r + 0.5) / H - 0.5)) / fps, with s the rolling shutter: the time of a frame is that of its middle row.
+Ground truth refers to this time and to the view without distortion, which `load_capture` returns.
+
+On disk: ``truth/disturbances.json``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from morgs_mi.capture.lens import Lens
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import check_number
+from morgs_mi.core.files import write_json
+from morgs_mi.io.bounded import read_json
+
+__all__ = [
+    "CameraDisturbance",
+    "Disturbances",
+    "compressed",
+    "draw_disturbances",
+    "load_disturbances",
+    "save_disturbances",
+    "undistorted",
+]
+
+# Bounds of the settings. A lens with a coefficient beyond 0.5 would fold the corners of a wide view.
+_INTERVALS = {
+    "time_offset": "[0, inf)",
+    "rolling_shutter": "[0, 1]",
+    "exposure_gain": "[0, 10]",
+    "exposure_drift": "[0, 10]",
+    "exposure_flicker": "[0, 1]",
+    "distortion": "[0, 0.5]",
+    "jpeg_quality": "[0, 100]",
+}
+
+
+@dataclass(frozen=True)
+class Disturbances:
+    """Strength of the disturbances of a recording; by default there are none.
+
+    The held-out camera is the reference: it has no time offset, and exposure as it should be.
+    """
+
+    time_offset: float = 0.0
+    """Largest time offset of a camera from cam00 in frames; drawn per camera."""
+    rolling_shutter: float = 0.0
+    """Time in which all cameras read their rows, as a share of a frame; a rolling shutter has about 0.5."""
+    exposure_gain: float = 0.0
+    """Largest deviation of a camera's exposure, drawn per camera: 0.2 for factors from 1 / 1.2 to 1.2."""
+    exposure_drift: float = 0.0
+    """Largest change of a camera's exposure from its first frame to its last, as for exposure-gain."""
+    exposure_flicker: float = 0.0
+    """Standard deviation of the exposure from frame to frame, drawn per camera and frame."""
+    distortion: float = 0.0
+    """Largest radial distortion of the lenses, COLMAP's SIMPLE_RADIAL k, drawn per camera; 0.1 is moderate."""
+    jpeg_quality: int = 0
+    """Quality from 1 to 100 of the JPEG compression of every image; 0: none."""
+
+
+@dataclass(frozen=True)
+class CameraDisturbance:
+    """The disturbance of one camera.
+
+    Attributes:
+        time_offset: frame k shows the time of frame k + time_offset of the reference, at its middle row.
+        rolling_shutter: time from the first row to the last, frames.
+        gains: factor on the linear light of each frame [T].
+        distortion: k of COLMAP's SIMPLE_RADIAL lens.
+        jpeg_quality: of the compression; 0 for none.
+    """
+
+    time_offset: float
+    rolling_shutter: float
+    gains: tuple[float, ...]
+    distortion: float
+    jpeg_quality: int
+
+    @property
+    def lens(self) -> Lens:
+        """The lens, as in a capture."""
+        return Lens("SIMPLE_RADIAL", (self.distortion,)) if self.distortion else Lens()
+
+    def row_times(self, frame: int, height: int) -> np.ndarray:
+        """Return the time at which each row of a frame is read [H], in frames of the reference."""
+        rows = (np.arange(height) + 0.5) / height - 0.5
+        return frame + self.time_offset + self.rolling_shutter * rows
+
+
+def draw_disturbances(
+    disturbances: Disturbances, num_cameras: int, num_frames: int, seed: int
+) -> tuple[CameraDisturbance, ...]:
+    """Return the disturbance of each camera; a setting changes nothing but its own draws.
+
+    Raises:
+        ValueError: a setting is out of range.
+    """
+    for name, interval in _INTERVALS.items():
+        check_number("draw_disturbances()", name, getattr(disturbances, name), interval)
+    d, shape = disturbances, (num_cameras, num_frames)
+    offsets, gains, drifts, flicker, lenses = (np.random.default_rng([seed, 3, kind]) for kind in range(5))
+    offset = d.time_offset * offsets.uniform(-1, 1, num_cameras)
+    log_gain = (np.log1p(d.exposure_gain) * gains.uniform(-1, 1, num_cameras))[:, None] + np.zeros(num_frames)
+    drift = np.log1p(d.exposure_drift) * drifts.uniform(-1, 1, num_cameras)
+    log_gain += drift[:, None] * np.linspace(0, 1, num_frames) + d.exposure_flicker * flicker.standard_normal(shape)
+    offset[0], log_gain[0] = 0, 0
+    k = d.distortion * lenses.uniform(-1, 1, num_cameras) + 0.0  # not -0
+    return tuple(
+        CameraDisturbance(
+            float(offset[c]),
+            float(d.rolling_shutter),
+            tuple(map(float, np.exp(log_gain[c]))),
+            float(k[c]),
+            int(d.jpeg_quality),
+        )
+        for c in range(num_cameras)
+    )
+
+
+def undistorted(camera: Camera, lens: Lens | None, pixels: np.ndarray) -> np.ndarray:
+    """Return where the pinhole `camera` sees what `lens` shows at `pixels` [P, 2], float64 [P, 2]."""
+    if lens is None or not any(lens.distortion):
+        return pixels
+    precise = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)
+    points = np.ascontiguousarray(pixels[:, None], np.float64)
+    return cv2.undistortPoints(points, camera.K, lens.opencv_coefficients, None, np.eye(3), camera.K, precise)[:, 0]
+
+
+def compressed(image: np.ndarray, quality: int) -> np.ndarray:
+    """Return an image, uint8 RGB [H, W, 3], after JPEG compression; unchanged for the quality 0."""
+    if not quality:
+        return image
+    data = cv2.imencode(".jpg", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    decoded = cv2.imdecode(data, cv2.IMREAD_COLOR)
+    assert decoded is not None
+    return cv2.cvtColor(decoded, cv2.COLOR_BGR2RGB)
+
+
+def save_disturbances(folder: str | Path, cameras: Mapping[str, CameraDisturbance]) -> None:
+    """Write the disturbance of each camera, by name, into a capture's ``truth`` folder.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    write_json(_path(folder), {name: asdict(camera) for name, camera in cameras.items()})
+
+
+def load_disturbances(folder: str | Path) -> dict[str, CameraDisturbance]:
+    """Read the disturbance of each camera, by name, from a capture's ``truth`` folder.
+
+    Raises:
+        FileNotFoundError: the folder has no such file.
+        ValueError: the file is broken.
+    """
+    path = _path(folder)
+    if not path.is_file():
+        raise FileNotFoundError(
+            f"load_disturbances(): there is no file {path}; pass the truth folder of a synthetic capture."
+        )
+    content = read_json(path)
+    try:
+        return {name: CameraDisturbance(**{**entry, "gains": tuple(entry["gains"])}) for name, entry in content.items()}
+    except (AttributeError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"{path}: expected the disturbances of each camera, got a broken file ({error}); synthesise the capture "
+            "again."
+        ) from None
+
+
+def _path(folder: str | Path) -> Path:
+    return Path(folder) / "disturbances.json"

@@ -1,0 +1,61 @@
+"""What a camera with a clock, a rolling shutter and a lens of its own sees of a moving scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.synth.disturbances import CameraDisturbance
+from morgs_mi.synth.path_tracer import PathTracer
+
+__all__ = ["check_lenses", "record_light"]
+
+# Rows that a rolling shutter reads at one time; at 10 pixels a frame, objects move by 0.2 pixels meanwhile.
+_BAND = 4
+
+
+def check_lenses(cameras: Sequence[Camera], disturbed: Sequence[CameraDisturbance]) -> None:
+    """Check that every lens shows the scene up to the corners of its image.
+
+    Raises:
+        ValueError: the distortion is too strong for the field of view.
+    """
+    for camera, own in zip(cameras, disturbed, strict=True):
+        if own.distortion < 0:
+            corner = np.linalg.norm(camera.K[:2, 2] / np.diag(camera.K)[:2])
+            # r (1 + k r^2) grows up to r = 1 / sqrt(-3 k).
+            largest = 2 / (3 * np.sqrt(-3 * own.distortion))
+            if not corner < 0.98 * largest:
+                raise ValueError(
+                    f"synthesize(): `distortion` must be small enough for the field of view, got {own.distortion:.3g} "
+                    f"with corners at the radius {corner:.3g}, which must be below {largest:.3g}; set a smaller one."
+                )
+
+
+def record_light(
+    tracer: PathTracer, camera: Camera, own: CameraDisturbance, frame: int, fps: float, spp: int, seed: int
+) -> np.ndarray:
+    """Return the light of a frame as a camera with its clock, shutter and lens receives it, linear [H, W, 3].
+
+    Args:
+        tracer: the scene, whose time is changed.
+        camera: the view without distortion.
+        own: its disturbance, of which exposure and compression are not applied.
+        frame: index of the frame.
+        fps: frames per second.
+        spp: samples per pixel.
+        seed: of the samples.
+    """
+    if not own.rolling_shutter and not own.distortion:
+        tracer.set_time((frame + own.time_offset) / fps)
+        return tracer.light(camera, spp, seed)
+    bands = np.arange(camera.height), own.row_times(frame, camera.height)
+    count = -(-camera.height // _BAND) if own.rolling_shutter else 1
+    light = []
+    for band, (rows, times) in enumerate(zip(*(np.array_split(values, count) for values in bands), strict=True)):
+        tracer.set_time(times.mean() / fps)
+        band_seed = int(np.random.SeedSequence([seed, band]).generate_state(1)[0])
+        light.append(tracer.light_of_rows(camera, rows, spp, band_seed, own.lens))
+    return np.concatenate(light)

@@ -1,0 +1,30 @@
+"""Report on disturbances: a tiny clip, and the page that quotes the committed figures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks.reports import disturbances
+from benchmarks.reports.disturbances import CELLS, Options, disturbance_table
+from tests.benchmarks.reports.pages import ROOT, page
+from tests.scenes.animated_gltf import write_glb
+
+
+def test_disturbances_page__quotes_the_committed_table() -> None:
+    committed = json.loads((ROOT / "benchmarks" / "results" / "disturbances.json").read_text())
+    assert disturbance_table(committed["cells"]) in page("disturbances.md")
+
+
+@pytest.mark.slow
+def test_main__measures_a_tiny_clip(tmp_path: Path) -> None:
+    work = {"num_gaussians": 200, "first_frame_steps": 10, "epochs": 1, "cameras": 3, "width": 64, "frames": 2}
+    model = write_glb(tmp_path / "model.glb")
+    disturbances.main(
+        Options(json=tmp_path / "out.json", model=model, animation="bend", clips=tmp_path / "clips", **work)
+    )
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert list(found["cells"]) == list(found["disturbances"]) == list(CELLS)
+    assert disturbance_table(found["cells"]).count("\n") == 1 + len(CELLS)
