@@ -179,15 +179,15 @@ def with_refined_cameras(
 
 def _about_cameras(loop: StreamLoop, capture: Capture, frame: PartialFrame, found: Refinement) -> dict[str, Any]:
     """Return what the first frame's report says about the cameras, and of the held-out view if there is one."""
-    about, test = {"cameras": {**asdict(found), "sentence": found.sentence}}, capture.test_view
+    about, test = {**asdict(found), "sentence": found.sentence}, capture.test_view
     image = None if test is None else frame.images[test]
     if test is None or image is None or loop.gaussians is None:
-        return about
+        return {"cameras": about}
     config, view = loop.setup.config, (image, capture.masks[test])
     given = capture.cameras[test]
     registered = register_camera(loop.gaussians, given, *view, loop.setup.extent, config.fit, config.render)
     psnr = [mean_psnr(loop.gaussians, [(camera, *view)], config.render) for camera in (given, registered)]
-    return {**about, "held_out": {"calibrated_psnr": psnr[0], "registered_psnr": psnr[1]}}
+    return {"cameras": {**about, "held_out": {"calibrated_psnr": psnr[0], "registered_psnr": psnr[1]}}}
 
 
 def push_frame(
