@@ -182,12 +182,12 @@ def _about_cameras(loop: StreamLoop, capture: Capture, frame: PartialFrame, foun
     about, test = {**asdict(found), "sentence": found.sentence}, capture.test_view
     image = None if test is None else frame.images[test]
     if test is None or image is None or loop.gaussians is None:
-        return {"cameras": about}
+        return {"refinement": about}
     config, view = loop.setup.config, (image, capture.masks[test])
     given = capture.cameras[test]
     registered = register_camera(loop.gaussians, given, *view, loop.setup.extent, config.fit, config.render)
     psnr = [mean_psnr(loop.gaussians, [(camera, *view)], config.render) for camera in (given, registered)]
-    return {"cameras": {**about, "held_out": {"calibrated_psnr": psnr[0], "registered_psnr": psnr[1]}}}
+    return {"refinement": {**about, "held_out": {"calibrated_psnr": psnr[0], "registered_psnr": psnr[1]}}}
 
 
 def push_frame(

@@ -376,7 +376,7 @@ def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path):
     stream, whole = StreamReader(tmp_path / "stream.morgs"), stream_of(tmp_path)
     assert np.array_equal(stream.cameras[0].viewmat, capture.cameras[0].viewmat), "the held-out view"
     assert all(not np.array_equal(stream.cameras[v].viewmat, capture.cameras[v].viewmat) for v in (1, 2))
-    first = report_of(tmp_path)["frames"][0]["validation"]["cameras"]
+    first = report_of(tmp_path)["frames"][0]["validation"]["refinement"]
     assert first["taken"]
     assert first["held_out"]["registered_psnr"] >= first["held_out"]["calibrated_psnr"]
     (tmp_path / "stream.morgs").write_bytes(whole[: stream.index()[-1][2]])

@@ -107,11 +107,11 @@ def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
 
 def first_frame_sentences(validation: Mapping[str, Any]) -> Iterator[str]:
     """Yield what the report of the first frame says about its views, sentence by sentence."""
-    cameras = validation.get("cameras", {})
-    if cameras:
-        yield cameras["sentence"]
-    if "held_out" in cameras:
-        psnr = cameras["held_out"]
+    refined = validation.get("refinement", {})
+    if refined:
+        yield refined["sentence"]
+    if "held_out" in refined:
+        psnr = refined["held_out"]
         yield (
             f"The held-out view has {psnr['calibrated_psnr']:.1f} dB as calibrated, {psnr['registered_psnr']:.1f} dB "
             "registered."
