@@ -24,6 +24,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.calibration.refine import Refinement, refine_cameras, register_camera
 from morgs_mi.calibration.rig_check import dense_points, match_capture
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.capture.outputs import check_output
@@ -31,7 +32,9 @@ from morgs_mi.codec.container import Packet, PacketKind, StreamWriter, Truncated
 from morgs_mi.codec.packets import CodedFrame, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import is_same_file, locked_folder, write_json
+from morgs_mi.fit.cross_validation import mean_psnr
 from morgs_mi.io.bounded import read_json
 from morgs_mi.method.flow import choose_key_views
 from morgs_mi.stream_loop import FrameReport, StreamLoop
@@ -47,6 +50,7 @@ __all__ = [
     "stream_metadata",
     "with_next",
     "with_points",
+    "with_refined_cameras",
 ]
 
 FILES = ("stream.morgs", "capture.json", "report.json")
@@ -107,8 +111,11 @@ def _stream(
     first = next(frames)
     metadata = stream_metadata(capture, first, config)
     interrupted = _interrupted(out, capture, metadata) if resume else None
+    refinement = None
     if interrupted is None:
-        capture = with_points(capture, config.seed, on_stage)
+        capture, refinement = with_refined_cameras(with_points(capture, config.seed, on_stage), config, on_stage)
+    else:
+        capture = replace(capture, cameras=interrupted.cameras)
     loop = StreamLoop(
         [capture.cameras[v] for v in train],
         capture.points,
@@ -139,6 +146,10 @@ def _stream(
         for frame, upcoming in with_next(frames):
             tick = None if on_step is None else _frame_ticker(on_step, frame.index)
             packet, report = push_frame(loop, frame, train, tick, upcoming)
+            if refinement is not None and not frame.index:
+                report = replace(
+                    report, validation=report.validation | _about_cameras(loop, capture, frame, refinement)
+                )
             reports.append(report)
             _check_in_place(path, written)
             write_json(out / "report.json", {**metadata, "frames": [asdict(r) for r in reports]})
@@ -155,6 +166,28 @@ def with_points(capture: Capture, seed: int, on_stage: Callable[[str, int, int],
     shared = match_capture(capture, partial(on_stage, "Matching views"))
     on_stage("Triangulating points", 0, 1)
     return max(capture, dense_points(capture, shared, seed), key=lambda c: len(c.points))
+
+
+def with_refined_cameras(
+    capture: Capture, config: StreamConfig, on_stage: Callable[[str, int, int], None]
+) -> tuple[Capture, Refinement | None]:
+    """Return a capture with refined cameras where the config asks for them, and what was found."""
+    if config.fit.refine_cameras == "off":
+        return capture, None
+    return refine_cameras(capture, config.fit, config.render, config.seed, partial(on_stage, "Refining cameras"))
+
+
+def _about_cameras(loop: StreamLoop, capture: Capture, frame: PartialFrame, found: Refinement) -> dict[str, Any]:
+    """Return what the first frame's report says about the cameras, and of the held-out view if there is one."""
+    about, test = {**asdict(found), "sentence": found.sentence}, capture.test_view
+    image = None if test is None else frame.images[test]
+    if test is None or image is None or loop.gaussians is None:
+        return {"refinement": about}
+    config, view = loop.setup.config, (image, capture.masks[test])
+    given = capture.cameras[test]
+    registered = register_camera(loop.gaussians, given, *view, loop.setup.extent, config.fit, config.render)
+    psnr = [mean_psnr(loop.gaussians, [(camera, *view)], config.render) for camera in (given, registered)]
+    return {"refinement": {**about, "held_out": {"calibrated_psnr": psnr[0], "registered_psnr": psnr[1]}}}
 
 
 def push_frame(
@@ -214,12 +247,14 @@ class _Interrupted:
         end: offset of the end of the last one.
         coded: state after it.
         reports: of the frames.
+        cameras: of its header.
     """
 
     index: list[tuple[int, int, int]]
     end: int
     coded: CodedFrame
     reports: list[FrameReport]
+    cameras: tuple[Camera, ...]
 
 
 def _interrupted(out: Path, capture: Capture, metadata: Mapping[str, Any]) -> _Interrupted | None:
@@ -237,7 +272,9 @@ def _interrupted(out: Path, capture: Capture, metadata: Mapping[str, Any]) -> _I
     if not index:
         return None
     coded = seek(stream, index[-1][1])
-    return _Interrupted(index, end, coded, read_reports(out / "report.json", range(coded.frame + 1)))
+    return _Interrupted(
+        index, end, coded, read_reports(out / "report.json", range(coded.frame + 1)), tuple(stream.cameras)
+    )
 
 
 def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str, Any]) -> None:
@@ -248,9 +285,12 @@ def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str
     """
     # Streams of earlier versions have paths in their headers.
     recorded = _without_folders({name: value for name, value in stream.metadata.items() if name != "capture"})
+    # Refined cameras differ from the calibrated ones, which are part of the fingerprint then.
+    refined = metadata["config"]["fit"]["refine_cameras"] != "off"
+    cameras = stream.cameras if refined else capture.cameras
     old, new = (
         json.loads(header_json(*parts))
-        for parts in ((stream.cameras, stream.fps, recorded), (capture.cameras, capture.fps, metadata))
+        for parts in ((stream.cameras, stream.fps, recorded), (cameras, capture.fps, metadata))
     )
     if difference := _difference(old, new):
         name, before, now = difference
@@ -264,8 +304,9 @@ def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig)
     """Return the entries of the stream's header about the fit; they must agree for a fit to be resumed."""
     train = capture.train_views
     key_views = choose_key_views([capture.cameras[v] for v in train], config.motion.key_views)
+    calibrated = () if config.fit.refine_cameras == "off" else [m for c in capture.cameras for m in (c.K, c.viewmat)]
     metadata = {
-        "fingerprint": _fingerprint([*first.images, capture.points, capture.point_colors]),
+        "fingerprint": _fingerprint([*first.images, capture.points, capture.point_colors, *calibrated]),
         "downscale": capture.downscale,
         "test_view": capture.test_view,
         "reading": asdict(capture.reading),

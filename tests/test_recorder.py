@@ -20,6 +20,7 @@ from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import PAYLOAD, TRAILER, StreamWriter
 from morgs_mi.codec.packets import CodedFrame, coded_frames, play, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.fit.config import RefinementConfig
 from morgs_mi.recorder import _without_folder, stream_capture, stream_metadata, with_next
 from morgs_mi.stream_loop import StreamLoop
 from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
@@ -361,3 +362,32 @@ def test_with_next__yields_the_frames_before_one_that_cannot_be_read() -> None:
     with pytest.raises(OSError, match="the video ends here"):
         seen.extend(with_next(frames()))
     assert seen == [("a", "b"), ("b", None)]
+
+
+def refined_config():
+    """Return the config with refined cameras, by as little work as possible."""
+    how = RefinementConfig(gaussians=40, steps=4, rounds=1)
+    return replace(CONFIG, fit=replace(CONFIG.fit, refine_cameras="on", refinement=how))
+
+
+def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path):
+    capture, config = recording(test_view=0, num_frames=2), refined_config()
+    stream_capture(capture, tmp_path, config)
+    stream, whole = StreamReader(tmp_path / "stream.morgs"), stream_of(tmp_path)
+    assert np.array_equal(stream.cameras[0].viewmat, capture.cameras[0].viewmat), "the held-out view"
+    assert all(not np.array_equal(stream.cameras[v].viewmat, capture.cameras[v].viewmat) for v in (1, 2))
+    first = report_of(tmp_path)["frames"][0]["validation"]["refinement"]
+    assert first["taken"]
+    assert first["held_out"]["registered_psnr"] >= first["held_out"]["calibrated_psnr"]
+    (tmp_path / "stream.morgs").write_bytes(whole[: stream.index()[-1][2]])
+    stream_capture(capture, tmp_path, config, resume=True)
+    assert stream_of(tmp_path) == whole
+
+
+def test_stream_metadata__names_the_calibration_that_cameras_are_refined_from():
+    capture = recording()
+    other = replace(capture.cameras[0], K=capture.cameras[0].K * np.array([[1.01, 1, 1], [1, 1.01, 1], [1, 1, 1]]))
+    others = replace(capture, cameras=(other, *capture.cameras[1:]))
+    first, config = next(capture.partial_frames()), refined_config()
+    same, different = (stream_metadata(c, first, config)["fingerprint"] for c in (capture, others))
+    assert same != different

@@ -17,9 +17,11 @@ from morgs_mi.core.camera import Camera
 __all__ = [
     "Features",
     "Match",
+    "Tracks",
     "descriptor_distances",
     "detect",
     "intersect",
+    "join_matches",
     "match_views",
     "mutual_neighbours",
     "reprojection_errors",
@@ -62,6 +64,34 @@ class Match:
 
     views: tuple[int, int]
     features: np.ndarray
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Features of one point each in several views: observation k is a feature of track `ids[k]` in view `views[k]`.
+
+    Attributes:
+        ids: [n] int.
+        views: [n] int.
+        pixels: [n, 2].
+        colors: [n, 3] in [0, 1].
+    """
+
+    ids: np.ndarray
+    views: np.ndarray
+    pixels: np.ndarray
+    colors: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """Number of tracks."""
+        return int(self.ids.max()) + 1 if len(self.ids) else 0
+
+    def mean_colors(self) -> np.ndarray:
+        """Return the mean colour of each track [P, 3]."""
+        return (
+            np.stack([np.bincount(self.ids, band) for band in self.colors.T], axis=1) / np.bincount(self.ids)[:, None]
+        )
 
 
 def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features:
@@ -171,39 +201,38 @@ def triangulate(
         max_error: largest distance of a point's projection from any of its features, px.
         min_angle: smallest accepted angle between the rays to a point, degrees.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
-    starts = np.concatenate([[0], np.cumsum([len(f.points) for f in features])])
-    total = int(starts[-1])
-    edges = [
-        match.features[reprojection_errors(match, features, cameras) <= max_error] + starts[list(match.views)]
+    close = [
+        replace(match, features=match.features[reprojection_errors(match, features, cameras) <= max_error])
         for match in matches
     ]
-    edges = np.concatenate(edges) if edges else np.zeros((0, 2), int)
-    none = np.zeros((0, 3), np.float32)
-    if not len(edges):
-        return none, none
-    graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(total, total))
-    _, track = connected_components(graph, directed=False)
-    views = np.repeat(np.arange(len(features)), np.diff(starts))
-    pixels = np.concatenate([f.points for f in features])
-    colors = np.concatenate([f.colors for f in features])
-    # A track is valid if it has at least two features, all in different views.
-    sizes = np.bincount(track)
-    distinct = np.bincount(np.unique(np.stack([track, views]), axis=1)[0])
-    used = np.flatnonzero(((sizes >= 2) & (distinct == sizes))[track])
-    if not len(used):
-        return none, none
-    _, track = np.unique(track[used], return_inverse=True)
-    views, pixels, colors = views[used], pixels[used], colors[used]
-    count = int(track.max()) + 1
+    tracks = join_matches(close, features)
+    track, views, pixels, count = tracks.ids, tracks.views, tracks.pixels, tracks.count
+    if not count:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32)
     points = intersect(track, views, pixels, cameras, count)
     worst = np.zeros(count)
     np.maximum.at(worst, track, _distances(points[track], views, pixels, cameras))
-    mean = np.stack([np.bincount(track, band) for band in colors.T], axis=1) / np.bincount(track)[:, None]
     good = (worst <= max_error) & (_widest_angles(points, track, views, cameras) >= min_angle)
-    return points[good].astype(np.float32), mean[good].astype(np.float32)
+    return points[good].astype(np.float32), tracks.mean_colors()[good].astype(np.float32)
+
+
+def join_matches(matches: Sequence[Match], features: Sequence[Features]) -> Tracks:
+    """Return the tracks of features that are matched directly or by others, all of them in different views."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    starts = np.concatenate([[0], np.cumsum([len(f.points) for f in features])]).astype(int)
+    edges = np.concatenate([np.zeros((0, 2), int), *(m.features + starts[list(m.views)] for m in matches)])
+    graph = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(starts[-1], starts[-1]))
+    _, track = connected_components(graph, directed=False)
+    views = np.repeat(np.arange(len(features)), np.diff(starts))
+    # A track is valid if it has at least two features, all in different views.
+    sizes = np.bincount(track)
+    distinct = np.bincount(np.unique(np.stack([track, views]), axis=1)[0], minlength=len(sizes))
+    used = np.flatnonzero(((sizes >= 2) & (distinct == sizes))[track])
+    _, track = np.unique(track[used], return_inverse=True)
+    pixels, colors = (np.concatenate([getattr(f, name) for f in features])[used] for name in ("points", "colors"))
+    return Tracks(track, views[used], pixels, colors)
 
 
 def intersect(

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import DisallowNone, Positional, arg
 
@@ -101,8 +101,23 @@ def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
         f"{stream}: {len(reports)} frames, {stream.stat().st_size / 1e6:.1f} MB, "
         f"{first.seconds:.1f} s for the first one ({first.num_gaussians} Gaussians, {first.steps} steps){later}."
     )
-    if first.validation:
-        print_result(first.validation["sentence"])
+    for sentence in first_frame_sentences(first.validation):
+        print_result(sentence)
+
+
+def first_frame_sentences(validation: Mapping[str, Any]) -> Iterator[str]:
+    """Yield what the report of the first frame says about its views, sentence by sentence."""
+    refined = validation.get("refinement", {})
+    if refined:
+        yield refined["sentence"]
+    if "held_out" in refined:
+        psnr = refined["held_out"]
+        yield (
+            f"The held-out view has {psnr['calibrated_psnr']:.1f} dB as calibrated, {psnr['registered_psnr']:.1f} dB "
+            "registered."
+        )
+    if "sentence" in validation:
+        yield validation["sentence"]
 
 
 @contextmanager

@@ -142,6 +142,11 @@ async def fit_in_segments(
     on_part: OnPart | None = None,
 ) -> SegmentedFit:
     """Fit a capture in segments as `stream_segments`; `on_part` is called with the result of every task."""
+    if config.fit.refine_cameras != "off":
+        raise ValueError(
+            f"stream_segments(): `fit.refine_cameras` must be off, got {config.fit.refine_cameras!r}: workers read the "
+            "calibrated cameras; fit without segments, or calibrate again."
+        )
     out, seams = Path(out), seams or SeamConfig()
     starts = _starts(capture.num_frames, segments)
     for name in FILES:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from morgs_mi.calibration.refine import register_camera
 from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.container import PacketKind, encode_packet
 from morgs_mi.codec.packets import CodedFrame, coded_frames
@@ -36,6 +37,9 @@ from morgs_mi.evaluate.results import (
 )
 from morgs_mi.evaluate.temporal import StillVariation, recorded_change, slope
 from morgs_mi.evaluate.tracking import evaluate_tracks
+from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.cross_validation import mean_psnr
+from morgs_mi.fit.initialise import scene_extent
 from morgs_mi.io.bounded import read_json
 from morgs_mi.playback.player import (
     has_confidence,
@@ -99,7 +103,7 @@ def evaluate_stream(
     false_alarms = _FALSE_ALARMS if recording.truth is None else 0
     variations = {view: StillVariation(recording.masks[view], false_alarms) for view in views}
     rows: list[FrameScores] = []
-    before, last = None, None
+    before, last, registered = None, None, float("nan")
     # The file may have grown since it was read.
     decoded = coded_frames(islice(stream, count))
     recorded = recording.partial_frames(min(packets), max(packets) + 1)
@@ -125,6 +129,8 @@ def evaluate_stream(
         rows.append(
             FrameScores(coded.frame, kind.name.lower(), num_bytes, seconds.get(coded.frame), mean, motion, scores)
         )
+        if not rows[1:] and recording.test_view is not None:
+            registered = _registered_psnr(stream, recording, coded, frame.images[views[0]])
         before, last = coded, frame.images
         if progress is not None:
             progress(len(rows), len(packets))
@@ -140,7 +146,19 @@ def evaluate_stream(
         psnr_slope=slope([row.scores.psnr for row in rows]),
         frames=tuple(rows),
         tracking=evaluate_tracks(stream, recording, views),
+        registered_psnr=registered,
     )
+
+
+def _registered_psnr(stream: StreamReader, recording: Capture, coded: CodedFrame, image: np.ndarray | None) -> float:
+    """Return the PSNR of the held-out view from the camera that fits its image best, NaN without the image."""
+    test, config = recording.test_view, render_config(stream)
+    if image is None or test is None:
+        return float("nan")
+    extent = scene_extent([stream.cameras[v] for v in recording.train_views])
+    view = image, recording.masks[test]
+    found = register_camera(coded.gaussians, stream.cameras[test], *view, extent, FitConfig(), config)
+    return mean_psnr(coded.gaussians, [(found, *view)], config)
 
 
 def _packets(stream: StreamReader) -> tuple[dict[int, tuple[PacketKind, int]], int]:

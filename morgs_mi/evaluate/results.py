@@ -246,6 +246,9 @@ class Evaluation:
     frames: tuple[FrameScores, ...]
     tracking: tuple[TrackingScores, ...] = ()
     """3D point tracks against the true ones, a row per protocol; empty without true tracks."""
+    registered_psnr: float = float("nan")
+    """PSNR of the held-out view in the first frame, seen from the camera that fits its image best, dB; NaN without a
+    held-out view. The scores of the frames are those as calibrated."""
 
     @property
     def num_frames(self) -> int:
@@ -290,6 +293,7 @@ class Evaluation:
             "regions": self.regions,
             **means,
             "psnr_slope": self.psnr_slope,
+            "registered_psnr": self.registered_psnr,
             "motion_3d": _optional(self.motion_3d),
             "tracking": [asdict(row) for row in self.tracking],
             "seconds": {**asdict(self.seconds), "definition": _SECONDS},

@@ -69,6 +69,11 @@ def evaluation_summary(result: Evaluation) -> Iterator[str]:
         f"Drift: PSNR {figure(first, 2)} dB in the first frame, {figure(last, 2)} dB in the last, "
         f"{figure(result.psnr_slope, 4)} dB per frame."
     )
+    if result.held_out:
+        yield (
+            f"Held-out view in the first frame: {figure(first, 2)} dB as calibrated, "
+            f"{figure(result.registered_psnr, 2)} dB registered, from the camera that fits its image best."
+        )
     motion = result.motion_3d
     if motion is not None and motion.num_gaussians:
         yield (

@@ -5,17 +5,20 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from math import inf
+from typing import Literal
 
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.method.objective import ObjectiveConfig
 
 __all__ = [
+    "CameraPriors",
     "ConvergenceConfig",
     "CrossValidationConfig",
     "DensityConfig",
     "DetailConfig",
     "FitConfig",
     "LearningRates",
+    "RefinementConfig",
 ]
 
 
@@ -196,6 +199,49 @@ class ConvergenceConfig:
 
 
 @dataclass(frozen=True)
+class CameraPriors:
+    """Standard deviations of the errors of a calibration, under which its cameras are refined."""
+
+    rotation: float = 0.5
+    """Of the rotation about each axis, degrees."""
+    position: float = 0.005
+    """Of the position along each axis, in scene extents."""
+    focal: float = 0.01
+    """Of the focal lengths, relative."""
+    principal_point: float = 2e-4
+    """Of the principal point along each axis, in image widths. Images hardly tell its displacement from a rotation, so
+    it follows the calibration closely."""
+
+    def __post_init__(self) -> None:
+        for name, deviation in asdict(self).items():
+            if not 0 < deviation < inf:
+                raise ValueError(f"CameraPriors(): `{name}` must be positive, got {deviation}.")
+
+
+@dataclass(frozen=True)
+class RefinementConfig:
+    """Settings of the refinement of the cameras (see `calibration.refine`)."""
+
+    priors: CameraPriors = field(default_factory=CameraPriors)
+    """Errors that the calibration may have."""
+    gaussians: int = 4000
+    """Gaussians of the fits with which cameras are refined and judged."""
+    steps: int = 300
+    """Steps of such a fit; each further round takes half as many."""
+    rounds: int = 5
+    """Rounds of fitting Gaussians and refining cameras."""
+    width: int = 320
+    """Least width to which images are reduced, px."""
+    least_gain: float = 0.1
+    """Increase of the PSNR of withheld pixels from which refined cameras are taken, dB: less is chance."""
+
+    def __post_init__(self) -> None:
+        for name, low in (("gaussians", 4), ("steps", 2), ("rounds", 1), ("width", 1), ("least_gain", 0)):
+            if not low <= getattr(self, name) < inf:
+                raise ValueError(f"RefinementConfig(): `{name}` must be at least {low}, got {getattr(self, name)}.")
+
+
+@dataclass(frozen=True)
 class FitConfig:
     """Settings of the optimisation."""
 
@@ -224,6 +270,11 @@ class FitConfig:
     None: no prior."""
     depth_weight: float = 0.1
     """Weight of that prior at the start of the first frame; it falls to 0 over the planned steps."""
+    refine_cameras: Literal["off", "auto", "on"] = "off"
+    """Refine poses and intrinsics on the first frame: off, auto (taken if withheld pixels show that they are better) or
+    on (always taken)."""
+    refinement: RefinementConfig = field(default_factory=RefinementConfig)
+    """Refinement of the cameras."""
     sh_band_fraction: float = 1 / 30
     """Fraction of the first frame's steps after which another SH band is added, as in 3DGS."""
     confidence_steps: int = 40

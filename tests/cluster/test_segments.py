@@ -224,3 +224,9 @@ def test_stream_segments__triangulates_points_where_there_are_few(
     monkeypatch.setattr("morgs_mi.cluster.segments.with_points", lambda *_: capture)
     fit(few, tmp_path / "few", workers, segments=1, config=StreamConfig(SETTINGS.fit, SETTINGS.motion))
     assert len(next(coded_frames(StreamReader(tmp_path / "few" / "stream.morgs")))) == SETTINGS.fit.num_gaussians
+
+
+def test_stream_segments__refuses_to_refine_cameras(capture: Capture, workers: Workers, tmp_path: Path) -> None:
+    config = replace(CONFIG, fit=replace(CONFIG.fit, refine_cameras="auto"))
+    with pytest.raises(ValueError, match=r"`fit\.refine_cameras` must be off, got 'auto'"):
+        stream_segments(capture, tmp_path / "out", workers, config, 2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.evaluate.evaluate import IMAGE_SCORES, REGIONS, evaluate_stream
 from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.results import known_mean
+from morgs_mi.evaluate.tables import evaluation_summary
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.render.rasterize import rasterize
 from tests.evaluate.tiny_onnx import squared_difference
@@ -94,6 +96,16 @@ def test_evaluate_stream__uses_the_size_of_a_downscaled_fit(fitted_clip: Path, t
         writer.write(keyframe_packet(moved(0), 0))
     # The recording was averaged down, the rendering was not: similar, not equal.
     assert evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture").scores.psnr > 20
+
+
+def test_evaluate_stream__scores_the_held_out_view_registered_too(fitted_clip: Path, tmp_path: Path) -> None:
+    turned = np.array([[1, 0, 0.01, 0], [0, 1, 0, 0], [-0.01, 0, 1, 0], [0, 0, 0, 1]]) @ CAMERAS[0].viewmat
+    cameras = [replace(CAMERAS[0], viewmat=turned), CAMERAS[1]]
+    with StreamWriter(tmp_path / "s.morgs", cameras, 25, {"test_view": 0}) as writer:
+        writer.write(keyframe_packet(moved(0), 0, cameras, EXACT))
+    result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
+    assert result.registered_psnr > result.scores.psnr + 10
+    assert f"{result.registered_psnr:.2f} dB registered" in " ".join(evaluation_summary(result))
 
 
 def test_evaluate_stream__reports_every_score_by_region(fitted_clip: Path) -> None:

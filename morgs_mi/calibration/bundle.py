@@ -1,0 +1,221 @@
+"""Bundle adjustment: the changes of calibrated cameras, and the points, that agree best with matched features.
+
+A point X lies at x = exp([w]) R (X - C - d) in the axes of a camera with the rotation R and the centre C, and at the
+pixel
+
+    u = (1 + s) f x / z + c + p W
+
+so that the change of a camera has nine numbers: a small rotation w [3], a displacement d [3] of its centre, the
+relative change s of its focal lengths, and the displacement p [2] of its principal point in image widths W. They have
+independent normal priors around zero. Images do not determine a common similarity of cameras and points: there the
+priors alone decide, and leave the rig where the sum of the squared changes is least.
+
+Reprojection errors have Cauchy's loss in units of their own scale, so that wrong matches do not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+
+from morgs_mi.capture.features import Tracks, intersect
+from morgs_mi.core.camera import Camera
+from morgs_mi.fit.config import CameraPriors
+
+__all__ = ["NormalEquations", "bundle_adjust", "camera_jacobian", "changed_camera", "prior_deviations"]
+
+_CHANGES = 9
+# Steps, and the relative decrease of the loss below which they end.
+_STEPS, _LEAST_DECREASE = 60, 1e-6
+# Damping of Levenberg and Marquardt at the start and at most.
+_DAMPING, _MOST_DAMPING = 1e-3, 1e6
+# px, the least scale of the reprojection errors. Cauchy's loss halves the weight of an error of 2.4 deviations.
+_LEAST_SCALE, _CAUCHY = 0.05, 2.4
+
+
+def bundle_adjust(
+    cameras: Sequence[Camera], tracks: Tracks, extent: float, priors: CameraPriors
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the changes [V, 9] of the cameras, and the points [P, 3] in world units, that fit the tracks best.
+
+    Args:
+        cameras: V views as calibrated.
+        tracks: features of P > 0 points, each with at most one in a view.
+        extent: of the scene, world units.
+        priors: of the changes.
+    """
+    deviations, damping = np.stack([prior_deviations(camera, extent, priors) for camera in cameras]), _DAMPING
+    changes = np.zeros((len(cameras), _CHANGES))
+    points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
+    errors = _errors(cameras, changes, points, tracks)
+    scale = _scale(errors)
+    loss = _loss(errors, changes, scale, deviations)
+    for _ in range(_STEPS):
+        of_changes, of_points = _step(cameras, changes, points, tracks, errors, scale, deviations, damping)
+        tried = changes + of_changes, points + of_points
+        found = _errors(cameras, *tried, tracks)
+        new = _loss(found, tried[0], scale, deviations)
+        if not new < loss:
+            damping *= 10
+            if damping > _MOST_DAMPING:
+                break
+            continue
+        converged = loss - new < _LEAST_DECREASE * loss
+        (changes, points), errors, damping = tried, found, damping / 10
+        if converged:
+            break
+        scale = min(scale, _scale(errors))
+        loss = _loss(errors, changes, scale, deviations)
+    return changes, points
+
+
+def changed_camera(camera: Camera, changes: np.ndarray) -> Camera:
+    """Return a camera with the changes [9] of the module docstring."""
+    K, V = camera.K.copy(), np.eye(4)
+    K[[0, 1], [0, 1]] *= 1 + changes[6]
+    K[:2, 2] += changes[7:] * camera.width
+    V[:3, :3] = cv2.Rodrigues(np.asarray(changes[:3], np.float64))[0] @ np.asarray(camera.viewmat)[:3, :3]
+    V[:3, 3] = -V[:3, :3] @ (camera.position + changes[3:6])
+    return replace(camera, K=K, viewmat=V)
+
+
+def prior_deviations(camera: Camera, extent: float, priors: CameraPriors) -> np.ndarray:
+    """Return the standard deviations [9] of the changes of a camera; `extent` of the scene, world units."""
+    of_kind = np.deg2rad(priors.rotation), priors.position * extent, priors.focal, priors.principal_point
+    return np.repeat(of_kind, (3, 3, 1, 2))
+
+
+def camera_jacobian(camera: Camera, factor: float, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives of pixel positions by the changes of the camera [n, 2, 9] and by the points [n, 2, 3].
+
+    The derivative by w is that by a further small rotation, which is the same to first order.
+
+    Args:
+        camera: with the changes so far.
+        factor: 1 + s.
+        points: [n, 3], world units; the derivatives of points behind the near plane are zero.
+    """
+    by_point = camera.projection_jacobian(points)
+    R = np.asarray(camera.viewmat, np.float64)[:3, :3]
+    x = (points - camera.position) @ R.T
+    cross = np.zeros((len(x), 3, 3))  # d(exp([w]) x) / dw = -[x]
+    cross[:, [1, 2, 0], [2, 0, 1]] = x
+    cross -= cross.transpose(0, 2, 1)
+    front = x[:, 2] > camera.near
+    J = np.zeros((len(x), 2, _CHANGES))
+    J[:, :, :3], J[:, :, 3:6] = by_point @ R.T @ cross, -by_point
+    J[front, :, 6] = (camera.project(points[front])[0] - camera.K[:2, 2]) / factor
+    J[front, 0, 7] = J[front, 1, 8] = camera.width
+    return J, by_point
+
+
+class NormalEquations:
+    """Normal equations of the changes of V cameras and the displacements of P points.
+
+    An observation that shifts by u contributes u' G u / 2 + b' u to the cost.
+    """
+
+    def __init__(self, views: int, points: int) -> None:
+        self._cameras, self._right = np.zeros((views, _CHANGES, _CHANGES)), np.zeros((views, _CHANGES))
+        self._points, self._right_points = np.zeros((points, 3, 3)), np.zeros((points, 3))
+        self._across = np.zeros((points, views, _CHANGES, 3))
+
+    def add(
+        self, view: int, ids: np.ndarray | slice, jacobians: tuple[np.ndarray, np.ndarray], G: np.ndarray, b: np.ndarray
+    ) -> None:
+        """Add the observations of n different points in a view.
+
+        Args:
+            view: its index.
+            ids: of the points.
+            jacobians: as from `camera_jacobian`.
+            G: [n, 2, 2].
+            b: [n, 2].
+        """
+        of_camera, of_point = jacobians
+        left, right = of_camera.transpose(0, 2, 1) @ G, of_point.transpose(0, 2, 1) @ G
+        self.add_camera(view, of_camera, G, b)
+        self._points[ids] += right @ of_point
+        self._right_points[ids] += np.einsum("nij,ni->nj", of_point, b)
+        self._across[ids, view] += left @ of_point
+
+    def add_camera(self, view: int, of_camera: np.ndarray, G: np.ndarray, b: np.ndarray) -> None:
+        """Add observations of points that stay where they are; arguments as for `add`."""
+        left = of_camera.transpose(0, 2, 1) @ G
+        self._cameras[view] += np.tensordot(left, of_camera, axes=((0, 2), (0, 1)))
+        self._right[view] += np.einsum("nij,ni->j", of_camera, b)
+
+    def step(self, changes: np.ndarray, deviations: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the step of Levenberg and Marquardt for cameras [V, 9] and points [P, 3], by Schur's complement.
+
+        Args:
+            changes: of the cameras so far [V, 9].
+            deviations: of their priors [V, 9].
+            damping: relative increase of the diagonal.
+        """
+        views, size = changes.shape
+        precision = deviations**-2.0
+        system = _damped(self._cameras + precision[..., None] * np.eye(size), damping)
+        points = _damped(self._points, damping)
+        across = self._across.reshape(len(points), views * size, 3)
+        solved = across @ np.linalg.inv(points)
+        full = np.zeros((views, size, views, size))
+        full[np.arange(views), :, np.arange(views)] = system
+        reduced = full.reshape(views * size, -1) - np.tensordot(solved, across, axes=((0, 2), (0, 2)))
+        right = (self._right + precision * changes).ravel() - np.einsum("pij,pj->i", solved, self._right_points)
+        step = -np.linalg.solve(reduced, right)
+        rest = -self._right_points - np.einsum("pij,i->pj", across, step)
+        return step.reshape(views, size), np.linalg.solve(points, rest[..., None])[..., 0]
+
+
+def _damped(blocks: np.ndarray, damping: float) -> np.ndarray:
+    """Return blocks [..., k, k] with an increased diagonal; that of a singular block becomes a little more than 0."""
+    diagonal = np.einsum("...ii->...i", blocks)
+    added = damping * diagonal + 1e-9 * diagonal.max(axis=-1, keepdims=True) + 1e-30
+    return blocks + added[..., None] * np.eye(blocks.shape[-1])
+
+
+def _step(
+    cameras: Sequence[Camera],
+    changes: np.ndarray,
+    points: np.ndarray,
+    tracks: Tracks,
+    errors: np.ndarray,
+    scale: float,
+    deviations: np.ndarray,
+    damping: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return a step of iteratively reweighted least squares, in units of the errors' scale."""
+    equations = NormalEquations(len(cameras), tracks.count)
+    weights = 1 / (scale**2 + (errors**2).sum(axis=1, keepdims=True) / _CAUCHY**2)
+    for view, (camera, change) in enumerate(zip(cameras, changes, strict=True)):
+        here = tracks.views == view
+        jacobians = camera_jacobian(changed_camera(camera, change), 1 + change[6], points[tracks.ids[here]])
+        w = weights[here]
+        equations.add(view, tracks.ids[here], jacobians, w[..., None] * np.eye(2), w * errors[here])
+    return equations.step(changes, deviations, damping)
+
+
+def _errors(cameras: Sequence[Camera], changes: np.ndarray, points: np.ndarray, tracks: Tracks) -> np.ndarray:
+    """Return the projections minus the features [n, 2], px; large behind a camera."""
+    errors, depths = np.empty_like(tracks.pixels), np.empty(len(tracks.ids))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for view, (camera, change) in enumerate(zip(cameras, changes, strict=True)):
+            here = tracks.views == view
+            errors[here], depths[here] = changed_camera(camera, change).project(points[tracks.ids[here]])
+        errors -= tracks.pixels
+    return np.where((depths[:, None] > 0) & np.isfinite(errors), errors, 1e6)
+
+
+def _scale(errors: np.ndarray) -> float:
+    """Return the standard deviation of the errors along one axis, px."""
+    # The median length of a normal error in two dimensions is 1.18 deviations.
+    return max(_LEAST_SCALE, float(np.median(np.linalg.norm(errors, axis=1))) / 1.18)
+
+
+def _loss(errors: np.ndarray, changes: np.ndarray, scale: float, deviations: np.ndarray) -> float:
+    squares = (errors**2).sum(axis=1) / (_CAUCHY * scale) ** 2
+    return float(_CAUCHY**2 * np.log1p(squares).sum() + np.sum((changes / deviations) ** 2))

@@ -1,0 +1,344 @@
+"""Refinement of calibrated cameras on the first frame: poses, focal lengths and principal points.
+
+Beyond the paper. Feature matches give a first estimate by bundle adjustment (see `bundle`), where there are enough.
+Then rounds of a short fit of Gaussians, and of Gauss-Newton steps for all cameras and the means of all Gaussians at
+once, lower the difference between images and renderings. With the blend weights w fixed, the error e = target - image
+of a view is linear in the shift u of a splat (Lucas and Kanade 1981; as in `method.photometric`): with the gradient g,
+it becomes e + g . u, so that a Gaussian is an observation of `NormalEquations` in each view, with
+
+    G = sum_x w g g' / v,    b = sum_x w e g / v,
+
+where the variance v is the mean square error times the number of pixels whose errors are alike.
+
+Refined cameras are judged by pixels that no fit has seen: blocks that are withheld from every training view. A fit from
+the same start with the calibrated cameras and one with the refined cameras are compared by the PSNR of these pixels.
+
+The calibration's priors fix what images leave open, which is where the rig is, how it is turned, and its scale. Points
+move so that their projections stay. The held-out view keeps its calibrated camera; `register_camera` fits a camera to
+its image while the Gaussians are frozen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import cv2
+import numpy as np
+
+from morgs_mi.calibration.bundle import (
+    NormalEquations,
+    bundle_adjust,
+    camera_jacobian,
+    changed_camera,
+    prior_deviations,
+)
+from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.features import detect, intersect, join_matches, match_views
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.cross_validation import mean_psnr, reduced
+from morgs_mi.fit.first_frame import fit_first_frame
+from morgs_mi.fit.initialise import fill_points, from_points, resample_points, scene_extent, seed_points, seen_points
+from morgs_mi.losses.ssim import Target
+from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.config import RenderConfig
+
+__all__ = ["Refinement", "refine_cameras", "register_camera"]
+
+# A camera with features in fewer tracks is not determined by them.
+_MIN_TRACKS = 40
+# Pixels whose errors are alike, because the fit lacks a detail there: they count as one. Without it, priors would not
+# count at all, and cameras would follow the errors of a short fit.
+_ALIKE = 10.0
+# Gauss-Newton steps of a round, their damping, and the longest step of a mean in scene extents.
+_STEPS, _DAMPING, _LONGEST = 3, 1e-3, 0.02
+# px, standard deviations of the blur of images and gradients in the first rounds, for errors of several pixels.
+_BLURS = (2.0, 1.0)
+# Error at which a pixel has half its weight, relative to white: it shows what the fit lacks.
+_HALF_WEIGHT = 0.1
+# Least mean square error: that of a rendering that is compared with itself is 0.
+_LEAST_ERROR = 1e-10
+# Withheld blocks: side in px, and one of how many.
+_BLOCK, _SHARE = 12, 8
+# Steps of the registration of a camera, which end when they change its pixels by less than this, px.
+_REGISTRATION_STEPS, _LEAST_SHIFT = 30, 1e-3
+# Factors on the learning rates in the rounds after the first.
+_LATER_RATES = {"means": 0.25, "scales": 0.5, "quats": 0.5, "opacities": 0.25}
+_View = tuple[Camera, np.ndarray, np.ndarray | None]
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Result of refining cameras.
+
+    Attributes:
+        taken: whether the refined cameras are used.
+        calibrated_psnr: of withheld pixels in a fit with the calibrated cameras, dB; NaN where they were not compared.
+        refined_psnr: of the same pixels in a fit with the refined cameras, dB.
+        tracks: number of points in the bundle adjustment; 0 where there were too few.
+        rotation: largest change of a rotation, degrees.
+        position: largest change of a position, world units.
+        focal: largest relative change of a focal length.
+    """
+
+    taken: bool
+    calibrated_psnr: float
+    refined_psnr: float
+    tracks: int
+    rotation: float
+    position: float
+    focal: float
+
+    @property
+    def sentence(self) -> str:
+        """What was changed, and why."""
+        sizes = f"by up to {self.rotation:.2g} degrees, {self.position:.2g} units and {100 * self.focal:.2g} %"
+        scores = f"withheld pixels have {self.refined_psnr:.2f} dB instead of {self.calibrated_psnr:.2f} dB"
+        if np.isnan(self.calibrated_psnr):
+            return f"The cameras were refined, {sizes} of the focal length."
+        if self.taken:
+            return f"The cameras were refined, {sizes} of the focal length: {scores}."
+        return f"The cameras stay as calibrated: refined ones are no clear gain, {scores}."
+
+
+def refine_cameras(
+    capture: Capture,
+    config: FitConfig,
+    render: RenderConfig | None = None,
+    seed: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[Capture, Refinement]:
+    """Return the capture with refined training cameras and moved points, if they are better, and what was found.
+
+    Args:
+        capture: its first frame and its points are used; the held-out view is not.
+        config: of the fit; `refine_cameras` "on" takes the refined cameras in any case.
+        render: cut-offs.
+        seed: of all random choices.
+        progress: called with (fits done, fits in all).
+
+    Raises:
+        ValueError: fewer than two training views have an image of the first frame.
+    """
+    how, render = config.refinement, render or RenderConfig()
+    images = next(capture.partial_frames(0, 1)).images
+    seen = {v: image for v in capture.train_views if (image := images[v]) is not None}
+    if len(seen) < 2:
+        raise ValueError(
+            f"refine_cameras(): expected images of at least two training views, got {len(seen)}; record more, or set "
+            "`refine_cameras` to off."
+        )
+    judge = config.refine_cameras == "auto"
+    report, fits = progress or (lambda done, count: None), how.rounds + 2 * judge
+    cameras, masks = [capture.cameras[v] for v in seen], [capture.masks[v] for v in seen]
+    extent, colors = scene_extent(cameras), capture.point_colors
+    deviations = np.stack([prior_deviations(camera, extent, how.priors) for camera in cameras])
+    changes, tracks = _matched(capture, list(seen), config, extent)
+    views, unseen = _withheld(cameras, list(seen.values()), masks, how.width, seed)
+    fit = partial(_fit, views=views, extent=extent, config=config, render=render, seed=seed)
+    gaussians = _start(_changed(views, changes), _moved(capture.points, cameras, changes), colors, config, seed)
+    for done in range(how.rounds):
+        report(done, fits)
+        gaussians = fit(gaussians, changes, later=done > 0)
+        blur = _BLURS[done] if done < len(_BLURS) else 0.0
+        for _ in range(_STEPS):
+            gaussians, changes = _joint_step(gaussians, views, changes, deviations, extent, blur, render)
+    points, scores = _moved(capture.points, cameras, changes), [float("nan")] * 2
+    if judge:
+        for k, (change, start) in enumerate(((0 * changes, capture.points), (changes, points))):
+            report(how.rounds + k, fits)
+            fitted = fit(_start(_changed(views, change), start, colors, config, seed), change)
+            scores[k] = mean_psnr(fitted, _changed(unseen, change), render)
+    taken = not judge or scores[1] >= scores[0] + how.least_gain
+    rotation, position = (np.linalg.norm(changes[:, k : k + 3], axis=1).max() for k in (0, 3))
+    sizes = float(np.rad2deg(rotation)), float(position), float(np.abs(changes[:, 6]).max())
+    found = Refinement(taken, scores[0], scores[1], tracks, *sizes)
+    if not taken:
+        return capture, found
+    refined = dict(zip(seen, (changed_camera(*pair) for pair in zip(cameras, changes, strict=True)), strict=True))
+    every = tuple(refined.get(v, camera) for v, camera in enumerate(capture.cameras))
+    return replace(capture, cameras=every, points=points), found
+
+
+def register_camera(
+    gaussians: Gaussians,
+    camera: Camera,
+    image: np.ndarray,
+    mask: np.ndarray | None,
+    extent: float,
+    config: FitConfig,
+    render: RenderConfig | None = None,
+) -> Camera:
+    """Return the camera, near the given one, from which frozen Gaussians look most like an image.
+
+    Args:
+        gaussians: frozen.
+        camera: as calibrated.
+        image: [H, W, 3], uint8.
+        mask: valid pixels [H, W], or None.
+        extent: of the scene, world units.
+        config: has the priors of the changes.
+        render: cut-offs.
+    """
+    render, target = render or RenderConfig(), Target(image, mask)
+    deviations, best = prior_deviations(camera, extent, config.refinement.priors)[None], np.zeros((1, 9))
+    means = np.asarray(gaussians.means, np.float64)
+    for blur in (*_BLURS, 0.0):
+        changes, error = best, np.inf
+        for _ in range(_REGISTRATION_STEPS):
+            now = changed_camera(camera, changes[0])
+            G, b, found = _shifts(gaussians, now, target, blur, render)
+            if not found < error:
+                break
+            best, error = changes, found
+            equations, (of_camera, _) = NormalEquations(1, 0), camera_jacobian(now, 1 + changes[0, 6], means)
+            equations.add_camera(0, of_camera, G / found / _ALIKE, b / found / _ALIKE)
+            step, _ = equations.step(changes, deviations, 0.0)
+            changes = changes + step
+            if np.abs(of_camera @ step[0]).mean() < _LEAST_SHIFT:
+                break
+    return changed_camera(camera, best[0])
+
+
+def _matched(capture: Capture, train: Sequence[int], config: FitConfig, extent: float) -> tuple[np.ndarray, int]:
+    """Return the changes [V, 9] by bundle adjustment, and the number of its points; no change without enough."""
+    recorded = capture.at_recorded_size()
+    images, cameras = next(recorded.partial_frames(0, 1)).images, [recorded.cameras[v] for v in train]
+    features = [detect(images[v], recorded.masks[v]) for v in train]
+    tracks = join_matches(match_views(features, cameras), features)
+    if np.bincount(tracks.views, minlength=len(train)).min() < _MIN_TRACKS:
+        return np.zeros((len(train), 9)), 0
+    return bundle_adjust(cameras, tracks, extent, config.refinement.priors)[0], tracks.count
+
+
+def _withheld(
+    cameras: Sequence[Camera],
+    images: Sequence[np.ndarray],
+    masks: Sequence[np.ndarray | None],
+    width: int,
+    seed: int,
+) -> tuple[list[_View], list[_View]]:
+    """Return the reduced views without withheld blocks of pixels, and with these alone."""
+    rng, views, unseen = np.random.default_rng([seed, 2]), [], []
+    for camera, image, mask in zip(cameras, images, masks, strict=True):
+        small = reduced(camera, image, mask, width)
+        rows, columns = (np.arange(size) // _BLOCK for size in small[1].shape[:2])
+        withheld = (rng.random((rows[-1] + 1, columns[-1] + 1)) < 1 / _SHARE)[rows][:, columns]
+        valid = np.ones_like(withheld) if small[2] is None else small[2]
+        views.append((*small[:2], valid & ~withheld))
+        unseen.append((*small[:2], valid & withheld))
+    return views, [view for view in unseen if view[2].any()]
+
+
+def _changed(views: Sequence[_View], changes: np.ndarray) -> list[_View]:
+    return [(changed_camera(view[0], change), *view[1:]) for view, change in zip(views, changes, strict=True)]
+
+
+def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -> np.ndarray:
+    """Return points [P, 3] whose projections in changed cameras are those that they had in the views that show them."""
+    changed = [changed_camera(*pair) for pair in zip(cameras, changes, strict=True)]
+    seen = [seen_points(camera, points)[:2] for camera in cameras]
+    ids = np.concatenate([np.flatnonzero(inside) for inside, _ in seen])
+    views = np.repeat(np.arange(len(cameras)), [len(pixels) for _, pixels in seen])
+    if not len(ids):
+        return points
+    found = intersect(ids, views, np.concatenate([pixels for _, pixels in seen]), changed, len(points))
+    several = np.bincount(ids, minlength=len(points)) >= 2
+    moved = np.where((several & np.isfinite(found).all(axis=1))[:, None], found, points)
+    return moved.astype(np.float32)
+
+
+def _start(views: Sequence[_View], points: np.ndarray, colors: np.ndarray, config: FitConfig, seed: int) -> Gaussians:
+    """Return the Gaussians that a fit starts from, without view-dependent colours, which would hide wrong poses."""
+    cameras, images, masks = (list(part) for part in zip(*views, strict=True))
+    count, rng = config.refinement.gaussians, np.random.default_rng([seed, 3])
+    given = (points, colors) if len(points) else None
+    start = (
+        seed_points(cameras, images, masks, count, rng)
+        if given is None
+        else fill_points(*given, cameras, images, masks, count, rng)
+    )
+    return from_points(*resample_points(*start, count, rng), 0, config.initial_opacity)
+
+
+def _fit(
+    gaussians: Gaussians,
+    changes: np.ndarray,
+    views: Sequence[_View],
+    extent: float,
+    config: FitConfig,
+    render: RenderConfig,
+    seed: int,
+    later: bool = False,
+) -> Gaussians:
+    """Return the Gaussians after a short fit; a later one continues with half the steps and lower rates."""
+    how, rates = config.refinement, config.first_frame_rates
+    if later:
+        rates = replace(rates, **{name: factor * getattr(rates, name) for name, factor in _LATER_RATES.items()})
+    short = replace(
+        config,
+        num_gaussians=how.gaussians,
+        first_frame_steps=how.steps // 2 if later else how.steps,
+        first_frame_rates=rates,
+        dropping=0.0,
+        density=replace(config.density, rounds=0),
+    )
+    targets, cameras = [Target(*view[1:]) for view in views], [view[0] for view in _changed(views, changes)]
+    rng = np.random.default_rng([seed, 4])
+    return fit_first_frame(gaussians, cameras, targets, extent, short, render, rng).gaussians
+
+
+def _joint_step(
+    gaussians: Gaussians,
+    views: Sequence[_View],
+    changes: np.ndarray,
+    deviations: np.ndarray,
+    extent: float,
+    blur: float,
+    render: RenderConfig,
+) -> tuple[Gaussians, np.ndarray]:
+    """Return the Gaussians and the changes of the cameras [V, 9] after one Gauss-Newton step of both."""
+    means = np.asarray(gaussians.means, np.float64)
+    cameras = [view[0] for view in _changed(views, changes)]
+    shifts = [
+        _shifts(gaussians, camera, Target(*view[1:]), blur, render) for camera, view in zip(cameras, views, strict=True)
+    ]
+    variance, equations = _ALIKE * np.mean([error for *_, error in shifts]), NormalEquations(len(views), len(means))
+    for v, (camera, (G, b, _)) in enumerate(zip(cameras, shifts, strict=True)):
+        equations.add(v, slice(None), camera_jacobian(camera, 1 + changes[v, 6], means), G / variance, b / variance)
+    of_changes, of_means = equations.step(changes, deviations, _DAMPING)
+    length = np.linalg.norm(of_means, axis=1, keepdims=True)
+    of_means *= np.minimum(1, _LONGEST * extent / np.maximum(length, 1e-30))
+    return replace(gaussians, means=(means + of_means).astype(np.float32)), changes + of_changes
+
+
+def _shifts(
+    gaussians: Gaussians, camera: Camera, target: Target, blur: float, render: RenderConfig
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return G v [N, 2, 2] and b v [N, 2] of the module docstring in a view, and the mean square error."""
+    view = ActiveView(camera, render)
+    image = view.render(gaussians).color
+    error = target.difference(image)
+    square = max(float(np.mean(error**2)), _LEAST_ERROR)
+    # The image that the target would be without the error, also where it is masked.
+    x, y = _gradient(np.asarray(image) + 0.5 * error, blur)
+    error = _blurred(error, blur)
+    weight = 1 / (1 + np.sum(error**2, axis=-1) / _HALF_WEIGHT**2)
+    sums = [weight * np.sum(a * b, axis=-1) for a, b in ((x, x), (x, y), (y, y), (error, x), (error, y))]
+    sums = view.backproject(gaussians, np.stack(sums, axis=-1)).astype(np.float64)
+    return sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2), sums[:, 3:], square
+
+
+def _blurred(image: np.ndarray, blur: float) -> np.ndarray:
+    return cv2.GaussianBlur(image, (0, 0), blur) if blur else image
+
+
+def _gradient(image: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives of a blurred image along x and y, per px."""
+    image = _blurred(image.astype(np.float32), blur)
+    return cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8), cv2.Sobel(
+        image, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8
+    )

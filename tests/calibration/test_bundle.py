@@ -1,0 +1,56 @@
+"""Bundle adjustment: derivatives, and cameras from exact features with wrong matches among them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from morgs_mi.calibration.bundle import bundle_adjust, camera_jacobian, changed_camera
+from morgs_mi.capture.features import Tracks
+from morgs_mi.fit.config import CameraPriors
+from morgs_mi.fit.initialise import scene_extent
+from tests.assertions import assert_close
+from tests.scenes.textured import rig
+
+POINTS = np.random.default_rng(0).uniform((-2, -1.5, 3), (2, 1.5, 6), (300, 3))
+
+
+def seen_by(cameras) -> Tracks:
+    """Return the exact features of all points in all cameras."""
+    views, ids = (grid.ravel() for grid in np.mgrid[: len(cameras), : len(POINTS)])
+    pixels = np.concatenate([camera.project(POINTS)[0] for camera in cameras])
+    return Tracks(ids, views, pixels, np.zeros((len(ids), 3)))
+
+
+def disturbed(cameras, rng):
+    deviations = np.array([0.005] * 3 + [0.01] * 3 + [0.01, 0, 0])
+    return [changed_camera(camera, deviations * rng.normal(size=9)) for camera in cameras]
+
+
+def test_camera_jacobian__is_that_of_finite_differences():
+    camera, step, before = rig(shift=7)[1], 1e-6, np.array([0, 0, 0, 0.02, -0.01, 0.03, 0.02, 0.001, -0.002])
+    of_changes, of_points = camera_jacobian(changed_camera(camera, before), 1.02, POINTS)
+    for k in range(9):
+        ahead, back = (changed_camera(camera, before + sign * step * np.eye(9)[k]) for sign in (1, -1))
+        difference = (ahead.project(POINTS)[0] - back.project(POINTS)[0]) / (2 * step)
+        assert_close(of_changes[:, :, k], difference, rtol=1e-5, atol=1e-4)
+    moved = [changed_camera(camera, before).project(POINTS + sign * step * np.eye(3)[0])[0] for sign in (1, -1)]
+    assert_close(of_points[:, :, 0], (moved[0] - moved[1]) / (2 * step), rtol=1e-5, atol=1e-4)
+
+
+def test_bundle_adjust__finds_the_reprojections_despite_wrong_matches():
+    true, rng = rig(shift=7), np.random.default_rng(1)
+    tracks, given = seen_by(true), disturbed(true, rng)
+    wrong = rng.random(len(tracks.ids)) < 0.1
+    tracks.pixels[wrong] += rng.normal(scale=30, size=(wrong.sum(), 2))
+    changes, points = bundle_adjust(given, tracks, scene_extent(given), CameraPriors())
+    found = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
+    projected = np.concatenate([camera.project(points)[0] for camera in found])
+    assert np.median(np.linalg.norm(projected - tracks.pixels, axis=1)[~wrong]) < 0.02
+    relative = [rig[0].viewmat[:3, :3] @ rig[-1].viewmat[:3, :3].T for rig in (found, true)]
+    assert np.rad2deg(np.arccos((np.trace(relative[0].T @ relative[1]) - 1) / 2)) < 0.02
+
+
+def test_bundle_adjust__leaves_the_gauge_to_the_priors():
+    true = rig()
+    changes, _ = bundle_adjust(true, seen_by(true), scene_extent(true), CameraPriors())
+    assert np.abs(changes).max() < 1e-6

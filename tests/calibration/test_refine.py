@@ -1,0 +1,161 @@
+"""Refinement of cameras: with splats of a known scene, and on textured planes whose images are exact."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morgs_mi.calibration.bundle import changed_camera, prior_deviations
+from morgs_mi.calibration.refine import (
+    Refinement,
+    _joint_step,
+    _matched,
+    _moved,
+    refine_cameras,
+    register_camera,
+)
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.fit.config import CameraPriors, FitConfig, RefinementConfig
+from morgs_mi.fit.cross_validation import rendered
+from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.playback.visualise import write_png
+from morgs_mi.render.config import RenderConfig
+from tests.assertions import assert_close
+from tests.scenes.cameras import look_at_cameras
+from tests.scenes.gaussians import isotropic
+
+# Too little to find a gain.
+LEAST = FitConfig(refine_cameras="auto", refinement=RefinementConfig(gaussians=50, steps=2, rounds=1, width=40))
+WRONG = np.array([0.006, -0.008, 0.004, 0.01, 0.008, -0.01, 0.004, 0, 0])
+PLACES = [(x, y, -4) for x, y in ((-1, 0), (0, 0.5), (1, 0), (0, -0.7))]
+CAMERAS = look_at_cameras(PLACES, 60, 64, 48)
+
+
+def splats():
+    """Return a cloud of coloured splats."""
+    rng = np.random.default_rng(0)
+    means, sh = rng.uniform(-1, 1, (60, 3)), rng.uniform(-1, 1.5, (60, 1, 3))
+    return isotropic(means.astype(np.float32), 0.15, 0.9, sh.astype(np.float32))
+
+
+def image_of(camera) -> np.ndarray:
+    return np.rint(255 * rendered(splats(), camera, RenderConfig())).astype(np.uint8)
+
+
+def disturbed(cameras, scale: float = 1.0) -> list:
+    """Return cameras with wrong poses and focal lengths."""
+    signs = np.random.default_rng(1).choice([-1, 1], (len(cameras), 9))
+    return [changed_camera(c, scale * s * WRONG) for c, s in zip(cameras, signs, strict=True)]
+
+
+def relative_turns(cameras) -> np.ndarray:
+    """Return the angles between the viewing directions of each two cameras, degrees."""
+    rays = np.array([camera.viewmat[2, :3] for camera in cameras])
+    return np.rad2deg(np.arccos(np.clip(rays @ rays.T, -1, 1)))[np.triu_indices(len(rays), 1)]
+
+
+@pytest.fixture(scope="module")
+def splat_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """A capture of the splats in five views, the first of which is held out."""
+    path, cameras = tmp_path_factory.mktemp("splats"), look_at_cameras([(0, 0, -4), *PLACES], 60, 64, 48)
+    gaussians = splats()
+    write_colmap(path / "sparse", cameras, np.asarray(gaussians.means), np.full((60, 3), 0.5))
+    for camera in cameras:
+        write_png(path / camera.name / "0000.png", image_of(camera))
+    return load_capture(path, test_view=0)
+
+
+def test_joint_step__turns_cameras_to_where_the_images_were_taken():
+    given, gaussians, changes = disturbed(CAMERAS), splats(), np.zeros((4, 9))
+    views = [(camera, image_of(true), None) for camera, true in zip(given, CAMERAS, strict=True)]
+    deviations = np.stack([prior_deviations(camera, 1.0, CameraPriors()) for camera in given])
+    for _ in range(8):
+        gaussians, changes = _joint_step(gaussians, views, changes, deviations, 1.0, 0.0, RenderConfig())
+    found = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
+    errors = [np.abs(relative_turns(rig) - relative_turns(CAMERAS)).max() for rig in (given, found)]
+    assert errors[1] < 0.15 * errors[0]
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0])
+def test_register_camera__finds_the_camera_of_an_image(scale):
+    given = disturbed(CAMERAS[:1], scale)[0]
+    image = image_of(CAMERAS[0])
+    found = register_camera(splats(), given, image, None, 1.0, FitConfig())
+    error = np.square(rendered(splats(), found, RenderConfig()) - image / 255).mean()
+    assert error < 1e-5, "the rounding to 8 bits alone has 1e-6"
+
+
+def test_register_camera__keeps_a_camera_that_fits():
+    found = register_camera(splats(), CAMERAS[0], image_of(CAMERAS[0]), None, 1.0, FitConfig())
+    assert_close(found.viewmat, CAMERAS[0].viewmat, rtol=0, atol=1e-3)
+
+
+def test_moved__keeps_the_projections_of_points():
+    points, changes = np.asarray(splats().means), np.tile([0, 0, 0, 0.1, -0.2, 0.05, 0, 0, 0], (4, 1))
+    assert_close(_moved(points, CAMERAS, changes), points + changes[0, 3:6], rtol=0, atol=1e-5)
+
+
+def test_refine_cameras__returns_the_calibrated_cameras_without_a_gain(splat_capture):
+    refined, found = refine_cameras(splat_capture, LEAST)
+    assert not found.taken
+    assert refined is splat_capture
+    assert "stay as calibrated" in found.sentence
+
+
+@pytest.mark.parametrize(("gain", "taken"), [(0.05, False), (0.2, True)])
+def test_refine_cameras__takes_cameras_with_which_withheld_pixels_gain(splat_capture, monkeypatch, gain, taken):
+    scores = iter((25.0, 25.0 + gain))
+    monkeypatch.setattr("morgs_mi.calibration.refine.mean_psnr", lambda *_: next(scores))
+    refined, found = refine_cameras(splat_capture, LEAST)
+    assert found.taken is taken
+    assert (refined is splat_capture) is not taken
+    assert refined.cameras[0] is splat_capture.cameras[0], "the held-out view stays as calibrated"
+    assert np.array_equal(refined.points, splat_capture.points) is not taken
+
+
+@pytest.mark.slow
+def test_refine_cameras__improves_withheld_pixels_of_disturbed_cameras(textured_capture):
+    capture = replace(textured_capture, cameras=tuple(disturbed(textured_capture.cameras, 1.5)))
+    how = RefinementConfig(steps=200, rounds=2, width=160)
+    refined, found = refine_cameras(capture, FitConfig(refine_cameras="auto", refinement=how))
+    assert found.taken
+    assert found.refined_psnr > found.calibrated_psnr + 0.5
+    true, before, after = ([c.cameras[v] for v in capture.train_views] for c in (textured_capture, capture, refined))
+    errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (before, after)]
+    assert errors[1] < 0.1 * errors[0]
+
+
+def test_refine_cameras__does_not_judge_where_refined_cameras_are_wanted(splat_capture):
+    refined, found = refine_cameras(splat_capture, replace(LEAST, refine_cameras="on"))
+    assert found.taken
+    assert np.isnan(found.calibrated_psnr)
+    assert refined is not splat_capture
+
+
+def test_matched__finds_the_cameras_by_features(textured_capture, monkeypatch):
+    monkeypatch.setattr("morgs_mi.capture.features._MAX_FEATURES", 300)
+    capture = replace(textured_capture, cameras=tuple(disturbed(textured_capture.cameras)))
+    given, true = ([c.cameras[v] for v in capture.train_views] for c in (capture, textured_capture))
+    changes, tracks = _matched(capture, capture.train_views, LEAST, scene_extent(given))
+    found = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
+    errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (given, found)]
+    assert tracks > 100
+    assert errors[1] < 0.1 * errors[0]
+
+
+def test_refine_cameras__needs_two_images(splat_capture):
+    fields = {name: getattr(splat_capture, name)[:1] for name in ("cameras", "masks", "_sources")}
+    with pytest.raises(ValueError, match="at least two training views, got 1"):
+        refine_cameras(replace(splat_capture, **fields, test_view=None), LEAST)
+
+
+def test_Refinement__reports_the_changes_and_the_gain():
+    found = Refinement(True, 26.0, 31.5, 200, 0.51, 0.02, 0.011)
+    assert found.sentence == (
+        "The cameras were refined, by up to 0.51 degrees, 0.02 units and 1.1 % of the focal length: withheld pixels "
+        "have 31.50 dB instead of 26.00 dB."
+    )
+    assert "dB" not in replace(found, calibrated_psnr=np.nan, refined_psnr=np.nan).sentence
