@@ -37,8 +37,9 @@ class ActiveSetConfig:
 
     min_responsibility: float = 0.05
     """Responsibility above which a Gaussian is active."""
-    min_weight: float = 1.0
-    """Blend weight in changed blocks, summed over all views in px, below which a Gaussian counts as hidden."""
+    min_weight: float = 0.2
+    """Blend weight in changed blocks, summed over all views in px, below which a Gaussian counts as hidden. One inside
+    an object that moves is nearly hidden: it would stay behind, and be uncovered later."""
     min_explained: float = 0.5
     """Fraction of a connected change that active Gaussians must cover to explain it."""
     min_cluster: int = 5
