@@ -27,6 +27,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 import tyro
+from scipy.special import expit
 
 from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.few_views import spread_views, with_points
@@ -44,7 +45,7 @@ from morgs_mi.render.rasterize import Image
 from morgs_mi.synth.synthesize import synthesize
 
 CASES = ((20, 16, 0.0), (21, 8, 0.0), (22, 4, 0.0), (23, 16, 0.02), (24, 8, 0.02), (25, 4, 0.02))
-"""Seed of the scene, number of training views, and noise relative to white."""
+"""Seed of the scene, number of training views, and noise of the reduced images relative to white."""
 
 Points = tuple[np.ndarray, np.ndarray]
 
@@ -67,9 +68,11 @@ class CaseOptions(CellOptions):
     def cases(self) -> Iterator[tuple[str, Capture, tuple[int, ...]]]:
         """Yield the name, the capture with the points of its training views, and these views."""
         for seed, count, noise in CASES:
-            clip = self.clips / f"{seed}-{count}"
+            clip = self.clips / f"{seed}-{count}-{noise * self.downscale:g}"
             if not clip.exists():
-                synthesize("random", clip, num_cameras=20, num_frames=1, noise=noise, seed=seed)
+                # The mean over a block has less noise than its pixels.
+                noise_of_pixels = noise * self.downscale
+                synthesize("random", clip, num_cameras=20, num_frames=1, noise=noise_of_pixels, seed=seed)
             capture = load_capture(clip, self.downscale)
             train = spread_views(capture.cameras, count, capture.train_views)
             yield f"{count} views{', noisy' if noise else ''}", with_points(capture, train, "stereo"), train
@@ -177,8 +180,8 @@ def _exploring() -> Iterator[None]:
         rng, losses = np.random.default_rng(start), {}
         for step, view in enumerate(views, start):
             losses = optimise(optimizer, rates, [view], losses_at, {}, decay, on_step, step, last)
-            means, opacity = np.asarray(optimizer["means"]), 1 / (1 + np.exp(-np.asarray(optimizer["logit_opacities"])))
-            gate = 1 / (1 + np.exp(-100 * (1 - opacity - 0.995)))
+            means, opacity = np.asarray(optimizer["means"]), expit(np.asarray(optimizer["logit_opacities"]))
+            gate = expit(100 * (0.005 - opacity))
             variance = np.exp(2 * np.asarray(optimizer["log_scales"])).mean(axis=1)
             size = 5e5 * 1.6e-4 * decay(step) * gate * variance
             noise = size[:, None] * rng.standard_normal(means.shape)
