@@ -67,6 +67,8 @@ ELSEWHERE: dict[str, str] = {
     "fit.cross_validation": "chooses among few values: tests/fit/test_cross_validation.py",
     "fit.depth_model": "a network that the user brings: tests/fit/test_depth_prior.py",
     "fit.depth_weight": "no network here: tests/fit/test_depth_prior.py",
+    "fit.refine_cameras": "cameras are refined by the recorder: tests/calibration/test_refine.py",
+    "fit.refinement": "cameras are refined by the recorder: tests/calibration/test_refine.py",
     "motion.flow.farneback": "a method that is not the default: tests/method/flow_sources",
     "motion.active_set.min_explained": "no change here is unexplained: tests/method/test_active_set.py",
     "motion.active_set.min_cluster": "no change here is unexplained: tests/method/test_active_set.py",
