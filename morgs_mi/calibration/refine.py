@@ -10,8 +10,9 @@ it becomes e + g . u, so that a Gaussian is an observation of `NormalEquations` 
 
 where the variance v is the mean square error times the number of pixels whose errors are alike.
 
-Refined cameras are judged by pixels that no fit has seen: blocks that are withheld from every training view. A fit from
-the same start with the calibrated cameras and one with the refined cameras are compared by the PSNR of these pixels.
+Refined cameras are judged by pixels that no fit has seen: blocks that are withheld from every training view. Fits from
+the same start with the calibrated cameras, with those of the bundle adjustment and with those after the rounds are
+compared by the PSNR of these pixels: where features are many and sharp, the rounds only lose accuracy.
 
 The calibration's priors fix what images leave open, which is where the rig is, how it is turned, and its scale. Points
 move so that their projections stay. The held-out view keeps its calibrated camera; `register_camera` fits a camera to
@@ -131,12 +132,14 @@ def refine_cameras(
             f"refine_cameras(): expected images of at least two training views, got {len(seen)}; record more, or set "
             "`refine_cameras` to off."
         )
-    judge = config.refine_cameras == "auto"
-    report, fits = progress or (lambda done, count: None), how.rounds + 2 * judge
+    report = progress or (lambda done, count: None)
     cameras, masks = [capture.cameras[v] for v in seen], [capture.masks[v] for v in seen]
     extent, colors = scene_extent(cameras), capture.point_colors
     deviations = np.stack([prior_deviations(camera, extent, how.priors) for camera in cameras])
     changes, tracks = _matched(capture, list(seen), config, extent)
+    judge = config.refine_cameras == "auto"
+    estimates = [0 * changes] * judge + [changes] * bool(tracks)
+    fits = how.rounds + len(estimates) + bool(estimates)
     views, unseen = _withheld(cameras, list(seen.values()), masks, how.width, seed)
     fit = partial(_fit, views=views, extent=extent, config=config, render=render, seed=seed)
     gaussians = _start(_changed(views, changes), _moved(capture.points, cameras, changes), colors, config, seed)
@@ -146,21 +149,25 @@ def refine_cameras(
         blur = _BLURS[done] if done < len(_BLURS) else 0.0
         for _ in range(_STEPS):
             gaussians, changes = _joint_step(gaussians, views, changes, deviations, extent, blur, render)
-    points, scores = _moved(capture.points, cameras, changes), [float("nan")] * 2
-    if judge:
-        for k, (change, start) in enumerate(((0 * changes, capture.points), (changes, points))):
+    estimates.append(changes)
+    points, scores = [_moved(capture.points, cameras, change) for change in estimates], [float("nan")] * len(estimates)
+    if len(estimates) > 1:
+        for k, (change, start) in enumerate(zip(estimates, points, strict=True)):
             report(how.rounds + k, fits)
             fitted = fit(_start(_changed(views, change), start, colors, config, seed), change)
             scores[k] = mean_psnr(fitted, _changed(unseen, change), render)
-    taken = not judge or scores[1] >= scores[0] + how.least_gain
+    calibrated = scores[0] if judge else float("nan")
+    best = judge + int(np.argmax(scores[judge:]))
+    taken = not scores[best] < calibrated + how.least_gain
+    changes = estimates[best]
     rotation, position = (np.linalg.norm(changes[:, k : k + 3], axis=1).max() for k in (0, 3))
     sizes = float(np.rad2deg(rotation)), float(position), float(np.abs(changes[:, 6]).max())
-    found = Refinement(taken, scores[0], scores[1], tracks, *sizes)
+    found = Refinement(taken, calibrated, scores[best], tracks, *sizes)
     if not taken:
         return capture, found
     refined = dict(zip(seen, (changed_camera(*pair) for pair in zip(cameras, changes, strict=True)), strict=True))
     every = tuple(refined.get(v, camera) for v, camera in enumerate(capture.cameras))
-    return replace(capture, cameras=every, points=points), found
+    return replace(capture, cameras=every, points=points[best]), found
 
 
 def register_camera(
