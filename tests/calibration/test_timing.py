@@ -53,10 +53,9 @@ def test_timing_config__refuses_too_few_frames() -> None:
 @pytest.mark.slow
 def test_estimate_time_offsets__finds_the_offsets_of_a_clip(tmp_path: Path) -> None:
     clip = tmp_path / "clip"
-    synthesize("spheres", clip, num_cameras=7, width=96, height=72, disturbances=Disturbances(time_offset=1.5))
-    found = estimate_time_offsets(load_capture(clip), TimingConfig(instants=1))
+    synthesize("spheres", clip, num_cameras=7, width=128, height=96, disturbances=Disturbances(time_offset=1.5))
+    found = estimate_time_offsets(load_capture(clip))
     truth = {name: -camera.time_offset for name, camera in load_disturbances(clip / "truth").items()}
     assert found.reference == "cam00"
-    assert found.converged
-    # Those that are known are included, so that the same clocks are found.
-    assert found.offsets == pytest.approx(truth, abs=0.1)
+    # Things move by about a pixel per frame in images of 128 pixels.
+    assert found.offsets == pytest.approx(truth, abs=0.15)
