@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.capture.color_correction import ColorCorrection
+from morgs_mi.capture.interpolation import image_between
 from morgs_mi.capture.lens import Lens, Undistortion
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video import FrameReader, ImageOrError
@@ -25,6 +26,7 @@ class CameraSource:
         lens: the lens that the clip was recorded through.
         undistortion: the pixel maps that remove the lens distortion, or None.
         frame_indices: the clip's frames that show the instants 0, 1, ... of the recording, -1 for none, int [T].
+        shares: the share of the time to the clip's next frame that has passed at each instant [T]; None: none has.
         color_correction: the colour correction, or None.
         opaque: the mask of the recorded pixels that are not transparent [H, W], or None if all are opaque.
     """
@@ -33,16 +35,31 @@ class CameraSource:
     lens: Lens
     undistortion: Undistortion | None
     frame_indices: np.ndarray
+    shares: np.ndarray | None = None
     color_correction: ColorCorrection | None = None
     opaque: np.ndarray | None = None
 
     def images(self, camera: Camera, start: int, stop: int) -> Generator[ImageOrError, None, None]:
         """Yield the processed images of the instants start..stop-1, with an error in place of a missing image."""
+        if self.shares is not None:
+            yield from self._interpolated(camera, self.frame_indices[start:stop], self.shares[start:stop])
+            return
         indices = self.frame_indices[start:stop]
         frames = self.reader.pick(indices[indices >= 0].tolist())
         for instant, index in enumerate(indices, start):
             image = next(frames) if index >= 0 else ValueError(f"{self.reader.path}: no frame at instant {instant}.")
             yield self.process(image, camera) if isinstance(image, np.ndarray) else image
+
+    def _interpolated(
+        self, camera: Camera, indices: np.ndarray, shares: np.ndarray
+    ) -> Generator[ImageOrError, None, None]:
+        frames = self.reader.pick(np.stack([indices, indices + 1], axis=1).ravel().tolist())
+        for share in shares:
+            first, second = next(frames), next(frames)
+            if isinstance(first, np.ndarray) and isinstance(second, np.ndarray):
+                yield image_between(self.process(first, camera), self.process(second, camera), share)
+            else:
+                yield second if isinstance(first, np.ndarray) else first
 
     def process(self, image: np.ndarray, camera: Camera) -> np.ndarray:
         """Return a recorded image undistorted, downscaled to the size of `camera` and colour-corrected."""

@@ -251,9 +251,9 @@ def load_capture(
     common = timeline(path, names, readers, reading, max_frames, settings.get("fps"))
     opaque = [opaque_pixels(reader, camera.name) for reader, camera in zip(readers, recorded, strict=True)]
     sources = tuple(
-        CameraSource(reader, lens, undistortion(camera, lens), indices, opaque=mask)
-        for reader, lens, camera, indices, (mask, _) in zip(
-            readers, calibration.lenses, recorded, common.frame_indices, opaque, strict=True
+        CameraSource(reader, lens, undistortion(camera, lens), indices, shares, opaque=mask)
+        for reader, lens, camera, indices, shares, (mask, _) in zip(
+            readers, calibration.lenses, recorded, common.frame_indices, common.shares, opaque, strict=True
         )
     )
     cameras = tuple(_resized(camera, downscale) for camera in recorded)

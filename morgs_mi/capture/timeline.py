@@ -5,6 +5,7 @@ An instant t = 0, 1, ... is a frame of the recording. It is shown by frame k of 
     k = o + r t,    with o the clip's offset and r its frame rate divided by the lowest frame rate.
 
 In a clip of variable frame rate k is a position on its regular clock, and the frame nearest to it shows the instant.
+If o is not whole, the clip has no frame of the instant, and one is interpolated between two (see `interpolation`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from morgs_mi.core.checks import check_number
 from morgs_mi.io.bounded import read_json
 from morgs_mi.io.video import FrameReader
 
@@ -36,9 +38,10 @@ class ReadConfig:
 
     trim: bool = False
     """Whether to use only the instants that all clips cover, at the lowest of their frame rates."""
-    offset: dict[str, int] = field(default_factory=dict)
+    offset: dict[str, float] = field(default_factory=dict)
     """Frame of each listed camera's clip that is simultaneous with frame 0 of the others; negative for a clip that
-    started later. Instants that not all clips cover are left out, as with trim."""
+    started later. Instants that not all clips cover are left out, as with trim. If it is not whole, images are
+    interpolated between two frames."""
     gaps: bool = False
     """Whether images may be missing; a camera is left out of the frames that it lacks."""
     color: Literal["none", "linear", "root-polynomial", "vandermonde"] = "none"
@@ -61,12 +64,15 @@ class Timeline:
 
     Attributes:
         frame_indices: per camera the clip's frames in ascending order, -1 for none, int [T].
+        shares: per camera the share of the time to the next frame [T] that has passed at each instant; None: no image
+            is interpolated.
         fps: instants per second.
         unchanged: whether instant t is frame t of every clip.
         notes: a sentence for each clip of variable frame rate.
     """
 
     frame_indices: tuple[np.ndarray, ...]
+    shares: tuple[np.ndarray | None, ...]
     fps: float
     unchanged: bool
     notes: tuple[str, ...] = ()
@@ -92,10 +98,12 @@ def timeline(
 
     Raises:
         ValueError: lengths or rates differ or a rate varies and `config` does not resolve it, a clip is cut off, the
-            clips have no instant in common, or `config` names an unknown camera.
+            clips have no instant in common, or `config` names an unknown camera or has an offset that is not finite.
     """
     if unknown := [name for name in config.offset if name not in names]:
         raise ValueError(f"{path}: `offset` must name cameras of {', '.join(names)}, got {', '.join(unknown)}.")
+    for name, offset in config.offset.items():
+        check_number(str(path), f"offset of {name}", offset, "(-inf, inf)")
     if config.aligns_clips:
         clocks = _aligned_clocks(names, readers, config, fps)
         instants = _common_instants(path, names, readers, config, clocks)[:max_frames]
@@ -104,15 +112,21 @@ def timeline(
         clocks = _Clocks(np.zeros(len(readers)), np.ones(len(readers)), _fps(path, readers, fps))
     positions = clocks.offsets[:, None] + clocks.rates[:, None] * instants
     nearest = (nearest_frames(reader, own) for reader, own in zip(readers, positions, strict=True))
-    indices, apart = zip(*nearest, strict=True)
+    indices, apart = map(list, zip(*nearest, strict=True))
+    shares: list[np.ndarray | None] = [None] * len(readers)
+    for c, (name, reader) in enumerate(zip(names, readers, strict=True)):
+        if _is_interpolated(reader, config.offset.get(name, 0)):
+            indices[c] = np.clip(np.floor(positions[c]).astype(int), 0, reader.num_frames - 2)
+            shares[c], apart[c] = positions[c] - indices[c], np.zeros_like(positions[c])
     if config.gaps:
         indices = [np.where(distance > _NEAR, -1, index) for index, distance in zip(indices, apart, strict=True)]
     used = [distance[index >= 0].max(initial=0) for index, distance in zip(indices, apart, strict=True)]
     if (largest := float(np.max(used / (clocks.rates * clocks.fps)))) > 1e-3:
         _LOG.warning("%s: images of one instant are up to %.1f ms apart.", path, 1e3 * largest)
     unchanged = all(np.array_equal(index, np.arange(len(instants))) for index in indices)
+    unchanged = unchanged and not any(config.offset.values())
     notes = tuple(_note(r, k) for r, k in zip(readers, indices, strict=True) if r.positions is not None)
-    return Timeline(tuple(indices), clocks.fps, unchanged, notes)
+    return Timeline(tuple(indices), tuple(shares), clocks.fps, unchanged, notes)
 
 
 @dataclass(frozen=True)
@@ -154,10 +168,16 @@ def _common_instants(
     raise ValueError(f"{path}: the clips have no instant in common, {table}; check `offset`.")
 
 
-def _position(reader: FrameReader, index: int) -> int:
+def _is_interpolated(reader: FrameReader, offset: float) -> bool:
+    """Return whether images of a clip are interpolated: at a constant frame rate, with an offset that is not whole."""
+    return reader.positions is None and offset != round(offset) and reader.num_frames > 1
+
+
+def _position(reader: FrameReader, offset: float) -> float:
     """Return the position of a frame of a clip, which may lie before its first or after its last."""
     if reader.positions is None:
-        return index
+        return offset
+    index = round(offset)
     held = min(max(index, 0), len(reader.positions) - 1)
     return round(reader.positions[held]) + index - held
 

@@ -12,10 +12,11 @@ from rich.table import Table
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.calibration.rig_check import CameraCheck, RigCheck, check_rig, match_capture, triangulate_points
+from morgs_mi.calibration.timing import TimeOffsets, estimate_time_offsets
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, print_table, progress
-from morgs_mi.cli.settings import GivenReading, Reading, optional
+from morgs_mi.cli.settings import Flag, GivenReading, Reading, optional
 from morgs_mi.fit.forecast import forecast
 
 __all__ = ["Info"]
@@ -31,6 +32,8 @@ class Info:
     """File for a plot of the rig, .png or .jpg."""
     check: Annotated[bool, arg(help_behavior_hint="(default: --check)")] = True
     """Check the poses against feature matches between the views of the first frame."""
+    time: Flag = False
+    """Estimate the time offsets of the cameras from what moves in the first frames."""
     reading: GivenReading = field(default_factory=Reading)
 
     arguments: ClassVar[Mapping[str, str]] = {"max_frames": "--frames of morgs-mi fit"}
@@ -55,6 +58,12 @@ class Info:
         print_result(f"{capture.num_frames} frames at {capture.fps:g} fps, {points}, {truth}.")
         for line in (*capture.notes, *_check_lines(found), *_color_lines(capture), *_forecast_lines(capture)):
             print_result(line)
+        if self.time:
+            with progress() as report:
+                offsets = estimate_time_offsets(
+                    capture, None, lambda done, total: report("Comparing clocks", done, total)
+                )
+            print_result(_time_line(offsets))
         if self.plot is not None:
             write_rig(self.plot, capture)
             print_result(f"Plot of the rig: {self.plot}")
@@ -87,6 +96,15 @@ def _check_lines(found: RigCheck | None) -> list[str]:
     error = f"median {found.error:.2f} px over " if found.matches else ""
     result = f"Reprojection check: {error}{found.matches} matches in {found.pairs} pairs; {found.advice}"
     return [result, *advice_lines(found.cameras)]
+
+
+def _time_line(found: TimeOffsets) -> str:
+    """Return the time offsets as the options that align the clips."""
+    listed = " ".join(f"{name} {offset:.2f}" for name, offset in found.offsets.items() if name != found.reference)
+    doubt = (
+        "" if found.converged else f" They still change by {found.change:.2f} frames: the clips may not show enough."
+    )
+    return f"Clocks: pass --offset {listed} for the time of {found.reference}.{doubt}"
 
 
 def _forecast_lines(capture: Capture) -> list[str]:

@@ -70,7 +70,7 @@ class Reading:
 
     trim: Flag = False
     """Use the instants that all clips contain, at their lowest frame rate."""
-    offset: Annotated[dict[str, int], arg(metavar="CAMERA INT ...", help_behavior_hint="")] = field(
+    offset: Annotated[dict[str, float], arg(metavar="CAMERA FLOAT ...", help_behavior_hint="")] = field(
         default_factory=dict
     )
     """Frame of a camera's clip that shows frame 0 of the others; negative if it began later."""

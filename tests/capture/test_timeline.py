@@ -58,6 +58,23 @@ def test_timeline__aligns_clips(tmp_path: Path, clips, config, fps, instants) ->
     assert [frame.index for frame in capture.partial_frames(1)] == list(range(1, len(instants)))
 
 
+def test_timeline__interpolates_images_at_an_offset_that_is_not_whole(tmp_path: Path) -> None:
+    path = layouts.n3dv(tmp_path / "c", ("a", "b"), lambda *_: None)
+    for name in ("a", "b"):
+        write_video(
+            path / f"{name}.mkv", [np.full((layouts.HEIGHT, layouts.WIDTH, 3), 40 * t, np.uint8) for t in range(4)], 25
+        )
+    capture = load_capture(path, reading=ReadConfig(offset={"b": -1.25}))
+    # At frame 2 of a, b shows its frame 0.75.
+    assert frame_numbers(capture) == [[80, 30], [120, 70]]
+    assert [int(image[0, 0, 0]) for image in capture.images(1, 1)] == [70]
+    assert frame_numbers(load_capture(path, reading=ReadConfig(offset={"a": 1.5, "b": 2}))) == [
+        [20, 40],
+        [60, 80],
+        [100, 120],
+    ]
+
+
 def test_timeline__uses_the_true_rate_and_the_frame_limit_for_aligned_clips(tmp_path: Path) -> None:
     path = capture_of(tmp_path / "c", {"a": (4, 25), "b": (6, 50)})
     (path / "capture.json").write_text('{"fps": 20}')
@@ -91,6 +108,11 @@ def test_timeline__keeps_truth_only_for_unshifted_clips(tmp_path: Path) -> None:
             r"same number of frames, got a.mkv 4, b.mkv 6; .*`max_frames=4`, .* --trim, .* --offset",
         ),
         ({"a": (4, 25), "b": (4, 50)}, ReadConfig(), "same frame rate, got a.mkv 25, b.mkv 50; .* --trim"),
+        (
+            {"a": (4, 25), "b": (4, 25)},
+            ReadConfig(offset={"b": np.nan}),
+            r"`offset of b` must be a number in .*got nan",
+        ),
         ({"a": (4, 25), "b": (4, 25)}, ReadConfig(offset={"c": 1}), "`offset` must name cameras of a, b, got c"),
         (
             {"a": (4, 25), "b": (4, 25)},

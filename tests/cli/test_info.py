@@ -12,7 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
+from morgs_mi.calibration.timing import TimeOffsets
 from morgs_mi.capture.capture import Capture
+from morgs_mi.cli import info
 from morgs_mi.io.video_writer import write_video
 from tests.cli.commands import assert_refused
 from tests.scenes.noise_capture import FRAMES, HEIGHT, NAMES, WIDTH
@@ -69,3 +71,13 @@ def test_info__prints_the_check_and_draws_the_rig(textured_capture: Capture, tmp
     assert "Reprojection" not in out
     refused = run("info", textured_capture.path, "--plot", tmp_path / "rig.pdf")
     assert_refused(refused, "the suffix of a plot must be .png or .jpg, got '.pdf'")
+
+
+def test_info__prints_the_time_offsets_as_options(capture: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = TimeOffsets({NAMES[0]: 0.0, NAMES[1]: -0.254, NAMES[2]: 1.5}, NAMES[0], 0.3, converged=False)
+    monkeypatch.setattr(info, "estimate_time_offsets", lambda *_: found)
+    status, out, _ = run("info", capture, "--no-check", "--time")
+    assert status == 0
+    out = " ".join(out.split())
+    assert f"--offset {NAMES[1]} -0.25 {NAMES[2]} 1.50 for the time of {NAMES[0]}." in out
+    assert "They still change by 0.30 frames" in out

@@ -1,0 +1,60 @@
+"""Images between two frames of a clip, by optical flow: what a camera would have shown at the time of another one.
+
+A point that moves by the flow F from the first frame to the second has moved by s F at the share s of the time between
+them. So the pixel x shows the point p of the first frame with p + s F(p) = x, and the point q of the second frame with
+q + (1 - s) B(q) = x, with B the flow back. Both are found by fixed-point iteration, and their colours are averaged with
+the weights 1 - s and s. A point whose flow is not reliable, because the other frame does not show it, hardly counts.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from morgs_mi.method.flow_sources.consistency import consistency_mask
+from morgs_mi.method.flow_sources.registry import FramePair, flow_source
+
+__all__ = ["image_between"]
+
+# Rounds of the fixed-point iteration: flow is smooth, so that each one gains about a digit.
+_ROUNDS = 5
+# Weight of an unreliable point: it counts where neither frame has a reliable one.
+_LEAST_WEIGHT = 1e-3
+
+
+def image_between(first: np.ndarray, second: np.ndarray, share: float) -> np.ndarray:
+    """Return the image at a share of the time from one frame of a clip to the next, uint8 [H, W, 3].
+
+    Args:
+        first: uint8 [H, W, 3], RGB.
+        second: likewise.
+        share: in [0, 1]; 0 for the first frame, 1 for the second.
+
+    Raises:
+        ValueError: the images are not RGB or differ in size.
+    """
+    backward, forward = flow_source("dis")(FramePair(second, first))
+    both = (first, forward, backward, share), (second, backward, forward, 1 - share)
+    total, weights = np.zeros(first.shape, np.float32), np.zeros((*first.shape[:2], 1), np.float32)
+    for image, flow, back, passed in both:
+        places = _origins(flow, passed)
+        reliable = _sampled(consistency_mask(flow, back).astype(np.float32), places, cv2.INTER_LINEAR)[..., None]
+        weight = np.float32(1 - passed) * (reliable + np.float32(_LEAST_WEIGHT))
+        total += weight * _sampled(image.astype(np.float32), places, cv2.INTER_CUBIC)
+        weights += weight
+    return np.clip(np.rint(total / weights), 0, 255).astype(np.uint8)
+
+
+def _origins(flow: np.ndarray, share: float) -> np.ndarray:
+    """Return the points p of a frame with p + share flow(p) = x for every pixel x, in pixels [H, W, 2]."""
+    pixels = np.stack(np.meshgrid(*(np.arange(n, dtype=np.float32) for n in flow.shape[1::-1])), axis=-1)
+    places = pixels
+    for _ in range(_ROUNDS):
+        places = pixels - np.float32(share) * _sampled(flow, places, cv2.INTER_LINEAR)
+    return places
+
+
+def _sampled(image: np.ndarray, places: np.ndarray, how: int) -> np.ndarray:
+    """Return the values of an image [H, W, ...] at some places [H, W, 2], in pixels."""
+    x, y = np.ascontiguousarray(places[..., 0]), np.ascontiguousarray(places[..., 1])
+    return cv2.remap(image, x, y, how, borderMode=cv2.BORDER_REPLICATE)

@@ -1,0 +1,27 @@
+"""Report on clocks that are apart: the page that quotes the committed figures, and a tiny clip."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks.reports import timing
+from benchmarks.reports.timing import Options, timing_table
+from tests.benchmarks.reports.pages import ROOT, page
+
+
+def test_timing_page__quotes_the_committed_table() -> None:
+    committed = json.loads((ROOT / "benchmarks" / "results" / "timing.json").read_text())
+    assert timing_table(committed["scenes"]) in page("timing.md")
+
+
+@pytest.mark.slow
+def test_main__measures_a_tiny_clip(tmp_path: Path) -> None:
+    work = {"num_gaussians": 200, "first_frame_steps": 10, "epochs": 1, "width": 64, "frames": 6, "fitted": 2}
+    options = Options(json=tmp_path / "out.json", seeds=(3,), clips=tmp_path / "clips", time_offset=0.4, **work)
+    timing.main(options)
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert list(found["scenes"]) == ["random 3"]
+    assert timing_table(found["scenes"]).count("\n") == 2

@@ -1,0 +1,51 @@
+"""Images between two frames of a clip."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.capture.interpolation import image_between
+from morgs_mi.evaluate.metrics import psnr
+
+HEIGHT, WIDTH = 72, 96
+
+
+def texture() -> np.ndarray:
+    """Return a smooth random image [2H, 2W, 3]."""
+    noise = np.random.default_rng(0).uniform(0, 255, (2 * HEIGHT, 2 * WIDTH, 3))
+    return cv2.normalize(cv2.GaussianBlur(noise, (0, 0), 2), None, 0, 255, cv2.NORM_MINMAX)
+
+
+def moving_square(position: float) -> np.ndarray:
+    """Return a textured square at some column before a static background, uint8."""
+    background, square = texture()[HEIGHT:, WIDTH:], np.zeros((HEIGHT, WIDTH, 3))
+    square[20:52, 30:62] = texture()[20:52, 30:62]
+    opaque = np.zeros((HEIGHT, WIDTH))
+    opaque[20:52, 30:62] = 1
+    shift = np.float32([[1, 0, position], [0, 1, 0]])
+    square, opaque = (cv2.warpAffine(a, shift, (WIDTH, HEIGHT), flags=cv2.INTER_CUBIC) for a in (square, opaque))
+    opaque = opaque.clip(0, 1)[..., None]
+    return np.clip(background * (1 - opaque) + square * opaque, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("share", [0.25, 0.5, 0.8])
+def test_image_between__shows_things_where_they_have_moved_to(share: float) -> None:
+    first, second, wanted = moving_square(0), moving_square(4), moving_square(4 * share)
+    found, blended = image_between(first, second, share), (1 - share) * first + share * second
+    assert found.dtype == np.uint8
+    inside = slice(24, 48), slice(38, 58)
+    assert psnr(found[inside] / 255, wanted[inside] / 255) > psnr(blended[inside] / 255, wanted[inside] / 255) + 10
+    assert psnr(found / 255, wanted / 255) > psnr(blended / 255, wanted / 255) + 2
+
+
+@pytest.mark.parametrize("share", [0, 1])
+def test_image_between__is_a_frame_at_either_end(share: float) -> None:
+    frames = moving_square(0), moving_square(4)
+    np.testing.assert_allclose(image_between(*frames, share).astype(int), frames[share], atol=1)
+
+
+def test_image_between__refuses_images_of_different_sizes() -> None:
+    with pytest.raises(ValueError, match="must be RGB of one size"):
+        image_between(np.zeros((40, 40, 3), np.uint8), np.zeros((40, 41, 3), np.uint8), 0.5)
