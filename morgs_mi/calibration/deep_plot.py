@@ -23,7 +23,7 @@ def draw_deep(check: DeepCheck) -> np.ndarray:
     """Return the plot of a check, RGB uint8 [900, 1440, 3].
 
     The panels show reprojection error, time offset, exposure per channel, brightness and sharpness over time, repeated
-    frames and overlap. Cameras with a finding are red.
+    frames and overlap. Cameras with a finding are red; a question mark stands for what was not measured.
     """
     panels = [
         _bars(check, "error", "Reprojection error, px", check.errors[:, None], (0, 1)),
@@ -58,6 +58,8 @@ def _bars(check: DeepCheck, question: str, title: str, values: np.ndarray, least
             right = left + _BAR * place / len(group)
             if np.isfinite(value):
                 cv2.rectangle(panel, (round(left), row(0)), (max(round(left), round(right) - 1), row(value)), color, -1)
+            else:
+                _text(panel, "?", (round((left + right) / 2) - 3, row(0) - 4), 0.38, _GREY)
         _label_camera(panel, check, question, view, place)
     return panel
 
@@ -119,8 +121,8 @@ def _matrix(check: DeepCheck) -> np.ndarray:
 
 
 def _sentences(check: DeepCheck, count: int) -> list[np.ndarray]:
-    """Return `count` panels with the findings."""
-    lines = [line for f in check.findings for line in _wrapped(f.sentence)] or ["Nothing is wrong."]
+    """Return `count` panels with the findings, and what was not measured."""
+    lines = [line for text in (*(f.sentence for f in check.findings), check.unmeasured) for line in _wrapped(text)]
     fitting = (_HEIGHT - _HEAD) // 16
     if len(lines) > count * fitting:
         lines = [*lines[: count * fitting - 1], "..."]

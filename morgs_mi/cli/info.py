@@ -99,7 +99,8 @@ def _deep_lines(deep: DeepCheck | None) -> list[str]:
     """Return the findings of the check of many frames, and what it could not measure."""
     if deep is None:
         return []
-    result = f"{len(deep.findings)} findings" if len(deep.findings) != 1 else "1 finding"
+    count = len(deep.findings)
+    result = "no findings" if not count else "1 finding" if count == 1 else f"{count} findings"
     sentences = [finding.sentence for finding in deep.findings]
     return [f"Check of {deep.frames} frames: {result}.", *sentences, *filter(None, [deep.unmeasured])]
 

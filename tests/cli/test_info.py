@@ -76,7 +76,7 @@ def test_info__checks_a_whole_recording(textured_capture: Capture, tmp_path: Pat
     plot, measured = tmp_path / "rig.png", tmp_path / "deep.json"
     status, out, _ = run("info", textured_capture.path, "--deep", "--plot", plot, "--json", measured)
     assert status == 0
-    assert "Check of 1 frames: 0 findings." in out
+    assert "Check of 1 frames: no findings." in out
     assert "Not measured, without enough common motion or matches: time offsets of all cameras." in out
     assert cv2.imread(str(plot)).shape == (760 + 900, 1440, 3)
     content = json.loads(measured.read_text())
