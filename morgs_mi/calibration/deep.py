@@ -227,19 +227,37 @@ def _flicker(check: DeepCheck) -> Iterator[Finding]:
 
 
 def _variations(check: DeepCheck) -> Iterator[Finding]:
-    for view, values in enumerate(check.brightness.T):
+    common = known_median(check.brightness, axis=1)[:, None]
+    span, rest = _span(common)[0], _usual(_span(check.brightness - common))
+    # The range of a flicker is twice its amplitude; twice as much is no flicker alone.
+    flicker = np.array([4 * lamp.amplitude if lamp else 0 for lamp in check.lamps])
+    lit = len(check.names) > 2 and span > max(_VARIATION, flicker.max()) and rest < 0.5 * span
+    if lit:
+        yield _finding(
+            check,
+            "variation",
+            range(len(check.names)),
+            f"change their brightness alike, by {100 * np.expm1(span):.0f} % over time: the light of the scene "
+            "changes; use constant light, or leave out --exposure",
+        )
+    for view, values in enumerate((check.brightness - common if lit else check.brightness).T):
         known = values[np.isfinite(values)]
-        lamp = check.lamps[view]
-        swing = 2 * lamp.amplitude if lamp else 0
-        if len(known) and (span := np.ptp(known)) > max(_VARIATION, 2 * swing):
+        if len(known) and (own := np.ptp(known)) > max(_VARIATION, flicker[view]):
             yield _finding(
                 check,
                 "variation",
                 [view],
-                f"changes its brightness by {100 * np.expm1(span):.0f} % over time, up to "
+                f"changes its brightness by {100 * np.expm1(own):.0f} % over time, up to "
                 f"{100 * np.expm1(np.abs(np.diff(known)).max()):.0f} % from frame to frame: fix the exposure, or use "
                 "--exposure if the light itself is constant",
             )
+
+
+def _span(values: np.ndarray) -> np.ndarray:
+    """Return the range over time of values [T, C] where known, NaN without any [C]."""
+    known = np.isfinite(values)
+    spans = np.where(known, values, -np.inf).max(axis=0) - np.where(known, values, np.inf).min(axis=0)
+    return np.where(known.any(axis=0), spans, np.nan)
 
 
 def _blur(check: DeepCheck) -> Iterator[Finding]:

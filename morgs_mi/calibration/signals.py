@@ -147,6 +147,8 @@ def lamp_flicker(bands: np.ndarray, fps: float) -> Lamp | None:
 def known_median(values: np.ndarray, axis: int) -> np.ndarray:
     """Return the median of what is not NaN, and NaN without a warning where all is."""
     empty = np.isnan(values).all(axis=axis)
+    if empty.all():
+        return np.full(empty.shape, np.nan)
     found = np.nanmedian(np.where(np.expand_dims(empty, axis), 0, values), axis=axis)
     return np.where(empty, np.nan, found)
 

@@ -55,8 +55,8 @@ class _PairShift:
 def time_offsets(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> np.ndarray:
     """Return the time offset of each camera from the others' median [C], frames; NaN where it is not determined.
 
-    It is determined for a camera that sees the same motion as others, if most of these agree about it. The error is
-    about 0.2 frames, and larger where things hardly move across the epipolar planes.
+    It is determined for a camera that sees the same motion as others, if most of these agree about it. It tells whole
+    frames; the fraction is off by up to 0.4 frames where things hardly move across the epipolar planes.
 
     Args:
         cameras: C views.

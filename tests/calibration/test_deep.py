@@ -37,6 +37,12 @@ def flickering(clips: Clips) -> Clips:
     return clips
 
 
+def darkening(clips: Clips) -> Clips:
+    for camera in range(len(clips)):
+        clips = changed(clips, camera, lambda t, x: brighter(x, np.exp(-0.01 * t)))
+    return clips
+
+
 def lost_frames(clips: Clips) -> Clips:
     del clips
     whole = film(frames=58)
@@ -55,6 +61,7 @@ FAULTS = {
         c, 1, lambda t, x: brighter(x, 1.15 if t > 15 else 1)
     ),
     "cam0, cam1, cam2, cam3 flicker by 1.9 % at 10.0 Hz, as lamps on 50 Hz mains do": flickering,
+    "cam0, cam1, cam2, cam3 change their brightness alike, by 36 % over time: the light": darkening,
     "cam3 is less sharp than the other cameras": lambda c: changed(c, 3, lambda _, x: cv2.GaussianBlur(x, (0, 0), 2.0)),
     "cam2 is blurred in frames 8, 9:": lambda c: changed(
         c, 2, lambda t, x: cv2.GaussianBlur(x, (0, 0), 1.5) if t in (8, 9) else x
@@ -87,6 +94,14 @@ def test_check_deep__states_what_it_cannot_measure(clips: Clips) -> None:
         "other cameras of all cameras."
     )
     json.dumps(json_finite(check.as_dict()), allow_nan=False)
+
+
+@pytest.mark.parametrize(("cameras", "frames"), [(1, 32), (2, 32), (4, 1), (4, 2)])
+@pytest.mark.filterwarnings("error")
+def test_check_deep__finds_nothing_in_few_cameras_or_frames(cameras: int, frames: int, clips: Clips) -> None:
+    check = checked([clip[:frames] for clip in clips[:cameras]])
+    assert check.findings == ()
+    assert draw_deep(check).shape == (900, 1440, 3)
 
 
 def test_draw_deep__marks_the_cameras_with_findings(clips: Clips) -> None:

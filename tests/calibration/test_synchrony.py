@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
-import numpy as np
+from pathlib import Path
 
+import numpy as np
+import pytest
+
+from morgs_mi import cli
 from morgs_mi.calibration.signals import read_signals
 from morgs_mi.calibration.synchrony import consensus, time_offsets
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.synth.disturbances import load_disturbances
 from tests.assertions import assert_close
 from tests.scenes.filmed import Clips, film, filmed, rig
 
@@ -14,6 +20,17 @@ def test_time_offsets__are_recovered_to_a_fraction_of_a_frame() -> None:
     true = np.array([0.0, 1.3, -2.0, 0.4])
     found = time_offsets(rig(), read_signals(filmed(film(true.tolist())), 32).thumbs)
     assert_close(found, true, atol=0.15)
+
+
+@pytest.mark.slow
+def test_time_offsets__are_those_of_a_path_traced_clip(tmp_path: Path) -> None:
+    options = "--cameras 4 --frames 20 --width 160 --height 120 --spp 4 --no-lossless --time-offset 3 --seed 3"
+    assert cli.main(["synth", "arm", str(tmp_path / "clip"), *options.split()]) == 0
+    capture = load_capture(tmp_path / "clip")
+    true = np.array([camera.time_offset for camera in load_disturbances(tmp_path / "clip" / "truth").values()])
+    found = time_offsets(capture.cameras, read_signals(capture, 20).thumbs)
+    # Near enough to tell whole frames.
+    assert_close(found - found[0], true, atol=0.5)
 
 
 def test_time_offsets__do_not_depend_on_the_exposure(clips: Clips) -> None:

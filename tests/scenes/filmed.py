@@ -26,10 +26,10 @@ class Filmed(Capture):
 
 
 def filmed(clips: Clips, fps: float = FPS) -> Filmed:
-    """Return the capture of one clip per camera."""
+    """Return the capture of one clip per camera, of the first ones of the rig."""
     none = np.zeros((0, 3), np.float32)
     capture = Filmed(
-        *(Path("filmed"), tuple(rig()), len(clips[0]), fps, none, none),
+        *(Path("filmed"), tuple(rig()[: len(clips)]), len(clips[0]), fps, none, none),
         masks=(None,) * len(clips),
         test_view=None,
         truth=None,
