@@ -21,8 +21,13 @@ _MAX_POINTS = 20_000
 Projection = Callable[[np.ndarray], np.ndarray]
 
 
-def write_rig(path: Path, capture: Capture) -> None:
+def write_rig(path: Path, capture: Capture, *below: np.ndarray) -> None:
     """Write the plot of a capture's rig as .png or .jpg; the file appears whole or not at all.
+
+    Args:
+        path: the file.
+        capture: the capture.
+        below: plots of the same width that are appended below.
 
     Raises:
         ValueError: the name has another suffix.
@@ -32,6 +37,7 @@ def write_rig(path: Path, capture: Capture) -> None:
     if suffix not in (".png", ".jpg", ".jpeg"):
         raise ValueError(f"{path}: the suffix of a plot must be .png or .jpg, got {suffix!r}; rename it.")
     image = draw_rig(capture.cameras, capture.points, capture.point_colors, capture.test_view)
+    image = np.concatenate([image, *below])
     data = cv2.imencode(suffix, cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
     with atomic_path(path, "write_rig()") as partial:
         partial.parent.mkdir(parents=True, exist_ok=True)

@@ -20,7 +20,7 @@ from morgs_mi.capture.features import Features, Match, detect, match_views, repr
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
 
-__all__ = ["COLOR_METHODS", "ColorCorrection", "ColorFit", "fit_colors"]
+__all__ = ["COLOR_METHODS", "ColorCorrection", "ColorFit", "fit_colors", "matched_colors"]
 
 _LOG = logging.getLogger(__name__)
 
@@ -126,8 +126,7 @@ def fit_colors(
         reference: index of the reference view; by default the one that shares most points with the others.
     """
     features = [detect(image, mask) for image, mask in zip(images, masks, strict=True)]
-    colors = [np.zeros((0, 3)) if i is None else _colors_at(i, f.points) for i, f in zip(images, features, strict=True)]
-    pairs = [_reliable(match, features, cameras, colors) for match in match_views(features, cameras)]
+    pairs, colors = matched_colors(cameras, images, features, match_views(features, cameras))
     counts = np.zeros((len(cameras),) * 2, int)
     for match in pairs:
         counts[match.views] = counts[match.views[::-1]] = len(match.features)
@@ -154,6 +153,24 @@ def fit_colors(
         _differences(pairs, colors),
         _differences(pairs, after),
     )
+
+
+def matched_colors(
+    cameras: Sequence[Camera],
+    images: Sequence[np.ndarray | None],
+    features: Sequence[Features],
+    matches: Sequence[Match],
+) -> tuple[list[Match], list[np.ndarray]]:
+    """Return the matches on which poses agree and that are well exposed, and the linear colours [K, 3] of all features.
+
+    Args:
+        cameras: C views.
+        images: per view uint8 [H, W, 3], or None: it has no features.
+        features: per view, in pixels of `images`.
+        matches: from `match_views`.
+    """
+    colors = [np.zeros((0, 3)) if i is None else _colors_at(i, f.points) for i, f in zip(images, features, strict=True)]
+    return [_reliable(match, features, cameras, colors) for match in matches], colors
 
 
 def _colors_at(image: np.ndarray, points: np.ndarray) -> np.ndarray:

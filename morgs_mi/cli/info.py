@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
 
@@ -11,12 +12,22 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from tyro.conf import DisallowNone, Positional, arg
 
-from morgs_mi.calibration.rig_check import CameraCheck, RigCheck, check_rig, match_capture, triangulate_points
+from morgs_mi.calibration.deep import MAX_FRAMES, DeepCheck, check_deep
+from morgs_mi.calibration.rig_check import (
+    CameraCheck,
+    RigCheck,
+    SharedFeatures,
+    check_rig,
+    match_capture,
+    triangulate_points,
+)
+from morgs_mi.calibration.signals import read_signals
 from morgs_mi.calibration.timing import TimeOffsets, estimate_time_offsets
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, print_table, progress
 from morgs_mi.cli.settings import Flag, GivenReading, Reading, optional
+from morgs_mi.core.files import write_json
 from morgs_mi.fit.forecast import forecast
 
 __all__ = ["Info"]
@@ -34,16 +45,26 @@ class Info:
     """Check the poses against feature matches between the views of the first frame."""
     time: Flag = False
     """Estimate the time offsets of the cameras from what moves in the first frames."""
+    deep: Flag = False
+    """Also check synchronisation, exposure, sharpness, lost frames, flicker and overlap, which reads many frames."""
+    json: Annotated[Path | None, DisallowNone, optional("FILE.json")] = None
+    """File for all measurements of --deep."""
     reading: GivenReading = field(default_factory=Reading)
 
     arguments: ClassVar[Mapping[str, str]] = {"max_frames": "--frames of morgs-mi fit"}
 
     def run(self) -> None:
+        from morgs_mi.calibration.deep_plot import draw_deep
         from morgs_mi.calibration.rig_plot import write_rig
 
-        if self.plot is not None:
-            check_output(self.plot)
-        capture, found = load_capture(self.capture, reading=self.reading.read_config()), None
+        if self.deep and not self.check:
+            raise ValueError("--deep: expected the check of the poses, on which it builds; leave out --no-check.")
+        if self.json is not None and not self.deep:
+            raise ValueError("--json: expected --deep, whose measurements it holds; add --deep.")
+        for output in (self.plot, self.json):
+            if output is not None:
+                check_output(output)
+        capture, found, deep = load_capture(self.capture, reading=self.reading.read_config()), None, None
         origin = "" if len(capture.points) else "without points"
         if self.check:
             with progress() as report:
@@ -52,6 +73,8 @@ class Info:
             if origin:
                 capture = triangulate_points(capture, common)
                 origin += f" ({len(capture.points)} can be triangulated)"
+            if self.deep:
+                deep = _deep_check(capture, common, found)
         print_table(_camera_table(capture, found))
         points = origin or f"{len(capture.points)} points"
         truth = "with ground truth" if capture.truth else "without ground truth"
@@ -64,9 +87,31 @@ class Info:
                     capture, None, lambda done, total: report("Comparing clocks", done, total)
                 )
             print_result(_time_line(offsets))
+        for line in _deep_lines(deep):
+            print_result(line)
+        if self.json is not None and deep:
+            write_json(self.json, deep.as_dict())
+            print_result(f"All measurements: {self.json}")
         if self.plot is not None:
-            write_rig(self.plot, capture)
+            write_rig(self.plot, capture, *([draw_deep(deep)] if deep else []))
             print_result(f"Plot of the rig: {self.plot}")
+
+
+def _deep_check(capture: Capture, shared: SharedFeatures, found: RigCheck) -> DeepCheck:
+    """Return the check of the first frames."""
+    with progress() as report:
+        signals = read_signals(capture, MAX_FRAMES, partial(report, "Reading frames"))
+    return check_deep(capture, shared, found, signals)
+
+
+def _deep_lines(deep: DeepCheck | None) -> list[str]:
+    """Return the findings of the check of many frames, and what it could not measure."""
+    if deep is None:
+        return []
+    count = len(deep.findings)
+    result = "no findings" if not count else "1 finding" if count == 1 else f"{count} findings"
+    sentences = [finding.sentence for finding in deep.findings]
+    return [f"Check of {deep.frames} frames: {result}.", *sentences, *filter(None, [deep.unmeasured])]
 
 
 def _camera_table(capture: Capture, found: RigCheck | None) -> Table:

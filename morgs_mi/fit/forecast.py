@@ -11,7 +11,7 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.fit.initialise import focus_depths, scene_extent, seen_points
 
-__all__ = ["POOR_LOSS", "Forecast", "angles_to", "forecast", "mean_views", "scene_depths"]
+__all__ = ["POOR_LOSS", "Forecast", "angles_to", "forecast", "mean_views", "overlaps", "scene_depths"]
 
 # dB below the training views above which views between the cameras look poor.
 POOR_LOSS = 8.0
@@ -77,9 +77,18 @@ def mean_views(cameras: Sequence[Camera], points: np.ndarray) -> float:
         cameras: at least one.
         points: [P, 3] of the scene, world units, or none.
     """
+    return max(1.0, float(overlaps(cameras, points).sum(axis=1).mean()))
+
+
+def overlaps(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
+    """Return the share of each camera's image that each camera sees, as far as their frustums tell [C, C].
+
+    Args:
+        cameras: C views.
+        points: [P, 3] of the scene, world units, or none.
+    """
     surfaces = [_surface(*view) for view in zip(cameras, scene_depths(cameras, points), strict=True)]
-    seen = [[np.mean(seen_points(other, surface)[0]) for other in cameras] for surface in surfaces]
-    return max(1.0, float(np.sum(seen, axis=1).mean()))
+    return np.array([[np.mean(seen_points(other, surface)[0]) for other in cameras] for surface in surfaces])
 
 
 def scene_depths(cameras: Sequence[Camera], points: np.ndarray) -> list[float]:

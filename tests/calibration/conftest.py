@@ -1,4 +1,4 @@
-"""The capture of textured planes, by short names."""
+"""The capture of textured planes, by short names, and clips of moving ones."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import pytest
 
 from morgs_mi.calibration.rig_check import SharedFeatures
 from morgs_mi.capture.capture import Capture
+from tests.scenes.filmed import Clips, film
 
 
 @pytest.fixture(scope="session")
@@ -16,3 +17,8 @@ def capture(textured_capture: Capture) -> Capture:
 @pytest.fixture(scope="session")
 def shared(textured_features: SharedFeatures) -> SharedFeatures:
     return textured_features
+
+
+@pytest.fixture(scope="session")
+def clips() -> Clips:
+    return film()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.fit.forecast import forecast
+from morgs_mi.fit.forecast import forecast, overlaps
 from tests.scenes.cameras import arc, look_at_cameras
 
 NO_POINTS = np.zeros((0, 3))
@@ -44,3 +44,11 @@ def test_forecast__sees_that_cameras_share_nothing():
     found = forecast(cameras, np.array([(-1, 0, 1), (1, 0, 1)]))
     assert found.overlap == 0
     assert "will be poor" in found.sentence
+
+
+def test_overlaps__are_the_shares_of_an_image_that_each_camera_sees():
+    wide, narrow = (look_at_cameras([(0, 0, -4)], fov)[0] for fov in (53.13, 28.07))
+    away = look_at_cameras([(0, 0, -4)], 40, target=(0, 0, -8))[0]
+    # Half the width and half the height.
+    expected = [[1, 0.25, 0], [1, 1, 0], [0, 0, 1]]
+    np.testing.assert_allclose(overlaps([wide, narrow, away], np.zeros((1, 3))), expected, atol=0.01)

@@ -66,12 +66,17 @@ def textures() -> list[np.ndarray]:
     return found
 
 
-def render(camera: Camera, planes: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the image of the planes in a camera, RGB uint8 [H, W, 3]."""
-    image = np.zeros((camera.height, camera.width, 3), np.uint8)
+def render(
+    camera: Camera,
+    planes: Sequence[np.ndarray],
+    places: Sequence[tuple] = _PLANES,
+    background: np.ndarray | None = None,
+) -> np.ndarray:
+    """Return the image of the planes in a camera, RGB uint8 [H, W, 3], in front of a `background` image."""
+    image = np.zeros((camera.height, camera.width, 3), np.uint8) if background is None else background.copy()
     R, t = camera.viewmat[:3, :3], camera.viewmat[:3, 3]
     centre = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])  # OpenCV's pixel centres are integers
-    for (corner, across, down), texture in zip(_PLANES, planes, strict=True):
+    for (corner, across, down), texture in zip(places, planes, strict=True):
         plane = np.stack([R @ across, R @ down, R @ corner + t], axis=1) @ np.diag([1 / _TEXTURE, 1 / _TEXTURE, 1])
         H = np.linalg.inv(centre) @ camera.K @ plane @ centre
         # Rendered at twice the size and downscaled, against aliasing.

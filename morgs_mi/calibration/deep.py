@@ -1,0 +1,340 @@
+"""Check of a whole recording: which cameras differ from the others in time, exposure, sharpness or place.
+
+The poses are checked on the first frame by `rig_check`; here many frames are read. A finding is a sentence with numbers
+and advice. The limits are far above what clips without faults show, so that a finding is worth a look.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from morgs_mi.calibration.rig_check import RigCheck, SharedFeatures
+from morgs_mi.calibration.signals import Lamp, Signals, brightness, known_median, lamp_flicker, repeated_frames
+from morgs_mi.calibration.synchrony import consensus, time_offsets
+from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.color_correction import matched_colors
+from morgs_mi.fit.forecast import overlaps
+
+__all__ = ["MAX_FRAMES", "DeepCheck", "Finding", "check_deep"]
+
+# Frames that are read: the faults of a longer recording show in its beginning.
+MAX_FRAMES = 120
+# px, and multiple of the rig's median, above which a reprojection error is a finding.
+_ERROR, _TIMES_ERROR = 0.7, 3.0
+# Frames. A time offset is a finding if a whole frame is nearer to it than none, by more than its error.
+_OFFSET, _OFFSET_CHANGE, _MIN_HALF = 0.65, 0.75, 24
+# Differences of log gains: about 10 % of exposure, and 5 % of one channel against the mean of all.
+_EXPOSURE, _BALANCE, _MIN_SAMPLES = 0.1, 0.05, 16
+# Error of a median log ratio that no number of points removes, because surfaces look different from two sides.
+_LOG_ERROR = 0.02
+# Range of the log brightness over time: about 8 %; people who move in a room shade it by up to 5 %.
+_VARIATION = 0.08
+# Octaves by which an image is less sharp than those of the rig, and than the others of its camera.
+_BLUR, _BLURRED_FRAME, _SPREADS = 1.0, 0.5, 6.0
+# Share of a camera's image that the camera with the largest overlap sees.
+_OVERLAP = 0.3
+_MAX_LISTED = 6
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that is wrong with a recording.
+
+    Attributes:
+        question: what was checked: error, time, exposure, variation, flicker, blur, repeats or overlap.
+        cameras: names of the cameras that it concerns.
+        sentence: numbers and advice.
+    """
+
+    question: str
+    cameras: tuple[str, ...]
+    sentence: str
+
+
+@dataclass(frozen=True)
+class DeepCheck:
+    """Result of checking a recording; what could not be measured is NaN.
+
+    Attributes:
+        names: of the C cameras.
+        frames: number T of frames that were read.
+        errors: median reprojection error of each camera [C], px.
+        offsets: time offset of each camera from the median [C], frames.
+        halves: the same in the first and the last half of the frames [2, C].
+        gains: log gain of each camera's channels in linear light, relative to the median [C, 3].
+        brightness: log brightness of each camera over time, relative to its median [T, C].
+        sharpness: of each image [T, C], octaves.
+        repeated: per camera the frames that repeat the one before.
+        lamps: per camera the flicker of lamps, or None.
+        overlaps: share of each camera's image that each other one sees [C, C].
+        findings: what is wrong.
+    """
+
+    names: tuple[str, ...]
+    frames: int
+    errors: np.ndarray
+    offsets: np.ndarray
+    halves: np.ndarray
+    gains: np.ndarray
+    brightness: np.ndarray
+    sharpness: np.ndarray
+    repeated: tuple[tuple[int, ...], ...]
+    lamps: tuple[Lamp | None, ...]
+    overlaps: np.ndarray
+    findings: tuple[Finding, ...] = ()
+
+    @property
+    def unmeasured(self) -> str:
+        """What could not be measured for which cameras, in a sentence; empty if all was."""
+        values = {"time offsets": self.offsets, "exposure against the other cameras": self.gains.mean(axis=1)}
+        missing = {what: [self.names[view] for view in np.flatnonzero(np.isnan(v))] for what, v in values.items()}
+        parts = [f"{what} of {_listed(names, len(self.names))}" for what, names in missing.items() if names]
+        return f"Not measured, without enough common motion or matches: {'; '.join(parts)}." if parts else ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all measurements and findings in JSON types."""
+        return {key: x.tolist() if isinstance(x, np.ndarray) else x for key, x in asdict(self).items()}
+
+
+def check_deep(capture: Capture, shared: SharedFeatures, rig: RigCheck, signals: Signals) -> DeepCheck:
+    """Return what is wrong with a recording.
+
+    Args:
+        capture: at its recorded size.
+        shared: features of its first frame.
+        rig: result of checking the poses with these.
+        signals: measurements of its frames.
+    """
+    bands = brightness(signals)
+    half = len(bands) // 2
+    parts = ([t[:half] for t in signals.thumbs], [t[half:] for t in signals.thumbs]) if half >= _MIN_HALF else ()
+    measured = DeepCheck(
+        names=capture.names,
+        frames=len(bands),
+        errors=np.array([camera.error for camera in rig.cameras]),
+        offsets=time_offsets(capture.cameras, signals.thumbs),
+        halves=np.array([time_offsets(capture.cameras, part) for part in parts]).reshape(-1, len(capture.cameras)),
+        gains=_gains(capture, shared),
+        brightness=known_median(bands, axis=2),
+        sharpness=signals.sharpness,
+        repeated=repeated_frames(signals),
+        lamps=tuple(lamp_flicker(bands[:, c], capture.fps) for c in range(len(capture.cameras))),
+        overlaps=overlaps(capture.cameras, capture.points),
+    )
+    found = [
+        *_errors(measured),
+        *_times(measured, capture),
+        *_exposures(measured),
+        *_flicker(measured),
+        *_variations(measured),
+        *_blur(measured),
+        *_repeats(measured),
+        *_overlap(measured),
+    ]
+    return DeepCheck(**{**vars(measured), "findings": tuple(found)})
+
+
+def _gains(capture: Capture, shared: SharedFeatures) -> np.ndarray:
+    """Return the log gains of all cameras [C, 3] that explain the colours of points that two of them see."""
+    images = next(capture.partial_frames(0, 1)).images
+    pairs, colors = matched_colors(capture.cameras, images, shared.features, shared.matches)
+    pairs = [pair for pair in pairs if len(pair.features) >= _MIN_SAMPLES]
+    ratios = []
+    for pair in pairs:
+        a, b = (colors[view][pair.features[:, k]] for k, view in enumerate(pair.views))
+        ratios.append(np.log(b / a))
+    middles = np.array([np.median(ratio, axis=0) for ratio in ratios]).reshape(-1, 3)
+    deviations = np.array([np.abs(r - m).mean() / np.sqrt(len(r)) for r, m in zip(ratios, middles, strict=True)])
+    views, weights = np.array([pair.views for pair in pairs]).reshape(-1, 2), 1 / (deviations**2 + _LOG_ERROR**2)
+    return np.stack([consensus(len(colors), views, channel, weights) for channel in middles.T], axis=1)
+
+
+def _errors(check: DeepCheck) -> Iterator[Finding]:
+    for view, error in enumerate(check.errors):
+        usual = _usual(np.delete(check.errors, view))
+        if np.isfinite(error) and error > max(_ERROR, _TIMES_ERROR * usual):
+            yield _finding(
+                check,
+                "error",
+                [view],
+                f"has a reprojection error of {error:.2f} px, the others {usual:.2f} px: check its lens model and "
+                "focal length, or calibrate again (morgs-mi calibrate)",
+            )
+
+
+def _times(check: DeepCheck, capture: Capture) -> Iterator[Finding]:
+    period = 1e3 / capture.fps
+    for view, offset in enumerate(check.offsets):
+        name, halves = check.names[view], check.halves[:, view]
+        if len(halves) and abs(change := halves[1] - halves[0]) >= _OFFSET_CHANGE:
+            yield _finding(
+                check,
+                "time",
+                [view],
+                f"moves {abs(change):.1f} frames {'ahead of' if change > 0 else 'behind'} the other cameras during "
+                f"the first {check.frames} frames: frames were lost or its clock runs at another rate; copy the clip "
+                "again, or convert it with its true time stamps",
+            )
+        elif abs(offset) >= _OFFSET and not (np.abs(halves - offset) > _OFFSET_CHANGE).any():
+            frame = capture.reading.offset.get(name, 0) - round(float(offset))
+            yield _finding(
+                check,
+                "time",
+                [view],
+                f"is {abs(offset):.1f} frames ({abs(offset) * period:.0f} ms) {'ahead of' if offset > 0 else 'behind'} "
+                f"the other cameras: use --offset {name} {frame}, or record with synchronised cameras",
+            )
+
+
+def _exposures(check: DeepCheck) -> Iterator[Finding]:
+    means = check.gains.mean(axis=1)
+    for view, (mean, gains) in enumerate(zip(means, check.gains, strict=True)):
+        if abs(mean) > _EXPOSURE:
+            yield _finding(
+                check,
+                "exposure",
+                [view],
+                f"is {_percent(mean)} than the other cameras: set the same exposure and gain, or use --color linear",
+            )
+        if np.abs(gains - mean).max() > _BALANCE:
+            channels = ", ".join(f"{n} {100 * np.expm1(g - mean):+.0f} %" for n, g in zip("RGB", gains, strict=True))
+            yield _finding(
+                check,
+                "exposure",
+                [view],
+                f"has another white balance than the other cameras ({channels}): set a fixed one, or use "
+                "--color linear",
+            )
+
+
+def _flicker(check: DeepCheck) -> Iterator[Finding]:
+    for mains in sorted({lamp.mains for lamp in check.lamps if lamp}):
+        views = [view for view, lamp in enumerate(check.lamps) if lamp and lamp.mains == mains]
+        lamps = [lamp for lamp in check.lamps if lamp and lamp.mains == mains]
+        hertz = " or ".join(str(frequency) for frequency in mains)
+        exposure = " or ".join(f"1/{2 * frequency}" for frequency in mains)
+        yield _finding(
+            check,
+            "flicker",
+            views,
+            f"flicker by {100 * max(lamp.amplitude for lamp in lamps):.1f} % at {lamps[0].alias:.1f} Hz, as lamps on "
+            f"{hertz} Hz mains do: expose for a multiple of {exposure} s, use lamps without flicker, or --exposure",
+        )
+
+
+def _variations(check: DeepCheck) -> Iterator[Finding]:
+    common = known_median(check.brightness, axis=1)[:, None]
+    span, rest = _span(common)[0], _usual(_span(check.brightness - common))
+    # The range of a flicker is twice its amplitude; twice as much is no flicker alone.
+    flicker = np.array([4 * lamp.amplitude if lamp else 0 for lamp in check.lamps])
+    lit = len(check.names) > 2 and span > max(_VARIATION, flicker.max()) and rest < 0.5 * span
+    if lit:
+        yield _finding(
+            check,
+            "variation",
+            range(len(check.names)),
+            f"change their brightness alike, by {100 * np.expm1(span):.0f} % over time: the light of the scene "
+            "changes; use constant light, or leave out --exposure",
+        )
+    for view, values in enumerate((check.brightness - common if lit else check.brightness).T):
+        known = values[np.isfinite(values)]
+        if len(known) and (own := np.ptp(known)) > max(_VARIATION, flicker[view]):
+            yield _finding(
+                check,
+                "variation",
+                [view],
+                f"changes its brightness by {100 * np.expm1(own):.0f} % over time, up to "
+                f"{100 * np.expm1(np.abs(np.diff(known)).max()):.0f} % from frame to frame: fix the exposure, or use "
+                "--exposure if the light itself is constant",
+            )
+
+
+def _span(values: np.ndarray) -> np.ndarray:
+    """Return the range over time of values [T, C] where known, NaN without any [C]."""
+    known = np.isfinite(values)
+    spans = np.where(known, values, -np.inf).max(axis=0) - np.where(known, values, np.inf).min(axis=0)
+    return np.where(known.any(axis=0), spans, np.nan)
+
+
+def _blur(check: DeepCheck) -> Iterator[Finding]:
+    levels = np.array([_usual(values) for values in check.sharpness.T])
+    for view, level in enumerate(levels):
+        usual = _usual(np.delete(levels, view))
+        if usual - level > _BLUR:
+            share = 100 * 2.0 ** (level - usual)
+            yield _finding(
+                check,
+                "blur",
+                [view],
+                f"is less sharp than the other cameras, with {share:.0f} % of their fine detail: "
+                "check focus and lens, and that its clip is not enlarged or strongly compressed",
+            )
+    relative = check.sharpness - levels
+    for view, values in enumerate(relative.T):
+        # Compression changes from frame to frame, in all cameras alike if they share an encoder.
+        dips = values - np.array([_usual(row) for row in np.delete(relative, view, axis=1)])
+        dips = dips if np.isfinite(dips).any() else values
+        spread = 1.5 * _usual(np.abs(dips - _usual(dips)))
+        frames = np.flatnonzero(dips < -max(_BLURRED_FRAME, _SPREADS * spread))
+        if len(frames):
+            yield _finding(
+                check,
+                "blur",
+                [view],
+                f"is blurred in {_frames(frames)}: see whether it was touched, or focuses automatically",
+            )
+
+
+def _repeats(check: DeepCheck) -> Iterator[Finding]:
+    for view, frames in enumerate(check.repeated):
+        if frames:
+            yield _finding(
+                check,
+                "repeats",
+                [view],
+                f"repeats its last image in {_frames(frames)} while the other cameras see motion: frames were lost; "
+                "copy or record the clip again, without converting its frame rate",
+            )
+
+
+def _overlap(check: DeepCheck) -> Iterator[Finding]:
+    for view, shares in enumerate(check.overlaps):
+        others = np.delete(shares, view)
+        if len(others) and others.max() < _OVERLAP:
+            yield _finding(
+                check,
+                "overlap",
+                [view],
+                f"shares at most {100 * others.max():.0f} % of its image with another camera: turn it towards what the "
+                "others see, or add a camera in between",
+            )
+
+
+def _finding(check: DeepCheck, question: str, views: Sequence[int], text: str) -> Finding:
+    names = tuple(check.names[view] for view in views)
+    return Finding(question, names, f"{', '.join(names)} {text}.")
+
+
+def _usual(values: np.ndarray) -> float:
+    """Return the median of what is not NaN, or NaN."""
+    return float(known_median(values, axis=0))
+
+
+def _percent(log_gain: float) -> str:
+    return f"{100 * abs(np.expm1(log_gain)):.0f} % {'brighter' if log_gain > 0 else 'darker'}"
+
+
+def _frames(frames: Sequence[int] | np.ndarray) -> str:
+    """Return frame numbers as text, a few of many."""
+    listed = ", ".join(str(frame) for frame in frames[:_MAX_LISTED])
+    if len(frames) > _MAX_LISTED:
+        return f"{len(frames)} frames ({listed}, ...)"
+    return f"{'frame' if len(frames) == 1 else 'frames'} {listed}"
+
+
+def _listed(names: Sequence[str], count: int) -> str:
+    return "all cameras" if len(names) == count else ", ".join(names)
