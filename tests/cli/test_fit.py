@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shlex
 import signal
 import subprocess
@@ -185,7 +184,7 @@ def test_fit__refuses_to_leave_fewer_than_32_pixels(tmp_path: Path, run, monkeyp
 def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
     capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
 ) -> None:
-    before_frame_2(monkeypatch, lambda: os.kill(os.getpid(), number))
+    before_frame_2(monkeypatch, lambda: signal.raise_signal(number))
     args = ["fit", str(capture), str(tmp_path / "my out"), *QUICK]
     status, _, error = run(*args)
     again = shlex.join(["morgs-mi", *args, "--resume"])
