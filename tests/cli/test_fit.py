@@ -7,7 +7,7 @@ import shlex
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -180,9 +180,17 @@ def test_fit__refuses_to_leave_fewer_than_32_pixels(tmp_path: Path, run, monkeyp
     assert fitted_capture(monkeypatch, run, clip, tmp_path / "out", "--downscale", 1.43).cameras[0].height == 32
 
 
+@pytest.fixture
+def heeds_interrupts() -> Iterator[None]:
+    """Python's handler of SIGINT, which a shell ignores for the processes that it starts in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
-    capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+    capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, number: signal.Signals, heeds_interrupts: None
 ) -> None:
     before_frame_2(monkeypatch, lambda: signal.raise_signal(number))
     args = ["fit", str(capture), str(tmp_path / "my out"), *QUICK]
