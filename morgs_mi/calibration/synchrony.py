@@ -55,8 +55,8 @@ class _PairShift:
 def time_offsets(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> np.ndarray:
     """Return the time offset of each camera from the others' median [C], frames; NaN where it is not determined.
 
-    It is determined for a camera that sees the same motion as others, if most of these agree about it. It tells whole
-    frames; the fraction is off by up to 0.4 frames where things hardly move across the epipolar planes.
+    An offset is determined if three quarters of the camera's pairs with others agree about it. It is accurate to 0.4
+    frames where things hardly move across the epipolar planes (see `timing` for fractions of frames).
 
     Args:
         cameras: C views.

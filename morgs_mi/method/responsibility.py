@@ -38,7 +38,7 @@ def responsibility(
     changes: Mapping[int, np.ndarray],
     boxes: Mapping[int, Boxes],
     render: RenderConfig,
-    min_weight: float = 0.2,
+    min_weight: float,
     width: int = 640,
 ) -> np.ndarray:
     """Return the responsibility r [N] of each Gaussian for the changes, from 0 to 1; 0 for hidden ones.

@@ -27,7 +27,7 @@ def gaussians():
 
 def responsibility_for(gaussians, changes, width=640):
     boxes = {view: boxes_around(gaussians, camera, RENDER, CORE) for view, camera in CAMERAS.items()}
-    return responsibility(gaussians, CAMERAS, changes, boxes, RENDER, width=width)
+    return responsibility(gaussians, CAMERAS, changes, boxes, RENDER, 0.2, width)
 
 
 def exact_ratio(gaussians, changes):
