@@ -32,7 +32,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.export.web import write_web_page
 from morgs_mi.playback.player import open_stream
 
-WARM_UP = 8
+WARM_UP = 20
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 # Sort the depths of a frame, which Spark has read back from the GPU, as it does for every frame.
 TIME_SORTING = """async (repeats) => {
@@ -59,8 +59,8 @@ class Options(Output):
     """Number of Gaussians."""
     active: float = 0.1
     """Fraction of them that changes in every frame."""
-    frames: int = 20
-    """Number of frames; the first eight warm up."""
+    frames: int = 60
+    """Number of frames; the first twenty warm up."""
     chromium: str = shutil.which("chromium") or "chromium"
     """The browser."""
 

@@ -257,6 +257,18 @@ def test_page__plays_to_the_end_and_scrubs_back(page, clip):
     assert np.array_equal(page.image(), played)
 
 
+def test_page__steps_to_frames_that_are_being_decoded(page):
+    page.show(3)
+    jumped = page.image()
+    page.show(0)
+    decoded = page.page.evaluate("player.playback.decodeTimes.length")
+    page.page.evaluate("for (let position = 1; position <= 3; position++) player.playback.seek(position)")
+    page.wait("player.playback.position === 3 && player.settled")
+    assert np.array_equal(page.image(), jumped)
+    # Every frame on the way was shown once, none was decoded anew.
+    assert page.page.evaluate("player.playback.decodeTimes.length") <= decoded + 3
+
+
 def test_page__repeats(page):
     page.page.evaluate("player.selectSpeed(5)")
     shown = page.page.evaluate("player.playback.decodeTimes.length")

@@ -32,6 +32,8 @@ export class Playback {
   /** The ticket of the last jump; frames with an older one are dropped. */
   private ticket = 0;
   private requested = -1;
+  /** Where the jump leads. */
+  private target = -1;
   private waiting = 0;
   private jumping = false;
   private broken = false;
@@ -66,14 +68,18 @@ export class Playback {
   /** Show a position as soon as it is decoded. */
   seek(position: number): void {
     const target = Math.max(0, Math.min(this.last, position));
-    if (this.ready[0]?.position === target && !this.jumping) {
-      this.present(this.ready.shift()!);
+    const repeats = this.requested < this.position;
+    const requested = this.position < target && (target <= this.requested || repeats);
+    const underWay = requested && !this.jumping && !this.broken;
+    this.target = target;
+    this.jumping = true;
+    if (underWay) {
+      while (this.jumping && this.ready.length > 0) this.accept(this.ready.shift()!);
       return;
     }
     this.ready = [];
     this.waiting = 0;
     this.ticket++;
-    this.jumping = true;
     this.broken = false;
     this.request(target, true);
   }
@@ -148,8 +154,10 @@ export class Playback {
       this.ready.push(shown);
       return;
     }
-    this.jumping = false;
-    this.due = performance.now() + 1000 / (this.fps * this.speed);
+    if (shown.position === this.target) {
+      this.jumping = false;
+      this.due = performance.now() + 1000 / (this.fps * this.speed);
+    }
     this.present(shown);
   }
 
