@@ -177,7 +177,7 @@ def _fit_first_frame(
     gaussians, status = _first_gaussians(setup, images, fit, rng)
     targets = [Target(image, mask) for image, mask in zip(images.values(), masks, strict=True)]
     given = gaussians, cameras, list(images.values()), masks, targets, setup.points, setup.extent
-    chosen = first_settings(*given, fit, config.render, [config.seed, 0, 1], on_step)
+    chosen = first_settings(*given, fit, config.render, [config.seed, 0, 1], on_step, prior)
     before = chosen.steps_before
     tick = None if on_step is None else lambda done, steps: on_step(before + done, before + steps)
     start = gaussians, cameras, targets, setup.extent, chosen.config, config.render, rng, tick

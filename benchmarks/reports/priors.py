@@ -60,7 +60,7 @@ class CaseOptions(CellOptions):
     """Folder of the synthetic captures, which are made where they are missing."""
     downscale: float = 2
     """Factor by which the synthetic captures are reduced."""
-    width: int = 320
+    width: int = 160
     """Width to which the other captures are reduced by a whole factor, px."""
     fit_seeds: tuple[int, ...] = (0, 1, 2)
     """Seeds of the fits."""
@@ -156,13 +156,13 @@ def _penalised(penalty: Callable[[Gaussians], Tensor]) -> Iterator[None]:
         yield
 
 
-def _size_and_opacity(gaussians: Gaussians) -> Tensor:
+def size_and_opacity(gaussians: Gaussians) -> Tensor:
     means = np.asarray(dr.detach(gaussians.means))
     extent = float(np.linalg.norm(np.percentile(means, 95, axis=0) - np.percentile(means, 5, axis=0))) / 2
     return 0.01 * dr.mean(gaussians.opacities.array) + 0.01 / extent * dr.mean(gaussians.scales.array)
 
 
-def _needles(gaussians: Gaussians) -> Tensor:
+def needles(gaussians: Gaussians) -> Tensor:
     count = len(gaussians)
     a, b, c = (dr.gather(mi.Float, gaussians.log_scales.array, 3 * dr.arange(mi.UInt32, count) + k) for k in range(3))
     longest = dr.maximum(dr.maximum(a, b), c)
@@ -231,8 +231,8 @@ def _smoothing() -> Iterator[None]:
 
 
 _PATCHES = {
-    "penalties": lambda: _penalised(_size_and_opacity),
-    "needles": lambda: _penalised(_needles),
+    "penalties": lambda: _penalised(size_and_opacity),
+    "needles": lambda: _penalised(needles),
     "exploration": _exploring,
     "smooth depth": _smoothing,
 }

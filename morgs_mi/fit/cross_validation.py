@@ -17,6 +17,7 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.depth_prior import DepthPrior
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.forecast import POOR_LOSS, forecast
 from morgs_mi.losses.ssim import Target
@@ -115,6 +116,7 @@ def cross_validate(
     render: RenderConfig,
     seed: Sequence[int],
     on_step: Callable[[int], None] | None = None,
+    prior: DepthPrior | None = None,
 ) -> CrossValidation:
     """Return what cross-validation of the first frame finds.
 
@@ -128,18 +130,20 @@ def cross_validate(
         render: cut-offs.
         seed: of every fit.
         on_step: called with the number of steps done, in all fits.
+        prior: inverse depth of the views, or None.
     """
     how = config.cross_validation
     withheld, steps = withheld_views(cameras, how.share), trial_steps(config)
     small = [reduced(*view, how.width) for view in zip(cameras, images, masks, strict=True)]
-    trained = [view for index, view in enumerate(small) if index not in withheld]
-    judged, targets = [small[index] for index in withheld], [Target(image, mask) for _, image, mask in trained]
+    kept = [index for index in range(len(small)) if index not in withheld]
+    trained, judged = [small[index] for index in kept], [small[index] for index in withheld]
+    views, targets = [view[0] for view in trained], [Target(image, mask) for _, image, mask in trained]
+    depth = None if prior is None else prior.reduced(kept, views)
     trials: list[Trial] = []
     for dropping in how.candidates:
         trial, rng = replace(config, dropping=dropping, first_frame_steps=steps), np.random.default_rng(seed)
         tick = None if on_step is None else shifted(on_step, len(trials) * steps)
-        views = [view[0] for view in trained]
-        fitted = fit_first_frame(start, views, targets, extent, trial, render, rng, tick).gaussians
+        fitted = fit_first_frame(start, views, targets, extent, trial, render, rng, tick, depth).gaussians
         trials.append(Trial(dropping, mean_psnr(fitted, judged, render), mean_psnr(fitted, trained, render)))
         if len(trials) > 1 and trials[-1].withheld_psnr <= trials[-2].withheld_psnr:
             break

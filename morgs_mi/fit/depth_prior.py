@@ -44,6 +44,8 @@ _MIN_SAMPLES = 20
 # Alpha from which a pixel's rendered depth counts for the alignment.
 _OPAQUE = 0.5
 _ROUNDS = 20
+# Fraction of known pixels from which a reduced one is known: all, but for rounding.
+_WHOLE = 0.999
 
 
 class DepthNetwork:
@@ -115,6 +117,11 @@ class AlignedDepth:
         weights = mi.TensorXf(dr.detach(image.alpha).array * self.known.array, tuple(self.known.shape))
         return depth_loss(image.depth, self.inverse, weights, self.unit)
 
+    def reduced(self, camera: Camera) -> AlignedDepth:
+        """Return the inverse depth at the size of a camera; a pixel is known if all that it covers is."""
+        inverse, known = (_reduced(np.asarray(values), camera) for values in (self.inverse, self.known))
+        return replace(self, inverse=_tensor(inverse), known=_tensor(known > _WHOLE))
+
 
 @dataclass(frozen=True, eq=False)
 class DepthPrior:
@@ -140,6 +147,21 @@ class DepthPrior:
             for found, relative, view in zip(self.aligned, self.relative, views, strict=True)
         )
         return replace(self, aligned=tuple(aligned))
+
+    def reduced(self, views: Sequence[int], cameras: Sequence[Camera]) -> DepthPrior:
+        """Return the prior of some views at a smaller size.
+
+        Args:
+            views: indices of the views.
+            cameras: of these views, of that size.
+        """
+        return DepthPrior(
+            tuple(_reduced(self.relative[v], camera) for v, camera in zip(views, cameras, strict=True)),
+            tuple(
+                None if (found := self.aligned[v]) is None else found.reduced(camera)
+                for v, camera in zip(views, cameras, strict=True)
+            ),
+        )
 
 
 def depth_prior(
@@ -226,6 +248,11 @@ def _aligned(relative: np.ndarray, samples: np.ndarray, inverse: np.ndarray, fin
     # Beyond infinity, as the sky can be where all samples are near, is infinity.
     whole, valid = np.maximum(scale * relative + shift, 0), np.isfinite(relative)
     return AlignedDepth(_tensor(np.where(valid, whole, 0)), _tensor(valid), float(np.median(y)), final)
+
+
+def _reduced(values: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return the means of a map [H, W] over the pixels of a camera, NaN where any value is."""
+    return cv2.resize(values.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
 
 
 def _tensor(values: np.ndarray) -> Tensor:

@@ -14,6 +14,7 @@ from morgs_mi.fit.agreement import NUM_FITS, Agreement, compare_fits
 from morgs_mi.fit.budget import planned_trials, steps_within
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, trial_steps
+from morgs_mi.fit.depth_prior import DepthPrior
 from morgs_mi.fit.dropping import dropping_by_noise
 from morgs_mi.fit.forecast import Forecast, forecast
 from morgs_mi.losses.ssim import Target
@@ -51,6 +52,7 @@ def first_settings(
     render: RenderConfig,
     seed: Sequence[int],
     on_step: Callable[[int, int], None] | None = None,
+    prior: DepthPrior | None = None,
 ) -> FirstSettings:
     """Return the settings of the first frame.
 
@@ -69,10 +71,11 @@ def first_settings(
         render: cut-offs.
         seed: of the trials.
         on_step: called with (steps of the trials done, steps of trials and first frame).
+        prior: inverse depth of the views, or None.
     """
     if config.first_frame_seconds is not None:
         steps = steps_within(
-            config.first_frame_seconds, gaussians, cameras, targets, extent, config, render, [*seed, 1]
+            config.first_frame_seconds, gaussians, cameras, targets, extent, config, render, [*seed, 1], prior
         )
         config = replace(config, first_frame_steps=steps)
     if config.dropping is not None:
@@ -87,11 +90,11 @@ def first_settings(
 
     dropping = None
     if planned.validation:
-        found = cross_validate(gaussians, *given, config, render, seed, tick)
+        found = cross_validate(gaussians, *given, config, render, seed, tick, prior)
         expected.append(found)
         dropping = found.best.dropping
     config = replace(config, dropping=dropping_by_noise(images) if dropping is None else dropping)
     if planned.comparison and len(gaussians) >= NUM_FITS:
         later = partial(tick, offset=trial_steps(config) * planned.validation)
-        expected.append(compare_fits(gaussians, *given, config, render, seed, later))
+        expected.append(compare_fits(gaussians, *given, config, render, seed, later, prior))
     return FirstSettings(config, tuple(expected), before)

@@ -10,7 +10,9 @@ from onnx import helper
 
 from morgs_mi import RenderConfig, StreamConfig, StreamLoop, rasterize
 from morgs_mi.evaluate.metrics import psnr
-from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.agreement import compare_fits
+from morgs_mi.fit.config import CrossValidationConfig, FitConfig
+from morgs_mi.fit.cross_validation import cross_validate
 from morgs_mi.fit.depth_prior import DepthNetwork, depth_prior, fit_line, fit_line_robustly
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.initialise import from_points
@@ -171,6 +173,18 @@ def test_depth_prior__that_contradicts_the_points_is_not_used():
     assert prior.aligned == (None,) * 3
 
 
+def test_depth_prior__reduced_is_the_mean_over_known_pixels():
+    upper = np.repeat(np.arange(48)[:, None] < 25, 64, axis=1)
+    prior = depth_prior(depth_maps(), VIEWS, surface_points()[0], [None, upper, upper])
+    small = [VIEWS[2].resized(32, 24), VIEWS[0].resized(16, 12)]
+    reduced = prior.reduced([2, 0], small)
+    means = np.asarray(prior.aligned[0].inverse).reshape(12, 4, 16, 4).mean(axis=(1, 3))
+    assert_close(reduced.aligned[1].inverse, means, atol=1e-5)
+    # A row of which only a half is known is not.
+    assert np.array_equal(np.asarray(reduced.aligned[0].known), np.repeat(np.arange(24)[:, None] < 12, 32, axis=1))
+    assert np.array_equal(np.isfinite(reduced.relative[0]), np.asarray(reduced.aligned[0].known) > 0)
+
+
 CONFIG = FitConfig(sh_degree=0, num_gaussians=500, first_frame_steps=100)
 
 
@@ -215,6 +229,19 @@ def test_fit_first_frame__without_weight_is_the_same_to_the_bit(monkeypatch):
     assert np.array_equal(np.asarray(plain.gaussians.means), np.asarray(off.gaussians.means))
     assert set(rendered) == {("color",)}
     assert {*off.losses} == {"recon"}
+
+
+@pytest.mark.parametrize("trial", [cross_validate, compare_fits])
+def test_trials__expect_more_of_other_views_with_depth(trial):
+    points, rays, colors = surface_points()
+    start = from_points(points + 0.1 * np.random.default_rng(0).normal(size=(len(points), 1)) * rays, colors, 0)
+    images = [np.uint8(255 * card(camera)[0] + 0.5) for camera in VIEWS]
+    # Without dropping, whose effect on so few Gaussians is larger than that of their depth.
+    trials = CrossValidationConfig(candidates=(0.0,))
+    config = dataclasses.replace(CONFIG, first_frame_steps=200, cross_validation=trials)
+    given = start, VIEWS, images, [None] * 3, 3.0, config, RenderConfig(reproducible=True), [0]
+    without, guided = (trial(*given, prior=p) for p in (None, depth_prior(depth_maps(), VIEWS, points)))
+    assert guided.expected_psnr > without.expected_psnr + 0.2
 
 
 def test_fit_config__rejects_a_negative_depth_weight():
