@@ -56,6 +56,8 @@ class CaseOptions(CellOptions):
 
     captures: tuple[Path, ...] = ()
     """Further captures."""
+    synthetic: tuple[int, ...] = tuple(seed for seed, _, _ in CASES)
+    """Seeds of the synthetic captures."""
     clips: Path = Path("out/priors")
     """Folder of the synthetic captures, which are made where they are missing."""
     downscale: float = 2
@@ -68,6 +70,8 @@ class CaseOptions(CellOptions):
     def cases(self) -> Iterator[tuple[str, Capture, tuple[int, ...]]]:
         """Yield the name, the capture with the points of its training views, and these views."""
         for seed, count, noise in CASES:
+            if seed not in self.synthetic:
+                continue
             clip = self.clips / f"{seed}-{count}-{noise * self.downscale:g}"
             if not clip.exists():
                 # The mean over a block has less noise than its pixels.

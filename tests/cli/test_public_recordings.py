@@ -1,0 +1,45 @@
+"""The commands for N3DV and Meet Room of the documentation, on short clips with the names and files of these."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+
+from morgs_mi.synth.synthesize import synthesize
+
+PAGE = Path(__file__).parents[2] / "docs/experiments/index.md"
+FRAMES = 3
+
+
+def stand_in(path: Path, width: int, height: int, number: str) -> None:
+    """Write videos with camera numbers in this format, and `poses_bounds.npy`, as these recordings have them."""
+    synthesize("random", path, num_cameras=8, num_frames=FRAMES, width=width, height=height, seed=3, lossless=False)
+    for extra in ("sparse", "truth"):
+        shutil.rmtree(path / extra)
+    (path / "capture.json").unlink()
+    for camera, clip in enumerate(sorted(path.glob("*.mp4"))):
+        clip.rename(path / number.format(camera))
+    assert {file.suffix for file in path.iterdir()} == {".mp4", ".npy"}
+
+
+@pytest.mark.slow
+def test_commands_for_public_recordings__give_scores_of_camera_0(tmp_path, run, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    stand_in(tmp_path / "N3DV/cut_roasted_beef", 640, 480, "cam{:02d}.mp4")
+    stand_in(tmp_path / "MeetRoom/discussion", 320, 240, "cam_{}.mp4")
+    block = PAGE.read_text().partition("<!-- commands: recordings -->\n")[2]
+    commands = re.findall(r"^    morgs-mi (.*)$", block, re.MULTILINE)
+    assert len(commands) == 7
+    for command in commands:
+        status, _, error = run(*shlex.split(command.replace("--frames 300", f"--frames {FRAMES}")))
+        assert status == 0, error
+    for name, held_out in (("cut_roasted_beef", "cam00"), ("discussion", "cam_0")):
+        found = json.loads((tmp_path / "out" / name / "eval.json").read_text())
+        assert found["held_out"] is True
+        assert [*found["views"]] == [held_out]
+        assert found["psnr"]["mean"] > 25
