@@ -4,8 +4,9 @@ d_i is the displacement of Gaussian i from frame t-1 to frame t, and d*_i that o
 
 1. A Gaussian lies on the surface of object k if, in some view at t-1, the pixel under its centre shows k within 1 % of
    the centre's depth, and the same holds for no other object in any view.
-2. Objects are rigid. The motion of k is the rigid motion that best maps its tracked points from t-1 to t, exact up to
-   rounding; an object whose tracks do not fit a rigid motion is excluded.
+2. The motion of a rigid object is the rigid motion that best maps its tracked points from t-1 to t, exact up to
+   rounding. Another object deforms: the motion around a Gaussian is the rigid one that best maps the eight nearest
+   tracked points, and the Gaussian is excluded where they leave more than a tenth of its displacement.
 3. Gaussians are evaluated if their opacity is at least 0.1 and their d* is at least a tenth of the longest on their
    object: the others are hardly visible or have no meaningful direction.
 
@@ -17,18 +18,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+from scipy.spatial import KDTree
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.results import Motion3DScores
 from morgs_mi.synth.ground_truth import GroundTruth
 
-__all__ = ["compare_motion", "evaluate_motion", "rigid_motions", "surface_ids"]
+__all__ = ["compare_motion", "evaluate_motion", "local_motion", "rigid_motions", "surface_ids"]
 
 _DEPTH_TOLERANCE = 0.01
 _LEAST_OPACITY = 0.1
 _LEAST_SHARE = 0.1
 # Tolerances relative to an object's size: distance of tracked points from a rigid motion, and from one line.
 _RIGID, _FLAT = 1e-4, 1e-3
+# Tracked points around a Gaussian on a deforming object, and how much of the displacement they may leave.
+_NEIGHBOURS, _LEAST_AGREEMENT = 8, 0.1
 
 
 def evaluate_motion(
@@ -47,15 +51,41 @@ def evaluate_motion(
         tracks: the tracked points at t-1 and at t [P, 3], and their objects' ids [P].
         views: cameras with their ground truth at t-1.
     """
-    ids = surface_ids(means, views)
+    ids, rigid = surface_ids(means, views), rigid_motions(*tracks)
     true, evaluated = np.zeros_like(means, float), np.zeros(len(means), bool)
-    for index, (rotation, shift) in rigid_motions(*tracks).items():
-        own = tracks[2] == index
-        longest = np.linalg.norm(tracks[1][own] - tracks[0][own], axis=-1).max()
+    for index in np.unique(tracks[2]):
+        before, after = (points[tracks[2] == index] for points in tracks[:2])
+        longest = np.linalg.norm(after - before, axis=-1).max()
         on = (ids == index) & (opacities >= _LEAST_OPACITY)
-        true[on] = means[on] @ (rotation - np.eye(3)).T + shift
+        if not longest:
+            continue
+        if index in rigid:
+            rotation, shift = rigid[index]
+            true[on] = means[on] @ (rotation - np.eye(3)).T + shift
+        else:
+            true[on] = local_motion(means[on], before, after)
         evaluated |= on & (np.linalg.norm(true, axis=-1) >= _LEAST_SHARE * longest)
     return compare_motion(displacements[evaluated], true[evaluated])
+
+
+def local_motion(points: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Return the displacement of points [M, 3] on a deforming object, NaN where the tracks around one disagree.
+
+    Args:
+        points: at the earlier time, world units.
+        before: tracked points of the object at that time [P, 3].
+        after: the same points one frame later.
+    """
+    if len(before) < _NEIGHBOURS:
+        return np.full_like(points, np.nan)
+    _, nearest = KDTree(before).query(points, k=_NEIGHBOURS)
+    p, q = before[nearest], after[nearest]
+    center, target = p.mean(axis=1, keepdims=True), q.mean(axis=1, keepdims=True)
+    turn = _rotation(p - center, q - target)
+    left = np.linalg.norm((p - center) @ turn.swapaxes(-1, -2) + target - q, axis=-1).max(axis=-1)
+    moved = np.einsum("mij,mj->mi", turn, points - center[:, 0]) + target[:, 0] - points
+    moved[left > _LEAST_AGREEMENT * np.linalg.norm(moved, axis=-1)] = np.nan
+    return moved
 
 
 def compare_motion(motion: np.ndarray, truth: np.ndarray) -> Motion3DScores:
@@ -114,10 +144,17 @@ def rigid_motions(
             continue
         center, target = p.mean(0), q.mean(0)
         size = np.linalg.norm(p - center, axis=-1).max()
-        U, spread, Vt = np.linalg.svd((q - target).T @ (p - center) / len(p))
-        rotation = U @ np.diag([1, 1, np.linalg.det(U @ Vt)]) @ Vt
+        spread = np.linalg.svd((q - target).T @ (p - center) / len(p), compute_uv=False)
+        rotation = _rotation(p - center, q - target)
         shift = target - rotation @ center
         off = np.linalg.norm(p @ rotation.T + shift - q, axis=-1).max()
         if spread[1] > (_FLAT * size) ** 2 and off <= _RIGID * size:
             found[int(index)] = (rotation, shift)
     return found
+
+
+def _rotation(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Return the rotations [..., 3, 3] that best map points p to q [..., P, 3], both around their means."""
+    U, _, Vt = np.linalg.svd(q.swapaxes(-1, -2) @ p)
+    U[..., :, 2] *= np.linalg.det(U @ Vt)[..., None]
+    return U @ Vt

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.evaluate.motion3d import compare_motion, evaluate_motion, rigid_motions, surface_ids
+from morgs_mi.evaluate.motion3d import compare_motion, evaluate_motion, local_motion, rigid_motions, surface_ids
 from morgs_mi.synth.ground_truth import GroundTruth
 from tests.assertions import assert_close
 
@@ -98,3 +98,42 @@ def test_evaluate_motion__selects_opaque_gaussians_on_a_moving_object_off_its_ax
     assert score.true_length == pytest.approx(2 * 0.4 * np.sin(0.1))
     assert (score.relative_error, score.length_ratio) == pytest.approx((0.5, 1.5))
     assert score.angle == pytest.approx(0, abs=1e-5)  # an arc cosine near 1 halves the digits
+
+
+def bent(points: np.ndarray, curvature: float) -> np.ndarray:
+    """Return points of the wall [..., 3] after it is bent to a cylinder about the y axis."""
+    x, y, z = np.moveaxis(points, -1, 0)
+    angle, radius = x * curvature, 1 / curvature
+    return np.stack([(radius - z) * np.sin(angle), y, radius - (radius - z) * np.cos(angle)], axis=-1)
+
+
+def test_local_motion__of_a_bending_wall():
+    points, tracked = (rng.uniform(-1, 1, (n, 3)) * (1, 1, 0) for n in (200, 1500))
+    before, after = bent(tracked, 0.2), bent(tracked, 0.3)
+    true = bent(points, 0.3) - bent(points, 0.2)
+    found = local_motion(bent(points, 0.2), before, after)
+    moved = np.linalg.norm(true, axis=-1) > 0.1 * np.linalg.norm(after - before, axis=-1).max()
+    kept = moved & np.isfinite(found[:, 0])
+    assert kept.sum() > 0.9 * moved.sum()
+    error = np.linalg.norm(found - true, axis=-1)[kept] / np.linalg.norm(true, axis=-1)[kept]
+    assert np.median(error) < 0.01
+    assert error.max() < 0.1
+
+
+def test_local_motion__excludes_points_between_parts_that_move_apart():
+    tracked = rng.uniform(0.2, 1, (400, 3)) * (1, 1, 0) * np.where(np.arange(400) % 2, 1, -1)[:, None]
+    after = tracked + np.sign(tracked[:, :1]) * [0, 0, 0.1]
+    found = local_motion(np.array([(0.6, 0.6, 0.0), (0.0, 0.0, 0.0)]), tracked, after)
+    assert_close(found[0], [0, 0, 0.1], atol=1e-12)
+    assert np.isnan(found[1]).all()
+
+
+def test_evaluate_motion__evaluates_gaussians_on_a_deforming_object():
+    tracked = rng.uniform(-1.5, 0, (600, 3)) * (1, 1, 0)
+    after = tracked + 0.02 * tracked**2 @ [[0, 0, 1], [0, 0, 0], [0, 0, 0]]
+    means = np.array([(-1.0, -0.5, 0), (-1.2, -0.2, 0)])
+    true = 0.02 * means**2 @ [[0, 0, 1], [0, 0, 0], [0, 0, 0]]
+    views = [(FRONT, plane(4, 3, -1))]
+    score = evaluate_motion(means, true, np.full(2, 0.9), (tracked, after, np.full(600, 3)), views)
+    assert score.num_gaussians == 2
+    assert score.relative_error < 0.02
