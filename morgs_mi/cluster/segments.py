@@ -189,6 +189,7 @@ class _Run:
             self.metadata["segments"] = {"starts": list(starts[:-1]), **asdict(seams)}
         self.peaks: dict[str, int] = {}
         self.active = 0  # segments whose later frames are being fitted
+        self.starting = 0  # segments whose start is fitted, or waits for a worker
 
     async def fit(self, resume: bool) -> SegmentedFit:
         """Fit, or continue, all segments and join them."""
@@ -297,8 +298,10 @@ class _Segment:
         """Fit what is missing of the segment, task after task."""
         common = min(COMMON_FRAMES, self.stop)
         if self.number and not self.reports:
+            self.run.starting += 1
             keyframe, _ = await self.run.base
             self._add(await self.run.run(fit_segment_start, keyframe, self.start))
+            self.run.starting -= 1
         elif not self.number:
             if self.num_fitted < common:
                 frames = FrameRange(0, self.num_fitted, common)
@@ -307,17 +310,24 @@ class _Segment:
             self.run.base.set_result((reemitted_keyframe(coded).encoded, coded.next_id))
         overlap = takewhile(lambda packet: packet.frame < self.start, StreamReader(self.path))
         self.run.begun[self.number].set_result(tuple(packet.encoded for packet in overlap))
-        while self.run.active >= self.run.workers.count:  # a worker continues the loop of one segment, not of many
-            await asyncio.sleep(_POLL)
+        # A worker continues the loop of one segment, not of many.
+        await self._until(lambda: self.run.active < self.run.workers.count)
         self.run.active += 1
         while (at := self.start + self.num_fitted) < self.stop:
             stop, following = min(at + TASK_FRAMES, self.fade), None
             if at == self.fade:  # one task, which alone knows both the faded Gaussians and those that it fits
                 _, shared_ids = await self.run.base
                 stop, following = self.stop, Following(await self.run.begun[self.number + 1], shared_ids)
+            # Starts are the longest tasks, and what other segments wait for: a late one would be fitted last and alone.
+            await self._until(lambda: self.run.starting < self.run.workers.count)
             frames = FrameRange(self.start, at, stop)
             self._add(await self.run.run(fit_frames, frames, self.restart, following))
         self.run.active -= 1
+
+    @staticmethod
+    async def _until(condition: Callable[[], bool]) -> None:
+        while not condition():
+            await asyncio.sleep(_POLL)
 
     def packets(self) -> Iterator[Packet]:
         """Yield the packets of the segment, without those of the overlap before it."""

@@ -20,6 +20,7 @@ from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.cluster.executor import Workers, open_workers
 from morgs_mi.cluster.seams import SeamConfig
 from morgs_mi.cluster.segments import SegmentedFit, stream_segments
+from morgs_mi.cluster.tasks import fit_segment_start
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.packets import coded_frames, frames_with_lasting_ids, seek
 from morgs_mi.codec.reader import StreamReader
@@ -105,6 +106,35 @@ def test_stream_segments__reports_frames_and_seams(whole: Path) -> None:
     assert [seam["frame"] for seam in report["seams"]] == list(STARTS[1:])
     assert all(np.isfinite(list(seam.values())).all() for seam in report["seams"])
     assert all(peak > 1e7 for peak in report["workers"].values())
+
+
+class Noted(Workers):
+    """Workers that note, when later frames are given to them, how many starts of segments are missing."""
+
+    def __init__(self, workers: Workers, starts: int) -> None:
+        self.place, self.workers, self.missing, self.noted = workers.place, workers, starts, []
+
+    @property
+    def count(self) -> int:
+        return self.workers.count
+
+    async def run(self, function, *args):
+        if function is fit_segment_start:
+            result = await self.workers.run(function, *args)
+            self.missing -= 1
+            return result
+        if args[1].start:
+            self.noted.append(self.missing)
+        return await self.workers.run(function, *args)
+
+
+def test_stream_segments__begins_segments_before_it_continues_others(
+    capture: Capture, workers: Workers, tmp_path: Path
+) -> None:
+    noted = Noted(workers, starts=2)
+    fit(capture, tmp_path, noted, seams=replace(SEAMS, overlap=0))  # the first segment waits for no other
+    assert noted.noted
+    assert max(noted.noted) < workers.count
 
 
 @pytest.mark.parametrize("command", [("eval",), ("export", "tracks"), ("render", "--camera", "0")])
