@@ -1,10 +1,12 @@
-"""The figures of a benchmark as JSON, with the machine and the versions that they belong to."""
+"""The figures of a benchmark as JSON, with the commit, the date, the machine and the versions that they belong to."""
 
 from __future__ import annotations
 
 import json
+import subprocess
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from datetime import date
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -30,7 +32,23 @@ class Output:
             packages: whose versions are recorded beside those of the package's own dependencies.
             unprinted: names of figures that only the file has.
         """
-        found = {**figures, "machine": machine(), "versions": versions() | {name: version(name) for name in packages}}
+        found = {
+            **figures,
+            "commit": commit(),
+            "date": date.today().isoformat(),
+            "machine": machine(),
+            "versions": versions() | {name: version(name) for name in packages},
+        }
         print(json.dumps({name: value for name, value in found.items() if name not in unprinted}, indent=2))
         if self.json is not None:
             write_json(self.json, found)
+
+
+def commit() -> str:
+    """Return the commit of this checkout, with -dirty if files differ from it; empty outside of a repository."""
+    command = ["git", "describe", "--always", "--dirty", "--exclude=*"]
+    try:
+        done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return ""
+    return done.stdout.strip()
