@@ -96,7 +96,7 @@ def _summary(out: Path, rows: Sequence[LiveFrame]) -> str:
 
 
 def _start_viewer(out: Path, open_browser: bool) -> subprocess.Popen[bytes]:
-    """Start the viewer in a process of its own: two threads cannot use Dr.Jit for long computations side by side."""
+    """Start the viewer in a process of its own: in one process it would wait for the renderings of the fit."""
     browser = "--open-browser" if open_browser else "--no-open-browser"
     command = [sys.executable, "-m", "morgs_mi", "view", str(out), "--follow", browser, "--variant", mi.variant()]
     return subprocess.Popen(command, start_new_session=True)  # Ctrl-C is for the fit, which ends the viewer

@@ -423,7 +423,7 @@ class Viewer:
     def _recorded_image(self, view: int, frame: int, camera: Camera) -> np.ndarray | None:
         """Return the recorded image of a camera of the rig as the page sees it; None if there is none."""
         try:
-            if self._recording is None:
+            if self._recording is None or frame >= self._recording.num_frames:  # that of a live fit grows
                 self._recording = RecordedImages(self._open_capture())
             image = self._recording.at(view, frame)
         except (OSError, ValueError) as error:
