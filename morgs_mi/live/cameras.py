@@ -6,6 +6,7 @@ import atexit
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from threading import Condition, Thread
 
@@ -23,6 +24,7 @@ _KEPT = 4
 _MAX_SKEW = 0.5
 # Reads that may fail in succession before a source counts as ended, and the pause after each, s.
 _FAILURES, _PAUSE = 10, 0.02
+_RETRY = 1.0  # pause before a connection is opened again, s
 # Time to wait for a thread that ends, s; a source may hang.
 _CLOSING = 1.0
 
@@ -34,11 +36,12 @@ class CameraFeed:
     one that is nearest in time.
 
     Args:
-        cameras: the images of each camera, uint8 [H, W, 3], RGB, by its name. Their iterators wait for the next image.
+        cameras: the images of each camera, uint8 [H, W, 3], RGB, by its name, with None where one is missing. Their
+            iterators wait for the next image.
         timeout: seconds to wait for a camera before it is left out.
     """
 
-    def __init__(self, cameras: Mapping[str, Iterable[np.ndarray]], timeout: float) -> None:
+    def __init__(self, cameras: Mapping[str, Iterable[np.ndarray | None]], timeout: float) -> None:
         self.names, self._timeout, self._changed = tuple(cameras), timeout, Condition()
         self._cameras = [_Camera(images, self._changed) for images in cameras.values()]
         # A thread that executes library code when the interpreter ends aborts the process.
@@ -117,7 +120,7 @@ class CameraFeed:
 class _Camera(Thread):
     """Thread that reads the images of a camera; its state is guarded by `changed`."""
 
-    def __init__(self, images: Iterable[np.ndarray], changed: Condition) -> None:
+    def __init__(self, images: Iterable[np.ndarray | None], changed: Condition) -> None:
         super().__init__(daemon=True, name="camera")
         self.shots: deque[Shot] = deque(maxlen=_KEPT)
         self.ended: str | None = None  # why there are no images any more
@@ -127,11 +130,14 @@ class _Camera(Thread):
 
     def run(self) -> None:
         """Read until the source ends or `closed` is set."""
+        number = 0
         try:
-            for number, image in enumerate(self._images):
-                with self._changed:
-                    self.shots.append(Shot(image, time.monotonic(), number))
-                    self._changed.notify_all()
+            for image in self._images:
+                if image is not None:
+                    with self._changed:
+                        self.shots.append(Shot(image, time.monotonic(), number))
+                        self._changed.notify_all()
+                    number += 1
                 if self.closed:
                     break
         except Exception as error:
@@ -168,8 +174,10 @@ def _nearest(new: Sequence[Sequence[Shot]], expected: Sequence[bool]) -> list[Sh
     return chosen if max(times) - min(times) <= _MAX_SKEW else None
 
 
-def read_camera(source: int | str | Path, size: tuple[int, int] | None = None) -> Iterator[np.ndarray]:
-    """Yield the images of a source, RGB uint8 [H, W, 3], as they arrive; those of a video file at its own speed.
+def read_camera(source: int | str | Path, size: tuple[int, int] | None = None) -> Iterator[np.ndarray | None]:
+    """Yield the images of a source, RGB uint8 [H, W, 3], as they arrive, with None where a read has failed.
+
+    A video file is played at its own speed. A connection that breaks is opened again.
 
     Args:
         source: a camera of this machine, by OpenCV's index; or a path or URL that FFmpeg opens.
@@ -178,7 +186,18 @@ def read_camera(source: int | str | Path, size: tuple[int, int] | None = None) -
     Raises:
         OSError: the source cannot be opened.
     """
-    stream = open_source(source)
+    yield from _read(open_source(source), source, size)
+    while "://" in str(source):
+        time.sleep(_RETRY)
+        yield None
+        with suppress(OSError):
+            yield from _read(open_source(source), source, size)
+
+
+def _read(
+    stream: cv2.VideoCapture, source: int | str | Path, size: tuple[int, int] | None
+) -> Iterator[np.ndarray | None]:
+    """Yield the images of an opened source until it ends; see `read_camera`."""
     if isinstance(source, int) and size is not None:
         stream.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
         stream.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
@@ -187,12 +206,11 @@ def read_camera(source: int | str | Path, size: tuple[int, int] | None = None) -
     try:
         while failures < _FAILURES:
             read, image = stream.read()
+            if read and is_file:
+                time.sleep(max(0.0, start + stream.get(cv2.CAP_PROP_POS_MSEC) / 1000 - time.monotonic()))
             failures = 0 if read else failures + 1
+            yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if read else None
             if not read:
                 time.sleep(_PAUSE)
-                continue
-            if is_file:
-                time.sleep(max(0.0, start + stream.get(cv2.CAP_PROP_POS_MSEC) / 1000 - time.monotonic()))
-            yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
     finally:
         stream.release()
