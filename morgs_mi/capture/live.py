@@ -93,7 +93,7 @@ def open_source(source: int | str | Path) -> cv2.VideoCapture:
     """
     stream = cv2.VideoCapture(source) if isinstance(source, int) else cv2.VideoCapture(str(source), cv2.CAP_FFMPEG)
     if not stream.isOpened():
-        raise OSError(f"live_frames(): the source {source} cannot be opened; check that it exists and is not in use.")
+        raise OSError(f"live_frames(): cannot open the source {source}; check that it exists and is not in use.")
     return stream
 
 

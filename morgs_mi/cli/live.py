@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,6 +17,7 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, print_warning, progress
 from morgs_mi.cli.settings import Flag, GivenSettings, Settings
+from morgs_mi.config import StreamConfig
 from morgs_mi.live.config import LiveConfig
 
 if TYPE_CHECKING:
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["Live"]
 
 _PERIOD = 1.0  # least time between two lines about frames, s
+_FIRST_SECONDS = 30.0  # of the first frame, during which nothing should move, unless its steps or its time are given
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,7 @@ class Live:
         from morgs_mi.live.fit import fit_live
 
         out = self.out or Path(time.strftime("live-%Y%m%d-%H%M%S"))
-        config = self.settings.stream_config()
+        config = _hurried(self.settings.stream_config())
         self.settings.check_methods(config)
         sources = [int(source) if source.isdecimal() else source for source in self.camera]
         with ExitStack() as viewer, progress() as report:
@@ -62,6 +64,13 @@ class Live:
 
             rows = fit_live(sources, out, self.live, config, on_frame, report)
         print_result(_summary(out, rows))
+
+
+def _hurried(config: StreamConfig) -> StreamConfig:
+    """Return a config in which the time of the first frame is limited."""
+    if config.fit.first_frame_seconds is not None or config.fit.first_frame_steps is not None:
+        return config
+    return replace(config, fit=replace(config.fit, first_frame_seconds=_FIRST_SECONDS))
 
 
 class _Lines:

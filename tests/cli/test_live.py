@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from morgs_mi.cli import live as module
 from morgs_mi.cli.live import Live, _Lines, _summary
+from morgs_mi.cli.settings import Settings
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.live.fit import LiveFrame
 from morgs_mi.playback.player import open_stream
@@ -65,8 +67,8 @@ def test_Live__ends_with_a_summary_on_ctrl_c(capture: Path, tmp_path: Path, vide
         (
             ("--camera", "a", "b", "nowhere"),
             (
-                "the source ",
-                " cannot be opened; check that it exists",
+                "Cannot open the source ",
+                "; check that it exists and is not in use",
             ),
         ),
         (("--frames", 0), ("--frames must be a number in [1, inf), got 0",)),
@@ -80,8 +82,23 @@ def test_Live__refuses_in_one_sentence(capture: Path, tmp_path: Path, videos, ru
     assert not (tmp_path / "out").exists()
 
 
-def test_Live__names_the_output_after_the_time() -> None:
-    assert Live().out is None
+def test_Live__names_the_output_after_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    given: dict[str, Any] = {}
+
+    def fit(sources, out, live, config, *_):
+        given.update(out=out, sources=sources, fit=config.fit)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("morgs_mi.live.fit.fit_live", fit)
+    for settings, seconds in ((Settings(), 30), (Settings(first_frame_steps=7), None), (Settings(preset="s"), 30)):
+        with pytest.raises(KeyboardInterrupt):
+            Live(camera=("0", "rtsp://10.0.0.10/live"), settings=settings).run()
+        assert re.fullmatch(r"live-\d{8}-\d{6}", given["out"].name)
+        assert given["sources"] == [0, "rtsp://10.0.0.10/live"]
+        assert given["fit"].first_frame_seconds == seconds, "the first frame ends unless its steps are given"
+    with pytest.raises(KeyboardInterrupt):
+        Live(settings=Settings(first_frame_seconds=5)).run()
+    assert given["fit"].first_frame_seconds == 5
 
 
 def test_Lines__count_what_was_dropped_since_the_last_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -148,8 +148,8 @@ def test_CameraFeed__names_a_camera_without_a_first_image(opened) -> None:
     with pytest.raises(ValueError, match=r"images of cam1, got none \(it has ended\)"):
         feed.newest()
     failing, (_, c) = opened(1, 0, timeout=60)
-    c.end(OSError("the source 63 cannot be opened"))
-    with pytest.raises(OSError, match="63 cannot be opened"):
+    c.end(OSError("cannot open the source 63"))
+    with pytest.raises(OSError, match="cannot open the source 63"):
         failing.newest()
 
 

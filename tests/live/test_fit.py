@@ -161,7 +161,7 @@ FAULTS = [
     (lambda images: None, ["a", "a"], r"must have different sources, got 2 \(a, a\)"),
     (lambda images: None, ["images", "b"], "must be one folder with the images of all cameras, or one source per"),
     (lambda images: None, [61, 62], r"each of the 4 calibrated cameras \(cam0, cam1, cam2, cam3\), got 2 \(61, 62\)"),
-    (lambda images: None, [60, 61, 62, 63], "the source 6. cannot be opened; check that it exists"),
+    (lambda images: None, [60, 61, 62, 63], "cannot open the source 6.; check that it exists"),
     (lambda images: None, ["images"], "expected images of cam0, cam1, cam2, cam3 .* found folders called nothing"),
     (other_size, ["images"], "expected 200x150, the calibrated size of cam2, or a scaled version of it, got 90x90"),
     (other_names, ["images"], "expected images of cam0, .* found folders called cam0, cam1, cam2, camera3"),
