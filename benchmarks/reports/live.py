@@ -29,7 +29,7 @@ from morgs_mi.synth.synthesize import synthesize
 class Options(Output):
     """Clips, work and output."""
 
-    scenes: tuple[str, ...] = ("arm", "random-3", "random-4")
+    scenes: tuple[str, ...] = ("arm", "random-3")
     """Scenes; random-N is the random one of the seed N."""
     clips: Path = Path("out/live")
     """Folder of the clips, which are made where they are missing."""
@@ -37,7 +37,7 @@ class Options(Output):
     """Frames from one that is fitted to the next, in ascending order."""
     gap: int = 16
     """Frames from the first one to the second, in a further fit of each stride; a multiple of the largest stride."""
-    frames: int = 33
+    frames: int = 25
     """Frames of a clip."""
     width: int = 160
     """Width of the images; the height is three quarters of it."""
@@ -71,14 +71,14 @@ def main(options: Options) -> None:
     for name in options.scenes:
         clip, (scene, _, seed) = options.clips / name, name.partition("-")
         if not clip.exists():
-            size = {"width": options.width, "height": 3 * options.width // 4}
-            synthesize(scene, clip, num_frames=options.frames, seed=int(seed or 0), **size)
+            height = 3 * options.width // 4
+            synthesize(scene, clip, num_frames=options.frames, width=options.width, height=height, seed=int(seed or 0))
         scores = measure(load_capture(clip), options)
         clips[name] = {
             stride: {key: {"mean": float(np.nanmean(values)), "psnr_moving": values} for key, values in row.items()}
             for stride, row in scores.items()
         }
-    options.write({"clips": clips}, unprinted=[])
+    options.write({"clips": clips}, unprinted=["clips"])
 
 
 if __name__ == "__main__":

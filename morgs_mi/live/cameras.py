@@ -39,10 +39,13 @@ class CameraFeed:
         cameras: the images of each camera, uint8 [H, W, 3], RGB, by its name, with None where one is missing. Their
             iterators wait for the next image.
         timeout: seconds to wait for a camera before it is left out.
+        warm_up: seconds that the cameras have, after the first image of the last of them, to adjust their exposure.
     """
 
-    def __init__(self, cameras: Mapping[str, Iterable[np.ndarray | None]], timeout: float) -> None:
-        self.names, self._timeout, self._changed = tuple(cameras), timeout, Condition()
+    def __init__(
+        self, cameras: Mapping[str, Iterable[np.ndarray | None]], timeout: float, warm_up: float = 0.0
+    ) -> None:
+        self.names, self._timeout, self._warm_up, self._changed = tuple(cameras), timeout, warm_up, Condition()
         self._cameras = [_Camera(images, self._changed) for images in cameras.values()]
         # A thread that executes library code when the interpreter ends aborts the process.
         atexit.register(self.close)
@@ -51,26 +54,31 @@ class CameraFeed:
 
     def newest(self, after: Bundle | None = None) -> Bundle | None:
         """Wait for the newest bundle and return it; None if no camera delivers images any more."""
-        deadline = time.monotonic() + self._timeout
         with self._changed:
+            if after is None:
+                self._wait_for_first()
+            deadline = time.monotonic() + self._timeout
             while True:
                 left = deadline - time.monotonic()
                 running = any(camera.ended is None for camera in self._cameras)
                 new = [camera.newer(after.numbers[k] if after else -1) for k, camera in enumerate(self._cameras)]
-                if after is None:
-                    self._check_first(new, running and left > 0)
-                    expected = [True] * len(new)
-                elif running:
+                if after is not None and running:
                     expected = self._expected(new, after, late=left <= 0)
-                else:  # the last images, if they are complete
-                    expected = [image is not None for image in after.images]
+                else:  # the first images have to be complete, and so have the last ones
+                    expected = [after is None or after.images[k] is not None for k in range(len(new))]
                 if shots := _nearest(new, expected):
                     times = [shot.time for shot in shots if shot is not None]
                     numbers = [camera.shots[-1].number for camera in self._cameras]
                     return bundled(shots, numbers, max(times) - min(times), after)
-                if not running or left <= 0:
+                if running and left > 0:
+                    self._changed.wait(left)
+                elif after is not None:
                     return None
-                self._changed.wait(left)
+                else:
+                    raise ValueError(
+                        f"CameraFeed(): expected simultaneous images of {', '.join(self.names)}, got none that arrived "
+                        f"within {_MAX_SKEW:g} s of each other; start the cameras together."
+                    )
 
     def problem(self, camera: int) -> str:
         """Return why a camera has no image in the last bundle."""
@@ -96,25 +104,27 @@ class CameraFeed:
             for wait, image, shots, recent in zip(waited, after.images, new, _simultaneous(new), strict=True)
         ]
 
-    def _check_first(self, new: Sequence[Sequence[Shot]], waiting: bool) -> None:
-        """Check that each camera has a first image, or may still have one.
+    def _wait_for_first(self) -> None:
+        """Wait until every camera has had an image, and has adjusted its exposure.
 
         Raises:
             OSError, ValueError: one has none.
         """
-        for name, camera, shots in zip(self.names, self._cameras, new, strict=True):
-            if camera.ended is not None and not shots and camera.error is not None:
-                raise camera.error
-            if not shots and (camera.ended is not None or not waiting):
-                raise ValueError(
-                    f"CameraFeed(): expected images of {name}, got none ({camera.ended or 'it is silent'}); check that "
-                    f"it records, or wait for it longer than {self._timeout:g} s (--timeout)."
-                )
-        if not waiting and not _nearest(new, [True] * len(new)):
-            raise ValueError(
-                f"CameraFeed(): expected simultaneous images of {', '.join(self.names)}, got none that arrived within "
-                f"{_MAX_SKEW:g} s of each other; start the cameras together."
-            )
+        deadline = time.monotonic() + self._timeout
+        while silent := [k for k, camera in enumerate(self._cameras) if not camera.shots]:
+            left = deadline - time.monotonic()
+            for name, camera in ((self.names[k], self._cameras[k]) for k in silent):
+                if camera.error is not None:
+                    raise camera.error
+                if camera.ended is not None or left <= 0:
+                    raise ValueError(
+                        f"CameraFeed(): expected images of {name}, got none ({camera.ended or 'it is silent'}); check "
+                        f"that it records, or wait for it longer than {self._timeout:g} s (--timeout)."
+                    )
+            self._changed.wait(left)
+        end = time.monotonic() + self._warm_up
+        while (left := end - time.monotonic()) > 0 and all(camera.ended is None for camera in self._cameras):
+            self._changed.wait(left)
 
 
 class _Camera(Thread):

@@ -30,6 +30,8 @@ class LiveConfig:
     """Frames per second at which the stream is played."""
     timeout: float = 10
     """Seconds to wait for a camera before it is left out."""
+    warm_up: float = 1
+    """Seconds in which the cameras adjust their exposure before the first images are taken; not of a folder."""
     size: tuple[int, int] | None = None
     """Width and height of the images that cameras of this machine are asked for; by default they choose."""
 
@@ -39,7 +41,7 @@ class LiveConfig:
         Raises:
             ValueError: one is out of range.
         """
-        for name, least in (("downscale", 1), ("frames", 1)):
+        for name, least in (("downscale", 1), ("frames", 1), ("warm_up", 0)):
             if (value := getattr(self, name)) is not None:
                 check_number(place, name, value, f"[{least}, inf)")
         for name in ("seconds", "fps", "timeout"):

@@ -48,7 +48,7 @@ def open_feed(sources: Sequence[Source], config: LiveConfig, names: Sequence[str
             f"({', '.join(names)}), got {_listed(sources)}; name them in that order."
         )
     cameras = {name: read_camera(source, config.size) for name, source in zip(names, sources, strict=True)}
-    return CameraFeed(cameras, config.timeout)
+    return CameraFeed(cameras, config.timeout, config.warm_up)
 
 
 def _listed(sources: Sequence[Source]) -> str:

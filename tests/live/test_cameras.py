@@ -7,6 +7,7 @@ from collections.abc import Generator, Iterator
 from itertools import islice
 from pathlib import Path
 from queue import SimpleQueue
+from threading import Timer
 
 import cv2
 import numpy as np
@@ -151,6 +152,35 @@ def test_CameraFeed__names_a_camera_without_a_first_image(opened) -> None:
     c.end(OSError("cannot open the source 63"))
     with pytest.raises(OSError, match="cannot open the source 63"):
         failing.newest()
+
+
+def test_CameraFeed__lets_the_cameras_adjust_their_exposure() -> None:
+    a, b = Source(1), Source()
+    feed, start = CameraFeed({"a": a, "b": b}, 5, warm_up=0.2), time.monotonic()
+    Timer(0.1, b.deliver).start()
+    Timer(0.25, lambda: (a.deliver(), b.deliver())).start()
+    first = feed.newest()
+    assert first is not None
+    assert time.monotonic() - start >= 0.3
+    assert first.numbers == (1, 1)
+    assert first.dropped == 0
+    for source in (a, b):
+        source.end()
+    feed.close()
+    c, start = Source(2), time.monotonic()
+    c.end()
+    short = CameraFeed({"c": c}, 5, warm_up=5)
+    assert short.newest() is not None, "a short clip"
+    assert time.monotonic() - start < 1
+    short.close()
+
+
+def test_CameraFeed__refuses_images_of_different_times(opened) -> None:
+    feed, (a, b) = opened(1, 0, timeout=0.7)
+    a.end()
+    Timer(0.6, b.deliver).start()
+    with pytest.raises(ValueError, match=r"simultaneous images of cam0, cam1, got none that arrived within 0.5 s"):
+        feed.newest()
 
 
 def test_read_camera__plays_a_file_at_its_own_speed(tmp_path: Path) -> None:

@@ -59,8 +59,8 @@ def test_fit_live__follows_a_folder_that_is_filled(tmp_path: Path, rig: Path, im
     assert grown == [0, 1, 2, 3], "the stream can be read while it grows"
     assert [row.frame for row in rows] == [0, 1, 2, 3]
     for before, row in pairwise(rows):
-        # A frame is written in a few milliseconds, so their number is known to one or two.
-        assert row.dropped == pytest.approx((row.time - before.time) * FPS - 1, abs=2)
+        # A busy machine writes some frames late.
+        assert row.dropped == pytest.approx((row.time - before.time) * FPS - 1, rel=0.1, abs=3)
         assert row.latency < 5
         assert not row.problems
     assert sum(row.dropped for row in rows) > 10, "the fit is slower than the clip"
@@ -192,6 +192,7 @@ def test_fit_live__does_not_replace_an_earlier_capture(tmp_path: Path, rig: Path
         ({"frames": 0}, r"`frames` must be a number in \[1, inf\), got 0"),
         ({"seconds": 0.0}, r"`seconds` must be a number in \(0, inf\), got 0.0"),
         ({"fps": -1.0}, r"`fps` must be a number in \(0, inf\), got -1.0"),
+        ({"warm_up": -1.0}, r"`warm_up` must be a number in \[0, inf\), got -1.0"),
         ({"timeout": 0.0}, r"`timeout` must be a number in \(0, inf\), got 0.0"),
     ],
 )
