@@ -51,7 +51,7 @@ class Live:
         from morgs_mi.live.fit import fit_live
 
         out = self.out or Path(time.strftime("live-%Y%m%d-%H%M%S"))
-        config = _hurried(self.settings.stream_config())
+        config = _with_first_seconds(self.settings.stream_config())
         self.settings.check_methods(config)
         sources = [int(source) if source.isdecimal() else source for source in self.camera]
         with ExitStack() as viewer, progress() as report:
@@ -66,7 +66,7 @@ class Live:
         print_result(_summary(out, rows))
 
 
-def _hurried(config: StreamConfig) -> StreamConfig:
+def _with_first_seconds(config: StreamConfig) -> StreamConfig:
     """Return a config in which the time of the first frame is limited."""
     if config.fit.first_frame_seconds is not None or config.fit.first_frame_steps is not None:
         return config

@@ -17,6 +17,7 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.metrics import psnr_of
+from morgs_mi.io.png import png_bytes
 from morgs_mi.live.config import LiveConfig
 from morgs_mi.live.fit import fit_live
 from morgs_mi.playback.player import open_stream
@@ -110,6 +111,21 @@ def test_fit_live__leaves_out_a_camera_that_stops(tmp_path: Path, rig: Path, ima
     ]
     views = evaluate_stream(tmp_path / "out").frames[1].views
     assert [np.isnan(views[name].psnr) for name in NAMES] == [False, True, False, False]
+
+
+def test_fit_live__leaves_out_images_of_another_size(tmp_path: Path, rig: Path, images: Path) -> None:
+    def write(number: int, **sizes: tuple[int, int]) -> None:
+        for name, clip in zip(NAMES, clips(), strict=True):
+            image = cv2.resize(clip[number], sizes.get(name, (200, 150)))
+            file = images / name / f"{number:04d}.png"
+            file.parent.mkdir(exist_ok=True)
+            file.write_bytes(png_bytes(image))
+
+    write(0)
+    live = LiveConfig(rig, downscale=4, frames=2, timeout=5)
+    _, row = fit_live([images], tmp_path / "out", live, CONFIG, lambda *_: write(1, cam2=(100, 75)))
+    assert row.problems == ("cam2: expected an image of 200x150, got 100x75",)
+    assert not (tmp_path / "out" / "capture" / "cam2" / "0001.png").exists()
 
 
 @pytest.mark.slow
