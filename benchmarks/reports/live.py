@@ -43,6 +43,8 @@ class Options(Output):
     """Width of the images; the height is three quarters of it."""
     epochs: int = 2
     """Epochs of a later frame."""
+    gap_epochs: tuple[int, ...] = (10, 30)
+    """Other numbers of epochs of the frame after the gap, each in a further fit of the smallest stride."""
     steps: int = 600
     """Steps of the first frame."""
 
@@ -61,6 +63,20 @@ def measure(capture: Capture, options: Options) -> dict[str, dict[str, list[floa
             rows = zip(taken, fitted_frames(loop, capture, taken), strict=True)
             common = [row for frame, row in rows if frame.index >= options.gap and frame.index % largest == 0]
             scores.setdefault(f"{stride}", {})[name] = [round(row["psnr_moving"], 2) for row in common]
+    setup, after, rest = (
+        loop.setup,
+        frames[options.gap : options.gap + 1],
+        frames[options.gap + 1 :: options.strides[0]],
+    )
+    for epochs in options.gap_epochs:
+        loop.state = first
+        loop.setup = replace(setup, config=replace(config, fit=replace(config.fit, epochs=epochs)))
+        rows = list(fitted_frames(loop, capture, after))
+        loop.setup = setup
+        rows += fitted_frames(loop, capture, rest)
+        scores[f"{options.strides[0]}"][f"after_gap_{epochs}_epochs"] = [
+            round(row["psnr_moving"], 2) for row in (rows[0], rows[-1])
+        ]
     return scores
 
 
@@ -75,7 +91,9 @@ def main(options: Options) -> None:
             synthesize(scene, clip, num_frames=options.frames, width=options.width, height=height, seed=int(seed or 0))
         scores = measure(load_capture(clip), options)
         clips[name] = {
-            stride: {key: {"mean": float(np.nanmean(values)), "psnr_moving": values} for key, values in row.items()}
+            stride: {
+                key: {"mean": round(float(np.nanmean(values)), 2), "psnr_moving": values} for key, values in row.items()
+            }
             for stride, row in scores.items()
         }
     options.write({"clips": clips}, unprinted=["clips"])
