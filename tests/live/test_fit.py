@@ -193,6 +193,14 @@ def test_fit_live__names_what_is_wrong(tmp_path: Path, rig: Path, images: Path, 
     assert not (tmp_path / "out").exists()
 
 
+def test_fit_live__keeps_images_that_cannot_be_calibrated(tmp_path: Path, images: Path) -> None:
+    other_size(images)
+    with pytest.raises(ValueError, match="expected at least 100 features in every view, got 0 in cam0") as failed:
+        fit_live([images], tmp_path / "out", LiveConfig(timeout=0.2), CONFIG)
+    assert f"The images are in {tmp_path / 'out' / 'capture'}: calibrate them with" in failed.value.__notes__[0]
+    assert (tmp_path / "out" / "capture" / "cam0" / "0000.png").exists()
+
+
 def test_fit_live__does_not_replace_an_earlier_capture(tmp_path: Path, rig: Path, images: Path) -> None:
     (tmp_path / "out" / "capture").mkdir(parents=True)
     with pytest.raises(FileExistsError, match="got that of an earlier fit; choose another folder"):
