@@ -41,6 +41,7 @@ from morgs_mi.stream_loop import FrameReport, StreamLoop
 
 __all__ = [
     "FILES",
+    "about_cameras",
     "check_same_fit",
     "described_capture",
     "due_keyframe",
@@ -147,9 +148,7 @@ def _stream(
             tick = None if on_step is None else _frame_ticker(on_step, frame.index)
             packet, report = push_frame(loop, frame, train, tick, upcoming)
             if refinement is not None and not frame.index:
-                report = replace(
-                    report, validation=report.validation | _about_cameras(loop, capture, frame, refinement)
-                )
+                report = replace(report, validation=report.validation | about_cameras(loop, capture, frame, refinement))
             reports.append(report)
             _check_in_place(path, written)
             write_json(out / "report.json", {**metadata, "frames": [asdict(r) for r in reports]})
@@ -177,7 +176,7 @@ def with_refined_cameras(
     return refine_cameras(capture, config.fit, config.render, config.seed, partial(on_stage, "Refining cameras"))
 
 
-def _about_cameras(loop: StreamLoop, capture: Capture, frame: PartialFrame, found: Refinement) -> dict[str, Any]:
+def about_cameras(loop: StreamLoop, capture: Capture, frame: PartialFrame, found: Refinement) -> dict[str, Any]:
     """Return what the first frame's report says about the cameras, and of the held-out view if there is one."""
     about, test = {**asdict(found), "sentence": found.sentence}, capture.test_view
     image = None if test is None else frame.images[test]

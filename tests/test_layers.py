@@ -27,6 +27,7 @@ SUBPACKAGES = (
     "calibration",
     "synth",
     "recorder",
+    "live",
     "importer",
     "playback",
     "evaluate",

@@ -22,7 +22,7 @@ import numpy as np
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.io.prefetch import prefetched
 
-__all__ = ["Source", "live_frames"]
+__all__ = ["Source", "live_frames", "open_source"]
 
 Source = int | str | Path | BinaryIO | Iterable[np.ndarray | None]
 
@@ -79,15 +79,22 @@ def _check_size(rig: Capture, view: int, image: np.ndarray | None) -> None:
 
 def _images(source: Source, width: int, height: int) -> Iterator[np.ndarray | None]:
     if isinstance(source, int | str | Path):
-        stream = cv2.VideoCapture(source) if isinstance(source, int) else cv2.VideoCapture(str(source), cv2.CAP_FFMPEG)
-        if not stream.isOpened():
-            raise OSError(
-                f"live_frames(): the source {source} cannot be opened; check that it exists and is not in use."
-            )
-        return _captured(stream)
+        return _captured(open_source(source))
     if hasattr(source, "read"):
         return _raw(cast(BinaryIO, source), width, height)
     return iter(cast(Iterable[np.ndarray | None], source))
+
+
+def open_source(source: int | str | Path) -> cv2.VideoCapture:
+    """Return OpenCV's reader of a camera, by its index, or of anything that FFmpeg opens.
+
+    Raises:
+        OSError: it cannot be opened.
+    """
+    stream = cv2.VideoCapture(source) if isinstance(source, int) else cv2.VideoCapture(str(source), cv2.CAP_FFMPEG)
+    if not stream.isOpened():
+        raise OSError(f"live_frames(): cannot open the source {source}; check that it exists and is not in use.")
+    return stream
 
 
 def _captured(stream: cv2.VideoCapture) -> Iterator[np.ndarray | None]:

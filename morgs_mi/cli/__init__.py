@@ -1,7 +1,7 @@
 """Command line, the package's only argument parser.
 
-`morgs-mi synth`, `info`, `calibrate`, `fit`, `batch`, `render`, `export`, `import`, `view`, `eval`, `salvage` and
-`demo`.
+`morgs-mi synth`, `info`, `calibrate`, `fit`, `live`, `batch`, `render`, `export`, `import`, `view`, `eval`, `salvage`
+and `demo`.
 
 Results go to standard output; progress, warnings and errors to standard error. An error that the user can correct is
 one sentence and exit status 1, an interruption by Ctrl-C or SIGTERM is status 130; `--debug` adds the traceback.
@@ -32,6 +32,7 @@ from morgs_mi.cli.export import Export
 from morgs_mi.cli.fit import Fit
 from morgs_mi.cli.import_frames import Import
 from morgs_mi.cli.info import Info
+from morgs_mi.cli.live import Live
 from morgs_mi.cli.render import Render
 from morgs_mi.cli.salvage import Salvage
 from morgs_mi.cli.settings import Flag, Settings
@@ -45,6 +46,7 @@ Command = (
     | Annotated[Info, tyro.conf.subcommand("info")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Fit, tyro.conf.subcommand("fit")]
+    | Annotated[Live, tyro.conf.subcommand("live")]
     | Annotated[Batch, tyro.conf.subcommand("batch")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Export, tyro.conf.subcommand("export")]

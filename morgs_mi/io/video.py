@@ -27,6 +27,7 @@ __all__ = [
     "ImageOrError",
     "VideoReader",
     "decode_image",
+    "image_number",
     "natural_key",
     "numbering_gap",
     "open_clips",
@@ -292,7 +293,7 @@ def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
     folders = [clip for clip in clips if isinstance(clip, Path) and clip.is_dir()]
     if not gaps or not folders:
         return [FolderReader.of_files(c, gaps) if isinstance(c, tuple) else open_frames(c) for c in clips]
-    numbered = {folder: {_number(file): file for file in _images(folder)} for folder in folders}
+    numbered = {folder: {image_number(file): file for file in _images(folder)} for folder in folders}
     numbers = sorted(set().union(*numbered.values()))
     step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
     if (numbers[-1] - numbers[0]) // step > 10 * len(numbers) + 1000:
@@ -396,7 +397,12 @@ def _images(path: Path) -> list[Path]:
     return files
 
 
-def _number(file: Path) -> int:
+def image_number(file: Path) -> int:
+    """Return the last number in the name of an image.
+
+    Raises:
+        ValueError: there is none.
+    """
     numbers = re.findall(r"[0-9]+", file.stem)
     if not numbers:
         raise ValueError(f"{file}: expected an image whose name ends in a number, got none; extract the frames again.")

@@ -23,9 +23,13 @@ class RecordedImages:
 
     Args:
         capture: the recording.
+
+    Attributes:
+        num_frames: number of its frames.
     """
 
     def __init__(self, capture: Capture) -> None:
+        self.num_frames = capture.num_frames
         self._capture = capture
         self._view, self._next = -1, 0
         self._images: Iterator[np.ndarray | Exception] = iter(())

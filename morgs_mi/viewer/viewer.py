@@ -79,6 +79,8 @@ class ViewerConfig:
     """Names under which browsers may open the page, besides localhost, HOST and addresses in digits."""
     trail: int = 10
     """Length of the trajectories, in frames."""
+    follow: bool = False
+    """Show the newest frame while the file grows."""
     capture: Path | None = None
     """Folder of the capture with the recorded images; by default the one that was fitted."""
 
@@ -114,6 +116,7 @@ class Viewer:
             ) from error
         config = config or ViewerConfig()
         self._cache, self._trail, self._stopped = FrameCache(path), config.trail, Event()
+        self._follow = config.follow
         if not self._cache.frames:
             raise ValueError(
                 f"{self._cache.stream.path}: at least one frame was expected, got none; wait for the first."
@@ -195,6 +198,7 @@ class Viewer:
             crop_limits(means),
             self._missing_capture(),
         )
+        self._controls.follow.value = self._follow
         self._mode = self._controls.mode.value
         self._connect()
 
@@ -419,7 +423,7 @@ class Viewer:
     def _recorded_image(self, view: int, frame: int, camera: Camera) -> np.ndarray | None:
         """Return the recorded image of a camera of the rig as the page sees it; None if there is none."""
         try:
-            if self._recording is None:
+            if self._recording is None or frame >= self._recording.num_frames:  # that of a live fit grows
                 self._recording = RecordedImages(self._open_capture())
             image = self._recording.at(view, frame)
         except (OSError, ValueError) as error:

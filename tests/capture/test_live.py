@@ -80,8 +80,8 @@ def test_live_frames__read_an_endless_source(rig: Capture) -> None:
     ("sources", "error", "message"),
     [
         ([[]], ValueError, r"`sources` must be one for each of 3 cameras \(cam1, cam2, cam3\), got 1"),
-        ([63, [], []], OSError, "the source 63 cannot be opened; check that it exists and is not in use"),
-        ([[], [], "/nowhere/cam.sdp"], OSError, "the source /nowhere/cam.sdp cannot be opened"),
+        ([63, [], []], OSError, "cannot open the source 63; check that it exists and is not in use"),
+        ([[], [], "/nowhere/cam.sdp"], OSError, "cannot open the source /nowhere/cam.sdp"),
         ([[np.zeros((8, 8, 3), np.uint8)], [], []], ValueError, r"of cam1 must be uint8 \[46, 62, 3\] as in its clip"),
     ],
 )

@@ -92,6 +92,14 @@ def render(
     return image
 
 
+def points(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return random points [count, 3] on the planes, and their colours in [0, 1]."""
+    corners, across, down = (np.array(column) for column in zip(*_PLANES, strict=True))
+    rows, (x, y) = rng.integers(0, len(corners), count), rng.uniform(0, 1, (2, count, 1))
+    columns, lines = (np.minimum(_TEXTURE * place[:, 0], _TEXTURE - 1).astype(int) for place in (x, y))
+    return corners[rows] + x * across[rows] + y * down[rows], np.array(textures())[rows, lines, columns] / 255
+
+
 def distance_to_planes(points: np.ndarray) -> np.ndarray:
     """Return the distance of each point [n, 3] from the nearest of the planes (taken as infinite), world units."""
     found = []

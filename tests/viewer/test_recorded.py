@@ -18,6 +18,7 @@ def test_recorded_images__in_any_order(tmp_path):
         assert image is not None
         assert image[0, 0].tolist()[:2] == [view, frame]
     assert recorded.at(0, 9) is None
+    assert recorded.num_frames == 4
 
 
 def test_recorded_images__a_missing_image_is_none(tmp_path):

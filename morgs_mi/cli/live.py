@@ -1,0 +1,116 @@
+"""`morgs-mi live`: from cameras to a stream, while they record."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import mitsuba as mi
+import numpy as np
+from tyro.conf import DisallowNone, Positional, arg
+
+from morgs_mi.cli.console import print_result, print_warning, progress
+from morgs_mi.cli.settings import Flag, GivenSettings, Settings
+from morgs_mi.config import StreamConfig
+from morgs_mi.live.config import LiveConfig
+
+if TYPE_CHECKING:
+    from morgs_mi.live.fit import LiveFrame
+
+__all__ = ["Live"]
+
+_PERIOD = 1.0  # least time between two lines about frames, s
+_FIRST_SECONDS = 30.0  # of the first frame, during which nothing should move, unless its steps or its time are given
+
+
+@dataclass(frozen=True)
+class Live:
+    """Reconstruct what cameras see, while they see it, into OUT/stream.morgs; Ctrl-C ends it.
+
+    Whenever a frame is fitted, the newest images follow, and those between are dropped.
+    """
+
+    out: Annotated[Positional[Path | None], arg(help_behavior_hint="(default: live-DATE-TIME)", metavar="[OUT]")] = None
+    """Folder for stream.morgs, capture.json and report.json, and for the fitted images in its folder capture."""
+    camera: Annotated[tuple[str, ...], arg(metavar="SOURCE ...", help_behavior_hint="")] = ()
+    """Per camera its number, a URL, a named pipe or a video; or one folder that another program fills."""
+    live: Annotated[LiveConfig, arg(name=""), DisallowNone] = field(default_factory=LiveConfig)
+    view: Flag = False
+    """Show the stream in the viewer, which follows it."""
+    open_browser: bool = True
+    """Open the viewer in the browser of this machine."""
+    settings: GivenSettings = field(default_factory=Settings)
+
+    def run(self) -> None:
+        from morgs_mi.live.fit import fit_live
+
+        out = self.out or Path(time.strftime("live-%Y%m%d-%H%M%S"))
+        config = _with_first_seconds(self.settings.stream_config())
+        self.settings.check_methods(config)
+        sources = [int(source) if source.isdecimal() else source for source in self.camera]
+        with ExitStack() as viewer, progress() as report:
+            lines = _Lines()
+
+            def on_frame(row: LiveFrame, *_: Any) -> None:
+                lines.add(row)
+                if self.view and row.frame == 0:
+                    viewer.callback(_stop, _start_viewer(out, self.open_browser))
+
+            rows = fit_live(sources, out, self.live, config, on_frame, report)
+        print_result(_summary(out, rows))
+
+
+def _with_first_seconds(config: StreamConfig) -> StreamConfig:
+    """Return a config in which the time of the first frame is limited."""
+    if config.fit.first_frame_seconds is not None or config.fit.first_frame_steps is not None:
+        return config
+    return replace(config, fit=replace(config.fit, first_frame_seconds=_FIRST_SECONDS))
+
+
+class _Lines:
+    """Lines about frames on standard error, at most one per second; each counts what was dropped since the last."""
+
+    def __init__(self) -> None:
+        self._last, self._dropped = float("-inf"), 0
+
+    def add(self, row: LiveFrame) -> None:
+        self._dropped += row.dropped
+        if (now := time.monotonic()) - self._last < _PERIOD:
+            return
+        print_warning(
+            f"Frame {row.frame}: {row.time:.1f} s after the first, latency {row.latency:.2f} s, {self._dropped} frames "
+            f"dropped, skew {1e3 * row.skew:.0f} ms."
+        )
+        self._last, self._dropped = now, 0
+
+
+def _summary(out: Path, rows: Sequence[LiveFrame]) -> str:
+    """Return what a live fit has done, in one sentence."""
+    stream, later = out / "stream.morgs", rows[1:]
+    dropped = sum(row.dropped for row in rows)
+    text = (
+        f"{stream}: fitted {len(rows)} of {len(rows) + dropped} frames ({dropped} dropped) in {rows[-1].time:.1f} s, "
+    )
+    text += f"{stream.stat().st_size / 1e6:.1f} MB, {rows[0].latency:.1f} s for the first one"
+    if not later:
+        return f"{text}."
+    latency, skew = np.mean([row.latency for row in later]), max(row.skew for row in rows)
+    return f"{text}, mean latency of the others {latency:.2f} s, largest skew {1e3 * skew:.0f} ms."
+
+
+def _start_viewer(out: Path, open_browser: bool) -> subprocess.Popen[bytes]:
+    """Start the viewer in a process of its own: in one process it would wait for the renderings of the fit."""
+    browser = "--open-browser" if open_browser else "--no-open-browser"
+    command = [sys.executable, "-m", "morgs_mi", "view", str(out), "--follow", browser, "--variant", mi.variant()]
+    return subprocess.Popen(command, start_new_session=True)  # Ctrl-C is for the fit, which ends the viewer
+
+
+def _stop(process: subprocess.Popen[bytes]) -> None:
+    process.kill()  # asked to end, it would report an interruption
+    process.wait()

@@ -1,0 +1,49 @@
+"""Settings of a live fit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from morgs_mi.core.checks import check_number
+
+__all__ = ["LiveConfig"]
+
+
+@dataclass(frozen=True)
+class LiveConfig:
+    """Settings of a live fit, besides those of the loop."""
+
+    calibration: Path | None = None
+    """Folder of a calibrated capture of the same cameras; by default they are calibrated by their first images."""
+    downscale: float = 1
+    """Factor by which the images are reduced."""
+    test_view: str | None = None
+    """Held-out camera, by index or name; by default all are fitted."""
+    frames: int | None = None
+    """Number of frames to fit; by default as many as come."""
+    seconds: float | None = None
+    """Time in seconds for the frames after the first one; by default until the cameras end."""
+    record: bool = True
+    """Store the images of all fitted frames; otherwise those of the first one alone."""
+    fps: float = 30
+    """Frames per second at which the stream is played."""
+    timeout: float = 10
+    """Seconds to wait for a camera before it is left out."""
+    warm_up: float = 1
+    """Seconds in which the cameras adjust their exposure before the first images are taken; not of a folder."""
+    size: tuple[int, int] | None = None
+    """Width and height of the images that cameras of this machine are asked for; by default they choose."""
+
+    def check(self, place: str) -> None:
+        """Check the numbers; an error's sentence begins with `place`.
+
+        Raises:
+            ValueError: one is out of range.
+        """
+        for name, least in (("downscale", 1), ("frames", 1), ("warm_up", 0)):
+            if (value := getattr(self, name)) is not None:
+                check_number(place, name, value, f"[{least}, inf)")
+        for name in ("seconds", "fps", "timeout"):
+            if (value := getattr(self, name)) is not None:
+                check_number(place, name, value, "(0, inf)")

@@ -1,0 +1,95 @@
+"""The interface of live images: what a fit gets whenever it is ready for its next frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+__all__ = ["Bundle", "Feed", "Shot", "bundled"]
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """One image of one camera.
+
+    Attributes:
+        image: uint8 [H, W, 3], RGB.
+        time: at which it arrived, s of `time.monotonic`.
+        number: its number among the camera's images, without gaps.
+    """
+
+    image: np.ndarray
+    time: float
+    number: int
+
+
+@dataclass(frozen=True, eq=False)
+class Bundle:
+    """Images of the cameras at about one time.
+
+    Attributes:
+        images: per camera uint8 [H, W, 3], RGB, None where it has none.
+        numbers: per camera the number of its image, or of its newest one before where it has none.
+        time: at which the last of the images arrived, s of `time.monotonic`.
+        skew: largest difference in time between two of the images, s.
+        dropped: number of images that each camera delivered after the bundle before and that are in none.
+    """
+
+    images: tuple[np.ndarray | None, ...]
+    numbers: tuple[int, ...]
+    time: float
+    skew: float
+    dropped: int
+
+
+class Feed(Protocol):
+    """Live images of several cameras."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the cameras, known with the first bundle."""
+        ...
+
+    def newest(self, after: Bundle | None = None) -> Bundle | None:
+        """Wait for the newest bundle and return it; None if no camera delivers images any more.
+
+        The first bundle has an image of every camera.
+
+        Args:
+            after: the bundle before; all images of the new one are newer.
+
+        Raises:
+            OSError, ValueError: a camera cannot be opened, or has no first image.
+        """
+        ...
+
+    def problem(self, camera: int) -> str:
+        """Return why a camera has no image in the last bundle."""
+        ...
+
+    def close(self) -> None:
+        """End the reading."""
+        ...
+
+
+def bundled(shots: Sequence[Shot | None], numbers: Sequence[int], skew: float, after: Bundle | None) -> Bundle:
+    """Return the bundle of at least one shot.
+
+    Args:
+        shots: per camera its image, None where it has none.
+        numbers: per camera the number of its newest image.
+        skew: largest difference in time between two of the images, s.
+        after: the bundle before.
+    """
+    before = after.numbers if after else [0] * len(shots)
+    dropped = [shot.number - number - 1 for shot, number in zip(shots, before, strict=True) if shot is not None]
+    return Bundle(
+        tuple(shot and shot.image for shot in shots),
+        tuple(shot.number if shot else number for shot, number in zip(shots, numbers, strict=True)),
+        max(shot.time for shot in shots if shot is not None),
+        skew,
+        min(dropped) if after else 0,
+    )

@@ -1,0 +1,225 @@
+"""Live fits of a clip that is played at real speed: frames are dropped, and the stream shows those that are not."""
+
+from __future__ import annotations
+
+import json
+import os
+from contextlib import ExitStack
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.evaluate.metrics import psnr_of
+from morgs_mi.io.png import png_bytes
+from morgs_mi.live.config import LiveConfig
+from morgs_mi.live.fit import fit_live
+from morgs_mi.playback.player import open_stream
+from morgs_mi.recorder import stream_capture
+from tests.scenes.live_clip import (
+    CONFIG,
+    FPS,
+    NAMES,
+    clips,
+    filling,
+    in_background,
+    piping,
+    write_calibration,
+    write_loop,
+)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    """The calibration of the cameras."""
+    return write_calibration(tmp_path / "rig")
+
+
+@pytest.fixture
+def images(tmp_path: Path) -> Path:
+    """An empty folder."""
+    (tmp_path / "images").mkdir()
+    return tmp_path / "images"
+
+
+def packets(path: Path) -> list[bytes]:
+    return [packet.encoded for packet in StreamReader(path / "stream.morgs")]
+
+
+def test_fit_live__follows_a_folder_that_is_filled(tmp_path: Path, rig: Path, images: Path) -> None:
+    out, grown = tmp_path / "out", []
+    with in_background(filling(images)):
+        live = LiveConfig(rig, downscale=4, frames=4)
+        rows = fit_live([images], out, live, CONFIG, lambda *_: grown.append(open_stream(out).index()[-1][1]))
+    assert grown == [0, 1, 2, 3], "the stream can be read while it grows"
+    assert [row.frame for row in rows] == [0, 1, 2, 3]
+    for before, row in pairwise(rows):
+        # A busy machine writes some frames late.
+        assert row.dropped == pytest.approx((row.time - before.time) * FPS - 1, rel=0.1, abs=3)
+        assert row.latency < 5
+        assert not row.problems
+    assert sum(row.dropped for row in rows) > 10, "the fit is slower than the clip"
+    report = json.loads((out / "report.json").read_text())
+    assert [row["dropped"] for row in report["live"]] == [row.dropped for row in rows]
+    assert open_stream(out).closed()
+    # The live fit is that of a recording of its frames, to the bit.
+    capture = load_capture(out / "capture", 4)
+    assert capture.num_frames == 4
+    stream_capture(capture, tmp_path / "again", CONFIG)
+    assert packets(out) == packets(tmp_path / "again")
+    scores = evaluate_stream(out)
+    assert scores.complete
+    for row, frame in zip(scores.frames, capture.frames(), strict=True):
+        assert row.scores.psnr > np.mean([grey_psnr(image) for image in frame.images]) + 4
+
+
+def grey_psnr(image: np.ndarray) -> float:
+    values = image / 255
+    return psnr_of(((values - values.mean((0, 1))) ** 2).mean())
+
+
+def test_fit_live__reads_videos_through_pipes(tmp_path: Path, rig: Path) -> None:
+    repeats, pipes = 20, [tmp_path / f"pipe{k}" for k in range(len(NAMES))]
+    with ExitStack() as playing:
+        for pipe, clip in zip(pipes, clips(), strict=True):
+            os.mkfifo(pipe)
+            data = write_loop(tmp_path / "clip.mkv", clip, repeats)
+            playing.enter_context(in_background(piping(pipe, data, repeats * len(clip) / FPS)))
+        rows = fit_live(pipes, tmp_path / "out", LiveConfig(rig, downscale=2, frames=4), CONFIG)
+    assert len(rows) == 4
+    assert sum(row.dropped for row in rows) > 10, "the fit is slower than the clip"
+    assert sum(row.dropped + 1 for row in rows) <= repeats * len(clips()[0])
+    assert max(row.skew for row in rows) <= 0.5
+    assert not any(row.problems for row in rows)
+    assert evaluate_stream(tmp_path / "out").num_frames == 4
+
+
+def test_fit_live__leaves_out_a_camera_that_stops(tmp_path: Path, rig: Path, images: Path, caplog) -> None:
+    with in_background(filling(images, ends={"cam1": 10})):
+        rows = fit_live([images], tmp_path / "out", LiveConfig(rig, downscale=2, frames=3, timeout=1), CONFIG)
+    assert [bool(row.problems) for row in rows] == [False, True, True]
+    (problem,) = rows[2].problems
+    assert problem.startswith("cam1: no complete image in")
+    assert [record.message for record in caplog.records if "left out" in record.message] == [
+        f"frame 1: cam1 is left out: no complete image in {images / 'cam1'} for 1 s"
+    ]
+    views = evaluate_stream(tmp_path / "out").frames[1].views
+    assert [np.isnan(views[name].psnr) for name in NAMES] == [False, True, False, False]
+
+
+def test_fit_live__leaves_out_images_of_another_size(tmp_path: Path, rig: Path, images: Path) -> None:
+    def write(number: int, **sizes: tuple[int, int]) -> None:
+        for name, clip in zip(NAMES, clips(), strict=True):
+            image = cv2.resize(clip[number], sizes.get(name, (200, 150)))
+            file = images / name / f"{number:04d}.png"
+            file.parent.mkdir(exist_ok=True)
+            file.write_bytes(png_bytes(image))
+
+    write(0)
+    live = LiveConfig(rig, downscale=4, frames=2, timeout=5)
+    _, row = fit_live([images], tmp_path / "out", live, CONFIG, lambda *_: write(1, cam2=(100, 75)))
+    assert row.problems == ("cam2: expected an image of 200x150, got 100x75",)
+    assert not (tmp_path / "out" / "capture" / "cam2" / "0001.png").exists()
+
+
+@pytest.mark.slow
+def test_fit_live__calibrates_the_cameras_once(tmp_path: Path, images: Path) -> None:
+    with in_background(filling(images)):
+        rows = fit_live([images], tmp_path / "out", LiveConfig(seconds=1, record=False), CONFIG)
+    assert len(rows) >= 2
+    assert rows[-1].time <= rows[0].latency + 1
+    capture = load_capture(tmp_path / "out" / "capture")
+    assert capture.names == NAMES
+    assert capture.num_frames == 1, "only the first frame is recorded"
+
+
+def test_fit_live__ends_with_a_whole_stream_when_it_is_interrupted(tmp_path: Path, rig: Path, images: Path) -> None:
+    def interrupt(row, report) -> None:
+        if row.frame == 1:
+            raise KeyboardInterrupt
+
+    with in_background(filling(images)):
+        rows = fit_live([images], tmp_path / "out", LiveConfig(rig, downscale=2), CONFIG, interrupt)
+        assert [row.frame for row in rows] == [0, 1]
+        assert open_stream(tmp_path / "out").closed()
+        assert len(packets(tmp_path / "out")) == 2
+
+        def interrupt_first(stage: str, done: int, total: int) -> None:
+            if stage == "Fitting the first frame" and done:
+                raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            fit_live([images], tmp_path / "first", LiveConfig(rig, downscale=2), CONFIG, on_stage=interrupt_first)
+
+
+def other_size(images: Path) -> None:
+    for name in NAMES:
+        size = (120, 90) if name != "cam2" else (90, 90)
+        for number in range(2):
+            file = images / name / f"{number:04d}.png"
+            file.parent.mkdir(exist_ok=True)
+            cv2.imwrite(str(file), np.zeros((*size[::-1], 3), np.uint8))
+
+
+def other_names(images: Path) -> None:
+    other_size(images)
+    (images / "cam3").rename(images / "camera3")
+
+
+FAULTS = [
+    (lambda images: None, [], "`camera` must have a source per camera, or a folder, got none"),
+    (lambda images: None, ["a", "a"], r"must have different sources, got 2 \(a, a\)"),
+    (lambda images: None, ["images", "b"], "must be one folder with the images of all cameras, or one source per"),
+    (lambda images: None, [61, 62], r"each of the 4 calibrated cameras \(cam0, cam1, cam2, cam3\), got 2 \(61, 62\)"),
+    (lambda images: None, [60, 61, 62, 63], "cannot open the source 6.; check that it exists"),
+    (lambda images: None, ["images"], "expected images of cam0, cam1, cam2, cam3 .* found folders called nothing"),
+    (other_size, ["images"], "expected 200x150, the calibrated size of cam2, or a scaled version of it, got 90x90"),
+    (other_names, ["images"], "expected images of cam0, .* found folders called cam0, cam1, cam2, camera3"),
+]
+
+
+@pytest.mark.parametrize(("spoil", "sources", "message"), FAULTS)
+def test_fit_live__names_what_is_wrong(tmp_path: Path, rig: Path, images: Path, spoil, sources, message: str) -> None:
+    spoil(images)
+    sources = [images if source == "images" else source for source in sources]
+    with pytest.raises((ValueError, OSError), match=message):
+        fit_live(sources, tmp_path / "out", LiveConfig(rig, timeout=0.2), CONFIG)
+    assert not (tmp_path / "out").exists()
+
+
+def test_fit_live__keeps_images_that_cannot_be_calibrated(tmp_path: Path, images: Path) -> None:
+    other_size(images)
+    with pytest.raises(ValueError, match="expected at least 100 features in every view, got 0 in cam0") as failed:
+        fit_live([images], tmp_path / "out", LiveConfig(timeout=0.2), CONFIG)
+    assert f"The images are in {tmp_path / 'out' / 'capture'}: calibrate them with" in failed.value.__notes__[0]
+    assert (tmp_path / "out" / "capture" / "cam0" / "0000.png").exists()
+
+
+def test_fit_live__does_not_replace_an_earlier_capture(tmp_path: Path, rig: Path, images: Path) -> None:
+    (tmp_path / "out" / "capture").mkdir(parents=True)
+    with pytest.raises(FileExistsError, match="got that of an earlier fit; choose another folder"):
+        fit_live([images], tmp_path / "out", LiveConfig(rig), CONFIG)
+    with pytest.raises(FileNotFoundError, match="expected a calibrated capture of the cameras, found none"):
+        fit_live([images], tmp_path / "new", LiveConfig(tmp_path / "nowhere"), CONFIG)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"downscale": 0.5}, r"`downscale` must be a number in \[1, inf\), got 0.5"),
+        ({"frames": 0}, r"`frames` must be a number in \[1, inf\), got 0"),
+        ({"seconds": 0.0}, r"`seconds` must be a number in \(0, inf\), got 0.0"),
+        ({"fps": -1.0}, r"`fps` must be a number in \(0, inf\), got -1.0"),
+        ({"warm_up": -1.0}, r"`warm_up` must be a number in \[0, inf\), got -1.0"),
+        ({"timeout": 0.0}, r"`timeout` must be a number in \(0, inf\), got 0.0"),
+    ],
+)
+def test_fit_live__refuses_settings_out_of_range(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        fit_live([0], tmp_path / "out", LiveConfig(**changes))

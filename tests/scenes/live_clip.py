@@ -1,0 +1,109 @@
+"""A clip of `filmed` that is played in a loop at its own speed: into a folder, or as a video through a pipe."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from functools import cache
+from pathlib import Path
+from threading import Event, Thread
+
+import numpy as np
+
+from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.config import StreamConfig
+from morgs_mi.fit.config import DensityConfig, FitConfig
+from morgs_mi.io.png import png_bytes
+from morgs_mi.io.video_writer import write_video
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.render.config import RenderConfig
+from tests.scenes import filmed, textured
+
+FPS = 20.0
+NAMES = tuple(camera.name for camera in filmed.rig())
+# Enough for a rough image, and slower than the clip.
+CONFIG = StreamConfig(
+    fit=FitConfig(
+        sh_degree=0,
+        num_gaussians=1500,
+        first_frame_steps=150,
+        confidence_steps=4,
+        epochs=2,
+        density=DensityConfig(rounds=0),
+    ),
+    motion=MotionConfig(key_views=1),
+    render=RenderConfig(reproducible=True),
+)
+
+
+@cache
+def clips() -> list[list[np.ndarray]]:
+    """Return the clip of each camera: 16 frames that swing to and fro, so that they can be repeated."""
+    forth = filmed.film(frames=9)
+    return [[image for image in (*clip, *clip[-2:0:-1]) if image is not None] for clip in forth]
+
+
+def write_calibration(path: Path) -> Path:
+    """Write the calibration of the cameras with a photo of each, and points on the planes."""
+    rng = np.random.default_rng(0)
+    points, colors = textured.points(rng, 1500)
+    write_colmap(path / "sparse" / "0", filmed.rig(), points, colors)
+    for name, clip in zip(NAMES, clips(), strict=True):
+        (path / f"{name}.png").write_bytes(png_bytes(clip[0]))
+    return path
+
+
+@contextmanager
+def in_background(work) -> Iterator[None]:
+    """Run `work(stopped)` in a thread until the body ends."""
+    stopped = Event()
+    thread = Thread(target=work, args=(stopped,), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stopped.set()
+        thread.join(timeout=10)
+
+
+def filling(folder: Path, frames: int = 10**6, ends: dict[str, int] | None = None):
+    """Return work that writes the clip into a folder in real time, each camera up to a frame of `ends`."""
+
+    def fill(stopped: Event) -> None:
+        start = time.monotonic()
+        for t in range(frames):
+            for name, clip in zip(NAMES, clips(), strict=True):
+                if t < (ends or {}).get(name, frames):
+                    file = folder / name / f"{t:04d}.png"
+                    file.parent.mkdir(parents=True, exist_ok=True)
+                    data = png_bytes(clip[t % len(clip)])
+                    with file.open("wb") as opened:  # in two parts, as a program that is slow to write it
+                        opened.write(data[:5000])
+                        opened.flush()
+                        time.sleep(0.001)
+                        opened.write(data[5000:])
+            if stopped.wait(max(0.0, start + (t + 1) / FPS - time.monotonic())):
+                return
+
+    return fill
+
+
+def piping(pipe: Path, data: bytes, seconds: float):
+    """Return work that writes the bytes of a video into a pipe at the speed at which it was recorded."""
+
+    def write(stopped: Event) -> None:
+        start, count = time.monotonic(), 100
+        with suppress(BrokenPipeError), pipe.open("wb", buffering=0) as opened:
+            for k in range(count):
+                opened.write(data[len(data) * k // count : len(data) * (k + 1) // count])
+                if stopped.wait(max(0.0, start + seconds * (k + 1) / count - time.monotonic())):
+                    return
+
+    return write
+
+
+def write_loop(path: Path, clip: Sequence[np.ndarray], repeats: int) -> bytes:
+    """Return a video that repeats a clip."""
+    write_video(path, [image for _ in range(repeats) for image in clip], FPS, "mp4v")
+    return path.read_bytes()
