@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Sequence
 from contextlib import ExitStack
 from itertools import pairwise
 from pathlib import Path
@@ -60,11 +61,13 @@ def test_fit_live__follows_a_folder_that_is_filled(tmp_path: Path, rig: Path, im
     assert grown == [0, 1, 2, 3], "the stream can be read while it grows"
     assert [row.frame for row in rows] == [0, 1, 2, 3]
     for before, row in pairwise(rows):
-        # A busy machine writes some frames late.
-        assert row.dropped == pytest.approx((row.time - before.time) * FPS - 1, rel=0.1, abs=3)
-        assert row.latency < 5
+        assert row.time > before.time
+        assert row.latency >= 0
         assert not row.problems
     assert sum(row.dropped for row in rows) > 10, "the fit is slower than the clip"
+    assert counts_what_is_dropped(
+        [row.dropped for row in rows], list(load_capture(out / "capture").images(2)), clips()[2]
+    )
     report = json.loads((out / "report.json").read_text())
     assert [row["dropped"] for row in report["live"]] == [row.dropped for row in rows]
     assert open_stream(out).closed()
@@ -77,6 +80,15 @@ def test_fit_live__follows_a_folder_that_is_filled(tmp_path: Path, rig: Path, im
     assert scores.complete
     for row, frame in zip(scores.frames, capture.frames(), strict=True):
         assert row.scores.psnr > np.mean([grey_psnr(image) for image in frame.images]) + 4
+
+
+def counts_what_is_dropped(dropped: list[int], recorded: list[Any], clip: list[np.ndarray]) -> bool:
+    """Return whether recorded images are those of a looped clip, from any frame on, without those that were dropped."""
+    numbers = np.cumsum([0, *(count + 1 for count in dropped[1:])])
+    return any(
+        all(np.array_equal(image, clip[(begin + n) % len(clip)]) for n, image in zip(numbers, recorded, strict=True))
+        for begin in range(len(clip))
+    )
 
 
 def grey_psnr(image: np.ndarray) -> float:
@@ -100,30 +112,31 @@ def test_fit_live__reads_videos_through_pipes(tmp_path: Path, rig: Path) -> None
     assert evaluate_stream(tmp_path / "out").num_frames == 4
 
 
+def write(images: Path, number: int, names: Sequence[str] = NAMES, **sizes: tuple[int, int]) -> None:
+    """Write an image of each camera, at the sizes that are given and otherwise the recorded one."""
+    for name, clip in zip(NAMES, clips(), strict=True):
+        if name in names:
+            file = images / name / f"{number:04d}.png"
+            file.parent.mkdir(exist_ok=True)
+            file.write_bytes(png_bytes(cv2.resize(clip[number], sizes.get(name, (200, 150)))))
+
+
 def test_fit_live__leaves_out_a_camera_that_stops(tmp_path: Path, rig: Path, images: Path, caplog) -> None:
-    with in_background(filling(images, ends={"cam1": 10})):
-        rows = fit_live([images], tmp_path / "out", LiveConfig(rig, downscale=2, frames=3, timeout=1), CONFIG)
+    write(images, 0)
+    live, others = LiveConfig(rig, downscale=4, frames=3, timeout=0.5), ("cam0", "cam2", "cam3")
+    rows = fit_live([images], tmp_path / "out", live, CONFIG, lambda row, _: write(images, row.frame + 1, names=others))
     assert [bool(row.problems) for row in rows] == [False, True, True]
-    (problem,) = rows[2].problems
-    assert problem.startswith("cam1: no complete image in")
     assert [record.message for record in caplog.records if "left out" in record.message] == [
-        f"frame 1: cam1 is left out: no complete image in {images / 'cam1'} for 1 s"
+        f"frame 1: cam1 is left out: no complete image in {images / 'cam1'} for 0.5 s"
     ]
     views = evaluate_stream(tmp_path / "out").frames[1].views
     assert [np.isnan(views[name].psnr) for name in NAMES] == [False, True, False, False]
 
 
 def test_fit_live__leaves_out_images_of_another_size(tmp_path: Path, rig: Path, images: Path) -> None:
-    def write(number: int, **sizes: tuple[int, int]) -> None:
-        for name, clip in zip(NAMES, clips(), strict=True):
-            image = cv2.resize(clip[number], sizes.get(name, (200, 150)))
-            file = images / name / f"{number:04d}.png"
-            file.parent.mkdir(exist_ok=True)
-            file.write_bytes(png_bytes(image))
-
-    write(0)
+    write(images, 0)
     live = LiveConfig(rig, downscale=4, frames=2, timeout=5)
-    _, row = fit_live([images], tmp_path / "out", live, CONFIG, lambda *_: write(1, cam2=(100, 75)))
+    _, row = fit_live([images], tmp_path / "out", live, CONFIG, lambda *_: write(images, 1, cam2=(100, 75)))
     assert row.problems == ("cam2: expected an image of 200x150, got 100x75",)
     assert not (tmp_path / "out" / "capture" / "cam2" / "0001.png").exists()
 
@@ -195,7 +208,7 @@ def test_fit_live__names_what_is_wrong(tmp_path: Path, rig: Path, images: Path, 
 
 def test_fit_live__keeps_images_that_cannot_be_calibrated(tmp_path: Path, images: Path) -> None:
     other_size(images)
-    with pytest.raises(ValueError, match="expected at least 100 features in every view, got 0 in cam0") as failed:
+    with pytest.raises(ValueError, match="expected at least 100 features in every view, got 0 in cam") as failed:
         fit_live([images], tmp_path / "out", LiveConfig(timeout=0.2), CONFIG)
     assert f"The images are in {tmp_path / 'out' / 'capture'}: calibrate them with" in failed.value.__notes__[0]
     assert (tmp_path / "out" / "capture" / "cam0" / "0000.png").exists()

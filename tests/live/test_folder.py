@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 from threading import Timer
@@ -85,6 +86,21 @@ def test_FolderFeed__leaves_out_a_camera_that_stops_until_it_is_back(tmp_path: P
     assert fourth is not None
     assert fourth.numbers == (6, 6)
     assert feed.newest(fourth) is None
+
+
+def test_FolderFeed__leaves_out_a_camera_that_stopped_long_before_the_others(tmp_path: Path) -> None:
+    """During a fit: its last images have numbers that the others have, too."""
+    feed = FolderFeed(fill(tmp_path, range(1), "a", "b"), 0.2, ["a", "b"])
+    first = feed.newest()
+    fill(tmp_path, range(1, 9), "a")
+    fill(tmp_path, range(1, 3), "b")
+    for number in range(1, 3):
+        for name in ("a", "b"):
+            os.utime(tmp_path / name / f"{number:04d}.png", times=(time.time() - 60, time.time() - 60))
+    second = feed.newest(first)
+    assert second is not None
+    assert second.numbers == (8, 8)
+    assert [image is not None for image in second.images] == [True, False]
 
 
 def test_FolderFeed__names_what_it_lacks(tmp_path: Path) -> None:

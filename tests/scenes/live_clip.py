@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
+from itertools import count
 from pathlib import Path
 from threading import Event, Thread
 
@@ -67,22 +68,21 @@ def in_background(work) -> Iterator[None]:
         thread.join(timeout=10)
 
 
-def filling(folder: Path, frames: int = 10**6, ends: dict[str, int] | None = None):
-    """Return work that writes the clip into a folder in real time, each camera up to a frame of `ends`."""
+def filling(folder: Path):
+    """Return work that writes the clip into a folder again and again, in real time."""
 
     def fill(stopped: Event) -> None:
         start = time.monotonic()
-        for t in range(frames):
+        for t in count():
             for name, clip in zip(NAMES, clips(), strict=True):
-                if t < (ends or {}).get(name, frames):
-                    file = folder / name / f"{t:04d}.png"
-                    file.parent.mkdir(parents=True, exist_ok=True)
-                    data = png_bytes(clip[t % len(clip)])
-                    with file.open("wb") as opened:  # in two parts, as a program that is slow to write it
-                        opened.write(data[:5000])
-                        opened.flush()
-                        time.sleep(0.001)
-                        opened.write(data[5000:])
+                file = folder / name / f"{t:04d}.png"
+                file.parent.mkdir(parents=True, exist_ok=True)
+                data = png_bytes(clip[t % len(clip)])
+                with file.open("wb") as opened:  # in two parts, as a program that is slow to write it
+                    opened.write(data[:5000])
+                    opened.flush()
+                    time.sleep(0.001)
+                    opened.write(data[5000:])
             if stopped.wait(max(0.0, start + (t + 1) / FPS - time.monotonic())):
                 return
 
@@ -93,11 +93,11 @@ def piping(pipe: Path, data: bytes, seconds: float):
     """Return work that writes the bytes of a video into a pipe at the speed at which it was recorded."""
 
     def write(stopped: Event) -> None:
-        start, count = time.monotonic(), 100
+        start, parts = time.monotonic(), 100
         with suppress(BrokenPipeError), pipe.open("wb", buffering=0) as opened:
-            for k in range(count):
-                opened.write(data[len(data) * k // count : len(data) * (k + 1) // count])
-                if stopped.wait(max(0.0, start + seconds * (k + 1) / count - time.monotonic())):
+            for k in range(parts):
+                opened.write(data[len(data) * k // parts : len(data) * (k + 1) // parts])
+                if stopped.wait(max(0.0, start + seconds * (k + 1) / parts - time.monotonic())):
                     return
 
     return write
