@@ -97,7 +97,8 @@ def grey_psnr(image: np.ndarray) -> float:
 
 
 def test_fit_live__reads_videos_through_pipes(tmp_path: Path, rig: Path) -> None:
-    repeats, pipes = 20, [tmp_path / f"pipe{k}" for k in range(len(NAMES))]
+    # Long enough for a slow machine; the pipes are closed when the fit ends.
+    repeats, pipes = 120, [tmp_path / f"pipe{k}" for k in range(len(NAMES))]
     with ExitStack() as playing:
         for pipe, clip in zip(pipes, clips(), strict=True):
             os.mkfifo(pipe)
