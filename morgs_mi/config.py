@@ -6,6 +6,7 @@ Presets:
     baseline, ml, ml-mo, ml-mo-mc     rows of the ablation: residuals only; with motion; with offset; with confidence
     paper                             all three modules; motion starts from zero instead of the lifted flow, one gate,
                                       constant learning rates
+    hicom                             what another publication adds to the baseline (docs/experiments/field.md)
 
 The number of key views (2, 4, 8 or 12 in the paper) is `MotionConfig.key_views` and belongs to no preset.
 
@@ -48,7 +49,7 @@ __all__ = [
     "relocated",
 ]
 
-PresetName = Literal["l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper"]
+PresetName = Literal["l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper", "hicom"]
 Config = TypeVar("Config")
 _NONE = "none"
 _COMMENT_WIDTH = 110
@@ -97,6 +98,7 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
             **_modules(True, True, True),
         },
     },
+    "hicom": {"motion": {"model": "hicom", **_modules(False, False, False)}},
 }
 
 

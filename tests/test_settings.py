@@ -35,6 +35,7 @@ BASE = StreamConfig(
 VALUES: dict[str, Any] = {
     "motion.flow_method": "farneback",
     "motion.mask_method": "superpixels",
+    "motion.model": "hicom",
     "fit.early_stopping_tolerance": 0.5,
     "fit.dropping": 0.3,
     "fit.first_frame_seconds": 0.01,
@@ -76,6 +77,8 @@ ELSEWHERE: dict[str, str] = {
     "motion.masks": "tests/method/test_confidence.py and tests/method/mask_refiners",
     "motion.search": "flow explains all parts here: tests/method/test_search.py",
     "motion.search_motion": "flow explains all parts here: tests/method/test_search.py",
+    "motion.model_share": "no motion model here: tests/fit/test_motion_stage.py",
+    "motion.hicom": "a model that is not the default: tests/fit/test_motion_stage.py",
     "codec.keyframe_interval": "keyframes are written by the recorder: tests/test_recorder.py",
 }
 

@@ -15,6 +15,7 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.density import apply_plan, plan_additions, resize_optimizer
+from morgs_mi.fit.motion_stage import fit_motion, motion_model
 from morgs_mi.fit.optimise import adam, optimise, values_of, view_order
 from morgs_mi.losses.attribution import densification_scores
 from morgs_mi.losses.ssim import Target
@@ -87,14 +88,18 @@ def fit_later_frame(
     views = sorted(active.views)
     if not views or not len(active.indices):
         return LaterFrame(with_zero_motion(previous), np.arange(len(previous)), {}, 0)
-    base = active.select(previous)
-    optimizer, source = adam(residual_parameters(base, motion, problem.start)), np.arange(len(base))
+    base, source = active.select(previous), np.arange(len(active.indices))
     losses_at = partial(_losses_at, problem, _on_active_views(problem), config, motion)
-    order = view_order(len(views), config.epochs * len(views), rng)
+    order = [views[k] for k in view_order(len(views), config.epochs * len(views), rng)]
     tick = None if on_step is None else lambda done: on_step(done, len(order))
     density_epoch = round(config.density.later_round * config.epochs)
-    losses, done = {}, 0
-    for epoch in range(config.epochs):
+    start, losses, first_epoch = problem.start, {}, 0
+    if (model := motion_model(base, problem.extent, motion)) is not None:
+        first_epoch = max(1, round(motion.model_share * config.epochs))
+        how = order[: first_epoch * len(views)], config.objective.dssim_weight, tick
+        start, losses = fit_motion(base, model, start, active.views, problem.targets, *how)
+    optimizer, done = adam(residual_parameters(base, motion, start)), first_epoch * len(views)
+    for epoch in range(first_epoch, config.epochs):
         if epoch == density_epoch and config.density.later_frames:
             now = _current(base, optimizer, motion)
             scores = densification_scores(
@@ -108,7 +113,7 @@ def fit_later_frame(
         losses = optimise(
             optimizer,
             config.rates_at(epoch).by_parameter(problem.extent),
-            [views[k] for k in order[done : done + len(views)]],
+            order[done : done + len(views)],
             partial(losses_at, base),
             weights_of(config.objective),
             on_step=tick,

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
+from morgs_mi.core.checks import check_number
 from morgs_mi.method.active_set import ActiveSetConfig
 from morgs_mi.method.change import ChangeConfig
 from morgs_mi.method.cohesion import CohesionConfig
 from morgs_mi.method.flow_sources.config import FlowConfig
+from morgs_mi.method.hicom import HicomConfig
 from morgs_mi.method.lift import LiftConfig
 from morgs_mi.method.mask_refiners.config import MaskConfig
 from morgs_mi.method.photometric import PhotometricConfig
@@ -59,6 +62,11 @@ class MotionConfig:
     """Gate below which a lifted motion is no longer scaled up to pass the gate at full length."""
     confidence_decay: float = 0.3
     """Logit that a confidence loses per frame without evidence of motion: where something moved, more is to correct."""
+    model: Literal["none", "hicom"] = "none"
+    """Motion that Gaussians share, fitted before the residual: none, or that of another publication (see
+    docs/experiments/field.md)."""
+    model_share: float = 0.5
+    """Fraction of a later frame's epochs that fit this model, at least one epoch."""
     flow: FlowConfig = field(default_factory=FlowConfig)
     """Optical flow and its forward-backward check."""
     masks: MaskConfig = field(default_factory=MaskConfig)
@@ -77,8 +85,11 @@ class MotionConfig:
     """Selection of the Gaussians that a frame may change."""
     change: ChangeConfig = field(default_factory=ChangeConfig)
     """Detection of changed pixels."""
+    hicom: HicomConfig = field(default_factory=HicomConfig)
+    """Hierarchical coherent motion, the model `hicom`."""
 
     def __post_init__(self) -> None:
         for name in ("key_views", "mask_interval"):
             if getattr(self, name) < 1:
                 raise ValueError(f"MotionConfig(): `{name}` must be at least 1, got {getattr(self, name)}.")
+        check_number("MotionConfig()", "model_share", self.model_share, "[0, 1]")

@@ -44,7 +44,7 @@ def residual_parameters(previous: Gaussians, config: MotionConfig, start: Lift |
     shapes = {**previous.parameters(), "motion": previous.means, "offset": previous.means}
     names = [n for n in _RESIDUALS if n in shapes and (n != "offset" or config.learn_offset)]
     parameters: dict[str, Tensor] = {name: dr.zeros(mi.TensorXf, tuple(shapes[name].shape)) for name in names}
-    displacement = None if start is None else start.displacement
+    displacement, rotation = (None, None) if start is None else (start.displacement, start.rotation)
     if config.learn_confidence:
         logit = previous.logit_confidence
         if logit is None:
@@ -54,12 +54,15 @@ def residual_parameters(previous: Gaussians, config: MotionConfig, start: Lift |
             )
         if start is not None and config.lift_confidence:
             logit = from_numpy(mi.TensorXf, start.logit_confidence)
-        if displacement is not None:
-            # The gate would shrink the displacement; a Gaussian that hardly moves may stay shrunk.
-            displacement = displacement / np.maximum(np.asarray(sigmoid(logit.array)), config.min_gate)[:, None]
+        # The gate would shrink the displacement; a Gaussian that hardly moves may stay shrunk.
+        gate = np.maximum(np.asarray(sigmoid(logit.array)), config.min_gate)[:, None]
+        displacement = None if displacement is None else displacement / gate
+        rotation = None if rotation is None else rotation / gate
         parameters["logit_confidence"] = logit
     if displacement is not None:
         parameters["motion"] = from_numpy(mi.TensorXf, displacement)
+    if rotation is not None:
+        parameters["quats"] = from_numpy(mi.TensorXf, rotation)
     if start is not None and start.color_change is not None:
         parameters["sh_dc"] = from_numpy(mi.TensorXf, start.color_change[:, None])
     return parameters
