@@ -25,6 +25,7 @@ from morgs_mi.method.flow import choose_key_views
 from morgs_mi.method.lift import Lift
 from morgs_mi.method.objective import Observations, Prediction, channels_of, losses_of, weights_of
 from morgs_mi.method.residual import apply_residual, residual_parameters
+from morgs_mi.method.rigidity import find_neighbours
 from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["FrameProblem", "LaterFrame", "fit_later_frame"]
@@ -99,6 +100,7 @@ def fit_later_frame(
         how = order[: first_epoch * len(views)], config.objective.dssim_weight, tick
         start, losses = fit_motion(base, model, start, active.views, problem.targets, *how)
     optimizer, done = adam(residual_parameters(base, motion, start)), first_epoch * len(views)
+    neighbours = _neighbours(base, problem, config)
     for epoch in range(first_epoch, config.epochs):
         if epoch == density_epoch and config.density.later_frames:
             now = _current(base, optimizer, motion)
@@ -108,13 +110,14 @@ def fit_later_frame(
             plan = plan_additions(now, scores, config.density, rng, len(previous) - len(active.indices))
             # A birth starts from its parent's past and shares its residual, so that its motion is the parent's.
             base, source = apply_plan(base, plan), plan.source
+            neighbours = _neighbours(base, problem, config)
             resize_optimizer(optimizer, plan)
         last_recon = losses.get("recon", np.inf)
         losses = optimise(
             optimizer,
             config.rates_at(epoch).by_parameter(problem.extent),
             order[done : done + len(views)],
-            partial(losses_at, base),
+            partial(losses_at, base, neighbours),
             weights_of(config.objective),
             on_step=tick,
             first_step=done,
@@ -140,6 +143,13 @@ def _spread(problem: FrameProblem, count: int) -> tuple[list[ActiveView], list[T
     return [problem.active.views[indices[k]] for k in chosen], [problem.targets[indices[k]] for k in chosen]
 
 
+def _neighbours(base: Gaussians, problem: FrameProblem, config: FitConfig) -> Observations:
+    """Return the observation of all views that compares neighbours, if a term does."""
+    objective = config.objective
+    found = find_neighbours(base, problem.extent, objective.rigidity) if objective.is_rigid else None
+    return {} if found is None else {"neighbours": found}
+
+
 def _on_active_views(problem: FrameProblem) -> dict[int, Observations]:
     """Return the observations of each active view as tensors on its region, its target included."""
     return {
@@ -158,16 +168,18 @@ def _losses_at(
     config: FitConfig,
     motion: MotionConfig,
     base: Gaussians,
+    neighbours: Observations,
     parameters: Mapping[str, Tensor],
     view_index: int,
 ) -> dict[str, Tensor]:
     """Render one view and return its losses by name."""
-    view, observed = problem.active.views[view_index], observations[view_index]
+    view, observed = problem.active.views[view_index], {**observations[view_index], **neighbours}
     channels = channels_of(observed, config.objective)
     detached = [name for name in channels if name != "color"] if config.objective.detach_weights else ()
-    image = view.render(apply_residual(base, parameters, motion), channels, detached)
+    now = apply_residual(base, parameters, motion)
+    image = view.render(now, channels, detached)
     num_pixels, num_gaussians = view.camera.width * view.camera.height, problem.active.num_gaussians
-    prediction = Prediction(image, parameters, view.region, num_pixels, num_gaussians, problem.extent)
+    prediction = Prediction(image, parameters, view.region, num_pixels, num_gaussians, problem.extent, now)
     return losses_of(prediction, observed, config.objective)
 
 

@@ -21,6 +21,9 @@ from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["fit_motion", "motion_model"]
 
+# Learning rates at the end, as a fraction of those at the start.
+_FINAL_RATE = 0.1
+
 
 def fit_motion(
     gaussians: Gaussians,
@@ -58,7 +61,17 @@ def fit_motion(
         return {"recon": recon_loss(image.color, targets[index], dssim_weight, view.region), **model.losses(parameters)}
 
     optimizer = adam(model.parameters)
-    losses = optimise(optimizer, model.rates, order, losses_at, {}, on_step=on_step, last=len(views))
+    # Adam's steps are as long as the rate; long ones find the motion, short ones settle it.
+    losses = optimise(
+        optimizer,
+        model.rates,
+        order,
+        losses_at,
+        {},
+        decay=lambda step: _FINAL_RATE ** (step / len(order)),
+        on_step=on_step,
+        last=len(views),
+    )
     with dr.suspend_grad():
         displacement, rotation = model.motion(values_of(optimizer))
         change = moved(gaussians, displacement, rotation).quats - gaussians.quats

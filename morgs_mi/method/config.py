@@ -40,6 +40,8 @@ class MotionConfig:
     """Gate means and rotations only, so that appearance changes freely; False: one gate for all, as in the paper."""
     lift_flow: bool = True
     """Start each Gaussian's motion from lifted flow; False: from zero, as in the paper."""
+    constant_velocity: bool = False
+    """Without lifted flow: start each Gaussian's motion from that into the previous frame."""
     propagate_motion: bool = True
     """Also try the motion of the previous frame and of neighbours as starts; needs `lift_flow`."""
     search_motion: bool = True

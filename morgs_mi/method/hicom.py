@@ -31,10 +31,10 @@ class HicomConfig:
 
     cells: tuple[float, ...] = (0.4, 0.2, 0.1, 0.05)
     """Side of the cells of each level, in scene extents."""
-    translation_rate: float = 5e-4
-    """Learning rate of the translations, in scene extents."""
-    rotation_rate: float = 2e-3
-    """Learning rate of the rotations."""
+    translation_rate: float = 4e-3
+    """Learning rate of the translations at the start, in scene extents; it falls to a tenth."""
+    rotation_rate: float = 8e-3
+    """Learning rate of the rotations at the start; it falls to a tenth."""
 
     def __post_init__(self) -> None:
         if not self.cells:

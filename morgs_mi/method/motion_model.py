@@ -26,7 +26,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Jit, Tensor
 
-__all__ = ["MotionModel", "moved", "sparse_product"]
+__all__ = ["MotionModel", "moved", "quaternion_product", "sparse_product"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,12 +49,12 @@ class MotionModel:
 def moved(gaussians: Gaussians, displacement: Tensor, rotation: Tensor) -> Gaussians:
     """Return N Gaussians after a motion, as a `MotionModel` gives it."""
     q, r = (dr.unravel(mi.Vector4f, tensor.array) for tensor in (gaussians.quats, rotation))
-    turned: Jit = dr.ravel(_product(r + mi.Vector4f(1, 0, 0, 0), q))
+    turned: Jit = dr.ravel(quaternion_product(r + mi.Vector4f(1, 0, 0, 0), q))
     quats = mi.TensorXf(turned, tuple(gaussians.quats.shape))
     return replace(gaussians, means=gaussians.means + displacement, quats=quats)
 
 
-def _product(r: Jit, q: Jit) -> Jit:
+def quaternion_product(r: Jit, q: Jit) -> Jit:
     """Return the Hamilton product of quaternions wxyz."""
     a, b, c, d = r
     w, x, y, z = q

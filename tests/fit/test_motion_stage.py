@@ -13,11 +13,14 @@ from morgs_mi.fit.later_frame import FrameProblem, LaterFrame, fit_later_frame
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.hicom import HicomConfig
 from morgs_mi.method.lift import Lift
 from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
 
 RENDER, EXTENT, SHIFT = RenderConfig(reproducible=True), 3.0, np.array([0.06, -0.03, 0.02], np.float32)
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
+# Settings that suit a ball of 400 Gaussians.
+MODELS = {"hicom": replace(PLAIN, model="hicom", hicom=HicomConfig(cells=(1.0, 0.3), translation_rate=2e-3))}
 FIT = FitConfig(sh_degree=0, epochs=8, density=DensityConfig(later_frames=False))
 
 
@@ -35,26 +38,26 @@ def motion_error(found: LaterFrame) -> float:
     return float(np.linalg.norm(np.asarray(found.gaussians.motion) - SHIFT, axis=1).mean())
 
 
-@pytest.mark.parametrize("model", ["hicom"])
-def test_fit_later_frame__finds_the_motion_that_gaussians_share(model):
+@pytest.mark.parametrize("motion", MODELS.values(), ids=MODELS)
+def test_fit_later_frame__finds_the_motion_that_gaussians_share(motion):
     """With as many steps, the motion of a rigid body is nearer to the truth than that of free Gaussians."""
-    (free, truth), (shared, _) = fit(PLAIN), fit(replace(PLAIN, model=model))
+    (free, truth), (shared, _) = fit(PLAIN), fit(motion)
     assert motion_error(shared) < 0.7 * motion_error(free)
     assert mean_psnr(shared.gaussians, images_of(truth)) > mean_psnr(free.gaussians, images_of(truth))
     assert shared.epochs == free.epochs == FIT.epochs
 
 
-@pytest.mark.parametrize("model", ["hicom"])
-def test_fit_later_frame__continues_from_a_start(model):
+@pytest.mark.parametrize("motion", MODELS.values(), ids=MODELS)
+def test_fit_later_frame__continues_from_a_start(motion):
     """The steps after the start still move Gaussians that are seen badly, but the start is not lost."""
     exact = Lift(np.tile(SHIFT, (400, 1)), np.zeros(400, np.float32))
-    (begun, _), (found, _) = (fit(replace(PLAIN, model=model), start) for start in (exact, None))
+    (begun, _), (found, _) = (fit(motion, start, replace(FIT, epochs=2)) for start in (exact, None))
     assert motion_error(begun) < 0.5 * motion_error(found)
 
 
-@pytest.mark.parametrize("model", ["hicom"])
-def test_fit_later_frame__repeats_a_motion_model_to_the_bit(model):
-    one, other = (fit(replace(PLAIN, model=model), config=replace(FIT, epochs=2))[0].gaussians for _ in range(2))
+@pytest.mark.parametrize("motion", MODELS.values(), ids=MODELS)
+def test_fit_later_frame__repeats_a_motion_model_to_the_bit(motion):
+    one, other = (fit(motion, config=replace(FIT, epochs=2))[0].gaussians for _ in range(2))
     assert all(np.array_equal(value, other.numpy()[name]) for name, value in one.numpy().items())
 
 
@@ -72,7 +75,7 @@ SETTINGS = {
 
 @pytest.mark.parametrize(("model", "name"), [(model, name) for model, names in SETTINGS.items() for name in names])
 def test_fit_later_frame__every_setting_of_a_model_acts(model, name):
-    config, usual = replace(FIT, epochs=2), replace(PLAIN, model=model)
+    config, usual = replace(FIT, epochs=2), MODELS[model]
     changed = replace(usual, **{model: replace(getattr(usual, model), **{name: SETTINGS[model][name]})})
     results = [fit(motion, config=config)[0].gaussians.numpy() for motion in (usual, changed)]
     assert any(not np.array_equal(value, results[1][field]) for field, value in results[0].items())
