@@ -6,7 +6,7 @@ Presets:
     baseline, ml, ml-mo, ml-mo-mc     rows of the ablation: residuals only; with motion; with offset; with confidence
     paper                             all three modules; motion starts from zero instead of the lifted flow, one gate,
                                       constant learning rates
-    hicom, rigidity                   what another publication adds to the baseline (docs/experiments/field.md)
+    hicom, rigidity, gates            what another publication adds to the baseline (docs/experiments/field.md)
 
 The number of key views (2, 4, 8 or 12 in the paper) is `MotionConfig.key_views` and belongs to no preset.
 
@@ -49,7 +49,7 @@ __all__ = [
     "relocated",
 ]
 
-PresetName = Literal["l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper", "hicom", "rigidity"]
+PresetName = Literal["l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper", "hicom", "rigidity", "gates"]
 Config = TypeVar("Config")
 _NONE = "none"
 _COMMENT_WIDTH = 110
@@ -107,6 +107,10 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
             "rates": {"means": 4e-3, "quats": 0.02, "scales": 0.0, "opacities": 0.0, "sh_dc": 0.0, "sh_rest": 0.0},
         },
         "motion": {"constant_velocity": True, **_modules(False, False, False)},
+    },
+    "gates": {
+        "fit": {"rates": {"means": 2e-3}},
+        "motion": {"learn_gates": True, **_modules(False, False, False)},
     },
 }
 

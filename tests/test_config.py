@@ -115,9 +115,7 @@ def test_apply_preset__adds_a_motion_model_to_the_baseline(name, model) -> None:
 
 
 def test_apply_preset__rejects_an_unknown_name() -> None:
-    with pytest.raises(
-        ValueError, match="must be one of l, s, baseline, ml, ml-mo, ml-mo-mc, paper, hicom, rigidity, got 'xl'"
-    ):
+    with pytest.raises(ValueError, match=f"must be one of {', '.join(PRESETS)}, got 'xl'"):
         apply_preset(StreamConfig(), "xl")  # type: ignore[arg-type]
 
 

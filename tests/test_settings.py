@@ -82,6 +82,8 @@ ELSEWHERE: dict[str, str] = {
     "motion.search_motion": "flow explains all parts here: tests/method/test_search.py",
     "fit.objective.rigidity": "no weight on rigidity here: tests/fit/test_later_frame.py",
     "motion.constant_velocity": "flow is lifted here: tests/fit/test_later_frame.py",
+    "fit.objective.gate_weight": "no gates here: tests/fit/test_later_frame.py",
+    "motion.gates": "no gates here: tests/fit/test_later_frame.py",
     "motion.model_share": "no motion model here: tests/fit/test_motion_stage.py",
     "motion.hicom": "a model that is not the default: tests/fit/test_motion_stage.py",
     "codec.keyframe_interval": "keyframes are written by the recorder: tests/test_recorder.py",

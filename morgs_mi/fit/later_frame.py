@@ -115,7 +115,7 @@ def fit_later_frame(
         last_recon = losses.get("recon", np.inf)
         losses = optimise(
             optimizer,
-            config.rates_at(epoch).by_parameter(problem.extent),
+            {**config.rates_at(epoch).by_parameter(problem.extent), "logit_gate": motion.gates.rate},
             order[done : done + len(views)],
             partial(losses_at, base, neighbours),
             weights_of(config.objective),

@@ -10,6 +10,7 @@ from morgs_mi.method.active_set import ActiveSetConfig
 from morgs_mi.method.change import ChangeConfig
 from morgs_mi.method.cohesion import CohesionConfig
 from morgs_mi.method.flow_sources.config import FlowConfig
+from morgs_mi.method.gates import GateConfig
 from morgs_mi.method.hicom import HicomConfig
 from morgs_mi.method.lift import LiftConfig
 from morgs_mi.method.mask_refiners.config import MaskConfig
@@ -36,6 +37,9 @@ class MotionConfig:
     """MO: a learned offset corrects the flow-guided motion (eq. 8)."""
     learn_confidence: bool = True
     """MC: a learned confidence gates the residuals (eq. 12)."""
+    learn_gates: bool = False
+    """Learn a hard gate for the displacement of each Gaussian, and round the residuals of its other attributes (see
+    `gates`)."""
     two_gates: bool = True
     """Gate means and rotations only, so that appearance changes freely; False: one gate for all, as in the paper."""
     lift_flow: bool = True
@@ -87,6 +91,8 @@ class MotionConfig:
     """Selection of the Gaussians that a frame may change."""
     change: ChangeConfig = field(default_factory=ChangeConfig)
     """Detection of changed pixels."""
+    gates: GateConfig = field(default_factory=GateConfig)
+    """Hard gates and steps of residuals."""
     hicom: HicomConfig = field(default_factory=HicomConfig)
     """Hierarchical coherent motion, the model `hicom`."""
 
