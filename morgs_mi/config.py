@@ -6,7 +6,8 @@ Presets:
     baseline, ml, ml-mo, ml-mo-mc     rows of the ablation: residuals only; with motion; with offset; with confidence
     paper                             all three modules; motion starts from zero instead of the lifted flow, one gate,
                                       constant learning rates
-    hicom, rigidity, gates            what another publication adds to the baseline (docs/experiments/field.md)
+    hicom, rigidity, gates, cache,
+    grid                              what another publication adds to the baseline (docs/experiments/field.md)
 
 The number of key views (2, 4, 8 or 12 in the paper) is `MotionConfig.key_views` and belongs to no preset.
 
@@ -49,7 +50,9 @@ __all__ = [
     "relocated",
 ]
 
-PresetName = Literal["l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper", "hicom", "rigidity", "gates"]
+PresetName = Literal[
+    "l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper", "hicom", "rigidity", "gates", "cache", "grid"
+]
 Config = TypeVar("Config")
 _NONE = "none"
 _COMMENT_WIDTH = 110
@@ -112,6 +115,8 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
         "fit": {"rates": {"means": 2e-3}},
         "motion": {"learn_gates": True, **_modules(False, False, False)},
     },
+    "cache": {"motion": {"model": "cache", **_modules(False, False, False)}},
+    "grid": {"motion": {"model": "grid", **_modules(False, False, False)}},
 }
 
 

@@ -86,6 +86,8 @@ ELSEWHERE: dict[str, str] = {
     "motion.gates": "no gates here: tests/fit/test_later_frame.py",
     "motion.model_share": "no motion model here: tests/fit/test_motion_stage.py",
     "motion.hicom": "a model that is not the default: tests/fit/test_motion_stage.py",
+    "motion.cache": "a model that is not the default: tests/fit/test_motion_stage.py",
+    "motion.grid": "a model that is not the default: tests/fit/test_motion_stage.py",
     "codec.keyframe_interval": "keyframes are written by the recorder: tests/test_recorder.py",
 }
 

@@ -36,7 +36,7 @@ from morgs_mi.stream_loop import FrameReport
 __all__ = ["METHODS", "Options", "field_table", "main", "plot_field"]
 
 # Presets in the order of the tables; DEFAULT has none.
-METHODS = ("baseline", "hicom", "rigidity", "gates", "paper", DEFAULT)
+METHODS = ("baseline", "hicom", "rigidity", "gates", "cache", "grid", "paper", DEFAULT)
 _IMAGES = ("psnr", "psnr_moving", "motion_error_moving", "motion_error_still")
 _TRACKS = ("average_jaccard", "delta_avg", "median_error", "median_error_percent", "survival")
 _OVER_TIME = ("psnr", "psnr_moving", "motion_error_moving")

@@ -95,7 +95,7 @@ def fit_later_frame(
     tick = None if on_step is None else lambda done: on_step(done, len(order))
     density_epoch = round(config.density.later_round * config.epochs)
     start, losses, first_epoch = problem.start, {}, 0
-    if (model := motion_model(base, problem.extent, motion)) is not None:
+    if (model := motion_model(base, problem.extent, motion, rng)) is not None:
         first_epoch = max(1, round(motion.model_share * config.epochs))
         how = order[: first_epoch * len(views)], config.objective.dssim_weight, tick
         start, losses = fit_motion(base, model, start, active.views, problem.targets, *how)

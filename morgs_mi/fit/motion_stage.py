@@ -16,7 +16,9 @@ from morgs_mi.losses.ssim import Target
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.hicom import coherent_motion
 from morgs_mi.method.lift import Lift
+from morgs_mi.method.motion_grid import motion_grid
 from morgs_mi.method.motion_model import MotionModel, moved
+from morgs_mi.method.transformation_cache import transformation_cache
 from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["fit_motion", "motion_model"]
@@ -79,10 +81,23 @@ def fit_motion(
     return replace(start, displacement=displacement, rotation=np.array(change)), losses
 
 
-def motion_model(gaussians: Gaussians, extent: float, config: MotionConfig) -> MotionModel | None:
-    """Return the motion model of N Gaussians, None if there is none; `extent` of the scene in world units."""
+def motion_model(
+    gaussians: Gaussians, extent: float, config: MotionConfig, rng: np.random.Generator
+) -> MotionModel | None:
+    """Return the motion model of N Gaussians, None if there is none.
+
+    Args:
+        gaussians: of the previous frame, detached.
+        extent: of the scene, world units.
+        config: which model, and its settings.
+        rng: draws its parameters.
+    """
     match config.model:
         case "none":
             return None
         case "hicom":
             return coherent_motion(gaussians, extent, config.hicom)
+        case "cache":
+            return transformation_cache(gaussians, extent, rng, config.cache)
+        case "grid":
+            return motion_grid(gaussians, extent, config.grid)

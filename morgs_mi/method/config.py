@@ -14,9 +14,11 @@ from morgs_mi.method.gates import GateConfig
 from morgs_mi.method.hicom import HicomConfig
 from morgs_mi.method.lift import LiftConfig
 from morgs_mi.method.mask_refiners.config import MaskConfig
+from morgs_mi.method.motion_grid import GridConfig
 from morgs_mi.method.photometric import PhotometricConfig
 from morgs_mi.method.propagation import PropagationConfig
 from morgs_mi.method.search import SearchConfig
+from morgs_mi.method.transformation_cache import CacheConfig
 
 __all__ = ["MotionConfig"]
 
@@ -68,7 +70,7 @@ class MotionConfig:
     """Gate below which a lifted motion is no longer scaled up to pass the gate at full length."""
     confidence_decay: float = 0.3
     """Logit that a confidence loses per frame without evidence of motion: where something moved, more is to correct."""
-    model: Literal["none", "hicom"] = "none"
+    model: Literal["none", "hicom", "cache", "grid"] = "none"
     """Motion that Gaussians share, fitted before the residual: none, or that of another publication (see
     docs/experiments/field.md)."""
     model_share: float = 0.5
@@ -95,6 +97,10 @@ class MotionConfig:
     """Hard gates and steps of residuals."""
     hicom: HicomConfig = field(default_factory=HicomConfig)
     """Hierarchical coherent motion, the model `hicom`."""
+    cache: CacheConfig = field(default_factory=CacheConfig)
+    """Neural transformation cache, the model `cache`."""
+    grid: GridConfig = field(default_factory=GridConfig)
+    """Motion grid whose rate is part of the loss, the model `grid`."""
 
     def __post_init__(self) -> None:
         for name in ("key_views", "mask_interval"):

@@ -26,7 +26,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Jit, Tensor
 
-__all__ = ["MotionModel", "moved", "quaternion_product", "sparse_product"]
+__all__ = ["MotionModel", "corners", "moved", "quaternion_product", "sparse_product"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +64,22 @@ def quaternion_product(r: Jit, q: Jit) -> Jit:
         a * y - b * z + c * w + d * x,
         a * z + b * y - c * x + d * w,
     )
+
+
+def corners(points: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of the cubic cells around points, and their weights in trilinear interpolation.
+
+    Args:
+        points: [N, 3], world units.
+        side: of the cells, world units.
+
+    Returns:
+        Integer coordinates [N, 8, 3], and weights float32 [N, 8], which sum to 1.
+    """
+    lowest = np.floor(points / side)
+    offsets, fraction = np.indices((2, 2, 2)).reshape(3, 8).T, points / side - lowest
+    weights = np.prod(np.where(offsets, fraction[:, None], 1 - fraction[:, None]), axis=-1)
+    return lowest.astype(np.int64)[:, None] + offsets, weights.astype(np.float32)
 
 
 def sparse_product(matrix: csr_array, x: Tensor) -> Tensor:

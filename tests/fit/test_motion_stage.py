@@ -15,12 +15,18 @@ from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.hicom import HicomConfig
 from morgs_mi.method.lift import Lift
+from morgs_mi.method.motion_grid import GridConfig
+from morgs_mi.method.transformation_cache import CacheConfig
 from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
 
 RENDER, EXTENT, SHIFT = RenderConfig(reproducible=True), 3.0, np.array([0.06, -0.03, 0.02], np.float32)
 PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
 # Settings that suit a ball of 400 Gaussians.
-MODELS = {"hicom": replace(PLAIN, model="hicom", hicom=HicomConfig(cells=(1.0, 0.3), translation_rate=2e-3))}
+MODELS = {
+    "hicom": replace(PLAIN, model="hicom", hicom=HicomConfig(cells=(1.0, 0.3), translation_rate=2e-3)),
+    "cache": replace(PLAIN, model="cache", cache=CacheConfig(levels=2, coarsest=1.0)),
+    "grid": replace(PLAIN, model="grid", grid=GridConfig(cells=(1.0, 0.3), translation_rate=2e-3)),
+}
 FIT = FitConfig(sh_degree=0, epochs=8, density=DensityConfig(later_frames=False))
 
 
@@ -70,6 +76,27 @@ def test_fit_later_frame__fits_the_model_alone_in_a_single_epoch():
 
 SETTINGS = {
     "hicom": {"cells": (0.3, 0.1), "translation_rate": 1e-3, "rotation_rate": 0.0},
+    "cache": {
+        "levels": 3,
+        "coarsest": 0.5,
+        "table": 100,
+        "features": 2,
+        "hidden": 8,
+        "spread": 0.1,
+        "displacement": 0.3,
+        "rate": 1e-4,
+        "table_rate": 0.0,
+    },
+    "grid": {
+        "cells": (0.3, 0.1),
+        "translation_step": 1e-2,
+        "rotation_step": 0.1,
+        "translation_rate": 1e-3,
+        "rotation_rate": 0.0,
+        "scale": 0.5,
+        "scale_rate": 1.0,
+        "rate_weight": 1.0,
+    },
 }
 
 
