@@ -36,6 +36,7 @@ from morgs_mi.stream_loop import FrameReport
 __all__ = ["METHODS", "Options", "field_table", "main", "plot_field"]
 
 _FAST = {"fit": {"rates": {"means": 2e-3}}}
+_RIGID = {"rigid_weight": 0.4, "rotation_weight": 0.4, "isometry_weight": 0.2}
 _SHORT_GRID = {"model": "grid", "model_share": 0.25, "grid": {"translation_rate": 5e-4, "rotation_rate": 2e-3}}
 # Presets and further settings by name, in the order of the tables; DEFAULT is no preset.
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -49,9 +50,15 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "paper": ("paper", {}),
     "default": (DEFAULT, {}),
     "default + grid": (DEFAULT, {"motion": _SHORT_GRID}),
+    "default + rigidity": (DEFAULT, {"fit": {"objective": _RIGID}}),
 }
 _IMAGES = ("psnr", "psnr_moving", "motion_error_moving", "motion_error_still")
 _TRACKS = ("average_jaccard", "delta_avg", "median_error", "median_error_percent", "survival")
+# Scores that are plotted: name and axis.
+_PLOTTED = (
+    ("psnr_moving", "PSNR where things move, dB"),
+    ("motion_error_moving", "motion error where things move, px"),
+)
 _OVER_TIME = ("psnr", "psnr_moving", "motion_error_moving")
 # Of the columns: title, name of the score, factor, decimals.
 _COLUMNS = (
@@ -188,22 +195,19 @@ def plot_field(cells: Cells, path: Path) -> None:
     axes = figure.subplots(2, 2)
     for k, method in enumerate(methods):
         style = {"color": f"C{k}", "label": method, "linewidth": 2.2 if method == DEFAULT else 1.2}
-        for axis, (score, title) in zip(axes[0], (("psnr_moving", "PSNR where things move, dB"), _MOTION), strict=True):
+        for axis, (score, title) in zip(axes[0], _PLOTTED, strict=True):
             series = [cell[f"{method}/{most}"]["by_frame"][score] for cell in cells.values()]
             values = np.nanmean(np.array(series, float), axis=0)
             axis.plot(range(1, len(values) + 1), values, **style)
-            axis.set(xlabel=f"frame ({most} epochs)", ylabel=title)
-        for axis, (score, title) in zip(axes[1], (("psnr_moving", "PSNR where things move, dB"), _MOTION), strict=True):
+            axis.set(xlabel=f"frame ({most} epochs)", ylabel=title, xticks=range(1, len(values) + 1))
+        for axis, (score, title) in zip(axes[1], _PLOTTED, strict=True):
             found = [mean_scores(cells, name) for name in names if name.split("/")[0] == method]
             axis.plot([s["num_bytes"] / 1000 for s in found], [s[score] for s in found], marker="o", **style)
             axis.set(xlabel="kB per later frame (by epochs)", ylabel=title)
     for axis in axes.flat:
         axis.grid(alpha=0.3)
-    axes[0, 0].legend(fontsize=8)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper", fontsize=8)
     save_figure(figure, path)
-
-
-_MOTION = ("motion_error_moving", "motion error where things move, px")
 
 
 def main(options: Options) -> None:
