@@ -6,6 +6,8 @@ Presets:
     baseline, ml, ml-mo, ml-mo-mc     rows of the ablation: residuals only; with motion; with offset; with confidence
     paper                             all three modules; motion starts from zero instead of the lifted flow, one gate,
                                       constant learning rates
+    hicom, rigidity, gates, cache,
+    grid                              what another publication adds to the baseline (docs/experiments/field.md)
 
 The number of key views (2, 4, 8 or 12 in the paper) is `MotionConfig.key_views` and belongs to no preset.
 
@@ -48,7 +50,9 @@ __all__ = [
     "relocated",
 ]
 
-PresetName = Literal["l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper"]
+PresetName = Literal[
+    "l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper", "hicom", "rigidity", "gates", "cache", "grid"
+]
 Config = TypeVar("Config")
 _NONE = "none"
 _COMMENT_WIDTH = 110
@@ -97,6 +101,22 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
             **_modules(True, True, True),
         },
     },
+    "hicom": {"motion": {"model": "hicom", **_modules(False, False, False)}},
+    "rigidity": {
+        "fit": {
+            "objective": {"rigid_weight": 0.4, "rotation_weight": 0.4, "isometry_weight": 0.2},
+            "density": {"later_frames": False},
+            "decay_means_rate": False,
+            "rates": {"means": 4e-3, "quats": 0.02, "scales": 0.0, "opacities": 0.0, "sh_dc": 0.0, "sh_rest": 0.0},
+        },
+        "motion": {"constant_velocity": True, **_modules(False, False, False)},
+    },
+    "gates": {
+        "fit": {"rates": {"means": 2e-3}},
+        "motion": {"learn_gates": True, **_modules(False, False, False)},
+    },
+    "cache": {"motion": {"model": "cache", **_modules(False, False, False)}},
+    "grid": {"motion": {"model": "grid", **_modules(False, False, False)}},
 }
 
 

@@ -35,6 +35,10 @@ BASE = StreamConfig(
 VALUES: dict[str, Any] = {
     "motion.flow_method": "farneback",
     "motion.mask_method": "superpixels",
+    "motion.model": "hicom",
+    "fit.objective.rigid_weight": 1.0,
+    "fit.objective.rotation_weight": 1.0,
+    "fit.objective.isometry_weight": 1.0,
     "fit.early_stopping_tolerance": 0.5,
     "fit.dropping": 0.3,
     "fit.first_frame_seconds": 0.01,
@@ -76,6 +80,14 @@ ELSEWHERE: dict[str, str] = {
     "motion.masks": "tests/method/test_confidence.py and tests/method/mask_refiners",
     "motion.search": "flow explains all parts here: tests/method/test_search.py",
     "motion.search_motion": "flow explains all parts here: tests/method/test_search.py",
+    "fit.objective.rigidity": "no weight on rigidity here: tests/fit/test_later_frame.py",
+    "motion.constant_velocity": "flow is lifted here: tests/fit/test_later_frame.py",
+    "fit.objective.gate_weight": "no gates here: tests/fit/test_later_frame.py",
+    "motion.gates": "no gates here: tests/fit/test_later_frame.py",
+    "motion.model_share": "no motion model here: tests/fit/test_motion_stage.py",
+    "motion.hicom": "a model that is not the default: tests/fit/test_motion_stage.py",
+    "motion.cache": "a model that is not the default: tests/fit/test_motion_stage.py",
+    "motion.grid": "a model that is not the default: tests/fit/test_motion_stage.py",
     "codec.keyframe_interval": "keyframes are written by the recorder: tests/test_recorder.py",
 }
 

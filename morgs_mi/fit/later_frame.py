@@ -15,6 +15,7 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.density import apply_plan, plan_additions, resize_optimizer
+from morgs_mi.fit.motion_stage import fit_motion, motion_model
 from morgs_mi.fit.optimise import adam, optimise, values_of, view_order
 from morgs_mi.losses.attribution import densification_scores
 from morgs_mi.losses.ssim import Target
@@ -24,6 +25,7 @@ from morgs_mi.method.flow import choose_key_views
 from morgs_mi.method.lift import Lift
 from morgs_mi.method.objective import Observations, Prediction, channels_of, losses_of, weights_of
 from morgs_mi.method.residual import apply_residual, residual_parameters
+from morgs_mi.method.rigidity import find_neighbours
 from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["FrameProblem", "LaterFrame", "fit_later_frame"]
@@ -87,14 +89,19 @@ def fit_later_frame(
     views = sorted(active.views)
     if not views or not len(active.indices):
         return LaterFrame(with_zero_motion(previous), np.arange(len(previous)), {}, 0)
-    base = active.select(previous)
-    optimizer, source = adam(residual_parameters(base, motion, problem.start)), np.arange(len(base))
+    base, source = active.select(previous), np.arange(len(active.indices))
     losses_at = partial(_losses_at, problem, _on_active_views(problem), config, motion)
-    order = view_order(len(views), config.epochs * len(views), rng)
+    order = [views[k] for k in view_order(len(views), config.epochs * len(views), rng)]
     tick = None if on_step is None else lambda done: on_step(done, len(order))
     density_epoch = round(config.density.later_round * config.epochs)
-    losses, done = {}, 0
-    for epoch in range(config.epochs):
+    start, losses, first_epoch = problem.start, {}, 0
+    if (model := motion_model(base, problem.extent, motion, rng)) is not None:
+        first_epoch = max(1, round(motion.model_share * config.epochs))
+        how = order[: first_epoch * len(views)], config.objective.dssim_weight, tick
+        start, losses = fit_motion(base, model, start, active.views, problem.targets, *how)
+    optimizer, done = adam(residual_parameters(base, motion, start)), first_epoch * len(views)
+    neighbours = _neighbours(base, problem, config)
+    for epoch in range(first_epoch, config.epochs):
         if epoch == density_epoch and config.density.later_frames:
             now = _current(base, optimizer, motion)
             scores = densification_scores(
@@ -103,13 +110,14 @@ def fit_later_frame(
             plan = plan_additions(now, scores, config.density, rng, len(previous) - len(active.indices))
             # A birth starts from its parent's past and shares its residual, so that its motion is the parent's.
             base, source = apply_plan(base, plan), plan.source
+            neighbours = _neighbours(base, problem, config)
             resize_optimizer(optimizer, plan)
         last_recon = losses.get("recon", np.inf)
         losses = optimise(
             optimizer,
-            config.rates_at(epoch).by_parameter(problem.extent),
-            [views[k] for k in order[done : done + len(views)]],
-            partial(losses_at, base),
+            {**config.rates_at(epoch).by_parameter(problem.extent), "logit_gate": motion.gates.rate},
+            order[done : done + len(views)],
+            partial(losses_at, base, neighbours),
             weights_of(config.objective),
             on_step=tick,
             first_step=done,
@@ -135,6 +143,13 @@ def _spread(problem: FrameProblem, count: int) -> tuple[list[ActiveView], list[T
     return [problem.active.views[indices[k]] for k in chosen], [problem.targets[indices[k]] for k in chosen]
 
 
+def _neighbours(base: Gaussians, problem: FrameProblem, config: FitConfig) -> Observations:
+    """Return the observation of all views that compares neighbours, if a term does."""
+    objective = config.objective
+    found = find_neighbours(base, problem.extent, objective.rigidity) if objective.is_rigid else None
+    return {} if found is None else {"neighbours": found}
+
+
 def _on_active_views(problem: FrameProblem) -> dict[int, Observations]:
     """Return the observations of each active view as tensors on its region, its target included."""
     return {
@@ -153,16 +168,18 @@ def _losses_at(
     config: FitConfig,
     motion: MotionConfig,
     base: Gaussians,
+    neighbours: Observations,
     parameters: Mapping[str, Tensor],
     view_index: int,
 ) -> dict[str, Tensor]:
     """Render one view and return its losses by name."""
-    view, observed = problem.active.views[view_index], observations[view_index]
+    view, observed = problem.active.views[view_index], {**observations[view_index], **neighbours}
     channels = channels_of(observed, config.objective)
     detached = [name for name in channels if name != "color"] if config.objective.detach_weights else ()
-    image = view.render(apply_residual(base, parameters, motion), channels, detached)
+    now = apply_residual(base, parameters, motion)
+    image = view.render(now, channels, detached)
     num_pixels, num_gaussians = view.camera.width * view.camera.height, problem.active.num_gaussians
-    prediction = Prediction(image, parameters, view.region, num_pixels, num_gaussians, problem.extent)
+    prediction = Prediction(image, parameters, view.region, num_pixels, num_gaussians, problem.extent, now)
     return losses_of(prediction, observed, config.objective)
 
 

@@ -66,17 +66,19 @@ class LiftConfig:
 
 @dataclass(frozen=True, eq=False)
 class Lift:
-    """Start of the motion, of the confidence and of the colour of N Gaussians.
+    """Start of the motion, of the confidence, of the colour and of the rotation of N Gaussians.
 
     Attributes:
         displacement: d [N, 3] since the previous frame, world units; 0 for a Gaussian that does not move.
         logit_confidence: logit of the confidence that it moves [N].
         color_change: change of the constant SH coefficients [N, 3]; None: none.
+        rotation: change of the quaternions [N, 4]; None: none.
     """
 
     displacement: np.ndarray
     logit_confidence: np.ndarray
     color_change: np.ndarray | None = None
+    rotation: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,9 +41,11 @@ def initial_motion(
         config: which modules are on.
         rng: draws the neighbours that proposals come from.
     """
-    if not (config.learn_motion and config.lift_flow and active.views and len(active.indices)):
+    if not (active.views and len(active.indices)):
         return None
     gaussians = active.select(previous)
+    if not (config.learn_motion and config.lift_flow):
+        return _constant_velocity(gaussians) if config.constant_velocity else None
     start = lift_flow(gaussians, active.views, flows, config.lift, config.masks)
     views = {v: active.views[v] for v in sorted(flows.keys() & active.views.keys())}
     if config.propagate_motion:
@@ -55,6 +57,13 @@ def initial_motion(
         moved = replace(gaussians, means=np.asarray(gaussians.means) + start.displacement)
         start = replace(start, color_change=mean_color_error(moved, views, targets, config.photometric))
     return replace(start, logit_confidence=_initial_confidence(start, active, previous, config))
+
+
+def _constant_velocity(gaussians: Gaussians) -> Lift:
+    """Return the motion into the previous frame as the start, with the confidence as it is."""
+    means, logit = np.asarray(gaussians.means), gaussians.logit_confidence
+    displacement = np.zeros_like(means) if gaussians.motion is None else np.asarray(gaussians.motion)
+    return Lift(displacement, np.zeros(len(means), np.float32) if logit is None else np.asarray(logit))
 
 
 def _initial_confidence(lifted: Lift, active: ActiveSet, previous: Gaussians, config: MotionConfig) -> np.ndarray:

@@ -3,24 +3,28 @@
 A `Term` declares its weight, the channels that must be rendered for it, and the observations that it compares them
 with. Which channels a view renders, which static splats it needs and which losses a report lists follow from `TERMS`.
 
-An observation is an array of one view at one frame, by name. `target` exists in all views; those of `OBSERVERS` exist
-in key views, where an observer returns them. A term acts in the views that have all its observations.
+An observation is an array of one view at one frame, by name. `target` exists in all views, and so do `neighbours`, the
+Gaussians of the previous frame, where a term compares them; those of `OBSERVERS` exist in key views, where an observer
+returns them. A term acts in the views that have all its observations.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from morgs_mi.core.checks import check_number
+from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Tensor
 from morgs_mi.losses.losses import flow_loss, mask_loss, offset_loss, recon_loss
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.flow_sources.registry import FramePair
+from morgs_mi.method.gates import gate_loss
+from morgs_mi.method.rigidity import RigidityConfig, isometry_loss, rigid_loss, rotation_loss
 from morgs_mi.render.rasterize import Image
 from morgs_mi.render.region import Region
 
@@ -52,6 +56,16 @@ class ObjectiveConfig:
     """lambda_mask of eq. 13."""
     offset_weight: float = 0.01
     """lambda_off of eq. 13, per scene extent."""
+    rigid_weight: float = 0.0
+    """Weight of the local rigidity (see `rigidity`), per scene extent."""
+    rotation_weight: float = 0.0
+    """Weight of the similarity of rotations there."""
+    isometry_weight: float = 0.0
+    """Weight of the isometry there, per scene extent."""
+    gate_weight: float = 0.001
+    """Weight of the share of open gates (see `gates`)."""
+    rigidity: RigidityConfig = field(default_factory=RigidityConfig)
+    """Neighbours of the local rigidity."""
     detach_weights: bool = True
     """Keep all terms but L_recon from moving opacity and geometry: they are about motion and confidence."""
 
@@ -59,6 +73,11 @@ class ObjectiveConfig:
         for name, value in vars(self).items():
             if name.endswith("_weight"):
                 check_number("ObjectiveConfig()", name, value, "[0, 1]" if name == "dssim_weight" else "[0, inf)")
+
+    @property
+    def is_rigid(self) -> bool:
+        """Whether a term compares neighbours."""
+        return max(self.rigid_weight, self.rotation_weight, self.isometry_weight) > 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +104,7 @@ class Prediction:
         num_pixels: of the whole view.
         num_gaussians: of the whole scene.
         extent: of the scene, world units.
+        gaussians: the active ones, after the residual.
     """
 
     image: Image
@@ -93,6 +113,7 @@ class Prediction:
     num_pixels: int
     num_gaussians: int
     extent: float
+    gaussians: Gaussians
 
 
 @dataclass(frozen=True)
@@ -143,6 +164,21 @@ TERMS: tuple[Term, ...] = (
         lambda config: config.offset_weight,
         lambda p, o, config: offset_loss(p.parameters["offset"], p.extent, p.num_gaussians),
         parameters=("offset",),
+    ),
+    *(
+        Term(  # not in the paper, see `rigidity`
+            name,
+            lambda config, name=name: getattr(config, f"{name}_weight"),
+            lambda p, o, config, loss=loss: loss(p.gaussians, o["neighbours"]),
+            observations=("neighbours",),
+        )
+        for name, loss in (("rigid", rigid_loss), ("rotation", rotation_loss), ("isometry", isometry_loss))
+    ),
+    Term(  # not in the paper, see `gates`
+        "gates",
+        lambda config: config.gate_weight,
+        lambda p, o, config: gate_loss(p.parameters["logit_gate"], p.num_gaussians),
+        parameters=("logit_gate",),
     ),
 )
 

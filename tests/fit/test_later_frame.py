@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from morgs_mi import Gaussians, RenderConfig
+from morgs_mi.config import StreamConfig, apply_preset
 from morgs_mi.fit.config import DensityConfig, FitConfig
 from morgs_mi.fit.later_frame import FrameProblem, LaterFrame, fit_later_frame
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.gates import GateConfig
+from morgs_mi.method.motion import initial_motion
+from morgs_mi.method.objective import ObjectiveConfig
+from morgs_mi.method.rigidity import RigidityConfig
 from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
 
 RENDER, EXTENT = RenderConfig(), 3.0
@@ -62,3 +69,94 @@ def test_fit_later_frame__adds_none_when_no_step_is_left_to_fit_them():
     config = FitConfig(sh_degree=0, epochs=1, density=DensityConfig(min_error=0))
     fitted = fit(truth.select(np.arange(200)), images_of(truth), config)
     assert np.array_equal(fitted.source, np.arange(200))
+
+
+def shifted(shift: tuple[float, float, float]) -> tuple[Gaussians, Gaussians, np.ndarray]:
+    """Return a ball, the ball after a shift, and the shift."""
+    before, by = opaque_ball(), np.array(shift, np.float32)
+    return before, replace(before, means=np.asarray(before.means) + by), by
+
+
+def test_fit_later_frame__rigid_neighbours_move_alike():
+    before, truth, shift = shifted((0.06, -0.03, 0.02))
+    usual = FitConfig(sh_degree=0, epochs=8, density=DensityConfig(later_frames=False))
+    preset = apply_preset(StreamConfig(fit=usual), "rigidity").fit
+    results = [fit(before, images_of(truth), config) for config in (usual, preset)]
+    free, rigid = (np.linalg.norm(np.asarray(r.gaussians.motion) - shift, axis=1).mean() for r in results)
+    assert rigid < 0.5 * free
+    assert results[1].losses.keys() == {"recon", "rigid", "rotation", "isometry"}
+    for name in ("log_scales", "logit_opacities", "sh_coeffs"):
+        assert np.array_equal(getattr(results[1].gaussians, name), getattr(before, name)), "the preset moves alone"
+
+
+def test_fit_later_frame__compares_the_neighbours_of_births_with_their_parents():
+    """With births, there are more Gaussians after the round of density control than before it."""
+    truth = opaque_ball()
+    before = truth.select(np.flatnonzero(truth.numpy()["means"][:, 0] < 0.3))
+    config = FitConfig(
+        sh_degree=0,
+        epochs=4,
+        objective=ObjectiveConfig(rigid_weight=1.0),
+        density=DensityConfig(births=0.3, min_error=0),
+    )
+    found = fit(before, images_of(truth), config)
+    assert len(found.gaussians) > len(before)
+    assert np.isfinite(found.losses["rigid"])
+
+
+@pytest.mark.parametrize("setting", [{"neighbours": 3}, {"reach": 0.02}])
+def test_fit_later_frame__every_setting_of_rigidity_acts(setting):
+    before, truth, _ = shifted((0.06, -0.03, 0.02))
+    results = [
+        fit(
+            before,
+            images_of(truth),
+            FitConfig(sh_degree=0, epochs=2, objective=ObjectiveConfig(rigid_weight=4.0, rigidity=r)),
+        )
+        for r in (RigidityConfig(), RigidityConfig(**setting))
+    ]
+    assert results[0].losses["rigid"] != pytest.approx(results[1].losses["rigid"], rel=0.05)
+
+
+GATED = replace(PLAIN, learn_gates=True)
+
+
+def test_fit_later_frame__closes_gates_that_the_images_do_not_need():
+    before, truth, _ = shifted((0.02, 0, 0))
+    config = FitConfig(sh_degree=0, epochs=8, density=DensityConfig(later_frames=False))
+    free, gated = (
+        fit(before, images_of(truth), replace(config, objective=ObjectiveConfig(gate_weight=weight)), motion)
+        for weight, motion in ((0.0, GATED), (10.0, replace(GATED, gates=GateConfig(start=0.0))))
+    )
+    free, gated = free.gaussians.numpy()["motion"], gated.gaussians.numpy()["motion"]
+    assert (free.any(axis=1)).mean() > 0.9
+    assert not gated.any()
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"start": 0.0},
+        {"rate": 0.3},
+        {"scale_step": 0.1},
+        {"rotation_step": 0.1},
+        {"opacity_step": 0.4},
+        {"color_step": 0.1},
+    ],
+    ids=lambda setting: next(iter(setting)),
+)
+def test_fit_later_frame__every_setting_of_the_gates_acts(setting):
+    before, truth, _ = shifted((0.02, 0, 0))
+    config = FitConfig(sh_degree=0, epochs=2)
+    motions = GATED, replace(GATED, gates=GateConfig(**setting))
+    one, other = (fit(before, images_of(truth), config, motion).gaussians.numpy() for motion in motions)
+    assert any(not np.array_equal(value, other[name]) for name, value in one.items())
+
+
+def test_initial_motion__continues_with_constant_velocity():
+    before, rng = replace(opaque_ball(), motion=np.full((400, 3), 0.1)), np.random.default_rng(0)
+    active = full_active_set(before, dict(enumerate(views())), RENDER)
+    assert initial_motion(before, active, {}, {}, PLAIN, rng) is None
+    start = initial_motion(before, active, {}, {}, replace(PLAIN, constant_velocity=True), rng)
+    assert start is not None
+    assert np.array_equal(start.displacement, np.full((400, 3), 0.1, np.float32))

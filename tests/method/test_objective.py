@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -21,7 +23,9 @@ from morgs_mi.method.objective import (
     observe,
     weights_of,
 )
+from morgs_mi.method.rigidity import RigidityConfig, find_neighbours
 from morgs_mi.render.rasterize import Image
+from tests.scenes.gaussians import make_scene, to_gaussians
 
 H, W = 16, 24
 NAMES = [term.name for term in TERMS]
@@ -63,17 +67,30 @@ def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
         return values
 
     image = Image(color=tensor(H, W, 3), motion=tensor(H, W, 2), confidence=tensor(H, W, 1))
+    before, moved = (
+        to_gaussians(make_scene()),
+        replace(to_gaussians(make_scene()), means=tensor(10, 3), quats=tensor(10, 4)),
+    )
     inputs = {"recon": image.color, "flow": image.motion, "mask": image.confidence, "offset": tensor(5, 3)}
+    inputs |= {"rigid": moved.means, "rotation": moved.quats, "isometry": moved.means, "gates": tensor(10)}
     assert list(inputs) == NAMES, "a new term needs an input here"
-    prediction = Prediction(image, {"offset": inputs["offset"]}, None, H * W, 10, 2.0)
+    prediction = Prediction(
+        image, {"offset": inputs["offset"], "logit_gate": inputs["gates"]}, None, H * W, 10, 2.0, moved
+    )
     observations = {
         "target": Target(np.zeros((H, W, 3), np.float32)),
         "motion": mi.TensorXf(np.zeros((H, W, 2), np.float32)),
         "reliable": mi.TensorXf(np.ones((H, W), np.float32)),
         "mask": mi.TensorXf(np.zeros((H, W), np.float32)),
+        "neighbours": find_neighbours(before, 2.0, RigidityConfig()),
     }
-    assert losses_of(prediction, {"target": observations["target"]}, ObjectiveConfig()).keys() == {"recon", "offset"}
-    losses = losses_of(prediction, observations, ObjectiveConfig())
+    assert losses_of(prediction, {"target": observations["target"]}, ObjectiveConfig()).keys() == {
+        "recon",
+        "offset",
+        "gates",
+    }
+    assert losses_of(prediction, observations, ObjectiveConfig()).keys() == {*NAMES[:4], "gates"}, "the others are off"
+    losses = losses_of(prediction, observations, ObjectiveConfig(rigid_weight=1, rotation_weight=1, isometry_weight=1))
     assert list(losses) == NAMES
     for name, loss in losses.items():
         dr.backward(loss, flags=dr.ADFlag.ClearVertices)
@@ -83,7 +100,16 @@ def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
 
 
 def test_weights_of__are_those_of_the_settings():
-    config = ObjectiveConfig(flow_weight=2.0, mask_weight=3.0, offset_weight=4.0)
-    assert weights_of(config) == {"recon": 1, "flow": 2, "mask": 3, "offset": 4}
+    config = ObjectiveConfig(flow_weight=2.0, mask_weight=3.0, offset_weight=4.0, gate_weight=5.0)
+    assert weights_of(config) == {
+        "recon": 1,
+        "flow": 2,
+        "mask": 3,
+        "offset": 4,
+        "rigid": 0,
+        "rotation": 0,
+        "isometry": 0,
+        "gates": 5,
+    }
     with pytest.raises(ValueError, match=r"`flow_weight` must be a number in \[0, inf\), got -1"):
         ObjectiveConfig(flow_weight=-1)

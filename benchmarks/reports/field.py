@@ -1,0 +1,226 @@
+"""The methods of other publications beside this package's, on one renderer, one codec and one number of steps.
+
+    python -m benchmarks.reports.field --seeds 16 17 18 --json out.json --plot out.png
+
+Each clip is `morgs-mi synth random --seed SEED`, made in `--clips` if it is not there. Settings were chosen on seeds 0
+to 2. All methods continue from the same first frame of a clip. Image and motion scores are means over the later frames
+of the held-out view, those of tracks are over the whole clip, all against the exact ground truth.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import tyro
+
+from benchmarks.reports.cells import OnWorkers, run_cells
+from benchmarks.reports.fits import random_capture
+from benchmarks.reports.method_cells import DEFAULT, Clip
+from benchmarks.reports.plots import blank_figure, markdown, save_figure
+from benchmarks.speed.output import Output
+from morgs_mi.cluster.tasks import Source
+from morgs_mi.codec.packets import coded_frames
+from morgs_mi.config import StreamConfig, apply_preset, apply_values
+from morgs_mi.core.files import json_finite
+from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.evaluate.results import Evaluation, known_mean
+from morgs_mi.stream_loop import FrameReport
+
+__all__ = ["METHODS", "Options", "field_table", "main", "plot_field"]
+
+_FAST = {"fit": {"rates": {"means": 2e-3}}}
+_RIGID = {"rigid_weight": 0.4, "rotation_weight": 0.4, "isometry_weight": 0.2}
+_SHORT_GRID = {"model": "grid", "model_share": 0.25, "grid": {"translation_rate": 5e-4, "rotation_rate": 2e-3}}
+# Presets and further settings by name, in the order of the tables; DEFAULT is no preset.
+METHODS: dict[str, tuple[str, dict[str, Any]]] = {
+    "baseline": ("baseline", {}),
+    "baseline, 4x rate": ("baseline", _FAST),  # of the means, tuned like those of the other methods
+    "hicom": ("hicom", {}),
+    "rigidity": ("rigidity", {}),
+    "gates": ("gates", {}),
+    "cache": ("cache", {}),
+    "grid": ("grid", {}),
+    "paper": ("paper", {}),
+    "default": (DEFAULT, {}),
+    "default + grid": (DEFAULT, {"motion": _SHORT_GRID}),
+    "default + rigidity": (DEFAULT, {"fit": {"objective": _RIGID}}),
+}
+_IMAGES = ("psnr", "psnr_moving", "motion_error_moving", "motion_error_still")
+_TRACKS = ("average_jaccard", "delta_avg", "median_error", "median_error_percent", "survival")
+# Scores that are plotted: name and axis.
+_PLOTTED = (
+    ("psnr_moving", "PSNR where things move, dB"),
+    ("motion_error_moving", "motion error where things move, px"),
+)
+_OVER_TIME = ("psnr", "psnr_moving", "motion_error_moving")
+# Of the columns: title, name of the score, factor, decimals.
+_COLUMNS = (
+    ("PSNR, dB", "psnr", 1, 2),
+    ("moving", "psnr_moving", 1, 2),
+    ("motion error, px", "motion_error_moving", 1, 2),
+    ("still", "motion_error_still", 1, 3),
+    ("in 3D, %", "motion_3d_relative_error", 100, 0),
+    ("AJ, %", "Dynamic 3D Gaussians average_jaccard", 100, 1),
+    ("<d avg, %", "Dynamic 3D Gaussians delta_avg", 100, 1),
+    ("MTE, cm", "Dynamic 3D Gaussians median_error", 100, 2),
+    ("kB", "num_bytes", 1e-3, 1),
+    ("CPU s", "cpu_s", 1, 1),
+    ("steps", "steps", 1, 0),
+)
+
+
+@dataclass(frozen=True)
+class Options(Output, OnWorkers):
+    """Clips, work and output."""
+
+    seeds: tuple[int, ...] = (16, 17, 18)
+    """Seeds of the scenes."""
+    fit_seeds: tuple[int, ...] = (0,)
+    """Seeds of the fits of each scene."""
+    methods: tuple[str, ...] = tuple(METHODS)
+    """Names of the methods."""
+    clips: Path = Path("out/random")
+    """Folder of the clips."""
+    downscale: float = 1
+    """Factor by which the images are reduced."""
+    frames: int = 8
+    """Number of frames, the first included."""
+    epochs: tuple[int, ...] = (2, 8)
+    """Epochs of a later frame."""
+    num_gaussians: int | None = None
+    """Gaussians of the first frame; default: by the detail of its images."""
+    first_frame_steps: int | None = None
+    """Steps of the first frame; default: until it has converged."""
+    plot: Path | None = None
+    """Plot of the errors over time and over bytes, .png or .svg; needs matplotlib."""
+
+    def cells(self) -> dict[str, tuple[Source, dict[str, StreamConfig]]]:
+        """Return the clip, and the settings of each method and number of epochs, of each cell."""
+        cells = {}
+        for seed in self.seeds:
+            capture = random_capture(self.clips, seed, self.downscale)
+            source = replace(Source.of(capture), num_frames=min(self.frames, capture.num_frames))
+            for fit_seed in self.fit_seeds:
+                methods = {f"{m}/{e}": self.settings(m, e, fit_seed) for e in self.epochs for m in self.methods}
+                cells[f"{seed}/{fit_seed}"] = source, methods
+        return cells
+
+    def settings(self, method: str, epochs: int, seed: int) -> StreamConfig:
+        """Return the settings of a method."""
+        preset, values = METHODS[method]
+        config = StreamConfig() if preset == DEFAULT else apply_preset(StreamConfig(), preset)  # pyright: ignore[reportArgumentType]
+        config = apply_values(config, values)
+        work = {"num_gaussians": self.num_gaussians, "first_frame_steps": self.first_frame_steps, "epochs": epochs}
+        return replace(config, fit=replace(config.fit, **work), seed=seed)
+
+
+def measure(source: Source, methods: Mapping[str, StreamConfig]) -> dict[str, dict[str, Any]]:
+    """Fit a clip by each method after the same first frame and return the scores by method."""
+    clip = Clip.read(source.open())
+    loop = clip.loop(next(iter(methods.values())))
+    keyframe, _ = loop.push(clip.images[0])
+    (coded,) = coded_frames([keyframe])
+    found = {}
+    for method, config in methods.items():
+        loop, reports, seconds = clip.loop(config), list[FrameReport](), list[float]()
+        loop.resume(coded, clip.images[:1])
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "stream.morgs"
+            with clip.writer(path, config) as writer:
+                writer.write(keyframe)
+                for images in clip.images[1:]:
+                    start = time.process_time()
+                    packet, report = loop.push(images)
+                    seconds.append(time.process_time() - start)
+                    writer.write(packet)
+                    reports.append(report)
+            found[method] = scores_of(evaluate_stream(path, clip.capture.path), reports, seconds)
+    return found
+
+
+def scores_of(found: Evaluation, reports: Sequence[FrameReport], seconds: Sequence[float]) -> dict[str, Any]:
+    """Return the scores of a stream as JSON."""
+    later = found.frames[1:]
+    motion = [asdict(row.motion_3d) for row in later if row.motion_3d is not None]
+    scores = {
+        **{name: known_mean([getattr(row.scores, name) for row in later]) for name in _IMAGES},
+        **{f"motion_3d_{name}": known_mean([row[name] for row in motion]) for name in ("error", "relative_error")},
+        **{f"{row.protocol} {name}": getattr(row.moving, name) for row in found.tracking for name in _TRACKS},
+        "num_bytes": known_mean([report.num_bytes for report in reports]),
+        "cpu_s": known_mean(seconds),
+        "steps": known_mean([report.steps for report in reports]),
+    }
+    rounded = {name: float(f"{value:.4g}") for name, value in scores.items()}
+    series = {name: [float(f"{getattr(row.scores, name):.4g}") for row in later] for name in _OVER_TIME}
+    return json_finite({**rounded, "by_frame": series})
+
+
+Cells = Mapping[str, Mapping[str, Mapping[str, Any]]]
+
+
+def mean_scores(cells: Cells, method: str) -> dict[str, float]:
+    """Return the mean of each score of a method over the cells that have it."""
+    rows = [{name: np.nan if v is None else v for name, v in cell[method].items()} for cell in cells.values()]
+    return {name: known_mean([row[name] for row in rows]) for name in rows[0] if name != "by_frame"}
+
+
+def field_table(cells: Cells) -> str:
+    """Return the scores of the methods, means over the cells, as a table in Markdown."""
+    rows = []
+    for name in next(iter(cells.values())):
+        method, epochs = name.split("/")
+        scores = mean_scores(cells, name)
+        values = (f"{factor * scores[score]:.{decimals}f}" for _, score, factor, decimals in _COLUMNS)
+        rows.append((f"`{method}`", epochs, *values))
+    return markdown(("method", "epochs", *(title for title, *_ in _COLUMNS)), rows)
+
+
+def plot_field(cells: Cells, path: Path) -> None:
+    """Plot the errors of the methods over the frames, and over the bytes of a frame; means over the cells.
+
+    Raises:
+        OSError: the file cannot be written.
+        ValueError: matplotlib is not installed.
+    """
+    names = list(next(iter(cells.values())))
+    methods, most = list(dict.fromkeys(n.split("/")[0] for n in names)), max(int(n.split("/")[1]) for n in names)
+    figure = blank_figure(11, 7)
+    axes = figure.subplots(2, 2)
+    for k, method in enumerate(methods):
+        style = {"color": f"C{k}", "label": method, "linewidth": 2.2 if method == DEFAULT else 1.2}
+        for axis, (score, title) in zip(axes[0], _PLOTTED, strict=True):
+            series = [cell[f"{method}/{most}"]["by_frame"][score] for cell in cells.values()]
+            values = np.nanmean(np.array(series, float), axis=0)
+            axis.plot(range(1, len(values) + 1), values, **style)
+            axis.set(xlabel=f"frame ({most} epochs)", ylabel=title, xticks=range(1, len(values) + 1))
+        for axis, (score, title) in zip(axes[1], _PLOTTED, strict=True):
+            found = [mean_scores(cells, name) for name in names if name.split("/")[0] == method]
+            axis.plot([s["num_bytes"] / 1000 for s in found], [s[score] for s in found], marker="o", **style)
+            axis.set(xlabel="kB per later frame (by epochs)", ylabel=title)
+    for axis in axes.flat:
+        axis.grid(alpha=0.3)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right upper", fontsize=8)
+    save_figure(figure, path)
+
+
+def main(options: Options) -> None:
+    """Run the report."""
+    mi.set_variant("llvm_ad_rgb")
+    with options.opened() as workers:
+        cells = run_cells(measure, options.cells(), workers, lambda name, _: print(f"{name} is done", flush=True))
+    print(field_table(cells))
+    if options.plot is not None:
+        plot_field(cells, options.plot)
+    about = {name: getattr(options, name) for name in ("downscale", "frames", "epochs", "num_gaussians")}
+    options.write({**about, "cells": cells}, unprinted=["cells"])
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))

@@ -1,0 +1,105 @@
+"""Motion models: a few parameters that move all Gaussians, fitted before each Gaussian has a residual of its own.
+
+3DGStream, HiCoM and 4DGC fit a later frame in two stages: first a motion that Gaussians share, then what it leaves
+over. A model is the first stage. It maps its parameters to a displacement d of every Gaussian and to a rotation r, a
+quaternion,
+
+    mu' = mu + d,    q' = r q    (Hamilton product),
+
+and the residual (eq. 12) starts from there. `fit.motion_stage` fits it. The spherical harmonics are not rotated.
+
+The models read positions through a constant sparse matrix W [N, C]: row i has the weights of the C entries of a grid at
+the mean of Gaussian i in the previous frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.sparse import csr_array
+
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.memory import from_numpy
+from morgs_mi.core.types import Jit, Tensor
+
+__all__ = ["MotionModel", "corners", "moved", "quaternion_product", "sparse_product"]
+
+
+@dataclass(frozen=True, eq=False)
+class MotionModel:
+    """A motion that N Gaussians share.
+
+    Attributes:
+        parameters: tensors at their start, by name, for which nothing moves.
+        rates: Adam's learning rate of each, by name.
+        motion: parameters -> (displacements [N, 3] in world units, rotations [N, 4] minus the identity, wxyz).
+        losses: parameters -> weighted losses besides L_recon, by name.
+    """
+
+    parameters: Mapping[str, Tensor]
+    rates: Mapping[str, float]
+    motion: Callable[[Mapping[str, Tensor]], tuple[Tensor, Tensor]]
+    losses: Callable[[Mapping[str, Tensor]], dict[str, Tensor]] = lambda parameters: {}
+
+
+def moved(gaussians: Gaussians, displacement: Tensor, rotation: Tensor) -> Gaussians:
+    """Return N Gaussians after a motion, as a `MotionModel` gives it."""
+    q, r = (dr.unravel(mi.Vector4f, tensor.array) for tensor in (gaussians.quats, rotation))
+    turned: Jit = dr.ravel(quaternion_product(r + mi.Vector4f(1, 0, 0, 0), q))
+    quats = mi.TensorXf(turned, tuple(gaussians.quats.shape))
+    return replace(gaussians, means=gaussians.means + displacement, quats=quats)
+
+
+def quaternion_product(r: Jit, q: Jit) -> Jit:
+    """Return the Hamilton product of quaternions wxyz."""
+    a, b, c, d = r
+    w, x, y, z = q
+    return mi.Vector4f(
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    )
+
+
+def corners(points: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the corners of the cubic cells around points, and their weights in trilinear interpolation.
+
+    Args:
+        points: [N, 3], world units.
+        side: of the cells, world units.
+
+    Returns:
+        Integer coordinates [N, 8, 3], and weights float32 [N, 8], which sum to 1.
+    """
+    lowest = np.floor(points / side)
+    offsets, fraction = np.indices((2, 2, 2)).reshape(3, 8).T, points / side - lowest
+    weights = np.prod(np.where(offsets, fraction[:, None], 1 - fraction[:, None]), axis=-1)
+    return lowest.astype(np.int64)[:, None] + offsets, weights.astype(np.float32)
+
+
+def sparse_product(matrix: csr_array, x: Tensor) -> Tensor:
+    """Return W x [N, K] of a constant matrix W [N, C] and a tensor x [C, K], differentiable in x.
+
+    A gather's adjoint would add atomically, in no fixed order; this one is a product with the transpose.
+    """
+    return dr.custom(_SparseProduct, x, matrix)
+
+
+class _SparseProduct(dr.CustomOp):
+    def eval(self, x: Tensor, matrix: csr_array) -> Tensor:
+        self.matrix = matrix
+        return from_numpy(mi.TensorXf, matrix @ np.asarray(x))
+
+    def backward(self) -> None:
+        self.set_grad_in("x", from_numpy(mi.TensorXf, self.matrix.T @ np.asarray(self.grad_out())))
+
+    def forward(self) -> None:
+        self.set_grad_out(from_numpy(mi.TensorXf, self.matrix @ np.asarray(self.grad_in("x"))))
+
+    def name(self) -> str:
+        return "morgs_mi.sparse_product"

@@ -1,0 +1,141 @@
+"""Local rigidity, after Dynamic 3D Gaussians (Luiten et al., 3DV 2024): neighbours move like parts of one body.
+
+For a Gaussian i and each of its k nearest neighbours j, with r_i the rotation of i since the previous frame and e_ij =
+mu_j - mu_i then, e'_ij now,
+
+    rigid     w_ij |e'_ij - r_i(e_ij)|        j keeps its place in the coordinate system of i,
+    rotation  w_ij |r_j - r_i|                both turn alike (quaternions),
+    isometry  w_ij ||e'_ij| - |e_ij||         their distance stays,
+
+each a mean over all pairs, with w_ij = exp(-|e_ij|^2 / s^2). Lengths count in scene extents.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.sparse import csr_array
+
+from morgs_mi.core.checks import check_number
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.memory import from_numpy
+from morgs_mi.core.types import Float, Jit, Tensor
+from morgs_mi.method.motion_model import quaternion_product, sparse_product
+from morgs_mi.method.propagation import nearest_neighbours
+
+__all__ = ["Neighbours", "RigidityConfig", "find_neighbours", "isometry_loss", "rigid_loss", "rotation_loss"]
+
+# Scene extents below which a length counts as 0: the derivative of a norm is infinite there.
+_SHORT = 1e-6
+
+
+@dataclass(frozen=True)
+class RigidityConfig:
+    """Settings of the local rigidity."""
+
+    neighbours: int = 20
+    """Nearest neighbours k of each Gaussian, as in the publication."""
+    reach: float = 0.1
+    """Distance s at which the weight of a neighbour has fallen to 0.37, in scene extents."""
+
+    def __post_init__(self) -> None:
+        if self.neighbours < 1:
+            raise ValueError(f"RigidityConfig(): `neighbours` must be at least 1, got {self.neighbours}.")
+        check_number("RigidityConfig()", "reach", self.reach, "(0, inf)")
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbours:
+    """E pairs (i, j) of N Gaussians as they were in the previous frame.
+
+    Attributes:
+        first: matrix [E, N] that selects i.
+        difference: matrix [E, N] that subtracts the value of i from that of j.
+        weights: w [E], divided by E.
+        edges: e [3, E], scene extents.
+        inverse: inverse rotations, unit quaternions wxyz [4, N].
+        extent: of the scene, world units.
+    """
+
+    first: csr_array
+    difference: csr_array
+    weights: Float
+    edges: Jit
+    inverse: Jit
+    extent: float
+
+
+def find_neighbours(gaussians: Gaussians, extent: float, config: RigidityConfig) -> Neighbours | None:
+    """Return the pairs of neighbours among N Gaussians of the previous frame, None if there is only one Gaussian."""
+    means = np.asarray(gaussians.means)
+    if len(means) < 2:
+        return None
+    near = nearest_neighbours(means, config.neighbours)
+    (N, k), pairs = near.shape, np.arange(near.size)
+    ones = np.ones(near.size, np.float32)
+    first, second = (
+        csr_array((ones, (pairs, of)), (near.size, N)) for of in (np.repeat(np.arange(N), k), near.ravel())
+    )
+    edges = (means[near] - means[:, None]).reshape(-1, 3) / extent
+    weights = np.exp(-np.sum(edges**2, axis=1) / config.reach**2) / len(edges)
+    quats = np.asarray(gaussians.quats)
+    inverse = quats * (1, -1, -1, -1) / np.maximum(np.sum(quats**2, axis=1, keepdims=True), 1e-30)
+    return Neighbours(
+        first,
+        csr_array(second - first),
+        from_numpy(mi.Float, weights),
+        mi.Vector3f(*(from_numpy(mi.Float, x) for x in edges.T)),
+        mi.Vector4f(*(from_numpy(mi.Float, x) for x in inverse.T)),
+        extent,
+    )
+
+
+def rigid_loss(gaussians: Gaussians, neighbours: Neighbours) -> Tensor:
+    """Return the mean of w_ij |e'_ij - r_i(e_ij)| over all pairs, a scalar tensor.
+
+    Args:
+        gaussians: N Gaussians now.
+        neighbours: theirs in the previous frame.
+    """
+    r = _columns(sparse_product(neighbours.first, _turns(gaussians, neighbours)), 4)
+    e, u = neighbours.edges, mi.Vector3f(r.y, r.z, r.w)
+    t = 2 * dr.cross(u, e)
+    return _mean(_length(_edges(gaussians, neighbours) - (e + r.x * t + dr.cross(u, t))), neighbours)
+
+
+def rotation_loss(gaussians: Gaussians, neighbours: Neighbours) -> Tensor:
+    """Return the mean of w_ij |r_j - r_i| over all pairs, a scalar tensor; see `rigid_loss`."""
+    return _mean(_length(_columns(sparse_product(neighbours.difference, _turns(gaussians, neighbours)), 4)), neighbours)
+
+
+def isometry_loss(gaussians: Gaussians, neighbours: Neighbours) -> Tensor:
+    """Return the mean of w_ij ||e'_ij| - |e_ij|| over all pairs, a scalar tensor; see `rigid_loss`."""
+    change = _length(_edges(gaussians, neighbours)) - _length(neighbours.edges)
+    return _mean(dr.abs(change), neighbours)
+
+
+def _turns(gaussians: Gaussians, neighbours: Neighbours) -> Tensor:
+    """Return the rotations r [N, 4] since the previous frame, unit quaternions wxyz."""
+    now = dr.normalize(_columns(gaussians.quats, 4))
+    unit = neighbours.inverse * dr.rcp(dr.norm(neighbours.inverse))
+    turns: Jit = dr.ravel(quaternion_product(now, unit))
+    return mi.TensorXf(turns, (len(gaussians), 4))
+
+
+def _edges(gaussians: Gaussians, neighbours: Neighbours) -> Jit:
+    return _columns(sparse_product(neighbours.difference, gaussians.means), 3) / neighbours.extent
+
+
+def _columns(tensor: Tensor, width: int) -> Jit:
+    return dr.unravel(mi.Vector3f if width == 3 else mi.Vector4f, tensor.array)
+
+
+def _length(x: Jit) -> Float:
+    return dr.sqrt(dr.squared_norm(x) + _SHORT**2)
+
+
+def _mean(values: Float, neighbours: Neighbours) -> Tensor:
+    return dr.sum(neighbours.weights * values)

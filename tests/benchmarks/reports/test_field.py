@@ -1,0 +1,53 @@
+"""Report on the field's methods: a tiny clip, and the page that quotes the committed figures."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks.reports import field
+from benchmarks.reports.field import METHODS, Options, field_table
+from morgs_mi.synth.synthesize import synthesize
+from tests.benchmarks.reports.pages import ROOT, page
+
+
+@pytest.mark.parametrize("name", ["field", "field_default"])
+def test_field_page__quotes_the_committed_tables(name) -> None:
+    committed = json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text())
+    assert field_table(committed["cells"]) in page("field.md")
+
+
+def test_settings__differ_between_methods_alone() -> None:
+    options = Options(num_gaussians=77)
+    found = {method: options.settings(method, epochs=3, seed=5) for method in METHODS}
+    assert len({repr(config) for config in found.values()}) == len(METHODS)
+    assert {(c.fit.num_gaussians, c.fit.epochs, c.seed, c.codec) for c in found.values()} == {
+        (77, 3, 5, found["default"].codec)
+    }
+
+
+@pytest.mark.slow
+def test_main__measures_a_tiny_clip(tmp_path: Path) -> None:
+    clip = tmp_path / "clips" / "random-3"
+    synthesize("random", clip, num_frames=3, width=64, height=48, spp=1, seed=3)
+    work = {
+        "num_gaussians": 200,
+        "first_frame_steps": 10,
+        "epochs": (2,),
+        "frames": 3,
+        "methods": ("hicom", "default"),
+    }
+    field.main(
+        Options(json=tmp_path / "out.json", plot=tmp_path / "out.png", seeds=(3,), clips=tmp_path / "clips", **work)
+    )
+    found = json.loads((tmp_path / "out.json").read_text())["cells"]
+    assert list(found) == ["3/0"]
+    assert list(found["3/0"]) == ["hicom/2", "default/2"]
+    for scores in found["3/0"].values():
+        assert scores["num_bytes"] > 0
+        assert len(scores["by_frame"]["psnr"]) == 2
+        assert "TAPVid-3D delta_avg" in scores
+    assert field_table(found).count("\n") == 4
+    assert (tmp_path / "out.png").stat().st_size > 1000

@@ -1,0 +1,68 @@
+"""Motion models: products with a sparse matrix, moved Gaussians, and the gradients of both."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.spatial.transform import Rotation
+
+from morgs_mi.core.geometry import unit_quats
+from morgs_mi.method.motion_model import moved, sparse_product
+from tests.assertions import assert_close
+from tests.scenes.gaussians import make_scene, to_gaussians
+
+RNG = np.random.default_rng(3)
+MATRIX = csr_array(RNG.normal(size=(9, 5)) * (RNG.random((9, 5)) < 0.4), dtype=np.float32)
+
+
+def tensor(*shape: int) -> mi.TensorXf:
+    return mi.TensorXf(RNG.normal(size=shape).astype(np.float32))
+
+
+def test_sparse_product__is_that_of_dense_matrices():
+    x = tensor(5, 3)
+    assert_close(sparse_product(MATRIX, x), MATRIX.toarray() @ np.asarray(x), atol=1e-6)
+
+
+def test_sparse_product__has_an_adjoint_in_both_modes():
+    x, weight = tensor(5, 3), tensor(9, 3)
+    dr.enable_grad(x)
+    dr.backward(dr.sum(weight * sparse_product(MATRIX, x), axis=None))
+    assert_close(dr.grad(x), MATRIX.toarray().T @ np.asarray(weight), atol=1e-6)
+    x = dr.detach(x)
+    dr.enable_grad(x)
+    tangent = tensor(5, 3)
+    dr.set_grad(x, tangent)
+    assert_close(dr.forward_to(sparse_product(MATRIX, x)), MATRIX.toarray() @ np.asarray(tangent), atol=1e-6)
+
+
+def test_moved__shifts_means_and_turns_rotations():
+    gaussians = to_gaussians(make_scene())
+    shift, turns = tensor(10, 3), Rotation.random(10, rng=RNG)
+    quats = turns.as_quat(scalar_first=True) - (1, 0, 0, 0)
+    now = moved(gaussians, shift, mi.TensorXf(quats.astype(np.float32)))
+    assert_close(now.means, np.asarray(gaussians.means) + np.asarray(shift), atol=1e-6)
+    before, after = (Rotation.from_quat(unit_quats(g), scalar_first=True) for g in (gaussians, now))
+    assert_close(after.as_matrix(), (turns * before).as_matrix(), atol=1e-5)
+
+
+def test_moved__without_motion_changes_no_bit():
+    gaussians = to_gaussians(make_scene())
+    now = moved(gaussians, dr.zeros(mi.TensorXf, (10, 3)), dr.zeros(mi.TensorXf, (10, 4)))
+    assert all(np.array_equal(now.numpy()[name], value) for name, value in gaussians.numpy().items())
+
+
+def test_moved__gradients_agree_with_central_differences():
+    gaussians, weight = to_gaussians(make_scene()), tensor(10, 4)
+    rotation, direction = tensor(10, 4), np.asarray(tensor(10, 4))
+
+    def value(rotation):
+        return dr.sum(weight * moved(gaussians, dr.zeros(mi.TensorXf, (10, 3)), rotation).quats, axis=None)
+
+    dr.enable_grad(rotation)
+    dr.backward(value(rotation))
+    found, at = np.vdot(np.asarray(dr.grad(rotation)), direction), np.asarray(dr.detach(rotation))
+    ends = [np.asarray(value(mi.TensorXf(np.asarray(at + h * direction, np.float32)))).item() for h in (0.5, -0.5)]
+    assert abs(found - (ends[0] - ends[1])) < 1e-4 * abs(found)  # linear in the rotation
