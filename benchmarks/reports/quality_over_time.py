@@ -25,6 +25,9 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 
+SECONDS = (5, 10, 20, 50, 100, 200, 500)
+"""Ticks of the plot."""
+
 
 @dataclass(frozen=True)
 class Options(CaseOptions):
@@ -70,6 +73,9 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
             panel.fill_between(seconds, held_out.min(axis=1), held_out.max(axis=1), color=color, alpha=0.2)
         panel.set_title(case, fontsize=8)
         panel.set(xscale="log")
+        panel.set_xticks(SECONDS, [f"{seconds:g}" for seconds in SECONDS])
+        panel.minorticks_off()
+        panel.set_xlim(0.8 * min(row["cpu_s"] for row in rows), 1.2 * max(row["cpu_s"] for row in rows))
         panel.tick_params(labelsize=7)
     for panel in panels[len(cases) :]:
         panel.set_axis_off()
