@@ -1,0 +1,201 @@
+"""Exposure and white balance of each camera and frame: a gain and a bias per channel. Beyond the paper.
+
+A camera shows the display-referred colours x of the scene as y = gain x + bias. As sRGB is 1.055 l^(1/2.4) - 0.055 of
+the light l, a factor on the light is such a map, except in the darkest tones. It is solved in closed form by least
+squares with a prior, weighted against outliers: what moved, highlights, and what a rendering lacks.
+
+Between cameras, x is a rendering of Gaussians that all cameras share (see `fit.balance`). Over time, x is the image of
+the same camera that changes are detected against, so that static pixels do not change where the exposure does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from morgs_mi.core.checks import check_number
+
+__all__ = ["Exposure", "ExposureConfig", "centred", "common_change", "fit_exposure", "follow_exposure"]
+
+# Values, of 1, that are neither nearly black nor nearly white.
+_DARK, _BRIGHT = 0.03, 0.97
+# Steps of the reweighted least squares, and the least scale of its errors, of 1.
+_STEPS, _LEAST_SCALE = 12, 1e-3
+_MIN_PIXELS = 30
+# Normal standard deviations in a median absolute deviation.
+_NORMAL = 1.4826
+_WIDTH = 160  # px, of the thumbnails on which changes over time are measured: means of pixels have less noise
+_TONES = np.array([0.1, 0.5, 0.9])[:, None]
+
+
+@dataclass(frozen=True)
+class ExposureConfig:
+    """Settings of the exposures."""
+
+    prior: float = 1e-4
+    """Weight of the prior of a gain and a bias, relative to all pixels: it acts where images have no contrast."""
+    least_change: float = 1e-3
+    """Change of tones over time, of 1, below which an image is not corrected: it is an error of the measurement."""
+    gaussians: int = 4000
+    """Gaussians of the fits by which the cameras of the first frame are balanced."""
+    steps: int = 300
+    """Steps of such a fit; each further round takes half as many."""
+    rounds: int = 5
+    """Rounds of fitting Gaussians and solving for the exposures."""
+    width: int = 320
+    """Least width to which images are reduced for that, px."""
+    least_gain: float = 0.1
+    """Increase of the PSNR of withheld pixels from which the exposures are taken by `auto`, dB: less is chance."""
+
+    def __post_init__(self) -> None:
+        for name, low in (("gaussians", 4), ("steps", 2), ("rounds", 1), ("width", 1)):
+            check_number("ExposureConfig()", name, getattr(self, name), f"[{low}, inf)")
+        for name in ("prior", "least_change", "least_gain"):
+            check_number("ExposureConfig()", name, getattr(self, name), "[0, inf)")
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Exposure and white balance of an image: recorded = gain * scene + bias, display-referred in [0, 1].
+
+    Attributes:
+        gain: of R, G and B.
+        bias: of R, G and B.
+    """
+
+    gain: tuple[float, ...] = (1.0, 1.0, 1.0)
+    bias: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    def __call__(self, colors: np.ndarray) -> np.ndarray:
+        """Return how the camera shows colours [..., 3] of the scene; not clipped."""
+        return colors * np.array(self.gain) + np.array(self.bias)
+
+    def corrected(self, image: np.ndarray) -> np.ndarray:
+        """Return the image, uint8 [H, W, 3], in the colours of the scene; what was clipped stays lost."""
+        if self == Exposure():
+            return image
+        table = 255 * self.inverse(np.arange(256)[:, None] / 255)
+        return cv2.LUT(image, np.clip(np.rint(table), 0, 255).astype(np.uint8)[None])
+
+    def inverse(self, colors: np.ndarray) -> np.ndarray:
+        """Return the colours [..., 3] of the scene that the camera shows as these."""
+        return (colors - np.array(self.bias)) / np.array(self.gain)
+
+    def after(self, first: Exposure) -> Exposure:
+        """Return the exposure that acts as `first` and then this one."""
+        gain = np.array(self.gain)
+        return _exposure(gain * first.gain, gain * first.bias + np.array(self.bias))
+
+    def without(self, first: Exposure) -> Exposure:
+        """Return the exposure that, after `first`, acts as this one."""
+        gain = np.array(self.gain) / first.gain
+        return _exposure(gain, np.array(self.bias) - gain * first.bias)
+
+    @property
+    def change(self) -> float:
+        """Largest change of a dark, middle or bright tone, of 1."""
+        return float(np.abs(self(_TONES) - _TONES).max())
+
+
+def fit_exposure(
+    scene: np.ndarray,
+    recorded: np.ndarray,
+    mask: np.ndarray | None = None,
+    prior: Exposure | None = None,
+    weight: float = ExposureConfig.prior,
+) -> Exposure:
+    """Return the exposure that shows the colours of a scene as a recorded image.
+
+    Args:
+        scene: colours [H, W, 3] in [0, 1].
+        recorded: image of the same pixels, likewise.
+        mask: pixels that count [H, W]; None: all.
+        prior: expected exposure; None: no change.
+        weight: of the prior, relative to that of all pixels.
+    """
+    prior = prior or Exposure()
+    good = ((recorded > _DARK) & (recorded < _BRIGHT) & (scene > _DARK) & (scene < _BRIGHT)).all(axis=-1)
+    good = good if mask is None else good & mask
+    if good.sum() < _MIN_PIXELS:
+        return prior
+    channels = zip(scene[good].T.astype(float), recorded[good].T.astype(float), prior.gain, prior.bias, strict=True)
+    gains, biases = zip(*(_line(x, y, np.array(line), weight) for x, y, *line in channels), strict=True)
+    return _exposure(np.array(gains), np.array(biases))
+
+
+def _line(x: np.ndarray, y: np.ndarray, prior: np.ndarray, weight: float) -> tuple[float, float]:
+    """Return slope and intercept of y over x [P] by reweighted least squares (Geman and McClure 1987)."""
+    line = _solve(x, y, np.ones_like(x), prior, weight)
+    for _ in range(_STEPS):
+        errors = y - line[0] * x - line[1]
+        scale = 2 * max(_NORMAL * float(np.median(np.abs(errors))), _LEAST_SCALE)
+        line = _solve(x, y, (1 + (errors / scale) ** 2) ** -2.0, prior, weight)
+    return float(line[0]), float(line[1])
+
+
+def _solve(x: np.ndarray, y: np.ndarray, weights: np.ndarray, prior: np.ndarray, weight: float) -> np.ndarray:
+    """Return the weighted least-squares line [2] with a prior."""
+    rows = np.stack([x, np.ones_like(x)])
+    regular = weight * len(x) * np.eye(2)
+    return np.linalg.solve((rows * weights) @ rows.T + regular, (rows * weights) @ y + regular @ prior)
+
+
+def centred(exposures: Mapping[int, Exposure]) -> dict[int, Exposure]:
+    """Return the exposures of all cameras such that their mean log gain and mean bias are 0.
+
+    Which of them are right is unknown: all could be brighter and the scene darker.
+    """
+    gains = np.array([exposure.gain for exposure in exposures.values()])
+    biases = np.array([exposure.bias for exposure in exposures.values()])
+    gains = gains / np.exp(np.log(gains).mean(axis=0))
+    biases = biases - gains * biases.mean(axis=0) / gains.mean(axis=0)
+    return {v: _exposure(*pair) for v, *pair in zip(exposures, gains, biases, strict=True)}
+
+
+def common_change(exposures: Sequence[Exposure]) -> Exposure:
+    """Return the change that all cameras show, which is that of the scene's light, or none if they differ too much.
+
+    The cameras' common change is their median, if most are nearer to it than half of its size.
+    """
+    if len(exposures) < 3:
+        return Exposure()
+    lines = np.array([(e.gain, e.bias) for e in exposures])
+    middle = _exposure(*np.median(lines, axis=0))
+    spread = float(np.median([np.abs(e(_TONES) - middle(_TONES)).max() for e in exposures]))
+    return middle if spread < 0.5 * middle.change else Exposure()
+
+
+def follow_exposure(
+    reference: np.ndarray,
+    image: np.ndarray,
+    mask: np.ndarray | None = None,
+    last: Exposure | None = None,
+    weight: float = ExposureConfig.prior,
+) -> Exposure:
+    """Return the exposure of an image relative to an earlier one of the same fixed camera.
+
+    Args:
+        reference: the earlier image, uint8 [H, W, 3].
+        image: the later one, likewise.
+        mask: pixels that count [H, W]; None: all.
+        last: exposure of the last frame, the prior; None: that of the reference.
+        weight: of the prior, as for `fit_exposure`.
+    """
+    height, width = image.shape[:2]
+    size = (min(width, _WIDTH), max(1, round(height * min(1, _WIDTH / width))))
+    before, now = (
+        cv2.resize(x.astype(np.float32) / 255, size, interpolation=cv2.INTER_AREA) for x in (reference, image)
+    )
+    small = None if mask is None else cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
+    return fit_exposure(before, now, small, last, weight)
+
+
+def _thumb(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    return np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+
+
+def _exposure(gain: np.ndarray, bias: np.ndarray) -> Exposure:
+    return Exposure(tuple(map(float, gain)), tuple(map(float, bias)))
