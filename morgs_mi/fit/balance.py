@@ -48,7 +48,7 @@ class Balance:
         change = f"exposures differ by up to {100 * max(exposure.change for exposure in self.exposures):.1f} % of white"
         scores = f"withheld pixels have {self.balanced_psnr:.2f} dB instead of {self.recorded_psnr:.2f} dB"
         if np.isnan(self.recorded_psnr):
-            return f"The cameras were balanced: {change}."
+            return f"The cameras {'were balanced' if self.taken else 'stay as recorded'}: {change}."
         if self.taken:
             return f"The cameras were balanced: {change}, and {scores}."
         return f"The cameras stay as recorded: balanced ones are no clear gain, {scores}."
@@ -112,8 +112,9 @@ def balance_cameras(
                 for v, (camera, image, mask) in enumerate(views)
             }
         )
-    if config.exposure == "on":
-        return Balance(tuple(exposures.values()), True, float("nan"), float("nan"), done)
+    differ = max(exposure.change for exposure in exposures.values()) >= how.least_difference
+    if config.exposure == "on" or not differ:
+        return Balance(tuple(exposures.values()), config.exposure == "on", float("nan"), float("nan"), done)
     scores = []
     for candidate in ({v: Exposure() for v in exposures}, exposures):
         fitted = fit(start, candidate, how.steps)

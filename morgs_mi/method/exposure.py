@@ -25,6 +25,8 @@ _DARK, _BRIGHT = 0.03, 0.97
 # Steps of the reweighted least squares, and the least scale of its errors, of 1.
 _STEPS, _LEAST_SCALE = 12, 1e-3
 _MIN_PIXELS = 30
+# Gains beyond 4, and inverse ones, are no exposures: the images do not show the same.
+_MAX_LOG_GAIN = np.log(4)
 # Normal standard deviations in a median absolute deviation.
 _NORMAL = 1.4826
 _WIDTH = 160  # px, of the thumbnails on which changes over time are measured: means of pixels have less noise
@@ -47,13 +49,15 @@ class ExposureConfig:
     """Rounds of fitting Gaussians and solving for the exposures."""
     width: int = 320
     """Least width to which images are reduced for that, px."""
+    least_difference: float = 0.005
+    """Difference of tones, of 1, from which `auto` considers to take the exposures: about a grey level."""
     least_gain: float = 0.1
-    """Increase of the PSNR of withheld pixels from which the exposures are taken by `auto`, dB: less is chance."""
+    """Increase of the PSNR of withheld pixels from which it takes them, dB: less is chance."""
 
     def __post_init__(self) -> None:
         for name, low in (("gaussians", 4), ("steps", 2), ("rounds", 1), ("width", 1)):
             check_number("ExposureConfig()", name, getattr(self, name), f"[{low}, inf)")
-        for name in ("prior", "least_change", "least_gain"):
+        for name in ("prior", "least_change", "least_difference", "least_gain"):
             check_number("ExposureConfig()", name, getattr(self, name), "[0, inf)")
 
 
@@ -115,6 +119,10 @@ def fit_exposure(
         mask: pixels that count [H, W]; None: all.
         prior: expected exposure; None: no change.
         weight: of the prior, relative to that of all pixels.
+
+    Returns:
+        The exposure, or the prior where it is not determined: with few well-exposed pixels, and for images that do not
+        show the same.
     """
     prior = prior or Exposure()
     good = ((recorded > _DARK) & (recorded < _BRIGHT) & (scene > _DARK) & (scene < _BRIGHT)).all(axis=-1)
@@ -123,7 +131,8 @@ def fit_exposure(
         return prior
     channels = zip(scene[good].T.astype(float), recorded[good].T.astype(float), prior.gain, prior.bias, strict=True)
     gains, biases = zip(*(_line(x, y, np.array(line), weight) for x, y, *line in channels), strict=True)
-    return _exposure(np.array(gains), np.array(biases))
+    plausible = min(gains) > 0 and np.abs(np.log(gains)).max() < _MAX_LOG_GAIN
+    return _exposure(np.array(gains), np.array(biases)) if plausible else prior
 
 
 def _line(x: np.ndarray, y: np.ndarray, prior: np.ndarray, weight: float) -> tuple[float, float]:

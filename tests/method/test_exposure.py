@@ -51,6 +51,10 @@ def test_fit_exposure__is_the_prior_without_well_exposed_pixels():
     assert fit_exposure(np.ones((40, 40, 3)), scene(size=(40, 40)), prior=WARM) == WARM
 
 
+def test_fit_exposure__is_the_prior_of_images_that_do_not_show_the_same():
+    assert fit_exposure(scene(), 0.9 - scene(), prior=WARM) == WARM
+
+
 def test_fit_exposure__keeps_the_gain_of_the_prior_where_images_have_no_contrast():
     grey = np.full((40, 40, 3), 0.5)
     found = fit_exposure(grey, WARM(grey) + 0.01, prior=WARM)
@@ -116,7 +120,10 @@ def test_follow_exposure__finds_a_change_of_two_percent():
     assert_close(follow_exposure(image, as_bytes(change(image / 255))), change, 2e-3)
 
 
-@pytest.mark.parametrize("name", ["gaussians", "steps", "rounds", "width", "prior", "least_change", "least_gain"])
+@pytest.mark.parametrize(
+    "name",
+    ["gaussians", "steps", "rounds", "width", "prior", "least_change", "least_difference", "least_gain"],
+)
 def test_exposure_config__refuses_negative_numbers(name: str):
     with pytest.raises(ValueError, match=name):
         ExposureConfig(**{name: -1})
