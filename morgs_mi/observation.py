@@ -159,7 +159,7 @@ def _exposures(setup: Setup, before: Seen, recorded: Images) -> dict[int, Exposu
     config, known = setup.config.fit.exposures, sorted(recorded.keys() & before.references.keys())
     found = map_in_threads(
         lambda v: follow_exposure(
-            before.references[v], recorded[v], setup.masks[v], before.exposures.get(v), config.prior
+            before.references[v], recorded[v], setup.masks[v], before.exposures.get(v), config.priors
         ),
         known,
     )

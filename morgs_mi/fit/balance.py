@@ -108,7 +108,7 @@ def balance_cameras(
         gaussians = fit(gaussians, exposures, how.steps // 2 if k else how.steps)
         exposures = centred(
             {
-                v: fit_exposure(rendered(gaussians, camera, render), image / 255, mask, weight=how.prior)
+                v: fit_exposure(rendered(gaussians, camera, render), image / 255, mask, weights=how.priors)
                 for v, (camera, image, mask) in enumerate(views)
             }
         )

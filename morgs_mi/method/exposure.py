@@ -23,13 +23,15 @@ __all__ = ["Exposure", "ExposureConfig", "centred", "common_change", "fit_exposu
 # Values, of 1, that are neither nearly black nor nearly white.
 _DARK, _BRIGHT = 0.03, 0.97
 # Steps of the reweighted least squares, and the least scale of its errors, of 1.
-_STEPS, _LEAST_SCALE = 12, 1e-3
+_STEPS, _LEAST_SCALE = 13, 1e-3
 _MIN_PIXELS = 30
 # Gains beyond 4, and inverse ones, are no exposures: the images do not show the same.
 _MAX_LOG_GAIN = np.log(4)
 # Normal standard deviations in a median absolute deviation.
 _NORMAL = 1.4826
 _WIDTH = 160  # px, of the thumbnails on which changes over time are measured: means of pixels have less noise
+# sRGB is 1.055 l^(1/2.4) - 0.055: a gain g of the light's root comes with the bias 0.055 (g - 1).
+_TOE = 0.055
 _TONES = np.array([0.1, 0.5, 0.9])[:, None]
 
 
@@ -38,8 +40,11 @@ class ExposureConfig:
     """Settings of the exposures."""
 
     prior: float = 1e-4
-    """Weight of the prior of a gain and a bias, relative to all pixels: it acts where images have no contrast."""
-    least_change: float = 1e-3
+    """Weight of the prior of a gain, relative to all pixels: it acts where nearly all pixels are dark."""
+    bias_prior: float = 0.02
+    """Weight of the prior of a bias beyond that of a factor on the light, likewise: it acts where images have little
+    contrast, so that a gain explains a change there."""
+    least_change: float = 3e-3
     """Change of tones over time, of 1, below which an image is not corrected: it is an error of the measurement."""
     gaussians: int = 4000
     """Gaussians of the fits by which the cameras of the first frame are balanced."""
@@ -54,10 +59,15 @@ class ExposureConfig:
     least_gain: float = 0.1
     """Increase of the PSNR of withheld pixels from which it takes them, dB: less is chance."""
 
+    @property
+    def priors(self) -> tuple[float, float]:
+        """Weights of both priors."""
+        return self.prior, self.bias_prior
+
     def __post_init__(self) -> None:
         for name, low in (("gaussians", 4), ("steps", 2), ("rounds", 1), ("width", 1)):
             check_number("ExposureConfig()", name, getattr(self, name), f"[{low}, inf)")
-        for name in ("prior", "least_change", "least_difference", "least_gain"):
+        for name in ("prior", "bias_prior", "least_change", "least_difference", "least_gain"):
             check_number("ExposureConfig()", name, getattr(self, name), "[0, inf)")
 
 
@@ -109,7 +119,7 @@ def fit_exposure(
     recorded: np.ndarray,
     mask: np.ndarray | None = None,
     prior: Exposure | None = None,
-    weight: float = ExposureConfig.prior,
+    weights: tuple[float, float] = (ExposureConfig.prior, ExposureConfig.bias_prior),
 ) -> Exposure:
     """Return the exposure that shows the colours of a scene as a recorded image.
 
@@ -118,7 +128,7 @@ def fit_exposure(
         recorded: image of the same pixels, likewise.
         mask: pixels that count [H, W]; None: all.
         prior: expected exposure; None: no change.
-        weight: of the prior, relative to that of all pixels.
+        weights: of the priors of gain and bias, see `ExposureConfig`.
 
     Returns:
         The exposure, or the prior where it is not determined: with few well-exposed pixels, and for images that do not
@@ -130,26 +140,22 @@ def fit_exposure(
     if good.sum() < _MIN_PIXELS:
         return prior
     channels = zip(scene[good].T.astype(float), recorded[good].T.astype(float), prior.gain, prior.bias, strict=True)
-    gains, biases = zip(*(_line(x, y, np.array(line), weight) for x, y, *line in channels), strict=True)
+    gains, biases = zip(*(_line(x, y, line, weights) for x, y, *line in channels), strict=True)
     plausible = min(gains) > 0 and np.abs(np.log(gains)).max() < _MAX_LOG_GAIN
     return _exposure(np.array(gains), np.array(biases)) if plausible else prior
 
 
-def _line(x: np.ndarray, y: np.ndarray, prior: np.ndarray, weight: float) -> tuple[float, float]:
+def _line(x: np.ndarray, y: np.ndarray, prior: Sequence[float], weights: tuple[float, float]) -> tuple[float, float]:
     """Return slope and intercept of y over x [P] by reweighted least squares (Geman and McClure 1987)."""
-    line = _solve(x, y, np.ones_like(x), prior, weight)
+    # The change of the gain, and of the bias beyond that of a factor on the light.
+    rows, rest = np.stack([x + _TOE, np.ones_like(x)]), y - prior[0] * x - prior[1]
+    regular, counts = len(x) * np.diag(weights), np.ones_like(x)
     for _ in range(_STEPS):
-        errors = y - line[0] * x - line[1]
+        change = np.linalg.solve((rows * counts) @ rows.T + regular, (rows * counts) @ rest)
+        errors = rest - change @ rows
         scale = 2 * max(_NORMAL * float(np.median(np.abs(errors))), _LEAST_SCALE)
-        line = _solve(x, y, (1 + (errors / scale) ** 2) ** -2.0, prior, weight)
-    return float(line[0]), float(line[1])
-
-
-def _solve(x: np.ndarray, y: np.ndarray, weights: np.ndarray, prior: np.ndarray, weight: float) -> np.ndarray:
-    """Return the weighted least-squares line [2] with a prior."""
-    rows = np.stack([x, np.ones_like(x)])
-    regular = weight * len(x) * np.eye(2)
-    return np.linalg.solve((rows * weights) @ rows.T + regular, (rows * weights) @ y + regular @ prior)
+        counts = (1 + (errors / scale) ** 2) ** -2.0
+    return float(prior[0] + change[0]), float(prior[1] + change[1] + _TOE * change[0])
 
 
 def centred(exposures: Mapping[int, Exposure]) -> dict[int, Exposure]:
@@ -182,7 +188,7 @@ def follow_exposure(
     image: np.ndarray,
     mask: np.ndarray | None = None,
     last: Exposure | None = None,
-    weight: float = ExposureConfig.prior,
+    weights: tuple[float, float] = (ExposureConfig.prior, ExposureConfig.bias_prior),
 ) -> Exposure:
     """Return the exposure of an image relative to an earlier one of the same fixed camera.
 
@@ -191,7 +197,7 @@ def follow_exposure(
         image: the later one, likewise.
         mask: pixels that count [H, W]; None: all.
         last: exposure of the last frame, the prior; None: that of the reference.
-        weight: of the prior, as for `fit_exposure`.
+        weights: of the priors, as for `fit_exposure`.
     """
     height, width = image.shape[:2]
     size = (min(width, _WIDTH), max(1, round(height * min(1, _WIDTH / width))))
@@ -199,7 +205,7 @@ def follow_exposure(
         cv2.resize(x.astype(np.float32) / 255, size, interpolation=cv2.INTER_AREA) for x in (reference, image)
     )
     small = None if mask is None else cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
-    return fit_exposure(before, now, small, last, weight)
+    return fit_exposure(before, now, small, last, weights)
 
 
 def _thumb(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
