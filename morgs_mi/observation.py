@@ -16,6 +16,7 @@ from morgs_mi.core.checks import check_mask, check_points, check_type
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.initialise import scene_extent
 from morgs_mi.method.change import box_around, change_mask, moving_region, update_reference
+from morgs_mi.method.exposure import Exposure, common_change, follow_exposure
 from morgs_mi.method.flow import FlowObservation, choose_key_views, observe_key_views
 from morgs_mi.method.flow_sources.registry import FramePair
 from morgs_mi.method.objective import KeyView
@@ -28,15 +29,17 @@ Images = Mapping[int, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """Images up to a frame.
+    """Images up to a frame, with the exposure of each view's first image if exposures are estimated.
 
     Attributes:
         images: of that frame, by view index, of the views that have one.
         references: images that the next frame is compared with to detect changes, by view index.
+        exposures: of that frame relative to the view's first image, by view index; empty if they are not estimated.
     """
 
     images: Images = field(default_factory=dict)
     references: Images = field(default_factory=dict)
+    exposures: Mapping[int, Exposure] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +51,14 @@ class FrameObservation:
         changes: masks of changed pixels [H, W], by view index; None: all pixels may have changed.
         flows: optical flow of the key views that changed, by view index.
         key_views: these views for the terms of the objective, by view index.
+        recorded: the images as they were given, by view index.
     """
 
     seen: Seen
     changes: Mapping[int, np.ndarray] | None
     flows: Mapping[int, FlowObservation]
     key_views: Mapping[int, KeyView]
+    recorded: Images
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,23 +127,47 @@ def observe_frame(setup: Setup, frame: int, before: Seen, images: Sequence[np.nd
     Raises:
         ValueError: an image has another size or type than its camera, or the first frame has no image at all.
     """
-    seen, changes = see_frame(setup, frame, before, images)
-    return FrameObservation(seen, changes, *_flows(setup, frame, before.images, seen.images, changes))
+    recorded = _copies(setup.cameras, images, frame)
+    seen, changes = _seen(setup, before, recorded)
+    return FrameObservation(seen, changes, *_flows(setup, frame, before.images, seen.images, changes), recorded)
 
 
 def see_frame(
     setup: Setup, frame: int, before: Seen, images: Sequence[np.ndarray | None]
 ) -> tuple[Seen, dict[int, np.ndarray] | None]:
     """Return the images up to a frame and the masks of its changes, without flow; see `observe_frame`."""
-    now = _copies(setup.cameras, images, frame)
-    if not setup.config.fit.skip_static:
-        return Seen(now), None
+    return _seen(setup, before, _copies(setup.cameras, images, frame))
+
+
+def _seen(setup: Setup, before: Seen, recorded: Images) -> tuple[Seen, dict[int, np.ndarray] | None]:
+    """Return the images up to a frame with these, and the masks of its changes; None: all may have changed."""
+    skip, follow = setup.config.fit.skip_static, setup.config.fit.exposure != "off"
+    if not (skip or follow):
+        return Seen(recorded), None
+    exposures = _exposures(setup, before, recorded) if follow else {}
+    now = {v: exposures[v].corrected(image) if v in exposures else image for v, image in recorded.items()}
     changes = {v: np.zeros(image.shape[:2], bool) for v, image in now.items()}  # where it is the view's first image
     known, config = sorted(now.keys() & before.references.keys()), setup.config.motion.change
     masks = map_in_threads(lambda v: change_mask(before.references[v], now[v], setup.masks[v], config), known)
     changes |= dict(zip(known, masks, strict=True))
     references = {v: update_reference(before.references[v], now[v], changes[v]) for v in known}
-    return Seen(now, {**before.references, **now, **references}), changes
+    return Seen(now, {**before.references, **now, **references}, exposures), changes if skip else None
+
+
+def _exposures(setup: Setup, before: Seen, recorded: Images) -> dict[int, Exposure]:
+    """Return the exposures relative to the views' first images, without the change of light that all views show."""
+    config, known = setup.config.fit.exposures, sorted(recorded.keys() & before.references.keys())
+    found = map_in_threads(
+        lambda v: follow_exposure(
+            before.references[v], recorded[v], setup.masks[v], before.exposures.get(v), config.priors
+        ),
+        known,
+    )
+    light = common_change(found)
+    own = {v: exposure.without(light) for v, exposure in zip(known, found, strict=True)}
+    # Less is an error of the measurement.
+    kept = {v: exposure if exposure.change > config.least_change else Exposure() for v, exposure in own.items()}
+    return {**before.exposures, **kept}
 
 
 def _flows(

@@ -36,6 +36,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import is_same_file, locked_folder, write_json
 from morgs_mi.fit.cross_validation import mean_psnr
 from morgs_mi.io.bounded import read_json
+from morgs_mi.method.exposure import Exposure
 from morgs_mi.method.flow import choose_key_views
 from morgs_mi.stream_loop import FrameReport, StreamLoop
 
@@ -130,12 +131,14 @@ def _stream(
         writer, reports = StreamWriter(path, capture.cameras, capture.fps, metadata), []
         frames = chain((first,), frames)
     else:
-        # Changes are detected against references that depend on all images so far.
-        start, now = 0 if config.fit.skip_static else interrupted.coded.frame, interrupted.coded.frame
+        # Changes and exposures are relative to references that depend on all images so far.
+        now = interrupted.coded.frame
+        start = 0 if config.fit.skip_static or config.fit.exposure != "off" else now
         frames = capture.partial_frames(start)
         count = now + 1 - start
         past = _reported(islice(frames, count), partial(on_stage, "Reading the fitted frames"), count)
-        loop.resume(interrupted.coded, ([frame.images[v] for v in train] for frame in past))
+        images = ([frame.images[v] for v in train] for frame in past)
+        loop.resume(interrupted.coded, images, interrupted.reports[0].exposures)
         write_json(out / "capture.json", about)
         writer = StreamWriter.continued(path, interrupted.index, interrupted.end)
         reports = interrupted.reports
@@ -373,7 +376,9 @@ def read_reports(path: Path, frames: range) -> list[FrameReport]:
 
 
 def _report(row: Mapping[str, Any]) -> FrameReport:
-    return FrameReport(**{**row, "seconds": float(row["seconds"]), "missing_views": tuple(row["missing_views"])})
+    exposures = tuple(Exposure(tuple(e["gain"]), tuple(e["bias"])) for e in row.get("exposures", ()))
+    known = {"seconds": float(row["seconds"]), "missing_views": tuple(row["missing_views"]), "exposures": exposures}
+    return FrameReport(**{**row, **known})
 
 
 def due_keyframe(coded: CodedFrame | None, interval: int) -> list[Packet]:

@@ -23,6 +23,7 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.threads import in_background
+from morgs_mi.fit.balance import Balance, balance_cameras, balance_config
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import mean_psnr
 from morgs_mi.fit.depth_prior import DepthNetwork, depth_prior
@@ -35,6 +36,7 @@ from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
 from morgs_mi.method.confidence import motion_mask
+from morgs_mi.method.exposure import Exposure
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.objective import Observations, channels_of, observe
@@ -66,6 +68,7 @@ class FrameReport:
             the results of cross-validation (see `fit.cross_validation`) and the comparison of two fits (see
             `fit.agreement`), or else the forecast (see `fit.forecast`), which has no number; empty with a single view.
         steps: number of optimisation steps, without those of trials.
+        exposures: gain and bias of each view; empty if they are not estimated.
     """
 
     frame: int
@@ -78,6 +81,7 @@ class FrameReport:
     active: dict[str, float] = field(default_factory=dict)
     validation: dict[str, Any] = field(default_factory=dict)
     steps: int = 0
+    exposures: tuple[Exposure, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,11 +94,13 @@ class StreamState:
         frame: index of the next frame.
         coded: state of a decoder after the last frame; None before the first.
         seen: images up to the last frame.
+        balance: exposures of the first frame, by view; empty if they are not estimated.
     """
 
     frame: int = 0
     coded: CodedFrame | None = None
     seen: Seen = field(default_factory=Seen)
+    balance: tuple[Exposure, ...] = ()
 
     @property
     def gaussians(self) -> Gaussians | None:
@@ -126,15 +132,17 @@ def step(
     fit = _fit_first_frame if state.coded is None else _fit_later_frame
     packet, about = fit(setup, state, observed, on_step)
     coded, seen = decode(state.coded, packet), observed.seen
+    balance = about.pop("balance", state.balance)
     report = FrameReport(
         state.frame,
         time.perf_counter() - start,
         packet.num_bytes,
         num_gaussians=len(coded),
         missing_views=tuple(camera.name for v, camera in enumerate(setup.cameras) if v not in seen.images),
+        exposures=tuple(seen.exposures.get(v, Exposure()).after(first) for v, first in enumerate(balance)),
         **about,
     )
-    return StreamState(state.frame + 1, coded, seen), packet, report
+    return StreamState(state.frame + 1, coded, seen, balance), packet, report
 
 
 def _fit_later_frame(
@@ -147,7 +155,8 @@ def _fit_later_frame(
     previous = _first_confidence(setup, state, flows, rng)  # frame 0's confidence (11)
     observations = observe(observed.key_views, motion, config.fit.objective)
     active = _active_set(setup, previous, images, observed.changes, observations)
-    targets = {view: Target(images[view], setup.masks[view]) for view in active.views}
+    balanced = _balanced({view: images[view] for view in active.views}, state.balance)
+    targets = {view: Target(image, setup.masks[view]) for view, image in balanced.items()}
     initial = initial_motion(previous, active, flows, targets, motion, rng)  # motion (5)
     problem = FrameProblem(previous, active, targets, observations, initial, setup.extent)
     fitted = fit_later_frame(problem, config.fit, motion, rng, on_step)  # residual (6-8, 12), objective (13)
@@ -166,7 +175,9 @@ def _fit_first_frame(
     """Return the first frame's packet and what its report says."""
     config, images, rng = setup.config, observed.seen.images, np.random.default_rng([setup.config.seed, 0])
     cameras, masks = [setup.cameras[v] for v in images], [setup.masks[v] for v in images]
-    fit = config.fit
+    fit, found = config.fit, _balance(setup, images)
+    balance = _exposures_of(setup, images, found)
+    images = _balanced(images, balance)
     if fit.num_gaussians is None:
         count = gaussians_for(cameras, list(images.values()), masks, setup.points, fit.detail)
         fit = replace(fit, num_gaussians=count)
@@ -188,9 +199,42 @@ def _fit_first_frame(
     return keyframe_packet(fitted.gaussians, 0, setup.cameras, config.codec), {
         "losses": fitted.losses,
         "status": status,
-        "validation": _described(expected) if expected else {},
+        "validation": (_described(expected) if expected else {}) | _about_balance(found),
         "steps": fitted.steps,
+        "balance": balance,
     }
+
+
+def _balance(setup: Setup, images: Images) -> Balance | None:
+    """Return the balance of the cameras in the first frame; None if it is not estimated, or of a single view."""
+    config = setup.config
+    if config.fit.exposure == "off" or len(images) < 2:
+        return None
+    start, _ = _first_gaussians(setup, images, balance_config(config.fit), np.random.default_rng([config.seed, 0, 2]))
+    cameras, masks = [setup.cameras[v] for v in images], [setup.masks[v] for v in images]
+    views = cameras, list(images.values()), masks
+    return balance_cameras(start, *views, setup.extent, config.fit, config.render, config.seed)
+
+
+def _exposures_of(setup: Setup, images: Images, found: Balance | None) -> tuple[Exposure, ...]:
+    """Return the exposure of each view in the first frame: none of one without an image; empty if not estimated."""
+    if setup.config.fit.exposure == "off":
+        return ()
+    known = dict(zip(images, found.exposures, strict=True)) if found is not None and found.taken else {}
+    return tuple(known.get(v, Exposure()) for v in range(len(setup.cameras)))
+
+
+def _balanced(images: Images, balance: Sequence[Exposure]) -> dict[int, np.ndarray]:
+    """Return images in the colours of the scene, which all views share."""
+    return {v: balance[v].corrected(image) if balance else image for v, image in images.items()}
+
+
+def _about_balance(found: Balance | None) -> dict[str, Any]:
+    """Return what the first frame's report says about the balance of the cameras."""
+    if found is None:
+        return {}
+    scores = {"recorded_psnr": found.recorded_psnr, "balanced_psnr": found.balanced_psnr}
+    return {"exposure": {"sentence": found.sentence, "taken": found.taken, **scores}}
 
 
 def _described(expected: Sequence[Expected]) -> dict[str, Any]:
@@ -319,17 +363,24 @@ class StreamLoop:
         if ahead is None or ahead[0] != self.state.frame:
             return None
         observed, given = ahead[1].result(), {v: image for v, image in enumerate(images) if image is not None}
-        same = given.keys() == observed.seen.images.keys()
-        return observed if same and all(np.array_equal(given[v], observed.seen.images[v]) for v in given) else None
+        same = given.keys() == observed.recorded.keys()
+        return observed if same and all(np.array_equal(given[v], observed.recorded[v]) for v in given) else None
 
-    def resume(self, coded: CodedFrame, frames: Iterable[Sequence[np.ndarray | None]]) -> None:
+    def resume(
+        self,
+        coded: CodedFrame,
+        frames: Iterable[Sequence[np.ndarray | None]],
+        balance: Sequence[Exposure] = (),
+    ) -> None:
         """Continue after a frame of a stream, as if it had just been pushed.
 
         Args:
             coded: state of the stream after that frame.
-            frames: images of all frames up to it, as for `push`; the last frame suffices without `skip_static`.
+            frames: images of all frames up to it, as for `push`; the last frame suffices without `skip_static` and
+                `exposure`.
+            balance: exposures in the report of the first frame.
         """
         seen = Seen()
         for images in frames:
             seen, _ = see_frame(self.setup, coded.frame, seen, images)
-        self.state, self._ahead = StreamState(coded.frame + 1, coded, seen), None
+        self.state, self._ahead = StreamState(coded.frame + 1, coded, seen, tuple(balance)), None

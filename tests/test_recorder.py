@@ -21,6 +21,7 @@ from morgs_mi.codec.container import PAYLOAD, TRAILER, StreamWriter
 from morgs_mi.codec.packets import CodedFrame, coded_frames, play, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.fit.config import RefinementConfig
+from morgs_mi.method.exposure import ExposureConfig
 from morgs_mi.recorder import _without_folder, stream_capture, stream_metadata, with_next
 from morgs_mi.stream_loop import StreamLoop
 from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
@@ -382,6 +383,18 @@ def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path):
     (tmp_path / "stream.morgs").write_bytes(whole[: stream.index()[-1][2]])
     stream_capture(capture, tmp_path, config, resume=True)
     assert stream_of(tmp_path) == whole
+
+
+def test_stream_capture__resumes_with_the_exposures_of_the_report(tmp_path):
+    how = ExposureConfig(gaussians=40, steps=4, rounds=1)
+    capture, config = recording(num_frames=3), replace(CONFIG, fit=replace(CONFIG.fit, exposure="on", exposures=how))
+    stream_capture(capture, tmp_path, config)
+    stream, whole, report = StreamReader(tmp_path / "stream.morgs"), stream_of(tmp_path), report_of(tmp_path)
+    assert all(len(row["exposures"]) == len(capture.train_views) for row in report["frames"])
+    (tmp_path / "stream.morgs").write_bytes(whole[: stream.index()[-1][2]])
+    stream_capture(capture, tmp_path, config, resume=True)
+    assert stream_of(tmp_path) == whole
+    assert [row["exposures"] for row in report_of(tmp_path)["frames"]] == [r["exposures"] for r in report["frames"]]
 
 
 def test_stream_metadata__names_the_calibration_that_cameras_are_refined_from():

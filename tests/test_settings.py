@@ -73,6 +73,8 @@ ELSEWHERE: dict[str, str] = {
     "fit.depth_weight": "no network here: tests/fit/test_depth_prior.py",
     "fit.refine_cameras": "cameras are refined by the recorder: tests/calibration/test_refine.py",
     "fit.refinement": "cameras are refined by the recorder: tests/calibration/test_refine.py",
+    "fit.exposure": "the tests of the loop have cameras that differ: tests/test_stream_loop.py",
+    "fit.exposures": "not estimated by default: tests/method/test_exposure.py, tests/fit/test_balance.py",
     "motion.flow.farneback": "a method that is not the default: tests/method/flow_sources",
     "motion.active_set.min_explained": "no change here is unexplained: tests/method/test_active_set.py",
     "motion.active_set.min_cluster": "no change here is unexplained: tests/method/test_active_set.py",

@@ -21,6 +21,7 @@ from morgs_mi.core.color_space import SH_C0
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
 from morgs_mi.fit.config import CrossValidationConfig, DensityConfig, FitConfig, LearningRates
 from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.exposure import ExposureConfig
 from morgs_mi.recorder import stream_capture
 from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.cameras import QUAD, look_at_cameras
@@ -479,3 +480,60 @@ def test_push__refuses_upcoming_images_of_another_size_in_their_turn(clip):
         loop.push(small)
     loop.push(clip[1][:4])
     assert loop.state.frame == 2
+
+
+EXPOSED = dataclasses.replace(
+    QUICK,
+    fit=dataclasses.replace(QUICK.fit, exposure="on", exposures=ExposureConfig(gaussians=600, steps=60, rounds=2)),
+    render=RenderConfig(reproducible=True),
+)
+
+
+def brighter(images, gains):
+    """Return the images of a frame with a gain per view."""
+    return [np.rint(np.clip(g * image, 0, 255)).astype(np.uint8) for g, image in zip(gains, images, strict=True)]
+
+
+@pytest.fixture(scope="module")
+def auto_exposed(clip):
+    """A static clip whose cameras differ, and change by up to 10 % in each frame; reports of a fit with exposures."""
+    gains = [(0.9, 1.0, 0.95, 0.85), (0.9, 1.1, 0.95, 0.75), (1.0, 0.9, 0.9, 0.85)]
+    frames = [brighter(clip[0][:4], each) for each in gains]
+    loop = new_loop(EXPOSED)
+    return np.array(gains), frames, loop, [loop.push(images)[1] for images in frames]
+
+
+def test_push__reports_the_exposure_of_each_view_over_time(auto_exposed):
+    gains, _, _, reports = auto_exposed
+    middle = np.array([[np.mean(e(0.4 * np.ones(3))) for e in report.exposures] for report in reports]) / 0.4
+    np.testing.assert_allclose(middle / middle[0], gains / gains[0], atol=0.01)
+    assert np.abs(np.log(middle[0])).max() > 0.02, "the cameras differ in the first frame, too"
+    assert "The cameras were balanced" in reports[0].validation["exposure"]["sentence"]
+
+
+def test_push__changes_no_static_gaussian_where_only_the_exposure_changes(auto_exposed):
+    _, frames, _, reports = auto_exposed
+    plain = new_loop(dataclasses.replace(EXPOSED, fit=QUICK.fit))
+    without = [plain.push(images)[1] for images in frames]
+    assert max(report.num_bytes for report in reports[1:]) < 0.1 * min(report.num_bytes for report in without[1:])
+    assert without[0].exposures == ()
+
+
+def test_resume__continues_with_the_exposures_of_the_reports(auto_exposed, clip):
+    gains, frames, loop, reports = auto_exposed
+    following = brighter(clip[1][:4], gains[1])
+    packet, report = stream_loop.step(loop.setup, loop.state, following)[1:]
+    resumed = new_loop(EXPOSED)
+    resumed.resume(loop.state.coded, frames, reports[0].exposures)
+    again, same = resumed.push(following)
+    assert again.encoded == packet.encoded
+    assert same.exposures == report.exposures
+
+
+def test_push__leaves_a_change_of_light_in_the_scene(clip):
+    loop = new_loop(EXPOSED)
+    frames = [clip[0][:4], brighter(clip[0][:4], [0.8] * 4)]
+    reports = [loop.push(images)[1] for images in frames]
+    # All cameras see it: the stream becomes darker, and no exposure changes.
+    assert reports[1].exposures == reports[0].exposures
+    assert reports[1].num_bytes > 1000

@@ -198,7 +198,8 @@ def _exposures(check: DeepCheck) -> Iterator[Finding]:
                 check,
                 "exposure",
                 [view],
-                f"is {_percent(mean)} than the other cameras: set the same exposure and gain, or use --color linear",
+                f"is {_percent(mean)} than the other cameras: set the same exposure and gain, or use --color linear or "
+                "fit.exposure",
             )
         if np.abs(gains - mean).max() > _BALANCE:
             channels = ", ".join(f"{n} {100 * np.expm1(g - mean):+.0f} %" for n, g in zip("RGB", gains, strict=True))
@@ -222,7 +223,8 @@ def _flicker(check: DeepCheck) -> Iterator[Finding]:
             "flicker",
             views,
             f"flicker by {100 * max(lamp.amplitude for lamp in lamps):.1f} % at {lamps[0].alias:.1f} Hz, as lamps on "
-            f"{hertz} Hz mains do: expose for a multiple of {exposure} s, use lamps without flicker, or --exposure",
+            f"{hertz} Hz mains do: expose for a multiple of {exposure} s, use lamps without flicker, "
+            "--exposure or fit.exposure",
         )
 
 

@@ -40,7 +40,7 @@ from morgs_mi.capture.features import detect, intersect, join_matches, match_vie
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.cross_validation import mean_psnr, reduced
+from morgs_mi.fit.cross_validation import mean_psnr, withheld_blocks
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.initialise import fill_points, from_points, resample_points, scene_extent, seed_points, seen_points
 from morgs_mi.losses.ssim import Target
@@ -62,8 +62,6 @@ _BLURS = (2.0, 1.0)
 _HALF_WEIGHT = 0.1
 # Least mean square error: that of a rendering that is compared with itself is 0.
 _LEAST_ERROR = 1e-10
-# Withheld blocks: side in px, and one of how many.
-_BLOCK, _SHARE = 12, 8
 # Steps of the registration of a camera, which end when they change its pixels by less than this, px.
 _REGISTRATION_STEPS, _LEAST_SHIFT = 30, 1e-3
 # Factors on the learning rates in the rounds after the first.
@@ -140,7 +138,8 @@ def refine_cameras(
     judge = config.refine_cameras == "auto"
     estimates = [0 * changes] * judge + [changes] * bool(tracks)
     fits = how.rounds + len(estimates) + bool(estimates)
-    views, unseen = _withheld(cameras, list(seen.values()), masks, how.width, seed)
+    views, unseen = withheld_blocks(cameras, list(seen.values()), masks, how.width, seed)
+    unseen = [view for view in unseen if view[2] is not None and view[2].any()]
     fit = partial(_fit, views=views, extent=extent, config=config, render=render, seed=seed)
     gaussians = _start(_changed(views, changes), _moved(capture.points, cameras, changes), colors, config, seed)
     for done in range(how.rounds):
@@ -219,25 +218,6 @@ def _matched(capture: Capture, train: Sequence[int], config: FitConfig, extent: 
     if np.bincount(tracks.views, minlength=len(train)).min() < _MIN_TRACKS:
         return np.zeros((len(train), 9)), 0
     return bundle_adjust(cameras, tracks, extent, config.refinement.priors)[0], tracks.count
-
-
-def _withheld(
-    cameras: Sequence[Camera],
-    images: Sequence[np.ndarray],
-    masks: Sequence[np.ndarray | None],
-    width: int,
-    seed: int,
-) -> tuple[list[_View], list[_View]]:
-    """Return the reduced views without withheld blocks of pixels, and with these alone."""
-    rng, views, unseen = np.random.default_rng([seed, 2]), [], []
-    for camera, image, mask in zip(cameras, images, masks, strict=True):
-        small = reduced(camera, image, mask, width)
-        rows, columns = (np.arange(size) // _BLOCK for size in small[1].shape[:2])
-        withheld = (rng.random((rows[-1] + 1, columns[-1] + 1)) < 1 / _SHARE)[rows][:, columns]
-        valid = np.ones_like(withheld) if small[2] is None else small[2]
-        views.append((*small[:2], valid & ~withheld))
-        unseen.append((*small[:2], valid & withheld))
-    return views, [view for view in unseen if view[2].any()]
 
 
 def _changed(views: Sequence[_View], changes: np.ndarray) -> list[_View]:

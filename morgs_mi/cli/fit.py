@@ -116,6 +116,8 @@ def first_frame_sentences(validation: Mapping[str, Any]) -> Iterator[str]:
             f"The held-out view has {psnr['calibrated_psnr']:.1f} dB as calibrated, {psnr['registered_psnr']:.1f} dB "
             "registered."
         )
+    if "exposure" in validation:
+        yield validation["exposure"]["sentence"]
     if "sentence" in validation:
         yield validation["sentence"]
 

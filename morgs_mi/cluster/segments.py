@@ -147,6 +147,11 @@ async def fit_in_segments(
             f"stream_segments(): `fit.refine_cameras` must be off, got {config.fit.refine_cameras!r}: workers read the "
             "calibrated cameras; fit without segments, or calibrate again."
         )
+    if config.fit.exposure != "off":
+        raise ValueError(
+            f"stream_segments(): `fit.exposure` must be off, got {config.fit.exposure!r}: exposures follow from all "
+            "frames before; fit without segments, or read the capture with --color and --exposure."
+        )
     out, seams = Path(out), seams or SeamConfig()
     starts = _starts(capture.num_frames, segments)
     for name in FILES:

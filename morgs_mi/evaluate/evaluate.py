@@ -41,6 +41,7 @@ from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import mean_psnr
 from morgs_mi.fit.initialise import scene_extent
 from morgs_mi.io.bounded import read_json
+from morgs_mi.method.exposure import follow_exposure
 from morgs_mi.playback.player import (
     has_confidence,
     open_stream,
@@ -214,7 +215,8 @@ def _image_scores(image: np.ndarray, seen: _RecordedView, lpips: Lpips | None) -
     maps = {"psnr": np.square(a - b), "flip": flip_map(a, b), "delta_e": delta_e_map(a, b)}
     if min(image.shape[:2]) >= WINDOW:
         maps["ssim"] = ssim_map(a, b)
-    scores = {}
+    matched = follow_exposure(image, seen.image, seen.valid)(a).clip(0, 1)
+    scores = {"psnr_matched": psnr_of(mean_over(np.square(matched - b), whole))}
     for name, values in maps.items():
         finish = psnr_of if name == "psnr" else float
         scores |= {name + r: finish(mean_over(values, mask)) for r, mask in zip(REGIONS, regions, strict=True)}

@@ -61,6 +61,8 @@ class ViewScores(_Scores):
     """PSNR, dB."""
     psnr_moving: float = _NAN
     psnr_still: float = _NAN
+    psnr_matched: float = _NAN
+    """PSNR after the gain and bias per channel that make the rendered image most like the recorded one, dB."""
     ssim: float = _NAN
     """SSIM, at most 1."""
     ssim_moving: float = _NAN

@@ -74,6 +74,10 @@ def evaluation_summary(result: Evaluation) -> Iterator[str]:
             f"Held-out view in the first frame: {figure(first, 2)} dB as calibrated, "
             f"{figure(result.registered_psnr, 2)} dB registered, from the camera that fits its image best."
         )
+        yield (
+            f"Held-out view in all frames: {figure(mean.psnr, 2)} dB as recorded, {figure(mean.psnr_matched, 2)} dB "
+            "after the gain and bias per channel that fit best."
+        )
     motion = result.motion_3d
     if motion is not None and motion.num_gaussians:
         yield (

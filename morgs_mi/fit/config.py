@@ -8,6 +8,7 @@ from math import inf
 from typing import Literal
 
 from morgs_mi.core.attributes import ATTRIBUTES
+from morgs_mi.method.exposure import ExposureConfig
 from morgs_mi.method.objective import ObjectiveConfig
 
 __all__ = [
@@ -275,6 +276,11 @@ class FitConfig:
     on (always taken)."""
     refinement: RefinementConfig = field(default_factory=RefinementConfig)
     """Refinement of the cameras."""
+    exposure: Literal["off", "auto", "on"] = "off"
+    """Estimate gain and bias of each camera and frame: off, auto (differences between the cameras are taken if withheld
+    pixels show that they are real) or on (always taken)."""
+    exposures: ExposureConfig = field(default_factory=ExposureConfig)
+    """Estimation of the exposures."""
     sh_band_fraction: float = 1 / 30
     """Fraction of the first frame's steps after which another SH band is added, as in 3DGS."""
     confidence_steps: int = 40
@@ -310,6 +316,8 @@ class FitConfig:
         for name, low in lowest.items():
             if getattr(self, name) is not None and not getattr(self, name) >= low:
                 raise ValueError(f"FitConfig(): `{name}` must be at least {low}, got {getattr(self, name)}.")
+        if self.exposure not in ("off", "auto", "on"):
+            raise ValueError(f"FitConfig(): `exposure` must be off, auto or on, got {self.exposure!r}.")
         if self.sh_degree not in (0, 1, 2, 3):
             raise ValueError(f"FitConfig(): `sh_degree` must be 0 to 3, got {self.sh_degree}.")
         if not 0 < self.initial_opacity < 1:

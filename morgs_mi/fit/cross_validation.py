@@ -36,10 +36,13 @@ __all__ = [
     "squared_errors",
     "trial_steps",
     "verdict",
+    "withheld_blocks",
     "withheld_views",
 ]
 
 _MIN_SIDE = 32  # px
+# Withheld blocks: side in px, and one of how many.
+_BLOCK, _SHARE = 12, 8
 POOR_PSNR = 22.0
 """PSNR in dB below which views between the cameras look poor."""
 _View = tuple[Camera, np.ndarray, np.ndarray | None]
@@ -205,6 +208,33 @@ def reduced(camera: Camera, image: np.ndarray, mask: np.ndarray | None, width: i
     smaller = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
     valid = None if mask is None else cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
     return camera.resized(*size), smaller, valid
+
+
+def withheld_blocks(
+    cameras: Sequence[Camera],
+    images: Sequence[np.ndarray],
+    masks: Sequence[np.ndarray | None],
+    width: int,
+    seed: int,
+) -> tuple[list[_View], list[_View]]:
+    """Return the reduced views without withheld blocks of pixels, and with these alone, which may be none in a view.
+
+    Args:
+        cameras: V views.
+        images: their images [H, W, 3], uint8.
+        masks: valid pixels of each [H, W], or None.
+        width: least width of the reduced images, px.
+        seed: of the choice of the blocks.
+    """
+    rng, views, unseen = np.random.default_rng([seed, 2]), [], []
+    for camera, image, mask in zip(cameras, images, masks, strict=True):
+        small = reduced(camera, image, mask, width)
+        rows, columns = (np.arange(size) // _BLOCK for size in small[1].shape[:2])
+        withheld = (rng.random((rows[-1] + 1, columns[-1] + 1)) < 1 / _SHARE)[rows][:, columns]
+        valid = np.ones_like(withheld) if small[2] is None else small[2]
+        views.append((*small[:2], valid & ~withheld))
+        unseen.append((*small[:2], valid & withheld))
+    return views, unseen
 
 
 def squared_errors(gaussians: Gaussians, views: Sequence[_View], render: RenderConfig) -> np.ndarray:

@@ -260,3 +260,9 @@ def test_stream_segments__refuses_to_refine_cameras(capture: Capture, workers: W
     config = replace(CONFIG, fit=replace(CONFIG.fit, refine_cameras="auto"))
     with pytest.raises(ValueError, match=r"`fit\.refine_cameras` must be off, got 'auto'"):
         stream_segments(capture, tmp_path / "out", workers, config, 2)
+
+
+def test_stream_segments__refuses_to_estimate_exposures(capture: Capture, workers: Workers, tmp_path: Path) -> None:
+    config = replace(CONFIG, fit=replace(CONFIG.fit, exposure="on"))
+    with pytest.raises(ValueError, match=r"`fit\.exposure` must be off, got 'on'"):
+        stream_segments(capture, tmp_path / "out", workers, config, 2)

@@ -14,6 +14,7 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, reemitted_keyframe, residual_packet
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.color_space import SH_C0
 from morgs_mi.evaluate.evaluate import IMAGE_SCORES, REGIONS, evaluate_stream
 from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.results import known_mean
@@ -106,6 +107,16 @@ def test_evaluate_stream__scores_the_held_out_view_registered_too(fitted_clip: P
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
     assert result.registered_psnr > result.scores.psnr + 10
     assert f"{result.registered_psnr:.2f} dB registered" in " ".join(evaluation_summary(result))
+
+
+def test_evaluate_stream__scores_the_held_out_view_with_matched_colours_too(fitted_clip: Path, tmp_path: Path) -> None:
+    bright = moved(0).sh_coeffs + 0.5 / SH_C0
+    darker = replace(moved(0), sh_coeffs=0.9 * bright - 0.5 / SH_C0)
+    with StreamWriter(tmp_path / "s.morgs", CAMERAS, 25, {"test_view": 0}) as writer:
+        writer.write(keyframe_packet(darker, 0, CAMERAS, EXACT))
+    result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
+    assert result.scores.psnr_matched > result.scores.psnr + 10
+    assert f"{result.scores.psnr_matched:.2f} dB after the gain and bias" in " ".join(evaluation_summary(result))
 
 
 def test_evaluate_stream__reports_every_score_by_region(fitted_clip: Path) -> None:

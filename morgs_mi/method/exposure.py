@@ -1,0 +1,216 @@
+"""Exposure and white balance of each camera and frame: a gain and a bias per channel. Beyond the paper.
+
+A camera shows the display-referred colours x of the scene as y = gain x + bias. As sRGB is 1.055 l^(1/2.4) - 0.055 of
+the light l, a factor on the light is such a map, except in the darkest tones. It is solved in closed form by least
+squares with a prior, weighted against outliers: what moved, highlights, and what a rendering lacks.
+
+Between cameras, x is a rendering of Gaussians that all cameras share (see `fit.balance`). Over time, x is the image of
+the same camera that changes are detected against, so that static pixels do not change where the exposure does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from morgs_mi.core.checks import check_number
+
+__all__ = ["Exposure", "ExposureConfig", "centred", "common_change", "fit_exposure", "follow_exposure"]
+
+# Values, of 1, that are neither nearly black nor nearly white.
+_DARK, _BRIGHT = 0.03, 0.97
+# Steps of the reweighted least squares, and the least scale of its errors, of 1.
+_STEPS, _LEAST_SCALE = 13, 1e-3
+_MIN_PIXELS = 30
+# Gains beyond 4, and inverse ones, are no exposures: the images do not show the same.
+_MAX_LOG_GAIN = np.log(4)
+# Normal standard deviations in a median absolute deviation.
+_NORMAL = 1.4826
+_WIDTH = 160  # px, of the thumbnails on which changes over time are measured: means of pixels have less noise
+# sRGB is 1.055 l^(1/2.4) - 0.055: a gain g of the light's root comes with the bias 0.055 (g - 1).
+_TOE = 0.055
+_TONES = np.array([0.1, 0.5, 0.9])[:, None]
+
+
+@dataclass(frozen=True)
+class ExposureConfig:
+    """Settings of the exposures."""
+
+    prior: float = 1e-4
+    """Weight of the prior of a gain, relative to all pixels: it acts where nearly all pixels are dark."""
+    bias_prior: float = 0.02
+    """Weight of the prior of a bias beyond that of a factor on the light, likewise: it acts where images have little
+    contrast, so that a gain explains a change there."""
+    least_change: float = 3e-3
+    """Change of tones over time, of 1, below which an image is not corrected: it is an error of the measurement."""
+    gaussians: int = 4000
+    """Gaussians of the fits by which the cameras of the first frame are balanced."""
+    steps: int = 300
+    """Steps of such a fit; each further round takes half as many."""
+    rounds: int = 5
+    """Rounds of fitting Gaussians and solving for the exposures."""
+    width: int = 320
+    """Least width to which images are reduced for that, px."""
+    least_difference: float = 0.005
+    """Difference of tones, of 1, from which `auto` considers to take the exposures: about a grey level."""
+    least_gain: float = 0.1
+    """Increase of the PSNR of withheld pixels from which it takes them, dB: less is chance."""
+
+    @property
+    def priors(self) -> tuple[float, float]:
+        """Weights of both priors."""
+        return self.prior, self.bias_prior
+
+    def __post_init__(self) -> None:
+        for name, low in (("gaussians", 4), ("steps", 2), ("rounds", 1), ("width", 1)):
+            check_number("ExposureConfig()", name, getattr(self, name), f"[{low}, inf)")
+        for name in ("prior", "bias_prior", "least_change", "least_difference", "least_gain"):
+            check_number("ExposureConfig()", name, getattr(self, name), "[0, inf)")
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """Exposure and white balance of an image: recorded = gain * scene + bias, display-referred in [0, 1].
+
+    Attributes:
+        gain: of R, G and B.
+        bias: of R, G and B.
+    """
+
+    gain: tuple[float, ...] = (1.0, 1.0, 1.0)
+    bias: tuple[float, ...] = (0.0, 0.0, 0.0)
+
+    def __call__(self, colors: np.ndarray) -> np.ndarray:
+        """Return how the camera shows colours [..., 3] of the scene; not clipped."""
+        return colors * np.array(self.gain) + np.array(self.bias)
+
+    def corrected(self, image: np.ndarray) -> np.ndarray:
+        """Return the image, uint8 [H, W, 3], in the colours of the scene; what was clipped stays lost."""
+        if self == Exposure():
+            return image
+        table = 255 * self.inverse(np.arange(256)[:, None] / 255)
+        return cv2.LUT(image, np.clip(np.rint(table), 0, 255).astype(np.uint8)[None])
+
+    def inverse(self, colors: np.ndarray) -> np.ndarray:
+        """Return the colours [..., 3] of the scene that the camera shows as these."""
+        return (colors - np.array(self.bias)) / np.array(self.gain)
+
+    def after(self, first: Exposure) -> Exposure:
+        """Return the exposure that acts as `first` and then this one."""
+        gain = np.array(self.gain)
+        return _exposure(gain * first.gain, gain * first.bias + np.array(self.bias))
+
+    def without(self, first: Exposure) -> Exposure:
+        """Return the exposure that, after `first`, acts as this one."""
+        gain = np.array(self.gain) / first.gain
+        return _exposure(gain, np.array(self.bias) - gain * first.bias)
+
+    @property
+    def change(self) -> float:
+        """Largest change of a dark, middle or bright tone, of 1."""
+        return float(np.abs(self(_TONES) - _TONES).max())
+
+
+def fit_exposure(
+    scene: np.ndarray,
+    recorded: np.ndarray,
+    mask: np.ndarray | None = None,
+    prior: Exposure | None = None,
+    weights: tuple[float, float] = (ExposureConfig.prior, ExposureConfig.bias_prior),
+) -> Exposure:
+    """Return the exposure that shows the colours of a scene as a recorded image.
+
+    Args:
+        scene: colours [H, W, 3] in [0, 1].
+        recorded: image of the same pixels, likewise.
+        mask: pixels that count [H, W]; None: all.
+        prior: expected exposure; None: no change.
+        weights: of the priors of gain and bias, see `ExposureConfig`.
+
+    Returns:
+        The exposure, or the prior where it is not determined: with few well-exposed pixels, and for images that do not
+        show the same.
+    """
+    prior = prior or Exposure()
+    good = ((recorded > _DARK) & (recorded < _BRIGHT) & (scene > _DARK) & (scene < _BRIGHT)).all(axis=-1)
+    good = good if mask is None else good & mask
+    if good.sum() < _MIN_PIXELS:
+        return prior
+    channels = zip(scene[good].T.astype(float), recorded[good].T.astype(float), prior.gain, prior.bias, strict=True)
+    gains, biases = zip(*(_line(x, y, line, weights) for x, y, *line in channels), strict=True)
+    plausible = min(gains) > 0 and np.abs(np.log(gains)).max() < _MAX_LOG_GAIN
+    return _exposure(np.array(gains), np.array(biases)) if plausible else prior
+
+
+def _line(x: np.ndarray, y: np.ndarray, prior: Sequence[float], weights: tuple[float, float]) -> tuple[float, float]:
+    """Return slope and intercept of y over x [P] by reweighted least squares (Geman and McClure 1987)."""
+    # The change of the gain, and of the bias beyond that of a factor on the light.
+    rows, rest = np.stack([x + _TOE, np.ones_like(x)]), y - prior[0] * x - prior[1]
+    regular, counts = len(x) * np.diag(weights), np.ones_like(x)
+    for _ in range(_STEPS):
+        change = np.linalg.solve((rows * counts) @ rows.T + regular, (rows * counts) @ rest)
+        errors = rest - change @ rows
+        scale = 2 * max(_NORMAL * float(np.median(np.abs(errors))), _LEAST_SCALE)
+        counts = (1 + (errors / scale) ** 2) ** -2.0
+    return float(prior[0] + change[0]), float(prior[1] + change[1] + _TOE * change[0])
+
+
+def centred(exposures: Mapping[int, Exposure]) -> dict[int, Exposure]:
+    """Return the exposures of all cameras such that their mean log gain and mean bias are 0.
+
+    Which of them are right is unknown: all could be brighter and the scene darker.
+    """
+    gains = np.array([exposure.gain for exposure in exposures.values()])
+    biases = np.array([exposure.bias for exposure in exposures.values()])
+    gains = gains / np.exp(np.log(gains).mean(axis=0))
+    biases = biases - gains * biases.mean(axis=0) / gains.mean(axis=0)
+    return {v: _exposure(*pair) for v, *pair in zip(exposures, gains, biases, strict=True)}
+
+
+def common_change(exposures: Sequence[Exposure]) -> Exposure:
+    """Return the change that all cameras show, which is that of the scene's light, or none if they differ too much.
+
+    The cameras' common change is their median, if most are nearer to it than half of its size.
+    """
+    if len(exposures) < 3:
+        return Exposure()
+    lines = np.array([(e.gain, e.bias) for e in exposures])
+    middle = _exposure(*np.median(lines, axis=0))
+    spread = float(np.median([np.abs(e(_TONES) - middle(_TONES)).max() for e in exposures]))
+    return middle if spread < 0.5 * middle.change else Exposure()
+
+
+def follow_exposure(
+    reference: np.ndarray,
+    image: np.ndarray,
+    mask: np.ndarray | None = None,
+    last: Exposure | None = None,
+    weights: tuple[float, float] = (ExposureConfig.prior, ExposureConfig.bias_prior),
+) -> Exposure:
+    """Return the exposure of an image relative to an earlier one of the same fixed camera.
+
+    Args:
+        reference: the earlier image, uint8 [H, W, 3].
+        image: the later one, likewise.
+        mask: pixels that count [H, W]; None: all.
+        last: exposure of the last frame, the prior; None: that of the reference.
+        weights: of the priors, as for `fit_exposure`.
+    """
+    height, width = image.shape[:2]
+    size = (min(width, _WIDTH), max(1, round(height * min(1, _WIDTH / width))))
+    before, now = (
+        cv2.resize(x.astype(np.float32) / 255, size, interpolation=cv2.INTER_AREA) for x in (reference, image)
+    )
+    small = None if mask is None else cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
+    return fit_exposure(before, now, small, last, weights)
+
+
+def _thumb(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    return np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA))
+
+
+def _exposure(gain: np.ndarray, bias: np.ndarray) -> Exposure:
+    return Exposure(tuple(map(float, gain)), tuple(map(float, bias)))

@@ -1,0 +1,28 @@
+"""Report on exposures: the page that quotes the committed figures, and a tiny clip."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from benchmarks.reports import exposure
+from benchmarks.reports.exposure import Options, exposure_table
+from tests.benchmarks.reports.pages import ROOT, page
+
+
+def test_exposure_page__quotes_the_committed_tables() -> None:
+    for name in ("exposure", "exposure_chosen"):
+        committed = json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text())
+        assert exposure_table(committed["fits"]) in page("exposure.md")
+
+
+@pytest.mark.slow
+def test_main__measures_a_tiny_clip(tmp_path: Path) -> None:
+    work = {"num_gaussians": 200, "first_frame_steps": 10, "epochs": 1, "width": 64, "frames": 3}
+    options = Options(json=tmp_path / "out.json", seeds=(3,), clips=tmp_path / "clips", **work)
+    exposure.main(options)
+    found = json.loads((tmp_path / "out.json").read_text())
+    assert list(found["fits"]) == ["3 equal off", "3 equal auto", "3 disturbed off", "3 disturbed auto"]
+    assert exposure_table(found["fits"]).count("\n") == 5

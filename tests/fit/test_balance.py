@@ -1,0 +1,94 @@
+"""Balance of cameras whose exposures differ, against those that were applied to the images."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morgs_mi import Gaussians, RenderConfig, rasterize
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
+from morgs_mi.fit.balance import Balance, balance_cameras
+from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.method.exposure import Exposure, ExposureConfig
+from tests.scenes.cameras import QUAD, look_at_cameras
+from tests.scenes.gaussians import isotropic
+
+RENDER = RenderConfig()
+CAMERAS = look_at_cameras(QUAD, 50, 96, 72)
+# Factors on the light, whose mean logarithm is 0, as that of the result.
+GAINS = np.exp([0.24, -0.24, 0.12, -0.12])
+TONES = np.array([0.3, 0.5, 0.7])[:, None]
+FIT = FitConfig(exposure="auto", exposures=ExposureConfig(gaussians=400, steps=100, rounds=6))
+
+
+def scene() -> Gaussians:
+    """A textured wall; all Gaussians are seen by all cameras."""
+    rng = np.random.default_rng(0)
+    return isotropic(
+        rng.uniform((-2.4, -2.0, 0.6), (2.4, 2.0, 1.2), (400, 3)), 0.16, 0.95, rng.uniform(-1.0, 1.0, (400, 1, 3))
+    )
+
+
+def exposed(colors: np.ndarray, gain: float) -> np.ndarray:
+    return linear_to_srgb(np.clip(gain * srgb_to_linear(colors), 0, 1))
+
+
+def images(cameras: list[Camera], gains: np.ndarray) -> list[np.ndarray]:
+    rendered = [np.asarray(rasterize(scene(), camera, ("color",)).color) for camera in cameras]
+    return [
+        np.rint(255 * exposed(image.clip(0, 1), g)).astype(np.uint8) for g, image in zip(gains, rendered, strict=True)
+    ]
+
+
+def balanced(gains: np.ndarray, config: FitConfig = FIT) -> Balance:
+    start = replace(scene(), sh_coeffs=0.8 * scene().sh_coeffs)  # colours of points are about right
+    masks = [None] * len(CAMERAS)
+    given = start, CAMERAS, images(CAMERAS, gains), masks, scene_extent(CAMERAS), config, RENDER, 0
+    return balance_cameras(*given)
+
+
+def test_balance_cameras__finds_the_exposures_and_takes_them():
+    found = balanced(GAINS)
+    for exposure, gain in zip(found.exposures, GAINS, strict=True):
+        # A tenth of the largest change of a tone, 0.075, is left.
+        np.testing.assert_allclose(exposure(TONES), np.repeat(exposed(TONES, gain), 3, axis=1), atol=0.007)
+    assert found.taken
+    assert found.balanced_psnr > found.recorded_psnr + 5
+    assert "The cameras were balanced" in found.sentence
+
+
+def test_balance_cameras__leaves_equal_cameras_alone():
+    found = balanced(np.ones(4))
+    assert not found.taken
+    assert max(exposure.change for exposure in found.exposures) < 0.003
+    assert found.steps == 100 + 5 * 50, "nothing to judge"
+    assert "stay as recorded" in found.sentence
+
+
+def test_balance_cameras__judges_by_withheld_pixels(monkeypatch: pytest.MonkeyPatch):
+    scores = iter((25.0, 25.05))
+    monkeypatch.setattr("morgs_mi.fit.balance.mean_psnr", lambda *_: next(scores))
+    found = balanced(GAINS)
+    assert not found.taken
+    assert "balanced ones are no clear gain, withheld pixels have 25.05 dB instead of 25.00 dB" in found.sentence
+
+
+def test_balance_cameras__does_not_judge_where_balanced_cameras_are_wanted():
+    found = balanced(GAINS, replace(FIT, exposure="on"))
+    assert found.taken
+    assert np.isnan(found.recorded_psnr)
+    assert found.steps == 100 + 5 * 50
+
+
+def test_fit_config__refuses_an_unknown_choice():
+    with pytest.raises(ValueError, match="`exposure` must be off, auto or on, got 'yes'"):
+        FitConfig(exposure="yes")  # pyright: ignore[reportArgumentType]
+
+
+def test_balance__sentence_names_the_largest_change():
+    found = Balance((Exposure((1.1, 1, 1)), Exposure()), True, float("nan"), float("nan"), 0)
+    assert found.sentence == "The cameras were balanced: exposures differ by up to 9.0 % of white."

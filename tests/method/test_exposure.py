@@ -1,0 +1,127 @@
+"""Exposures in closed form: gains and biases, outliers, priors, and what all cameras have in common."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
+from morgs_mi.method.exposure import (
+    Exposure,
+    ExposureConfig,
+    centred,
+    common_change,
+    fit_exposure,
+    follow_exposure,
+)
+
+WARM = Exposure((1.1, 1.0, 0.9), (0.02, 0.0, -0.01))
+
+
+def scene(seed: int = 0, size: tuple[int, int] = (60, 80)) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0.1, 0.8, (*size, 3))
+
+
+def as_bytes(colors: np.ndarray) -> np.ndarray:
+    return np.rint(255 * colors.clip(0, 1)).astype(np.uint8)
+
+
+def assert_close(found: Exposure, expected: Exposure, atol: float) -> None:
+    np.testing.assert_allclose((found.gain, found.bias), (expected.gain, expected.bias), atol=atol)
+
+
+def test_fit_exposure__finds_gain_and_bias_of_each_channel():
+    assert_close(fit_exposure(scene(), WARM(scene()), weights=(0, 0)), WARM, 1e-9)
+
+
+def test_fit_exposure__is_not_drawn_by_a_third_of_moved_pixels():
+    recorded = WARM(scene())
+    recorded[:20] = scene(1)[:20]
+    assert_close(fit_exposure(scene(), recorded, weights=(0, 0)), WARM, 2e-3)
+
+
+def test_fit_exposure__explains_a_factor_on_the_light_within_a_grey_level():
+    colors = scene()
+    brighter = linear_to_srgb(1.2 * srgb_to_linear(colors))
+    found = fit_exposure(colors, brighter)
+    assert np.abs(found(colors) - brighter).max() < 1 / 255
+
+
+def test_fit_exposure__is_the_prior_without_well_exposed_pixels():
+    assert fit_exposure(np.ones((40, 40, 3)), scene(size=(40, 40)), prior=WARM) == WARM
+
+
+def test_fit_exposure__is_the_prior_of_images_that_do_not_show_the_same():
+    assert fit_exposure(scene(), 0.9 - scene(), prior=WARM) == WARM
+
+
+def test_fit_exposure__explains_a_change_by_a_factor_on_the_light_where_images_have_no_contrast():
+    dull = linear_to_srgb(np.random.default_rng(0).uniform(0.2, 0.21, (40, 40, 3)))
+    found = fit_exposure(dull, linear_to_srgb(1.1 * srgb_to_linear(dull)))
+    np.testing.assert_allclose(found(scene()), linear_to_srgb(1.1 * srgb_to_linear(scene())), atol=0.003)
+
+
+def test_fit_exposure__ignores_masked_pixels():
+    recorded, mask = WARM(scene()), np.ones((60, 80), bool)
+    recorded[:45], mask[:45] = 0.5, False
+    assert_close(fit_exposure(scene(), recorded, mask, weights=(0, 0)), WARM, 1e-9)
+
+
+def test_exposure__corrects_to_the_colours_of_the_scene():
+    image = as_bytes(scene())
+    shown = as_bytes(WARM(image / 255))
+    assert np.abs(WARM.corrected(shown).astype(int) - image).max() <= 1
+    assert Exposure().corrected(image) is image
+
+
+def test_exposure__composes():
+    first, second = Exposure((1.2, 1, 1), (0.1, 0, 0)), Exposure((0.5, 2, 1), (0, 0, 0.3))
+    np.testing.assert_allclose(second.after(first)(scene()), second(first(scene())))
+    np.testing.assert_allclose(second.after(first).without(first)(scene()), second(scene()))
+
+
+def test_centred__leaves_differences_between_cameras_and_no_mean():
+    given = {0: WARM, 3: Exposure((1.3, 1.2, 1.1), (0.1, 0.1, 0.0))}
+    found = centred(given)
+    np.testing.assert_allclose(np.log([e.gain for e in found.values()]).mean(axis=0), 0, atol=1e-12)
+    np.testing.assert_allclose(np.mean([e.bias for e in found.values()], axis=0), 0, atol=1e-12)
+    # The map from one camera's image to another's is the same.
+    colors = scene()
+    np.testing.assert_allclose(found[3](found[0].inverse(colors)), given[3](given[0].inverse(colors)))
+
+
+def test_common_change__is_that_of_most_cameras():
+    dimmed = Exposure((0.8,) * 3, (0.0,) * 3)
+    assert_close(common_change([dimmed, dimmed, Exposure((0.81,) * 3), WARM]), Exposure((0.805,) * 3), 0.01)
+
+
+def test_common_change__is_none_where_cameras_differ():
+    gains = (0.9, 0.95, 1.02, 1.1)
+    assert common_change([Exposure((gain,) * 3) for gain in gains]) == Exposure()
+
+
+def test_common_change__needs_three_cameras():
+    assert common_change([WARM, WARM]) == Exposure()
+
+
+@pytest.mark.parametrize("noise", [0, 2])
+def test_follow_exposure__is_none_without_a_change(noise: int):
+    rng, image = np.random.default_rng(2), as_bytes(scene(size=(120, 160)))
+    noisy = np.clip(image + rng.normal(0, noise, image.shape).round(), 0, 255).astype(np.uint8)
+    noisy[:30] = 90  # something moved
+    assert follow_exposure(image, noisy).change < ExposureConfig.least_change
+
+
+def test_follow_exposure__finds_a_change_of_two_percent():
+    image = as_bytes(scene(size=(120, 160)))
+    change = Exposure((1.02, 0.98, 1.0), (0.0011, -0.0011, 0))
+    assert_close(follow_exposure(image, as_bytes(change(image / 255))), change, 2e-3)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["gaussians", "steps", "rounds", "width", "prior", "bias_prior", "least_change", "least_difference", "least_gain"],
+)
+def test_exposure_config__refuses_negative_numbers(name: str):
+    with pytest.raises(ValueError, match=name):
+        ExposureConfig(**{name: -1})
