@@ -208,9 +208,5 @@ def follow_exposure(
     return fit_exposure(before, now, small, last, weights)
 
 
-def _thumb(image: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    return np.asarray(cv2.resize(image.astype(np.float32), size, interpolation=cv2.INTER_AREA))
-
-
 def _exposure(gain: np.ndarray, bias: np.ndarray) -> Exposure:
     return Exposure(tuple(map(float, gain)), tuple(map(float, bias)))
