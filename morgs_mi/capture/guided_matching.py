@@ -21,6 +21,8 @@ __all__ = ["match_guided"]
 _BAND, _MAX_DISTANCE = 1.0, 0.9
 # Largest difference of the patches in size, octaves, and in orientation, degrees.
 _MAX_OCTAVES, _MAX_TURN = 0.7, 30.0
+# Distance of two cameras, relative to that from the origin, that rounding can cause.
+_ROUNDING = 1e-9
 
 
 def match_guided(
@@ -43,6 +45,9 @@ def match_guided(
 
 def _line_distances(x: np.ndarray, y: np.ndarray, a: Camera, b: Camera) -> np.ndarray:
     """Return the larger distance of two pixel positions, [K, 2] and [L, 2], from each other's lines, [K, L], px."""
+    centres = np.array([a.position, b.position], np.float64)
+    if np.linalg.norm(centres[1] - centres[0]) <= _ROUNDING * np.linalg.norm(centres):
+        return np.full((len(x), len(y)), np.inf)  # two cameras at one place have no lines
     relative = np.asarray(b.viewmat, np.float64) @ np.linalg.inv(np.asarray(a.viewmat, np.float64))
     (tx, ty, tz), R = relative[:3, 3], relative[:3, :3]
     essential = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ R
@@ -50,7 +55,7 @@ def _line_distances(x: np.ndarray, y: np.ndarray, a: Camera, b: Camera) -> np.nd
     x, y = (np.column_stack([v, np.ones(len(v))]) for v in (x, y))
     of_x, of_y = x @ fundamental.T, y @ fundamental
     slopes = np.minimum(np.hypot(*of_x[:, :2].T)[:, None], np.hypot(*of_y[:, :2].T))
-    with np.errstate(divide="ignore", invalid="ignore"):  # two cameras at one place have no lines
+    with np.errstate(divide="ignore", invalid="ignore"):  # the epipoles have no lines
         return np.abs(of_x @ y.T) / slopes
 
 
