@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.evaluate.metrics import ssim
 from morgs_mi.losses.losses import depth_loss, flow_loss, mask_loss, offset_loss, recon_loss
 from morgs_mi.losses.ssim import Target
@@ -242,7 +243,8 @@ def test_recon_loss__compiles_its_kernels_once_for_all_sizes():
     rng = np.random.default_rng(0)
 
     def step(height, width):
-        image = mi.TensorXf(np.float32(rng.uniform(size=(height, width, 3)))) * dr.opaque(mi.Float, 1)
+        # An array of NumPy may not be aligned, which needs a kernel of its own.
+        image = from_numpy(mi.TensorXf, rng.uniform(size=(height, width, 3))) * dr.opaque(mi.Float, 1)
         dr.eval(image)
         dr.enable_grad(image)
         dr.backward(recon_loss(image, Target(np.asarray(image))))
