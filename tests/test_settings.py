@@ -52,7 +52,7 @@ VALUES: dict[str, Any] = {
     "motion.flow.min_side": 100,
     "motion.flow.fine_width": 32,
     "motion.propagation.floor_px": 10.0,
-    "motion.propagation.min_logit": 2.5,
+    "motion.propagation.min_logit": 6.0,
     "motion.active_set.max_changed": 0.0,
     "motion.active_set.quiet_views": 1,
     "motion.photometric.floor_px": 100.0,
