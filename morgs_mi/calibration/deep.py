@@ -31,7 +31,7 @@ _OFFSET, _OFFSET_CHANGE, _MIN_HALF = 0.65, 0.75, 24
 _EXPOSURE, _BALANCE, _MIN_SAMPLES = 0.1, 0.05, 16
 # Error of a median log ratio that no number of points removes, because surfaces look different from two sides.
 _LOG_ERROR = 0.02
-# Range of the log brightness over time, about 8 %. People who walk through a room change it by up to 5 %.
+# Threshold on the range of the log brightness over time, about 8 %: people walking through a room cause up to 5 %.
 _VARIATION = 0.08
 # Octaves by which an image is less sharp than those of the rig, and than the others of its camera.
 _BLUR, _BLURRED_FRAME, _SPREADS = 1.0, 0.5, 6.0

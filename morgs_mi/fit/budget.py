@@ -1,7 +1,4 @@
-"""The steps and Gaussians of the first frame within a time budget, from the speed of a few steps on this machine.
-
-Where the time allows few steps, more steps with fewer Gaussians are better (see `docs/experiments/first-frame.md`).
-"""
+"""The number of steps of the first frame within a time budget, from the speed of a few steps on this machine."""
 
 from __future__ import annotations
 
@@ -21,17 +18,15 @@ from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["PlannedTrials", "planned_trials", "within_seconds"]
+__all__ = ["PlannedTrials", "planned_trials", "steps_within"]
 
 # Steps that are timed, and the least number that a first frame gets.
 _TIMED, _LEAST = 20, 100
-# Steps below which there are fewer Gaussians, in proportion.
-_FEW = 200
 # Mean time of a step over that of the first ones, whose Gaussians density control doubles.
 _GROWTH = 1.5
 
 
-def within_seconds(
+def steps_within(
     seconds: float,
     gaussians: Gaussians,
     cameras: Sequence[Camera],
@@ -41,11 +36,10 @@ def within_seconds(
     render: RenderConfig,
     seed: Sequence[int],
     prior: DepthPrior | None = None,
-) -> FitConfig:
-    """Return the settings with the number of steps of the first frame, at least 100, that this machine makes in a time.
+) -> int:
+    """Return the number of steps of the first frame, at least 100, that this machine makes in a time.
 
-    Where they are fewer than 200, density control adds fewer Gaussians or none, so that there are more. The time of the
-    measurement and of the trials is part of the given one. The same `first_frame_steps` and `num_gaussians` give the
+    The time of the measurement and of the trials is part of it. The same number as `first_frame_steps` gives the
     same result on any machine.
 
     Args:
@@ -68,14 +62,8 @@ def within_seconds(
         start = time.perf_counter()
         fit_first_frame(gaussians, cameras, targets, extent, timed, render, np.random.default_rng(seed), None, prior)
         took = time.perf_counter() - start
-    per_step = took / _TIMED * (1 + sum(planned_trials(config, len(cameras))) * config.cross_validation.steps)
-    affordable = (seconds - (time.perf_counter() - begin)) / per_step
-    steps, planned = affordable / _GROWTH, config.planned_gaussians
-    if steps < _FEW:
-        planned = max(config.first_count, round(planned * steps / _FEW))
-        added = 2 * planned / config.planned_gaussians - 1
-        steps = affordable / (1 + (_GROWTH - 1) * added)
-    return replace(config, first_frame_steps=max(_LEAST, int(steps)), num_gaussians=planned)
+    per_step = _GROWTH * took / _TIMED * (1 + sum(planned_trials(config, len(cameras))) * config.cross_validation.steps)
+    return max(_LEAST, int((seconds - (time.perf_counter() - begin)) / per_step))
 
 
 class PlannedTrials(NamedTuple):

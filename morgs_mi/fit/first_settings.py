@@ -11,7 +11,7 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.agreement import NUM_FITS, Agreement, compare_fits
-from morgs_mi.fit.budget import planned_trials, within_seconds
+from morgs_mi.fit.budget import planned_trials, steps_within
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, trial_steps
 from morgs_mi.fit.depth_prior import DepthPrior
@@ -30,7 +30,7 @@ class FirstSettings:
     """Settings of the first frame.
 
     Attributes:
-        config: with a number of steps, in a time budget also of Gaussians, and a strength of dropping.
+        config: with a number of steps and a strength of dropping.
         expected: what to expect of views between the cameras, by each way that was taken; none for a single camera.
         steps_before: number of steps that trials have made.
     """
@@ -74,8 +74,10 @@ def first_settings(
         prior: inverse depth of the views, or None.
     """
     if config.first_frame_seconds is not None:
-        timed = config.first_frame_seconds, gaussians, cameras, targets, extent, config, render
-        config = within_seconds(*timed, [*seed, 1], prior)
+        steps = steps_within(
+            config.first_frame_seconds, gaussians, cameras, targets, extent, config, render, [*seed, 1], prior
+        )
+        config = replace(config, first_frame_steps=steps)
     if config.dropping is not None:
         return FirstSettings(config, (forecast(cameras, points),) if len(cameras) > 1 else ())
     planned, given = planned_trials(config, len(cameras)), (cameras, images, masks, extent)

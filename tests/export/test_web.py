@@ -265,7 +265,7 @@ def test_page__steps_to_frames_that_are_being_decoded(page):
     page.page.evaluate("for (let position = 1; position <= 3; position++) player.playback.seek(position)")
     page.wait("player.playback.position === 3 && player.settled")
     assert np.array_equal(page.image(), jumped)
-    # Every frame on the way was shown once, none was decoded anew.
+    # Each intermediate frame was shown once, and none was decoded twice.
     assert page.page.evaluate("player.playback.decodeTimes.length") <= decoded + 3
 
 
