@@ -7,7 +7,7 @@ Presets:
     paper                             all three modules; motion starts from zero instead of the lifted flow, one gate,
                                       constant learning rates
     hicom, rigidity, gates, cache,
-    grid                              what another publication adds to the baseline (docs/experiments/field.md)
+    grid, anchors                     what another publication adds to the baseline (docs/experiments/field.md)
 
 The number of key views (2, 4, 8 or 12 in the paper) is `MotionConfig.key_views` and belongs to no preset.
 
@@ -51,7 +51,7 @@ __all__ = [
 ]
 
 PresetName = Literal[
-    "l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper", "hicom", "rigidity", "gates", "cache", "grid"
+    "l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper", "hicom", "rigidity", "gates", "cache", "grid", "anchors"
 ]
 Config = TypeVar("Config")
 _NONE = "none"
@@ -117,6 +117,7 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
     },
     "cache": {"motion": {"model": "cache", **_modules(False, False, False)}},
     "grid": {"motion": {"model": "grid", **_modules(False, False, False)}},
+    "anchors": {"motion": {"model": "anchors", **_modules(False, False, False)}},
 }
 
 

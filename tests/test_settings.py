@@ -90,6 +90,7 @@ ELSEWHERE: dict[str, str] = {
     "motion.hicom": "a model that is not the default: tests/fit/test_motion_stage.py",
     "motion.cache": "a model that is not the default: tests/fit/test_motion_stage.py",
     "motion.grid": "a model that is not the default: tests/fit/test_motion_stage.py",
+    "motion.anchors": "a model that is not the default: tests/fit/test_motion_stage.py",
     "codec.keyframe_interval": "keyframes are written by the recorder: tests/test_recorder.py",
 }
 

@@ -47,6 +47,7 @@ METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "gates": ("gates", {}),
     "cache": ("cache", {}),
     "grid": ("grid", {}),
+    "anchors": ("anchors", {}),
     "paper": ("paper", {}),
     "default": (DEFAULT, {}),
     "default + grid": (DEFAULT, {"motion": _SHORT_GRID}),

@@ -13,6 +13,7 @@ from morgs_mi.core.types import Tensor
 from morgs_mi.fit.optimise import adam, optimise, values_of
 from morgs_mi.losses.losses import recon_loss
 from morgs_mi.losses.ssim import Target
+from morgs_mi.method.anchors import anchored_motion
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.hicom import coherent_motion
 from morgs_mi.method.lift import Lift
@@ -101,3 +102,5 @@ def motion_model(
             return transformation_cache(gaussians, extent, rng, config.cache)
         case "grid":
             return motion_grid(gaussians, extent, config.grid)
+        case "anchors":
+            return anchored_motion(gaussians, extent, config.anchors)

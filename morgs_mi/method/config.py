@@ -7,6 +7,7 @@ from typing import Literal
 
 from morgs_mi.core.checks import check_number
 from morgs_mi.method.active_set import ActiveSetConfig
+from morgs_mi.method.anchors import AnchorConfig
 from morgs_mi.method.change import ChangeConfig
 from morgs_mi.method.cohesion import CohesionConfig
 from morgs_mi.method.flow_sources.config import FlowConfig
@@ -70,7 +71,7 @@ class MotionConfig:
     """Gate below which a lifted motion is no longer scaled up to pass the gate at full length."""
     confidence_decay: float = 0.3
     """Logit that a confidence loses per frame without evidence of motion: where something moved, more is to correct."""
-    model: Literal["none", "hicom", "cache", "grid"] = "none"
+    model: Literal["none", "hicom", "cache", "grid", "anchors"] = "none"
     """Motion that Gaussians share, fitted before the residual: none, or that of another publication (see
     docs/experiments/field.md)."""
     model_share: float = 0.5
@@ -101,6 +102,8 @@ class MotionConfig:
     """Neural transformation cache, the model `cache`."""
     grid: GridConfig = field(default_factory=GridConfig)
     """Motion grid whose rate is part of the loss, the model `grid`."""
+    anchors: AnchorConfig = field(default_factory=AnchorConfig)
+    """Motion of anchors, the model `anchors`."""
 
     def __post_init__(self) -> None:
         for name in ("key_views", "mask_interval"):

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from morgs_mi.export.order import equal_cells, z_order
+from morgs_mi.core.z_order import equal_cells, z_order
 
 __all__ = ["SplatChunks", "packed_splats"]
 

@@ -12,6 +12,7 @@ from morgs_mi.fit.config import DensityConfig, FitConfig
 from morgs_mi.fit.later_frame import FrameProblem, LaterFrame, fit_later_frame
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import full_active_set
+from morgs_mi.method.anchors import AnchorConfig
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.hicom import HicomConfig
 from morgs_mi.method.lift import Lift
@@ -26,6 +27,7 @@ MODELS = {
     "hicom": replace(PLAIN, model="hicom", hicom=HicomConfig(cells=(1.0, 0.3), translation_rate=2e-3)),
     "cache": replace(PLAIN, model="cache", cache=CacheConfig(levels=2, coarsest=1.0)),
     "grid": replace(PLAIN, model="grid", grid=GridConfig(cells=(1.0, 0.3), translation_rate=2e-3)),
+    "anchors": replace(PLAIN, model="anchors", anchors=AnchorConfig(levels=2, gaussians=40, translation_rate=2e-3)),
 }
 FIT = FitConfig(sh_degree=0, epochs=8, density=DensityConfig(later_frames=False))
 
@@ -96,6 +98,15 @@ SETTINGS = {
         "scale": 0.5,
         "scale_rate": 1.0,
         "rate_weight": 1.0,
+    },
+    "anchors": {
+        "levels": 1,
+        "gaussians": 80,
+        "ratio": 2,
+        "translation_step": 0.0,
+        "rotation_step": 0.0,
+        "translation_rate": 1e-3,
+        "rotation_rate": 0.0,
     },
 }
 
