@@ -81,8 +81,8 @@ def exact_depth(capture: Capture, camera: Camera) -> np.ndarray:
 
 def measure(capture: Capture, seed: int, options: Options) -> list[dict[str, Any]]:
     """Return the mean PSNR of the training views and of the held-out ones, without a prior and with each."""
-    others, every, config = capture.train_views, range(len(capture.cameras)), FitConfig()
-    train = [others[k] for k in spread_views([capture.cameras[v] for v in others], options.views)]
+    every, config = range(len(capture.cameras)), FitConfig()
+    train = spread_views(capture.cameras, options.views, capture.train_views)
     capture = with_points(capture, train, options.points)
     cameras, rng = [capture.cameras[v] for v in train], np.random.default_rng(seed)
     images = list(next(capture.frames(0, 1)).images)

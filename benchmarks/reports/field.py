@@ -61,6 +61,8 @@ _PLOTTED = (
     ("motion_error_moving", "motion error where things move, px"),
 )
 _OVER_TIME = ("psnr", "psnr_moving", "motion_error_moving")
+# Scores whose standard deviation over the fits is in the table.
+_SPREAD = ("psnr", "psnr_moving", "Dynamic 3D Gaussians average_jaccard", "Dynamic 3D Gaussians median_error")
 # Of the columns: title, name of the score, factor, decimals.
 _COLUMNS = (
     ("PSNR, dB", "psnr", 1, 2),
@@ -172,13 +174,24 @@ def mean_scores(cells: Cells, method: str) -> dict[str, float]:
     return {name: known_mean([row[name] for row in rows]) for name in rows[0] if name != "by_frame"}
 
 
+def spread_of_scores(cells: Cells, method: str) -> dict[str, float]:
+    """Return the standard deviation over the fits, of the means over the clips; {} for a single fit of each clip."""
+    fits = sorted({name.split("/")[1] for name in cells})
+    means = [mean_scores({n: c for n, c in cells.items() if n.split("/")[1] == fit}, method) for fit in fits]
+    return {} if len(fits) == 1 else {name: float(np.std([m[name] for m in means], ddof=1)) for name in _SPREAD}
+
+
 def field_table(cells: Cells) -> str:
-    """Return the scores of the methods, means over the cells, as a table in Markdown."""
+    """Return the scores of the methods, means over the cells and their spread, as a table in Markdown."""
     rows = []
     for name in next(iter(cells.values())):
         method, epochs = name.split("/")
-        scores = mean_scores(cells, name)
-        values = (f"{factor * scores[score]:.{decimals}f}" for _, score, factor, decimals in _COLUMNS)
+        scores, spread = mean_scores(cells, name), spread_of_scores(cells, name)
+        values = (
+            f"{factor * scores[score]:.{decimals}f}"
+            + (f" ± {factor * spread[score]:.{decimals}f}" if score in spread else "")
+            for _, score, factor, decimals in _COLUMNS
+        )
         rows.append((f"`{method}`", epochs, *values))
     return markdown(("method", "epochs", *(title for title, *_ in _COLUMNS)), rows)
 

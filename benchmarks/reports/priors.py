@@ -10,6 +10,9 @@ of the package; the other priors are patched into the fit here:
     needles       mean(log(longest axis / (3 middle axis))), where that is positive
     exploration   noise of the means of nearly transparent Gaussians in every step, as 3DGS-MCMC has it
     smooth depth  0.1 mean|second derivative of the inverse depth|, falling to 0 over the steps
+    flat normals  0.1 mean|difference of the normals of neighbouring pixels|, falling to 0 over the steps
+    noise-aware   Huber's loss beyond twice the noise in place of L1, and less D-SSIM, whose C2 grows by its variance
+    exact depth   the depth prior, with the exact depth of synthetic captures in place of a network's
 """
 
 from __future__ import annotations
@@ -30,17 +33,22 @@ import tyro
 from scipy.special import expit
 
 from benchmarks.reports.cells import CellOptions
+from benchmarks.reports.depth_prior import exact_depth
 from benchmarks.reports.few_views import spread_views, with_points
 from benchmarks.reports.fits import first_frame
 from morgs_mi import stream_loop
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.core.types import Tensor
+from morgs_mi.core.types import Jit, Tensor
 from morgs_mi.fit import first_frame as first
+from morgs_mi.fit.depth_prior import depth_prior
+from morgs_mi.fit.dropping import noise_of
 from morgs_mi.fit.optimise import replace_parameter
+from morgs_mi.losses.ssim import Target
 from morgs_mi.render.rasterize import Image
 from morgs_mi.synth.synthesize import synthesize
 
@@ -48,6 +56,7 @@ CASES = ((20, 16, 0.0), (21, 8, 0.0), (22, 4, 0.0), (23, 16, 0.02), (24, 8, 0.02
 """Seed of the scene, number of training views, and noise of the reduced images relative to white."""
 
 Points = tuple[np.ndarray, np.ndarray]
+_C2 = 0.03**2  # of SSIM
 
 
 @dataclass(frozen=True)
@@ -100,6 +109,9 @@ class Options(CaseOptions):
         "needles",
         "exploration",
         "smooth depth",
+        "flat normals",
+        "noise-aware",
+        "exact depth",
     )
     """Priors that are compared."""
     steps: int = 600
@@ -124,7 +136,10 @@ def measured(source: Source, train: Sequence[int], points: Points, config: Strea
 
 def measure(source: Source, train: Sequence[int], points: Points, config: StreamConfig, prior: str) -> dict[str, float]:
     """Return what `measured` returns, with a prior."""
-    with _PATCHES[prior]() if prior in _PATCHES else ExitStack():
+    patched = _PATCHES[prior]() if prior in _PATCHES else ExitStack()
+    if prior == "exact depth":
+        patched = _known_depth(source.open(), train, points[0])
+    with patched:
         return measured(source, train, points, config)
 
 
@@ -213,24 +228,84 @@ class _Smooth:
 
 
 @dataclass(frozen=True)
-class _SmoothDepth:
+class _Flat:
+    """Stands in for the inverse depth of a view, too: the normals of neighbouring pixels are drawn to each other."""
+
+    camera: Camera
+
+    def loss(self, image: Image) -> Tensor:
+        height, width = image.depth.shape[:2]
+        x, y = (a.ravel() for a in np.meshgrid(np.arange(width - 2), np.arange(height - 2)))
+        (fx, _, cx), (_, fy, cy), _ = self.camera.K.tolist()
+
+        def point(dx: int, dy: int) -> mi.Vector3f:
+            column, row = (from_numpy(mi.UInt32, (a + d).astype(np.uint32)) for a, d in ((x, dx), (y, dy)))
+            depth: Jit = dr.gather(mi.Float, image.depth.array, row * width + column)
+            return depth * mi.Vector3f((column + (0.5 - cx)) / fx, (row + (0.5 - cy)) / fy, 1)
+
+        def normal(dx: int, dy: int) -> mi.Vector3f:
+            here = point(dx, dy)
+            across, down = point(dx + 1, dy) - here, point(dx, dy + 1) - here
+            # In units of the depth, so that the small number below makes flat what has no depth.
+            found = dr.cross(across, down) * dr.rcp(dr.square(dr.detach(dr.maximum(here.z, 1e-6))))
+            return found * dr.rsqrt(dr.squared_norm(found) + 1e-12)
+
+        middle = normal(0, 0)
+        return sum(dr.mean(dr.norm(normal(*offset) - middle + 1e-6)) for offset in ((1, 0), (0, 1)))
+
+
+@dataclass(frozen=True)
+class _Stand:
     """Stands in for a `DepthPrior`."""
 
-    aligned: tuple[_Smooth, ...]
+    aligned: tuple[Any, ...]
 
-    def realigned(self, *_: Any) -> _SmoothDepth:
+    def realigned(self, *_: Any) -> _Stand:
         return self
 
 
 @contextmanager
-def _smoothing() -> Iterator[None]:
+def _with_depth_term(prior: Callable[[Sequence[Camera]], Any]) -> Iterator[None]:
+    """Fit with a depth prior that follows from the cameras."""
     fit: Any = stream_loop.fit_first_frame
 
-    def smoothed(*args: Any) -> Any:
-        smooth: Any = _SmoothDepth((_Smooth(),) * len(args[1]))
-        return fit(*args[:-1], smooth)
+    def fitted(*args: Any) -> Any:
+        return fit(*args[:-1], prior(args[1]))
 
-    with patch.object(stream_loop, "fit_first_frame", smoothed):
+    with patch.object(stream_loop, "fit_first_frame", fitted):
+        yield
+
+
+def _known_depth(capture: Capture, train: Sequence[int], points: np.ndarray) -> Any:
+    """Fit with the exact inverse depth of the training views, which a capture without truth refuses."""
+    if capture.truth is None:
+        raise ValueError(f"{capture.path}: expected the truth beside the capture, found none; leave `exact depth` out.")
+    cameras = [capture.cameras[v] for v in train]
+    depths = [exact_depth(capture, camera) for camera in cameras]
+    inverse = [np.where(depth > 0, 1 / np.maximum(depth, 1e-6), 0) for depth in depths]
+    return _with_depth_term(lambda _: depth_prior(inverse, cameras, points))
+
+
+def huber(image: Tensor, target: Target, threshold: float) -> Tensor:
+    """Return the mean of Huber's loss, the absolute error less half the threshold beyond it."""
+    error = dr.abs(image.array - target.planes.image(target.pixels))
+    return dr.mean(dr.select(error < threshold, error * error / (2 * threshold), error - threshold / 2))
+
+
+@contextmanager
+def _noise_aware() -> Iterator[None]:
+    noise: dict[int, float] = {}
+    recon_loss = first.recon_loss
+
+    def aware(image: Tensor, target: Target, dssim_weight: float) -> Tensor:
+        if id(target) not in noise:
+            noise[id(target)] = noise_of((255 * target.image()).astype(np.uint8))
+        sigma = noise[id(target)]
+        weight = dssim_weight * _C2 / (_C2 + 2 * sigma**2)
+        similar = recon_loss(image, target, 1.0)
+        return (1 - weight) * huber(image, target, max(2 * sigma, 1e-4)) + weight * similar
+
+    with patch.object(first, "recon_loss", aware):
         yield
 
 
@@ -238,7 +313,9 @@ _PATCHES = {
     "penalties": lambda: _penalised(size_and_opacity),
     "needles": lambda: _penalised(needles),
     "exploration": _exploring,
-    "smooth depth": _smoothing,
+    "smooth depth": lambda: _with_depth_term(lambda cameras: _Stand((_Smooth(),) * len(cameras))),
+    "flat normals": lambda: _with_depth_term(lambda cameras: _Stand(tuple(map(_Flat, cameras)))),
+    "noise-aware": _noise_aware,
 }
 
 
@@ -263,7 +340,8 @@ def main(options: Options) -> None:
     about, cells = {}, {}
     for case, capture, train in options.cases():
         given = Source.of(capture), train, (capture.points, capture.point_colors)
-        for prior, seed in product(options.priors, options.fit_seeds):
+        known = [prior for prior in options.priors if capture.truth is not None or prior != "exact depth"]
+        for prior, seed in product(known, options.fit_seeds):
             name = f"{case}; {prior}; {seed}"
             cells[name] = *given, configured(options, prior, seed), prior
             about[name] = {"case": case, "prior": prior, "seed": seed}
