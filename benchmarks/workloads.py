@@ -117,4 +117,4 @@ def write_bin(gaussians: Gaussians, camera: Camera, path: Path) -> None:
         np.array([len(gaussians), camera.width, camera.height], np.int32).tofile(file)
         for column in columns:
             np.asarray(column, np.float32).tofile(file)
-        np.float32([*TARGET, 0, 0, 0]).tofile(file)
+        np.array([*TARGET, 0, 0, 0], np.float32).tofile(file)

@@ -70,13 +70,13 @@ class Options(CellOptions):
         """Return the clip of a cell."""
         folder = self.clips / name.replace(" ", "-")
         if not folder.exists():
-            size = {"width": self.width, "height": self.width * 3 // 4}
             synthesize(
                 self.model,
                 folder,
                 num_cameras=self.cameras,
                 num_frames=self.frames,
-                **size,
+                width=self.width,
+                height=self.width * 3 // 4,
                 disturbances=disturbances,
                 animation=self.animation,
             )

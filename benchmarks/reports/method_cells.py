@@ -103,7 +103,7 @@ class Clip:
         images = tuple(tuple(f.images[v] for v in capture.train_views) for f in capture.frames())
         contents = hashlib.sha256(np.ascontiguousarray(capture.points).tobytes())
         for image in (image for frame in images for image in frame):
-            contents.update(np.ascontiguousarray(image))
+            contents.update(np.ascontiguousarray(image).data)
         return cls(capture, images, contents.hexdigest())
 
     @property

@@ -107,7 +107,7 @@ class Reference64:
                 nudged = columns.astype(np.complex128)
                 nudged[:, k] += 1j * _STEP
                 numbers, _ = _project({**raw, name: nudged.reshape(raw[name].shape)}, self.camera, self.config.eps2d)
-                grad[:, k] = (numbers.imag / _STEP * incoming).sum(axis=1)
+                grad[:, k] = (np.imag(numbers) / _STEP * incoming).sum(axis=1)
             grads[name] = grad.reshape(raw[name].shape)
         positive = _project(raw, self.camera, self.config.eps2d)[0][:, 6:] > 0
         basis = _sh_basis(_directions(raw["means"], self.camera), raw["sh_coeffs"].shape[1])

@@ -6,9 +6,8 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import Any
-
-import drjit as dr
 
 # The first pattern that matches the start of a mnemonic determines its kind.
 _KINDS = (
@@ -54,7 +53,7 @@ def kernel_code(log: str, label: str) -> list[Instruction]:
         elif not text.startswith("jit_llvm_disasm(): ..."):
             break
     if not found:
-        raise SystemExit(f"kernel_code(): Dr.Jit {dr.__version__} printed no machine code for {label!r}.")
+        raise SystemExit(f"kernel_code(): Dr.Jit {version('drjit')} printed no machine code for {label!r}.")
     return found
 
 

@@ -24,7 +24,8 @@ def render(gaussians: Gaussians, camera: Camera, config: RenderConfig) -> Any:
     with dr.suspend_grad():
         splats = project(gaussians, camera, ("color",), config)
         color, _ = _blend(_columns(splats), _tile_lists(splats, camera), camera, config)
-    return mi.TensorXf(dr.ravel(mi.Color3f(*color)), (camera.height, camera.width, 3))
+    values: Any = dr.ravel(mi.Color3f(*color))
+    return mi.TensorXf(values, (camera.height, camera.width, 3))
 
 
 def step(gaussians: Gaussians, camera: Camera, target: Any, config: RenderConfig) -> list[Any]:

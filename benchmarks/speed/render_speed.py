@@ -108,7 +108,7 @@ def time_workload(path: Path, options: Options) -> dict[str, Any]:
         "size": [camera.width, camera.height],
         "threads": dr.thread_count(),
         "machine": f"{platform.machine()}, {machine()['processor']}",
-        "versions": {"mitsuba": mi.__version__, "drjit": dr.__version__, "python": platform.python_version()},
+        "versions": versions(),
         "variant": options.variant,
         "package": morgs_mi.__name__,
     }

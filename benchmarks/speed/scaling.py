@@ -289,9 +289,14 @@ def main(options: Options) -> None:
     mi.set_variant("llvm_ad_rgb")
     with TemporaryDirectory() as name:
         folder = Path(name)
-        size = {"width": options.width, "height": options.width * 3 // 4}
-        clip = {"num_cameras": options.cameras, "num_frames": options.frames}
-        synthesize(options.scene, folder / "clip", **clip, **size)
+        synthesize(
+            options.scene,
+            folder / "clip",
+            num_cameras=options.cameras,
+            num_frames=options.frames,
+            width=options.width,
+            height=options.width * 3 // 4,
+        )
         capture = load_capture(folder / "clip")
         runs, costs = measure(capture, options, folder)
     figures = {

@@ -81,7 +81,7 @@ def figures(n: int, width: int, height: int, options: Options) -> dict[str, Any]
         "surfaces": image(**surfaces, integrator={"type": "path"}),
         "both": image(**both, integrator={"type": "gaussian_splat", "surfaces": {"type": "path"}}),
         "shadow_ratio": lambda: mi.TensorXf(shadow_ratio(gaussians, inserted, camera.position)),
-        "tree": lambda: SplatRays(gaussians).transmittance(mi.Ray3f((0, 0, -3), (0, 0, 1))),
+        "tree": lambda: SplatRays(gaussians).transmittance(mi.Ray3f(mi.Point3f(0, 0, -3), mi.Vector3f(0, 0, 1))),
     }
     times = {name: seconds(work, options.repeats) for name, work in works.items()}
     times |= traced(gaussians, options)

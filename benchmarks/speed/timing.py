@@ -65,7 +65,7 @@ def stages(
     D-SSIM loss with its derivative.
     """
     config = RenderConfig()
-    target = np.broadcast_to(np.float32(TARGET), (camera.height, camera.width, 3)).copy()
+    target = np.broadcast_to(np.array(TARGET, np.float32), (camera.height, camera.width, 3)).copy()
     attributes, full, features = list(gaussians.items().values()), mi.TensorXf(target), None
     if num_features:
         features = mi.TensorXf(np.full((len(gaussians), num_features), 0.3, np.float32))

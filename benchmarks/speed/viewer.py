@@ -29,7 +29,7 @@ from playwright.sync_api import Page, sync_playwright
 from benchmarks.speed.output import Output
 from benchmarks.speed.web_player import FLAGS, write_clip
 
-SIZE = {"width": 640, "height": 360}
+SIZE: Any = {"width": 640, "height": 360}
 # Note the time at which all Gaussians are first drawn, in place of drawing them.
 NOTE_DRAWING = """(count) => {
   const { prototype } = WebGL2RenderingContext;
