@@ -77,6 +77,7 @@ ELSEWHERE: dict[str, str] = {
     "fit.exposures": "not estimated by default: tests/method/test_exposure.py, tests/fit/test_balance.py",
     "motion.flow.farneback": "a method that is not the default: tests/method/flow_sources",
     "motion.active_set.min_explained": "no change here is unexplained: tests/method/test_active_set.py",
+    "fit.noise_aware": "images without noise here: tests/fit/test_first_settings.py",
     "motion.active_set.min_cluster": "no change here is unexplained: tests/method/test_active_set.py",
     "motion.active_set.quiet_responsibility": "fewer views here than `quiet_views`: tests/method/test_active_set.py",
     "motion.masks": "tests/method/test_confidence.py and tests/method/mask_refiners",

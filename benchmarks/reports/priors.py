@@ -46,7 +46,7 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Jit, Tensor
 from morgs_mi.fit import first_frame as first
 from morgs_mi.fit.depth_prior import depth_prior
-from morgs_mi.fit.dropping import noise_of
+from morgs_mi.fit.noise import noise_of
 from morgs_mi.fit.optimise import replace_parameter
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.rasterize import Image
@@ -152,6 +152,7 @@ def configured(options: Options, prior: str, seed: int) -> StreamConfig:
         num_gaussians=options.gaussians,
         dropping=0.2 if prior == "dropping" else 0.0,
         depth_weight=0.1,
+        noise_aware=False,
     )
     if prior == "no D-SSIM":
         fit = replace(fit, objective=replace(fit.objective, dssim_weight=0.0))

@@ -266,6 +266,8 @@ class FitConfig:
     dropping: float | None = None
     """Probability with which each step of the first frame leaves a Gaussian out (see `dropping`); None: chosen by
     cross-validation, or by the noise of fewer than `min_views` views."""
+    noise_aware: bool = True
+    """Fit the first frame to noisy images by L1 alone: SSIM makes the fit follow their noise."""
     depth_model: str | None = None
     """ONNX file of a network that estimates depth from one image (see `depth_prior`), as a prior of the first frame;
     None: no prior."""

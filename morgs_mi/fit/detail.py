@@ -14,8 +14,8 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.fit.config import DetailConfig
-from morgs_mi.fit.dropping import noise_of
 from morgs_mi.fit.forecast import mean_views
+from morgs_mi.fit.noise import noise_of
 
 __all__ = ["count_details", "gaussians_for"]
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -18,15 +17,14 @@ import numpy as np
 from morgs_mi.core.attributes import sigmoid
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
+from morgs_mi.fit.noise import is_noisy
 
-__all__ = ["dropped", "dropping_by_noise", "noise_of"]
+__all__ = ["dropped", "dropping_by_noise"]
 
 # Logit of an opacity that no cut-off of the renderer lets pass, and the largest opacity.
 _INVISIBLE, _MOST = -30.0, 0.999
-# Noise from which few views are fitted with dropping, standard deviation relative to white, and its probability.
-_NOISY, _NOISY_DROPPING = 0.015, 0.2
-# The difference of two Laplacians, which is zero on gradients and edges, with unit gain for noise (Immerkaer 1996).
-_NOISE_FILTER = np.array([[1, -2, 1], [-2, 4, -2], [1, -2, 1]], np.float32) / 6
+# Probability with which few noisy views are fitted.
+_NOISY_DROPPING = 0.2
 
 
 def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) -> Gaussians:
@@ -51,10 +49,4 @@ def dropping_by_noise(images: Sequence[np.ndarray]) -> float:
     Args:
         images: [H, W, 3], uint8.
     """
-    return _NOISY_DROPPING if np.mean([noise_of(image) for image in images]) >= _NOISY else 0.0
-
-
-def noise_of(image: np.ndarray) -> float:
-    """Return the standard deviation of an image's noise relative to white; texture on less than half does not count."""
-    filtered = cv2.filter2D(image.astype(np.float32) / 255, -1, _NOISE_FILTER)
-    return float(np.median(np.abs(filtered)) / 0.6745)
+    return _NOISY_DROPPING if is_noisy(images) else 0.0

@@ -1,4 +1,4 @@
-"""The settings of the first frame that follow from the capture: its number of steps and its strength of dropping."""
+"""The settings of the first frame that follow from the capture: steps, dropping, and the loss of noisy images."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, trial
 from morgs_mi.fit.depth_prior import DepthPrior
 from morgs_mi.fit.dropping import dropping_by_noise
 from morgs_mi.fit.forecast import Forecast, forecast
+from morgs_mi.fit.noise import is_noisy
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.config import RenderConfig
 
@@ -30,7 +31,7 @@ class FirstSettings:
     """Settings of the first frame.
 
     Attributes:
-        config: with a number of steps and a strength of dropping.
+        config: with a number of steps, a strength of dropping, and the weights of the losses.
         expected: what to expect of views between the cameras, by each way that was taken; none for a single camera.
         steps_before: number of steps that trials have made.
     """
@@ -73,6 +74,8 @@ def first_settings(
         on_step: called with (steps of the trials done, steps of trials and first frame).
         prior: inverse depth of the views, or None.
     """
+    if config.noise_aware and is_noisy(images):
+        config = replace(config, objective=replace(config.objective, dssim_weight=0.0))
     if config.first_frame_seconds is not None:
         steps = steps_within(
             config.first_frame_seconds, gaussians, cameras, targets, extent, config, render, [*seed, 1], prior
