@@ -52,8 +52,8 @@ def measure(
 def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
-    cells = {seed: (*cell, options.strides) for seed, cell in options.cells().items()}
-    options.write({"seeds": options.run(measure, cells)}, unprinted=["seeds"])
+    cells = {name: (*cell, options.strides) for name, cell in options.cells().items()}
+    options.write({"fits": options.run(measure, cells)}, unprinted=["fits"])
 
 
 if __name__ == "__main__":

@@ -9,8 +9,9 @@ to 2. Scores are means over the later frames of the held-out view, against the e
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 
 import mitsuba as mi
@@ -33,6 +34,8 @@ class Options(CellOptions):
 
     seeds: tuple[int, ...] = (3, 4, 5, 6, 7, 8)
     """Seeds of the scenes."""
+    fit_seeds: tuple[int, ...] = (0,)
+    """Seeds of the fits of each scene."""
     clips: Path = Path("out/random")
     """Folder of the clips."""
     frames: int = 6
@@ -41,11 +44,14 @@ class Options(CellOptions):
     """Epochs of a later frame."""
 
     def cells(self) -> dict[str, tuple[Source, StreamConfig, int]]:
-        """Return clip, settings and number of frames of each seed; clips that are missing are made."""
+        """Return clip, settings and number of frames of each scene and fit; clips that are missing are made."""
         config = StreamConfig()
         config = replace(config, fit=replace(config.fit, epochs=self.epochs))
         clips = {str(seed): Source.of(random_capture(self.clips, seed)) for seed in self.seeds}
-        return {seed: (clip, config, self.frames) for seed, clip in clips.items()}
+        return {
+            f"{seed}/{fit}": (clip, replace(config, seed=fit), self.frames)
+            for (seed, clip), fit in product(clips.items(), self.fit_seeds)
+        }
 
 
 def measure(source: Source, config: StreamConfig, num_frames: int) -> dict[str, float]:
@@ -94,10 +100,23 @@ def scores_of(gaussians: Gaussians, capture: Capture, view: int, frame: int, rec
     }
 
 
+def spread(fits: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float]]:
+    """Return mean and standard deviation over the fits, of the means over the scenes of each score."""
+    numbers = sorted({name.split("/")[1] for name in fits})
+    by_fit = [[row for name, row in fits.items() if name.split("/")[1] == number] for number in numbers]
+    found = {}
+    for score in next(iter(fits.values())):
+        means = [float(np.nanmean([row[score] for row in rows])) for rows in by_fit]
+        deviation = float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
+        found[score] = {"mean": float(f"{np.mean(means):.4g}"), "deviation": float(f"{deviation:.2g}")}
+    return found
+
+
 def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
-    options.write({"seeds": options.run(measure, options.cells())}, unprinted=["seeds"])
+    fits = options.run(measure, options.cells())
+    options.write({"spread": spread(fits), "fits": fits}, unprinted=["fits"])
 
 
 if __name__ == "__main__":
