@@ -62,8 +62,8 @@ Command = (
 class Common:
     """Options of every command."""
 
-    variant: Annotated[Literal["llvm_ad_rgb", "cuda_ad_rgb"], arg(metavar="NAME")] = "llvm_ad_rgb"
-    """Mitsuba variant: llvm_ad_rgb for any processor, cuda_ad_rgb for an NVIDIA GPU."""
+    variant: Annotated[Literal["llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"], arg(metavar="NAME")] = "llvm_ad_rgb"
+    """Mitsuba variant: llvm_ad_rgb for any processor, cuda_ad_rgb for an NVIDIA GPU, metal_ad_rgb for a Mac's."""
     debug: Flag = False
     """Print tracebacks and debug messages."""
 

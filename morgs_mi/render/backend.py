@@ -1,4 +1,4 @@
-"""Choices that depend on the backend of the active variant: LLVM (CPU) or CUDA (GPU)."""
+"""Choices that depend on the backend of the active variant: LLVM (CPU), or CUDA or Metal (GPU)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def _backend() -> dr.JitBackend:
 
 def block_shape(config: RenderConfig) -> tuple[int, int]:
     """Return (width, height) in pixels of one lane's block: 8x4 on a CPU, 4x4 on a GPU, unless `config` sets it."""
-    default_width = 4 if _backend() == dr.JitBackend.CUDA else 8
+    default_width = 8 if _backend() == dr.JitBackend.LLVM else 4
     return config.block_width or default_width, config.block_height or 4
 
 

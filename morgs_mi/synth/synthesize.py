@@ -100,7 +100,7 @@ def synthesize(
         FileExistsError: `out` is not empty and `overwrite` is not set, or `out` is not a synthetic capture.
         OSError: a file cannot be written, or a mesh or texture of the scene does not exist.
     """
-    if not str(mi.variant()).startswith(("llvm", "cuda")):
+    if not str(mi.variant()).startswith(("llvm", "cuda", "metal")):
         raise ValueError(
             f"synthesize(): a vectorised variant is needed, got {mi.variant()!r}; "
             'call mitsuba.set_variant("llvm_ad_rgb") first.'

@@ -113,6 +113,7 @@ def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
         (["--config", "[motion]\nflow_method = 'no'"], ("bad.toml: `motion.flow_method` must be one of dis,",)),
         (["--config", "[motion]\nmask_method = 'no'"], ("bad.toml: `motion.mask_method` must be one of none,",)),
         (["--variant", "cuda_ad_rgb"], ("--variant cuda_ad_rgb cannot be used here", "llvm_ad_rgb")),
+        (["--variant", "metal_ad_rgb"], ("--variant metal_ad_rgb cannot be used here", "llvm_ad_rgb")),
     ],
 )
 def test_fit__rejects_bad_input_in_one_sentence(capture: Path, tmp_path: Path, run, args, parts) -> None:
