@@ -10,7 +10,7 @@ that fit best, because only differences between cameras are known.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
@@ -44,6 +44,8 @@ class Options(CellOptions):
 
     seeds: tuple[int, ...] = (3, 4)
     """Seeds of the scenes."""
+    fit_seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the fits of each scene."""
     clips: Path = Path("out/exposure")
     """Folder of the clips, which are made if they are not there."""
     width: int = 160
@@ -58,7 +60,7 @@ class Options(CellOptions):
     """Epochs of a later frame."""
 
     def cells(self) -> dict[str, tuple[Path, StreamConfig]]:
-        """Return the clip and the settings of each fit, by seed, cameras and `fit.exposure`."""
+        """Return the clip and the settings of each fit, by scene, cameras, `fit.exposure` and the fit's seed."""
         config = StreamConfig()
         work = {name: getattr(self, name) for name in ("num_gaussians", "first_frame_steps", "epochs")}
         found: dict[str, tuple[Path, StreamConfig]] = {}
@@ -67,7 +69,9 @@ class Options(CellOptions):
                 modes: tuple[Literal["off", "auto"], ...] = ("off", "auto")
                 for mode in modes:
                     fit = replace(config.fit, exposure=mode, dropping=0.0, **work)
-                    found[f"{seed} {cameras} {mode}"] = self.clip(seed, cameras), replace(config, fit=fit)
+                    for own in self.fit_seeds:
+                        name = f"{seed} {cameras} {mode} {own}"
+                        found[name] = self.clip(seed, cameras), replace(config, fit=fit, seed=own)
         return found
 
     def clip(self, seed: int, cameras: str) -> Path:
@@ -102,12 +106,20 @@ def measure(clip: Path, config: StreamConfig) -> dict[str, float]:
 
 
 def exposure_table(fits: Mapping[str, Mapping[str, float]]) -> str:
-    """Return the results of the fits as a table in Markdown."""
+    """Return the means and the standard deviations of the fits as a table in Markdown."""
+    groups: dict[str, list[Mapping[str, float]]] = {}
+    for name, row in fits.items():
+        groups.setdefault(name.rpartition(" ")[0], []).append(row)
+
+    def written(rows: Sequence[Mapping[str, float]], score: str) -> str:
+        values = [row[score] for row in rows]
+        return f"{np.mean(values):.2f} ± {np.std(values, ddof=1) if len(values) > 1 else 0:.2f} dB"
+
     head = "| seed | cameras | `fit.exposure` | as recorded | colours matched | still: mTV x100 | kB per later frame |"
     rows = [
-        f"| {' | '.join(name.split())} | {row['psnr']:.2f} dB | {row['psnr_matched']:.2f} dB | {row['mtv']:.3f} | "
-        f"{row['kb']:.1f} |"
-        for name, row in fits.items()
+        f"| {' | '.join(name.split())} | {written(of_name, 'psnr')} | {written(of_name, 'psnr_matched')} | "
+        f"{np.mean([row['mtv'] for row in of_name]):.3f} | {np.mean([row['kb'] for row in of_name]):.1f} |"
+        for name, of_name in groups.items()
     ]
     return "\n".join([head, "|---|---|---|---|---|---|---|", *rows])
 
