@@ -208,7 +208,8 @@ def plot_field(cells: Cells, path: Path) -> None:
     figure = blank_figure(11, 7)
     axes = figure.subplots(2, 2)
     for k, method in enumerate(methods):
-        style = {"color": f"C{k}", "label": method, "linewidth": 2.2 if method == DEFAULT else 1.2}
+        style = {"color": f"C{k % 10}", "linestyle": "--" if k >= 10 else "-", "label": method}
+        style |= {"linewidth": 2.2 if method == DEFAULT else 1.2}
         for axis, (score, title) in zip(axes[0], _PLOTTED, strict=True):
             series = [cell[f"{method}/{most}"]["by_frame"][score] for cell in cells.values()]
             values = np.nanmean(np.array(series, float), axis=0)
