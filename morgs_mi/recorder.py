@@ -117,7 +117,7 @@ def _stream(
     if interrupted is None:
         capture, refinement = with_refined_cameras(with_points(capture, config.seed, on_stage), config, on_stage)
     else:
-        capture = replace(capture, cameras=interrupted.cameras)
+        capture = replace(capture, cameras=capture.with_delays(interrupted.cameras))
     loop = StreamLoop(
         [capture.cameras[v] for v in train],
         capture.points,
@@ -137,7 +137,7 @@ def _stream(
         frames = capture.partial_frames(start)
         count = now + 1 - start
         past = _reported(islice(frames, count), partial(on_stage, "Reading the fitted frames"), count)
-        images = ([frame.images[v] for v in train] for frame in past)
+        images = (frame.comparable(train) for frame in past)
         loop.resume(interrupted.coded, images, interrupted.reports[0].exposures)
         write_json(out / "capture.json", about)
         writer = StreamWriter.continued(path, interrupted.index, interrupted.end)
@@ -202,7 +202,8 @@ def push_frame(
     """Fit the next frame of a loop on the views `train`; the report's status names the images that are missing."""
     images, ahead = (None if f is None else [f.images[v] for v in train] for f in (frame, upcoming))
     assert images is not None
-    packet, report = loop.push(images, on_step, ahead)
+    recorded = None if frame.recorded is None else frame.comparable(train)
+    packet, report = loop.push(images, on_step, ahead, recorded)
     status = "; ".join([*([report.status] if report.status != "ok" else []), *frame.problems]) or "ok"
     return packet, replace(report, status=status)
 

@@ -340,6 +340,7 @@ class StreamLoop:
         images: Sequence[np.ndarray | None],
         on_step: Callable[[int, int], None] | None = None,
         upcoming: Sequence[np.ndarray | None] | None = None,
+        recorded: Sequence[np.ndarray | None] | None = None,
     ) -> tuple[Packet, FrameReport]:
         """Fit the next frame and return its packet for the stream, and its report; see `step`.
 
@@ -348,13 +349,17 @@ class StreamLoop:
             on_step: as for `step`.
             upcoming: images of the frame after it, if they are there already: their optical flow is computed while
                 this frame is fitted. They change nothing else.
+            recorded: images that those of the next frame are compared with, if these are not `images`: of the first
+                frame, where those are interpolated because cameras have delays.
         """
-        start, frame = time.perf_counter(), self.state.frame
-        observed = self._observed_ahead(images) or observe_frame(self.setup, frame, self.state.seen, images)
+        start, frame, before = time.perf_counter(), self.state.frame, self.state.seen
+        observed = self._observed_ahead(images) or observe_frame(self.setup, frame, before, images)
+        seen = observed.seen if recorded is None else see_frame(self.setup, frame, before, recorded)[0]
         if upcoming is not None:
             copies = [None if image is None else np.array(image) for image in upcoming]
-            self._ahead = frame + 1, in_background(partial(observe_frame, self.setup, frame + 1, observed.seen, copies))
-        self.state, packet, report = step(self.setup, self.state, observed, on_step)
+            self._ahead = frame + 1, in_background(partial(observe_frame, self.setup, frame + 1, seen, copies))
+        state, packet, report = step(self.setup, self.state, observed, on_step)
+        self.state = replace(state, seen=seen)
         return packet, replace(report, seconds=time.perf_counter() - start)
 
     def _observed_ahead(self, images: Sequence[np.ndarray | None]) -> FrameObservation | None:

@@ -41,7 +41,7 @@ QUICK = StreamConfig(  # from all points, as the images were made of them
 )
 
 
-def scene(frame: int) -> tuple[Gaussians, np.ndarray]:
+def scene(frame: float) -> tuple[Gaussians, np.ndarray]:
     """A textured ball that moves by SHIFT in front of a static textured wall; and the mask of the moving Gaussians.
 
     The wall is thick, so that its Gaussians lie in the same order in every view.
@@ -59,16 +59,15 @@ def cameras() -> list[Camera]:
     return look_at_cameras([*QUAD, (0, 0, -3.5)], 50, 96, 72, [f"cam{i:02d}" for i in range(5)])
 
 
+def shown(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """Return an image of Gaussians in 8 bits."""
+    return np.uint8(np.clip(np.asarray(rasterize(gaussians, camera, ("color",)).color), 0, 1) * 255 + 0.5)
+
+
 @pytest.fixture(scope="module")
 def clip():
     """Five views, four frames; the last view is held out."""
-    return [
-        [
-            np.uint8(np.clip(np.asarray(rasterize(scene(t)[0], c, ("color",)).color), 0, 1) * 255 + 0.5)
-            for c in cameras()
-        ]
-        for t in range(4)
-    ]
+    return [[shown(scene(t)[0], camera) for camera in cameras()] for t in range(4)]
 
 
 def points_and_colors():
@@ -170,6 +169,28 @@ def test_push__stream_carries_births_and_deaths(clip):
     assert len(np.intersect1d(frames[0].ids, frames[2].ids)) < 600
     for name, value in frames[-1].gaussians.numpy().items():
         assert np.array_equal(value, loop.gaussians.numpy()[name]), name
+
+
+def test_push__fits_views_at_their_own_times(clip):
+    """Two of four views are half a frame late and two half a frame early; at the instants nobody saw the ball."""
+    delays = (0.5, -0.5, 0.5, -0.5)
+    views = [dataclasses.replace(c, delay=d) for c, d in zip(cameras()[:4], delays, strict=True)]
+    frames = [[shown(scene(t + d)[0], c) for c, d in zip(views, delays, strict=True)] for t in range(3)]
+    quality = []
+    for rig, first in ((views, clip[0][:4]), (cameras()[:4], frames[0])):
+        loop = StreamLoop(rig, *points_and_colors(), QUICK)
+        loop.push(first, recorded=frames[0])
+        for images in frames[1:]:
+            loop.push(images)
+        quality.append(np.mean([moving_psnr(loop, clip, view) for view in range(4)]))
+    assert quality[0] > quality[1] + 1.5
+
+
+def moving_psnr(loop: StreamLoop, clip, view: int) -> float:
+    """Return the PSNR of a view at frame 2, where it has changed."""
+    moved = np.abs(np.int16(clip[2][view]) - clip[1][view]).max(axis=-1) > 20
+    color = np.clip(np.asarray(rasterize(loop.gaussians, cameras()[view], ("color",)).color), 0, 1)
+    return psnr(color[moved], clip[2][view][moved] / 255.0)
 
 
 def test_push__modules_can_be_switched_off(clip):

@@ -1,19 +1,20 @@
-"""Time offsets of cameras whose clocks are apart: how exactly they are found, and what aligning the clips gains.
+"""Cameras that record at times of their own: how exactly offsets are found, and what rendering at these times gains.
 
     python -m benchmarks.reports.timing --seeds 3 6 --json out.json
 
-Each scene is `morgs-mi synth random --seed SEED`, recorded twice: by cameras of one clock, and by cameras that are up
-to `--time-offset` frames apart. The clip with offsets is fitted as it is and with the offsets that are found, over the
-same instants as the synchronised one. Scores are means over the later frames of the held-out view, whose clock is the
-reference.
+Each scene is `morgs-mi synth random --seed SEED`, recorded three times: by cameras of one clock, by cameras that are up
+to `--time-offset` frames apart, and by cameras with a rolling shutter. The second clip is fitted as it is and with the
+offsets that are found, the third as if its shutter were global and with its readout, all over the same instants as the
+first. Scores are means over the later frames of the held-out view, whose clock is the reference.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -21,11 +22,13 @@ import tyro
 
 from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.fits import new_loop
+from benchmarks.reports.plots import markdown
 from morgs_mi import rasterize
 from morgs_mi.calibration.timing import estimate_time_offsets
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.config import StreamConfig
 from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.recorder import push_frame
 from morgs_mi.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.synth.ground_truth import load_truth
 from morgs_mi.synth.synthesize import synthesize
@@ -49,6 +52,10 @@ class Options(CellOptions):
     """Number of frames that are fitted, the first included."""
     time_offset: float = 1.5
     """Largest time offset in frames."""
+    readout: float = 0.6
+    """Readout of the rolling shutters in frames."""
+    fit_seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the fits of each clip."""
     num_gaussians: int = 4000
     """Gaussians of the first frame."""
     first_frame_steps: int = 500
@@ -56,18 +63,19 @@ class Options(CellOptions):
     epochs: int = 4
     """Epochs of a later frame."""
 
-    def cells(self) -> dict[str, tuple[Path, Path, StreamConfig, int]]:
-        """Return the synchronised clip, the other one, the settings and the number of fitted frames of each seed."""
-        config = StreamConfig()
-        work = {name: getattr(self, name) for name in ("num_gaussians", "first_frame_steps", "epochs")}
-        config = replace(config, fit=replace(config.fit, **work))
-        return {
-            f"random {s}": (self.clip(s, 0), self.clip(s, self.time_offset), config, self.fitted) for s in self.seeds
-        }
+    def cells(self) -> dict[str, tuple[Options, int]]:
+        """Return the options and the seed of each scene."""
+        return {f"random {seed}": (self, seed) for seed in self.seeds}
 
-    def clip(self, seed: int, time_offset: float) -> Path:
-        """Return the folder of a clip."""
-        folder, own = self.clips / f"random-{seed}-{time_offset:g}", Disturbances(time_offset=time_offset)
+    def config(self, seed: int) -> StreamConfig:
+        """Return the settings of a fit."""
+        config = StreamConfig(seed=seed)
+        work = {name: getattr(self, name) for name in ("num_gaussians", "first_frame_steps", "epochs")}
+        return replace(config, fit=replace(config.fit, dropping=0.0, **work))
+
+    def clip(self, seed: int, own: Disturbances) -> Path:
+        """Return the folder of a clip, which is made if it is not there."""
+        folder = self.clips / f"random-{seed}-{own.time_offset:g}-{own.rolling_shutter:g}"
         if not folder.exists():
             width, height = self.width, self.width * 3 // 4
             synthesize(
@@ -76,26 +84,37 @@ class Options(CellOptions):
         return folder
 
 
-def measure(synchronised: Path, apart: Path, config: StreamConfig, num_frames: int) -> dict[str, float]:
-    """Return the error of the offsets of one scene and the scores of the three fits."""
-    recorded, start = load_capture(apart), time.perf_counter()
+def measure(options: Options, seed: int) -> dict[str, Any]:
+    """Return the errors of the offsets of one scene, and the scores of its fits by the way in which it is read."""
+    apart, rolling = Disturbances(time_offset=options.time_offset), Disturbances(rolling_shutter=options.readout)
+    recorded, start = load_capture(options.clip(seed, apart)), time.perf_counter()
     found = estimate_time_offsets(recorded)
     seconds = time.perf_counter() - start
-    truth = load_disturbances(apart / "truth")
+    truth = load_disturbances(recorded.path / "truth")
     errors = [offset + truth[name].time_offset for name, offset in found.offsets.items() if name != found.reference]
-    aligned = load_capture(apart, reading=replace(recorded.reading, offset=found.offsets))
+    aligned = load_capture(recorded.path, reading=replace(recorded.reading, offset=found.offsets))
     first = int(aligned.metadata()["cameras"][recorded.names.index(found.reference)]["first_frame"])
-    fits = {"synchronised": (load_capture(synchronised), first), "recorded": (recorded, first), "aligned": (aligned, 0)}
-    row = {
+    synchronised, shutter = load_capture(options.clip(seed, Disturbances())), load_capture(options.clip(seed, rolling))
+    cameras = tuple(replace(camera, readout=options.readout) for camera in shutter.cameras)
+    fits = {
+        "synchronised": (synchronised, first),
+        "recorded": (recorded, first),
+        "aligned": (aligned, 0),
+        "shutter": (shutter, first),
+        "readout": (replace(shutter, cameras=cameras), first),
+    }
+    numbers = {
         "views": len(recorded.cameras),
         "largest_offset": max(abs(camera.time_offset) for camera in truth.values()),
         "mean_error": float(np.abs(errors).mean()),
         "largest_error": float(np.abs(errors).max()),
         "seconds": seconds,
     }
+    row: dict[str, Any] = {name: float(f"{value:.4g}") for name, value in numbers.items()}
     for name, (capture, begin) in fits.items():
-        row |= {f"{score}_{name}": value for score, value in scores(capture, begin, first, config, num_frames).items()}
-    return {name: float(f"{value:.4g}") for name, value in row.items()}
+        rows = [scores(capture, begin, first, options.config(own), options.fitted) for own in options.fit_seeds]
+        row[name] = {score: [float(f"{each[score]:.4g}") for each in rows] for score in rows[0]}
+    return row
 
 
 def scores(capture: Capture, begin: int, first: int, config: StreamConfig, num_frames: int) -> dict[str, float]:
@@ -103,10 +122,12 @@ def scores(capture: Capture, begin: int, first: int, config: StreamConfig, num_f
     test, loop, rows = capture.test_view, new_loop(capture, config), []
     assert test is not None
     camera = capture.cameras[test]
-    for k, frame in enumerate(capture.frames(begin, begin + num_frames)):
-        loop.push([frame.images[v] for v in capture.train_views])
+    for k, frame in enumerate(capture.partial_frames(begin, begin + num_frames)):
+        push_frame(loop, frame, capture.train_views)
+        image = frame.images[test]
         assert loop.gaussians is not None
-        color, target = np.asarray(rasterize(loop.gaussians, camera, ("color",)).color), frame.images[test] / 255.0
+        assert image is not None
+        color, target = np.asarray(rasterize(loop.gaussians, camera, ("color",)).color), image / 255.0
         moving = load_truth(capture.path / "truth", camera.name, first + k).mask
         if k and moving.any():
             color = np.clip(color, 0, 1)
@@ -114,25 +135,31 @@ def scores(capture: Capture, begin: int, first: int, config: StreamConfig, num_f
     return dict(zip(("psnr", "moving"), np.mean(rows, axis=0).tolist(), strict=True))
 
 
-def timing_table(scenes: Mapping[str, Mapping[str, float]]) -> str:
-    """Return the results of the scenes as a table in Markdown."""
+def timing_table(scenes: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return the results for the scenes as a table in Markdown: PSNR where things move as mean and spread over fits."""
+    names = ("synchronised", "recorded", "aligned", "shutter", "readout")
     rows = [
-        f"| {name} | {row['views']:.0f} | {row['largest_offset']:.2f} | {row['mean_error']:.3f} | "
-        f"{row['largest_error']:.3f} | {row['moving_synchronised']:.2f} dB | {row['moving_recorded']:.2f} dB | "
-        f"{row['moving_aligned']:.2f} dB |"
+        (
+            *(name, f"{row['views']:.0f}", f"{row['largest_offset']:.2f}"),
+            *(f"{row[error]:.3f}" for error in ("mean_error", "largest_error")),
+            *(_spread(row[fit]["moving"]) for fit in names),
+        )
         for name, row in scenes.items()
     ]
-    head = (
-        "| scene | views | largest offset, frames | mean error | largest error | moving, synchronised | "
-        "as recorded | aligned |"
-    )
-    return "\n".join([head, "|---|---|---|---|---|---|---|---|", *rows])
+    head = ("scene", "views", "largest offset", "mean error", "largest error", "synchronised", "apart", "aligned")
+    return markdown((*head, "rolling shutter", "with its readout"), rows)
+
+
+def _spread(values: Sequence[float]) -> str:
+    return f"{np.mean(values):.2f} ± {np.std(values, ddof=1) if len(values) > 1 else 0:.2f}"
 
 
 def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
-    options.write({"scenes": options.run(measure, options.cells())}, unprinted=["scenes"])
+    found = options.run(measure, options.cells())
+    print(timing_table(found))
+    options.write({"scenes": found}, unprinted=["scenes"])
 
 
 if __name__ == "__main__":

@@ -35,6 +35,7 @@ from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import reduced
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.initialise import fill_points, from_points, resample_points, scene_extent, seed_points
+from morgs_mi.io.video import ImageOrError
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.registry import FramePair
@@ -177,10 +178,10 @@ class _Clips:
 
     @classmethod
     def of(cls, capture: Capture, count: int, width: int) -> _Clips:
-        frames = [frame.images for frame in capture.frames(0, count)]
-        views = zip(capture.cameras, frames[0], capture.masks, strict=True)
+        clips = [[_checked(image) for image in capture.images(v, 0, count)] for v in range(len(capture.cameras))]
+        views = zip(capture.cameras, (clip[0] for clip in clips), capture.masks, strict=True)
         cameras, _, masks = zip(*(reduced(*view, width) for view in views), strict=True)
-        images = tuple(tuple(_resized(frame[v], camera) for frame in frames) for v, camera in enumerate(cameras))
+        images = tuple(tuple(_resized(i, c) for i in clip) for clip, c in zip(clips, cameras, strict=True))
         return cls(cameras, masks, images, list(capture.train_views), capture.points, capture.point_colors)
 
     @property
@@ -194,6 +195,12 @@ class _Clips:
         first = np.minimum(np.floor(times).astype(int), self.num_frames - 2)
         views = zip(self.images, first, times - first, strict=True)
         return [clip[k + round(s)] if s in (0, 1) else image_between(clip[k], clip[k + 1], s) for clip, k, s in views]
+
+
+def _checked(image: ImageOrError) -> np.ndarray:
+    if isinstance(image, Exception):
+        raise image
+    return image
 
 
 def _resized(image: np.ndarray, camera: Camera) -> np.ndarray:
@@ -253,6 +260,7 @@ def _relative(capture: Capture, offsets: np.ndarray, change: float, tolerance: f
     """Return the result with the offsets from the reference's, in addition to those of the capture."""
     reference = capture.test_view or 0
     known = capture.reading.offset
-    own = {n: known.get(n, 0.0) - (o - offsets[reference]) for n, o in zip(capture.names, offsets, strict=True)}
+    apart = offsets - [camera.delay for camera in capture.cameras]
+    own = {n: known.get(n, 0.0) - (o - apart[reference]) for n, o in zip(capture.names, apart, strict=True)}
     rounded = {name: round(float(offset), 3) + 0.0 for name, offset in own.items()}
     return TimeOffsets(rounded, capture.names[reference], change, change < tolerance)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -29,6 +29,7 @@ class CameraSource:
         shares: the share of the time to the clip's next frame that has passed at each instant [T]; None: none has.
         color_correction: the colour correction, or None.
         opaque: the mask of the recorded pixels that are not transparent [H, W], or None if all are opaque.
+        delay: frames of the clip by which its frames are later than the instants that they show.
     """
 
     reader: FrameReader
@@ -38,6 +39,15 @@ class CameraSource:
     shares: np.ndarray | None = None
     color_correction: ColorCorrection | None = None
     opaque: np.ndarray | None = None
+    delay: float = 0.0
+
+    def at_instants(self) -> CameraSource:
+        """Return the source without a delay: its images are interpolated instead."""
+        if not self.delay:
+            return self
+        positions = self.frame_indices - self.delay
+        before = np.floor(positions).astype(int)
+        return replace(self, frame_indices=before, shares=positions - before, delay=0.0)
 
     def images(self, camera: Camera, start: int, stop: int) -> Generator[ImageOrError, None, None]:
         """Yield the processed images of the instants start..stop-1, with an error in place of a missing image."""

@@ -1,7 +1,7 @@
 """A multi-view recording: pinhole cameras and their synchronised frames.
 
 `layouts/registry.py` determines the layout of a capture folder and `layouts/clips.py` finds each camera's clip. An
-optional ``capture.json`` sets ``test_view`` (index or null) and ``fps``; ``truth/`` may hold ground truth.
+optional ``capture.json`` has settings (see `timeline.read_settings`); ``truth/`` may hold ground truth.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import logging
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -55,11 +55,18 @@ class PartialFrame:
         index: position in the recording, from 0.
         images: as in `Frame`, None for a missing image.
         problems: one sentence per missing image.
+        recorded: the images that those of the next frame are compared with; None if these are `images`.
     """
 
     index: int
     images: tuple[np.ndarray | None, ...]
     problems: tuple[str, ...] = ()
+    recorded: tuple[np.ndarray | None, ...] | None = None
+
+    def comparable(self, views: Sequence[int]) -> list[np.ndarray | None]:
+        """Return the images of some views that those of the next frame are compared with."""
+        images = self.images if self.recorded is None else self.recorded
+        return [images[view] for view in views]
 
 
 @dataclass(frozen=True)
@@ -169,22 +176,24 @@ class Capture:
             ValueError: a file is truncated or broken; the message names the frame.
             FileNotFoundError: an image is missing.
         """
-        for index, images, _ in prefetched(self._decoded(start, stop, True)):
-            yield Frame(index, images)
+        for frame in prefetched(self._decoded(start, stop, True)):
+            yield Frame(frame.index, cast(tuple[np.ndarray, ...], frame.images))
 
     def partial_frames(self, start: int = 0, stop: int | None = None) -> Iterator[PartialFrame]:
         """Yield frames start..stop-1 as `frames` does, with None for a missing image, which is logged."""
-        for frame in prefetched(self._decoded(start, stop, False)):
-            yield PartialFrame(*frame)
+        yield from prefetched(self._decoded(start, stop, False))
 
     def images(self, view: int, start: int = 0, stop: int | None = None) -> Iterator[ImageOrError]:
         """Yield the images of one camera at the frames start..stop-1, with an error in place of a missing image."""
         stop = self.num_frames if stop is None else min(stop, self.num_frames)
         return self._sources[view].images(self.cameras[view], start, stop)
 
-    def _decoded(
-        self, start: int, stop: int | None, strict: bool
-    ) -> Generator[tuple[int, tuple, tuple[str, ...]], None, None]:
+    def with_delays(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+        """Return the cameras of a stream of this capture with the delays and readouts of the capture's."""
+        pairs = zip(cameras, self.cameras, strict=True)
+        return tuple(replace(camera, delay=own.delay, readout=own.readout) for camera, own in pairs)
+
+    def _decoded(self, start: int, stop: int | None, strict: bool) -> Generator[PartialFrame, None, None]:
         stop = self.num_frames if stop is None else min(stop, self.num_frames)
         streams = [s.images(c, start, stop) for s, c in zip(self._sources, self.cameras, strict=True)]
         missing: set[str] = set()
@@ -197,10 +206,23 @@ class Capture:
                     _LOG.warning("frame %d: %s is left out: %s", index, name, errors[name])
                 missing = set(errors)
                 images = tuple(None if isinstance(f, Exception) else f for f in found)
-                yield index, images, tuple(f"{name}: {error}" for name, error in errors.items())
+                problems = tuple(f"{name}: {error}" for name, error in errors.items())
+                if index == 0 and any(source.delay for source in self._sources):
+                    yield PartialFrame(index, self._at_first_instant(images), problems, images)
+                else:
+                    yield PartialFrame(index, images, problems)
         finally:
             for stream in streams:
                 stream.close()
+
+    def _at_first_instant(self, images: Sequence[np.ndarray | None]) -> tuple[np.ndarray | None, ...]:
+        """Return the images of the first frame, interpolated at its instant.
+
+        No motion is known there that could be rendered.
+        """
+        views = zip(images, self._sources, self.cameras, strict=True)
+        found = (next(s.at_instants().images(c, 0, 1)) if s.delay and i is not None else i for i, s, c in views)
+        return tuple(own if isinstance(new, Exception) else new for own, new in zip(images, found, strict=True))
 
 
 def load_capture(
@@ -251,12 +273,22 @@ def load_capture(
     common = timeline(path, names, readers, reading, max_frames, settings.get("fps"))
     opaque = [opaque_pixels(reader, camera.name) for reader, camera in zip(readers, recorded, strict=True)]
     sources = tuple(
-        CameraSource(reader, lens, undistortion(camera, lens), indices, shares, opaque=mask)
-        for reader, lens, camera, indices, shares, (mask, _) in zip(
-            readers, calibration.lenses, recorded, common.frame_indices, common.shares, opaque, strict=True
+        CameraSource(
+            reader,
+            lens,
+            undistortion(camera, lens),
+            common.frame_indices[c],
+            common.shares[c],
+            opaque=opaque[c][0],
+            delay=common.delays[c],
         )
+        for c, (reader, lens, camera) in enumerate(zip(readers, calibration.lenses, recorded, strict=True))
     )
-    cameras = tuple(_resized(camera, downscale) for camera in recorded)
+    times = zip(common.delays, common.rates, _readouts(path, names, settings), strict=True)
+    cameras = tuple(
+        replace(_resized(camera, downscale), delay=delay / rate, readout=readout / rate)
+        for camera, (delay, rate, readout) in zip(recorded, times, strict=True)
+    )
     _check_downscale(downscale, cameras, recorded)
     capture = Capture(
         path=path,
@@ -276,6 +308,21 @@ def load_capture(
         notes=(*common.notes, *(note for _, note in opaque if note), *_photos(calibration.clips)),
     )
     return _color_corrected(capture, reading) if reading.color != "none" or reading.exposure else capture
+
+
+def _readouts(path: Path, names: Sequence[str], settings: dict[str, Any]) -> list[float]:
+    """Return the readout of each camera in its clip's frames.
+
+    Raises:
+        ValueError: the settings name an unknown camera.
+    """
+    readout = settings.get("readout", 0.0)
+    if not isinstance(readout, dict):
+        return [readout] * len(names)
+    if unknown := [name for name in readout if name not in names]:
+        where = path / "capture.json"
+        raise ValueError(f"{where}: `readout` must name cameras of {', '.join(names)}, got {', '.join(unknown)}.")
+    return [readout.get(name, 0.0) for name in names]
 
 
 def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, str]:

@@ -5,7 +5,9 @@ An instant t = 0, 1, ... is a frame of the recording. It is shown by frame k of 
     k = o + r t,    with o the clip's offset and r its frame rate divided by the lowest frame rate.
 
 In a clip of variable frame rate k is a position on its regular clock, and the frame nearest to it shows the instant.
-If o is not whole, the clip has no frame of the instant, and one is interpolated between two (see `interpolation`).
+If o is not whole, the clip has no frame of the instant. With a whole r the nearest one is always later by the same
+time, the camera's delay (see `Camera`), and is used as it is. Otherwise one is interpolated between two (see
+`interpolation`).
 """
 
 from __future__ import annotations
@@ -66,6 +68,8 @@ class Timeline:
         frame_indices: per camera the clip's frames in ascending order, -1 for none, int [T].
         shares: per camera the share of the time to the next frame [T] that has passed at each instant; None: no image
             is interpolated.
+        delays: per camera the frames of its clip by which those are later than the instants that they show.
+        rates: per camera the frames of its clip per instant.
         fps: instants per second.
         unchanged: whether instant t is frame t of every clip.
         notes: a sentence for each clip of variable frame rate.
@@ -73,6 +77,8 @@ class Timeline:
 
     frame_indices: tuple[np.ndarray, ...]
     shares: tuple[np.ndarray | None, ...]
+    delays: tuple[float, ...]
+    rates: tuple[float, ...]
     fps: float
     unchanged: bool
     notes: tuple[str, ...] = ()
@@ -114,8 +120,15 @@ def timeline(
     nearest = (nearest_frames(reader, own) for reader, own in zip(readers, positions, strict=True))
     indices, apart = map(list, zip(*nearest, strict=True))
     shares: list[np.ndarray | None] = [None] * len(readers)
+    delays = [0.0] * len(readers)
     for c, (name, reader) in enumerate(zip(names, readers, strict=True)):
-        if _is_interpolated(reader, config.offset.get(name, 0)):
+        if not _is_fractional(reader, config.offset.get(name, 0)):
+            continue
+        if clocks.rates[c] == round(clocks.rates[c]):
+            later = float(np.floor(positions[c][0] + 0.5) - positions[c][0])  # the same for all of its frames
+            indices[c] = np.rint(positions[c] + later).astype(int)
+            delays[c], apart[c] = later, np.zeros_like(positions[c])
+        else:
             indices[c] = np.clip(np.floor(positions[c]).astype(int), 0, reader.num_frames - 2)
             shares[c], apart[c] = positions[c] - indices[c], np.zeros_like(positions[c])
     if config.gaps:
@@ -126,7 +139,8 @@ def timeline(
     unchanged = all(np.array_equal(index, np.arange(len(instants))) for index in indices)
     unchanged = unchanged and not any(config.offset.values())
     notes = tuple(_note(r, k) for r, k in zip(readers, indices, strict=True) if r.positions is not None)
-    return Timeline(tuple(indices), tuple(shares), clocks.fps, unchanged, notes)
+    rates = tuple(clocks.rates.tolist())
+    return Timeline(tuple(indices), tuple(shares), tuple(delays), rates, clocks.fps, unchanged, notes)
 
 
 @dataclass(frozen=True)
@@ -168,8 +182,8 @@ def _common_instants(
     raise ValueError(f"{path}: the clips have no instant in common, {table}; check `offset`.")
 
 
-def _is_interpolated(reader: FrameReader, offset: float) -> bool:
-    """Return whether images of a clip are interpolated: at a constant frame rate, with an offset that is not whole."""
+def _is_fractional(reader: FrameReader, offset: float) -> bool:
+    """Return whether the offset of a clip of constant frame rate is not whole."""
     return reader.positions is None and offset != round(offset) and reader.num_frames > 1
 
 
@@ -284,7 +298,9 @@ def _fps(path: Path, readers: Sequence[FrameReader], given: float | None) -> flo
 def read_settings(path: Path) -> dict[str, Any]:
     """Return the settings in a capture's `capture.json`, or {} without such a file.
 
-    They are ``fps``, ``test_view`` and ``meters_per_unit``, the length of a world unit in metres.
+    They are ``fps``, ``test_view``, ``meters_per_unit``, the length of a world unit in metres, and ``readout``, the
+    frames from the exposure of an image's first row to that of its last: a number for all cameras, or an object with
+    those that are not 0, by the cameras' names.
 
     Raises:
         ValueError: the file is not a JSON object, or a setting is not valid.
@@ -299,6 +315,10 @@ def read_settings(path: Path) -> dict[str, Any]:
         value = settings.get(name)
         if value is not None and not (isinstance(value, int | float) and value > 0):
             raise ValueError(f"{path}: `{name}` must be a positive number, got {value!r}; correct it.")
+    readout = settings.get("readout", 0.0)
+    for value in readout.values() if isinstance(readout, dict) else [readout]:
+        if type(value) not in (int, float) or not -1 <= value <= 1:
+            raise ValueError(f"{path}: `readout` must be a number of frames in [-1, 1], got {value!r}; correct it.")
     if view is not None and type(view) is not int:
         raise ValueError(f"{path}: `test_view` must be a camera's index or null, got {view!r}; correct it.")
     return settings

@@ -130,6 +130,8 @@ def fit_seam_frame(
         config: settings.
         on_step: called with (steps done, steps) of each pass.
     """
+    # Motion over many frames is no speed.
+    setup = replace(setup, cameras=tuple(replace(camera, delay=0.0, readout=0.0) for camera in setup.cameras))
     coded, last, seconds = base, earlier, 0.0
     for number in range(config.passes):
         repeated = replace(setup, config=config.fit_config(setup.config, number))
@@ -221,9 +223,10 @@ def score_seam(stream: StreamReader, capture: Capture, frame: int) -> SeamScores
     views = capture.train_views if capture.test_view is None else (capture.test_view,)
     config = render_config(stream)
     rendered: dict[int, dict[int, np.ndarray]] = {}
+    cameras = capture.with_delays(stream.cameras)
     for coded in frames_near(stream, first):
         if first <= coded.frame < last:
-            images = {v: render(coded.gaussians, stream.cameras[v], ("color",), config)["color"] for v in views}
+            images = {v: render(coded.gaussians, cameras[v], ("color",), config)["color"] for v in views}
             rendered[coded.frame] = {view: to_uint8(image) for view, image in images.items()}
         if coded.frame == last - 1:
             break

@@ -307,7 +307,7 @@ def _opened(
     loop, recorded = _loop(capture, fit, points), capture.partial_frames(frames.segment)
     if restart:
         past = islice(recorded, frames.start - frames.segment)
-        loop.resume(_decoded(restart), ([frame.images[v] for v in capture.train_views] for frame in past))
+        loop.resume(_decoded(restart), (frame.comparable(capture.train_views) for frame in past))
     return loop, capture, recorded
 
 
@@ -332,9 +332,8 @@ def _decoded(packets: tuple[bytes, ...]) -> CodedFrame:
 
 def _images(capture: Capture, frame: int) -> dict[int, np.ndarray]:
     """Return the images of a frame, by training view."""
-    images = next(capture.partial_frames(frame, frame + 1)).images
-    found = {k: images[view] for k, view in enumerate(capture.train_views)}
-    return {view: image for view, image in found.items() if image is not None}
+    images = next(capture.partial_frames(frame, frame + 1)).comparable(capture.train_views)
+    return {view: image for view, image in enumerate(images) if image is not None}
 
 
 def _faded(

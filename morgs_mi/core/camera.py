@@ -34,6 +34,9 @@ class Camera:
         height: image height in pixels.
         name: in the capture, e.g. ``cam00``.
         near: depth in world units below which Gaussians are not rendered.
+        delay: frames by which its images are later than the instants of the recording, at the middle row. Gaussians
+            with motion are rendered where they are then.
+        readout: frames from the exposure of the first row to that of the last; 0 for a global shutter.
 
     Example:
         >>> camera = morgs_mi.Camera.look_at((0, -4, 1), (0, 0, 0), up=(0, 0, 1), fov_x=40, width=320, height=240)
@@ -50,11 +53,15 @@ class Camera:
     height: int
     name: str = ""
     near: float = 0.01
+    delay: float = 0.0
+    readout: float = 0.0
 
     def __post_init__(self) -> None:
         where = f"Camera({self.name!r})" if self.name else "Camera()"
         check_size(where, self.width, self.height)
         check_number(where, "near", self.near, "[1e-30, inf)")  # its reciprocal is a finite float32
+        for name in ("delay", "readout"):
+            check_number(where, name, getattr(self, name), "[-1, 1]")
         K = numbers(where, "K", self.K).astype(np.float64)
         if K.shape != (3, 3):
             raise ValueError(f"{where}: `K` must be [3, 3], got {K.shape}; pass one camera's intrinsics.")

@@ -21,7 +21,7 @@ from morgs_mi.core.checks import numbers
 from morgs_mi.core.memory import float_tensor
 from morgs_mi.core.types import Float, Tensor, UInt32
 
-__all__ = ["ActivatedGaussians", "Gaussians", "join_sh", "repeat_each", "split_sh", "tensor_rows"]
+__all__ = ["ActivatedGaussians", "Gaussians", "displaced", "join_sh", "repeat_each", "split_sh", "tensor_rows"]
 
 
 class ActivatedGaussians(Protocol):
@@ -65,6 +65,11 @@ class ActivatedGaussians(Protocol):
     def rows(self, name: str, index: UInt32) -> list[Float]:
         """Return an attribute of the Gaussians at `index`, as `tensor_rows` does."""
         ...
+
+
+def displaced(gaussians: Gaussians, displacement: np.ndarray) -> Gaussians:
+    """Return N Gaussians that have moved by displacements [N, 3], world units, in a frame."""
+    return replace(gaussians, means=np.asarray(gaussians.means) + displacement, motion=displacement, offset=None)
 
 
 def tensor_rows(tensor: Tensor, index: UInt32) -> list[Float]:

@@ -99,6 +99,7 @@ def evaluate_stream(
     recording = open_stream_capture(stream, capture, list(packets))
     seconds = _seconds(stream.path)
     views = recording.train_views if recording.test_view is None else (recording.test_view,)
+    cameras = recording.with_delays(stream.cameras)
     channels = ("color", "motion", *(("confidence",) if has_confidence(stream) else ()))
     config, tracks = render_config(stream), _tracks(recording)
     false_alarms = _FALSE_ALARMS if recording.truth is None else 0
@@ -112,7 +113,7 @@ def evaluate_stream(
         kind, num_bytes = packets[coded.frame]
         scores: dict[str, ViewScores] = {}
         for view in views:
-            camera, image = stream.cameras[view], frame.images[view]
+            camera, image = cameras[view], frame.images[view]
             if image is None:
                 scores[camera.name] = ViewScores()
                 continue

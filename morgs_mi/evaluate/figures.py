@@ -71,7 +71,7 @@ def draw_stream(
         raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
     recording = open_stream_capture(stream, capture, frames)
     view = recording.train_views[0] if recording.test_view is None else recording.test_view
-    camera = stream.cameras[view]
+    camera = recording.with_delays(stream.cameras)[view]
     # Nothing moves up to the first frame.
     later = frames[1:] or frames
     chosen = {later[i] for i in np.linspace(0, len(later) - 1, min(_ROWS, len(later))).astype(int)}

@@ -8,7 +8,7 @@ from dataclasses import replace
 import drjit as dr
 import numpy as np
 
-from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.core.types import Tensor
 from morgs_mi.fit.optimise import adam, optimise, values_of
 from morgs_mi.losses.losses import recon_loss
@@ -56,7 +56,7 @@ def fit_motion(
     """
     logit = np.zeros(len(gaussians)) if gaussians.logit_confidence is None else gaussians.logit_confidence
     start = start or Lift(np.zeros((len(gaussians), 3), np.float32), np.array(logit, np.float32))
-    begun = replace(gaussians, means=np.asarray(gaussians.means) + start.displacement)
+    begun = displaced(gaussians, start.displacement)
 
     def losses_at(parameters: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
         view = views[index]

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.method.cohesion import share_confidence
@@ -54,7 +54,7 @@ def initial_motion(
         start = search_motion(gaussians, start, views, targets, config.search)
     if config.refine_start and config.two_gates:
         start = refine_displacement(gaussians, start, views, targets, config.photometric)
-        moved = replace(gaussians, means=np.asarray(gaussians.means) + start.displacement)
+        moved = displaced(gaussians, start.displacement)
         start = replace(start, color_change=mean_color_error(moved, views, targets, config.photometric))
     return replace(start, logit_confidence=_initial_confidence(start, active, previous, config))
 

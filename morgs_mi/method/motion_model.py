@@ -51,7 +51,8 @@ def moved(gaussians: Gaussians, displacement: Tensor, rotation: Tensor) -> Gauss
     q, r = (dr.unravel(mi.Vector4f, tensor.array) for tensor in (gaussians.quats, rotation))
     turned: Jit = dr.ravel(quaternion_product(r + mi.Vector4f(1, 0, 0, 0), q))
     quats = mi.TensorXf(turned, tuple(gaussians.quats.shape))
-    return replace(gaussians, means=gaussians.means + displacement, quats=quats)
+    motion = displacement if gaussians.motion is None else gaussians.motion + displacement
+    return replace(gaussians, means=gaussians.means + displacement, motion=motion, quats=quats)
 
 
 def quaternion_product(r: Jit, q: Jit) -> Jit:

@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.color_space import SH_C0
-from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.lift import Lift
 from morgs_mi.method.propagation import narrowed_views, nearest_neighbours
@@ -83,7 +83,7 @@ def refine_displacement(
     gradients = {v: _gradient(view, targets[v]) for v, view in views.items()}
 
     def sums_of(d: np.ndarray) -> np.ndarray:
-        moved = replace(previous, means=means + d)
+        moved = displaced(previous, d)
         return np.stack([_sums(moved, view, targets[v], gradients[v]) for v, view in views.items()])
 
     def error_of(sums: np.ndarray) -> np.ndarray:

@@ -14,12 +14,12 @@ A Gaussian whose error falls clearly accepts its proposal. Only the surroundings
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import KDTree
 
-from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.losses.attribution import attribute_error
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.boxes import boxes_around
@@ -79,7 +79,7 @@ def propagate_motion(
     )
 
     def error_of(d: np.ndarray) -> np.ndarray:
-        moved = replace(previous, means=means + d)
+        moved = displaced(previous, d)
         sums = np.sum([attribute_error(moved, views[view], targets[view]) for view in views], axis=0)
         return (sums[:, 0] + config.floor_px) / (sums[:, 1] + 1)
 
@@ -129,8 +129,7 @@ def narrowed_views(
 ) -> dict[int, ActiveView]:
     """Return the views with the blocks that the `chosen` Gaussians reach, in place or displaced; without empty ones."""
     some = gaussians.select(np.flatnonzero(chosen))
-    means = np.asarray(some.means)
-    places = [some, *(replace(some, means=means + d[chosen]) for d in displacements if d.any())]
+    places = [some, *(displaced(some, d[chosen]) for d in displacements if d.any())]
     narrowed = {}
     for index, view in views.items():
         boxes = [boxes_around(place, view.camera, view.config, 1.0) for place in places]

@@ -24,7 +24,7 @@ from scipy.sparse.csgraph import connected_components
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
-from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.lift import Lift
 from morgs_mi.method.propagation import narrowed_views, nearest_neighbours
@@ -84,14 +84,14 @@ def search_motion(
         config: settings.
     """
     config = config or SearchConfig()
-    started = _displaced(previous, start.displacement)
+    started = displaced(previous, start.displacement)
     errors = _errors(started, views, targets)
     parts = _unexplained_parts(started, errors, views, config)
     displacement, logit = start.displacement, start.logit_confidence
     for part, d in _find(previous, parts, views, targets, config):
         proposal = np.where(part[:, None], d, displacement).astype(np.float32)
         around = narrowed_views(views, previous, part, [displacement, proposal])
-        moved = _displaced(previous, proposal)
+        moved = displaced(previous, proposal)
         before = sum(float(errors[v][views[v].crop(_drawn(view))].sum()) for v, view in around.items())
         after = sum(float(error.sum()) for error in _errors(moved, around, targets).values())
         if after < config.max_error_ratio * before:
@@ -100,10 +100,6 @@ def search_motion(
     if displacement is start.displacement:
         return start
     return replace(start, displacement=displacement, logit_confidence=logit.astype(np.float32))
-
-
-def _displaced(gaussians: Gaussians, d: np.ndarray) -> Gaussians:
-    return replace(gaussians, means=np.asarray(gaussians.means) + d)
 
 
 def _errors(

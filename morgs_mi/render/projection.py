@@ -132,7 +132,11 @@ def project(
     fx, fy, cx, cy, near, *limits = _intrinsics(camera)
 
     world = [mi.Float64(v) for v in means]
-    x, y, z = (mi.Float(dr.fma(a, world[0], dr.fma(b, world[1], dr.fma(c, world[2], t)))) for a, b, c, t in pose)
+    if (camera.delay or camera.readout) and gaussians.motion is not None:
+        _, y, z = _transformed(world, pose)
+        delay = _delays(dr.fma(fy, y / dr.maximum(z, near), cy), camera)
+        world = [v + mi.Float64(delay * d) for v, d in zip(world, _displacement(gaussians, rows), strict=True)]
+    x, y, z = _transformed(world, pose)
     probe = dr.detach(x + y + z)
     front = dr.detach((z >= near) & (dr.maximum(dr.maximum(dr.abs(x), dr.abs(y)), z) < FARTHEST))
     x, y, z = dr.select(front, x, 0), dr.select(front, y, 0), dr.select(front, z, 1)
@@ -176,6 +180,26 @@ def project(
     valid = front & (reach > 0) & finite  # pyright: ignore[reportOperatorIssue]
     extent = (dr.sqrt(reach * xx) / s, dr.sqrt(reach * yy) / s)
     return Splats(shape, blended, dr.detach(z), extent, valid, finite, profile=line)
+
+
+def _transformed(world: list[Float], pose: list[list[Float]]) -> tuple[Float, Float, Float]:
+    """Return points in camera space, in single precision."""
+    x, y, z = (mi.Float(dr.fma(a, world[0], dr.fma(b, world[1], dr.fma(c, world[2], t)))) for a, b, c, t in pose)
+    return x, y, z
+
+
+def _displacement(gaussians: ActivatedGaussians, rows: UInt32) -> list[Float]:
+    """Return the displacement of Gaussians from frame to frame: their motion, with the learned offset."""
+    motion = gaussians.rows("motion", rows)
+    if getattr(gaussians, "offset", None) is None:
+        return motion
+    return [a + b for a, b in zip(motion, gaussians.rows("offset", rows), strict=True)]
+
+
+def _delays(row: Float, camera: Camera) -> Float:
+    """Return the frames by which rows of a camera, in px, are exposed after the instant."""
+    delay, readout, height = (dr.opaque(mi.Float, value) for value in (camera.delay, camera.readout, camera.height))
+    return dr.fma(readout, dr.clip(row / height, 0, 1) - 0.5, delay)
 
 
 def _pose(viewmat: Tensor) -> tuple[list[list[Float]], list[list[Float]], list[Float]]:

@@ -195,6 +195,14 @@ def bad_settings(path: Path) -> None:
     (path / "capture.json").write_text(json.dumps({"test_view": "cam01"}))
 
 
+def bad_readout(path: Path) -> None:
+    (path / "capture.json").write_text('{"readout": {"cam01": 2}}')
+
+
+def readout_of_another(path: Path) -> None:
+    (path / "capture.json").write_text('{"readout": {"cam07": 0.4}}')
+
+
 def broken_settings(path: Path) -> None:
     (path / "capture.json").write_text("{")
 
@@ -225,6 +233,8 @@ def broken_settings(path: Path) -> None:
         ),
         (missing_video_of_a_row, ValueError, r"got 3 rows for 2 videos \(cam01, cam02\)"),
         (bad_settings, ValueError, "capture.json: `test_view` must be a camera's index or null, got 'cam01'"),
+        (bad_readout, ValueError, r"capture.json: `readout` must be a number of frames in \[-1, 1\], got 2"),
+        (readout_of_another, ValueError, "capture.json: `readout` must name cameras of cam01, cam02, .*got cam07"),
         (broken_settings, ValueError, "capture.json: expected JSON"),
     ],
 )

@@ -58,21 +58,51 @@ def test_timeline__aligns_clips(tmp_path: Path, clips, config, fps, instants) ->
     assert [frame.index for frame in capture.partial_frames(1)] == list(range(1, len(instants)))
 
 
-def test_timeline__interpolates_images_at_an_offset_that_is_not_whole(tmp_path: Path) -> None:
-    path = layouts.n3dv(tmp_path / "c", ("a", "b"), lambda *_: None)
-    for name in ("a", "b"):
-        write_video(
-            path / f"{name}.mkv", [np.full((layouts.HEIGHT, layouts.WIDTH, 3), 40 * t, np.uint8) for t in range(4)], 25
-        )
+def brightening(path: Path, fps: dict[str, float]) -> Path:
+    """Write a capture whose clips have frames t of the colour 40 t."""
+    layouts.n3dv(path, tuple(fps), lambda *_: None)
+    for name, rate in fps.items():
+        images = [np.full((layouts.HEIGHT, layouts.WIDTH, 3), 40 * t, np.uint8) for t in range(5)]
+        write_video(path / f"{name}.mkv", images, rate)
+    return path
+
+
+def test_timeline__gives_clips_whose_offset_is_not_whole_a_delay(tmp_path: Path) -> None:
+    path = brightening(tmp_path / "c", {"a": 25, "b": 25})
     capture = load_capture(path, reading=ReadConfig(offset={"b": -1.25}))
-    # At frame 2 of a, b shows its frame 0.75.
-    assert frame_numbers(capture) == [[80, 30], [120, 70]]
-    assert [int(image[0, 0, 0]) for image in capture.images(1, 1)] == [70]
-    assert frame_numbers(load_capture(path, reading=ReadConfig(offset={"a": 1.5, "b": 2}))) == [
-        [20, 40],
-        [60, 80],
-        [100, 120],
-    ]
+    # At frames 2, 3 and 4 of a, b would show its frames 0.75, 1.75 and 2.75. Only the first image is interpolated.
+    assert frame_numbers(capture) == [[80, 30], [120, 80], [160, 120]]
+    assert [camera.delay for camera in capture.cameras] == [0, 0.25]
+    first, second = list(capture.partial_frames())[:2]
+    assert [int(image[0, 0, 0]) for image in first.comparable((0, 1))] == [80, 40]
+    assert [int(image[0, 0, 0]) for image in second.comparable((1,))] == [80]
+    assert [int(image[0, 0, 0]) for image in capture.images(1)] == [40, 80, 120]
+    capture = load_capture(path, reading=ReadConfig(offset={"a": 1.5, "b": 2}))
+    assert frame_numbers(capture) == [[20, 40], [80, 80], [120, 120], [160, 160]]
+    assert [camera.delay for camera in capture.cameras] == [0.5, 0]
+
+
+def test_timeline__gives_faster_clips_a_delay_in_instants(tmp_path: Path) -> None:
+    path = brightening(tmp_path / "c", {"a": 25, "b": 50})
+    capture = load_capture(path, reading=ReadConfig(offset={"b": 0.5}))
+    assert frame_numbers(capture) == [[0, 20], [40, 120]]
+    assert [camera.delay for camera in capture.cameras] == [0, 0.25]
+
+
+def test_timeline__interpolates_images_where_the_delay_would_vary(tmp_path: Path) -> None:
+    path = brightening(tmp_path / "c", {"a": 20, "b": 30})
+    capture = load_capture(path, reading=ReadConfig(offset={"b": 0.25}))
+    # a's frames 0, 1 and 2 are b's 0.25, 1.75 and 3.25.
+    assert frame_numbers(capture) == [[0, 10], [40, 70], [80, 130]]
+    assert [camera.delay for camera in capture.cameras] == [0, 0]
+
+
+def test_load_capture__reads_the_readout_of_cameras(tmp_path: Path) -> None:
+    path = capture_of(tmp_path / "c", {"a": (3, 25), "b": (6, 50)})
+    for setting, expected in (("0.6", [0.6, 0.3]), ('{"b": -0.5}', [0, -0.25])):
+        (path / "capture.json").write_text(f'{{"readout": {setting}}}')
+        capture = load_capture(path, reading=ReadConfig(trim=True))
+        assert [camera.readout for camera in capture.cameras] == expected
 
 
 def test_timeline__uses_the_true_rate_and_the_frame_limit_for_aligned_clips(tmp_path: Path) -> None:

@@ -87,6 +87,8 @@ def test_camera__copies_its_matrices():
         ({"near": np.inf}, "`near` must be a number"),
         ({"near": 0}, "`near` must be a number"),
         ({"near": "1"}, "`near` must be a number"),
+        ({"delay": 1.5}, r"`delay` must be a number in \[-1, 1\], got 1.5"),
+        ({"readout": np.nan}, r"`readout` must be a number in \[-1, 1\], got nan"),
         ({"width": 8.5}, "at least 1x1 in integers, got 8.5x16"),
         ({"height": 0}, "at least 1x1 in integers, got 32x0"),
         ({"K": "K"}, "`K` must be an array of real numbers, got 'K'"),

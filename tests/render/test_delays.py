@@ -1,0 +1,64 @@
+"""Views at a time of their own: delays and rolling shutters displace what moves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import drjit as dr
+import numpy as np
+import pytest
+
+from morgs_mi import Camera, Gaussians, rasterize
+from tests import tolerances as tol
+from tests.assertions import assert_close
+from tests.scenes.cameras import make_camera
+from tests.scenes.gaussians import make_scene, to_gaussians
+
+
+@pytest.fixture(scope="module")
+def moving() -> tuple[dict[str, np.ndarray], Camera]:
+    """Gaussians that move by up to a few pixels in a frame, with the learned offset on top; and a camera."""
+    raw = make_scene()
+    raw["offset"] = 0.05 * np.random.default_rng(5).normal(size=raw["means"].shape)
+    return raw, make_camera()
+
+
+def test_rasterize__shows_gaussians_where_they_are_after_a_delay(moving) -> None:
+    raw, camera = moving
+    expected = rasterize(
+        to_gaussians({**raw, "means": raw["means"] + 0.4 * (raw["motion"] + raw["offset"])}), camera, ("color",)
+    )
+    found = rasterize(to_gaussians(raw), replace(camera, delay=0.4), ("color",))
+    assert_close(found.color, np.asarray(expected.color), atol=tol.IMAGE_ABS)
+    without = replace(to_gaussians(raw), motion=None, offset=None)
+    still = rasterize(without, replace(camera, delay=0.4), ("color",)).color
+    assert np.array_equal(still, rasterize(without, camera, ("color",)).color)
+
+
+def test_rasterize__shows_each_gaussian_at_the_time_of_its_row(moving) -> None:
+    raw, camera = moving
+    rows = camera.project(raw["means"])[0][:, 1] / camera.height
+    delays = 0.1 - 0.5 * (np.clip(rows, 0, 1) - 0.5)[:, None]
+    expected = rasterize(
+        to_gaussians({**raw, "means": raw["means"] + delays * (raw["motion"] + raw["offset"])}), camera, ("color",)
+    )
+    found = rasterize(to_gaussians(raw), replace(camera, delay=0.1, readout=-0.5), ("color",))
+    assert_close(found.color, np.asarray(expected.color), atol=tol.IMAGE_ABS)
+
+
+def test_rasterize__backward_agrees_with_central_differences_after_a_delay(moving) -> None:
+    raw, camera = moving
+    camera = replace(camera, delay=-0.3, readout=0.6)
+
+    def loss(gaussians: Gaussians):
+        return dr.sum(dr.square(rasterize(gaussians, camera, ("color",)).color), axis=None)
+
+    gaussians = to_gaussians(raw, grad=True)
+    dr.backward(loss(gaussians))
+    rng = np.random.default_rng(4)
+    for name in ("means", "motion", "offset"):
+        grad = np.asarray(dr.grad(getattr(gaussians, name)), np.float64)
+        v, h = np.sign(grad) * rng.uniform(0.5, 1, grad.shape), 2e-3
+        up, down = (loss(to_gaussians({**raw, name: raw[name] + s * h * v})) for s in (1, -1))
+        difference = (np.asarray(up).item() - np.asarray(down).item()) / (2 * h)
+        assert difference == pytest.approx(np.vdot(grad, v), rel=tol.CENTRAL_DIFFERENCE_REL), name
