@@ -44,7 +44,7 @@ def configured(how: str, steps: int, seed: int) -> StreamConfig:
     config = StreamConfig(seed=seed)
     fit = replace(config.fit, first_frame_steps=steps)
     if how == "before":
-        fit = replace(fit, num_gaussians=20_000, dropping=0.0)
+        fit = replace(fit, num_gaussians=20_000, dropping=0.0, noise_aware=False)
     return replace(config, fit=fit)
 
 
