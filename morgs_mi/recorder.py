@@ -32,9 +32,10 @@ from morgs_mi.codec.container import Packet, PacketKind, StreamWriter, Truncated
 from morgs_mi.codec.packets import CodedFrame, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import is_same_file, locked_folder, write_json
+from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.cross_validation import mean_psnr
+from morgs_mi.fit.initialise import scene_extent
 from morgs_mi.io.bounded import read_json
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.method.flow import choose_key_views
@@ -43,6 +44,8 @@ from morgs_mi.stream_loop import FrameReport, StreamLoop
 __all__ = [
     "FILES",
     "about_cameras",
+    "about_lenses",
+    "as_fitted",
     "check_same_fit",
     "described_capture",
     "due_keyframe",
@@ -116,8 +119,9 @@ def _stream(
     refinement = None
     if interrupted is None:
         capture, refinement = with_refined_cameras(with_points(capture, config.seed, on_stage), config, on_stage)
+        metadata |= about_lenses(capture)
     else:
-        capture = replace(capture, cameras=capture.with_delays(interrupted.cameras))
+        capture = interrupted.capture
     loop = StreamLoop(
         [capture.cameras[v] for v in train],
         capture.points,
@@ -129,7 +133,7 @@ def _stream(
     if interrupted is None:
         write_json(out / "capture.json", about)
         writer, reports = StreamWriter(path, capture.cameras, capture.fps, metadata), []
-        frames = chain((first,), frames)
+        frames = chain((first,), frames) if refinement is None else capture.partial_frames()
     else:
         # Changes and exposures are relative to references that depend on all images so far.
         now = interrupted.coded.frame
@@ -151,7 +155,9 @@ def _stream(
             tick = None if on_step is None else _frame_ticker(on_step, frame.index)
             packet, report = push_frame(loop, frame, train, tick, upcoming)
             if refinement is not None and not frame.index:
-                report = replace(report, validation=report.validation | about_cameras(loop, capture, frame, refinement))
+                assert loop.gaussians is not None
+                about = about_cameras(loop.gaussians, capture, frame, refinement, config)
+                report = replace(report, validation=report.validation | about)
             reports.append(report)
             _check_in_place(path, written)
             write_json(out / "report.json", {**metadata, "frames": [asdict(r) for r in reports]})
@@ -179,16 +185,18 @@ def with_refined_cameras(
     return refine_cameras(capture, config.fit, config.render, config.seed, partial(on_stage, "Refining cameras"))
 
 
-def about_cameras(loop: StreamLoop, capture: Capture, frame: PartialFrame, found: Refinement) -> dict[str, Any]:
+def about_cameras(
+    gaussians: Gaussians, capture: Capture, frame: PartialFrame, found: Refinement, config: StreamConfig
+) -> dict[str, Any]:
     """Return what the first frame's report says about the cameras, and of the held-out view if there is one."""
     about, test = {**asdict(found), "sentence": found.sentence}, capture.test_view
     image = None if test is None else frame.images[test]
-    if test is None or image is None or loop.gaussians is None:
+    if test is None or image is None:
         return {"refinement": about}
-    config, view = loop.setup.config, (image, capture.masks[test])
-    given = capture.cameras[test]
-    registered = register_camera(loop.gaussians, given, *view, loop.setup.extent, config.fit, config.render)
-    psnr = [mean_psnr(loop.gaussians, [(camera, *view)], config.render) for camera in (given, registered)]
+    view, given = (image, capture.masks[test]), capture.cameras[test]
+    extent = scene_extent([capture.cameras[v] for v in capture.train_views])
+    registered = register_camera(gaussians, given, *view, extent, config.fit, config.render)
+    psnr = [mean_psnr(gaussians, [(camera, *view)], config.render) for camera in (given, registered)]
     return {"refinement": {**about, "held_out": {"calibrated_psnr": psnr[0], "registered_psnr": psnr[1]}}}
 
 
@@ -250,14 +258,14 @@ class _Interrupted:
         end: offset of the end of the last one.
         coded: state after it.
         reports: of the frames.
-        cameras: of its header.
+        capture: with the cameras of its header.
     """
 
     index: list[tuple[int, int, int]]
     end: int
     coded: CodedFrame
     reports: list[FrameReport]
-    cameras: tuple[Camera, ...]
+    capture: Capture
 
 
 def _interrupted(out: Path, capture: Capture, metadata: Mapping[str, Any]) -> _Interrupted | None:
@@ -275,9 +283,31 @@ def _interrupted(out: Path, capture: Capture, metadata: Mapping[str, Any]) -> _I
     if not index:
         return None
     coded = seek(stream, index[-1][1])
-    return _Interrupted(
-        index, end, coded, read_reports(out / "report.json", range(coded.frame + 1)), tuple(stream.cameras)
-    )
+    reports = read_reports(out / "report.json", range(coded.frame + 1))
+    return _Interrupted(index, end, coded, reports, as_fitted(capture, stream))
+
+
+def as_fitted(capture: Capture, stream: StreamReader) -> Capture:
+    """Return a capture with the cameras of a stream, whose fit may have refined them.
+
+    Raises:
+        ValueError: the distortions in the stream's header are no pairs of numbers.
+    """
+    found, expected = stream.metadata.get("distortions", {}), "an object with two numbers for each camera"
+    try:
+        terms = np.array([found.get(name, (0, 0)) for name in capture.names], np.float64)
+    except (AttributeError, TypeError, ValueError):
+        terms = np.full((1, 1), np.nan)
+    if terms.shape[1:] != (2,) or not np.isfinite(terms).all():
+        raise ValueError(f"{stream.path}: packet 0: `distortions` must be {expected}; fit the capture again.")
+    return capture.with_cameras(capture.with_delays(stream.cameras), terms.tolist())
+
+
+def about_lenses(capture: Capture) -> dict[str, Any]:
+    """Return the entries of a stream's header that `as_fitted` reads, none where no distortion was refined."""
+    named = zip(capture.names, capture.distortions, strict=bool(capture.distortions))
+    terms = {name: list(terms) for name, terms in named if any(terms)}
+    return {"distortions": terms} if terms else {}
 
 
 def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str, Any]) -> None:
@@ -287,7 +317,8 @@ def check_same_fit(stream: StreamReader, capture: Capture, metadata: Mapping[str
         ValueError: it belongs to another capture or other settings.
     """
     # Streams of earlier versions have paths in their headers.
-    recorded = _without_folders({name: value for name, value in stream.metadata.items() if name != "capture"})
+    found = ("capture", "distortions")
+    recorded = _without_folders({name: value for name, value in stream.metadata.items() if name not in found})
     # Refined cameras differ from the calibrated ones, which are part of the fingerprint then.
     refined = metadata["config"]["fit"]["refine_cameras"] != "off"
     cameras = stream.cameras if refined else capture.cameras

@@ -16,18 +16,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import PAYLOAD, TRAILER, StreamWriter
 from morgs_mi.codec.packets import CodedFrame, coded_frames, play, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.fit.config import RefinementConfig
 from morgs_mi.method.exposure import ExposureConfig
-from morgs_mi.recorder import _without_folder, stream_capture, stream_metadata, with_next
+from morgs_mi.playback.player import open_stream_capture
+from morgs_mi.recorder import _without_folder, as_fitted, stream_capture, stream_metadata, with_next
 from morgs_mi.stream_loop import StreamLoop
 from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
 from tests.scenes.captures import colmap
 from tests.scenes.coded_clip import history
-from tests.scenes.recording import CONFIG, FRAMES, Recording, recording
+from tests.scenes.recording import CONFIG, FRAMES, Recording, recording, write_recording
 from tests.scenes.short_clip import Clip, Piece
 
 # About what the fit takes here; on a slower machine all kills come early.
@@ -371,10 +373,16 @@ def refined_config():
     return replace(CONFIG, fit=replace(CONFIG.fit, refine_cameras="on", refinement=how))
 
 
-def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path):
-    capture, config = recording(test_view=0, num_frames=2), refined_config()
+def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path_factory):
+    tmp_path, config = tmp_path_factory.mktemp("out"), refined_config()
+    capture = load_capture(write_recording(tmp_path_factory.mktemp("capture"), 2), test_view=0)
     stream_capture(capture, tmp_path, config)
     stream, whole = StreamReader(tmp_path / "stream.morgs"), stream_of(tmp_path)
+    names = set(stream.metadata["distortions"])
+    assert names == set(capture.names[1:]), "the terms of the training views"
+    opened = open_stream_capture(stream, None, [0, 1])
+    assert np.array_equal(opened.cameras[1].viewmat, stream.cameras[1].viewmat)
+    assert [list(terms) for terms in opened.distortions[1:]] == [*stream.metadata["distortions"].values()]
     assert np.array_equal(stream.cameras[0].viewmat, capture.cameras[0].viewmat), "the held-out view"
     assert all(not np.array_equal(stream.cameras[v].viewmat, capture.cameras[v].viewmat) for v in (1, 2))
     first = report_of(tmp_path)["frames"][0]["validation"]["refinement"]
@@ -383,6 +391,15 @@ def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path):
     (tmp_path / "stream.morgs").write_bytes(whole[: stream.index()[-1][2]])
     stream_capture(capture, tmp_path, config, resume=True)
     assert stream_of(tmp_path) == whole
+
+
+@pytest.mark.parametrize("found", [[1, 2], {"cam1": [0.1]}, {"cam1": ["x", "y"]}, {"cam1": None}])
+def test_as_fitted__refuses_broken_distortions(tmp_path, found):
+    capture = recording()
+    with StreamWriter(tmp_path / "stream.morgs", capture.cameras, 25.0, {"distortions": found}):
+        pass
+    with pytest.raises(ValueError, match="`distortions` must be an object with two numbers for each camera"):
+        as_fitted(capture, StreamReader(tmp_path / "stream.morgs"))
 
 
 def test_stream_capture__resumes_with_the_exposures_of_the_report(tmp_path):

@@ -7,11 +7,15 @@ random axis, displaced by as many per cent of the scene extent in a random direc
 1 % too long or too short; at 0 degrees, all cameras are true. The first frame is fitted with the true cameras, the
 disturbed and the refined ones. The held-out view is scored as calibrated, and registered: seen from the camera that
 fits its image best.
+
+With `--lens`, cameras are also refined that are true but for their lenses: the training views have a radial distortion
+of up to that (k1), of which the calibration knows nothing.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -24,14 +28,18 @@ import tyro
 
 from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.fits import new_loop, random_capture
-from morgs_mi.calibration.bundle import changed_camera
+from morgs_mi.calibration.bundle import changed_camera, distorted
 from morgs_mi.calibration.refine import refine_cameras, register_camera
-from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.capture.lens import Lens
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.fit.cross_validation import mean_psnr
 from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.synth.disturbances import Disturbances, load_disturbances
+from morgs_mi.synth.synthesize import synthesize
 
 _FOCAL_ERROR = 0.01
 
@@ -48,6 +56,8 @@ class Options(CellOptions):
     """Rotations of the cameras; their displacements in per cent of the scene extent."""
     disturbances: tuple[int, ...] = (0, 1, 2)
     """Seeds of the disturbances."""
+    lens: float = 0.0
+    """Largest distortion of lenses that the calibration denies; 0: none."""
     downscale: float = 1
     """Factor by which the clips are reduced."""
     steps: int = 600
@@ -121,6 +131,54 @@ def measure(source: Source, degrees: float, seed: int, config: StreamConfig) -> 
     }
 
 
+def lens_clips(clips: Path, seed: int, distortion: float) -> tuple[Path, Path]:
+    """Return a clip through lenses with distortion, and a copy whose calibration denies it for the training views."""
+    true = clips / f"random-{seed}-lens-{distortion:g}"
+    denied = true.with_name(f"{true.name}-denied")
+    if not denied.exists():
+        own = Disturbances(distortion=distortion)
+        synthesize("random", true, num_frames=1, seed=seed, disturbances=own, overwrite=True)
+        capture, truth = load_capture(true), load_disturbances(true / "truth")
+        lenses = [truth[n].lens if v == capture.test_view else Lens() for v, n in enumerate(capture.names)]
+        shutil.copytree(true, denied)
+        write_colmap(denied / "sparse" / "0", capture.cameras, capture.points, capture.point_colors, lenses)
+    return true, denied
+
+
+def measure_lens(source: Source, denied: Source, config: StreamConfig) -> dict[str, Any]:
+    """Return the scores with true, denied and refined lenses, and the errors of the cameras."""
+    capture, wrong = source.open(), denied.open()
+    better, found = refine_cameras(wrong, config.fit, config.render, config.seed)
+    truth, none = load_disturbances(capture.path / "truth"), [(0.0, 0.0)] * len(capture.cameras)
+    train = [(v, capture.cameras[v], truth[capture.names[v]].distortion) for v in capture.train_views]
+
+    def about(given: Capture) -> dict[str, float]:
+        terms = given.distortions or none
+        corners = [_at_corner(given.cameras[v], terms[v]) - _at_corner(camera, (k, 0.0)) for v, camera, k in train]
+        shift = float(np.mean(np.linalg.norm(corners, axis=1)))
+        errors = pose_errors([given.cameras[v] for v in given.train_views], [camera for _, camera, _ in train])
+        return scores(given, config) | errors | {"corner": round(shift, 3)}
+
+    return {
+        "true": scores(capture, config),
+        "disturbed": about(wrong),
+        "refined": about(better),
+        "refinement": asdict(found),
+    }
+
+
+def _at_corner(camera: Camera, terms: Sequence[float]) -> np.ndarray:
+    """Return by how much distortion shifts the first corner of an image, px."""
+    corner = np.zeros((1, 2))
+    return (distorted(camera, corner, np.asarray(terms)) - corner)[0]
+
+
+def recovered(row: Mapping[str, Any]) -> float:
+    """Return the share of the lost PSNR of the registered view that refinement brings back."""
+    true, before, after = (row[name]["registered"] for name in ("true", "disturbed", "refined"))
+    return round((after - before) / (true - before), 3)
+
+
 def main(options: Options) -> None:
     """Run the report; the file is written after each disturbance."""
     mi.set_variant("llvm_ad_rgb")
@@ -129,16 +187,22 @@ def main(options: Options) -> None:
     config = replace(config, fit=replace(fit, refine_cameras="auto"))
     sources = {seed: Source.of(random_capture(options.clips, seed, options.downscale)) for seed in options.seeds}
     true = options.run(measure_true, {str(seed): (source, config) for seed, source in sources.items()})
+    given = {"downscale": options.downscale, "steps": options.steps, "gaussians": options.gaussians}
     rows: list[dict[str, Any]] = []
+    lenses: list[dict[str, Any]] = []
+    if options.lens:
+        clips = {str(seed): lens_clips(options.clips, seed, options.lens) for seed in options.seeds}
+        pairs = {s: [Source.of(load_capture(path, options.downscale)) for path in pair] for s, pair in clips.items()}
+        found = options.run(measure_lens, {seed: (*pair, config) for seed, pair in pairs.items()})
+        lenses = [
+            {"seed": int(s), "lens": options.lens, "recovered": recovered(row), **row} for s, row in found.items()
+        ]
     for disturbance, degrees in product(options.disturbances, options.degrees):
         cells = {str(seed): (source, degrees, disturbance, config) for seed, source in sources.items()}
         for seed, row in options.run(measure, cells).items():
-            gain = row["refined"]["registered"] - row["disturbed"]["registered"]
-            lost = true[seed]["true"]["registered"] - row["disturbed"]["registered"]
-            about = {"seed": int(seed), "degrees": degrees, "disturbance": disturbance}
-            rows.append({**about, "recovered": round(gain / lost, 3) if degrees else None, **true[seed], **row})
-        given = {"downscale": options.downscale, "steps": options.steps, "gaussians": options.gaussians}
-        options.write({**given, "fits": rows}, unprinted=["fits"])
+            about, row = {"seed": int(seed), "degrees": degrees, "disturbance": disturbance}, {**true[seed], **row}
+            rows.append({**about, "recovered": recovered(row) if degrees else None, **row})
+        options.write({**given, "fits": rows, "lenses": lenses}, unprinted=["fits", "lenses"])
 
 
 if __name__ == "__main__":

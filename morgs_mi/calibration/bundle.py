@@ -3,12 +3,13 @@
 A point X lies at x = exp([w]) R (X - C - d) in the axes of a camera with the rotation R and the centre C, and at the
 pixel
 
-    u = (1 + s) f x / z + c + p W
+    u = (1 + s) f (1 + k1 r^2 + k2 r^4) x / z + c + p W ,    r = |(x, y)| / z ,
 
-so that the change of a camera has nine numbers: a small rotation w [3], a displacement d [3] of its centre, the
-relative change s of its focal lengths, and the displacement p [2] of its principal point in image widths W. They have
-independent normal priors around zero. Images do not determine a common similarity of cameras and points: there the
-priors alone decide, and leave the rig where the sum of the squared changes is least.
+so that the change of a camera has eleven numbers: a small rotation w [3], a displacement d [3] of its centre, the
+relative change s of its focal lengths, the displacement p [2] of its principal point in image widths W, and the radial
+distortion k [2] that is left in its images. They have independent normal priors around zero. Images do not determine a
+common similarity of cameras and points: there the priors alone decide, and leave the rig where the sum of the squared
+changes is least.
 
 Reprojection errors have Cauchy's loss in units of their own scale, so that wrong matches do not count.
 """
@@ -25,9 +26,19 @@ from morgs_mi.capture.features import Tracks, intersect
 from morgs_mi.core.camera import Camera
 from morgs_mi.fit.config import CameraPriors
 
-__all__ = ["NormalEquations", "bundle_adjust", "camera_jacobian", "changed_camera", "prior_deviations"]
+__all__ = [
+    "CHANGES",
+    "NormalEquations",
+    "bundle_adjust",
+    "camera_jacobian",
+    "changed_camera",
+    "distorted",
+    "prior_deviations",
+    "undistorted",
+]
 
-_CHANGES = 9
+# Numbers that change a camera.
+CHANGES = 11
 # Steps, and the relative decrease of the loss below which they end.
 _STEPS, _LEAST_DECREASE = 60, 1e-6
 # Damping of Levenberg and Marquardt at the start and at most.
@@ -39,7 +50,7 @@ _LEAST_SCALE, _CAUCHY = 0.05, 2.4
 def bundle_adjust(
     cameras: Sequence[Camera], tracks: Tracks, extent: float, priors: CameraPriors
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the changes [V, 9] of the cameras, and the points [P, 3] in world units, that fit the tracks best.
+    """Return the changes [V, 11] of the cameras, and the points [P, 3] in world units, that fit the tracks best.
 
     Args:
         cameras: V views as calibrated.
@@ -48,7 +59,7 @@ def bundle_adjust(
         priors: of the changes.
     """
     deviations, damping = np.stack([prior_deviations(camera, extent, priors) for camera in cameras]), _DAMPING
-    changes = np.zeros((len(cameras), _CHANGES))
+    changes = np.zeros((len(cameras), CHANGES))
     points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
     errors = _errors(cameras, changes, points, tracks)
     scale = _scale(errors)
@@ -73,23 +84,41 @@ def bundle_adjust(
 
 
 def changed_camera(camera: Camera, changes: np.ndarray) -> Camera:
-    """Return a camera with the changes [9] of the module docstring."""
+    """Return a camera with the changes [11] of the module docstring, without the distortion."""
     K, V = camera.K.copy(), np.eye(4)
     K[[0, 1], [0, 1]] *= 1 + changes[6]
-    K[:2, 2] += changes[7:] * camera.width
+    K[:2, 2] += changes[7:9] * camera.width
     V[:3, :3] = cv2.Rodrigues(np.asarray(changes[:3], np.float64))[0] @ np.asarray(camera.viewmat)[:3, :3]
     V[:3, 3] = -V[:3, :3] @ (camera.position + changes[3:6])
     return replace(camera, K=K, viewmat=V)
 
 
 def prior_deviations(camera: Camera, extent: float, priors: CameraPriors) -> np.ndarray:
-    """Return the standard deviations [9] of the changes of a camera; `extent` of the scene, world units."""
-    of_kind = np.deg2rad(priors.rotation), priors.position * extent, priors.focal, priors.principal_point
-    return np.repeat(of_kind, (3, 3, 1, 2))
+    """Return the standard deviations [11] of the changes of a camera; `extent` of the scene, world units."""
+    of_pose = np.deg2rad(priors.rotation), priors.position * extent
+    terms = priors.distortion, 0.2 * priors.distortion
+    return np.repeat((*of_pose, priors.focal, priors.principal_point, *terms), (3, 3, 1, 2, 1, 1))
 
 
-def camera_jacobian(camera: Camera, factor: float, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of pixel positions by the changes of the camera [n, 2, 9] and by the points [n, 2, 3].
+def distorted(camera: Camera, pixels: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    """Return where radial distortion k [2] shows the pixels [n, 2] of a pinhole camera."""
+    focal, centre = camera.K[[0, 1], [0, 1]], camera.K[:2, 2]
+    square = np.sum(((pixels - centre) / focal) ** 2, axis=-1, keepdims=True)
+    return pixels + (pixels - centre) * (distortion[0] + distortion[1] * square) * square
+
+
+def undistorted(camera: Camera, pixels: np.ndarray, distortion: np.ndarray) -> np.ndarray:
+    """Return the pixels [n, 2] of a pinhole camera that radial distortion k [2] shows at `pixels` [n, 2]."""
+    if not np.any(distortion) or not len(pixels):
+        return pixels
+    coefficients = np.array([*distortion, 0, 0], np.float64)
+    return cv2.undistortPoints(pixels[:, None].astype(np.float64), camera.K, coefficients, P=camera.K)[:, 0]
+
+
+def camera_jacobian(
+    camera: Camera, factor: float, points: np.ndarray, distortion: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the derivatives of pixel positions by the changes of the camera [n, 2, 11] and by the points [n, 2, 3].
 
     The derivative by w is that by a further small rotation, which is the same to first order.
 
@@ -97,6 +126,7 @@ def camera_jacobian(camera: Camera, factor: float, points: np.ndarray) -> tuple[
         camera: with the changes so far.
         factor: 1 + s.
         points: [n, 3], world units; the derivatives of points behind the near plane are zero.
+        distortion: k [2] so far, of images that are not undistorted by it; default: none.
     """
     by_point = camera.projection_jacobian(points)
     R = np.asarray(camera.viewmat, np.float64)[:3, :3]
@@ -105,9 +135,21 @@ def camera_jacobian(camera: Camera, factor: float, points: np.ndarray) -> tuple[
     cross[:, [1, 2, 0], [2, 0, 1]] = x
     cross -= cross.transpose(0, 2, 1)
     front = x[:, 2] > camera.near
-    J = np.zeros((len(x), 2, _CHANGES))
+    J = np.zeros((len(x), 2, CHANGES))
     J[:, :, :3], J[:, :, 3:6] = by_point @ R.T @ cross, -by_point
-    J[front, :, 6] = (camera.project(points[front])[0] - camera.K[:2, 2]) / factor
+    from_centre = camera.project(points[front])[0] - camera.K[:2, 2]
+    J[front, :, 6] = from_centre / factor
+    ray = from_centre / camera.K[[0, 1], [0, 1]]
+    square = np.sum(ray**2, axis=1, keepdims=True)
+    J[front, :, 9], J[front, :, 10] = from_centre * square, from_centre * square**2
+    if distortion is not None and distortion.any():
+        k1, k2 = distortion
+        scale, slope = 1 + (k1 + k2 * square) * square, 2 * k1 + 4 * k2 * square
+        by_pixel = scale[..., None] * np.eye(2) + slope[..., None] * np.einsum(
+            "ni,nj,j->nij", from_centre, ray, 1 / camera.K[[0, 1], [0, 1]]
+        )
+        J[front, :, :7], by_point[front] = by_pixel @ J[front, :, :7], by_pixel @ by_point[front]
+        J[front, :, 6] = from_centre * scale / factor
     J[front, 0, 7] = J[front, 1, 8] = camera.width
     return J, by_point
 
@@ -119,9 +161,9 @@ class NormalEquations:
     """
 
     def __init__(self, views: int, points: int) -> None:
-        self._cameras, self._right = np.zeros((views, _CHANGES, _CHANGES)), np.zeros((views, _CHANGES))
+        self._cameras, self._right = np.zeros((views, CHANGES, CHANGES)), np.zeros((views, CHANGES))
         self._points, self._right_points = np.zeros((points, 3, 3)), np.zeros((points, 3))
-        self._across = np.zeros((points, views, _CHANGES, 3))
+        self._across = np.zeros((points, views, CHANGES, 3))
 
     def add(
         self, view: int, ids: np.ndarray | slice, jacobians: tuple[np.ndarray, np.ndarray], G: np.ndarray, b: np.ndarray
@@ -193,7 +235,8 @@ def _step(
     weights = 1 / (scale**2 + (errors**2).sum(axis=1, keepdims=True) / _CAUCHY**2)
     for view, (camera, change) in enumerate(zip(cameras, changes, strict=True)):
         here = tracks.views == view
-        jacobians = camera_jacobian(changed_camera(camera, change), 1 + change[6], points[tracks.ids[here]])
+        now, seen = changed_camera(camera, change), points[tracks.ids[here]]
+        jacobians = camera_jacobian(now, 1 + change[6], seen, change[9:])
         w = weights[here]
         equations.add(view, tracks.ids[here], jacobians, w[..., None] * np.eye(2), w * errors[here])
     return equations.step(changes, deviations, damping)
@@ -205,7 +248,9 @@ def _errors(cameras: Sequence[Camera], changes: np.ndarray, points: np.ndarray, 
     with np.errstate(divide="ignore", invalid="ignore"):
         for view, (camera, change) in enumerate(zip(cameras, changes, strict=True)):
             here = tracks.views == view
-            errors[here], depths[here] = changed_camera(camera, change).project(points[tracks.ids[here]])
+            now = changed_camera(camera, change)
+            pixels, depths[here] = now.project(points[tracks.ids[here]])
+            errors[here] = distorted(now, pixels, change[9:])
         errors -= tracks.pixels
     return np.where((depths[:, None] > 0) & np.isfinite(errors), errors, 1e6)
 

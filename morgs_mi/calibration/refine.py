@@ -1,4 +1,4 @@
-"""Refinement of calibrated cameras on the first frame: poses, focal lengths and principal points.
+"""Refinement of calibrated cameras on the first frame: poses, focal lengths, principal points and radial distortion.
 
 Beyond the paper. Feature matches give a first estimate by bundle adjustment (see `bundle`), where there are enough.
 Then rounds of a short fit of Gaussians, and of Gauss-Newton steps for all cameras and the means of all Gaussians at
@@ -13,6 +13,8 @@ where the variance v is the mean square error times the number of pixels whose e
 Refined cameras are judged by pixels that no fit has seen: blocks that are withheld from every training view. Fits from
 the same start with the calibrated cameras, with those of the bundle adjustment and with those after the rounds are
 compared by the PSNR of these pixels: where features are many and sharp, the rounds only lose accuracy.
+
+Distortion is removed from the images, by what is known of it in each round, so that Gaussians see pinhole cameras.
 
 The calibration's priors fix what images leave open, which is where the rig is, how it is turned, and its scale. Points
 move so that their projections stay. The held-out view keeps its calibrated camera; `register_camera` fits a camera to
@@ -29,14 +31,18 @@ import cv2
 import numpy as np
 
 from morgs_mi.calibration.bundle import (
+    CHANGES,
     NormalEquations,
     bundle_adjust,
     camera_jacobian,
     changed_camera,
+    distorted,
     prior_deviations,
+    undistorted,
 )
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.features import detect, intersect, join_matches, match_views
+from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.config import FitConfig
@@ -62,6 +68,8 @@ _BLURS = (2.0, 1.0)
 _HALF_WEIGHT = 0.1
 # Least mean square error: that of a rendering that is compared with itself is 0.
 _LEAST_ERROR = 1e-10
+# Deviation of a distortion that is not to change; share of a resampled pixel that has to be valid.
+_NO_DISTORTION, _VALID = 1e-4, 0.999
 # Steps of the registration of a camera, which end when they change its pixels by less than this, px.
 _REGISTRATION_STEPS, _LEAST_SHIFT = 30, 1e-3
 # Factors on the learning rates in the rounds after the first.
@@ -81,6 +89,7 @@ class Refinement:
         rotation: largest change of a rotation, degrees.
         position: largest change of a position, world units.
         focal: largest relative change of a focal length.
+        distortion: largest shift of a pixel by the distortion that was left, in image widths.
     """
 
     taken: bool
@@ -90,16 +99,18 @@ class Refinement:
     rotation: float
     position: float
     focal: float
+    distortion: float = 0.0
 
     @property
     def sentence(self) -> str:
         """What was changed, and why."""
-        sizes = f"by up to {self.rotation:.2g} degrees, {self.position:.2g} units and {100 * self.focal:.2g} %"
+        sizes = f"by up to {self.rotation:.2g} degrees, {self.position:.2g} units, {100 * self.focal:.2g} % of the "
+        sizes += f"focal length and {100 * self.distortion:.2g} % of the image's width by the lens"
         scores = f"withheld pixels have {self.refined_psnr:.2f} dB instead of {self.calibrated_psnr:.2f} dB"
         if np.isnan(self.calibrated_psnr):
-            return f"The cameras were refined, {sizes} of the focal length."
+            return f"The cameras were refined, {sizes}."
         if self.taken:
-            return f"The cameras were refined, {sizes} of the focal length: {scores}."
+            return f"The cameras were refined, {sizes}: {scores}."
         return f"The cameras stay as calibrated: refined ones are no clear gain, {scores}."
 
 
@@ -160,13 +171,16 @@ def refine_cameras(
     taken = not scores[best] < calibrated + how.least_gain
     changes = estimates[best]
     rotation, position = (np.linalg.norm(changes[:, k : k + 3], axis=1).max() for k in (0, 3))
-    sizes = float(np.rad2deg(rotation)), float(position), float(np.abs(changes[:, 6]).max())
+    lens = max(_largest_shift(*pair) for pair in zip(cameras, changes, strict=True))
+    sizes = float(np.rad2deg(rotation)), float(position), float(np.abs(changes[:, 6]).max()), lens
     found = Refinement(taken, calibrated, scores[best], tracks, *sizes)
     if not taken:
         return capture, found
     refined = dict(zip(seen, (changed_camera(*pair) for pair in zip(cameras, changes, strict=True)), strict=True))
-    every = tuple(refined.get(v, camera) for v, camera in enumerate(capture.cameras))
-    return replace(capture, cameras=every, points=points[best]), found
+    left = dict(zip(seen, changes[:, 9:].tolist(), strict=True))
+    every = [refined.get(v, camera) for v, camera in enumerate(capture.cameras)]
+    rig = capture.with_cameras(every, [left.get(v, (0.0, 0.0)) for v in range(len(every))])
+    return replace(rig, points=points[best]), found
 
 
 def register_camera(
@@ -190,7 +204,8 @@ def register_camera(
         render: cut-offs.
     """
     render, target = render or RenderConfig(), Target(image, mask)
-    deviations, best = prior_deviations(camera, extent, config.refinement.priors)[None], np.zeros((1, 9))
+    priors = replace(config.refinement.priors, distortion=_NO_DISTORTION)  # the image stays as it is
+    deviations, best = prior_deviations(camera, extent, priors)[None], np.zeros((1, CHANGES))
     means = np.asarray(gaussians.means, np.float64)
     for blur in (*_BLURS, 0.0):
         changes, error = best, np.inf
@@ -210,18 +225,36 @@ def register_camera(
 
 
 def _matched(capture: Capture, train: Sequence[int], config: FitConfig, extent: float) -> tuple[np.ndarray, int]:
-    """Return the changes [V, 9] by bundle adjustment, and the number of its points; no change without enough."""
+    """Return the changes [V, 11] by bundle adjustment, and the number of its points; no change without enough."""
     recorded = capture.at_recorded_size()
     images, cameras = next(recorded.partial_frames(0, 1)).images, [recorded.cameras[v] for v in train]
     features = [detect(images[v], recorded.masks[v]) for v in train]
     tracks = join_matches(match_views(features, cameras), features)
     if np.bincount(tracks.views, minlength=len(train)).min() < _MIN_TRACKS:
-        return np.zeros((len(train), 9)), 0
+        return np.zeros((len(train), CHANGES)), 0
     return bundle_adjust(cameras, tracks, extent, config.refinement.priors)[0], tracks.count
 
 
 def _changed(views: Sequence[_View], changes: np.ndarray) -> list[_View]:
-    return [(changed_camera(view[0], change), *view[1:]) for view, change in zip(views, changes, strict=True)]
+    """Return views with changed cameras, whose distortion is removed from the images and masks."""
+    return [_changed_view(*view, change) for view, change in zip(views, changes, strict=True)]
+
+
+def _changed_view(camera: Camera, image: np.ndarray, mask: np.ndarray | None, change: np.ndarray) -> _View:
+    camera = changed_camera(camera, change)
+    correction = undistortion(camera, Lens("RADIAL", tuple(change[9:])))
+    if correction is None:
+        return camera, image, mask
+    valid = correction.mask
+    if mask is not None:
+        valid = valid & (correction(mask.astype(np.float32)) > _VALID)
+    return camera, correction(image), valid
+
+
+def _largest_shift(camera: Camera, change: np.ndarray) -> float:
+    """Return the largest shift of a pixel by the distortion of a camera's change, in image widths."""
+    corners = np.array([(x, y) for x in (0, camera.width) for y in (0, camera.height)], float)
+    return float(np.linalg.norm(distorted(camera, corners, change[9:]) - corners, axis=1).max() / camera.width)
 
 
 def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -> np.ndarray:
@@ -232,7 +265,8 @@ def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -
     views = np.repeat(np.arange(len(cameras)), [len(pixels) for _, pixels in seen])
     if not len(ids):
         return points
-    found = intersect(ids, views, np.concatenate([pixels for _, pixels in seen]), changed, len(points))
+    pixels = [undistorted(c, pixels, change[9:]) for c, (_, pixels), change in zip(changed, seen, changes, strict=True)]
+    found = intersect(ids, views, np.concatenate(pixels), changed, len(points))
     several = np.bincount(ids, minlength=len(points)) >= 2
     moved = np.where((several & np.isfinite(found).all(axis=1))[:, None], found, points)
     return moved.astype(np.float32)
@@ -273,7 +307,8 @@ def _fit(
         dropping=0.0,
         density=replace(config.density, rounds=0),
     )
-    targets, cameras = [Target(*view[1:]) for view in views], [view[0] for view in _changed(views, changes)]
+    changed = _changed(views, changes)
+    targets, cameras = [Target(*view[1:]) for view in changed], [view[0] for view in changed]
     rng = np.random.default_rng([seed, 4])
     return fit_first_frame(gaussians, cameras, targets, extent, short, render, rng).gaussians
 
@@ -287,14 +322,12 @@ def _joint_step(
     blur: float,
     render: RenderConfig,
 ) -> tuple[Gaussians, np.ndarray]:
-    """Return the Gaussians and the changes of the cameras [V, 9] after one Gauss-Newton step of both."""
+    """Return the Gaussians and the changes of the cameras [V, 11] after one Gauss-Newton step of both."""
     means = np.asarray(gaussians.means, np.float64)
-    cameras = [view[0] for view in _changed(views, changes)]
-    shifts = [
-        _shifts(gaussians, camera, Target(*view[1:]), blur, render) for camera, view in zip(cameras, views, strict=True)
-    ]
+    changed = _changed(views, changes)
+    shifts = [_shifts(gaussians, camera, Target(image, mask), blur, render) for camera, image, mask in changed]
     variance, equations = _ALIKE * np.mean([error for *_, error in shifts]), NormalEquations(len(views), len(means))
-    for v, (camera, (G, b, _)) in enumerate(zip(cameras, shifts, strict=True)):
+    for v, ((camera, *_), (G, b, _)) in enumerate(zip(changed, shifts, strict=True)):
         equations.add(v, slice(None), camera_jacobian(camera, 1 + changes[v, 6], means), G / variance, b / variance)
     of_changes, of_means = equations.step(changes, deviations, _DAMPING)
     length = np.linalg.norm(of_means, axis=1, keepdims=True)

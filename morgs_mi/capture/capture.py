@@ -19,7 +19,7 @@ from morgs_mi.capture.color_correction import ColorCorrection, ColorFit, fit_col
 from morgs_mi.capture.layouts.calibration import Calibration
 from morgs_mi.capture.layouts.clips import EXAMPLE
 from morgs_mi.capture.layouts.registry import find_layout
-from morgs_mi.capture.lens import undistortion
+from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.capture.timeline import ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points
@@ -88,6 +88,8 @@ class Capture:
         reading: how clips that do not match are read.
         colors: the colour correction of the cameras, or None.
         notes: a sentence for everything about the clips that was not as expected, e.g. a variable frame rate.
+        distortions: per camera the radial terms k1, k2 that its lens left in the images and that are removed, too;
+            empty if none are.
     """
 
     path: Path
@@ -105,6 +107,7 @@ class Capture:
     reading: ReadConfig = field(default_factory=ReadConfig)
     colors: ColorFit | None = None
     notes: tuple[str, ...] = ()
+    distortions: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         check_points(str(self.path), self.points, self.point_colors)
@@ -131,6 +134,25 @@ class Capture:
         cameras = tuple(c.resized(*size) for c, size in zip(self.cameras, self.recorded_sizes, strict=True))
         masks = tuple(source.mask(camera) for source, camera in zip(self._sources, cameras, strict=True))
         return replace(self, cameras=cameras, masks=masks, downscale=1)
+
+    def with_cameras(self, cameras: Sequence[Camera], distortions: Sequence[Sequence[float]] = ()) -> Capture:
+        """Return the capture, as calibrated, with refined cameras.
+
+        Args:
+            cameras: one per view, of the same sizes.
+            distortions: per camera the radial terms k1, k2 that its lens leaves in the images, which are undistorted by
+                them, too; empty: none.
+        """
+        rig = replace(self, cameras=tuple(cameras))
+        if not np.any(distortions):
+            return rig
+        sources, left = list(self._sources), tuple((float(k1), float(k2)) for k1, k2 in distortions)
+        views = zip(self.at_recorded_size().cameras, rig.at_recorded_size().cameras, left, strict=True)
+        for v, (given, refined, terms) in enumerate(views):
+            both = undistortion(given, sources[v].lens, (refined, Lens("RADIAL", terms)))
+            sources[v] = replace(sources[v], undistortion=both)
+        masks = tuple(source.mask(camera) for source, camera in zip(sources, rig.cameras, strict=True))
+        return replace(rig, masks=masks, _sources=tuple(sources), distortions=left)
 
     def process(self, view: int, image: np.ndarray) -> np.ndarray:
         """Return a recorded image of a camera undistorted, downscaled and colour-corrected, like its frames."""

@@ -95,14 +95,32 @@ class Undistortion:
         return cv2.remap(image, *self.maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
-def undistortion(camera: Camera, lens: Lens) -> Undistortion | None:
+def undistortion(camera: Camera, lens: Lens, refined: tuple[Camera, Lens] | None = None) -> Undistortion | None:
     """Return the undistortion of `lens`, or None for a lens without distortion.
 
     The undistorted view has the same K and size as the recorded one, so corners of a barrel-shaped
     image are lost and those of a pincushion-shaped one are empty (see `Undistortion.mask`).
+
+    Args:
+        camera: at the size of the recorded images.
+        lens: its lens.
+        refined: intrinsics of the view instead of the camera's, and the distortion that `lens` leaves in its images.
     """
-    if not any(lens.distortion):
+    stages = [(camera, lens)] if any(lens.distortion) else []
+    stages += [refined] if refined is not None and any(refined[1].distortion) else []
+    if not stages:
         return None
+    x, y, mask = _maps(*stages[0])
+    for stage in stages[1:]:
+        columns, rows, inside = _maps(*stage)
+        x, y = (cv2.remap(v, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for v in (x, y))
+        mask = inside & (cv2.remap(mask.astype(np.float32), columns, rows, cv2.INTER_LINEAR) > 1 - 1e-3)
+    # Fixed point halves the memory of a rig's maps; its 1/32 px is far below the error of any calibration.
+    return Undistortion(cv2.convertMaps(x, y, cv2.CV_16SC2), mask)
+
+
+def _maps(camera: Camera, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return columns and rows [H, W] px where the lens shows the pixels of a pinhole camera, and which are valid."""
     K = camera.K.copy()
     K[:2, 2] -= 0.5
     size = (camera.width, camera.height)
@@ -110,9 +128,7 @@ def undistortion(camera: Camera, lens: Lens) -> Undistortion | None:
     build = cv2.fisheye.initUndistortRectifyMap if fisheye else cv2.initUndistortRectifyMap
     x, y = build(K, lens.opencv_coefficients, np.eye(3), K, size, cv2.CV_32FC1)
     mask = (x >= -0.5) & (x <= camera.width - 0.5) & (y >= -0.5) & (y <= camera.height - 0.5)
-    mask &= ~_folded(x, y, camera)
-    # Fixed point halves the memory of a rig's maps; its 1/32 px is far below the error of any calibration.
-    return Undistortion(cv2.convertMaps(x, y, cv2.CV_16SC2), mask)
+    return x, y, mask & ~_folded(x, y, camera)
 
 
 def _folded(x: np.ndarray, y: np.ndarray, camera: Camera) -> np.ndarray:

@@ -10,7 +10,7 @@ import asyncio
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from itertools import dropwhile, takewhile
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.calibration.refine import Refinement
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cluster.executor import Workers, wait_for
@@ -40,12 +41,16 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import atomic_path, locked_folder, write_json
 from morgs_mi.recorder import (
     FILES,
+    about_cameras,
+    about_lenses,
+    as_fitted,
     check_same_fit,
     described_capture,
     due_keyframe,
     read_reports,
     stream_metadata,
     with_points,
+    with_refined_cameras,
 )
 from morgs_mi.stream_loop import FrameReport
 
@@ -142,11 +147,6 @@ async def fit_in_segments(
     on_part: OnPart | None = None,
 ) -> SegmentedFit:
     """Fit a capture in segments as `stream_segments`; `on_part` is called with the result of every task."""
-    if config.fit.refine_cameras != "off":
-        raise ValueError(
-            f"stream_segments(): `fit.refine_cameras` must be off, got {config.fit.refine_cameras!r}: workers read the "
-            "calibrated cameras; fit without segments, or calibrate again."
-        )
     if config.fit.exposure != "off":
         raise ValueError(
             f"stream_segments(): `fit.exposure` must be off, got {config.fit.exposure!r}: exposures follow from all "
@@ -192,6 +192,7 @@ class _Run:
         self.metadata = stream_metadata(capture, next(capture.partial_frames(0, 1)), config)
         if len(starts) > 2:
             self.metadata["segments"] = {"starts": list(starts[:-1]), **asdict(seams)}
+        self.refinement: Refinement | None = None
         self.peaks: dict[str, int] = {}
         self.active = 0  # segments whose later frames are being fitted
         self.starting = 0  # segments whose start is fitted, or waits for a worker
@@ -216,8 +217,13 @@ class _Run:
         self.segments = [_Segment(self, k) for k in range(len(self.starts) - 1)]
         points = None
         if not self.segments[0].num_fitted:
-            capture = with_points(self.capture, self.task.config.seed, self.on_stage)
+            capture, self.refinement = with_refined_cameras(
+                with_points(self.capture, self.task.config.seed, self.on_stage), self.task.config, self.on_stage
+            )
             points = None if capture is self.capture else (capture.points, capture.point_colors)
+            self._use(capture)
+        elif self.task.config.fit.refine_cameras != "off":
+            self._use(as_fitted(self.capture, StreamReader(self.segments[0].path)))
         loop = asyncio.get_running_loop()
         self.base: asyncio.Future[tuple[bytes, int]] = loop.create_future()  # common model and number of its ids
         self.begun: list[asyncio.Future[tuple[bytes, ...]]] = [loop.create_future() for _ in self.segments]
@@ -229,6 +235,12 @@ class _Run:
         except BaseExceptionGroup as errors:
             raise errors.exceptions[0] from None
         return None
+
+    def _use(self, capture: Capture) -> None:
+        """Fit with the cameras of a capture."""
+        if self.task.config.fit.refine_cameras != "off":
+            self.task = replace(self.task, rig=(capture.cameras, capture.distortions))
+            self.capture, self.metadata = capture, self.metadata | about_lenses(capture)
 
     async def run(self, function: Callable[..., Part], *args: Any) -> Part:
         """Return the result of a task on a worker."""
@@ -310,7 +322,8 @@ class _Segment:
         elif not self.number:
             if self.num_fitted < common:
                 frames = FrameRange(0, self.num_fitted, common)
-                self._add(await self.run.run(fit_frames, frames, self.restart, None, points))
+                part = await self.run.run(fit_frames, frames, self.restart, None, points)
+                self._add(part if self.num_fitted else self._with_refinement(part))
             coded = seek(StreamReader(self.path), common - 1)
             self.run.base.set_result((reemitted_keyframe(coded).encoded, coded.next_id))
         overlap = takewhile(lambda packet: packet.frame < self.start, StreamReader(self.path))
@@ -367,6 +380,16 @@ class _Segment:
             return index, end
         kept = [entry for entry in index if entry[1] < self.fade]
         return kept, index[len(kept)][2]
+
+    def _with_refinement(self, part: Part) -> Part:
+        """Return the first part of the recording, whose first report says what was found about the cameras."""
+        capture, found = self.run.capture, self.run.refinement
+        if found is None:
+            return part
+        coded, frame = decode(None, decode_packet(part.packets[0])), next(capture.partial_frames(0, 1))
+        about = about_cameras(coded.gaussians, capture, frame, found, self.run.task.config)
+        first = replace(part.reports[0], validation=part.reports[0].validation | about)
+        return replace(part, reports=(first, *part.reports[1:]))
 
     def _add(self, part: Part) -> None:
         """Add the frames of a task: first to the report, then to the stream."""

@@ -76,6 +76,10 @@ class Source:
         return load_capture(self.path, self.downscale, self.test_view, self.num_frames, self.reading)
 
 
+Points = tuple[np.ndarray, np.ndarray]
+Rig = tuple[tuple[Camera, ...], tuple[tuple[float, float], ...]]
+
+
 @dataclass(frozen=True)
 class Fit:
     """What all tasks of a fit share.
@@ -86,6 +90,7 @@ class Fit:
         seams: settings of the seams.
         variant: Mitsuba variant.
         versions: as `installed` returns them to the client.
+        rig: refined cameras and distortions, as `Capture.with_cameras` takes them; None: those of the recording.
     """
 
     source: Source
@@ -93,6 +98,12 @@ class Fit:
     seams: SeamConfig
     variant: str
     versions: tuple[tuple[str, str], ...]
+    rig: Rig | None = None
+
+    def open(self) -> Capture:
+        """Return the recording, with the refined cameras."""
+        capture = self.source.open()
+        return capture if self.rig is None else capture.with_cameras(*self.rig)
 
 
 @dataclass(frozen=True)
@@ -144,7 +155,6 @@ class Part:
     messages: tuple[str, ...]
 
 
-Points = tuple[np.ndarray, np.ndarray]
 _BUSY = threading.Lock()  # Dask runs several tasks at once in a worker with several threads
 _OPEN: dict[tuple[Any, ...], tuple[StreamLoop, Capture, Iterator[PartialFrame]]] = {}  # the loop of the last task
 
@@ -201,7 +211,7 @@ def fit_segment_start(fit: Fit, base: bytes, frame: int) -> Part:
         The packets of the overlap and of the frame, which ends with a keyframe, and the report of the frame.
     """
     with prepared(fit.variant, fit.versions) as messages:
-        capture, coded = fit.source.open(), decode(None, decode_packet(base))
+        capture, coded = fit.open(), decode(None, decode_packet(base))
         loop = _loop(capture, replace(fit, config=fit.seams.overlap_config(fit.config)), None)
         first = max(frame - fit.seams.overlap, coded.frame + 1)
         earlier, now = (_images(capture, t) for t in (coded.frame, first))
@@ -303,7 +313,7 @@ def _opened(
     _OPEN.clear()
     if found is not None:
         return found
-    capture = fit.source.open()
+    capture = fit.open()
     loop, recorded = _loop(capture, fit, points), capture.partial_frames(frames.segment)
     if restart:
         past = islice(recorded, frames.start - frames.segment)

@@ -212,6 +212,8 @@ class CameraPriors:
     principal_point: float = 2e-4
     """Of the principal point along each axis, in image widths. Images hardly tell its displacement from a rotation, so
     it follows the calibration closely."""
+    distortion: float = 0.1
+    """Of the first term of radial distortion that the calibrated lens leaves; that of the second is a fifth of it."""
 
     def __post_init__(self) -> None:
         for name, deviation in asdict(self).items():

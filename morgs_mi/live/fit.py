@@ -29,6 +29,7 @@ from morgs_mi.live.sources import Source, open_feed
 from morgs_mi.recorder import (
     FILES,
     about_cameras,
+    about_lenses,
     described_capture,
     due_keyframe,
     push_frame,
@@ -177,6 +178,7 @@ def _fit(
     metadata = stream_metadata(capture, next(capture.partial_frames()), config)
     del metadata["num_frames"]  # not known yet
     capture, refinement = with_refined_cameras(with_points(capture, config.seed, on_stage), config, on_stage)
+    frames.capture, metadata = capture, metadata | about_lenses(capture)
     masks = [capture.masks[v] for v in train]
     loop = StreamLoop([capture.cameras[v] for v in train], capture.points, capture.point_colors, config, masks)
     write_json(out / "capture.json", described_capture(capture, None))
@@ -189,7 +191,8 @@ def _fit(
                 tick = None if rows else partial(on_stage, "Fitting the first frame")
                 packet, report = push_frame(loop, frame, train, tick)
                 if refinement is not None and not rows:
-                    about = about_cameras(loop, capture, frame, refinement)
+                    assert loop.gaussians is not None
+                    about = about_cameras(loop.gaussians, capture, frame, refinement, config)
                     report = replace(report, validation=report.validation | about)
                 recorded.result()
                 reports.append(report)

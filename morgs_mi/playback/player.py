@@ -30,6 +30,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Tensor
 from morgs_mi.io.bounded import read_json
 from morgs_mi.playback.visualise import confidence_image, depth_image, grey_image, motion_image, to_uint8
+from morgs_mi.recorder import as_fitted
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.synth.ground_truth import GroundTruth, load_truth
@@ -316,7 +317,8 @@ def open_stream_capture(stream: StreamReader, capture: str | Path | None, frames
             f"{stream.path}: expected consecutive frames out of the {recording.num_frames} of {path}, got {frames}; "
             "pass the capture that was fitted (--capture)."
         )
-    return recording
+    # Other refined cameras change no image, and ground truth refers to those of the recording.
+    return as_fitted(recording, stream) if "distortions" in stream.metadata else recording
 
 
 def fitted_capture(stream: StreamReader) -> str:

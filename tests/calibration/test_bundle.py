@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from morgs_mi.calibration.bundle import bundle_adjust, camera_jacobian, changed_camera
+from morgs_mi.calibration.bundle import bundle_adjust, camera_jacobian, changed_camera, distorted, undistorted
 from morgs_mi.capture.features import Tracks
 from morgs_mi.fit.config import CameraPriors
 from morgs_mi.fit.initialise import scene_extent
@@ -22,19 +23,45 @@ def seen_by(cameras) -> Tracks:
 
 
 def disturbed(cameras, rng):
-    deviations = np.array([0.005] * 3 + [0.01] * 3 + [0.01, 0, 0])
-    return [changed_camera(camera, deviations * rng.normal(size=9)) for camera in cameras]
+    deviations = np.array([0.005] * 3 + [0.01] * 3 + [0.01, 0, 0, 0, 0])
+    return [changed_camera(camera, deviations * rng.normal(size=11)) for camera in cameras]
 
 
-def test_camera_jacobian__is_that_of_finite_differences():
-    camera, step, before = rig(shift=7)[1], 1e-6, np.array([0, 0, 0, 0.02, -0.01, 0.03, 0.02, 0.001, -0.002])
-    of_changes, of_points = camera_jacobian(changed_camera(camera, before), 1.02, POINTS)
-    for k in range(9):
-        ahead, back = (changed_camera(camera, before + sign * step * np.eye(9)[k]) for sign in (1, -1))
-        difference = (ahead.project(POINTS)[0] - back.project(POINTS)[0]) / (2 * step)
-        assert_close(of_changes[:, :, k], difference, rtol=1e-5, atol=1e-4)
-    moved = [changed_camera(camera, before).project(POINTS + sign * step * np.eye(3)[0])[0] for sign in (1, -1)]
+@pytest.mark.parametrize("distortion", [(0, 0), (-0.15, 0.04)])
+def test_camera_jacobian__is_that_of_finite_differences(distortion):
+    camera, step = rig(shift=7)[1], 1e-6
+    before = np.array([0, 0, 0, 0.02, -0.01, 0.03, 0.02, 0.001, -0.002, *distortion])
+
+    def seen(changes, points=POINTS):
+        now = changed_camera(camera, changes)
+        return distorted(now, now.project(points)[0], changes[9:])
+
+    of_changes, of_points = camera_jacobian(changed_camera(camera, before), 1.02, POINTS, before[9:])
+    for k in range(11):
+        ahead, back = (seen(before + sign * step * np.eye(11)[k]) for sign in (1, -1))
+        assert_close(of_changes[:, :, k], (ahead - back) / (2 * step), rtol=1e-5, atol=1e-4, name=str(k))
+    moved = [seen(before, POINTS + sign * step * np.eye(3)[0]) for sign in (1, -1)]
     assert_close(of_points[:, :, 0], (moved[0] - moved[1]) / (2 * step), rtol=1e-5, atol=1e-4)
+
+
+def test_undistorted__inverts_distorted():
+    camera, k = rig()[0], np.array([-0.12, 0.03])
+    pixels = np.random.default_rng(0).uniform(0, (camera.width, camera.height), (50, 2))
+    assert_close(undistorted(camera, distorted(camera, pixels, k), k), pixels, atol=1e-3)
+
+
+def test_bundle_adjust__finds_the_distortion_of_each_camera():
+    true, rng = rig(shift=7), np.random.default_rng(2)
+    terms = rng.normal(scale=(0.03, 0.01), size=(len(true), 2))
+    tracks = seen_by(true)
+    for v, (camera, k) in enumerate(zip(true, terms, strict=True)):
+        here = tracks.views == v
+        tracks.pixels[here] = distorted(camera, tracks.pixels[here], k)
+    changes, _ = bundle_adjust(true, tracks, scene_extent(true), CameraPriors())
+    for camera, change, k in zip(true, changes, terms, strict=True):
+        corner = np.array([[0.0, 0.0]])
+        shifts = [distorted(camera, corner, terms) - corner for terms in (change[9:], k)]
+        assert_close(shifts[0], shifts[1], atol=0.15 * np.abs(shifts[1]).max() + 0.1)
 
 
 def test_bundle_adjust__finds_the_reprojections_despite_wrong_matches():

@@ -30,7 +30,7 @@ from tests.scenes.gaussians import isotropic
 
 # Too little to find a gain.
 LEAST = FitConfig(refine_cameras="auto", refinement=RefinementConfig(gaussians=50, steps=2, rounds=1, width=40))
-WRONG = np.array([0.006, -0.008, 0.004, 0.01, 0.008, -0.01, 0.004, 0, 0])
+WRONG = np.array([0.006, -0.008, 0.004, 0.01, 0.008, -0.01, 0.004, 0, 0, 0, 0])
 PLACES = [(x, y, -4) for x, y in ((-1, 0), (0, 0.5), (1, 0), (0, -0.7))]
 CAMERAS = look_at_cameras(PLACES, 60, 64, 48)
 
@@ -48,7 +48,7 @@ def image_of(camera) -> np.ndarray:
 
 def disturbed(cameras, scale: float = 1.0) -> list:
     """Return cameras with wrong poses and focal lengths."""
-    signs = np.random.default_rng(1).choice([-1, 1], (len(cameras), 9))
+    signs = np.random.default_rng(1).choice([-1, 1], (len(cameras), 11))
     return [changed_camera(c, scale * s * WRONG) for c, s in zip(cameras, signs, strict=True)]
 
 
@@ -70,7 +70,7 @@ def splat_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 
 def test_joint_step__turns_cameras_to_where_the_images_were_taken():
-    given, gaussians, changes = disturbed(CAMERAS), splats(), np.zeros((4, 9))
+    given, gaussians, changes = disturbed(CAMERAS), splats(), np.zeros((4, 11))
     views = [(camera, image_of(true), None) for camera, true in zip(given, CAMERAS, strict=True)]
     deviations = np.stack([prior_deviations(camera, 1.0, CameraPriors()) for camera in given])
     for _ in range(8):
@@ -95,7 +95,7 @@ def test_register_camera__keeps_a_camera_that_fits():
 
 
 def test_moved__keeps_the_projections_of_points():
-    points, changes = np.asarray(splats().means), np.tile([0, 0, 0, 0.1, -0.2, 0.05, 0, 0, 0], (4, 1))
+    points, changes = np.asarray(splats().means), np.tile([0, 0, 0, 0.1, -0.2, 0.05, 0, 0, 0, 0, 0], (4, 1))
     assert_close(_moved(points, CAMERAS, changes), points + changes[0, 3:6], rtol=0, atol=1e-5)
 
 
@@ -148,6 +148,16 @@ def test_matched__finds_the_cameras_by_features(textured_capture, monkeypatch):
     assert errors[1] < 0.1 * errors[0]
 
 
+def test_matched__finds_the_distortion_that_is_left(textured_capture, monkeypatch):
+    monkeypatch.setattr("morgs_mi.capture.features._MAX_FEATURES", 300)
+    terms = [(0.08 * (-1) ** v, 0.0) for v in range(len(textured_capture.cameras))]
+    bent = textured_capture.with_cameras(textured_capture.cameras, terms)
+    cameras = [bent.cameras[v] for v in bent.train_views]
+    changes, _ = _matched(bent, bent.train_views, LEAST, scene_extent(cameras))
+    # Images that were undistorted without need have the opposite distortion.
+    assert_close(changes[:, 9], [-terms[v][0] for v in bent.train_views], atol=0.03)
+
+
 def test_refine_cameras__needs_two_images(splat_capture):
     fields = {name: getattr(splat_capture, name)[:1] for name in ("cameras", "masks", "_sources")}
     with pytest.raises(ValueError, match="at least two training views, got 1"):
@@ -155,9 +165,9 @@ def test_refine_cameras__needs_two_images(splat_capture):
 
 
 def test_Refinement__reports_the_changes_and_the_gain():
-    found = Refinement(True, 26.0, 31.5, 200, 0.51, 0.02, 0.011)
+    found = Refinement(True, 26.0, 31.5, 200, 0.51, 0.02, 0.011, 0.003)
     assert found.sentence == (
-        "The cameras were refined, by up to 0.51 degrees, 0.02 units and 1.1 % of the focal length: withheld pixels "
-        "have 31.50 dB instead of 26.00 dB."
+        "The cameras were refined, by up to 0.51 degrees, 0.02 units, 1.1 % of the focal length and 0.3 % of the "
+        "image's width by the lens: withheld pixels have 31.50 dB instead of 26.00 dB."
     )
     assert "dB" not in replace(found, calibrated_psnr=np.nan, refined_psnr=np.nan).sentence

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -16,6 +17,7 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import Lens
+from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
 from tests.assertions import assert_close
 from tests.scenes import captures as layouts
@@ -205,6 +207,28 @@ def readout_of_another(path: Path) -> None:
 
 def broken_settings(path: Path) -> None:
     (path / "capture.json").write_text("{")
+
+
+def test_with_cameras__reads_as_if_the_calibration_had_the_lens(tmp_path: Path) -> None:
+    path, terms = colmap(tmp_path / "capture"), (-0.12, 0.02)
+    capture = load_capture(path)
+    assert capture.with_cameras(capture.cameras).distortions == ()
+    cameras = [square(camera) for camera in capture.cameras]
+    found = replace(capture, cameras=tuple(cameras)).with_cameras(cameras, [terms] * len(cameras))
+    points = np.zeros((1, 3))
+    write_colmap(path / "sparse" / "0", cameras, points, points, [Lens("RADIAL", terms)] * len(cameras))
+    expected = load_capture(path)
+    for images in zip(*(next(c.frames(0, 1)).images for c in (expected, found)), strict=True):
+        assert np.array_equal(*images)
+    assert all(np.array_equal(a, b) for a, b in zip(expected.masks, found.masks, strict=True))
+    assert found.distortions == (terms,) * len(cameras)
+
+
+def square(camera: Camera) -> Camera:
+    """Return a camera whose focal lengths are equal, as those of the lens models with one are."""
+    K = camera.K.copy()
+    K[1, 1] = K[0, 0]
+    return replace(camera, K=K)
 
 
 @pytest.mark.parametrize(

@@ -57,6 +57,30 @@ def test_undistortion__moves_points_to_their_pinhole_projections(model: str) -> 
         assert_close(centre, (u, v), atol=0.15)
 
 
+@pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
+def test_undistortion__removes_what_a_refined_lens_leaves(model: str) -> None:
+    cam, lens, refined, left = camera(), Lens(model, LENSES.get(model, ())), camera(112.0), (0.06, -0.01)
+    points = np.array([[x, y, 2.0] for x in (-0.8, -0.1, 0.7) for y in (-0.6, 0.05, 0.5)])
+    expected, _ = refined.project(points)
+    x, y = ((expected - refined.K[:2, 2]) / refined.K[[0, 1], [0, 1]]).T
+    square = x**2 + y**2
+    # Where the refined lens, and then the calibrated one, shows the points.
+    rays = np.stack([x, y], axis=1) * (1 + left[0] * square + left[1] * square**2)[:, None]
+    seen = (rays * refined.K[[0, 1], [0, 1]] + refined.K[:2, 2] - cam.K[:2, 2]) / cam.K[[0, 1], [0, 1]]
+    K, there = cam.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], np.concatenate([seen, np.ones((len(seen), 1))], axis=1)
+    project = cv2.fisheye.projectPoints if model == "OPENCV_FISHEYE" else cv2.projectPoints
+    shape = (-1, 1, 3) if model == "OPENCV_FISHEYE" else (-1, 3)
+    distorted, _ = project(there.reshape(shape), np.zeros(3), np.zeros(3), K, lens.opencv_coefficients)
+    found = undistortion(cam, lens, (refined, Lens("RADIAL", left)))
+    assert found is not None
+    image = found(dots(distorted[:, 0] + 0.5)).astype(float)[..., 0]
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    for u, v in expected:
+        near = image * ((np.abs(columns - u) < 7) & (np.abs(rows - v) < 7))
+        centre = np.array([(near * columns).sum(), (near * rows).sum()]) / near.sum()
+        assert_close(centre, (u, v), atol=0.15)
+
+
 def test_undistortion__is_none_without_distortion() -> None:
     assert undistortion(camera(), Lens()) is None
     assert undistortion(camera(), Lens("OPENCV", (0.0, 0.0, 0.0, 0.0))) is None

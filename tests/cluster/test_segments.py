@@ -25,6 +25,7 @@ from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.packets import coded_frames, frames_with_lasting_ids, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
+from morgs_mi.fit.config import RefinementConfig
 from morgs_mi.recorder import FILES, stream_capture
 from tests.scenes.coded_clip import history
 from tests.scenes.recording import CONFIG, write_recording
@@ -256,10 +257,20 @@ def test_stream_segments__triangulates_points_where_there_are_few(
     assert len(next(coded_frames(StreamReader(tmp_path / "few" / "stream.morgs")))) == SETTINGS.fit.num_gaussians
 
 
-def test_stream_segments__refuses_to_refine_cameras(capture: Capture, workers: Workers, tmp_path: Path) -> None:
-    config = replace(CONFIG, fit=replace(CONFIG.fit, refine_cameras="auto"))
-    with pytest.raises(ValueError, match=r"`fit\.refine_cameras` must be off, got 'auto'"):
-        stream_segments(capture, tmp_path / "out", workers, config, 2)
+def test_stream_segments__refines_cameras_once(capture: Capture, workers: Workers, tmp_path: Path) -> None:
+    held_out = load_capture(capture.path, test_view=0)
+    how = RefinementConfig(gaussians=40, steps=4, rounds=1)
+    config = replace(SETTINGS, fit=replace(SETTINGS.fit, refine_cameras="on", refinement=how))
+    fit(held_out, tmp_path / "three", workers, config=config)
+    stream, row = StreamReader(tmp_path / "three" / "stream.morgs"), rows_of(tmp_path / "three")[0]
+    assert not np.array_equal(stream.cameras[1].viewmat, capture.cameras[1].viewmat)
+    assert row["validation"]["refinement"]["held_out"]["registered_psnr"] > 0
+    stream_capture(held_out, tmp_path / "plain", config)
+    plain = StreamReader(tmp_path / "plain" / "stream.morgs")
+    assert stream.metadata["distortions"] == plain.metadata["distortions"]
+    assert [c.viewmat.tolist() for c in stream.cameras] == [c.viewmat.tolist() for c in plain.cameras]
+    first = [next(coded_frames(s)).gaussians for s in (stream, plain)]
+    assert np.array_equal(first[0].means, first[1].means)
 
 
 def test_stream_segments__refuses_to_estimate_exposures(capture: Capture, workers: Workers, tmp_path: Path) -> None:
