@@ -20,6 +20,7 @@ import tyro
 
 from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.fits import new_loop, random_capture
+from benchmarks.reports.plots import markdown
 from morgs_mi import Gaussians, StreamLoop, rasterize
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.cluster.tasks import Source
@@ -112,10 +113,27 @@ def spread(fits: Mapping[str, Mapping[str, float]]) -> dict[str, dict[str, float
     return found
 
 
+def scenes_table(fits: Mapping[str, Mapping[str, float]]) -> str:
+    """Return mean and standard deviation over the fits of each scene, and of their means, as a table in Markdown."""
+    columns = (("psnr", 2, 1), ("psnr_moving", 2, 1), ("confidence_iou", 3, 1), ("motion_error_moving", 2, 1))
+    columns = (*columns, ("motion_error_still", 3, 1), ("bytes", 1, 1e-3))
+    seeds = list(dict.fromkeys(name.split("/")[0] for name in fits))
+    groups = {seed: {n: row for n, row in fits.items() if n.split("/")[0] == seed} for seed in seeds} | {"mean": fits}
+
+    def cells(rows: Mapping[str, Mapping[str, float]]) -> list[str]:
+        found = spread(rows)
+        written = [(factor * found[s]["mean"], factor * found[s]["deviation"], k) for s, k, factor in columns]
+        return [f"{mean:.{k}f} ± {deviation:.{k}f}" for mean, deviation, k in written]
+
+    head = ("seed", "PSNR, dB", "moving", "IoU of the confidence", "motion error, px", "still", "kB")
+    return markdown(head, [(name, *cells(rows)) for name, rows in groups.items()])
+
+
 def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
     fits = options.run(measure, options.cells())
+    print(scenes_table(fits))
     options.write({"spread": spread(fits), "fits": fits}, unprinted=["fits"])
 
 
