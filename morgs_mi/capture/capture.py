@@ -186,6 +186,8 @@ class Capture:
                     "distortion": list(source.lens.distortion),
                     "undistortion": "none" if source.undistortion is None else "cubic, same intrinsics",
                     "valid_share": 1.0 if mask is None else float(mask.mean()),
+                    **({"delay": camera.delay} if camera.delay else {}),
+                    **({"readout": camera.readout} if camera.readout else {}),
                 }
                 for camera, source, mask in views
             ],
@@ -193,6 +195,8 @@ class Capture:
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[Frame]:
         """Yield frames start..stop-1, decoded in a background thread.
+
+        Frame 0 has images at its instant, which are interpolated where cameras have delays.
 
         Raises:
             ValueError: a file is truncated or broken; the message names the frame.
