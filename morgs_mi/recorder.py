@@ -36,6 +36,7 @@ from morgs_mi.core.files import is_same_file, locked_folder, write_json
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.cross_validation import mean_psnr
 from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.fit.view import View
 from morgs_mi.io.bounded import read_json
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.method.flow import choose_key_views
@@ -196,7 +197,7 @@ def about_cameras(
     view, given = (image, capture.masks[test]), capture.cameras[test]
     extent = scene_extent([capture.cameras[v] for v in capture.train_views])
     registered = register_camera(gaussians, given, *view, extent, config.fit, config.render)
-    psnr = [mean_psnr(gaussians, [(camera, *view)], config.render) for camera in (given, registered)]
+    psnr = [mean_psnr(gaussians, [View(camera, *view)], config.render) for camera in (given, registered)]
     return {"refinement": {**about, "held_out": {"calibrated_psnr": psnr[0], "registered_psnr": psnr[1]}}}
 
 

@@ -33,6 +33,7 @@ from morgs_mi.fit.first_settings import Expected, first_settings
 from morgs_mi.fit.forecast import Forecast
 from morgs_mi.fit.initialise import fill_points, from_points, resample_points, seed_points
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
+from morgs_mi.fit.view import View
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
 from morgs_mi.method.confidence import motion_mask
@@ -186,14 +187,14 @@ def _fit_first_frame(
         network = DepthNetwork(fit.depth_model)
         prior = depth_prior([network(image) for image in images.values()], cameras, setup.points, masks)
     gaussians, status = _first_gaussians(setup, images, fit, rng)
-    targets = [Target(image, mask) for image, mask in zip(images.values(), masks, strict=True)]
-    given = gaussians, cameras, list(images.values()), masks, targets, setup.points, setup.extent
-    chosen = first_settings(*given, fit, config.render, [config.seed, 0, 1], on_step, prior)
+    views = [View(*view) for view in zip(cameras, images.values(), masks, strict=True)]
+    given = gaussians, views, setup.points, setup.extent, fit, config.render, [config.seed, 0, 1]
+    chosen = first_settings(*given, on_step, prior)
     before = chosen.steps_before
     tick = None if on_step is None else lambda done, steps: on_step(before + done, before + steps)
+    targets = [view.target for view in views]
     start = gaussians, cameras, targets, setup.extent, chosen.config, config.render, rng, tick
     fitted = fit_first_frame(*start, prior)
-    views = list(zip(cameras, images.values(), masks, strict=True))
     own = mean_psnr(fitted.gaussians, views, config.render) if chosen.steps_before else 0.0
     expected = [replace(e, training_psnr=own) if not isinstance(e, Forecast) else e for e in chosen.expected]
     return keyframe_packet(fitted.gaussians, 0, setup.cameras, config.codec), {
@@ -211,9 +212,8 @@ def _balance(setup: Setup, images: Images) -> Balance | None:
     if config.fit.exposure == "off" or len(images) < 2:
         return None
     start, _ = _first_gaussians(setup, images, balance_config(config.fit), np.random.default_rng([config.seed, 0, 2]))
-    cameras, masks = [setup.cameras[v] for v in images], [setup.masks[v] for v in images]
-    views = cameras, list(images.values()), masks
-    return balance_cameras(start, *views, setup.extent, config.fit, config.render, config.seed)
+    views = [View(setup.cameras[v], image, setup.masks[v]) for v, image in images.items()]
+    return balance_cameras(start, views, setup.extent, config.fit, config.render, config.seed)
 
 
 def _exposures_of(setup: Setup, images: Images, found: Balance | None) -> tuple[Exposure, ...]:

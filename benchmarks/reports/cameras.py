@@ -38,6 +38,7 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.fit.cross_validation import mean_psnr
 from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.fit.view import View
 from morgs_mi.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.synth.synthesize import synthesize
 
@@ -103,12 +104,12 @@ def scores(capture: Capture, config: StreamConfig) -> dict[str, float]:
     gaussians, test = loop.gaussians, capture.test_view
     assert gaussians is not None
     assert test is not None
-    view = capture.cameras[test], images[test], capture.masks[test]
+    view = View(capture.cameras[test], images[test], capture.masks[test])
     registered = register_camera(gaussians, *view, loop.setup.extent, config.fit, config.render)
     views = {
-        "training": [(capture.cameras[v], images[v], capture.masks[v]) for v in train],
+        "training": [View(capture.cameras[v], images[v], capture.masks[v]) for v in train],
         "calibrated": [view],
-        "registered": [(registered, *view[1:])],
+        "registered": [view._replace(camera=registered)],
     }
     return {name: round(mean_psnr(gaussians, given, config.render), 2) for name, given in views.items()}
 

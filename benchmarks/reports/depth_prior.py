@@ -28,6 +28,7 @@ from morgs_mi.fit.cross_validation import mean_psnr
 from morgs_mi.fit.depth_prior import depth_prior
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.initialise import fill_points, from_points, resample_points, scene_extent, seed_points
+from morgs_mi.fit.view import View
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.synth.ground_truth import load_truth
@@ -116,7 +117,7 @@ def measure(capture: Capture, seed: int, options: Options) -> list[dict[str, Any
             prior=prior,
         )
         scores = {
-            name: mean_psnr(fitted.gaussians, [(capture.cameras[v], images[v], None) for v in views], RenderConfig())
+            name: mean_psnr(fitted.gaussians, [View(capture.cameras[v], images[v]) for v in views], RenderConfig())
             for name, views in (("training", train), ("held_out", [v for v in every if v not in train]))
         }
         rows.append({"seed": seed, "error": error, "weight": weight, **{n: round(s, 2) for n, s in scores.items()}})

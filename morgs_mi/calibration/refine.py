@@ -49,6 +49,7 @@ from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import mean_psnr, withheld_blocks
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.initialise import fill_points, from_points, resample_points, scene_extent, seed_points, seen_points
+from morgs_mi.fit.view import View
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.config import RenderConfig
@@ -74,7 +75,6 @@ _NO_DISTORTION, _VALID = 1e-4, 0.999
 _REGISTRATION_STEPS, _LEAST_SHIFT = 30, 1e-3
 # Factors on the learning rates in the rounds after the first.
 _LATER_RATES = {"means": 0.25, "scales": 0.5, "quats": 0.5, "opacities": 0.25}
-_View = tuple[Camera, np.ndarray, np.ndarray | None]
 
 
 @dataclass(frozen=True)
@@ -149,8 +149,9 @@ def refine_cameras(
     judge = config.refine_cameras == "auto"
     estimates = [0 * changes] * judge + [changes] * bool(tracks)
     fits = how.rounds + len(estimates) + bool(estimates)
-    views, unseen = withheld_blocks(cameras, list(seen.values()), masks, how.width, seed)
-    unseen = [view for view in unseen if view[2] is not None and view[2].any()]
+    given = [View(*view) for view in zip(cameras, seen.values(), masks, strict=True)]
+    views, unseen = withheld_blocks(given, how.width, seed)
+    unseen = [view for view in unseen if np.any(view.mask)]
     fit = partial(_fit, views=views, extent=extent, config=config, render=render, seed=seed)
     gaussians = _start(_changed(views, changes), _moved(capture.points, cameras, changes), colors, config, seed)
     for done in range(how.rounds):
@@ -235,20 +236,20 @@ def _matched(capture: Capture, train: Sequence[int], config: FitConfig, extent: 
     return bundle_adjust(cameras, tracks, extent, config.refinement.priors)[0], tracks.count
 
 
-def _changed(views: Sequence[_View], changes: np.ndarray) -> list[_View]:
+def _changed(views: Sequence[View], changes: np.ndarray) -> list[View]:
     """Return views with changed cameras, whose distortion is removed from the images and masks."""
     return [_changed_view(*view, change) for view, change in zip(views, changes, strict=True)]
 
 
-def _changed_view(camera: Camera, image: np.ndarray, mask: np.ndarray | None, change: np.ndarray) -> _View:
+def _changed_view(camera: Camera, image: np.ndarray, mask: np.ndarray | None, change: np.ndarray) -> View:
     camera = changed_camera(camera, change)
     correction = undistortion(camera, Lens("RADIAL", tuple(change[9:])))
     if correction is None:
-        return camera, image, mask
+        return View(camera, image, mask)
     valid = correction.mask
     if mask is not None:
         valid = valid & (correction(mask.astype(np.float32)) > _VALID)
-    return camera, correction(image), valid
+    return View(camera, correction(image), valid)
 
 
 def _largest_shift(camera: Camera, change: np.ndarray) -> float:
@@ -272,7 +273,7 @@ def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -
     return moved.astype(np.float32)
 
 
-def _start(views: Sequence[_View], points: np.ndarray, colors: np.ndarray, config: FitConfig, seed: int) -> Gaussians:
+def _start(views: Sequence[View], points: np.ndarray, colors: np.ndarray, config: FitConfig, seed: int) -> Gaussians:
     """Return the Gaussians that a fit starts from, without view-dependent colours, which would hide wrong poses."""
     cameras, images, masks = (list(part) for part in zip(*views, strict=True))
     count, rng = config.refinement.gaussians, np.random.default_rng([seed, 3])
@@ -288,7 +289,7 @@ def _start(views: Sequence[_View], points: np.ndarray, colors: np.ndarray, confi
 def _fit(
     gaussians: Gaussians,
     changes: np.ndarray,
-    views: Sequence[_View],
+    views: Sequence[View],
     extent: float,
     config: FitConfig,
     render: RenderConfig,
@@ -308,14 +309,14 @@ def _fit(
         density=replace(config.density, rounds=0),
     )
     changed = _changed(views, changes)
-    targets, cameras = [Target(*view[1:]) for view in changed], [view[0] for view in changed]
+    targets, cameras = [view.target for view in changed], [view.camera for view in changed]
     rng = np.random.default_rng([seed, 4])
     return fit_first_frame(gaussians, cameras, targets, extent, short, render, rng).gaussians
 
 
 def _joint_step(
     gaussians: Gaussians,
-    views: Sequence[_View],
+    views: Sequence[View],
     changes: np.ndarray,
     deviations: np.ndarray,
     extent: float,
@@ -325,7 +326,7 @@ def _joint_step(
     """Return the Gaussians and the changes of the cameras [V, 11] after one Gauss-Newton step of both."""
     means = np.asarray(gaussians.means, np.float64)
     changed = _changed(views, changes)
-    shifts = [_shifts(gaussians, camera, Target(image, mask), blur, render) for camera, image, mask in changed]
+    shifts = [_shifts(gaussians, view.camera, view.target, blur, render) for view in changed]
     variance, equations = _ALIKE * np.mean([error for *_, error in shifts]), NormalEquations(len(views), len(means))
     for v, ((camera, *_), (G, b, _)) in enumerate(zip(changed, shifts, strict=True)):
         equations.add(v, slice(None), camera_jacobian(camera, 1 + changes[v, 6], means), G / variance, b / variance)

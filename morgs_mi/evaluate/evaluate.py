@@ -40,6 +40,7 @@ from morgs_mi.evaluate.tracking import evaluate_tracks
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import mean_psnr
 from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.fit.view import View
 from morgs_mi.io.bounded import read_json
 from morgs_mi.method.exposure import follow_exposure
 from morgs_mi.playback.player import (
@@ -160,7 +161,7 @@ def _registered_psnr(stream: StreamReader, recording: Capture, coded: CodedFrame
     extent = scene_extent([stream.cameras[v] for v in recording.train_views])
     view = image, recording.masks[test]
     found = register_camera(coded.gaussians, stream.cameras[test], *view, extent, FitConfig(), config)
-    return mean_psnr(coded.gaussians, [(found, *view)], config)
+    return mean_psnr(coded.gaussians, [View(found, *view)], config)
 
 
 def _packets(stream: StreamReader) -> tuple[dict[int, tuple[PacketKind, int]], int]:

@@ -28,7 +28,7 @@ from morgs_mi.fit.cross_validation import (
 from morgs_mi.fit.depth_prior import DepthPrior
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.forecast import angles_to, scene_depths
-from morgs_mi.losses.ssim import Target
+from morgs_mi.fit.view import View
 from morgs_mi.render.config import RenderConfig
 
 __all__ = ["NUM_FITS", "Agreement", "compare_fits", "views_between"]
@@ -69,9 +69,7 @@ class Agreement:
 
 def compare_fits(
     start: Gaussians,
-    cameras: Sequence[Camera],
-    images: Sequence[np.ndarray],
-    masks: Sequence[np.ndarray | None],
+    views: Sequence[View],
     extent: float,
     config: FitConfig,
     render: RenderConfig,
@@ -83,9 +81,7 @@ def compare_fits(
 
     Args:
         start: at least two Gaussians that the fits start from.
-        cameras: the V training views, at least two.
-        images: their images [H, W, 3], uint8.
-        masks: valid pixels of each [H, W], or None.
+        views: the V training views, at least two.
         extent: of the scene in world units.
         config: settings of the fit.
         render: cut-offs.
@@ -94,8 +90,8 @@ def compare_fits(
         prior: inverse depth of the views, or None.
     """
     steps, width = trial_steps(config), config.cross_validation.width
-    views = [reduced(*view, width) for view in zip(cameras, images, masks, strict=True)]
-    small, targets = [camera for camera, _, _ in views], [Target(image, mask) for _, image, mask in views]
+    views = [reduced(*view, width) for view in views]
+    small, targets = [view.camera for view in views], [view.target for view in views]
     depth = None if prior is None else prior.reduced(range(len(small)), small)
     angles, between = views_between(small, np.asarray(start.means))
     errors, shown = [], []
@@ -107,7 +103,7 @@ def compare_fits(
         shown.append(np.stack([rendered(fitted, camera, render) for camera in between]))
     differences = decibels(np.array([np.mean((a - b) ** 2) for a, b in zip(*shown, strict=True)]))
     training = float(decibels(np.concatenate(errors)).mean())
-    return Agreement(len(cameras), float(angles.mean()), tuple(differences.tolist()), training)
+    return Agreement(len(views), float(angles.mean()), tuple(differences.tolist()), training)
 
 
 def views_between(cameras: Sequence[Camera], points: np.ndarray) -> tuple[np.ndarray, list[Camera]]:

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import mean_psnr, rendered, shifted, withheld_blocks
 from morgs_mi.fit.first_frame import fit_first_frame
+from morgs_mi.fit.view import View
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.exposure import Exposure, centred, fit_exposure
 from morgs_mi.render.config import RenderConfig
@@ -69,9 +69,7 @@ def balance_config(config: FitConfig) -> FitConfig:
 
 def balance_cameras(
     start: Gaussians,
-    cameras: Sequence[Camera],
-    images: Sequence[np.ndarray],
-    masks: Sequence[np.ndarray | None],
+    views: Sequence[View],
     extent: float,
     config: FitConfig,
     render: RenderConfig,
@@ -82,9 +80,7 @@ def balance_cameras(
 
     Args:
         start: Gaussians that a fit starts from, as for `balance_config`.
-        cameras: V views.
-        images: their images [H, W, 3], uint8.
-        masks: valid pixels of each [H, W], or None.
+        views: V views.
         extent: of the scene in world units.
         config: of the fit; `exposure` "on" takes the exposures in any case.
         render: cut-offs.
@@ -92,15 +88,15 @@ def balance_cameras(
         on_step: called with the number of steps done, in all fits.
     """
     how, short = config.exposures, balance_config(config)
-    views, unseen = withheld_blocks(cameras, images, masks, how.width, seed)
-    exposures, gaussians, done = {v: Exposure() for v in range(len(cameras))}, start, 0
+    kept, unseen = withheld_blocks(views, how.width, seed)
+    exposures, gaussians, done = {v: Exposure() for v in range(len(views))}, start, 0
 
     def fit(gaussians: Gaussians, exposures: Mapping[int, Exposure], steps: int) -> Gaussians:
         nonlocal done
-        targets = [Target(exposures[v].corrected(image), mask) for v, (_, image, mask) in enumerate(views)]
+        targets = [Target(exposures[v].corrected(image), mask) for v, (_, image, mask) in enumerate(kept)]
         tick = None if on_step is None else shifted(on_step, done)
         settings, rng = replace(short, first_frame_steps=steps), np.random.default_rng([seed, 4])
-        reduced = [camera for camera, *_ in views]
+        reduced = [view.camera for view in kept]
         done += steps
         return fit_first_frame(gaussians, reduced, targets, extent, settings, render, rng, tick).gaussians
 
@@ -109,7 +105,7 @@ def balance_cameras(
         exposures = centred(
             {
                 v: fit_exposure(rendered(gaussians, camera, render), image / 255, mask, weights=how.priors)
-                for v, (camera, image, mask) in enumerate(views)
+                for v, (camera, image, mask) in enumerate(kept)
             }
         )
     differ = max(exposure.change for exposure in exposures.values()) >= how.least_difference
@@ -119,7 +115,7 @@ def balance_cameras(
     for candidate in ({v: Exposure() for v in exposures}, exposures):
         fitted = fit(start, candidate, how.steps)
         judged = [
-            (camera, candidate[v].corrected(image), mask)
+            View(camera, candidate[v].corrected(image), mask)
             for v, (camera, image, mask) in enumerate(unseen)
             if mask is not None and mask.any()
         ]

@@ -20,7 +20,7 @@ from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.depth_prior import DepthPrior
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.forecast import POOR_LOSS, forecast
-from morgs_mi.losses.ssim import Target
+from morgs_mi.fit.view import View
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 
@@ -45,7 +45,6 @@ _MIN_SIDE = 32  # px
 _BLOCK, _SHARE = 12, 8
 POOR_PSNR = 22.0
 """PSNR in dB below which views between the cameras look poor."""
-_View = tuple[Camera, np.ndarray, np.ndarray | None]
 
 
 @dataclass(frozen=True)
@@ -111,9 +110,7 @@ class CrossValidation:
 
 def cross_validate(
     start: Gaussians,
-    cameras: Sequence[Camera],
-    images: Sequence[np.ndarray],
-    masks: Sequence[np.ndarray | None],
+    views: Sequence[View],
     extent: float,
     config: FitConfig,
     render: RenderConfig,
@@ -125,9 +122,7 @@ def cross_validate(
 
     Args:
         start: Gaussians that each fit starts from.
-        cameras: the V training views, at least two.
-        images: their images [H, W, 3], uint8.
-        masks: valid pixels of each [H, W], or None.
+        views: the V training views, at least two.
         extent: of the scene in world units.
         config: settings of the fit.
         render: cut-offs.
@@ -136,17 +131,18 @@ def cross_validate(
         prior: inverse depth of the views, or None.
     """
     how = config.cross_validation
+    cameras = [camera for camera, *_ in views]
     withheld, steps = withheld_views(cameras, how.share), trial_steps(config)
-    small = [reduced(*view, how.width) for view in zip(cameras, images, masks, strict=True)]
+    small = [reduced(*view, how.width) for view in views]
     kept = [index for index in range(len(small)) if index not in withheld]
     trained, judged = [small[index] for index in kept], [small[index] for index in withheld]
-    views, targets = [view[0] for view in trained], [Target(image, mask) for _, image, mask in trained]
-    depth = None if prior is None else prior.reduced(kept, views)
+    rig, targets = [view.camera for view in trained], [view.target for view in trained]
+    depth = None if prior is None else prior.reduced(kept, rig)
     trials: list[Trial] = []
     for dropping in how.candidates:
         trial, rng = replace(config, dropping=dropping, first_frame_steps=steps), np.random.default_rng(seed)
         tick = None if on_step is None else shifted(on_step, len(trials) * steps)
-        fitted = fit_first_frame(start, views, targets, extent, trial, render, rng, tick, depth).gaussians
+        fitted = fit_first_frame(start, rig, targets, extent, trial, render, rng, tick, depth).gaussians
         trials.append(Trial(dropping, mean_psnr(fitted, judged, render), mean_psnr(fitted, trained, render)))
         if len(trials) > 1 and trials[-1].withheld_psnr <= trials[-2].withheld_psnr:
             break
@@ -196,48 +192,39 @@ def withheld_views(cameras: Sequence[Camera], share: int) -> tuple[int, ...]:
     return tuple(sorted(chosen))
 
 
-def reduced(camera: Camera, image: np.ndarray, mask: np.ndarray | None, width: int) -> _View:
+def reduced(camera: Camera, image: np.ndarray, mask: np.ndarray | None, width: int) -> View:
     """Return a view reduced by the largest whole factor that leaves a width.
 
     A pixel is valid if all that it covers is.
     """
     factor = camera.width // width
     if factor < 2 or camera.height // factor < _MIN_SIDE:
-        return camera, image, mask
+        return View(camera, image, mask)
     size = (camera.width // factor, camera.height // factor)
     smaller = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
     valid = None if mask is None else cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
-    return camera.resized(*size), smaller, valid
+    return View(camera.resized(*size), smaller, valid)
 
 
-def withheld_blocks(
-    cameras: Sequence[Camera],
-    images: Sequence[np.ndarray],
-    masks: Sequence[np.ndarray | None],
-    width: int,
-    seed: int,
-) -> tuple[list[_View], list[_View]]:
+def withheld_blocks(views: Sequence[View], width: int, seed: int) -> tuple[list[View], list[View]]:
     """Return the reduced views without withheld blocks of pixels, and with these alone, which may be none in a view.
 
     Args:
-        cameras: V views.
-        images: their images [H, W, 3], uint8.
-        masks: valid pixels of each [H, W], or None.
+        views: V views.
         width: least width of the reduced images, px.
         seed: of the choice of the blocks.
     """
-    rng, views, unseen = np.random.default_rng([seed, 2]), [], []
-    for camera, image, mask in zip(cameras, images, masks, strict=True):
-        small = reduced(camera, image, mask, width)
-        rows, columns = (np.arange(size) // _BLOCK for size in small[1].shape[:2])
+    rng, kept, unseen = np.random.default_rng([seed, 2]), [], []
+    for camera, image, mask in (reduced(*view, width) for view in views):
+        rows, columns = (np.arange(size) // _BLOCK for size in image.shape[:2])
         withheld = (rng.random((rows[-1] + 1, columns[-1] + 1)) < 1 / _SHARE)[rows][:, columns]
-        valid = np.ones_like(withheld) if small[2] is None else small[2]
-        views.append((*small[:2], valid & ~withheld))
-        unseen.append((*small[:2], valid & withheld))
-    return views, unseen
+        valid = np.ones_like(withheld) if mask is None else mask
+        kept.append(View(camera, image, valid & ~withheld))
+        unseen.append(View(camera, image, valid & withheld))
+    return kept, unseen
 
 
-def squared_errors(gaussians: Gaussians, views: Sequence[_View], render: RenderConfig) -> np.ndarray:
+def squared_errors(gaussians: Gaussians, views: Sequence[View], render: RenderConfig) -> np.ndarray:
     """Return the mean square error of each view [V], of its valid pixels."""
     errors = []
     for camera, image, mask in views:
@@ -256,6 +243,6 @@ def decibels(squares: np.ndarray) -> np.ndarray:
     return -10 * np.log10(np.maximum(squares, 1e-10))
 
 
-def mean_psnr(gaussians: Gaussians, views: Sequence[_View], render: RenderConfig) -> float:
+def mean_psnr(gaussians: Gaussians, views: Sequence[View], render: RenderConfig) -> float:
     """Return the mean PSNR of some views in dB, of their valid pixels."""
     return float(decibels(squared_errors(gaussians, views, render)).mean())

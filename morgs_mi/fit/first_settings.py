@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.agreement import NUM_FITS, Agreement, compare_fits
 from morgs_mi.fit.budget import planned_trials, steps_within
@@ -18,7 +17,7 @@ from morgs_mi.fit.depth_prior import DepthPrior
 from morgs_mi.fit.dropping import dropping_by_noise
 from morgs_mi.fit.forecast import Forecast, forecast
 from morgs_mi.fit.noise import is_noisy
-from morgs_mi.losses.ssim import Target
+from morgs_mi.fit.view import View
 from morgs_mi.render.config import RenderConfig
 
 __all__ = ["Expected", "FirstSettings", "first_settings"]
@@ -43,10 +42,7 @@ class FirstSettings:
 
 def first_settings(
     gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    images: Sequence[np.ndarray],
-    masks: Sequence[np.ndarray | None],
-    targets: Sequence[Target],
+    views: Sequence[View],
     points: np.ndarray,
     extent: float,
     config: FitConfig,
@@ -62,10 +58,7 @@ def first_settings(
 
     Args:
         gaussians: the start.
-        cameras: V views.
-        images: their images [H, W, 3], uint8.
-        masks: valid pixels of each [H, W], or None.
-        targets: both, as the first frame is fitted to them.
+        views: V views.
         points: [P, 3] of the capture, world units.
         extent: of the scene in world units.
         config: settings of the fit.
@@ -74,16 +67,18 @@ def first_settings(
         on_step: called with (steps of the trials done, steps of trials and first frame).
         prior: inverse depth of the views, or None.
     """
+    cameras, images = [view.camera for view in views], [view.image for view in views]
     if config.noise_aware and is_noisy(images):
         config = replace(config, objective=replace(config.objective, dssim_weight=0.0))
     if config.first_frame_seconds is not None:
+        targets, seeds = [view.target for view in views], [*seed, 1]
         steps = steps_within(
-            config.first_frame_seconds, gaussians, cameras, targets, extent, config, render, [*seed, 1], prior
+            config.first_frame_seconds, gaussians, cameras, targets, extent, config, render, seeds, prior
         )
         config = replace(config, first_frame_steps=steps)
     if config.dropping is not None:
         return FirstSettings(config, (forecast(cameras, points),) if len(cameras) > 1 else ())
-    planned, given = planned_trials(config, len(cameras)), (cameras, images, masks, extent)
+    planned = planned_trials(config, len(cameras))
     expected: list[Expected] = []
     before = trial_steps(config) * sum(planned)
 
@@ -93,11 +88,11 @@ def first_settings(
 
     dropping = None
     if planned.validation:
-        found = cross_validate(gaussians, *given, config, render, seed, tick, prior)
+        found = cross_validate(gaussians, views, extent, config, render, seed, tick, prior)
         expected.append(found)
         dropping = found.best.dropping
     config = replace(config, dropping=dropping_by_noise(images) if dropping is None else dropping)
     if planned.comparison and len(gaussians) >= NUM_FITS:
         later = partial(tick, offset=trial_steps(config) * planned.validation)
-        expected.append(compare_fits(gaussians, *given, config, render, seed, later, prior))
+        expected.append(compare_fits(gaussians, views, extent, config, render, seed, later, prior))
     return FirstSettings(config, tuple(expected), before)

@@ -21,6 +21,7 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.fit.config import CameraPriors, FitConfig, RefinementConfig
 from morgs_mi.fit.cross_validation import rendered
 from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.fit.view import View
 from morgs_mi.playback.visualise import write_png
 from morgs_mi.recorder import with_points
 from morgs_mi.render.config import RenderConfig
@@ -71,7 +72,7 @@ def splat_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
 
 def test_joint_step__turns_cameras_to_where_the_images_were_taken():
     given, gaussians, changes = disturbed(CAMERAS), splats(), np.zeros((4, 11))
-    views = [(camera, image_of(true), None) for camera, true in zip(given, CAMERAS, strict=True)]
+    views = [View(camera, image_of(true)) for camera, true in zip(given, CAMERAS, strict=True)]
     deviations = np.stack([prior_deviations(camera, 1.0, CameraPriors()) for camera in given])
     for _ in range(8):
         gaussians, changes = _joint_step(gaussians, views, changes, deviations, 1.0, 0.0, RenderConfig())

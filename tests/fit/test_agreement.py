@@ -12,6 +12,7 @@ from morgs_mi.fit.agreement import Agreement, compare_fits, views_between
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import trial_steps
 from morgs_mi.fit.first_frame import FirstFrame
+from morgs_mi.fit.view import View
 from tests.scenes.ball import ball, images_of, opaque_ball, views
 from tests.scenes.cameras import arc, look_at_cameras
 
@@ -22,10 +23,14 @@ def bytes_of(gaussians):
     return [(255 * image + 0.5).astype(np.uint8) for image in images_of(gaussians)]
 
 
+def views_with(images):
+    return [View(camera, image) for camera, image in zip(views(), images, strict=True)]
+
+
 def compare(start, on_step=None, seed=0):
     images = bytes_of(opaque_ball())
     render = RenderConfig(reproducible=True)
-    return compare_fits(start, views(), images, [None] * 4, 3.0, CONFIG, render, [seed], on_step)
+    return compare_fits(start, views_with(images), 3.0, CONFIG, render, [seed], on_step)
 
 
 def test_views_between__lie_halfway_between_neighbours():
@@ -51,7 +56,7 @@ def test_compare_fits__measures_the_difference_between_the_cameras(monkeypatch: 
     fits = [ball(400), opaque_ball()]
     given = iter(fits)
     monkeypatch.setattr(agreement, "fit_first_frame", lambda *_: FirstFrame(next(given), {}, 1))
-    found = compare_fits(ball(80), views(), bytes_of(fits[1]), [None] * 4, 3.0, CONFIG, RenderConfig(), [0])
+    found = compare_fits(ball(80), views_with(bytes_of(fits[1])), 3.0, CONFIG, RenderConfig(), [0])
     _, between = views_between(views(), np.asarray(ball(80).means))
     shown = [[np.asarray(rasterize(fit, view, ("color",)).color) for view in between] for fit in fits]
     expected = [psnr(*pair) for pair in zip(*shown, strict=True)]

@@ -13,6 +13,7 @@ from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
 from morgs_mi.fit.balance import Balance, balance_cameras
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.fit.view import View
 from morgs_mi.method.exposure import Exposure, ExposureConfig
 from tests.scenes.cameras import QUAD, look_at_cameras
 from tests.scenes.gaussians import isotropic
@@ -46,9 +47,8 @@ def images(cameras: list[Camera], gains: np.ndarray) -> list[np.ndarray]:
 
 def balanced(gains: np.ndarray, config: FitConfig = FIT) -> Balance:
     start = replace(scene(), sh_coeffs=0.8 * scene().sh_coeffs)  # colours of points are about right
-    masks = [None] * len(CAMERAS)
-    given = start, CAMERAS, images(CAMERAS, gains), masks, scene_extent(CAMERAS), config, RENDER, 0
-    return balance_cameras(*given)
+    views = [View(*view) for view in zip(CAMERAS, images(CAMERAS, gains), strict=True)]
+    return balance_cameras(start, views, scene_extent(CAMERAS), config, RENDER, 0)
 
 
 def test_balance_cameras__finds_the_exposures_and_takes_them():

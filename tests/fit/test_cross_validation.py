@@ -16,6 +16,7 @@ from morgs_mi.fit.cross_validation import (
     trial_steps,
     withheld_views,
 )
+from morgs_mi.fit.view import View
 from tests.scenes.ball import ball, images_of, opaque_ball, views
 from tests.scenes.cameras import arc, look_at_cameras
 
@@ -24,7 +25,8 @@ CONFIG = FitConfig(sh_degree=0, first_frame_steps=100, num_gaussians=150)
 
 def validate(images, masks=None, config=CONFIG, on_step=None, render=None):
     masks = [None] * len(images) if masks is None else masks
-    return cross_validate(ball(80), views(), images, masks, 3.0, config, render or RenderConfig(), [0], on_step)
+    given = [View(*view) for view in zip(views(), images, masks, strict=True)]
+    return cross_validate(ball(80), given, 3.0, config, render or RenderConfig(), [0], on_step)
 
 
 def bytes_of(images, noise=0.0):

@@ -16,6 +16,7 @@ from morgs_mi.fit.cross_validation import cross_validate
 from morgs_mi.fit.depth_prior import DepthNetwork, depth_prior, fit_line, fit_line_robustly
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.initialise import from_points
+from morgs_mi.fit.view import View
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from tests.assertions import assert_close
@@ -235,11 +236,11 @@ def test_fit_first_frame__without_weight_is_the_same_to_the_bit(monkeypatch):
 def test_trials__expect_more_of_other_views_with_depth(trial):
     points, rays, colors = surface_points()
     start = from_points(points + 0.1 * np.random.default_rng(0).normal(size=(len(points), 1)) * rays, colors, 0)
-    images = [np.uint8(255 * card(camera)[0] + 0.5) for camera in VIEWS]
+    views = [View(camera, np.uint8(255 * card(camera)[0] + 0.5)) for camera in VIEWS]
     # Without dropping, whose effect on so few Gaussians is larger than that of their depth, which is 0.3 dB and more.
     trials = CrossValidationConfig(candidates=(0.0,))
     config = dataclasses.replace(CONFIG, first_frame_steps=200, cross_validation=trials)
-    given = start, VIEWS, images, [None] * 3, 3.0, config, RenderConfig(reproducible=True), [0]
+    given = start, views, 3.0, config, RenderConfig(reproducible=True), [0]
     without, guided = (trial(*given, prior=p) for p in (None, depth_prior(depth_maps(), VIEWS, points)))
     assert guided.expected_psnr > without.expected_psnr + 0.2
 

@@ -9,7 +9,7 @@ import numpy as np
 from morgs_mi import RenderConfig
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_settings import first_settings
-from morgs_mi.losses.ssim import Target
+from morgs_mi.fit.view import View
 from tests.scenes.ball import ball, images_of, opaque_ball, views
 
 CONFIG = FitConfig(sh_degree=0, first_frame_steps=5, num_gaussians=80, dropping=0.0)
@@ -20,10 +20,8 @@ def dssim_weight(noise: float, config: FitConfig = CONFIG) -> float:
     rng = np.random.default_rng(0)
     grey = [0.2 + 0.6 * image + rng.normal(0, noise, image.shape) for image in images_of(opaque_ball())]
     images = [np.uint8(np.clip(255 * image + 0.5, 0, 255)) for image in grey]
-    targets, masks = [Target(image) for image in images], [None] * len(images)
-    found = first_settings(
-        ball(80), views(), images, masks, targets, np.zeros((0, 3)), 3.0, config, RenderConfig(), [0]
-    )
+    given = [View(*view) for view in zip(views(), images, strict=True)]
+    found = first_settings(ball(80), given, np.zeros((0, 3)), 3.0, config, RenderConfig(), [0])
     assert replace(found.config, objective=config.objective) == config
     return found.config.objective.dssim_weight
 
