@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import PAYLOAD, TRAILER, StreamWriter
 from morgs_mi.codec.packets import CodedFrame, coded_frames, play, reemitted_keyframe, seek
@@ -391,6 +392,21 @@ def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path_f
     (tmp_path / "stream.morgs").write_bytes(whole[: stream.index()[-1][2]])
     stream_capture(capture, tmp_path, config, resume=True)
     assert stream_of(tmp_path) == whole
+
+
+def test_stream_capture__resumes_where_cameras_have_delays(tmp_path):
+    reading = ReadConfig(offset={"cam1": 0.25, "cam2": -0.5})
+    capture = load_capture(write_recording(tmp_path / "capture"), reading=reading)
+    assert [camera.delay for camera in capture.cameras] == [0, -0.25, 0.5]
+    out = tmp_path / "out"
+    stream_capture(capture, out, CONFIG)
+    stream, whole = StreamReader(out / "stream.morgs"), stream_of(out)
+    for frame in (1, 3):
+        end = next(offset for _, index, offset in stream.index() if index == frame)
+        (out / "stream.morgs").write_bytes(whole[:end])
+        stream_capture(capture, out, CONFIG, resume=True)
+        assert stream_of(out) == whole
+    assert [c.delay for c in open_stream_capture(stream, None, [0, 1]).cameras] == [0, -0.25, 0.5]
 
 
 @pytest.mark.parametrize("found", [[1, 2], {"cam1": [0.1]}, {"cam1": ["x", "y"]}, {"cam1": None}])

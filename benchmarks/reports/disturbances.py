@@ -17,7 +17,8 @@ import tyro
 from tyro.conf import Positional
 
 from benchmarks.reports.cells import CellOptions
-from benchmarks.reports.random_scenes import measure
+from benchmarks.reports.plots import markdown
+from benchmarks.reports.random_scenes import measure, spread
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
@@ -34,6 +35,7 @@ CELLS = {
     "lens and compression": Disturbances(distortion=0.1, jpeg_quality=70),
 }
 _COLUMNS = ("psnr", "psnr_moving", "motion_error_moving", "motion_error_still", "confidence_iou")
+_DECIMALS = (2, 2, 2, 3, 2)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +46,8 @@ class Options(CellOptions):
     """Animated glTF file."""
     animation: str = "Walk"
     """Name of the animation."""
+    fit_seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the fits of each clip."""
     clips: Path = Path("out/disturbances")
     """Folder of the clips, which are made if they are not there."""
     cameras: int = 7
@@ -60,11 +64,16 @@ class Options(CellOptions):
     """Epochs of a later frame."""
 
     def cells(self) -> dict[str, tuple[Source, StreamConfig, int]]:
-        """Return clip, settings and number of frames of each cell."""
+        """Return clip, settings and number of frames of each cell, by disturbance and the fit's seed."""
         config = StreamConfig()
         work = {name: getattr(self, name) for name in ("num_gaussians", "first_frame_steps", "epochs")}
         config = replace(config, fit=replace(config.fit, **work))
-        return {name: (self.clip(name, own), config, self.frames) for name, own in CELLS.items()}
+        clips = {name: self.clip(name, own) for name, own in CELLS.items()}
+        return {
+            f"{name}/{seed}": (clip, replace(config, seed=seed), self.frames)
+            for name, clip in clips.items()
+            for seed in self.fit_seeds
+        }
 
     def clip(self, name: str, disturbances: Disturbances) -> Source:
         """Return the clip of a cell."""
@@ -84,14 +93,14 @@ class Options(CellOptions):
 
 
 def disturbance_table(cells: Mapping[str, Mapping[str, float]]) -> str:
-    """Return the scores of the cells as a table in Markdown."""
-    rows = [
-        f"| {name} | {row['psnr']:.2f} dB | {row['psnr_moving']:.2f} dB | {row['motion_error_moving']:.2f} px | "
-        f"{row['motion_error_still']:.3f} px | {row['confidence_iou']:.2f} |"
-        for name, row in cells.items()
-    ]
-    head = "| disturbance | PSNR | moving | motion error, moving | still | IoU of the confidence |"
-    return "\n".join([head, "|---|---|---|---|---|---|", *rows])
+    """Return mean and standard deviation over the fits of each disturbance as a table in Markdown."""
+    rows = []
+    for disturbance in dict.fromkeys(name.split("/")[0] for name in cells):
+        found = spread({name: row for name, row in cells.items() if name.split("/")[0] == disturbance})
+        scores = (found[column] for column in _COLUMNS)
+        written = (f"{s['mean']:.{k}f} ± {s['deviation']:.{k}f}" for s, k in zip(scores, _DECIMALS, strict=True))
+        rows.append((disturbance, *written))
+    return markdown(("disturbance", "PSNR, dB", "moving", "motion error, px", "still", "IoU of the confidence"), rows)
 
 
 def main(options: Options) -> None:
@@ -99,6 +108,7 @@ def main(options: Options) -> None:
     mi.set_variant("llvm_ad_rgb")
     found = options.run(measure, options.cells())
     scores = {name: {column: row[column] for column in _COLUMNS} for name, row in found.items()}
+    print(disturbance_table(scores))
     settings = {name: asdict(own) for name, own in CELLS.items()}
     options.write({"disturbances": settings, "cells": scores}, unprinted=["disturbances", "cells"])
 

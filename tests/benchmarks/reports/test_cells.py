@@ -47,7 +47,7 @@ REPORTS = {
     few_views: {**SMALL, "rigs": ("random",), "views": (2,), "points": ("random",)},
     first_frame: {"seeds": (1,), "steps": 3, "gaussians": 60},
     estimates: {**SMALL, "views": (2,)},
-    drift: {"scenes": ("random-1",), "frames": 3},
+    drift: {"scenes": ("random-1",), "frames": 3, "fit_seeds": (0,)},
     masks: {"frames": 1, "loops": ("none",)},
 }
 # Reports with several fits per clip.

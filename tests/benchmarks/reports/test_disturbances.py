@@ -21,10 +21,12 @@ def test_disturbances_page__quotes_the_committed_table() -> None:
 @pytest.mark.slow
 def test_main__measures_a_tiny_clip(tmp_path: Path) -> None:
     work = {"num_gaussians": 200, "first_frame_steps": 10, "epochs": 1, "cameras": 3, "width": 64, "frames": 2}
+    work |= {"fit_seeds": (0, 1)}
     model = write_glb(tmp_path / "model.glb")
     disturbances.main(
         Options(json=tmp_path / "out.json", model=model, animation="bend", clips=tmp_path / "clips", **work)
     )
     found = json.loads((tmp_path / "out.json").read_text())
-    assert list(found["cells"]) == list(found["disturbances"]) == list(CELLS)
-    assert disturbance_table(found["cells"]).count("\n") == 1 + len(CELLS)
+    assert list(found["disturbances"]) == list(CELLS)
+    assert list(found["cells"]) == [f"{name}/{seed}" for name in CELLS for seed in (0, 1)]
+    assert disturbance_table(found["cells"]).count("\n") == 2 + len(CELLS)
