@@ -33,7 +33,7 @@ class Options(CellOptions):
 
     scenes: tuple[str, ...] = ("arm", "random-14", "random-15", "random-16")
     """Scenes; random-N is the random one of the seed N."""
-    fit_seeds: tuple[int, ...] = (0, 1, 2)
+    fit_seeds: tuple[int, ...] = (0,)
     """Seeds of the fits of each clip."""
     clips: Path = Path("out/drift")
     """Folder of the clips, which are made where they are missing."""
