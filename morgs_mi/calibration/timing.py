@@ -1,31 +1,29 @@
 """Time offsets of the cameras of a rig whose clocks are apart, from what moves in their images.
 
 At an instant, Gaussians are fitted to the images of all training views, and the flow of the views is lifted to their
-displacement in one frame (see `method.lift`). A view whose clock is o frames ahead shows them displaced by o times as
-much, so that its error e = image - render is linear in o, with the gradient g of the image and the rendered motion m
-(eq. 6) in pixels:
+displacement in one frame (see `method.lift`). `offset_equations` gives the offsets that explain what the Gaussians then
+leave of the images. With the images interpolated at the instants that these offsets give, the Gaussians are fitted
+again: Gauss-Newton steps, first with blurred images, because the equations hold only for small displacements.
 
-    e + o g . m = 0 ,    o = - sum_x e (g . m) / sum_x (g . m)^2 ,
-
-a least squares over the pixels and colours of a view, with the sums of several instants added. Then the images are
-interpolated at the instants that the offsets give, and the Gaussians are fitted again: Gauss-Newton steps. The images
-that Gaussians are fitted to draw them to all offsets at once, and a displacement beyond what is linear hardly shows in
-e, so that a step is too short. By what factor follows from the last two rounds,
+A fit hides part of the offsets, in shapes and colours. Which part kappa remains to be seen follows from the last two
+rounds of one blur (the secant method),
 
     kappa = - sum_v s_v (o'_v - o_v) / sum_v s_v^2 ,
 
-with s the step between them: the secant method. Offsets that all cameras have in common change nothing; those of the
-training views have a mean of zero.
+with s the step between them and o, o' what the equations gave before and after it, for the training views.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
 
 import cv2
 import numpy as np
 
+from morgs_mi.calibration.offset_equations import OffsetEquations, offset_equations
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.interpolation import image_between
 from morgs_mi.core.camera import Camera
@@ -43,10 +41,10 @@ from morgs_mi.method.lift import lift_flow
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["TimeOffsets", "TimingConfig", "estimate_time_offsets", "time_step", "time_sums"]
+__all__ = ["TimeOffsets", "TimingConfig", "estimate_time_offsets"]
 
-# Shares of the offsets that a round finds: of the first, and bounds for the others.
-_FIRST_SHARE, _SHARES = 0.7, (0.2, 1.2)
+# Bounds of kappa, and of a step in frames.
+_SHARES, _LONGEST_STEP = (0.2, 1.2), 1.0
 
 
 @dataclass(frozen=True)
@@ -59,12 +57,14 @@ class TimingConfig:
     """Frames from the start of the recording that are used."""
     instants: int = 2
     """Instants that Gaussians are fitted at, spread over these frames."""
-    num_gaussians: int = 3000
-    """Gaussians of an instant."""
-    steps: int = 300
-    """Optimisation steps of an instant."""
-    rounds: int = 8
-    """Rounds at most."""
+    num_gaussians: int = 8000
+    """Gaussians of an instant; half as many for blurred images."""
+    steps: int = 600
+    """Optimisation steps of an instant; half as many for blurred images."""
+    blurs: tuple[float, ...] = (6, 3, 1.5)
+    """Standard deviations in pixels of the filters of the first rounds, one round each."""
+    rounds: int = 6
+    """Rounds at most after these, with images that are not blurred."""
     tolerance: float = 0.02
     """Largest step in frames of the last round: an offset is found to about half of it."""
     largest: int = 3
@@ -81,6 +81,10 @@ class TimingConfig:
         ):
             check_number("TimingConfig()", name, getattr(self, name), f"[{low}, inf)")
 
+    def halved(self) -> TimingConfig:
+        """Return the settings with half the work of an instant."""
+        return replace(self, num_gaussians=-(-self.num_gaussians // 2), steps=-(-self.steps // 2))
+
 
 @dataclass(frozen=True)
 class TimeOffsets:
@@ -89,12 +93,14 @@ class TimeOffsets:
     Attributes:
         offsets: by name, the frame of each camera's clip that is simultaneous with frame 0 of the reference's, as in
             `ReadConfig.offset`.
+        errors: by name, standard errors of the offsets, frames: large where the images hardly depend on the offset.
         reference: name of the held-out camera, or of the first one, whose offset is as it was.
         change: largest change in the last round, frames.
         converged: whether it is within the tolerance.
     """
 
     offsets: dict[str, float]
+    errors: dict[str, float]
     reference: str
     change: float
     converged: bool
@@ -105,7 +111,7 @@ def estimate_time_offsets(
 ) -> TimeOffsets:
     """Return the time offsets of a capture's cameras; those that it was read with are included.
 
-    No Gaussian is fitted to the held-out view, whose offset follows from its error alone.
+    No Gaussian is fitted to the held-out view, whose offset follows from its own error and from the others' offsets.
 
     Args:
         capture: a capture, whose clips have one frame rate.
@@ -113,8 +119,10 @@ def estimate_time_offsets(
         progress: called with (fits done, fits at most).
 
     Raises:
-        ValueError: the recording has fewer than four frames, an image is missing, or nothing moves.
+        ValueError: the recording has one camera or fewer than four frames, an image is missing, or nothing moves.
     """
+    if len(capture.cameras) < 2:
+        raise ValueError(f"{capture.path}: expected at least 2 cameras to compare clocks, got 1.")
     config = config or TimingConfig()
     clips = _Clips.of(capture, config.frames, config.width)
     largest = (clips.num_frames - 2) // 2
@@ -124,36 +132,27 @@ def estimate_time_offsets(
         )
     largest = min(config.largest, largest)
     instants = np.linspace(largest, clips.num_frames - 2 - largest, config.instants).round().astype(int)
-    offsets, step, pull = np.zeros(len(clips.cameras)), np.zeros(len(clips.cameras)), None
-    for round_index in range(config.rounds):
-        sums = np.zeros((len(clips.cameras), 2))
-        for k, instant in enumerate(instants):
-            sums += _sums_at(clips, instant - offsets, config)
+    blurs = (*config.blurs, *(0.0,) * config.rounds)
+    offsets, step, left = np.zeros(len(clips.cameras)), np.zeros(len(clips.cameras)), None
+    for index, blur in enumerate(blurs):
+        work, rounds = config.halved() if blur else config, []
+        for instant in instants:
+            rounds.append(_equations_at(clips, instant - offsets, blur, work))
             if progress is not None:
-                progress(round_index * len(instants) + k + 1, config.rounds * len(instants))
-        found = time_step(sums)
-        if found is None:
+                progress(index * len(instants) + len(rounds), len(blurs) * len(instants))
+        equations = reduce(add, rounds)
+        if not equations.own.any():
             raise ValueError(
                 f"{capture.path}: expected motion in the first {clips.num_frames} frames, found none; record something "
                 "that moves."
             )
-        found -= found[clips.train].mean()
-        factor, pull = _secant(step, found, pull), found
-        step = found / factor
-        before, offsets = offsets, np.clip(offsets + step, -largest, largest)
-        step = offsets - before
-        if np.abs(step).max() < config.tolerance:
+        before, left = left if blur in blurs[:index] else None, equations.solution()
+        share = 1.0 if before is None else _share(step[clips.train], (left - before)[clips.train])
+        moved = np.clip(offsets + np.clip(equations.solution(share), -_LONGEST_STEP, _LONGEST_STEP), -largest, largest)
+        offsets, step = moved, moved - offsets
+        if not blur and np.abs(step).max() < config.tolerance:
             break
-    return _relative(capture, offsets, float(np.abs(step).max()), config.tolerance)
-
-
-def time_step(sums: np.ndarray) -> np.ndarray | None:
-    """Return o [V] in frames from the sums of -e (g . m) and (g . m)^2 [V, 2] of each view; None: nothing moves.
-
-    A view that shows hardly any motion, against the others, gets an o near 0.
-    """
-    most = sums[:, 1].max()
-    return sums[:, 0] / (sums[:, 1] + 1e-3 * most) if most > 0 else None
+    return _relative(capture, offsets, equations, float(np.abs(step).max()), config.tolerance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,16 +206,16 @@ def _resized(image: np.ndarray, camera: Camera) -> np.ndarray:
     return np.asarray(cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
 
 
-def _sums_at(clips: _Clips, times: np.ndarray, config: TimingConfig) -> np.ndarray:
-    """Return the sums of `time_step` [V, 2] at an instant, which each view shows at a time of its own [V]."""
+def _equations_at(clips: _Clips, times: np.ndarray, blur: float, config: TimingConfig) -> OffsetEquations:
+    """Return the equations of an instant, which each view shows at a time of its own [V]."""
     images, after = clips.at(times), clips.at(times + 1)
     targets = [Target(image, mask) for image, mask in zip(images, clips.masks, strict=True)]
     gaussians = _fitted(clips, images, targets, config)
     pairs = {v: FramePair(after[v], images[v], valid=clips.masks[v]) for v in clips.train}
     views = [ActiveView(camera) for camera in clips.cameras]
     lifted = lift_flow(gaussians, {v: views[v] for v in clips.train}, observe_key_views(pairs))
-    moving = replace(gaussians, motion=lifted.displacement)
-    return np.array([time_sums(moving, view, target) for view, target in zip(views, targets, strict=True)])
+    train = np.isin(np.arange(len(views)), clips.train)
+    return offset_equations(replace(gaussians, motion=lifted.displacement), views, targets, train, blur)
 
 
 def _fitted(clips: _Clips, images: Sequence[np.ndarray], targets: Sequence[Target], config: TimingConfig) -> Gaussians:
@@ -233,34 +232,19 @@ def _fitted(clips: _Clips, images: Sequence[np.ndarray], targets: Sequence[Targe
     return fit_first_frame(start, cameras, shown, scene_extent(cameras), fit, RenderConfig(), rng).gaussians
 
 
-def time_sums(gaussians: Gaussians, view: ActiveView, target: Target) -> tuple[float, float]:
-    """Return the sums of -e (g . m) and of (g . m)^2 in a view, as `time_step` takes them.
-
-    Args:
-        gaussians: N Gaussians at an instant, with their `motion` in one frame.
-        view: a view.
-        target: its image, at about the same instant.
-    """
-    image = view.render(gaussians, ("color", "motion"))
-    slopes = np.stack(
-        [cv2.Sobel(target.image(), cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1))], axis=2
-    )
-    change = np.einsum("hwac,hwa->hwc", slopes, np.asarray(image.motion))
-    return -float(np.sum(target.difference(image.color) * change)), float(np.sum(change**2))
+def _share(step: np.ndarray, change: np.ndarray) -> float:
+    """Return kappa (see the module), within its bounds, from a step and the change of what is left after it."""
+    return float(np.clip(-np.sum(step * change) / np.sum(step**2), *_SHARES)) if step.any() else 1.0
 
 
-def _secant(step: np.ndarray, found: np.ndarray, before: np.ndarray | None) -> float:
-    """Return kappa (see the module), the share of an offset that a round finds, within its bounds."""
-    if before is None or not step.any():
-        return _FIRST_SHARE
-    return float(np.clip(-np.sum(step * (found - before)) / np.sum(step**2), *_SHARES))
-
-
-def _relative(capture: Capture, offsets: np.ndarray, change: float, tolerance: float) -> TimeOffsets:
+def _relative(
+    capture: Capture, offsets: np.ndarray, equations: OffsetEquations, change: float, tolerance: float
+) -> TimeOffsets:
     """Return the result with the offsets from the reference's, in addition to those of the capture."""
     reference = capture.test_view or 0
     known = capture.reading.offset
     apart = offsets - [camera.delay for camera in capture.cameras]
     own = {n: known.get(n, 0.0) - (o - apart[reference]) for n, o in zip(capture.names, apart, strict=True)}
     rounded = {name: round(float(offset), 3) + 0.0 for name, offset in own.items()}
-    return TimeOffsets(rounded, capture.names[reference], change, change < tolerance)
+    errors = dict(zip(capture.names, np.round(equations.errors(reference), 3).tolist(), strict=True))
+    return TimeOffsets(rounded, errors, capture.names[reference], change, change < tolerance)

@@ -32,6 +32,9 @@ from morgs_mi.fit.forecast import forecast
 
 __all__ = ["Info"]
 
+# Standard error in frames above which a time offset is uncertain.
+_UNCERTAIN = 0.1
+
 
 @dataclass(frozen=True)
 class Info:
@@ -86,7 +89,8 @@ class Info:
                 offsets = estimate_time_offsets(
                     capture, None, lambda done, total: report("Comparing clocks", done, total)
                 )
-            print_result(_time_line(offsets))
+            for line in _time_lines(offsets):
+                print_result(line)
         for line in _deep_lines(deep):
             print_result(line)
         if self.json is not None and deep:
@@ -143,13 +147,23 @@ def _check_lines(found: RigCheck | None) -> list[str]:
     return [result, *advice_lines(found.cameras)]
 
 
-def _time_line(found: TimeOffsets) -> str:
-    """Return the time offsets as the options that align the clips."""
+def _time_lines(found: TimeOffsets) -> list[str]:
+    """Return the time offsets as the options that align the clips, and how certain they are."""
     listed = " ".join(f"{name} {offset:.2f}" for name, offset in found.offsets.items() if name != found.reference)
-    doubt = (
-        "" if found.converged else f" They still change by {found.change:.2f} frames: the clips may not show enough."
-    )
-    return f"Clocks: pass --offset {listed} for the time of {found.reference}.{doubt}"
+    errors = {name: error for name, error in found.errors.items() if name != found.reference}
+    doubts = [f"{name} ({error:.2f})" for name, error in errors.items() if error > _UNCERTAIN]
+    lines = [
+        f"Clocks: pass --offset {listed} for the time of {found.reference}.",
+        f"Standard errors of these offsets: up to {max(errors.values()):.2f} frames.",
+    ]
+    if doubts:
+        lines.append(
+            f"Uncertain: {', '.join(doubts)}. Little moves in these views, or in a direction in which an offset looks "
+            "like a change of depth; record something that moves in several directions."
+        )
+    if not found.converged:
+        lines.append(f"They still change by {found.change:.2f} frames: the clips may not show enough.")
+    return lines
 
 
 def _forecast_lines(capture: Capture) -> list[str]:

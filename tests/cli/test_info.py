@@ -75,12 +75,15 @@ def test_info__prints_the_check_and_draws_the_rig(textured_capture: Capture, tmp
 
 
 def test_info__prints_the_time_offsets_as_options(capture: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = TimeOffsets({NAMES[0]: 0.0, NAMES[1]: -0.254, NAMES[2]: 1.5}, NAMES[0], 0.3, converged=False)
+    offsets, errors = {NAMES[0]: 0.0, NAMES[1]: -0.254, NAMES[2]: 1.5}, {NAMES[0]: 0.0, NAMES[1]: 0.023, NAMES[2]: 0.41}
+    found = TimeOffsets(offsets, errors, NAMES[0], 0.3, converged=False)
     monkeypatch.setattr(info, "estimate_time_offsets", lambda *_: found)
     status, out, _ = run("info", capture, "--no-check", "--time")
     assert status == 0
     out = " ".join(out.split())
     assert f"--offset {NAMES[1]} -0.25 {NAMES[2]} 1.50 for the time of {NAMES[0]}." in out
+    assert "Standard errors of these offsets: up to 0.41 frames." in out
+    assert f"Uncertain: {NAMES[2]} (0.41). Little moves" in out
     assert "They still change by 0.30 frames" in out
 
 

@@ -1,0 +1,162 @@
+"""Equations of the time offsets of cameras: Gaussians of one instant, and images that show them at times of their own.
+
+Gaussian k moves by d_k in a frame, which view v shows as m = J_v d_k pixels, with J_v the derivative of its projection.
+If the clock of the view is o_v frames ahead, the image shows the Gaussian o_v m further along. Gaussians that are
+fitted to all views at once lie between what these show, x_k away from their places. With the error e = image - render
+and the gradient g of the image,
+
+    e + g . (o_v m - J_v x_k) = 0
+
+in each pixel and colour. A Gaussian's share of a pixel weights its equations, so that the sums over the pixels
+
+    A_vk = sum_x g g^T ,    b_vk = sum_x e g
+
+are backprojections of two images. Least squares in the offsets and in the places, with the places eliminated as points
+are in bundle adjustment (Schur complement; Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, section 6.1),
+leaves one equation per view,
+
+    sum_w S_vw o_w = r_v ,    c_vk = J_v^T A_vk J_v d_k ,    H_k = sum_w J_w^T A_wk J_w + lambda ,
+    S_vw = sum_k (d_k^T c_vk [v = w] - c_vk^T H_k^-1 c_wk) ,
+    r_v = sum_k (c_vk^T H_k^-1 sum_w J_w^T b_wk - d_k^T J_v^T b_vk) ,
+
+where w runs over the training views. A held-out view has an equation, too, but its offset is in no other. Offsets that
+all views have in common solve S o = 0: they move the Gaussians along their motion. So do, nearly, offsets that other
+places of the Gaussians explain, as with motion along the epipolar lines of two cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from scipy.spatial import KDTree
+
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.losses.ssim import Target
+from morgs_mi.render.active_view import ActiveView
+
+__all__ = ["OffsetEquations", "offset_equations"]
+
+# lambda, as a fraction of a Gaussian's mean curvature along an axis.
+_PRIOR = 1e-4
+# Added to the eigenvalues of S, as a fraction of its mean diagonal without elimination: of a step, and of its error.
+_DAMPING, _FLOOR = 0.03, 1e-3
+# Standard deviation in frames of an offset of which nothing is known.
+_UNKNOWN = 1.0
+# Mean number of Gaussians of a group, whose errors count as one: neighbours share pixels, and are wrong together.
+_GROUP = 32
+
+
+@dataclass(frozen=True, eq=False)
+class OffsetEquations:
+    """S o = r of V views; sums of the equations of several instants are equations again.
+
+    Attributes:
+        matrix: S [V, V]; the columns of held-out views are zero off the diagonal.
+        right: r [V].
+        scatter: sum over groups of neighbouring Gaussians of the products of their parts of r [V, V].
+        own: sum of d^T c [V], the diagonal of S if the Gaussians were in their places.
+        train: which of the views are training views, bool [V].
+    """
+
+    matrix: np.ndarray
+    right: np.ndarray
+    scatter: np.ndarray
+    own: np.ndarray
+    train: np.ndarray
+
+    def __add__(self, other: OffsetEquations) -> OffsetEquations:
+        return OffsetEquations(
+            self.matrix + other.matrix,
+            self.right + other.right,
+            self.scatter + other.scatter,
+            self.own + other.own,
+            self.train,
+        )
+
+    def solution(self, share: float = 1.0) -> np.ndarray:
+        """Return o [V] in frames, of which those of the training views have a mean of zero.
+
+        Args:
+            share: part of the training views' offsets that their equations show.
+        """
+        return self._map(_DAMPING, share) @ self.right
+
+    def errors(self, reference: int) -> np.ndarray:
+        """Return the standard error [V] in frames of each offset from that of the view `reference`.
+
+        The parts of r of groups of neighbouring Gaussians count as independent: a sandwich estimate with clusters
+        (Liang and Zeger, Biometrika 73(1), 1986). What the equations leave open counts with a frame.
+        """
+        found = self._map(_FLOOR)
+        unseen = np.eye(len(found)) - found @ self.matrix
+        noise, missed = found - found[reference], unseen - unseen[reference]
+        return np.sqrt(np.einsum("vi,ij,vj->v", noise, self.scatter, noise) + _UNKNOWN**2 * (missed**2).sum(axis=1))
+
+    def _map(self, damping: float, share: float = 1.0) -> np.ndarray:
+        """Return the matrix [V, V] that turns r into o."""
+        train, scale, count = self.train, self.own.mean() or 1.0, int(self.train.sum())
+        centred = np.eye(count) - 1 / count
+        values, vectors = np.linalg.eigh(centred @ self.matrix[np.ix_(train, train)] @ centred)
+        inverse = (vectors / (np.maximum(values, 0) + damping * scale)) @ vectors.T
+        whole = np.zeros_like(self.matrix)
+        whole[np.ix_(train, train)] = centred @ inverse @ centred / share
+        for view in np.flatnonzero(~train):
+            own = self.matrix[view, view] + 1e-3 * scale
+            whole[view] = (np.eye(len(train))[view] - self.matrix[view, train] @ whole[train]) / own
+        return whole
+
+
+def offset_equations(
+    gaussians: Gaussians, views: Sequence[ActiveView], targets: Sequence[Target], train: np.ndarray, blur: float
+) -> OffsetEquations:
+    """Return the equations of an instant.
+
+    Args:
+        gaussians: N Gaussians that are fitted to the instant, with their `motion` in one frame.
+        views: V views.
+        targets: their images, at about that instant.
+        train: which of the views the Gaussians are fitted to, bool [V].
+        blur: standard deviation in pixels of a Gaussian filter of errors and gradients. Offsets are found that displace
+            by up to about as much; 0 leaves the images as they are.
+    """
+    motion = np.asarray(gaussians.motion, np.float64)
+    moving = (motion != 0).any(axis=1)
+    d, means = motion[moving], np.asarray(gaussians.means, np.float64)[moving]
+    J = np.stack([view.camera.projection_jacobian(means) for view in views])
+    sums = [_products(gaussians, *each, blur)[moving] for each in zip(views, targets, strict=True)]
+    A = np.stack([each[:, :4].reshape(-1, 2, 2) for each in sums])
+    b = np.einsum("vkai,vka->vki", J, np.stack([each[:, 4:] for each in sums]))
+    H = np.einsum("vkai,vkab,vkbj->vkij", J, A, J)
+    c = np.einsum("vkij,kj->vki", H, d)
+    total = H[train].sum(axis=0)
+    prior = _PRIOR * np.trace(total, axis1=1, axis2=2) / 3 + np.finfo(float).tiny
+    inverse = np.linalg.inv(total + prior[:, None, None] * np.eye(3))
+    reduced = np.einsum("vki,kij->vkj", c, inverse)
+    own = np.einsum("vki,ki->v", c, d)
+    matrix = np.diag(own)
+    matrix[:, train] -= np.einsum("vki,wki->vw", reduced, c[train])
+    parts = np.einsum("vki,ki->vk", reduced, b[train].sum(axis=0)) - np.einsum("vki,ki->vk", b, d)
+    groups = _grouped(parts, means)
+    return OffsetEquations(matrix, parts.sum(axis=1), groups @ groups.T, own, train)
+
+
+def _grouped(parts: np.ndarray, means: np.ndarray) -> np.ndarray:
+    """Return sums of the parts [V, n] of Gaussians over groups: those that are nearest to the same one of a few."""
+    if not len(means):
+        return parts
+    _, labels = KDTree(means[::_GROUP]).query(means)
+    return np.stack([np.bincount(labels, row) for row in parts])
+
+
+def _products(gaussians: Gaussians, view: ActiveView, target: Target, blur: float) -> np.ndarray:
+    """Return the sums of g g^T and of e g per Gaussian [N, 6]."""
+    error, image = target.difference(view.render(gaussians, ("color",)).color), target.image()
+    if blur:
+        error, image = (cv2.GaussianBlur(np.ascontiguousarray(each), (0, 0), blur) for each in (error, image))
+    g = np.stack([cv2.Sobel(image, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1))], axis=2)
+    products = np.einsum("hwac,hwbc->hwab", g, g).reshape(*g.shape[:2], 4)
+    both = np.concatenate([products, np.einsum("hwac,hwc->hwa", g, error)], axis=2)
+    return np.asarray(view.backproject(gaussians, view.crop(both.astype(np.float32))), np.float64)
