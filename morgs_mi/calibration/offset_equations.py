@@ -37,14 +37,14 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 
-__all__ = ["OffsetEquations", "offset_equations"]
+__all__ = ["UNKNOWN", "OffsetEquations", "offset_equations"]
 
 # lambda, as a fraction of a Gaussian's mean curvature along an axis.
 _PRIOR = 1e-4
 # Added to the eigenvalues of S, as a fraction of its mean diagonal without elimination: of a step, and of its error.
 _DAMPING, _FLOOR = 0.03, 1e-3
 # Standard deviation in frames of an offset of which nothing is known.
-_UNKNOWN = 1.0
+UNKNOWN = 1.0
 # Mean number of Gaussians of a group, whose errors count as one: neighbours share pixels, and are wrong together.
 _GROUP = 32
 
@@ -93,7 +93,7 @@ class OffsetEquations:
         found = self._map(_FLOOR)
         unseen = np.eye(len(found)) - found @ self.matrix
         noise, missed = found - found[reference], unseen - unseen[reference]
-        return np.sqrt(np.einsum("vi,ij,vj->v", noise, self.scatter, noise) + _UNKNOWN**2 * (missed**2).sum(axis=1))
+        return np.sqrt(np.einsum("vi,ij,vj->v", noise, self.scatter, noise) + UNKNOWN**2 * (missed**2).sum(axis=1))
 
     def _map(self, damping: float, share: float = 1.0) -> np.ndarray:
         """Return the matrix [V, V] that turns r into o."""

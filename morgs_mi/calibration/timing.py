@@ -10,7 +10,10 @@ rounds of one blur (the secant method),
 
     kappa = - sum_v s_v (o'_v - o_v) / sum_v s_v^2 ,
 
-with s the step between them and o, o' what the equations gave before and after it, for the training views.
+with s the step between them and o, o' what the equations gave before and after it, for the training views. Where
+cameras are far apart, a fit can hide the whole offset, since it explains each image by Gaussians of its own; then any
+offset looks right. So a last round moves the clocks by half a frame, and the errors of the offsets are divided by the
+part of it that the equations find back.
 """
 
 from __future__ import annotations
@@ -19,11 +22,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
+from pathlib import Path
 
 import cv2
 import numpy as np
 
-from morgs_mi.calibration.offset_equations import OffsetEquations, offset_equations
+from morgs_mi.calibration.offset_equations import UNKNOWN, OffsetEquations, offset_equations
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.interpolation import image_between
 from morgs_mi.core.camera import Camera
@@ -45,6 +49,8 @@ __all__ = ["TimeOffsets", "TimingConfig", "estimate_time_offsets"]
 
 # Bounds of kappa, and of a step in frames.
 _SHARES, _LONGEST_STEP = (0.2, 1.2), 1.0
+# Frames by which the last round moves the clocks, and the least part of it that counts as found.
+_MOVED, _LEAST_FOUND = 0.5, 0.05
 
 
 @dataclass(frozen=True)
@@ -125,34 +131,88 @@ def estimate_time_offsets(
         raise ValueError(f"{capture.path}: expected at least 2 cameras to compare clocks, got 1.")
     config = config or TimingConfig()
     clips = _Clips.of(capture, config.frames, config.width)
-    largest = (clips.num_frames - 2) // 2
+    largest = min(config.largest, (clips.num_frames - 2) // 2)
     if largest < 1:
         raise ValueError(
             f"{capture.path}: expected at least 4 frames to compare clocks, got {clips.num_frames}; record longer."
         )
-    largest = min(config.largest, largest)
     instants = np.linspace(largest, clips.num_frames - 2 - largest, config.instants).round().astype(int)
-    blurs = (*config.blurs, *(0.0,) * config.rounds)
+    rounds = _Rounds(clips, config, instants, progress)
+    offsets, step, equations = _aligned(rounds, largest)
+    reference = capture.test_view or 0
+    part = _found_back(rounds, offsets - step, equations, reference)
+    errors = np.minimum(equations.errors(reference) / part, UNKNOWN)
+    return _relative(capture, offsets, errors, float(np.abs(step).max()), config.tolerance)
+
+
+def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, OffsetEquations]:
+    """Return offsets [V] of at most `largest`, and the last step [V] with the equations that it was taken from."""
+    clips, blurs = rounds.clips, rounds.blurs
     offsets, step, left = np.zeros(len(clips.cameras)), np.zeros(len(clips.cameras)), None
     for index, blur in enumerate(blurs):
-        work, rounds = config.halved() if blur else config, []
-        for instant in instants:
-            rounds.append(_equations_at(clips, instant - offsets, blur, work))
-            if progress is not None:
-                progress(index * len(instants) + len(rounds), len(blurs) * len(instants))
-        equations = reduce(add, rounds)
-        if not equations.own.any():
-            raise ValueError(
-                f"{capture.path}: expected motion in the first {clips.num_frames} frames, found none; record something "
-                "that moves."
-            )
+        equations = rounds.equations(offsets, blur)
         before, left = left if blur in blurs[:index] else None, equations.solution()
         share = 1.0 if before is None else _share(step[clips.train], (left - before)[clips.train])
         moved = np.clip(offsets + np.clip(equations.solution(share), -_LONGEST_STEP, _LONGEST_STEP), -largest, largest)
         offsets, step = moved, moved - offsets
-        if not blur and np.abs(step).max() < config.tolerance:
+        if not blur and np.abs(step).max() < rounds.config.tolerance:
             break
-    return _relative(capture, offsets, equations, float(np.abs(step).max()), config.tolerance)
+    return offsets, step, equations
+
+
+def _share(step: np.ndarray, change: np.ndarray) -> float:
+    """Return kappa (see the module), within its bounds, from a step and the change of what is left after it."""
+    return float(np.clip(-np.sum(step * change) / np.sum(step**2), *_SHARES)) if step.any() else 1.0
+
+
+def _found_back(rounds: _Rounds, offsets: np.ndarray, equations: OffsetEquations, reference: int) -> np.ndarray:
+    """Return which part [V] the equations find if the clocks are moved against that of `reference`."""
+    moved = np.where(np.arange(len(offsets)) % 2, _MOVED, -_MOVED)
+    moved[reference] = 0
+    change = rounds.equations(offsets + moved, 0.0).solution() - equations.solution()
+    part = (change[reference] - change) / np.where(moved != 0, moved, 1)
+    return np.clip(part, _LEAST_FOUND, 1)
+
+
+@dataclass(eq=False)
+class _Rounds:
+    """Fits of one round after the other.
+
+    Attributes:
+        clips: what Gaussians are fitted to.
+        config: settings.
+        instants: frames that they are fitted at.
+        progress: called with (fits done, fits at most), or None.
+        done: number of fits that are done.
+    """
+
+    clips: _Clips
+    config: TimingConfig
+    instants: np.ndarray
+    progress: Callable[[int, int], None] | None
+    done: int = 0
+
+    @property
+    def blurs(self) -> tuple[float, ...]:
+        """The blur of each round, in pixels."""
+        return *self.config.blurs, *[0.0] * self.config.rounds
+
+    def equations(self, offsets: np.ndarray, blur: float) -> OffsetEquations:
+        """Return the sum of the equations of all instants, with images interpolated by offsets [V] and blurred."""
+        config = self.config.halved() if blur else self.config
+        found = []
+        for instant in self.instants:
+            found.append(_equations_at(self.clips, instant - offsets, blur, config))
+            self.done += 1
+            if self.progress is not None:
+                self.progress(self.done, (len(self.blurs) + 1) * len(self.instants))
+        equations = reduce(add, found)
+        if not equations.own.any():
+            raise ValueError(
+                f"{self.clips.path}: expected motion in the first {self.clips.num_frames} frames, found none; record "
+                "something that moves."
+            )
+        return equations
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,6 +220,7 @@ class _Clips:
     """The first frames of a capture, reduced.
 
     Attributes:
+        path: folder of the capture.
         cameras: V views.
         masks: valid pixels of each [H, W], or None.
         images: per view and frame uint8 [H, W, 3].
@@ -168,6 +229,7 @@ class _Clips:
         point_colors: [P, 3] in [0, 1].
     """
 
+    path: Path
     cameras: tuple[Camera, ...]
     masks: tuple[np.ndarray | None, ...]
     images: tuple[tuple[np.ndarray, ...], ...]
@@ -181,7 +243,9 @@ class _Clips:
         views = zip(capture.cameras, (clip[0] for clip in clips), capture.masks, strict=True)
         cameras, _, masks = zip(*(reduced(*view, width) for view in views), strict=True)
         images = tuple(tuple(_resized(i, c) for i in clip) for clip, c in zip(clips, cameras, strict=True))
-        return cls(cameras, masks, images, list(capture.train_views), capture.points, capture.point_colors)
+        return cls(
+            capture.path, cameras, masks, images, list(capture.train_views), capture.points, capture.point_colors
+        )
 
     @property
     def num_frames(self) -> int:
@@ -232,13 +296,8 @@ def _fitted(clips: _Clips, images: Sequence[np.ndarray], targets: Sequence[Targe
     return fit_first_frame(start, cameras, shown, scene_extent(cameras), fit, RenderConfig(), rng).gaussians
 
 
-def _share(step: np.ndarray, change: np.ndarray) -> float:
-    """Return kappa (see the module), within its bounds, from a step and the change of what is left after it."""
-    return float(np.clip(-np.sum(step * change) / np.sum(step**2), *_SHARES)) if step.any() else 1.0
-
-
 def _relative(
-    capture: Capture, offsets: np.ndarray, equations: OffsetEquations, change: float, tolerance: float
+    capture: Capture, offsets: np.ndarray, errors: np.ndarray, change: float, tolerance: float
 ) -> TimeOffsets:
     """Return the result with the offsets from the reference's, in addition to those of the capture."""
     reference = capture.test_view or 0
@@ -246,5 +305,5 @@ def _relative(
     apart = offsets - [camera.delay for camera in capture.cameras]
     own = {n: known.get(n, 0.0) - (o - apart[reference]) for n, o in zip(capture.names, apart, strict=True)}
     rounded = {name: round(float(offset), 3) + 0.0 for name, offset in own.items()}
-    errors = dict(zip(capture.names, np.round(equations.errors(reference), 3).tolist(), strict=True))
-    return TimeOffsets(rounded, errors, capture.names[reference], change, change < tolerance)
+    uncertain = dict(zip(capture.names, np.round(errors, 3).tolist(), strict=True))
+    return TimeOffsets(rounded, uncertain, capture.names[reference], change, change < tolerance)

@@ -32,8 +32,12 @@ from morgs_mi.fit.forecast import forecast
 
 __all__ = ["Info"]
 
-# Standard error in frames above which a time offset is uncertain.
-_UNCERTAIN = 0.1
+# Standard errors in frames above which a time offset is uncertain, and from which it counts as not found.
+_UNCERTAIN, _NOT_FOUND = 0.1, 0.5
+_UNCERTAIN_WHY = (
+    "Their images hardly depend on the clocks: little moves, or in a direction in which an offset looks like a change "
+    "of depth, or the cameras are far apart."
+)
 
 
 @dataclass(frozen=True)
@@ -149,20 +153,23 @@ def _check_lines(found: RigCheck | None) -> list[str]:
 
 def _time_lines(found: TimeOffsets) -> list[str]:
     """Return the time offsets as the options that align the clips, and how certain they are."""
-    listed = " ".join(f"{name} {offset:.2f}" for name, offset in found.offsets.items() if name != found.reference)
     errors = {name: error for name, error in found.errors.items() if name != found.reference}
-    doubts = [f"{name} ({error:.2f})" for name, error in errors.items() if error > _UNCERTAIN]
-    lines = [
-        f"Clocks: pass --offset {listed} for the time of {found.reference}.",
-        f"Standard errors of these offsets: up to {max(errors.values()):.2f} frames.",
-    ]
+    known = {name: error for name, error in errors.items() if error < _NOT_FOUND}
+    lines = []
+    if known:
+        listed = " ".join(f"{name} {found.offsets[name]:.2f}" for name in known)
+        lines += [
+            f"Clocks: pass --offset {listed} for the time of {found.reference}.",
+            f"Standard errors of these offsets: up to {max(known.values()):.2f} frames.",
+        ]
+    doubts = [f"{name} ({error:.2f})" for name, error in known.items() if error > _UNCERTAIN]
     if doubts:
-        lines.append(
-            f"Uncertain: {', '.join(doubts)}. Little moves in these views, or in a direction in which an offset looks "
-            "like a change of depth; record something that moves in several directions."
-        )
+        lines.append(f"Uncertain: {', '.join(doubts)}. {_UNCERTAIN_WHY}")
+    if len(known) < len(errors):
+        missing = ", ".join(name for name in errors if name not in known)
+        lines.append(f"Clocks not found: {missing}; keep what is known of them. {_UNCERTAIN_WHY}")
     if not found.converged:
-        lines.append(f"They still change by {found.change:.2f} frames: the clips may not show enough.")
+        lines.append(f"The offsets still change by {found.change:.2f} frames: the clips may not show enough.")
     return lines
 
 

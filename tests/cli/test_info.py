@@ -75,16 +75,19 @@ def test_info__prints_the_check_and_draws_the_rig(textured_capture: Capture, tmp
 
 
 def test_info__prints_the_time_offsets_as_options(capture: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
-    offsets, errors = {NAMES[0]: 0.0, NAMES[1]: -0.254, NAMES[2]: 1.5}, {NAMES[0]: 0.0, NAMES[1]: 0.023, NAMES[2]: 0.41}
+    names = (*NAMES[:3], "other")
+    offsets = dict(zip(names, (0.0, -0.254, 1.5, 0.7), strict=True))
+    errors = dict(zip(names, (0.0, 0.023, 0.41, 1.0), strict=True))
     found = TimeOffsets(offsets, errors, NAMES[0], 0.3, converged=False)
     monkeypatch.setattr(info, "estimate_time_offsets", lambda *_: found)
     status, out, _ = run("info", capture, "--no-check", "--time")
     assert status == 0
     out = " ".join(out.split())
-    assert f"--offset {NAMES[1]} -0.25 {NAMES[2]} 1.50 for the time of {NAMES[0]}." in out
+    assert f"pass --offset {NAMES[1]} -0.25 {NAMES[2]} 1.50 for the time of {NAMES[0]}." in out
     assert "Standard errors of these offsets: up to 0.41 frames." in out
-    assert f"Uncertain: {NAMES[2]} (0.41). Little moves" in out
-    assert "They still change by 0.30 frames" in out
+    assert f"Uncertain: {NAMES[2]} (0.41). Their images hardly depend on the clocks" in out
+    assert "Clocks not found: other; keep what is known of them." in out
+    assert "The offsets still change by 0.30 frames" in out
 
 
 def test_info__checks_a_whole_recording(textured_capture: Capture, tmp_path: Path, run) -> None:
