@@ -91,7 +91,8 @@ def measure(options: Options, seed: int) -> dict[str, Any]:
     found = estimate_time_offsets(recorded)
     seconds = time.perf_counter() - start
     truth = load_disturbances(recorded.path / "truth")
-    errors = [offset + truth[name].time_offset for name, offset in found.offsets.items() if name != found.reference]
+    others = [name for name in found.offsets if name != found.reference]
+    errors = [found.offsets[name] + truth[name].time_offset for name in others]
     aligned = load_capture(recorded.path, reading=replace(recorded.reading, offset=found.offsets))
     first = int(aligned.metadata()["cameras"][recorded.names.index(found.reference)]["first_frame"])
     synchronised, shutter = load_capture(options.clip(seed, Disturbances())), load_capture(options.clip(seed, rolling))
@@ -108,6 +109,7 @@ def measure(options: Options, seed: int) -> dict[str, Any]:
         "largest_offset": max(abs(camera.time_offset) for camera in truth.values()),
         "mean_error": float(np.abs(errors).mean()),
         "largest_error": float(np.abs(errors).max()),
+        "standard_error": float(np.mean([found.errors[name] for name in others])),
         "seconds": seconds,
     }
     row: dict[str, Any] = {name: float(f"{value:.4g}") for name, value in numbers.items()}
@@ -141,13 +143,13 @@ def timing_table(scenes: Mapping[str, Mapping[str, Any]]) -> str:
     rows = [
         (
             *(name, f"{row['views']:.0f}", f"{row['largest_offset']:.2f}"),
-            *(f"{row[error]:.3f}" for error in ("mean_error", "largest_error")),
+            *(f"{row[error]:.3f}" for error in ("mean_error", "largest_error", "standard_error")),
             *(_spread(row[fit]["moving"]) for fit in names),
         )
         for name, row in scenes.items()
     ]
-    head = ("scene", "views", "largest offset", "mean error", "largest error", "synchronised", "apart", "aligned")
-    return markdown((*head, "rolling shutter", "with its readout"), rows)
+    head = ("scene", "views", "largest offset", "mean error", "largest error", "standard error")
+    return markdown((*head, "synchronised", "apart", "aligned", "rolling shutter", "with its readout"), rows)
 
 
 def _spread(values: Sequence[float]) -> str:
