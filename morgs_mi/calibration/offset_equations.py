@@ -7,9 +7,9 @@ and the gradient g of the image,
 
     e + g . (o_v m - J_v x_k) = 0
 
-in each pixel and colour. A Gaussian's share of a pixel weights its equations, so that the sums over the pixels
+in each pixel and colour. A Gaussian's weight in a pixel weights its equations, so that the sums over the pixels
 
-    A_vk = sum_x g g^T ,    b_vk = sum_x e g
+    A_vk = sum w_k g g^T ,    b_vk = sum w_k e g
 
 are backprojections of two images. Least squares in the offsets and in the places, with the places eliminated as points
 are in bundle adjustment (Schur complement; Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, section 6.1),
@@ -82,7 +82,7 @@ class OffsetEquations:
         Args:
             share: part of the training views' offsets that their equations show.
         """
-        return self._map(_DAMPING, share) @ self.right
+        return self._inverse(_DAMPING, share) @ self.right
 
     def errors(self, reference: int) -> np.ndarray:
         """Return the standard error [V] in frames of each offset from that of the view `reference`.
@@ -90,12 +90,12 @@ class OffsetEquations:
         The parts of r of groups of neighbouring Gaussians count as independent: a sandwich estimate with clusters
         (Liang and Zeger, Biometrika 73(1), 1986). What the equations leave open counts with a frame.
         """
-        found = self._map(_FLOOR)
+        found = self._inverse(_FLOOR)
         unseen = np.eye(len(found)) - found @ self.matrix
         noise, missed = found - found[reference], unseen - unseen[reference]
         return np.sqrt(np.einsum("vi,ij,vj->v", noise, self.scatter, noise) + UNKNOWN**2 * (missed**2).sum(axis=1))
 
-    def _map(self, damping: float, share: float = 1.0) -> np.ndarray:
+    def _inverse(self, damping: float, share: float = 1.0) -> np.ndarray:
         """Return the matrix [V, V] that turns r into o."""
         train, scale, count = self.train, self.own.mean() or 1.0, int(self.train.sum())
         centred = np.eye(count) - 1 / count
@@ -104,7 +104,7 @@ class OffsetEquations:
         whole = np.zeros_like(self.matrix)
         whole[np.ix_(train, train)] = centred @ inverse @ centred / share
         for view in np.flatnonzero(~train):
-            own = self.matrix[view, view] + 1e-3 * scale
+            own = self.matrix[view, view] + _FLOOR * scale
             whole[view] = (np.eye(len(train))[view] - self.matrix[view, train] @ whole[train]) / own
         return whole
 
