@@ -19,7 +19,7 @@ import tyro
 
 from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.fits import new_loop
-from benchmarks.reports.plots import markdown
+from benchmarks.reports.plots import markdown, plus_minus
 from benchmarks.reports.random_scenes import fitted_frames
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.cluster.tasks import Source
@@ -73,8 +73,7 @@ def drift_table(fits: Mapping[str, Mapping[str, Any]]) -> str:
             (2, [np.nanmean(row["confidence_iou"]) for row in own]),
             (1, [np.mean(row["bytes"]) / 1000 for row in own]),
         )
-        written = (f"{np.mean(v):.{k}f} ± {np.std(v, ddof=1) if len(v) > 1 else 0:.{k}f}" for k, v in values)
-        rows.append((name, *written))
+        rows.append((name, *(plus_minus(v, k) for k, v in values)))
     head = ("clip", "PSNR, dB", "moving: first", "last", "mean", "slope, dB a frame", "IoU", "kB")
     return markdown(head, rows)
 

@@ -28,6 +28,7 @@ import tyro
 
 from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.fits import new_loop
+from benchmarks.reports.plots import markdown, plus_minus
 from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.codec.packets import CodedFrame
@@ -59,6 +60,8 @@ class Options(CellOptions):
     """Number of Gaussians of the first frame."""
     loops: tuple[str, ...] = ("grabcut", "superpixels+grabcut")
     """Methods with whose masks later frames are fitted; a minute each."""
+    fit_seeds: tuple[int, ...] = (0,)
+    """Seeds of the fits of each clip."""
 
 
 def overlap(mask: np.ndarray, truth: np.ndarray) -> dict[str, float]:
@@ -102,7 +105,8 @@ def processor_ms(image: np.ndarray, previous: np.ndarray) -> dict[str, float]:
 class Clip:
     """A capture with its first frame fitted."""
 
-    def __init__(self, path: Path, options: Options) -> None:
+    def __init__(self, path: Path, options: Options, seed: int = 0) -> None:
+        self.seed = seed
         self.capture: Capture = load_capture(path, max_frames=options.frames + 1)
         self.views = self.capture.train_views
         self.cameras = [self.capture.cameras[v] for v in self.views]
@@ -121,7 +125,7 @@ class Clip:
         return [self.frames[t].images[v] for v in self.views]
 
     def _loop(self, motion: MotionConfig) -> StreamLoop:
-        return new_loop(self.capture, StreamConfig(fit=self.fit, motion=motion))
+        return new_loop(self.capture, StreamConfig(seed=self.seed, fit=self.fit, motion=motion))
 
     def _truth(self, camera: Camera, t: int) -> np.ndarray:
         return load_truth(self.truth, camera.name, t).mask
@@ -162,9 +166,9 @@ class Clip:
         return {"key_views": means(key_views), "held_out": means(held_out)}
 
 
-def measure(path: Path, options: Options) -> dict[str, Any]:
-    """Return the figures of one clip."""
-    clip = Clip(path, options)
+def measure(path: Path, options: Options, seed: int = 0) -> dict[str, Any]:
+    """Return the figures of one clip, fitted with one seed."""
+    clip = Clip(path, options, seed)
     camera = clip.cameras[0]
     masks, last = clip.masks(), clip.capture.num_frames - 1
     costs = processor_ms(*(clip.frames[t].images[clip.views[0]] for t in (last, last - 1)))
@@ -173,14 +177,32 @@ def measure(path: Path, options: Options) -> dict[str, Any]:
         for start in ("lifted", "as before")
     }
     size = {"width": camera.width, "height": camera.height}
-    return {"name": path.resolve().name, **size, "masks": masks, "processor_ms": costs, "loops": loops}
+    name = path.resolve().name
+    return {"name": name, "seed": seed, **size, "masks": masks, "processor_ms": costs, "loops": loops}
+
+
+def loops_table(clips: Sequence[Mapping[str, Any]]) -> str:
+    """Return the held-out IoU and PSNR of the later frames in Markdown: mean and spread of each clip's fits."""
+    names, rows = list(dict.fromkeys(clip["name"] for clip in clips)), []
+    for start, label in (("lifted", "lifted"), ("as before", "as in the paper")):
+        for method in clips[0]["loops"][start]:
+            cells = []
+            for name in names:
+                fits = [clip["loops"][start][method]["held_out"] for clip in clips if clip["name"] == name]
+                overlaps, qualities = ([fit[key] for fit in fits] for key in ("iou", "psnr_moving"))
+                cells.append(f"{plus_minus(overlaps)}, {plus_minus(qualities)} dB")
+            rows.append((f"{label}, `{method}`", *cells))
+    return markdown(("start, masks", *(f"`{name}`" for name in names)), rows)
 
 
 def main(options: Options) -> None:
     """Print the figures and write them."""
     mi.set_variant("llvm_ad_rgb")
-    cells = {str(path): (path.resolve(), options) for path in options.captures}
+    cells = {
+        f"{path} {seed}": (path.resolve(), options, seed) for path in options.captures for seed in options.fit_seeds
+    }
     clips = list(options.run(measure, cells).values())
+    print(loops_table(clips))
     unused = ("captures", "json", "workers", "scheduler")
     settings = {name: value for name, value in asdict(options).items() if name not in unused}
     options.write({"clips": clips, "settings": settings}, unprinted=["clips"])

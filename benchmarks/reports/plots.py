@@ -6,10 +6,12 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["blank_figure", "label_points", "markdown", "save_figure"]
+__all__ = ["blank_figure", "label_points", "markdown", "plus_minus", "save_figure"]
 
 
 def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
@@ -17,6 +19,12 @@ def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1
     rule = "|---" * left + "|---:" * (len(titles) - left) + "|"
     lines = [f"| {' | '.join(cells)} |" for cells in (titles, *rows)]
     return "\n".join([lines[0], rule, *lines[1:]]) + "\n"
+
+
+def plus_minus(values: Sequence[float], digits: int = 2) -> str:
+    """Return the mean and the standard deviation of some fits, which is 0 for a single one."""
+    deviation = np.std(values, ddof=1) if len(values) > 1 else 0.0
+    return f"{np.mean(values):.{digits}f} ± {deviation:.{digits}f}"
 
 
 def blank_figure(width: float, height: float) -> Figure:

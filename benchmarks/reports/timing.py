@@ -11,7 +11,7 @@ first. Scores are means over the later frames of the held-out view, whose clock 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ import tyro
 
 from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.fits import new_loop
-from benchmarks.reports.plots import markdown
+from benchmarks.reports.plots import markdown, plus_minus
 from morgs_mi import rasterize
 from morgs_mi.calibration.timing import estimate_time_offsets
 from morgs_mi.capture.capture import Capture, load_capture
@@ -144,16 +144,12 @@ def timing_table(scenes: Mapping[str, Mapping[str, Any]]) -> str:
         (
             *(name, f"{row['views']:.0f}", f"{row['largest_offset']:.2f}"),
             *(f"{row[error]:.3f}" for error in ("mean_error", "largest_error", "standard_error")),
-            *(_spread(row[fit]["moving"]) for fit in names),
+            *(plus_minus(row[fit]["moving"]) for fit in names),
         )
         for name, row in scenes.items()
     ]
     head = ("scene", "views", "largest offset", "mean error", "largest error", "standard error")
     return markdown((*head, "synchronised", "apart", "aligned", "rolling shutter", "with its readout"), rows)
-
-
-def _spread(values: Sequence[float]) -> str:
-    return f"{np.mean(values):.2f} ± {np.std(values, ddof=1) if len(values) > 1 else 0:.2f}"
 
 
 def main(options: Options) -> None:
