@@ -98,11 +98,11 @@ class TimeOffsets:
 
     Attributes:
         offsets: by name, the frame of each camera's clip that is simultaneous with frame 0 of the reference's, as in
-            `ReadConfig.offset`.
+            `ReadConfig.offset`; negative for a camera that began later.
         errors: by name, standard errors of the offsets, frames: large where the images hardly depend on the offset.
         reference: name of the held-out camera, or of the first one, whose offset is as it was.
         change: largest change in the last round, frames.
-        converged: whether it is within the tolerance.
+        converged: whether it is within the tolerance, which does not say that the offsets are right: see `errors`.
     """
 
     offsets: dict[str, float]
@@ -115,7 +115,10 @@ class TimeOffsets:
 def estimate_time_offsets(
     capture: Capture, config: TimingConfig | None = None, progress: Callable[[int, int], None] | None = None
 ) -> TimeOffsets:
-    """Return the time offsets of a capture's cameras; those that it was read with are included.
+    """Return the time offsets of a capture's cameras in frames, see `TimeOffsets`.
+
+    They include those that the capture was read with: its `reading` with the result as `offset` aligns the clips. Two
+    runs differ by up to 0.02 frames, as gradients are summed in any order.
 
     No Gaussian is fitted to the held-out view, whose offset follows from its own error and from the others' offsets.
 
@@ -241,7 +244,9 @@ class _Clips:
     def of(cls, capture: Capture, count: int, width: int) -> _Clips:
         clips = [[_checked(image) for image in capture.images(v, 0, count)] for v in range(len(capture.cameras))]
         views = zip(capture.cameras, (clip[0] for clip in clips), capture.masks, strict=True)
-        cameras, _, masks = zip(*(reduced(*view, width) for view in views), strict=True)
+        small, _, masks = zip(*(reduced(*view, width) for view in views), strict=True)
+        # The images are whole frames: rendered at the time that the capture gives them, they would be displaced twice.
+        cameras = tuple(replace(camera, delay=0.0, readout=0.0) for camera in small)
         images = tuple(tuple(_resized(i, c) for i in clip) for clip, c in zip(clips, cameras, strict=True))
         return cls(
             capture.path, cameras, masks, images, list(capture.train_views), capture.points, capture.point_colors

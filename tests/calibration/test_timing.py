@@ -9,6 +9,7 @@ import pytest
 
 from morgs_mi.calibration.timing import TimingConfig, estimate_time_offsets
 from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.synth.synthesize import synthesize
 
@@ -39,3 +40,5 @@ def test_estimate_time_offsets__finds_the_offsets_of_a_clip(tmp_path: Path) -> N
     # Things move by about a pixel per frame in images of 128 pixels.
     assert found.offsets == pytest.approx(truth, abs=0.15)
     assert all(error < 0.1 for error in found.errors.values())
+    known = estimate_time_offsets(load_capture(clip, reading=ReadConfig(offset=found.offsets)))
+    assert known.offsets == pytest.approx(truth, abs=0.15)
