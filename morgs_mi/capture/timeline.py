@@ -42,8 +42,8 @@ class ReadConfig:
     """Whether to use only the instants that all clips cover, at the lowest of their frame rates."""
     offset: dict[str, float] = field(default_factory=dict)
     """Frame of each listed camera's clip that is simultaneous with frame 0 of the others; negative for a clip that
-    started later. Instants that not all clips cover are left out, as with trim. If it is not whole, images are
-    interpolated between two frames."""
+    started later. Instants that not all clips cover are left out, as with trim. If it is not whole, the nearest frames
+    are used, and `Camera.delay` is the rest; only the first images are interpolated between two frames."""
     gaps: bool = False
     """Whether images may be missing; a camera is left out of the frames that it lacks."""
     color: Literal["none", "linear", "root-polynomial", "vandermonde"] = "none"

@@ -158,9 +158,10 @@ def _time_lines(found: TimeOffsets) -> list[str]:
     lines = []
     if known:
         listed = " ".join(f"{name} {found.offsets[name]:.2f}" for name in known)
+        worst = max(known, key=lambda name: known[name])
         lines += [
             f"Clocks: pass --offset {listed} for the time of {found.reference}.",
-            f"Standard errors of these offsets: up to {max(known.values()):.2f} frames.",
+            f"Standard errors of these offsets: up to {known[worst]:.2f} frames ({worst}).",
         ]
     doubts = [f"{name} ({error:.2f})" for name, error in known.items() if error > _UNCERTAIN]
     if doubts:

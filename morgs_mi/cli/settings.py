@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from tyro.conf import DisallowNone, FlagCreatePairsOff, arg
+from tyro.constructors import PrimitiveConstructorSpec
 
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.config import PresetName, StreamConfig, apply_preset, apply_values, read_config, relocated
@@ -64,16 +65,44 @@ def setting(option: str, config: StreamConfig | None = None) -> Any:
     return arg(metavar=type(default).__name__.upper(), help_behavior_hint=f"(default: {default})")
 
 
+def _offsets(words: list[str]) -> dict[str, float]:
+    """Return the offset of each camera from the words of --offset, a camera and a number in turn.
+
+    Raises:
+        ValueError: a word is missing, is no number, or names a camera a second time.
+    """
+    names, numbers = words[::2], words[1::2]
+    if not words or len(names) > len(numbers):
+        last = f"{words[-1]!r} without one" if words else "nothing"
+        raise ValueError(f"expected pairs of a camera and a number, such as cam01 -0.5, got {last}.")
+    found: dict[str, float] = {}
+    for name, number in zip(names, numbers, strict=True):
+        if name in found:
+            raise ValueError(f"expected each camera once, got {name} twice.")
+        try:
+            found[name] = float(number)
+        except ValueError:
+            raise ValueError(f"the offset of {name} must be a number of frames, got {number!r}.") from None
+    return found
+
+
+_OFFSETS = PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="CAMERA FLOAT ...",
+    instance_from_str=_offsets,
+    is_instance=lambda value: isinstance(value, dict),
+    str_from_instance=lambda value: [word for pair in value.items() for word in map(str, pair)],
+)
+
+
 @dataclass(frozen=True)
 class Reading:
     """Options that resolve differences between the clips of a capture: the fields of `ReadConfig`."""
 
     trim: Flag = False
     """Use the instants that all clips contain, at their lowest frame rate."""
-    offset: Annotated[dict[str, float], arg(metavar="CAMERA FLOAT ...", help_behavior_hint="")] = field(
-        default_factory=dict
-    )
-    """Frame of a camera's clip that shows frame 0 of the others; negative if it began later."""
+    offset: Annotated[dict[str, float], arg(help_behavior_hint=""), _OFFSETS] = field(default_factory=dict)
+    """Frame of a camera's clip, whole or not, that shows frame 0 of the others; negative if it began later."""
     gaps: Flag = False
     """Continue where images are missing, without their cameras."""
     color: Annotated[Literal["none", "linear", "root-polynomial", "vandermonde"], arg(metavar="NAME")] = "none"

@@ -84,7 +84,7 @@ def test_info__prints_the_time_offsets_as_options(capture: Path, run, monkeypatc
     assert status == 0
     out = " ".join(out.split())
     assert f"pass --offset {NAMES[1]} -0.25 {NAMES[2]} 1.50 for the time of {NAMES[0]}." in out
-    assert "Standard errors of these offsets: up to 0.41 frames." in out
+    assert f"Standard errors of these offsets: up to 0.41 frames ({NAMES[2]})." in out
     assert f"Uncertain: {NAMES[2]} (0.41). Their images hardly depend on the clocks" in out
     assert "Clocks not found: other; keep what is known of them." in out
     assert "The offsets still change by 0.30 frames" in out

@@ -105,3 +105,20 @@ def test_fit__shows_the_defaults_of_its_options(capsys) -> None:
 def test_Reading__has_the_fields_of_the_config() -> None:
     assert get_type_hints(Reading) == get_type_hints(ReadConfig)
     assert Reading().read_config() == ReadConfig()
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["cam01", "abc"], "the offset of cam01 must be a number of frames, got 'abc'."),
+        (["cam01"], "expected pairs of a camera and a number, such as cam01 -0.5, got 'cam01' without one."),
+        (["cam01", "1", "cam02"], "got 'cam02' without one."),
+        (["cam01", "1", "cam01", "2"], "expected each camera once, got cam01 twice."),
+        ([], "expected pairs of a camera and a number, such as cam01 -0.5, got nothing."),
+    ],
+)
+def test_offset__refuses_what_is_no_pair(words: list[str], sentence: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["info", "capture", "--offset", *words])
+    captured = capsys.readouterr()
+    assert sentence in " ".join((captured.out + captured.err).replace("│", " ").split())
