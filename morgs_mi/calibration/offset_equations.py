@@ -29,12 +29,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from scipy.spatial import KDTree
 
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.losses.ssim import Target
+from morgs_mi.method.image_gradient import blurred, gradient_products, image_gradient
 from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["UNKNOWN", "OffsetEquations", "offset_equations"]
@@ -126,9 +126,9 @@ def offset_equations(
     moving = (motion != 0).any(axis=1)
     d, means = motion[moving], np.asarray(gaussians.means, np.float64)[moving]
     J = np.stack([view.camera.projection_jacobian(means) for view in views])
-    sums = [_products(gaussians, *each, blur)[moving] for each in zip(views, targets, strict=True)]
-    A = np.stack([each[:, :4].reshape(-1, 2, 2) for each in sums])
-    b = np.einsum("vkai,vka->vki", J, np.stack([each[:, 4:] for each in sums]))
+    sums = [_products(gaussians, *each, blur) for each in zip(views, targets, strict=True)]
+    A, b = (np.stack([each[moving] for each in kind]) for kind in zip(*sums, strict=True))
+    b = np.einsum("vkai,vka->vki", J, b)
     H = np.einsum("vkai,vkab,vkbj->vkij", J, A, J)
     c = np.einsum("vkij,kj->vki", H, d)
     total = H[train].sum(axis=0)
@@ -151,12 +151,7 @@ def _grouped(parts: np.ndarray, means: np.ndarray) -> np.ndarray:
     return np.stack([np.bincount(labels, row) for row in parts])
 
 
-def _products(gaussians: Gaussians, view: ActiveView, target: Target, blur: float) -> np.ndarray:
-    """Return the sums of g g^T and of e g per Gaussian [N, 6]."""
-    error, image = target.difference(view.render(gaussians, ("color",)).color), target.image()
-    if blur:
-        error, image = (cv2.GaussianBlur(np.ascontiguousarray(each), (0, 0), blur) for each in (error, image))
-    g = np.stack([cv2.Sobel(image, cv2.CV_32F, *order, scale=1 / 8) for order in ((1, 0), (0, 1))], axis=2)
-    products = np.einsum("hwac,hwbc->hwab", g, g).reshape(*g.shape[:2], 4)
-    both = np.concatenate([products, np.einsum("hwac,hwc->hwa", g, error)], axis=2)
-    return np.asarray(view.backproject(gaussians, view.crop(both.astype(np.float32))), np.float64)
+def _products(gaussians: Gaussians, view: ActiveView, target: Target, blur: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return A [N, 2, 2] and b [N, 2] of a view."""
+    error = target.difference(view.render(gaussians, ("color",)).color)
+    return gradient_products(gaussians, view, blurred(error, blur), image_gradient(blurred(target.image(), blur)))

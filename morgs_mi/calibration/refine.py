@@ -27,7 +27,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-import cv2
 import numpy as np
 
 from morgs_mi.calibration.bundle import (
@@ -51,6 +50,7 @@ from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.initialise import fill_points, from_points, resample_points, scene_extent, seed_points, seen_points
 from morgs_mi.fit.view import View
 from morgs_mi.losses.ssim import Target
+from morgs_mi.method.image_gradient import blurred, gradient_products, image_gradient
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.config import RenderConfig
 
@@ -345,21 +345,7 @@ def _shifts(
     error = target.difference(image)
     square = max(float(np.mean(error**2)), _LEAST_ERROR)
     # The image that the target would be without the error, also where it is masked.
-    x, y = _gradient(np.asarray(image) + 0.5 * error, blur)
-    error = _blurred(error, blur)
+    gradient = image_gradient(blurred((np.asarray(image) + 0.5 * error).astype(np.float32), blur))
+    error = blurred(error, blur)
     weight = 1 / (1 + np.sum(error**2, axis=-1) / _HALF_WEIGHT**2)
-    sums = [weight * np.sum(a * b, axis=-1) for a, b in ((x, x), (x, y), (y, y), (error, x), (error, y))]
-    sums = view.backproject(gaussians, np.stack(sums, axis=-1)).astype(np.float64)
-    return sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2), sums[:, 3:], square
-
-
-def _blurred(image: np.ndarray, blur: float) -> np.ndarray:
-    return cv2.GaussianBlur(image, (0, 0), blur) if blur else image
-
-
-def _gradient(image: np.ndarray, blur: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of a blurred image along x and y, per px."""
-    image = _blurred(image.astype(np.float32), blur)
-    return cv2.Sobel(image, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8), cv2.Sobel(
-        image, cv2.CV_32F, 0, 1, ksize=3, scale=1 / 8
-    )
+    return *gradient_products(gaussians, view, error, gradient, weight), square

@@ -82,10 +82,13 @@ class TimingConfig:
             ("frames", 4),
             ("instants", 1),
             ("num_gaussians", 1),
+            ("steps", 1),
             ("rounds", 1),
             ("largest", 1),
         ):
             check_number("TimingConfig()", name, getattr(self, name), f"[{low}, inf)")
+        for blur in self.blurs:
+            check_number("TimingConfig()", "blurs", blur, "(0, inf)")
 
     def halved(self) -> TimingConfig:
         """Return the settings with half the work of an instant."""
@@ -246,7 +249,7 @@ class _Clips:
         views = zip(capture.cameras, (clip[0] for clip in clips), capture.masks, strict=True)
         small, _, masks = zip(*(reduced(*view, width) for view in views), strict=True)
         # The images are whole frames: rendered at the time that the capture gives them, they would be displaced twice.
-        cameras = tuple(replace(camera, delay=0.0, readout=0.0) for camera in small)
+        cameras = tuple(camera.without_delays() for camera in small)
         images = tuple(tuple(_resized(i, c) for i in clip) for clip, c in zip(clips, cameras, strict=True))
         return cls(
             capture.path, cameras, masks, images, list(capture.train_views), capture.points, capture.point_colors

@@ -39,6 +39,7 @@ SETTINGS = {
     "quality": "codec.quality",
     "target_size": "codec.target_size",
     "keyframe_interval": "codec.keyframe_interval",
+    "refine_cameras": "fit.refine_cameras",
     "reproducible": "render.reproducible",
 }
 
@@ -147,6 +148,8 @@ class Settings:
     """Most bytes of a later frame; 0: no limit."""
     keyframe_interval: Annotated[int | None, setting("keyframe_interval")] = None
     """Frames between two keyframes; 0: the first only."""
+    refine_cameras: Annotated[Literal["off", "auto", "on"] | None, DisallowNone, setting("refine_cameras")] = None
+    """Refinement of the cameras: off, on, or auto (if withheld pixels gain)."""
     reproducible: Flag = False
     """Same bytes on every run; about half as fast."""
 

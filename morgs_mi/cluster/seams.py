@@ -131,7 +131,7 @@ def fit_seam_frame(
         on_step: called with (steps done, steps) of each pass.
     """
     # Motion over many frames is no speed.
-    setup = replace(setup, cameras=tuple(replace(camera, delay=0.0, readout=0.0) for camera in setup.cameras))
+    setup = replace(setup, cameras=tuple(camera.without_delays() for camera in setup.cameras))
     coded, last, seconds = base, earlier, 0.0
     for number in range(config.passes):
         repeated = replace(setup, config=config.fit_config(setup.config, number))

@@ -166,6 +166,10 @@ class Camera:
         J = np.stack([fx, zero, -fx * x * inverse, zero, fy, -fy * y * inverse], axis=1).reshape(-1, 2, 3)
         return J @ V[:3, :3]
 
+    def without_delays(self) -> Camera:
+        """Return the same view with images of the instants themselves: no delay and no rolling shutter."""
+        return replace(self, delay=0.0, readout=0.0)
+
     def resized(self, width: int, height: int) -> Camera:
         """Return the same view on a grid of width x height pixels (intrinsics scaled to match)."""
         K = np.diag([width / self.width, height / self.height, 1.0]) @ self.K

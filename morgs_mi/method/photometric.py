@@ -21,12 +21,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.losses.ssim import Target
+from morgs_mi.method.image_gradient import image_gradient
 from morgs_mi.method.lift import Lift
 from morgs_mi.method.propagation import narrowed_views, nearest_neighbours
 from morgs_mi.render.active_view import ActiveView
@@ -122,8 +122,7 @@ def mean_color_error(
 
 def _gradient(view: ActiveView, target: Target) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives of a target along x and y, per px, on the pixels of the view."""
-    image = target.image()
-    along_x, along_y = (cv2.Sobel(image, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1)))
+    along_x, along_y = image_gradient(target.image())
     return view.crop(along_x), view.crop(along_y)
 
 

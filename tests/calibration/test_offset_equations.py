@@ -14,6 +14,8 @@ from morgs_mi.render.active_view import ActiveView
 from tests.scenes.ball import opaque_ball
 from tests.scenes.cameras import look_at_cameras
 
+# The ball moves by about a pixel per frame, and the equations are linear: offsets are found to a twentieth of a pixel,
+# not exactly.
 POSITIONS = ((0.4, -0.3, -4), (-0.8, 0.3, -4), (0.8, 0.9, -3.8), (-0.5, -0.8, -4.2), (1.2, 0.1, -3.9))
 # Height, width and colours of the images.
 SIZE = (48, 64, 3)

@@ -25,9 +25,11 @@ def test_estimate_time_offsets__refuses_a_single_camera(textured_capture: Captur
         estimate_time_offsets(alone)
 
 
-def test_timing_config__refuses_too_few_frames() -> None:
+def test_timing_config__refuses_numbers_out_of_range() -> None:
     with pytest.raises(ValueError, match=r"TimingConfig\(\): `frames` must be a number in \[4, inf\), got 3"):
         TimingConfig(frames=3)
+    with pytest.raises(ValueError, match=r"`blurs` must be a number in \(0, inf\), got -1"):
+        TimingConfig(blurs=(3, -1))
 
 
 @pytest.mark.slow
