@@ -10,7 +10,7 @@ not used.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -22,6 +22,7 @@ import tyro
 
 from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.fits import first_frame, random_capture
+from benchmarks.reports.plots import markdown, plus_minus
 from morgs_mi.calibration.rig_check import dense_points, match_capture, triangulate_points
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.cluster.tasks import Source
@@ -58,6 +59,8 @@ class Options(CellOptions):
     """Steps of the first frame."""
     gaussians: int = 8000
     """Number of Gaussians."""
+    fit_seeds: tuple[int, ...] = (0,)
+    """Seeds of the fits of each rig."""
 
 
 def wide_capture(clips: Path, seed: int, downscale: float) -> Capture:
@@ -133,15 +136,29 @@ def measure(source: Source, train: Sequence[int], points: Points, config: Stream
     }
 
 
+def points_table(fits: Sequence[Mapping[str, Any]]) -> str:
+    """Return the held-out PSNR of each clip by the points that fits start from, in Markdown: mean and spread of fits."""
+    starts = list(dict.fromkeys(fit["start"] for fit in fits))
+    rows = []
+    for name in dict.fromkeys(fit["capture"] for fit in fits):
+        own = [[fit for fit in fits if (fit["capture"], fit["start"]) == (name, start)] for start in starts]
+        psnrs = ([np.mean([view["psnr"] for view in fit["held_out"]]) for fit in each] for each in own)
+        cells = zip(psnrs, own, strict=True)
+        rows.append((name, *(f"{plus_minus(values)} dB, {each[0]['points']:,} points" for values, each in cells)))
+    return markdown(("clip", *starts), rows)
+
+
 def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
     config, about, cells = StreamConfig(), {}, {}
     fit = replace(config.fit, first_frame_steps=options.steps, num_gaussians=options.gaussians)
-    for (capture, train), points, dropping in product(cases(options), options.points, options.droppings):
-        name = f"{capture.path} {train} {points} {dropping:g}"
-        cells[name] = Source.of(capture), train, points, replace(config, fit=replace(fit, dropping=dropping))
-        about[name] = {"capture": capture.path.name, "start": points, "dropping": dropping}
+    settings = options.points, options.droppings, options.fit_seeds
+    for (capture, train), points, dropping, seed in product(cases(options), *settings):
+        name = f"{capture.path} {train} {points} {dropping:g} {seed}"
+        own = replace(config, seed=seed, fit=replace(fit, dropping=dropping))
+        cells[name] = Source.of(capture), train, points, own
+        about[name] = {"capture": capture.path.name, "start": points, "dropping": dropping, "seed": seed}
     rows = [{**about[name], **row} for name, row in options.run(measure, cells).items()]
     given = {"downscale": options.downscale, "steps": options.steps, "gaussians": options.gaussians}
     options.write({**given, "fits": rows}, unprinted=["fits"])
