@@ -137,12 +137,12 @@ def measure(source: Source, train: Sequence[int], points: Points, config: Stream
 
 
 def points_table(fits: Sequence[Mapping[str, Any]]) -> str:
-    """Return the held-out PSNR of each clip by the points that fits start from, in Markdown: mean and spread of fits."""
+    """Return the held-out PSNR of each clip by the points that its fits start from, in Markdown."""
     starts = list(dict.fromkeys(fit["start"] for fit in fits))
     rows = []
     for name in dict.fromkeys(fit["capture"] for fit in fits):
         own = [[fit for fit in fits if (fit["capture"], fit["start"]) == (name, start)] for start in starts]
-        psnrs = ([np.mean([view["psnr"] for view in fit["held_out"]]) for fit in each] for each in own)
+        psnrs = ([float(np.mean([v["psnr"] for v in fit["held_out"]])) for fit in each] for each in own)
         cells = zip(psnrs, own, strict=True)
         rows.append((name, *(f"{plus_minus(values)} dB, {each[0]['points']:,} points" for values, each in cells)))
     return markdown(("clip", *starts), rows)
