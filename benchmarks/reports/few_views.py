@@ -28,7 +28,9 @@ from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
-from morgs_mi.fit.forecast import angles_to, forecast, scene_depths
+from morgs_mi.fit.cross_validation import POOR_PSNR
+from morgs_mi.fit.forecast import POOR_LOSS, angles_to, forecast, scene_depths
+from morgs_mi.fit.noise import white_noise_of
 from morgs_mi.synth.scene import load_scene
 from morgs_mi.synth.synthesize import synthesize
 
@@ -115,9 +117,13 @@ def with_points(capture: Capture, train: Sequence[int], points: Points) -> Captu
 
 
 def measure(source: Source, train: Sequence[int], points: Points, config: StreamConfig) -> dict[str, Any]:
-    """Return the PSNR of the training views and of each held-out one, with its angles to the training views."""
+    """Return the PSNR of the training views and of each held-out one, with its angles to the training views.
+
+    `noise` is the standard deviation of the white noise of the training views.
+    """
     capture = with_points(source.open(), train, points)
     scores, report = first_frame(capture, train, config)
+    images = next(capture.frames(0, 1)).images
     cameras = [capture.cameras[v] for v in train]
     rig, held_out = forecast(cameras, capture.points), [v for v in range(len(capture.cameras)) if v not in train]
     depths = scene_depths(capture.cameras, capture.points)
@@ -125,9 +131,11 @@ def measure(source: Source, train: Sequence[int], points: Points, config: Stream
     return {
         "train": list(train),
         "points": len(capture.points),
+        "noise": round(float(np.mean([white_noise_of(images[v]) for v in train])), 3),
         "spacing": round(rig.spacing, 2),
         "overlap": round(rig.overlap, 3),
         "reach": round(rig.reach, 2),
+        "forecast": rig.quality,
         "training": round(float(scores[list(train)].mean()), 2),
         "held_out": [
             {"view": v, "angles": angles[v][:3].round(2).tolist(), "psnr": round(float(scores[v]), 2)} for v in held_out
@@ -136,16 +144,71 @@ def measure(source: Source, train: Sequence[int], points: Points, config: Stream
     }
 
 
+def held_out_psnr(fit: Mapping[str, Any]) -> float:
+    """Return the mean PSNR of the held-out views of a fit, dB."""
+    return float(np.mean([view["psnr"] for view in fit["held_out"]]))
+
+
+def same_rig(fits: Sequence[Mapping[str, Any]], *keys: str) -> list[list[Mapping[str, Any]]]:
+    """Return the fits that have the capture, the training views and what `keys` name in common, in their order."""
+    groups: dict[Any, list[Mapping[str, Any]]] = {}
+    for fit in fits:
+        groups.setdefault((fit["capture"], *fit["train"], *(fit[key] for key in keys)), []).append(fit)
+    return list(groups.values())
+
+
 def points_table(fits: Sequence[Mapping[str, Any]]) -> str:
     """Return the held-out PSNR of each clip by the points that its fits start from, in Markdown."""
-    starts = list(dict.fromkeys(fit["start"] for fit in fits))
+    rows: dict[str, list[str]] = {}
+    for each in same_rig(fits, "start"):
+        found = plus_minus([held_out_psnr(fit) for fit in each])
+        rows.setdefault(each[0]["capture"], []).append(f"{found} dB, {each[0]['points']:,} points")
+    starts = dict.fromkeys(fit["start"] for fit in fits)
+    return markdown(("clip", *starts), ((f"`{name}`", *cells) for name, cells in rows.items()))
+
+
+def dropping_table(fits: Sequence[Mapping[str, Any]]) -> str:
+    """Return the held-out PSNR of each rig by the probability of dropping, in Markdown."""
+    rows: dict[tuple[str, ...], list[str]] = {}
+    for each in same_rig(fits, "dropping"):
+        first = each[0]
+        about = f"`{first['capture']}`", f"{len(first['train'])}", f"{first['noise']:.3f}"
+        rows.setdefault(about, []).append(f"{plus_minus([held_out_psnr(fit) for fit in each])} dB")
+    strengths = (f"p = {p:g}" for p in dict.fromkeys(fit["dropping"] for fit in fits))
+    return markdown(("clip", "training views", "noise", *strengths), ((*about, *row) for about, row in rows.items()))
+
+
+def forecast_table(fits: Sequence[Mapping[str, Any]]) -> str:
+    """Return the held-out PSNR of each rig and number of views, and how often the forecast is right, in Markdown.
+
+    Ranges are those of the captures, each of which is the mean of its fits.
+    """
+    rigs: dict[tuple[str, int], list[tuple[float, ...]]] = {}
+    for each in same_rig(fits):
+        first, psnr = each[0], float(np.mean([held_out_psnr(fit) for fit in each]))
+        loss = float(np.mean([fit["training"] for fit in each])) - psnr
+        right = first["forecast"] == turned_out(psnr, loss)
+        key = first["capture"].partition("-")[0], len(first["train"])
+        rigs.setdefault(key, []).append((first["spacing"], first["reach"], psnr, loss, right))
     rows = []
-    for name in dict.fromkeys(fit["capture"] for fit in fits):
-        own = [[fit for fit in fits if (fit["capture"], fit["start"]) == (name, start)] for start in starts]
-        psnrs = ([float(np.mean([v["psnr"] for v in fit["held_out"]])) for fit in each] for each in own)
-        cells = zip(psnrs, own, strict=True)
-        rows.append((name, *(f"{plus_minus(values)} dB, {each[0]['points']:,} points" for values, each in cells)))
-    return markdown(("clip", *starts), rows)
+    for (rig, views), found in sorted(rigs.items(), key=lambda item: (item[0][0], -item[0][1])):
+        spacing, reach, psnr, loss, right = zip(*found, strict=True)
+        measured = _span(spacing, 0), _span(reach, 0), f"{_span(psnr)} dB", f"{_span(loss)} dB"
+        rows.append((f"`{rig}`", f"{views}", *measured, f"{sum(right):.0f} of {len(right)}"))
+    return markdown(("rig", "views", "degrees apart", "`reach`", "held-out views", "loss", "forecast right"), rows)
+
+
+def turned_out(psnr: float, loss: float) -> str:
+    """Return whether held-out views are good, fair or poor, from their PSNR and what they have less than the others."""
+    if psnr < POOR_PSNR or loss > POOR_LOSS:
+        return "poor"
+    return "good" if loss < POOR_LOSS / 2 else "fair"
+
+
+def _span(values: Sequence[float], digits: int = 1) -> str:
+    """Return the smallest and the largest value, or the only one."""
+    low, high = f"{min(values):.{digits}f}", f"{max(values):.{digits}f}"
+    return low if low == high else f"{low} to {high}"
 
 
 def main(options: Options) -> None:

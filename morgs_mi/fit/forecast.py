@@ -42,12 +42,16 @@ class Forecast:
     expected_psnr: ClassVar[None] = None
 
     @property
+    def quality(self) -> str:
+        """Quality to expect of views between the cameras: good, fair or poor."""
+        return "good" if self.reach <= _GOOD else "fair" if self.reach <= _POOR else "poor"
+
+    @property
     def sentence(self) -> str:
         """What to expect of views between the cameras."""
-        quality = "good" if self.reach <= _GOOD else "fair" if self.reach <= _POOR else "poor"
         return (
-            f"Views between the cameras will be {quality}: {self.cameras} cameras, {self.spacing:.0f} degrees apart, "
-            f"neighbours share {100 * self.overlap:.0f} % of what they see."
+            f"Views between the cameras will be {self.quality}: {self.cameras} cameras, {self.spacing:.0f} degrees "
+            f"apart, neighbours share {100 * self.overlap:.0f} % of what they see."
         )
 
 
