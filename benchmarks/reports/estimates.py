@@ -1,6 +1,6 @@
 """Estimate of views between the cameras, as `fit` prints it, against the PSNR of held-out views.
 
-    python -m benchmarks.reports.estimates --seeds 3 4 5 6 7 8 --json out.json
+    python -m benchmarks.reports.estimates --seeds 3 4 5 6 7 8 --fit-seeds 0 1 2 --json out.json
 
 Each clip is `morgs-mi synth random --seed SEED`, as in `random_scenes`, reduced by `--downscale`. Some cameras that are
 spread over the rig are trained on, and all others are held out. Two fits are compared for every number of views.
@@ -8,7 +8,7 @@ spread over the rig are trained on, and all others are held out. Two fits are co
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,6 +20,7 @@ import tyro
 from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.few_views import spread_views
 from benchmarks.reports.fits import first_frame, random_capture
+from benchmarks.reports.plots import markdown, plus_minus
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 from morgs_mi.fit.agreement import Agreement
@@ -43,6 +44,8 @@ class Options(CellOptions):
     """Steps of the first frame."""
     gaussians: int = 5000
     """Number of Gaussians."""
+    fit_seeds: tuple[int, ...] = (0,)
+    """Seeds of the fits of each rig."""
 
 
 def estimates(found: dict[str, Any]) -> dict[str, float]:
@@ -78,6 +81,26 @@ def measure(source: Source, train: Sequence[int], config: StreamConfig, compare_
     }
 
 
+def estimates_table(fits: Sequence[Mapping[str, Any]]) -> str:
+    """Return the PSNR of held-out views and its estimates by clip and number of views, in Markdown."""
+    rigs: dict[tuple[int, int], list[Mapping[str, Any]]] = {}
+    for fit in fits:
+        rigs.setdefault((fit["seed"], fit["views"]), []).append(fit)
+    rows = []
+    for (seed, views), own in rigs.items():
+        keys = ("training", "held_out", "worst", "two_fits", "withheld_views")
+        cells = (f"{np.mean([fit[key] for fit in own]):.1f} dB" if key in own[0] else "-" for key in keys)
+        errors = [fit["estimate"] - fit["held_out"] for fit in own]
+        rows.append((f"{seed}", f"{views}", *cells, f"{plus_minus(errors, 1)} dB"))
+    titles = "training views", "held-out views", "worst one", "two fits", "withheld views", "error"
+    return markdown(("seed", "views", *titles), rows)
+
+
+def within(fits: Sequence[Mapping[str, Any]], limit: float) -> tuple[int, int]:
+    """Return how many estimates are at most `limit` dB off, and how many there are."""
+    return sum(abs(fit["estimate"] - fit["held_out"]) <= limit for fit in fits), len(fits)
+
+
 def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
@@ -90,9 +113,10 @@ def main(options: Options) -> None:
         capture = random_capture(options.clips, seed, options.downscale)
         for count in (n for n in options.views if n < len(capture.cameras) - 1):
             train = spread_views(capture.cameras, count, capture.train_views)
-            name = f"seed {seed}, {count} views"
-            cells[name] = Source.of(capture), train, replace(config, fit=fit), compare_views
-            about[name] = {"seed": seed, "views": count}
+            for fit_seed in options.fit_seeds:
+                name = f"seed {seed}, {count} views, fit {fit_seed}"
+                cells[name] = Source.of(capture), train, replace(config, seed=fit_seed, fit=fit), compare_views
+                about[name] = {"seed": seed, "views": count, "fit_seed": fit_seed}
     rows = [{**about[name], **row} for name, row in options.run(measure, cells).items()]
     given = {"downscale": options.downscale, "steps": options.steps, "gaussians": options.gaussians}
     options.write({**given, "fits": rows}, unprinted=["fits"])

@@ -1,6 +1,6 @@
 """Live fits: quality where things move by the number of frames that are dropped between two that are fitted.
 
-    python -m benchmarks.reports.live --json out.json
+    python -m benchmarks.reports.live --fit-seeds 0 1 2 --json out.json
 
 A live fit is that of a recording of the frames that it takes, so that frames of a clip are left out here in place of a
 race with a clock. After the first frame, during whose fit many frames are dropped, the fit continues with the next
@@ -10,23 +10,28 @@ fits have.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import tyro
 
+from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.fits import new_loop
+from benchmarks.reports.plots import markdown, plus_minus
 from benchmarks.reports.random_scenes import fitted_frames
-from benchmarks.speed.output import Output
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 from morgs_mi.synth.synthesize import synthesize
 
 
 @dataclass(frozen=True)
-class Options(Output):
+class Options(CellOptions):
     """Clips, work and output."""
 
     scenes: tuple[str, ...] = ("arm", "random-3")
@@ -47,56 +52,77 @@ class Options(Output):
     """Other numbers of epochs of the frame after the gap, each in a further fit of the smallest stride."""
     steps: int = 600
     """Steps of the first frame."""
+    fit_seeds: tuple[int, ...] = (0,)
+    """Seeds of the fits of each clip."""
 
 
-def measure(capture: Capture, options: Options) -> dict[str, dict[str, list[float]]]:
-    """Return PSNR where things move, dB, by stride and the second frame, at the common instants after the gap."""
-    config = StreamConfig()
+def measure(source: Source, options: Options, seed: int) -> list[dict[str, Any]]:
+    """Return PSNR where things move, dB, at the common instants, by stride, second frame and its epochs."""
+    config, capture = StreamConfig(seed=seed), source.open()
     config = replace(config, fit=replace(config.fit, epochs=options.epochs, first_frame_steps=options.steps))
     frames, loop = list(capture.partial_frames(0, options.frames)), new_loop(capture, config)
     loop.push([frames[0].images[v] for v in capture.train_views])
-    first, largest = loop.state, options.strides[-1]
-    scores: dict[str, dict[str, list[float]]] = {}
-    for stride in options.strides:
-        for name, second in (("continued", stride), ("after_gap", options.gap)):
-            loop.state, taken = first, frames[second::stride]
-            rows = zip(taken, fitted_frames(loop, capture, taken), strict=True)
-            common = [row for frame, row in rows if frame.index >= options.gap and frame.index % largest == 0]
-            scores.setdefault(f"{stride}", {})[name] = [round(row["psnr_moving"], 2) for row in common]
-    setup, after, rest = (
-        loop.setup,
-        frames[options.gap : options.gap + 1],
-        frames[options.gap + 1 :: options.strides[0]],
-    )
-    for epochs in options.gap_epochs:
+    first, setup, smallest, largest = loop.state, loop.setup, options.strides[0], options.strides[-1]
+    cases = [(stride, second, options.epochs) for stride in options.strides for second in (stride, options.gap)]
+    cases += [(smallest, options.gap, epochs) for epochs in options.gap_epochs]
+    rows = []
+    for stride, second, epochs in cases:
         loop.state = first
-        loop.setup = replace(setup, config=replace(config, fit=replace(config.fit, epochs=epochs)))
-        rows = list(fitted_frames(loop, capture, after))
+        own = setup.config
+        loop.setup = replace(setup, config=replace(own, fit=replace(own.fit, epochs=epochs)))
+        scores = list(fitted_frames(loop, capture, frames[second : second + 1]))
         loop.setup = setup
-        rows += fitted_frames(loop, capture, rest)
-        scores[f"{options.strides[0]}"][f"after_gap_{epochs}_epochs"] = [
-            round(row["psnr_moving"], 2) for row in (rows[0], rows[-1])
-        ]
-    return scores
+        scores += fitted_frames(loop, capture, frames[second + stride :: stride])
+        taken = range(second, options.frames, stride)
+        common = {t: row for t, row in zip(taken, scores, strict=True) if t >= options.gap and t % largest == 0}
+        psnr = {str(t): round(row["psnr_moving"], 2) for t, row in common.items()}
+        rows.append({"stride": stride, "second": second, "epochs": epochs, "psnr_moving": psnr})
+    return rows
+
+
+def strides_table(fits: Sequence[Mapping[str, Any]], gap: int) -> str:
+    """Return the mean PSNR where things move by clip and stride, without a gap and after it, in Markdown."""
+    rows: dict[tuple[str, int], dict[bool, list[float]]] = {}
+    fewest = min(fit["epochs"] for fit in fits)
+    for fit in (fit for fit in fits if fit["epochs"] == fewest):
+        cells = rows.setdefault((fit["clip"], fit["stride"]), {False: [], True: []})
+        cells[fit["second"] == gap].append(float(np.mean(list(fit["psnr_moving"].values()))))
+    table = (
+        (f"`{clip}`", f"{stride}", *(f"{plus_minus(cells[after])} dB" for after in (False, True)))
+        for (clip, stride), cells in rows.items()
+    )
+    return markdown(("clip", "every n-th frame", "continued", "after a gap"), table)
+
+
+def epochs_table(fits: Sequence[Mapping[str, Any]], gap: int) -> str:
+    """Return the PSNR where things move after a gap by clip and epochs of the frame after it, in Markdown."""
+    rows: dict[tuple[str, int], list[dict[str, float]]] = {}
+    smallest = min(fit["stride"] for fit in fits)
+    for fit in (fit for fit in fits if (fit["stride"], fit["second"]) == (smallest, gap)):
+        rows.setdefault((fit["clip"], fit["epochs"]), []).append(fit["psnr_moving"])
+    instants = list(next(iter(rows.values()))[0])
+    table = (
+        (f"`{clip}`", f"{epochs}", *(f"{plus_minus([found[t] for found in each])} dB" for t in instants))
+        for (clip, epochs), each in rows.items()
+    )
+    return markdown(("clip", f"epochs of frame {gap}", *(f"frame {t}" for t in instants)), table)
 
 
 def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
-    clips = {}
-    for name in options.scenes:
-        clip, (scene, _, seed) = options.clips / name, name.partition("-")
+    about, cells = {}, {}
+    for name, seed in product(options.scenes, options.fit_seeds):
+        clip, (scene, _, number) = options.clips / name, name.partition("-")
         if not clip.exists():
             height = 3 * options.width // 4
-            synthesize(scene, clip, num_frames=options.frames, width=options.width, height=height, seed=int(seed or 0))
-        scores = measure(load_capture(clip), options)
-        clips[name] = {
-            stride: {
-                key: {"mean": round(float(np.nanmean(values)), 2), "psnr_moving": values} for key, values in row.items()
-            }
-            for stride, row in scores.items()
-        }
-    options.write({"clips": clips}, unprinted=["clips"])
+            synthesize(
+                scene, clip, num_frames=options.frames, width=options.width, height=height, seed=int(number or 0)
+            )
+        cell = f"{name}, fit {seed}"
+        cells[cell], about[cell] = (Source.of(load_capture(clip)), options, seed), {"clip": name, "seed": seed}
+    rows = [{**about[cell], **row} for cell, found in options.run(measure, cells).items() for row in found]
+    options.write({"gap": options.gap, "fits": rows}, unprinted=["fits"])
 
 
 if __name__ == "__main__":

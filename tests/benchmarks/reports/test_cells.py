@@ -19,6 +19,7 @@ from benchmarks.reports import (
     first_frame,
     fits,
     generalise,
+    live,
     masks,
     random_scenes,
 )
@@ -48,10 +49,11 @@ REPORTS = {
     first_frame: {"seeds": (1,), "steps": 3, "gaussians": 60},
     estimates: {**SMALL, "views": (2,)},
     drift: {"scenes": ("random-1",), "frames": 3, "fit_seeds": (0,)},
+    live: {"scenes": ("random-1",), "frames": 3, "strides": (1,), "gap": 1, "gap_epochs": (2,), "steps": 3},
     masks: {"frames": 1, "loops": ("none",)},
 }
 # Reports with several fits per clip.
-SLOW = (fast_parts, generalise, masks)
+SLOW = (fast_parts, generalise, live, masks)
 
 
 def tiny_loop(cameras, points, colors, config, image_masks):
