@@ -1,6 +1,6 @@
 """Depth as a prior of the first frame: held-out PSNR with and without it, for depth of several qualities.
 
-    python -m benchmarks.reports.depth_prior --seeds 0 1 2 --json out.json
+    python -m benchmarks.reports.depth_prior --seeds 16 17 18 --fit-seeds 0 1 2 --json out.json
 
 Each seed gives a clip of `morgs-mi synth random`, of which some cameras that are spread over the rig are trained on and
 all others are held out. In place of a network, the exact inverse depth of the path tracer is changed: by an unknown
@@ -9,7 +9,9 @@ scale and shift per view, and by a smooth error, in standard deviations of the v
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +20,12 @@ import mitsuba as mi
 import numpy as np
 import tyro
 
+from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.few_views import Points, spread_views, with_points
-from benchmarks.reports.random_scenes import random_capture
-from benchmarks.speed.output import Output
+from benchmarks.reports.fits import random_capture
+from benchmarks.reports.plots import markdown, plus_minus
 from morgs_mi.capture.capture import Capture
+from morgs_mi.cluster.tasks import Source
 from morgs_mi.core.camera import Camera
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import mean_psnr
@@ -38,11 +42,13 @@ _CELLS = 6
 
 
 @dataclass(frozen=True)
-class Options(Output):
+class Options(CellOptions):
     """Clips, work and output."""
 
-    seeds: tuple[int, ...] = (0, 1, 2)
+    seeds: tuple[int, ...] = (16, 17, 18)
     """Seeds of the scenes."""
+    fit_seeds: tuple[int, ...] = (0,)
+    """Seeds of the fits of each scene, and of its noise and errors."""
     clips: Path = Path("out/random")
     """Folder of the clips."""
     views: int = 4
@@ -80,8 +86,9 @@ def exact_depth(capture: Capture, camera: Camera) -> np.ndarray:
     return cv2.resize(depth, (camera.width, camera.height), interpolation=cv2.INTER_NEAREST)
 
 
-def measure(capture: Capture, seed: int, options: Options) -> list[dict[str, Any]]:
+def measure(source: Source, seed: Sequence[int], options: Options) -> list[dict[str, Any]]:
     """Return the mean PSNR of the training views and of the held-out ones, without a prior and with each."""
+    capture = source.open()
     every, config = range(len(capture.cameras)), FitConfig()
     train = spread_views(capture.cameras, options.views, capture.train_views)
     capture = with_points(capture, train, options.points)
@@ -104,7 +111,7 @@ def measure(capture: Capture, seed: int, options: Options) -> list[dict[str, Any
     for error, weight in [(None, 0.0), *((e, w) for e in options.errors for w in options.weights)]:
         prior = None
         if error is not None:
-            maps = [estimated(depth, error, np.random.default_rng([seed, k])) for k, depth in enumerate(depths)]
+            maps = [estimated(depth, error, np.random.default_rng([*seed, k])) for k, depth in enumerate(depths)]
             prior = depth_prior(maps, cameras, capture.points)
         fitted = fit_first_frame(
             start,
@@ -120,19 +127,30 @@ def measure(capture: Capture, seed: int, options: Options) -> list[dict[str, Any
             name: mean_psnr(fitted.gaussians, [View(capture.cameras[v], images[v]) for v in views], RenderConfig())
             for name, views in (("training", train), ("held_out", [v for v in every if v not in train]))
         }
-        rows.append({"seed": seed, "error": error, "weight": weight, **{n: round(s, 2) for n, s in scores.items()}})
-        print(rows[-1], flush=True)
+        rows.append({"error": error, "weight": weight, **{n: round(s, 2) for n, s in scores.items()}})
     return rows
+
+
+def errors_table(fits: Sequence[Mapping[str, Any]]) -> str:
+    """Return the held-out PSNR of each scene by the error of the depth, in Markdown."""
+    seeds, rows = list(dict.fromkeys(fit["seed"] for fit in fits)), []
+    for error in dict.fromkeys(fit["error"] for fit in fits):
+        own = ([fit["held_out"] for fit in fits if (fit["seed"], fit["error"]) == (seed, error)] for seed in seeds)
+        name = "no prior" if error is None else f"{error:g}"
+        rows.append((name, *(f"{plus_minus(values)} dB" for values in own)))
+    return markdown(("error of the depth", *(f"seed {seed}" for seed in seeds)), rows)
 
 
 def main(options: Options) -> None:
     """Run the report."""
     mi.set_variant("llvm_ad_rgb")
-    rows = [
-        row
-        for seed in options.seeds
-        for row in measure(random_capture(options.clips, seed, options.downscale), seed, options)
-    ]
+    about, cells = {}, {}
+    for seed, fit_seed in product(options.seeds, options.fit_seeds):
+        name = f"seed {seed}, fit {fit_seed}"
+        about[name] = {"seed": seed, "fit_seed": fit_seed}
+        source = Source.of(random_capture(options.clips, seed, options.downscale))
+        cells[name] = source, (seed, fit_seed), options
+    rows = [{**about[name], **row} for name, found in options.run(measure, cells).items() for row in found]
     kept = ("views", "points", "noise", "dropping", "downscale", "steps", "gaussians")
     options.write({**{name: getattr(options, name) for name in kept}, "fits": rows}, unprinted=["fits"])
 
