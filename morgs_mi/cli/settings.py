@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from functools import reduce
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from tyro.conf import DisallowNone, FlagCreatePairsOff, arg
 from tyro.constructors import PrimitiveConstructorSpec
@@ -45,6 +45,8 @@ SETTINGS = {
 
 # A channel that commands render.
 ChannelName = Literal["color", "motion", "confidence", "depth", "alpha"]
+# Whether cameras are refined.
+Refinement = Literal["off", "auto", "on"]
 # A switch that is off by default.
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 
@@ -96,6 +98,18 @@ _OFFSETS = PrimitiveConstructorSpec(
 )
 
 
+def _one_of(names: tuple[str, ...]) -> PrimitiveConstructorSpec[Any]:
+    """Return how an option that may be missing is read, so that messages list these names, without None, in order."""
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="NAME",
+        instance_from_str=lambda words: words[0],
+        is_instance=lambda value: value is None or value in names,
+        str_from_instance=lambda value: [str(value)],
+        choices=names,
+    )
+
+
 @dataclass(frozen=True)
 class Reading:
     """Options that resolve differences between the clips of a capture: the fields of `ReadConfig`."""
@@ -122,7 +136,7 @@ class Reading:
 class Settings:
     """Settings of a fit. Later ones override: defaults, --preset, --config, the other options."""
 
-    preset: Annotated[PresetName | None, optional("NAME")] = None
+    preset: Annotated[PresetName | None, optional("NAME"), _one_of(get_args(PresetName))] = None
     """Preset: l, s (the paper's variants, 8 and 5 epochs), baseline, ml, ml-mo, ml-mo-mc (its ablation), or paper."""
     config: Annotated[Path | None, optional("FILE.toml")] = None
     """File with any settings, as --print-config writes it."""
@@ -148,7 +162,7 @@ class Settings:
     """Most bytes of a later frame; 0: no limit."""
     keyframe_interval: Annotated[int | None, setting("keyframe_interval")] = None
     """Frames between two keyframes; 0: the first only."""
-    refine_cameras: Annotated[Literal["off", "auto", "on"] | None, DisallowNone, setting("refine_cameras")] = None
+    refine_cameras: Annotated[Refinement | None, setting("refine_cameras"), _one_of(get_args(Refinement))] = None
     """Refinement of the cameras: off, on, or auto (if withheld pixels gain)."""
     reproducible: Flag = False
     """Same bytes on every run; about half as fast."""

@@ -122,3 +122,13 @@ def test_offset__refuses_what_is_no_pair(words: list[str], sentence: str, capsys
         cli.main(["info", "capture", "--offset", *words])
     captured = capsys.readouterr()
     assert sentence in " ".join((captured.out + captured.err).replace("│", " ").split())
+
+
+@pytest.mark.parametrize("option", ["--preset", "--refine-cameras"])
+def test_fit__lists_the_choices_of_an_option_without_none(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["fit", "capture", "out", option, "maybe"])
+    captured = capsys.readouterr()
+    printed = captured.out + captured.err
+    assert "maybe" in printed
+    assert "None" not in printed
