@@ -42,6 +42,7 @@ from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.objective import Observations, channels_of, observe
 from morgs_mi.observation import FrameObservation, Images, Seen, Setup, observe_frame, prepare, see_frame
+from morgs_mi.render.config import RenderConfig
 
 __all__ = ["FrameReport", "StreamLoop", "StreamState", "step"]
 
@@ -195,12 +196,10 @@ def _fit_first_frame(
     targets = [view.target for view in views]
     start = gaussians, cameras, targets, setup.extent, chosen.config, config.render, rng, tick
     fitted = fit_first_frame(*start, prior)
-    own = mean_psnr(fitted.gaussians, views, config.render) if chosen.steps_before else 0.0
-    expected = [replace(e, training_psnr=own) if not isinstance(e, Forecast) else e for e in chosen.expected]
     return keyframe_packet(fitted.gaussians, 0, setup.cameras, config.codec), {
         "losses": fitted.losses,
         "status": status,
-        "validation": (_described(expected) if expected else {}) | _about_balance(found),
+        "validation": _about_expected(chosen.expected, fitted.gaussians, views, config.render) | _about_balance(found),
         "steps": fitted.steps,
         "balance": balance,
     }
@@ -229,23 +228,23 @@ def _balanced(images: Images, balance: Sequence[Exposure]) -> dict[int, np.ndarr
     return {v: balance[v].corrected(image) if balance else image for v, image in images.items()}
 
 
+def _about_expected(
+    expected: Expected | None, gaussians: Gaussians, views: Sequence[View], render: RenderConfig
+) -> dict[str, Any]:
+    """Return what the first frame's report says about views between the cameras."""
+    if expected is None:
+        return {}
+    if not isinstance(expected, Forecast):
+        expected = replace(expected, training_psnr=mean_psnr(gaussians, views, render))
+    return {"sentence": expected.sentence, "expected_psnr": expected.expected_psnr, **asdict(expected)}
+
+
 def _about_balance(found: Balance | None) -> dict[str, Any]:
     """Return what the first frame's report says about the balance of the cameras."""
     if found is None:
         return {}
     scores = {"recorded_psnr": found.recorded_psnr, "balanced_psnr": found.balanced_psnr}
     return {"exposure": {"sentence": found.sentence, "taken": found.taken, **scores}}
-
-
-def _described(expected: Sequence[Expected]) -> dict[str, Any]:
-    """Return what to expect of views between the cameras, as in the report.
-
-    An estimate errs on the low side, as a rig without some views is another rig and a short fit is less certain. So the
-    highest one counts.
-    """
-    best = max(expected, key=lambda found: found.expected_psnr or 0.0)
-    found = {name: value for each in expected for name, value in asdict(each).items()}
-    return {"sentence": best.sentence, "expected_psnr": best.expected_psnr, **found}
 
 
 def _first_gaussians(setup: Setup, seen: Images, config: FitConfig, rng: np.random.Generator) -> tuple[Gaussians, str]:

@@ -72,10 +72,10 @@ def choice_table(fits: Sequence[Mapping[str, Any]]) -> str:
         chosen = [fit["chosen"] for fit in own]
         without = plus_minus([fit["without"]["held_out"] for fit in own])
         strengths = ", ".join(f"{strength:g}" for strength in sorted({each["dropping"] for each in chosen}))
-        psnrs, estimates = ([each[key] for each in chosen] for key in ("held_out", "estimate"))
-        row = f"{without} dB", strengths, f"{plus_minus(psnrs)} dB", f"{plus_minus(estimates)} dB"
+        with_it = plus_minus([each["held_out"] for each in chosen])
+        row = f"{without} dB", strengths, f"{with_it} dB"
         rows.append((f"{seed}", f"{own[0]['views']}", f"{chosen[0]['gaussians']:,}", *row))
-    return markdown(("seed", "training views", "Gaussians", "p = 0", "chosen p", "with it", "estimate"), rows)
+    return markdown(("seed", "training views", "Gaussians", "p = 0", "chosen p", "with it"), rows)
 
 
 def main(options: Options) -> None:

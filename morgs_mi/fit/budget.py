@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +17,7 @@ from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["PlannedTrials", "planned_trials", "steps_within"]
+__all__ = ["planned_trials", "steps_within"]
 
 # Steps that are timed, and the least number that a first frame gets.
 _TIMED, _LEAST = 20, 100
@@ -62,27 +61,13 @@ def steps_within(
         start = time.perf_counter()
         fit_first_frame(gaussians, cameras, targets, extent, timed, render, np.random.default_rng(seed), None, prior)
         took = time.perf_counter() - start
-    per_step = _GROWTH * took / _TIMED * (1 + sum(planned_trials(config, len(cameras))) * config.cross_validation.steps)
+    per_step = _GROWTH * took / _TIMED * (1 + planned_trials(config, len(cameras)) * config.cross_validation.steps)
     return max(_LEAST, int((seconds - (time.perf_counter() - begin)) / per_step))
 
 
-class PlannedTrials(NamedTuple):
-    """Number of trials before the first frame.
-
-    Attributes:
-        validation: of cross-validation, at most.
-        comparison: of the comparison of two fits.
-    """
-
-    validation: int
-    comparison: int
-
-
-def planned_trials(config: FitConfig, views: int) -> PlannedTrials:
-    """Return the number of trials before the first frame of some views."""
+def planned_trials(config: FitConfig, views: int) -> int:
+    """Return the number of trials before the first frame of some views, at most."""
+    if config.dropping is not None or views < 2:
+        return 0
     how = config.cross_validation
-    if config.dropping is not None:
-        return PlannedTrials(0, 0)
-    return PlannedTrials(
-        len(how.candidates) if views >= how.min_views else 0, NUM_FITS if 1 < views < how.compare_views else 0
-    )
+    return len(how.candidates) if views >= how.min_views else NUM_FITS

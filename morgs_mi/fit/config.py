@@ -125,10 +125,8 @@ class CrossValidationConfig:
     share: int = 6
     """One view of that many is withheld, at least one."""
     min_views: int = 6
-    """Number of views below which nothing is withheld: the others would be too few to stand for all."""
-    compare_views: int = 8
-    """Number of views below which two fits are compared to estimate other views (see `agreement`): a rig that lacks one
-    of fewer is too different."""
+    """Number of views below which nothing is withheld, as a rig that lacks one of fewer is too different: two fits are
+    compared to estimate other views (see `agreement`)."""
     width: int = 640
     """Images are reduced by the largest whole factor that leaves this width, in px."""
     steps: float = 0.4
@@ -141,7 +139,7 @@ class CrossValidationConfig:
                 "CrossValidationConfig(): `candidates` must be rising numbers from 0 to less than 1, got "
                 f"{self.candidates}."
             )
-        for name, low in (("share", 2), ("min_views", 2), ("compare_views", 0), ("width", 1)):
+        for name, low in (("share", 2), ("min_views", 2), ("width", 1)):
             if not getattr(self, name) >= low:
                 raise ValueError(
                     f"CrossValidationConfig(): `{name}` must be at least {low}, got {getattr(self, name)}."

@@ -4,6 +4,9 @@ Some training views are withheld, and a short fit to the others is judged by the
 the probability of dropping (see `dropping`): where images are noisy or few, dropping helps; where they are many and
 clean, it only costs. Candidates are tried in rising order until one is no better than the last. Of few views none can
 be spared: there the noise of the images decides.
+
+The error that a withheld view has more than the others grows with its angle to them. Views halfway between neighbouring
+cameras are nearer, and have as much less of it (see `docs/experiments/first-frame.md`).
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.depth_prior import DepthPrior
 from morgs_mi.fit.first_frame import fit_first_frame
-from morgs_mi.fit.forecast import POOR_LOSS, forecast
+from morgs_mi.fit.forecast import POOR_LOSS, angles_to, forecast, scene_depths
 from morgs_mi.fit.view import View
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
@@ -69,12 +72,14 @@ class CrossValidation:
     Attributes:
         withheld: names of the withheld views.
         spacing: mean angle from a camera to its nearest one, as seen from what they look at, in degrees.
+        distance: mean angle from a withheld view to the nearest of the others, in degrees.
         trials: the fits, by rising probability of dropping.
         training_psnr: mean PSNR of the first frame itself in the training views, dB; None: not fitted yet.
     """
 
     withheld: tuple[str, ...]
     spacing: float
+    distance: float
     trials: tuple[Trial, ...]
     training_psnr: float | None = None
 
@@ -85,18 +90,16 @@ class CrossValidation:
 
     @property
     def expected_psnr(self) -> float:
-        """Estimate of the mean PSNR of views between the cameras, dB.
+        """Estimate of the mean PSNR of views halfway between neighbouring cameras, dB.
 
-        The first frame has more steps than the trial. What the withheld views have more error than the others in the
-        trial is added to the error of the first frame in its training views.
+        What the withheld views have more error than the others in the trial, in proportion to the angles, and the error
+        of the first frame in its training views, which has more steps than the trial.
         """
         best = self.best
-        if self.training_psnr is None:
-            return best.withheld_psnr
-        withheld, trained, own = (
-            10 ** (-psnr / 10) for psnr in (best.withheld_psnr, best.training_psnr, self.training_psnr)
-        )
-        return float(decibels(np.array(max(withheld - trained, 0.0) + own)))
+        psnrs = best.withheld_psnr, best.training_psnr, self.training_psnr or best.training_psnr
+        withheld, trained, own = (10 ** (-psnr / 10) for psnr in psnrs)
+        nearer = min(0.5 * self.spacing, self.distance) / max(self.distance, 1e-6)
+        return float(decibels(np.array(nearer * max(withheld - trained, 0.0) + own)))
 
     @property
     def sentence(self) -> str:
@@ -146,8 +149,10 @@ def cross_validate(
         trials.append(Trial(dropping, mean_psnr(fitted, judged, render), mean_psnr(fitted, trained, render)))
         if len(trials) > 1 and trials[-1].withheld_psnr <= trials[-2].withheld_psnr:
             break
-    spacing = forecast(cameras, np.asarray(start.means)).spacing
-    return CrossValidation(tuple(cameras[v].name for v in withheld), spacing, tuple(trials))
+    names, points = tuple(cameras[v].name for v in withheld), np.asarray(start.means)
+    depths, others = scene_depths(cameras, points), [cameras[v] for v in kept]
+    distance = float(np.mean([angles_to(cameras[v], depths[v], others).min() for v in withheld]))
+    return CrossValidation(names, forecast(cameras, points).spacing, distance, tuple(trials))
 
 
 def verdict(expected_psnr: float, loss: float, estimate: str, spacing: float) -> str:

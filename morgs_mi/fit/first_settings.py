@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -31,12 +30,12 @@ class FirstSettings:
 
     Attributes:
         config: with a number of steps, a strength of dropping, and the weights of the losses.
-        expected: what to expect of views between the cameras, by each way that was taken; none for a single camera.
+        expected: what to expect of views between the cameras; None for a single camera.
         steps_before: number of steps that trials have made.
     """
 
     config: FitConfig
-    expected: tuple[Expected, ...]
+    expected: Expected | None
     steps_before: int = 0
 
 
@@ -53,8 +52,8 @@ def first_settings(
 ) -> FirstSettings:
     """Return the settings of the first frame.
 
-    What to expect of other views follows from cross-validation and, for fewer than `compare_views`, from the comparison
-    of two fits; where the strength of dropping is given, from a forecast.
+    What to expect of other views follows from cross-validation or, for fewer than `min_views`, from the comparison of
+    two fits; where the strength of dropping is given, from a forecast.
 
     Args:
         gaussians: the start.
@@ -77,22 +76,17 @@ def first_settings(
         )
         config = replace(config, first_frame_steps=steps)
     if config.dropping is not None:
-        return FirstSettings(config, (forecast(cameras, points),) if len(cameras) > 1 else ())
-    planned = planned_trials(config, len(cameras))
-    expected: list[Expected] = []
-    before = trial_steps(config) * sum(planned)
+        return FirstSettings(config, forecast(cameras, points) if len(cameras) > 1 else None)
+    before = trial_steps(config) * planned_trials(config, len(cameras))
 
-    def tick(done: int, offset: int = 0) -> None:
+    def tick(done: int) -> None:
         if on_step is not None:
-            on_step(offset + done, before + config.planned_steps)
+            on_step(done, before + config.planned_steps)
 
-    dropping = None
-    if planned.validation:
+    if len(cameras) >= config.cross_validation.min_views:
         found = cross_validate(gaussians, views, extent, config, render, seed, tick, prior)
-        expected.append(found)
-        dropping = found.best.dropping
-    config = replace(config, dropping=dropping_by_noise(images) if dropping is None else dropping)
-    if planned.comparison and len(gaussians) >= NUM_FITS:
-        later = partial(tick, offset=trial_steps(config) * planned.validation)
-        expected.append(compare_fits(gaussians, views, extent, config, render, seed, later, prior))
-    return FirstSettings(config, tuple(expected), before)
+        return FirstSettings(replace(config, dropping=found.best.dropping), found, before)
+    config, found = replace(config, dropping=dropping_by_noise(images)), None
+    if len(cameras) > 1 and len(gaussians) >= NUM_FITS:
+        found = compare_fits(gaussians, views, extent, config, render, seed, tick, prior)
+    return FirstSettings(config, found, before)

@@ -76,24 +76,28 @@ def test_cross_validate__judges_reduced_images_with_their_masks():
     ("withheld", "training", "poor"), [(33.0, 35.0, False), (15.0, 18.0, True), (24.0, 33.0, True)]
 )
 def test_sentence__says_what_to_expect(withheld: float, training: float, poor: bool):
-    found = CrossValidation(("cam03",), 40.0, (Trial(0.0, withheld - 1, 36.0), Trial(0.2, withheld, training)))
+    trials = Trial(0.0, withheld - 1, 36.0), Trial(0.2, withheld, training)
+    found = CrossValidation(("cam03",), 40.0, 20.0, trials)
     assert f"about {withheld:.0f} dB, estimated from cam03" in found.sentence
     assert ("will be poor" in found.sentence) == poor
     assert ("40 degrees apart" in found.sentence) == poor
 
 
 def test_expected_psnr__adds_the_excess_of_withheld_views_to_the_error_of_the_first_frame():
-    # 1e-3 - 0.4e-3 + 0.2e-3
-    trial = Trial(0.0, 30.0, 33.9794)
-    assert CrossValidation(("cam03",), 9.0, (trial,)).expected_psnr == 30
-    found = CrossValidation(("cam03",), 9.0, (trial,), training_psnr=36.9897)
-    assert found.expected_psnr == pytest.approx(30.9691, abs=1e-3)
+    # An excess of 1e-3 - 0.4e-3 at 9 degrees.
+    trials = (Trial(0.0, 30.0, 33.9794),)
+    assert CrossValidation(("cam03",), 18.0, 9.0, trials).expected_psnr == pytest.approx(30, abs=1e-3)
+    found = CrossValidation(("cam03",), 18.0, 9.0, trials, training_psnr=36.9897)
+    assert found.expected_psnr == pytest.approx(-10 * np.log10(0.6e-3 + 0.2e-3), abs=1e-3)
+    found = CrossValidation(("cam03",), 6.0, 9.0, trials, training_psnr=36.9897)
+    assert found.expected_psnr == pytest.approx(-10 * np.log10(0.2e-3 + 0.2e-3), abs=1e-3)
+    assert CrossValidation(("cam03",), 0.0, 0.0, trials).expected_psnr > 30
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"compare_views": -1}, "`compare_views` must be at least 0"),
+        ({"min_views": 1}, "`min_views` must be at least 2"),
         ({"candidates": ()}, "rising numbers"),
         ({"candidates": (0.2, 0.0)}, "rising numbers"),
         ({"candidates": (0.0, 1.0)}, "rising numbers"),
