@@ -67,9 +67,7 @@ def estimates_table(fits: Sequence[Mapping[str, Any]]) -> str:
         rigs.setdefault((fit["seed"], fit["views"]), []).append(fit)
     rows = []
     for (seed, views), own in rigs.items():
-        cells = (
-            f"{np.mean([fit[key] for fit in own]):.1f} dB" for key in ("training", "held_out", "worst", "estimate")
-        )
+        means = (np.mean([fit[key] for fit in own]) for key in ("training", "held_out", "worst", "estimate"))
         errors = [fit["estimate"] - fit["held_out"] for fit in own]
         how = "withheld views" if "trials" in own[0] else "two fits"
         rows.append((f"{seed}", f"{views}", *(f"{mean:.1f} dB" for mean in means), how, f"{plus_minus(errors, 1)} dB"))
