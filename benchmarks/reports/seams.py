@@ -1,6 +1,6 @@
 """PSNR and flicker at the seams of fits in segments, compared with the frames around and with fits in one piece.
 
-    python -m benchmarks.reports.seams --json benchmarks/results/seams.json
+    python -m benchmarks.reports.seams --fit-seeds 0 1 2 --json benchmarks/results/seams.json
 
 The settings of the seams were chosen on `arm`, `spheres`, `thin` and `flicker` with seed 0; nothing was chosen on
 others.
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -17,7 +18,7 @@ from typing import Any
 import mitsuba as mi
 import tyro
 
-from benchmarks.reports.plots import markdown
+from benchmarks.reports.plots import markdown, plus_minus
 from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.cluster.executor import open_workers
@@ -36,11 +37,15 @@ class Options(Output):
     clips: tuple[tuple[str, int, int], ...] = (
         ("arm", 0, 48),
         ("random", 5, 32),
+        ("random", 34, 32),
+        ("random", 35, 32),
         ("thin", 0, 32),
         ("flicker", 0, 32),
         ("spheres", 0, 32),
     )
     """Scenes, seeds and numbers of frames."""
+    fit_seeds: tuple[int, ...] = (0,)
+    """Seeds of the fits of each clip."""
     folder: Path = Path("out/seams")
     """Folder of the clips, which are made if missing."""
     cameras: int = 6
@@ -90,24 +95,26 @@ def measure(capture: Capture, config: StreamConfig, options: Options) -> dict[st
     return {"num_bytes": sizes[0], "num_bytes_whole": sizes[1], "seams": seams}
 
 
-def seam_table(clips: Sequence[Mapping[str, Any]]) -> str:
-    """Return the seams of the clips as a table: each beside the frames around, and beside the fit in one piece."""
-    titles = ("clip, seam", "PSNR before, at, around, dB", "in one piece", "mTV at, around", "in one piece", "kB")
+def seam_table(fits: Sequence[Mapping[str, Any]]) -> str:
+    """Return the seams of the clips as a table: each against the frames around, and beside the fit in one piece."""
+    seams: dict[tuple[str, int, int], list[tuple[Mapping[str, Any], float]]] = {}
+    for fit in fits:
+        for seam in fit["seams"]:
+            growth = fit["num_bytes"] / fit["num_bytes_whole"]
+            seams.setdefault((fit["scene"], fit["seed"], seam["frame"]), []).append((seam, growth))
     rows = []
-    for clip in clips:
-        for seam in clip["seams"]:
-            whole, sizes = seam["whole"], (clip["num_bytes"], clip["num_bytes_whole"])
-            rows.append(
-                [
-                    f"`{clip['scene']}` {clip['seed']}, frame {seam['frame']}",
-                    ", ".join(f"{seam[name]:.2f}" for name in ("psnr_before", "psnr", "psnr_around")),
-                    f"{whole['psnr']:.2f}",
-                    f"{seam['mtv']:.3f}, {seam['mtv_around']:.3f}",
-                    f"{whole['mtv']:.3f}",
-                    " / ".join(f"{size / 1e3:.0f}" for size in sizes),
-                ]
-            )
-    return markdown(titles, rows)
+    for (scene, seed, frame), found in seams.items():
+        own, growths = zip(*found, strict=True)
+        columns = (
+            [seam["psnr_around"] for seam in own],
+            [seam["psnr"] - seam["psnr_around"] for seam in own],
+            [seam["whole"]["psnr"] for seam in own],
+            [seam["mtv"] / seam["mtv_around"] for seam in own],
+            growths,
+        )
+        rows.append((f"`{scene}` {seed}, frame {frame}", *(plus_minus(values) for values in columns)))
+    titles = "PSNR around, dB", "at the seam, against that", "PSNR in one piece", "mTV, ratio to around", "size, ratio"
+    return markdown(("clip, seam", *titles), rows)
 
 
 def main(options: Options) -> None:
@@ -120,9 +127,9 @@ def main(options: Options) -> None:
         dropping=0.0,
     )
     given, rows = {n: v for n, v in asdict(options).items() if n not in ("json", "folder")}, []
-    for name, seed, frames in options.clips:
-        found = measure(clip(name, seed, frames, options), StreamConfig(fit=fit, seed=seed), options)
-        rows.append({"scene": name, "seed": seed, "frames": frames, **found})
+    for (name, seed, frames), fit_seed in product(options.clips, options.fit_seeds):
+        found = measure(clip(name, seed, frames, options), StreamConfig(fit=fit, seed=fit_seed), options)
+        rows.append({"scene": name, "seed": seed, "fit_seed": fit_seed, "frames": frames, **found})
         print(rows[-1], flush=True)
         options.write({"options": given, "clips": rows}, unprinted=["options", "clips"])
 
