@@ -23,7 +23,7 @@ import tyro
 from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.few_views import Points, spread_views, with_points
 from benchmarks.reports.fits import random_capture
-from benchmarks.reports.plots import markdown, plus_minus
+from benchmarks.reports.plots import grouped, markdown, plus_minus
 from morgs_mi.capture.capture import Capture
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.core.camera import Camera
@@ -134,10 +134,10 @@ def measure(source: Source, seed: Sequence[int], options: Options) -> list[dict[
 def errors_table(fits: Sequence[Mapping[str, Any]]) -> str:
     """Return the held-out PSNR of each scene by the error of the depth, in Markdown."""
     seeds, rows = list(dict.fromkeys(fit["seed"] for fit in fits)), []
-    for error in dict.fromkeys(fit["error"] for fit in fits):
-        own = ([fit["held_out"] for fit in fits if (fit["seed"], fit["error"]) == (seed, error)] for seed in seeds)
+    for (error,), own in grouped(fits, "error").items():
+        psnrs = ([fit["held_out"] for fit in each] for each in grouped(own, "seed").values())
         name = "no prior" if error is None else f"{error:g}"
-        rows.append((name, *(f"{plus_minus(values)} dB" for values in own)))
+        rows.append((name, *(f"{plus_minus(values)} dB" for values in psnrs)))
     return markdown(("error of the depth", *(f"seed {seed}" for seed in seeds)), rows)
 
 

@@ -20,7 +20,7 @@ import tyro
 from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.few_views import spread_views
 from benchmarks.reports.fits import first_frame, random_capture
-from benchmarks.reports.plots import markdown, plus_minus
+from benchmarks.reports.plots import grouped, markdown, plus_minus
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 
@@ -55,18 +55,15 @@ def measure(source: Source, train: Sequence[int], config: StreamConfig) -> dict[
         "held_out": round(float(held_out.mean()), 2),
         "worst": round(float(held_out.min()), 2),
         "estimate": round(found["expected_psnr"], 2),
-        **{key: found[key] for key in ("spacing", "distance", "trials", "differences") if key in found},
+        **{key: found[key] for key in ("spacing", "withheld_angle", "trials", "differences") if key in found},
         "seconds": round(report.seconds, 1),
     }
 
 
 def estimates_table(fits: Sequence[Mapping[str, Any]]) -> str:
     """Return the PSNR of training and held-out views and the estimate by clip and number of views, in Markdown."""
-    rigs: dict[tuple[int, int], list[Mapping[str, Any]]] = {}
-    for fit in fits:
-        rigs.setdefault((fit["seed"], fit["views"]), []).append(fit)
     rows = []
-    for (seed, views), own in rigs.items():
+    for (seed, views), own in grouped(fits, "seed", "views").items():
         means = (np.mean([fit[key] for fit in own]) for key in ("training", "held_out", "worst", "estimate"))
         errors = [fit["estimate"] - fit["held_out"] for fit in own]
         how = "withheld views" if "trials" in own[0] else "two fits"

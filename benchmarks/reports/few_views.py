@@ -22,7 +22,7 @@ import tyro
 
 from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.fits import first_frame, random_capture
-from benchmarks.reports.plots import markdown, plus_minus
+from benchmarks.reports.plots import grouped, markdown, plus_minus
 from morgs_mi.calibration.rig_check import dense_points, match_capture, triangulate_points
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.cluster.tasks import Source
@@ -149,18 +149,10 @@ def held_out_psnr(fit: Mapping[str, Any]) -> float:
     return float(np.mean([view["psnr"] for view in fit["held_out"]]))
 
 
-def same_rig(fits: Sequence[Mapping[str, Any]], *keys: str) -> list[list[Mapping[str, Any]]]:
-    """Return the fits that have the capture, the training views and what `keys` name in common, in their order."""
-    groups: dict[Any, list[Mapping[str, Any]]] = {}
-    for fit in fits:
-        groups.setdefault((fit["capture"], *fit["train"], *(fit[key] for key in keys)), []).append(fit)
-    return list(groups.values())
-
-
 def points_table(fits: Sequence[Mapping[str, Any]]) -> str:
     """Return the held-out PSNR of each clip by the points that its fits start from, in Markdown."""
     rows: dict[str, list[str]] = {}
-    for each in same_rig(fits, "start"):
+    for each in grouped(fits, "capture", "train", "start").values():
         found = plus_minus([held_out_psnr(fit) for fit in each])
         rows.setdefault(each[0]["capture"], []).append(f"{found} dB, {each[0]['points']:,} points")
     starts = dict.fromkeys(fit["start"] for fit in fits)
@@ -170,7 +162,7 @@ def points_table(fits: Sequence[Mapping[str, Any]]) -> str:
 def dropping_table(fits: Sequence[Mapping[str, Any]]) -> str:
     """Return the held-out PSNR of each rig by the probability of dropping, in Markdown."""
     rows: dict[tuple[str, ...], list[str]] = {}
-    for each in same_rig(fits, "dropping"):
+    for each in grouped(fits, "capture", "train", "dropping").values():
         first = each[0]
         about = f"`{first['capture']}`", f"{len(first['train'])}", f"{first['noise']:.3f}"
         rows.setdefault(about, []).append(f"{plus_minus([held_out_psnr(fit) for fit in each])} dB")
@@ -184,7 +176,7 @@ def forecast_table(fits: Sequence[Mapping[str, Any]]) -> str:
     Ranges are those of the captures, each of which is the mean of its fits.
     """
     rigs: dict[tuple[str, int], list[tuple[float, ...]]] = {}
-    for each in same_rig(fits):
+    for each in grouped(fits, "capture", "train").values():
         first, psnr = each[0], float(np.mean([held_out_psnr(fit) for fit in each]))
         loss = float(np.mean([fit["training"] for fit in each])) - psnr
         right = first["forecast"] == turned_out(psnr, loss)

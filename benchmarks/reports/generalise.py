@@ -19,7 +19,7 @@ import tyro
 
 from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.fits import first_frame, random_capture
-from benchmarks.reports.plots import markdown, plus_minus
+from benchmarks.reports.plots import grouped, markdown, plus_minus
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 from morgs_mi.fit.dropping import dropping_by_noise
@@ -67,8 +67,7 @@ def measure(source: Source, config: StreamConfig) -> dict[str, Any]:
 def choice_table(fits: Sequence[Mapping[str, Any]]) -> str:
     """Return the held-out PSNR of each clip without dropping and with the chosen strength, in Markdown."""
     rows = []
-    for seed in dict.fromkeys(fit["seed"] for fit in fits):
-        own = [fit for fit in fits if fit["seed"] == seed]
+    for (seed,), own in grouped(fits, "seed").items():
         chosen = [fit["chosen"] for fit in own]
         without = plus_minus([fit["without"]["held_out"] for fit in own])
         strengths = ", ".join(f"{strength:g}" for strength in sorted({each["dropping"] for each in chosen}))

@@ -22,7 +22,7 @@ import tyro
 
 from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.fits import new_loop
-from benchmarks.reports.plots import markdown, plus_minus
+from benchmarks.reports.plots import grouped, markdown, plus_minus
 from benchmarks.reports.random_scenes import fitted_frames
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.cluster.tasks import Source
@@ -82,28 +82,24 @@ def measure(source: Source, options: Options, seed: int) -> list[dict[str, Any]]
 
 def strides_table(fits: Sequence[Mapping[str, Any]], gap: int) -> str:
     """Return the mean PSNR where things move by clip and stride, without a gap and after it, in Markdown."""
-    rows: dict[tuple[str, int], dict[bool, list[float]]] = {}
-    fewest = min(fit["epochs"] for fit in fits)
-    for fit in (fit for fit in fits if fit["epochs"] == fewest):
-        cells = rows.setdefault((fit["clip"], fit["stride"]), {False: [], True: []})
-        cells[fit["second"] == gap].append(float(np.mean(list(fit["psnr_moving"].values()))))
-    table = (
-        (f"`{clip}`", f"{stride}", *(f"{plus_minus(cells[after])} dB" for after in (False, True)))
-        for (clip, stride), cells in rows.items()
-    )
-    return markdown(("clip", "every n-th frame", "continued", "after a gap"), table)
+    fewest, rows = min(fit["epochs"] for fit in fits), []
+    for (clip, stride), own in grouped((fit for fit in fits if fit["epochs"] == fewest), "clip", "stride").items():
+        by_start = grouped(own, "second")
+        psnrs = (
+            [float(np.mean(list(fit["psnr_moving"].values()))) for fit in by_start[second,]] for second in (stride, gap)
+        )
+        rows.append((f"`{clip}`", f"{stride}", *(f"{plus_minus(values)} dB" for values in psnrs)))
+    return markdown(("clip", "every n-th frame", "continued", "after a gap"), rows)
 
 
 def epochs_table(fits: Sequence[Mapping[str, Any]], gap: int) -> str:
     """Return the PSNR where things move after a gap by clip and epochs of the frame after it, in Markdown."""
-    rows: dict[tuple[str, int], list[dict[str, float]]] = {}
     smallest = min(fit["stride"] for fit in fits)
-    for fit in (fit for fit in fits if (fit["stride"], fit["second"]) == (smallest, gap)):
-        rows.setdefault((fit["clip"], fit["epochs"]), []).append(fit["psnr_moving"])
-    instants = list(next(iter(rows.values()))[0])
+    after_gap = [fit for fit in fits if (fit["stride"], fit["second"]) == (smallest, gap)]
+    instants = list(after_gap[0]["psnr_moving"])
     table = (
-        (f"`{clip}`", f"{epochs}", *(f"{plus_minus([found[t] for found in each])} dB" for t in instants))
-        for (clip, epochs), each in rows.items()
+        (f"`{clip}`", f"{epochs}", *(f"{plus_minus([fit['psnr_moving'][t] for fit in own])} dB" for t in instants))
+        for (clip, epochs), own in grouped(after_gap, "clip", "epochs").items()
     )
     return markdown(("clip", f"epochs of frame {gap}", *(f"frame {t}" for t in instants)), table)
 

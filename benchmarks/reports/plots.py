@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["blank_figure", "label_points", "markdown", "plus_minus", "save_figure"]
+__all__ = ["blank_figure", "grouped", "label_points", "markdown", "plus_minus", "save_figure"]
 
 
 def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:
@@ -19,6 +19,15 @@ def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1
     rule = "|---" * left + "|---:" * (len(titles) - left) + "|"
     lines = [f"| {' | '.join(cells)} |" for cells in (titles, *rows)]
     return "\n".join([lines[0], rule, *lines[1:]]) + "\n"
+
+
+def grouped(fits: Iterable[Mapping[str, Any]], *keys: str) -> dict[tuple[Any, ...], list[Mapping[str, Any]]]:
+    """Return the fits that have the values of `keys` in common, by these values, lists as tuples."""
+    groups: dict[tuple[Hashable, ...], list[Mapping[str, Any]]] = {}
+    for fit in fits:
+        values = (tuple(value) if isinstance(value := fit[key], list) else value for key in keys)
+        groups.setdefault(tuple(values), []).append(fit)
+    return groups
 
 
 def plus_minus(values: Sequence[float], digits: int = 2) -> str:

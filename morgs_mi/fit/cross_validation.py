@@ -72,14 +72,14 @@ class CrossValidation:
     Attributes:
         withheld: names of the withheld views.
         spacing: mean angle from a camera to its nearest one, as seen from what they look at, in degrees.
-        distance: mean angle from a withheld view to the nearest of the others, in degrees.
+        withheld_angle: mean angle from a withheld view to the nearest of the others, in degrees.
         trials: the fits, by rising probability of dropping.
         training_psnr: mean PSNR of the first frame itself in the training views, dB; None: not fitted yet.
     """
 
     withheld: tuple[str, ...]
     spacing: float
-    distance: float
+    withheld_angle: float
     trials: tuple[Trial, ...]
     training_psnr: float | None = None
 
@@ -96,9 +96,11 @@ class CrossValidation:
         of the first frame in its training views, which has more steps than the trial.
         """
         best = self.best
-        psnrs = best.withheld_psnr, best.training_psnr, self.training_psnr or best.training_psnr
-        withheld, trained, own = (10 ** (-psnr / 10) for psnr in psnrs)
-        nearer = min(0.5 * self.spacing, self.distance) / max(self.distance, 1e-6)
+        training_psnr = best.training_psnr if self.training_psnr is None else self.training_psnr
+        withheld, trained, own = (
+            10 ** (-psnr / 10) for psnr in (best.withheld_psnr, best.training_psnr, training_psnr)
+        )
+        nearer = min(0.5 * self.spacing, self.withheld_angle) / max(self.withheld_angle, 1e-6)
         return float(decibels(np.array(nearer * max(withheld - trained, 0.0) + own)))
 
     @property
@@ -151,8 +153,8 @@ def cross_validate(
             break
     names, points = tuple(cameras[v].name for v in withheld), np.asarray(start.means)
     depths, others = scene_depths(cameras, points), [cameras[v] for v in kept]
-    distance = float(np.mean([angles_to(cameras[v], depths[v], others).min() for v in withheld]))
-    return CrossValidation(names, forecast(cameras, points).spacing, distance, tuple(trials))
+    angle = float(np.mean([angles_to(cameras[v], depths[v], others).min() for v in withheld]))
+    return CrossValidation(names, forecast(cameras, points).spacing, angle, tuple(trials))
 
 
 def verdict(expected_psnr: float, loss: float, estimate: str, spacing: float) -> str:

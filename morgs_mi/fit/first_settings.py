@@ -30,7 +30,7 @@ class FirstSettings:
 
     Attributes:
         config: with a number of steps, a strength of dropping, and the weights of the losses.
-        expected: what to expect of views between the cameras; None for a single camera.
+        expected: what to expect of views between the cameras; None for a single camera or a single Gaussian.
         steps_before: number of steps that trials have made.
     """
 
