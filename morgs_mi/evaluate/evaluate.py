@@ -39,6 +39,7 @@ from morgs_mi.evaluate.temporal import StillVariation, recorded_change, slope
 from morgs_mi.evaluate.tracking import evaluate_tracks
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import mean_psnr
+from morgs_mi.fit.forecast import forecast
 from morgs_mi.fit.initialise import scene_extent
 from morgs_mi.fit.view import View
 from morgs_mi.io.bounded import read_json
@@ -82,7 +83,8 @@ def evaluate_stream(
     """Decode a stream and compare it with its recording: in the held-out view, or otherwise in all training views.
 
     Args:
-        out: stream file or its folder; seconds come from the ``report.json`` beside it.
+        out: stream file or its folder; seconds, and the estimate of other views, come from the ``report.json`` beside
+            it.
         capture: recording; default is the capture that the stream was fitted to.
         progress: called with (frames done, frames in all).
         lpips: network for LPIPS; without one there is no LPIPS.
@@ -98,7 +100,7 @@ def evaluate_stream(
     stream = open_stream(out)
     packets, count = _packets(stream)
     recording = open_stream_capture(stream, capture, list(packets))
-    seconds = _seconds(stream.path)
+    seconds, expected, expected_psnr = _of_fit(stream.path)
     views = recording.train_views if recording.test_view is None else (recording.test_view,)
     cameras = recording.with_delays(stream.cameras)
     channels = ("color", "motion", *(("confidence",) if has_confidence(stream) else ()))
@@ -150,6 +152,8 @@ def evaluate_stream(
         frames=tuple(rows),
         tracking=evaluate_tracks(stream, recording, views),
         registered_psnr=registered,
+        expected=expected or _forecast(recording),
+        expected_psnr=expected_psnr,
     )
 
 
@@ -279,13 +283,25 @@ def _sizes(num_bytes: int, rows: list[FrameScores]) -> Sizes:
     return Sizes(num_bytes, overhead, num_bytes / len(rows), mean("keyframe"), mean("residual"))
 
 
-def _seconds(stream: Path) -> dict[int, float]:
-    """Return seconds by frame from the report beside the stream, empty without one."""
+def _of_fit(stream: Path) -> tuple[dict[int, float], str, float]:
+    """Return seconds by frame, and the sentence and the PSNR that the fit expects of other views.
+
+    They come from the report beside the stream. Without one they are empty and NaN.
+    """
     path = stream.with_name("report.json")
     if not path.is_file():
-        return {}
+        return {}, "", float("nan")
     report = read_json(path)
     try:
-        return {row["frame"]: float(row["seconds"]) for row in report["frames"]}
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        seconds = {row["frame"]: float(row["seconds"]) for row in report["frames"]}
+        found = next((row["validation"] for row in report["frames"] if "sentence" in row.get("validation", {})), {})
+        psnr = found.get("expected_psnr")
+        return seconds, str(found.get("sentence", "")), float("nan" if psnr is None else psnr)
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{path}: expected a fit's report, got a broken one ({error!r}); remove it.") from None
+
+
+def _forecast(recording: Capture) -> str:
+    """Return what the rig lets expect of views between the training cameras, empty with a single one."""
+    cameras = [recording.cameras[v] for v in recording.train_views]
+    return forecast(cameras, recording.points).sentence if len(cameras) > 1 else ""

@@ -251,6 +251,11 @@ class Evaluation:
     registered_psnr: float = float("nan")
     """PSNR of the held-out view in the first frame, seen from the camera that fits its image best, dB; NaN without a
     held-out view. The scores of the frames are those as calibrated."""
+    expected: str = ""
+    """What the fit expects of views between the cameras, a sentence; without its report, a forecast from the rig; empty
+    with a single training view."""
+    expected_psnr: float = float("nan")
+    """Their PSNR as the fit estimates it, dB; NaN without an estimate."""
 
     @property
     def num_frames(self) -> int:
@@ -296,6 +301,8 @@ class Evaluation:
             **means,
             "psnr_slope": self.psnr_slope,
             "registered_psnr": self.registered_psnr,
+            "expected": self.expected,
+            "expected_psnr": self.expected_psnr,
             "motion_3d": _optional(self.motion_3d),
             "tracking": [asdict(row) for row in self.tracking],
             "seconds": {**asdict(self.seconds), "definition": _SECONDS},

@@ -59,7 +59,7 @@ def _tracking_table(result: Evaluation) -> Table:
 
 
 def evaluation_summary(result: Evaluation) -> Iterator[str]:
-    """Yield sentences on time, size, drift and 3D motion."""
+    """Yield sentences on other views, time, size, drift and 3D motion."""
     sizes, seconds, play, mean = result.sizes, result.seconds, result.playback, result.scores
     if not result.held_out:
         scores = (f"{name} {figure(score.psnr, 2)}" for name, score in result.views.items())
@@ -78,6 +78,8 @@ def evaluation_summary(result: Evaluation) -> Iterator[str]:
             f"Held-out view in all frames: {figure(mean.psnr, 2)} dB as recorded, {figure(mean.psnr_matched, 2)} dB "
             "after the gain and bias per channel that fit best."
         )
+    if result.expected:
+        yield result.expected
     motion = result.motion_3d
     if motion is not None and motion.num_gaussians:
         yield (

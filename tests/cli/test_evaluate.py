@@ -23,6 +23,7 @@ def test_eval__replaces_no_file_of_the_fit(stream: Path, tmp_path: Path, run) ->
     [
         ("[" * 100_000, "expected JSON, got a broken file"),
         ("[]", "expected a fit's report, got a broken one"),
+        ('{"frames": [{"frame": 0, "seconds": 1, "validation": 5}]}', "expected a fit's report, got a broken one"),
         (f'{{"frames": [{{"frame": 0, "seconds": {10**400}}}]}}', "expected a fit's report, got a broken one"),
     ],
 )
