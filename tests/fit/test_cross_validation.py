@@ -52,6 +52,16 @@ def test_cross_validate__tries_candidates_until_one_is_no_better():
     assert all(trial.training_psnr > trial.withheld_psnr > 15 for trial in found.trials)
 
 
+def test_cross_validate__measures_the_angle_of_the_withheld_view_to_the_others():
+    config = dataclasses.replace(CONFIG, first_frame_steps=5)
+    found, cameras = validate(bytes_of(images_of(opaque_ball())), config=config), views()
+    withheld = next(camera for camera in cameras if camera.name == found.withheld[0])
+    towards = [camera.position / np.linalg.norm(camera.position) for camera in cameras if camera is not withheld]
+    cosines = np.array(towards) @ withheld.position / np.linalg.norm(withheld.position)
+    # The ball lies at the origin; its surface, which the angle is measured at, is a little nearer.
+    assert found.withheld_angle == pytest.approx(np.rad2deg(np.arccos(cosines.max())), rel=0.1)
+
+
 def test_cross_validate__is_the_same_every_time():
     images = bytes_of(images_of(opaque_ball()), 0.05)
     config = dataclasses.replace(CONFIG, first_frame_steps=30)
