@@ -26,7 +26,6 @@ from morgs_mi.core.threads import in_background
 from morgs_mi.fit.balance import Balance, balance_cameras, balance_config
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import mean_psnr
-from morgs_mi.fit.depth_prior import DepthNetwork, depth_prior
 from morgs_mi.fit.detail import gaussians_for
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.first_settings import Expected, first_settings
@@ -183,19 +182,14 @@ def _fit_first_frame(
     if fit.num_gaussians is None:
         count = gaussians_for(cameras, list(images.values()), masks, setup.points, fit.detail)
         fit = replace(fit, num_gaussians=count)
-    prior = None
-    if fit.depth_model is not None and fit.depth_weight:
-        network = DepthNetwork(fit.depth_model)
-        prior = depth_prior([network(image) for image in images.values()], cameras, setup.points, masks)
     gaussians, status = _first_gaussians(setup, images, fit, rng)
     views = [View(*view) for view in zip(cameras, images.values(), masks, strict=True)]
     given = gaussians, views, setup.points, setup.extent, fit, config.render, [config.seed, 0, 1]
-    chosen = first_settings(*given, on_step, prior)
+    chosen = first_settings(*given, on_step)
     before = chosen.steps_before
     tick = None if on_step is None else lambda done, steps: on_step(before + done, before + steps)
     targets = [view.target for view in views]
-    start = gaussians, cameras, targets, setup.extent, chosen.config, config.render, rng, tick
-    fitted = fit_first_frame(*start, prior)
+    fitted = fit_first_frame(gaussians, cameras, targets, setup.extent, chosen.config, config.render, rng, tick)
     return keyframe_packet(fitted.gaussians, 0, setup.cameras, config.codec), {
         "losses": fitted.losses,
         "status": status,

@@ -69,8 +69,6 @@ ELSEWHERE: dict[str, str] = {
     "fit.detail": "the number of Gaussians is given here: tests/fit/test_detail.py",
     "fit.convergence": "the number of steps is given here: tests/fit/test_first_frame.py",
     "fit.cross_validation": "chooses among few values: tests/fit/test_cross_validation.py",
-    "fit.depth_model": "a network that the user brings: tests/fit/test_depth_prior.py",
-    "fit.depth_weight": "no network here: tests/fit/test_depth_prior.py",
     "fit.refine_cameras": "cameras are refined by the recorder: tests/calibration/test_refine.py",
     "fit.refinement": "cameras are refined by the recorder: tests/calibration/test_refine.py",
     "fit.exposure": "the tests of the loop have cameras that differ: tests/test_stream_loop.py",

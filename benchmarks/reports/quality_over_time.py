@@ -2,13 +2,16 @@
 
     python -m benchmarks.reports.quality_over_time --captures PHOTOS... --json out.json --plot out.png
 
-The captures are those of `priors`. Before, all captures had 20,000 Gaussians and nothing against overfitting, and
-fewer than 100 triangulated points were replaced by random ones. Every point of a curve is a fit of its own, with so
-many steps.
+The synthetic captures are `morgs-mi synth random` with as many training views as the case says, spread over the rig,
+and points from stereo. Of other captures, every fifth view is held out. Before, all captures had 20,000 Gaussians
+and nothing against overfitting, and fewer than 100 triangulated points were replaced by random ones. Every point of a
+curve is a fit of its own, with so many steps.
 """
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
@@ -18,15 +21,59 @@ import mitsuba as mi
 import numpy as np
 import tyro
 
-from benchmarks.reports.few_views import with_points
+from benchmarks.reports.cells import CellOptions
+from benchmarks.reports.few_views import spread_views, with_points
+from benchmarks.reports.fits import first_frame
 from benchmarks.reports.plots import blank_figure, save_figure
-from benchmarks.reports.priors import CaseOptions, measured
-from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
+from morgs_mi.synth.synthesize import synthesize
 
+CASES = ((20, 16, 0.0), (21, 8, 0.0), (22, 4, 0.0), (23, 16, 0.02), (24, 8, 0.02), (25, 4, 0.02))
+"""Seed of the scene, number of training views, and noise of the reduced images relative to white."""
+
+Points = tuple[np.ndarray, np.ndarray]
 SECONDS = (5, 10, 20, 50, 100, 200, 500)
 """Ticks of the plot."""
+
+
+@dataclass(frozen=True)
+class CaseOptions(CellOptions):
+    """Captures and their sizes."""
+
+    captures: tuple[Path, ...] = ()
+    """Further captures."""
+    synthetic: tuple[int, ...] = tuple(seed for seed, _, _ in CASES)
+    """Seeds of the synthetic captures."""
+    clips: Path = Path("out/first_frames")
+    """Folder of the synthetic captures, which are made where they are missing."""
+    downscale: float = 2
+    """Factor by which the synthetic captures are reduced."""
+    width: int = 160
+    """Width to which the other captures are reduced by a whole factor, px."""
+    fit_seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the fits."""
+
+    def cases(self) -> Iterator[tuple[str, Capture, tuple[int, ...]]]:
+        """Yield the name, the capture with the points of its training views, and these views."""
+        for seed, count, noise in CASES:
+            if seed not in self.synthetic:
+                continue
+            clip = self.clips / f"{seed}-{count}-{noise * self.downscale:g}"
+            if not clip.exists():
+                # The mean over a block has less noise than its pixels.
+                noise_of_pixels = noise * self.downscale
+                synthesize("random", clip, num_cameras=20, num_frames=1, noise=noise_of_pixels, seed=seed)
+            capture = load_capture(clip, self.downscale)
+            train = spread_views(capture.cameras, count, capture.train_views)
+            yield f"{count} views{', noisy' if noise else ''}", with_points(capture, train, "stereo"), train
+        for path in self.captures:
+            widest = max(camera.width for camera in load_capture(path).cameras)
+            capture = load_capture(path, max(widest // self.width, 1))
+            train = tuple(v for v in range(len(capture.cameras)) if v % 5 != 2)
+            enough = len(capture.points) >= 100
+            yield path.name, capture if enough else with_points(capture, train, "stereo"), train
 
 
 @dataclass(frozen=True)
@@ -37,6 +84,20 @@ class Options(CaseOptions):
     """Numbers of steps."""
     plot: Path | None = None
     """Plot, .png or .svg; needs matplotlib."""
+
+
+def measured(source: Source, train: Sequence[int], points: Points, config: StreamConfig) -> dict[str, float]:
+    """Return the mean PSNR of held-out and training views, the processor time, and how many Gaussians and steps."""
+    capture = replace(source.open(), points=points[0], point_colors=points[1])
+    start = time.process_time()
+    scores, report = first_frame(capture, train, config)
+    return {
+        "held_out": round(float(np.delete(scores, train).mean()), 3),
+        "training": round(float(scores[list(train)].mean()), 3),
+        "cpu_s": round(time.process_time() - start, 2),
+        "gaussians": report.num_gaussians,
+        "steps": report.steps,
+    }
 
 
 def configured(how: str, steps: int, seed: int) -> StreamConfig:

@@ -25,7 +25,6 @@ from morgs_mi.fit.cross_validation import (
     trial_steps,
     verdict,
 )
-from morgs_mi.fit.depth_prior import DepthPrior
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.forecast import angles_to, scene_depths
 from morgs_mi.fit.view import View
@@ -75,7 +74,6 @@ def compare_fits(
     render: RenderConfig,
     seed: Sequence[int],
     on_step: Callable[[int], None] | None = None,
-    prior: DepthPrior | None = None,
 ) -> Agreement:
     """Return how far two short fits agree between the cameras.
 
@@ -87,18 +85,16 @@ def compare_fits(
         render: cut-offs.
         seed: of both fits.
         on_step: called with the number of steps done, in both fits.
-        prior: inverse depth of the views, or None.
     """
     steps, width = trial_steps(config), config.cross_validation.width
     views = [reduced(*view, width) for view in views]
     small, targets = [view.camera for view in views], [view.target for view in views]
-    depth = None if prior is None else prior.reduced(range(len(small)), small)
     angles, between = views_between(small, np.asarray(start.means))
     errors, shown = [], []
     for k, rows in enumerate(np.array_split(np.random.default_rng(seed).permutation(len(start)), NUM_FITS)):
         given = start.select(np.sort(rows)), small, targets, extent, replace(config, first_frame_steps=steps), render
         tick = None if on_step is None else shifted(on_step, k * steps)
-        fitted = fit_first_frame(*given, np.random.default_rng([*seed, k]), tick, depth).gaussians
+        fitted = fit_first_frame(*given, np.random.default_rng([*seed, k]), tick).gaussians
         errors.append(squared_errors(fitted, views, render))
         shown.append(np.stack([rendered(fitted, camera, render) for camera in between]))
     differences = decibels(np.array([np.mean((a - b) ** 2) for a, b in zip(*shown, strict=True)]))

@@ -12,7 +12,6 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.agreement import NUM_FITS
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.depth_prior import DepthPrior
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.losses.ssim import Target
 from morgs_mi.render.config import RenderConfig
@@ -34,7 +33,6 @@ def steps_within(
     config: FitConfig,
     render: RenderConfig,
     seed: Sequence[int],
-    prior: DepthPrior | None = None,
 ) -> int:
     """Return the number of steps of the first frame, at least 100, that this machine makes in a time.
 
@@ -50,7 +48,6 @@ def steps_within(
         config: settings of the fit.
         render: cut-offs.
         seed: of the steps that are timed.
-        prior: inverse depth of the views, or None.
     """
     begin = time.perf_counter()
     timed = replace(
@@ -59,7 +56,7 @@ def steps_within(
     took = 0.0
     for _ in range(2):  # the first time, kernels are compiled
         start = time.perf_counter()
-        fit_first_frame(gaussians, cameras, targets, extent, timed, render, np.random.default_rng(seed), None, prior)
+        fit_first_frame(gaussians, cameras, targets, extent, timed, render, np.random.default_rng(seed))
         took = time.perf_counter() - start
     per_step = _GROWTH * took / _TIMED * (1 + planned_trials(config, len(cameras)) * config.cross_validation.steps)
     return max(_LEAST, int((seconds - (time.perf_counter() - begin)) / per_step))

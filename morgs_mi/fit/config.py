@@ -268,11 +268,6 @@ class FitConfig:
     cross-validation, or by the noise of fewer than `min_views` views."""
     noise_aware: bool = True
     """Fit the first frame to noisy images by L1 alone: SSIM makes the fit follow their noise."""
-    depth_model: str | None = None
-    """ONNX file of a network that estimates depth from one image (see `depth_prior`), as a prior of the first frame;
-    None: no prior."""
-    depth_weight: float = 0.1
-    """Weight of that prior at the start of the first frame; it falls to 0 over the planned steps."""
     refine_cameras: Literal["off", "auto", "on"] = "off"
     """Refine poses and intrinsics on the first frame: off, auto (taken if withheld pixels show that they are better) or
     on (always taken)."""
@@ -330,8 +325,6 @@ class FitConfig:
             )
         if self.dropping is not None and not 0 <= self.dropping < 1:
             raise ValueError(f"FitConfig(): `dropping` must be 0 to less than 1, or None, got {self.dropping}.")
-        if not 0 <= self.depth_weight < inf:
-            raise ValueError(f"FitConfig(): `depth_weight` must be finite and not negative, got {self.depth_weight}.")
         if not 0 < self.final_rate <= 1:
             raise ValueError(f"FitConfig(): `final_rate` must be above 0 and at most 1, got {self.final_rate}.")
 

@@ -20,7 +20,6 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.depth_prior import DepthPrior
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.forecast import POOR_LOSS, angles_to, forecast, scene_depths
 from morgs_mi.fit.view import View
@@ -121,7 +120,6 @@ def cross_validate(
     render: RenderConfig,
     seed: Sequence[int],
     on_step: Callable[[int], None] | None = None,
-    prior: DepthPrior | None = None,
 ) -> CrossValidation:
     """Return what cross-validation of the first frame finds.
 
@@ -133,7 +131,6 @@ def cross_validate(
         render: cut-offs.
         seed: of every fit.
         on_step: called with the number of steps done, in all fits.
-        prior: inverse depth of the views, or None.
     """
     how = config.cross_validation
     cameras = [camera for camera, *_ in views]
@@ -142,12 +139,11 @@ def cross_validate(
     kept = [index for index in range(len(small)) if index not in withheld]
     trained, judged = [small[index] for index in kept], [small[index] for index in withheld]
     rig, targets = [view.camera for view in trained], [view.target for view in trained]
-    depth = None if prior is None else prior.reduced(kept, rig)
     trials: list[Trial] = []
     for dropping in how.candidates:
         trial, rng = replace(config, dropping=dropping, first_frame_steps=steps), np.random.default_rng(seed)
         tick = None if on_step is None else shifted(on_step, len(trials) * steps)
-        fitted = fit_first_frame(start, rig, targets, extent, trial, render, rng, tick, depth).gaussians
+        fitted = fit_first_frame(start, rig, targets, extent, trial, render, rng, tick).gaussians
         trials.append(Trial(dropping, mean_psnr(fitted, judged, render), mean_psnr(fitted, trained, render)))
         if len(trials) > 1 and trials[-1].withheld_psnr <= trials[-2].withheld_psnr:
             break

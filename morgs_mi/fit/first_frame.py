@@ -4,9 +4,6 @@ Where the number of steps is not given, it follows from the images. A capture wi
 others have converged: if L_recon falls by more than `ConvergenceConfig.least_decrease` in the last third of the steps,
 they are doubled, and the learning rates continue on the schedule of twice as many steps. Noise, which no step removes,
 is part of the loss, so that noisy captures end early.
-
-With a depth prior (see `depth_prior`), the rendered inverse depth is drawn to that of a network. Its weight falls to 0
-over the planned steps, as the images are more exact than the network.
 """
 
 from __future__ import annotations
@@ -28,7 +25,6 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
 from morgs_mi.fit.config import ConvergenceConfig, FitConfig
 from morgs_mi.fit.density import plan_growth, resize_optimizer
-from morgs_mi.fit.depth_prior import DepthPrior
 from morgs_mi.fit.dropping import dropped
 from morgs_mi.fit.optimise import adam, optimise, replace_parameter, values_of, view_order
 from morgs_mi.losses.attribution import densification_scores
@@ -50,7 +46,7 @@ class FirstFrame:
 
     Attributes:
         gaussians: the fitted Gaussians.
-        losses: by name, means over the last steps; that of the depth prior with its weight.
+        losses: by name, means over the last steps.
         steps: number of steps.
     """
 
@@ -68,7 +64,6 @@ def fit_first_frame(
     render: RenderConfig,
     rng: np.random.Generator,
     on_step: Callable[[int, int], None] | None = None,
-    prior: DepthPrior | None = None,
 ) -> FirstFrame:
     """Fit Gaussians to the images of one instant by L_recon (eq. 2); the confidence stays unchanged.
 
@@ -85,24 +80,16 @@ def fit_first_frame(
         render: cut-offs.
         rng: draws the views and the means of births.
         on_step: called with (steps done, steps in all).
-        prior: inverse depth of the views; None: L_recon alone.
     """
     steps, bands = config.planned_steps, range(1, gaussians.sh_degree + 1)
     band_steps, rounds = [int(b * steps * config.sh_band_fraction + 1e-9) for b in bands], density_rounds(config)
     rates = config.first_frame_rates.by_parameter(extent)
     optimizer = adam(_start(gaussians))
     views = [ActiveView(camera, render) for camera in cameras]
-    weights = iter(_depth_weights(config, prior))
 
     def losses_at(values: Mapping[str, Tensor], view: int) -> dict[str, Tensor]:
-        weight = next(weights, 0.0)
-        depth = prior.aligned[view] if prior is not None and weight > 0 else None
-        channels = ("color",) if depth is None else ("color", "depth", "alpha")
-        image = views[view].render(dropped(gaussians.with_parameters(values), config.dropping or 0.0, rng), channels)
-        losses = {"recon": recon_loss(image.color, targets[view], config.objective.dssim_weight)}
-        if depth is not None:
-            losses["depth"] = dr.opaque(mi.Float, weight) * depth.loss(image)
-        return losses
+        image = views[view].render(dropped(gaussians.with_parameters(values), config.dropping or 0.0, rng), ("color",))
+        return {"recon": recon_loss(image.color, targets[view], config.objective.dssim_weight)}
 
     done, losses = 0, {}
     while done < steps:
@@ -114,8 +101,6 @@ def fit_first_frame(
             if start in rounds:
                 share = len(rounds) - rounds.index(start)
                 gaussians = _grown(gaussians, optimizer, views, targets, share, extent, config, rng)
-            if start and prior is not None:
-                prior = prior.realigned(gaussians.with_parameters(values_of(optimizer)), views)
             before = losses
             losses = optimise(
                 optimizer,
@@ -156,12 +141,6 @@ def _grown(
 def _decay(final: float, steps: int, step: int) -> float:
     """Return the factor on the learning rates at a step of `steps`."""
     return final ** (step / steps)
-
-
-def _depth_weights(config: FitConfig, prior: DepthPrior | None) -> np.ndarray:
-    """Return the weight of the depth prior in each of the planned steps."""
-    steps = 0 if prior is None else config.planned_steps
-    return config.depth_weight * (1 - np.arange(steps) / max(steps, 1))
 
 
 def _with_total(on_step: Callable[[int, int], None], steps: int, done: int) -> None:

@@ -12,7 +12,6 @@ from morgs_mi.fit.agreement import NUM_FITS, Agreement, compare_fits
 from morgs_mi.fit.budget import planned_trials, steps_within
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, trial_steps
-from morgs_mi.fit.depth_prior import DepthPrior
 from morgs_mi.fit.dropping import dropping_by_noise
 from morgs_mi.fit.forecast import Forecast, forecast
 from morgs_mi.fit.noise import is_noisy
@@ -48,7 +47,6 @@ def first_settings(
     render: RenderConfig,
     seed: Sequence[int],
     on_step: Callable[[int, int], None] | None = None,
-    prior: DepthPrior | None = None,
 ) -> FirstSettings:
     """Return the settings of the first frame.
 
@@ -64,16 +62,13 @@ def first_settings(
         render: cut-offs.
         seed: of the trials.
         on_step: called with (steps of the trials done, steps of trials and first frame).
-        prior: inverse depth of the views, or None.
     """
     cameras, images = [view.camera for view in views], [view.image for view in views]
     if config.noise_aware and is_noisy(images):
         config = replace(config, objective=replace(config.objective, dssim_weight=0.0))
     if config.first_frame_seconds is not None:
         targets, seeds = [view.target for view in views], [*seed, 1]
-        steps = steps_within(
-            config.first_frame_seconds, gaussians, cameras, targets, extent, config, render, seeds, prior
-        )
+        steps = steps_within(config.first_frame_seconds, gaussians, cameras, targets, extent, config, render, seeds)
         config = replace(config, first_frame_steps=steps)
     if config.dropping is not None:
         return FirstSettings(config, forecast(cameras, points) if len(cameras) > 1 else None)
@@ -84,9 +79,9 @@ def first_settings(
             on_step(done, before + config.planned_steps)
 
     if len(cameras) >= config.cross_validation.min_views:
-        found = cross_validate(gaussians, views, extent, config, render, seed, tick, prior)
+        found = cross_validate(gaussians, views, extent, config, render, seed, tick)
         return FirstSettings(replace(config, dropping=found.best.dropping), found, before)
     config, found = replace(config, dropping=dropping_by_noise(images)), None
     if len(cameras) > 1 and len(gaussians) >= NUM_FITS:
-        found = compare_fits(gaussians, views, extent, config, render, seed, tick, prior)
+        found = compare_fits(gaussians, views, extent, config, render, seed, tick)
     return FirstSettings(config, found, before)
