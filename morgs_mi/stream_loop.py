@@ -22,6 +22,7 @@ from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, residual
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.threads import in_background
 from morgs_mi.fit.balance import Balance, balance_cameras, balance_config
 from morgs_mi.fit.config import FitConfig
@@ -152,7 +153,7 @@ def _fit_later_frame(
     """Return a later frame's packet and what its report says; the numbers are those of the paper's equations."""
     assert state.coded is not None
     config, motion, images, flows = setup.config, setup.config.motion, observed.seen.images, observed.flows
-    rng = np.random.default_rng([config.seed, state.frame])  # of its own for each frame, so that it is no state
+    rng = rng_of(config.seed, Stream.LATER_FRAMES, state.frame)  # of its own for each frame: it is no state
     previous = _first_confidence(setup, state, flows, rng)  # frame 0's confidence (11)
     observations = observe(observed.key_views, motion, config.fit.objective)
     active = _active_set(setup, previous, images, observed.changes, observations)
@@ -174,7 +175,7 @@ def _fit_first_frame(
     setup: Setup, state: StreamState, observed: FrameObservation, on_step: Callable[[int, int], None] | None
 ) -> tuple[Packet, dict[str, Any]]:
     """Return the first frame's packet and what its report says."""
-    config, images, rng = setup.config, observed.seen.images, np.random.default_rng([setup.config.seed, 0])
+    config, images, rng = setup.config, observed.seen.images, rng_of(setup.config.seed, Stream.FIRST_FRAME)
     cameras, masks = [setup.cameras[v] for v in images], [setup.masks[v] for v in images]
     fit, found = config.fit, _balance(setup, images)
     balance = _exposures_of(setup, images, found)
@@ -184,7 +185,7 @@ def _fit_first_frame(
         fit = replace(fit, num_gaussians=count)
     gaussians, status = _first_gaussians(setup, images, fit, rng)
     views = [View(*view) for view in zip(cameras, images.values(), masks, strict=True)]
-    given = gaussians, views, setup.points, setup.extent, fit, config.render, [config.seed, 0, 1]
+    given = gaussians, views, setup.points, setup.extent, fit, config.render, config.seed
     chosen = first_settings(*given, on_step)
     before = chosen.steps_before
     tick = None if on_step is None else lambda done, steps: on_step(before + done, before + steps)
@@ -204,7 +205,7 @@ def _balance(setup: Setup, images: Images) -> Balance | None:
     config = setup.config
     if config.fit.exposure == "off" or len(images) < 2:
         return None
-    start, _ = _first_gaussians(setup, images, balance_config(config.fit), np.random.default_rng([config.seed, 0, 2]))
+    start, _ = _first_gaussians(setup, images, balance_config(config.fit), rng_of(config.seed, Stream.BALANCED_POINTS))
     views = [View(setup.cameras[v], image, setup.masks[v]) for v, image in images.items()]
     return balance_cameras(start, views, setup.extent, config.fit, config.render, config.seed)
 

@@ -44,6 +44,7 @@ from morgs_mi.capture.features import detect, intersect, join_matches, match_vie
 from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import mean_psnr, withheld_blocks
 from morgs_mi.fit.first_frame import fit_first_frame
@@ -276,7 +277,7 @@ def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -
 def _start(views: Sequence[View], points: np.ndarray, colors: np.ndarray, config: FitConfig, seed: int) -> Gaussians:
     """Return the Gaussians that a fit starts from, without view-dependent colours, which would hide wrong poses."""
     cameras, images, masks = (list(part) for part in zip(*views, strict=True))
-    count, rng = config.refinement.gaussians, np.random.default_rng([seed, 3])
+    count, rng = config.refinement.gaussians, rng_of(seed, Stream.REFINED_POINTS)
     given = (points, colors) if len(points) else None
     start = (
         seed_points(cameras, images, masks, count, rng)
@@ -310,7 +311,7 @@ def _fit(
     )
     changed = _changed(views, changes)
     targets, cameras = [view.target for view in changed], [view.camera for view in changed]
-    rng = np.random.default_rng([seed, 4])
+    rng = rng_of(seed, Stream.REFINEMENT)
     return fit_first_frame(gaussians, cameras, targets, extent, short, render, rng).gaussians
 
 

@@ -29,6 +29,7 @@ from morgs_mi.capture.features import Features, Match, detect, match_views, repr
 from morgs_mi.capture.guided_matching import match_guided
 from morgs_mi.capture.stereo import stereo_points
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.random_streams import Stream, rng_of
 
 __all__ = [
     "MAX_ERROR",
@@ -196,7 +197,7 @@ def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Cap
         [image for _, image in views],
         [recorded.masks[v] for v, _ in views],
         sparse.points,
-        np.random.default_rng(seed),
+        rng_of(seed, Stream.POINTS),
     )
     points, colors = np.concatenate([sparse.points, points]), np.concatenate([sparse.point_colors, colors])
     return replace(capture, points=points, point_colors=colors)

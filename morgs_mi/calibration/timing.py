@@ -33,6 +33,7 @@ from morgs_mi.capture.interpolation import image_between
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import reduced
 from morgs_mi.fit.first_frame import fit_first_frame
@@ -116,7 +117,10 @@ class TimeOffsets:
 
 
 def estimate_time_offsets(
-    capture: Capture, config: TimingConfig | None = None, progress: Callable[[int, int], None] | None = None
+    capture: Capture,
+    config: TimingConfig | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    seed: int = 0,
 ) -> TimeOffsets:
     """Return the time offsets of a capture's cameras in frames, see `TimeOffsets`.
 
@@ -129,6 +133,7 @@ def estimate_time_offsets(
         capture: a capture, whose clips have one frame rate.
         config: settings.
         progress: called with (fits done, fits at most).
+        seed: of the fits.
 
     Raises:
         ValueError: the recording has one camera or fewer than four frames, an image is missing, or nothing moves.
@@ -143,7 +148,7 @@ def estimate_time_offsets(
             f"{capture.path}: expected at least 4 frames to compare clocks, got {clips.num_frames}; record longer."
         )
     instants = np.linspace(largest, clips.num_frames - 2 - largest, config.instants).round().astype(int)
-    rounds = _Rounds(clips, config, instants, progress)
+    rounds = _Rounds(clips, config, instants, seed, progress)
     offsets, step, equations = _aligned(rounds, largest)
     reference = capture.test_view or 0
     part = _found_back(rounds, offsets - step, equations, reference)
@@ -188,6 +193,7 @@ class _Rounds:
         clips: what Gaussians are fitted to.
         config: settings.
         instants: frames that they are fitted at.
+        seed: of all fits.
         progress: called with (fits done, fits at most), or None.
         done: number of fits that are done.
     """
@@ -195,6 +201,7 @@ class _Rounds:
     clips: _Clips
     config: TimingConfig
     instants: np.ndarray
+    seed: int
     progress: Callable[[int, int], None] | None
     done: int = 0
 
@@ -208,7 +215,7 @@ class _Rounds:
         config = self.config.halved() if blur else self.config
         found = []
         for instant in self.instants:
-            found.append(_equations_at(self.clips, instant - offsets, blur, config))
+            found.append(_equations_at(self.clips, instant - offsets, blur, config, self.seed))
             self.done += 1
             if self.progress is not None:
                 self.progress(self.done, (len(self.blurs) + 1) * len(self.instants))
@@ -278,11 +285,11 @@ def _resized(image: np.ndarray, camera: Camera) -> np.ndarray:
     return np.asarray(cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
 
 
-def _equations_at(clips: _Clips, times: np.ndarray, blur: float, config: TimingConfig) -> OffsetEquations:
+def _equations_at(clips: _Clips, times: np.ndarray, blur: float, config: TimingConfig, seed: int) -> OffsetEquations:
     """Return the equations of an instant, which each view shows at a time of its own [V]."""
     images, after = clips.at(times), clips.at(times + 1)
     targets = [Target(image, mask) for image, mask in zip(images, clips.masks, strict=True)]
-    gaussians = _fitted(clips, images, targets, config)
+    gaussians = _fitted(clips, images, targets, config, seed)
     pairs = {v: FramePair(after[v], images[v], valid=clips.masks[v]) for v in clips.train}
     views = [ActiveView(camera) for camera in clips.cameras]
     lifted = lift_flow(gaussians, {v: views[v] for v in clips.train}, observe_key_views(pairs))
@@ -290,9 +297,11 @@ def _equations_at(clips: _Clips, times: np.ndarray, blur: float, config: TimingC
     return offset_equations(replace(gaussians, motion=lifted.displacement), views, targets, train, blur)
 
 
-def _fitted(clips: _Clips, images: Sequence[np.ndarray], targets: Sequence[Target], config: TimingConfig) -> Gaussians:
+def _fitted(
+    clips: _Clips, images: Sequence[np.ndarray], targets: Sequence[Target], config: TimingConfig, seed: int
+) -> Gaussians:
     """Return Gaussians that are fitted to the images of the training views at one instant."""
-    rng, count = np.random.default_rng(0), config.num_gaussians
+    rng, count = rng_of(seed, Stream.TIMING), config.num_gaussians
     cameras, masks = [clips.cameras[v] for v in clips.train], [clips.masks[v] for v in clips.train]
     own, shown = [images[v] for v in clips.train], [targets[v] for v in clips.train]
     if len(clips.points):

@@ -15,6 +15,7 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import (
     decibels,
@@ -72,7 +73,7 @@ def compare_fits(
     extent: float,
     config: FitConfig,
     render: RenderConfig,
-    seed: Sequence[int],
+    seed: int,
     on_step: Callable[[int], None] | None = None,
 ) -> Agreement:
     """Return how far two short fits agree between the cameras.
@@ -91,10 +92,10 @@ def compare_fits(
     small, targets = [view.camera for view in views], [view.target for view in views]
     angles, between = views_between(small, np.asarray(start.means))
     errors, shown = [], []
-    for k, rows in enumerate(np.array_split(np.random.default_rng(seed).permutation(len(start)), NUM_FITS)):
+    for k, rows in enumerate(np.array_split(rng_of(seed, Stream.TRIALS, NUM_FITS).permutation(len(start)), NUM_FITS)):
         given = start.select(np.sort(rows)), small, targets, extent, replace(config, first_frame_steps=steps), render
         tick = None if on_step is None else shifted(on_step, k * steps)
-        fitted = fit_first_frame(*given, np.random.default_rng([*seed, k]), tick).gaussians
+        fitted = fit_first_frame(*given, rng_of(seed, Stream.TRIALS, k), tick).gaussians
         errors.append(squared_errors(fitted, views, render))
         shown.append(np.stack([rendered(fitted, camera, render) for camera in between]))
     differences = decibels(np.array([np.mean((a - b) ** 2) for a, b in zip(*shown, strict=True)]))

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import mean_psnr, rendered, shifted, withheld_blocks
 from morgs_mi.fit.first_frame import fit_first_frame
@@ -95,7 +96,7 @@ def balance_cameras(
         nonlocal done
         targets = [Target(exposures[v].corrected(image), mask) for v, (_, image, mask) in enumerate(kept)]
         tick = None if on_step is None else shifted(on_step, done)
-        settings, rng = replace(short, first_frame_steps=steps), np.random.default_rng([seed, 4])
+        settings, rng = replace(short, first_frame_steps=steps), rng_of(seed, Stream.BALANCE)
         reduced = [view.camera for view in kept]
         done += steps
         return fit_first_frame(gaussians, reduced, targets, extent, settings, render, rng, tick).gaussians

@@ -6,10 +6,9 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.agreement import NUM_FITS
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_first_frame
@@ -32,7 +31,7 @@ def steps_within(
     extent: float,
     config: FitConfig,
     render: RenderConfig,
-    seed: Sequence[int],
+    seed: int,
 ) -> int:
     """Return the number of steps of the first frame, at least 100, that this machine makes in a time.
 
@@ -56,7 +55,7 @@ def steps_within(
     took = 0.0
     for _ in range(2):  # the first time, kernels are compiled
         start = time.perf_counter()
-        fit_first_frame(gaussians, cameras, targets, extent, timed, render, np.random.default_rng(seed))
+        fit_first_frame(gaussians, cameras, targets, extent, timed, render, rng_of(seed, Stream.BUDGET))
         took = time.perf_counter() - start
     per_step = _GROWTH * took / _TIMED * (1 + planned_trials(config, len(cameras)) * config.cross_validation.steps)
     return max(_LEAST, int((seconds - (time.perf_counter() - begin)) / per_step))

@@ -19,6 +19,7 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.forecast import POOR_LOSS, angles_to, forecast, scene_depths
@@ -118,7 +119,7 @@ def cross_validate(
     extent: float,
     config: FitConfig,
     render: RenderConfig,
-    seed: Sequence[int],
+    seed: int,
     on_step: Callable[[int], None] | None = None,
 ) -> CrossValidation:
     """Return what cross-validation of the first frame finds.
@@ -141,7 +142,7 @@ def cross_validate(
     rig, targets = [view.camera for view in trained], [view.target for view in trained]
     trials: list[Trial] = []
     for dropping in how.candidates:
-        trial, rng = replace(config, dropping=dropping, first_frame_steps=steps), np.random.default_rng(seed)
+        trial, rng = replace(config, dropping=dropping, first_frame_steps=steps), rng_of(seed, Stream.TRIALS)
         tick = None if on_step is None else shifted(on_step, len(trials) * steps)
         fitted = fit_first_frame(start, rig, targets, extent, trial, render, rng, tick).gaussians
         trials.append(Trial(dropping, mean_psnr(fitted, judged, render), mean_psnr(fitted, trained, render)))
@@ -217,7 +218,7 @@ def withheld_blocks(views: Sequence[View], width: int, seed: int) -> tuple[list[
         width: least width of the reduced images, px.
         seed: of the choice of the blocks.
     """
-    rng, kept, unseen = np.random.default_rng([seed, 2]), [], []
+    rng, kept, unseen = rng_of(seed, Stream.WITHHELD_BLOCKS), [], []
     for camera, image, mask in (reduced(*view, width) for view in views):
         rows, columns = (np.arange(size) // _BLOCK for size in image.shape[:2])
         withheld = (rng.random((rows[-1] + 1, columns[-1] + 1)) < 1 / _SHARE)[rows][:, columns]

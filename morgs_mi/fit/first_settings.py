@@ -45,7 +45,7 @@ def first_settings(
     extent: float,
     config: FitConfig,
     render: RenderConfig,
-    seed: Sequence[int],
+    seed: int,
     on_step: Callable[[int, int], None] | None = None,
 ) -> FirstSettings:
     """Return the settings of the first frame.
@@ -67,8 +67,8 @@ def first_settings(
     if config.noise_aware and is_noisy(images):
         config = replace(config, objective=replace(config.objective, dssim_weight=0.0))
     if config.first_frame_seconds is not None:
-        targets, seeds = [view.target for view in views], [*seed, 1]
-        steps = steps_within(config.first_frame_seconds, gaussians, cameras, targets, extent, config, render, seeds)
+        targets = [view.target for view in views]
+        steps = steps_within(config.first_frame_seconds, gaussians, cameras, targets, extent, config, render, seed)
         config = replace(config, first_frame_steps=steps)
     if config.dropping is not None:
         return FirstSettings(config, forecast(cameras, points) if len(cameras) > 1 else None)

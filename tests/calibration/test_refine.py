@@ -101,7 +101,9 @@ def test_moved__keeps_the_projections_of_points():
 
 
 def test_refine_cameras__returns_the_calibrated_cameras_without_a_gain(splat_capture):
-    refined, found = refine_cameras(splat_capture, LEAST)
+    # So short fits differ by tenths of a dB by chance, but by less than this.
+    config = replace(LEAST, refinement=replace(LEAST.refinement, least_gain=3))
+    refined, found = refine_cameras(splat_capture, config)
     assert not found.taken
     assert refined is splat_capture
     assert "stay as calibrated" in found.sentence

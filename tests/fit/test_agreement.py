@@ -30,7 +30,7 @@ def views_with(images):
 def compare(start, on_step=None, seed=0):
     images = bytes_of(opaque_ball())
     render = RenderConfig(reproducible=True)
-    return compare_fits(start, views_with(images), 3.0, CONFIG, render, [seed], on_step)
+    return compare_fits(start, views_with(images), 3.0, CONFIG, render, seed, on_step)
 
 
 def test_views_between__lie_halfway_between_neighbours():
@@ -56,7 +56,7 @@ def test_compare_fits__measures_the_difference_between_the_cameras(monkeypatch: 
     fits = [ball(400), opaque_ball()]
     given = iter(fits)
     monkeypatch.setattr(agreement, "fit_first_frame", lambda *_: FirstFrame(next(given), {}, 1))
-    found = compare_fits(ball(80), views_with(bytes_of(fits[1])), 3.0, CONFIG, RenderConfig(), [0])
+    found = compare_fits(ball(80), views_with(bytes_of(fits[1])), 3.0, CONFIG, RenderConfig(), 0)
     _, between = views_between(views(), np.asarray(ball(80).means))
     shown = [[np.asarray(rasterize(fit, view, ("color",)).color) for view in between] for fit in fits]
     expected = [psnr(*pair) for pair in zip(*shown, strict=True)]

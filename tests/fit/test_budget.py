@@ -21,7 +21,7 @@ def steps(monkeypatch):
     monkeypatch.setattr(budget.time, "perf_counter", lambda: now[0])
     monkeypatch.setattr(budget, "fit_first_frame", fit)
     return lambda seconds, views=4, **settings: steps_within(
-        seconds, None, [None] * views, [None] * views, 1.0, FitConfig(**settings), RenderConfig(), [0]
+        seconds, None, [None] * views, [None] * views, 1.0, FitConfig(**settings), RenderConfig(), 0
     )
 
 

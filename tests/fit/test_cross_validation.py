@@ -26,7 +26,7 @@ CONFIG = FitConfig(sh_degree=0, first_frame_steps=100, num_gaussians=150)
 def validate(images, masks=None, config=CONFIG, on_step=None, render=None):
     masks = [None] * len(images) if masks is None else masks
     given = [View(*view) for view in zip(views(), images, masks, strict=True)]
-    return cross_validate(ball(80), given, 3.0, config, render or RenderConfig(), [0], on_step)
+    return cross_validate(ball(80), given, 3.0, config, render or RenderConfig(), 0, on_step)
 
 
 def bytes_of(images, noise=0.0):

@@ -21,7 +21,7 @@ def dssim_weight(noise: float, config: FitConfig = CONFIG) -> float:
     grey = [0.2 + 0.6 * image + rng.normal(0, noise, image.shape) for image in images_of(opaque_ball())]
     images = [np.uint8(np.clip(255 * image + 0.5, 0, 255)) for image in grey]
     given = [View(*view) for view in zip(views(), images, strict=True)]
-    found = first_settings(ball(80), given, np.zeros((0, 3)), 3.0, config, RenderConfig(), [0])
+    found = first_settings(ball(80), given, np.zeros((0, 3)), 3.0, config, RenderConfig(), 0)
     assert replace(found.config, objective=config.objective) == config
     return found.config.objective.dssim_weight
 

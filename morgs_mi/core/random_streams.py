@@ -1,0 +1,48 @@
+"""Random streams of a fit: one for each purpose, none of which repeats another."""
+
+from __future__ import annotations
+
+from enum import IntEnum, auto
+
+import numpy as np
+
+__all__ = ["Stream", "rng_of"]
+
+
+class Stream(IntEnum):
+    """Purposes of random numbers."""
+
+    POINTS = auto()
+    """Points of stereo that are kept."""
+    REFINED_POINTS = auto()
+    """Initial Gaussians of the refinement of cameras."""
+    REFINEMENT = auto()
+    """Its fits."""
+    BALANCED_POINTS = auto()
+    """Initial Gaussians of the balance of exposures."""
+    BALANCE = auto()
+    """Its fits."""
+    WITHHELD_BLOCKS = auto()
+    """Blocks of pixels that are withheld from a fit."""
+    TIMING = auto()
+    """Fits of the estimate of time offsets."""
+    BUDGET = auto()
+    """Steps whose time is measured."""
+    TRIALS = auto()
+    """Trials of the first frame."""
+    FIRST_FRAME = auto()
+    """First frame."""
+    LATER_FRAMES = auto()
+    """Later frames, by their index."""
+
+
+def rng_of(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
+    """Return the generator of a random stream.
+
+    Args:
+        seed: of all streams.
+        stream: purpose of the numbers.
+        index: of the frame or the fit, where a stream has several.
+    """
+    # NumPy fills short keys with zeros, so that keys of unequal length may collide.
+    return np.random.default_rng([seed, stream, index])
