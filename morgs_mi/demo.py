@@ -14,6 +14,7 @@ from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import locked_folder, write_json
+from morgs_mi.core.progress import Progress, Report
 from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.figures import motion_scale
@@ -29,7 +30,6 @@ from morgs_mi.synth.synthesize import synthesize
 
 __all__ = ["ClipConfig", "DemoConfig", "DemoReport", "run_demo"]
 
-Progress = Callable[[str, float, float], None]
 _COMPARED = ("psnr", "ssim", "motion_error", "motion_error_moving", "motion_error_still", "true_motion_moving")
 # Factor on the error images: errors of a tenth are visible, typical ones are smaller.
 _ERROR_GAIN = 4
@@ -110,7 +110,7 @@ class DemoReport:
         }
 
 
-def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Progress | None = None) -> DemoReport:
+def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Report | None = None) -> DemoReport:
     """Synthesise a clip, fit it, and write images and results of its held-out view into `out`.
 
     The folder contains ``capture/`` (reused if it has the same settings), ``stream/``, ``stream_plain/``,
@@ -128,24 +128,26 @@ def run_demo(out: str | Path, config: DemoConfig | None = None, progress: Progre
     """
     root = check_output(Path(out))
     with locked_folder(root, "run_demo()"):
-        return _run(root, config or DemoConfig(), progress or (lambda step, done, total: None))
+        return _run(root, config or DemoConfig(), progress)
 
 
-def _run(root: Path, config: DemoConfig, report_progress: Progress) -> DemoReport:
+def _run(root: Path, config: DemoConfig, shown: Report | None) -> DemoReport:
     """Run the demonstration in a locked folder."""
     seconds: dict[str, float] = {}
 
-    def run_step(name: str, work: Callable[[Callable[[float, float], None]], Any]) -> Any:
+    def run_step(name: str, work: Callable[[Progress], Any]) -> Any:
         start = time.perf_counter()
-        result = work(lambda done, total: report_progress(name, done, total))
+        result = work(Progress(shown, name))
         seconds[name] = time.perf_counter() - start
         return result
 
     def fit(folder: str, settings: StreamConfig, frames: int | None) -> Callable[..., Any]:
         capture = load_capture(root / "capture", max_frames=frames)
-        count = capture.num_frames
-        return lambda report: stream_capture(
-            capture, root / folder, settings, lambda frame, step, steps: report(frame + step / steps, count)
+        return lambda progress: stream_capture(
+            capture,
+            root / folder,
+            settings,
+            progress=lambda stage, done, total: progress.of(f"{progress.stage}: {stage.lower()}")(done, total),
         )
 
     run_step("Path-tracing the clip", lambda report: _synthesize_clip(root / "capture", config, report))

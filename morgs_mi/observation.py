@@ -14,7 +14,7 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_mask, check_points, check_type
 from morgs_mi.core.threads import map_in_threads
-from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.fit.initialise import Points, scene_extent
 from morgs_mi.method.change import box_around, change_mask, moving_region, update_reference
 from morgs_mi.method.exposure import Exposure, common_change, follow_exposure
 from morgs_mi.method.flow import FlowObservation, choose_key_views, observe_key_views
@@ -82,6 +82,11 @@ class Setup:
     key_views: tuple[int, ...]
     extent: float
     config: StreamConfig
+
+    @property
+    def cloud(self) -> Points:
+        """The points and their colours."""
+        return self.points, self.point_colors
 
 
 def prepare(

@@ -11,10 +11,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from hashlib import blake2b
 from itertools import chain, islice
 from pathlib import Path
@@ -34,9 +33,9 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import is_same_file, locked_folder, write_json
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.fit.cross_validation import mean_psnr
+from morgs_mi.core.progress import Progress, Report
 from morgs_mi.fit.initialise import scene_extent
-from morgs_mi.fit.view import View
+from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.io.bounded import read_json
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.method.flow import choose_key_views
@@ -70,9 +69,8 @@ def stream_capture(
     capture: Capture,
     out: str | Path,
     config: StreamConfig | None = None,
-    on_step: Callable[[int, int, int], None] | None = None,
     resume: bool = False,
-    on_stage: Callable[[str, int, int], None] | None = None,
+    progress: Report | None = None,
 ) -> list[FrameReport]:
     """Fit a whole capture and write OUT/stream.morgs packet by packet, and OUT/report.json with every frame.
 
@@ -83,10 +81,9 @@ def stream_capture(
         capture: cameras and frames; the test view is not trained on, but is part of the stream's header.
         out: folder, made if missing.
         config: settings.
-        on_step: called with (frame, steps done, steps of that frame).
         resume: continue after the last complete packet of the stream in `out`, if there is one. With
             `RenderConfig(reproducible=True)` the stream has the same bytes as without an interruption.
-        on_stage: called with (name, done, total) of the work before the first frame that is fitted.
+        progress: called with (stage, done, total): matching views, trials, the first frame, later frames.
 
     Returns:
         The reports of all frames, including those before an interruption.
@@ -101,16 +98,15 @@ def stream_capture(
     for name in FILES:
         check_output(out / name)
     with locked_folder(out, "stream_capture()"):
-        return _stream(capture, out, config or StreamConfig(), on_step, resume, on_stage or (lambda *_: None))
+        return _stream(capture, out, config or StreamConfig(), resume, Progress(progress))
 
 
 def _stream(
     capture: Capture,
     out: Path,
     config: StreamConfig,
-    on_step: Callable[[int, int, int], None] | None,
     resume: bool,
-    on_stage: Callable[[str, int, int], None],
+    progress: Progress,
 ) -> list[FrameReport]:
     """Fit a capture into a locked folder."""
     path, train, frames = out / "stream.morgs", capture.train_views, capture.partial_frames()
@@ -119,7 +115,7 @@ def _stream(
     interrupted = _interrupted(out, capture, metadata) if resume else None
     refinement = None
     if interrupted is None:
-        capture, refinement = with_refined_cameras(with_points(capture, config.seed, on_stage), config, on_stage)
+        capture, refinement = with_refined_cameras(with_points(capture, config.seed, progress), config, progress)
         metadata |= about_lenses(capture)
     else:
         capture = interrupted.capture
@@ -141,20 +137,20 @@ def _stream(
         start = 0 if config.fit.skip_static or config.fit.exposure != "off" else now
         frames = capture.partial_frames(start)
         count = now + 1 - start
-        past = _reported(islice(frames, count), partial(on_stage, "Reading the fitted frames"), count)
+        past = _reported(islice(frames, count), progress.of("Reading the fitted frames"), count)
         images = (frame.comparable(train) for frame in past)
         loop.resume(interrupted.coded, images, interrupted.reports[0].exposures)
         write_json(out / "capture.json", about)
         writer = StreamWriter.continued(path, interrupted.index, interrupted.end)
         reports = interrupted.reports
-    interval, written = config.codec.keyframe_interval, os.stat(path)
+    interval, written, last = config.codec.keyframe_interval, os.stat(path), capture.num_frames - 1
     with writer:
         if interrupted is not None and interrupted.index[-1][0] == PacketKind.RESIDUAL:
             for packet in due_keyframe(interrupted.coded, interval):
                 writer.write(packet)
         for frame, upcoming in with_next(frames):
-            tick = None if on_step is None else _frame_ticker(on_step, frame.index)
-            packet, report = push_frame(loop, frame, train, tick, upcoming)
+            stage = progress.of("Later frames").part(frame.index - 1, last) if frame.index else progress
+            packet, report = push_frame(loop, frame, train, stage.report, upcoming)
             if refinement is not None and not frame.index:
                 assert loop.gaussians is not None
                 about = about_cameras(loop.gaussians, capture, frame, refinement, config)
@@ -168,22 +164,22 @@ def _stream(
     return reports
 
 
-def with_points(capture: Capture, seed: int, on_stage: Callable[[str, int, int], None]) -> Capture:
+def with_points(capture: Capture, seed: int, progress: Progress) -> Capture:
     """Return a capture with the points of `dense_points` if it has few and they are more; see `stream_capture`."""
     if len(capture.points) >= _FEW_POINTS:
         return capture
-    shared = match_capture(capture, partial(on_stage, "Matching views"))
-    on_stage("Triangulating points", 0, 1)
+    shared = match_capture(capture, progress.of("Matching views"))
+    progress.of("Triangulating points")(0, 1)
     return max(capture, dense_points(capture, shared, seed), key=lambda c: len(c.points))
 
 
 def with_refined_cameras(
-    capture: Capture, config: StreamConfig, on_stage: Callable[[str, int, int], None]
+    capture: Capture, config: StreamConfig, progress: Progress
 ) -> tuple[Capture, Refinement | None]:
     """Return a capture with refined cameras where the config asks for them, and what was found."""
     if config.fit.refine_cameras == "off":
         return capture, None
-    return refine_cameras(capture, config.fit, config.render, config.seed, partial(on_stage, "Refining cameras"))
+    return refine_cameras(capture, config.fit, config.render, config.seed, progress.of("Refining cameras"))
 
 
 def about_cameras(
@@ -205,14 +201,14 @@ def push_frame(
     loop: StreamLoop,
     frame: PartialFrame,
     train: Sequence[int],
-    on_step: Callable[[int, int], None] | None = None,
+    progress: Report | None = None,
     upcoming: PartialFrame | None = None,
 ) -> tuple[Packet, FrameReport]:
     """Fit the next frame of a loop on the views `train`; the report's status names the images that are missing."""
     images, ahead = (None if f is None else [f.images[v] for v in train] for f in (frame, upcoming))
     assert images is not None
     recorded = None if frame.recorded is None else frame.comparable(train)
-    packet, report = loop.push(images, on_step, ahead, recorded)
+    packet, report = loop.push(images, progress, ahead, recorded)
     status = "; ".join([*([report.status] if report.status != "ok" else []), *frame.problems]) or "ok"
     return packet, replace(report, status=status)
 
@@ -233,10 +229,10 @@ def with_next(frames: Iterable[PartialFrame]) -> Iterator[tuple[PartialFrame, Pa
         frame = upcoming
 
 
-def _reported(frames: Iterable[PartialFrame], report: Callable[[int, int], None], count: int) -> Iterator[PartialFrame]:
+def _reported(frames: Iterable[PartialFrame], progress: Progress, count: int) -> Iterator[PartialFrame]:
     """Yield frames and report how many were there before."""
     for done, frame in enumerate(frames):
-        report(done, count)
+        progress(done, count)
         yield frame
 
 
@@ -419,7 +415,3 @@ def due_keyframe(coded: CodedFrame | None, interval: int) -> list[Packet]:
     if coded is None or not interval or not coded.frame or coded.frame % interval:
         return []
     return [reemitted_keyframe(coded)]
-
-
-def _frame_ticker(on_step: Callable[[int, int, int], None], frame: int) -> Callable[[int, int], None]:
-    return lambda done, steps: on_step(frame, done, steps)

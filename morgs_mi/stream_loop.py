@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -22,17 +22,17 @@ from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, residual
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.threads import in_background
 from morgs_mi.fit.balance import Balance, balance_cameras, balance_config
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.cross_validation import mean_psnr
-from morgs_mi.fit.detail import gaussians_for
+from morgs_mi.fit.detail import with_num_gaussians
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.first_settings import Expected, first_settings
-from morgs_mi.fit.forecast import Forecast
-from morgs_mi.fit.initialise import fill_points, from_points, resample_points, seed_points
+from morgs_mi.fit.initialise import MIN_POINTS
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
+from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import View
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
@@ -42,15 +42,10 @@ from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.objective import Observations, channels_of, observe
 from morgs_mi.observation import FrameObservation, Images, Seen, Setup, observe_frame, prepare, see_frame
-from morgs_mi.render.config import RenderConfig
 
 __all__ = ["FrameReport", "StreamLoop", "StreamState", "step"]
 
 _LOG = logging.getLogger(__name__)
-
-# With fewer points, the first frame starts from random ones inside the views; with less than `_MANY_POINTS`, some are
-# added where views show none.
-_MIN_POINTS, _MANY_POINTS = 20, 1000
 
 
 @dataclass(frozen=True)
@@ -67,8 +62,8 @@ class FrameReport:
         missing_views: names of the views without an image.
         active: what took part, as fractions of everything, by name: gaussians, views, pixels, epochs.
         validation: of the first frame, a `sentence` on views between the cameras and their `expected_psnr` in dB, with
-            the results of cross-validation (see `fit.cross_validation`) and the comparison of two fits (see
-            `fit.agreement`), or else the forecast (see `fit.forecast`), which has no number; empty with a single view.
+            the result of cross-validation (see `fit.cross_validation`) or a forecast (see `fit.forecast`), for which
+            that PSNR is None; empty with a single view.
         steps: number of optimisation steps, without those of trials.
         exposures: gain and bias of each view; empty if they are not estimated.
     """
@@ -114,7 +109,7 @@ def step(
     setup: Setup,
     state: StreamState,
     images: Sequence[np.ndarray | None] | FrameObservation,
-    on_step: Callable[[int, int], None] | None = None,
+    progress: Report | None = None,
 ) -> tuple[StreamState, Packet, FrameReport]:
     """Fit one frame and return (state, packet, report). The function is pure: all state is in what it returns.
 
@@ -123,7 +118,7 @@ def step(
         state: as returned for the last frame; `StreamState()` before the first.
         images: per training view uint8 [H, W, 3], RGB, or None where the view has no image. They are copied. Or what
             `observe_frame` found in them.
-        on_step: called with (steps done, steps of this frame).
+        progress: called with (stage, done, total): the stages of the first frame, or the steps of a later one.
 
     Raises:
         ValueError: an image has another size or type than its camera, or the first frame has no image at all.
@@ -132,7 +127,7 @@ def step(
     if not isinstance(observed, FrameObservation):
         observed = observe_frame(setup, state.frame, state.seen, observed)
     fit = _fit_first_frame if state.coded is None else _fit_later_frame
-    packet, about = fit(setup, state, observed, on_step)
+    packet, about = fit(setup, state, observed, Progress(progress, f"Frame {state.frame}"))
     coded, seen = decode(state.coded, packet), observed.seen
     balance = about.pop("balance", state.balance)
     report = FrameReport(
@@ -148,7 +143,7 @@ def step(
 
 
 def _fit_later_frame(
-    setup: Setup, state: StreamState, observed: FrameObservation, on_step: Callable[[int, int], None] | None
+    setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress
 ) -> tuple[Packet, dict[str, Any]]:
     """Return a later frame's packet and what its report says; the numbers are those of the paper's equations."""
     assert state.coded is not None
@@ -161,7 +156,7 @@ def _fit_later_frame(
     targets = {view: Target(image, setup.masks[view]) for view, image in balanced.items()}
     initial = initial_motion(previous, active, flows, targets, motion, rng)  # motion (5)
     problem = FrameProblem(previous, active, targets, observations, initial, setup.extent)
-    fitted = fit_later_frame(problem, config.fit, motion, rng, on_step)  # residual (6-8, 12), objective (13)
+    fitted = fit_later_frame(problem, config.fit, motion, rng, progress)  # residual (6-8, 12), objective (13)
     packet = residual_packet(state.coded, fitted.gaussians, fitted.source, setup.cameras, config.codec)  # (3)
     return packet, {
         "losses": fitted.losses,
@@ -172,42 +167,48 @@ def _fit_later_frame(
 
 
 def _fit_first_frame(
-    setup: Setup, state: StreamState, observed: FrameObservation, on_step: Callable[[int, int], None] | None
+    setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress
 ) -> tuple[Packet, dict[str, Any]]:
     """Return the first frame's packet and what its report says."""
-    config, images, rng = setup.config, observed.seen.images, rng_of(setup.config.seed, Stream.FIRST_FRAME)
-    cameras, masks = [setup.cameras[v] for v in images], [setup.masks[v] for v in images]
-    fit, found = config.fit, _balance(setup, images)
+    config, images = setup.config, observed.seen.images
+    found = _balance(setup, images, progress)
     balance = _exposures_of(setup, images, found)
-    images = _balanced(images, balance)
-    if fit.num_gaussians is None:
-        count = gaussians_for(cameras, list(images.values()), masks, setup.points, fit.detail)
-        fit = replace(fit, num_gaussians=count)
-    gaussians, status = _first_gaussians(setup, images, fit, rng)
-    views = [View(*view) for view in zip(cameras, images.values(), masks, strict=True)]
-    given = gaussians, views, setup.points, setup.extent, fit, config.render, config.seed
-    chosen = first_settings(*given, on_step)
-    before = chosen.steps_before
-    tick = None if on_step is None else lambda done, steps: on_step(before + done, before + steps)
-    targets = [view.target for view in views]
-    fitted = fit_first_frame(gaussians, cameras, targets, setup.extent, chosen.config, config.render, rng, tick)
+    views, rng = _views(setup, _balanced(images, balance)), rng_of(config.seed, Stream.FIRST_FRAME)
+    fit = with_num_gaussians(config.fit, views, setup.points)
+    problem = FirstFrameProblem.of(views, setup.cloud, fit, config.render, rng)
+    chosen = first_settings(problem, fit, config.seed, progress)
+    fitted = fit_first_frame(problem, chosen.config, rng, progress.of("First frame"))
     return keyframe_packet(fitted.gaussians, 0, setup.cameras, config.codec), {
         "losses": fitted.losses,
-        "status": status,
-        "validation": _about_expected(chosen.expected, fitted.gaussians, views, config.render) | _about_balance(found),
+        "status": _start_status(setup, fit),
+        "validation": _about_expected(chosen.expected, problem.psnr(fitted.gaussians)) | _about_balance(found),
         "steps": fitted.steps,
         "balance": balance,
     }
 
 
-def _balance(setup: Setup, images: Images) -> Balance | None:
+def _views(setup: Setup, images: Images) -> list[View]:
+    """Return the views that have an image."""
+    return [View(setup.cameras[v], image, setup.masks[v]) for v, image in images.items()]
+
+
+def _start_status(setup: Setup, config: FitConfig) -> str:
+    """Return a status about the points that the first frame starts from."""
+    if (count := len(setup.points)) >= MIN_POINTS:
+        return "ok"
+    status = f"the capture has {count} points, too few: seeded {config.first_count} random ones inside the views"
+    _LOG.warning("frame 0: %s", status)
+    return status
+
+
+def _balance(setup: Setup, images: Images, progress: Progress) -> Balance | None:
     """Return the balance of the cameras in the first frame; None if it is not estimated, or of a single view."""
     config = setup.config
     if config.fit.exposure == "off" or len(images) < 2:
         return None
-    start, _ = _first_gaussians(setup, images, balance_config(config.fit), rng_of(config.seed, Stream.BALANCED_POINTS))
-    views = [View(setup.cameras[v], image, setup.masks[v]) for v, image in images.items()]
-    return balance_cameras(start, views, setup.extent, config.fit, config.render, config.seed)
+    rng, short = rng_of(config.seed, Stream.BALANCED_POINTS), balance_config(config.fit)
+    problem = FirstFrameProblem.of(_views(setup, images), setup.cloud, short, config.render, rng)
+    return balance_cameras(problem, config.fit, config.seed, progress)
 
 
 def _exposures_of(setup: Setup, images: Images, found: Balance | None) -> tuple[Exposure, ...]:
@@ -223,15 +224,12 @@ def _balanced(images: Images, balance: Sequence[Exposure]) -> dict[int, np.ndarr
     return {v: balance[v].corrected(image) if balance else image for v, image in images.items()}
 
 
-def _about_expected(
-    expected: Expected | None, gaussians: Gaussians, views: Sequence[View], render: RenderConfig
-) -> dict[str, Any]:
+def _about_expected(expected: Expected | None, training_psnr: float) -> dict[str, Any]:
     """Return what the first frame's report says about views between the cameras."""
     if expected is None:
         return {}
-    if not isinstance(expected, Forecast):
-        expected = replace(expected, training_psnr=mean_psnr(gaussians, views, render))
-    return {"sentence": expected.sentence, "expected_psnr": expected.expected_psnr, **asdict(expected)}
+    known = replace(expected, training_psnr=training_psnr)
+    return {"sentence": known.sentence, "expected_psnr": known.expected_psnr, **asdict(known)}
 
 
 def _about_balance(found: Balance | None) -> dict[str, Any]:
@@ -240,22 +238,6 @@ def _about_balance(found: Balance | None) -> dict[str, Any]:
         return {}
     scores = {"recorded_psnr": found.recorded_psnr, "balanced_psnr": found.balanced_psnr}
     return {"exposure": {"sentence": found.sentence, "taken": found.taken, **scores}}
-
-
-def _first_gaussians(setup: Setup, seen: Images, config: FitConfig, rng: np.random.Generator) -> tuple[Gaussians, str]:
-    """Return the initial Gaussians, and a status about where they lie."""
-    status = "ok"
-    count, images = config.first_count, list(seen.values())
-    cameras, masks = [setup.cameras[v] for v in seen], [setup.masks[v] for v in seen]
-    points, colors = setup.points, setup.point_colors
-    if len(points) < _MIN_POINTS:
-        status = f"the capture has {len(points)} points, too few: seeded {count} random ones inside the views"
-        _LOG.warning("frame 0: %s", status)
-        points, colors = seed_points(cameras, images, masks, count, rng)
-    elif len(points) < _MANY_POINTS:
-        points, colors = fill_points(points, colors, cameras, images, masks, count, rng)
-    points, colors = resample_points(points, colors, count, rng)
-    return from_points(points, colors, config.sh_degree, config.initial_opacity), status
 
 
 def _first_confidence(
@@ -332,7 +314,7 @@ class StreamLoop:
     def push(
         self,
         images: Sequence[np.ndarray | None],
-        on_step: Callable[[int, int], None] | None = None,
+        progress: Report | None = None,
         upcoming: Sequence[np.ndarray | None] | None = None,
         recorded: Sequence[np.ndarray | None] | None = None,
     ) -> tuple[Packet, FrameReport]:
@@ -340,7 +322,7 @@ class StreamLoop:
 
         Args:
             images: as for `step`.
-            on_step: as for `step`.
+            progress: as for `step`.
             upcoming: images of the frame after it, if they are there already: their optical flow is computed while
                 this frame is fitted. They change nothing else.
             recorded: images that those of the next frame are compared with, if these are not `images`: of the first
@@ -352,7 +334,7 @@ class StreamLoop:
         if upcoming is not None:
             copies = [None if image is None else np.array(image) for image in upcoming]
             self._ahead = frame + 1, in_background(partial(observe_frame, self.setup, frame + 1, seen, copies))
-        state, packet, report = step(self.setup, self.state, observed, on_step)
+        state, packet, report = step(self.setup, self.state, observed, progress)
         self.state = replace(state, seen=seen)
         return packet, replace(report, seconds=time.perf_counter() - start)
 

@@ -20,13 +20,16 @@ SMALL = DemoConfig(
     stream=StreamConfig(fit=FitConfig(sh_degree=0, num_gaussians=500, first_frame_steps=20, epochs=1)),
 )
 
+FIT_STAGES = ("trial", "first frame", "later frames")
+
 
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo")
     steps: list[str] = []
     run_demo(folder, SMALL, lambda step, done, total: steps.append(step))
-    assert list(dict.fromkeys(steps))[:3] == ["Path-tracing the clip", "Fitting", "Fitting without ML, MO, MC"]
+    fits = [f"Fitting{which}: {stage}" for which in ("", " without ML, MO, MC") for stage in FIT_STAGES]
+    assert list(dict.fromkeys(steps))[:7] == ["Path-tracing the clip", *fits]
     return folder
 
 

@@ -18,7 +18,7 @@ NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
 LONG_CALLS = {
-    "Fitting": "morgs_mi.stream_capture(capture, out, CONFIG, on_step=Bar('Fitting', 2).on_step)",
+    "Fitting": "morgs_mi.stream_capture(capture, out, CONFIG, progress=Bar('Fitting').report)",
     "Evaluating": "morgs_mi.evaluate_stream(out, progress=Bar('Evaluating'))",
     "Tracking": "morgs_mi.track_points(stream(), [(0, 0, 0)], 0, progress=Bar('Tracking', 2))",
     "Extracting": "morgs_mi.extract_tracks(stream(), Bar('Extracting', 2))",

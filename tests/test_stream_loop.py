@@ -222,21 +222,29 @@ def test_push__reports_what_cross_validation_of_the_first_frame_found(clip):
     assert "Views between the cameras" in found["sentence"]
     assert len(found["withheld"]) == 1
     assert [trial["dropping"] for trial in found["trials"]][:2] == [0.0, 0.2]
-    steps = [done for done, _ in ticks]
-    assert steps == sorted(set(steps))
-    assert ticks[-1][0] == ticks[-1][1] == 20 + 3 * 8
+    trials = [f"Trial {number} of 3" for number in range(1, len(found["trials"]) + 1)]
+    assert list(dict.fromkeys(stage for stage, *_ in ticks)) == [*trials, "First frame"]
+    assert ticks[-1] == ("First frame", 20, 20)
     assert "trials" not in new_loop(given).push(clip[0][:4])[1].validation
 
 
-def test_push__compares_two_fits_of_few_views(clip):
+def test_push__withholds_one_of_few_views(clip):
     ticks = []
     config = dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, first_frame_steps=20))
     _, report = new_loop(config).push(clip[0][:4], lambda *tick: ticks.append(tick))
     assert report.validation["sentence"].startswith("Views between the cameras will ")
-    assert report.validation["cameras"] == 4
+    assert len(report.validation["withheld"]) == 1
     assert 0 < report.validation["expected_psnr"] < report.validation["training_psnr"]
-    total = 20 + 2 * 8
-    assert ticks == [(done, total) for done in range(1, total + 1)]
+    steps = {"Trial": 8, "First frame": 20}
+    assert ticks == [(stage, done, total) for stage, total in steps.items() for done in range(1, total + 1)]
+
+
+def test_push__bounds_what_to_expect_between_two_views(clip):
+    config = dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, first_frame_steps=20))
+    loop = StreamLoop(cameras()[:2], *points_and_colors(), config)
+    validation = loop.push(clip[0][:2])[1].validation
+    assert validation["expected_psnr"] is None
+    assert validation["sentence"].endswith(f"They have at most {validation['training_psnr']:.0f} dB.")
 
 
 def test_push__forecasts_other_views_without_trials(clip):
@@ -251,7 +259,7 @@ def test_push__fits_the_first_frame_in_the_steps_that_a_time_allows(clip):
     hardly_any = dataclasses.replace(QUICK, fit=dataclasses.replace(QUICK.fit, first_frame_seconds=1e-3))
     _, report = new_loop(hardly_any).push(clip[0][:4], lambda *tick: ticks.append(tick))
     assert report.steps == 100
-    assert ticks[-1] == (180, 180)  # with two trials of 40 steps
+    assert ticks[-1] == ("First frame", 100, 100)
 
 
 def without(images, *views):
@@ -322,14 +330,14 @@ def test_stream_capture__writes_a_file(clip, tmp_path):
         downscale=2,
     )
     ticks = []
-    reports = stream_capture(capture, tmp_path / "out", QUICK, lambda *tick: ticks.append(tick))
+    reports = stream_capture(capture, tmp_path / "out", QUICK, progress=lambda *tick: ticks.append(tick))
     path = tmp_path / "out" / "stream.morgs"
     reader = StreamReader(path)
     assert [c.name for c in reader.cameras] == [c.name for c in cameras()]
     assert (reader.metadata["train_views"], reader.metadata["downscale"]) == ([0, 1, 2, 3], 2)
     assert [frame for frame, _ in play(reader)] == [0, 1]
     assert sum(r.num_bytes for r in reports) < path.stat().st_size
-    assert ticks[-1] == (1, 16, 16)
+    assert ticks[-1] == ("Later frames", 1, 1)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["capture.json", "report.json", "stream.morgs"]
     about = json.loads((tmp_path / "out" / "capture.json").read_text())
     assert about == {"layout": "in memory", "capture": str(capture.path)}

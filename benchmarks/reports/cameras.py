@@ -36,9 +36,8 @@ from morgs_mi.capture.lens import Lens
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
-from morgs_mi.fit.cross_validation import mean_psnr
 from morgs_mi.fit.initialise import scene_extent
-from morgs_mi.fit.view import View
+from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.synth.synthesize import synthesize
 

@@ -55,7 +55,7 @@ def measure(source: Source, train: Sequence[int], config: StreamConfig) -> dict[
         "held_out": round(float(held_out.mean()), 2),
         "worst": round(float(held_out.min()), 2),
         "estimate": round(found["expected_psnr"], 2),
-        **{key: found[key] for key in ("spacing", "withheld_angle", "trials", "differences") if key in found},
+        **{key: found[key] for key in ("spacing", "withheld_angle", "trials") if key in found},
         "seconds": round(report.seconds, 1),
     }
 
@@ -66,9 +66,8 @@ def estimates_table(fits: Sequence[Mapping[str, Any]]) -> str:
     for (seed, views), own in grouped(fits, "seed", "views").items():
         means = (np.mean([fit[key] for fit in own]) for key in ("training", "held_out", "worst", "estimate"))
         errors = [fit["estimate"] - fit["held_out"] for fit in own]
-        how = "withheld views" if "trials" in own[0] else "two fits"
-        rows.append((f"{seed}", f"{views}", *(f"{mean:.1f} dB" for mean in means), how, f"{plus_minus(errors, 1)} dB"))
-    titles = "training views", "held-out views", "worst one", "estimate", "from", "error"
+        rows.append((f"{seed}", f"{views}", *(f"{mean:.1f} dB" for mean in means), f"{plus_minus(errors, 1)} dB"))
+    titles = "training views", "held-out views", "worst one", "estimate", "error"
     return markdown(("seed", "views", *titles), rows)
 
 

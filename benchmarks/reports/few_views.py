@@ -28,8 +28,7 @@ from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
-from morgs_mi.fit.cross_validation import POOR_PSNR
-from morgs_mi.fit.forecast import POOR_LOSS, angles_to, forecast, scene_depths
+from morgs_mi.fit.forecast import angles_to, forecast, quality_of, scene_depths
 from morgs_mi.fit.noise import white_noise_of
 from morgs_mi.synth.scene import load_scene
 from morgs_mi.synth.synthesize import synthesize
@@ -179,7 +178,7 @@ def forecast_table(fits: Sequence[Mapping[str, Any]]) -> str:
     for each in grouped(fits, "capture", "train").values():
         first, psnr = each[0], float(np.mean([held_out_psnr(fit) for fit in each]))
         loss = float(np.mean([fit["training"] for fit in each])) - psnr
-        right = first["forecast"] == turned_out(psnr, loss)
+        right = first["forecast"] == quality_of(psnr, loss, 0.0)
         key = first["capture"].partition("-")[0], len(first["train"])
         rigs.setdefault(key, []).append((first["spacing"], first["reach"], psnr, loss, right))
     rows = []
@@ -188,13 +187,6 @@ def forecast_table(fits: Sequence[Mapping[str, Any]]) -> str:
         measured = _span(spacing, 0), _span(reach, 0), f"{_span(psnr)} dB", f"{_span(loss)} dB"
         rows.append((f"`{rig}`", f"{views}", *measured, f"{sum(right):.0f} of {len(right)}"))
     return markdown(("rig", "views", "degrees apart", "`reach`", "held-out views", "loss", "forecast right"), rows)
-
-
-def turned_out(psnr: float, loss: float) -> str:
-    """Return whether held-out views are good, fair or poor, from their PSNR and what they have less than the others."""
-    if psnr < POOR_PSNR or loss > POOR_LOSS:
-        return "poor"
-    return "good" if loss < POOR_LOSS / 2 else "fair"
 
 
 def _span(values: Sequence[float], digits: int = 1) -> str:

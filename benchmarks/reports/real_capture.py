@@ -53,13 +53,16 @@ def fit(options: Options) -> None:
     options.out.mkdir(parents=True, exist_ok=True)
     capture = load_capture(options.capture, options.downscale, "auto", options.frames, options.reading.read_config())
     with (options.out / "memory.jsonl").open("a", encoding="utf-8") as log:
+        logged: set[int] = set()
 
-        def log_memory(frame: int, step: int, steps: int) -> None:
-            if step == 1:  # a frame that stops early has no last step
+        def log_memory(stage: str, done: float, total: float) -> None:
+            frame = 1 + int(done) if stage == "Later frames" else 0
+            if frame not in logged:
+                logged.add(frame)
                 log.write(json.dumps({"frame": frame, "resident_mib": resident()}) + "\n")
                 log.flush()
 
-        stream_capture(capture, options.out, options.settings.stream_config(), log_memory, resume=True)
+        stream_capture(capture, options.out, options.settings.stream_config(), resume=True, progress=log_memory)
 
 
 def summary(out: Path, capture: Path) -> dict[str, Any]:

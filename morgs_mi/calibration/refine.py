@@ -25,7 +25,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -46,10 +45,10 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.cross_validation import mean_psnr, withheld_blocks
 from morgs_mi.fit.first_frame import fit_first_frame
-from morgs_mi.fit.initialise import fill_points, from_points, resample_points, scene_extent, seed_points, seen_points
-from morgs_mi.fit.view import View
+from morgs_mi.fit.initialise import Points, scene_extent, seen_points
+from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.view import View, mean_psnr, withheld_blocks
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.image_gradient import blurred, gradient_products, image_gradient
 from morgs_mi.render.active_view import ActiveView
@@ -144,30 +143,36 @@ def refine_cameras(
         )
     report = progress or (lambda done, count: None)
     cameras, masks = [capture.cameras[v] for v in seen], [capture.masks[v] for v in seen]
-    extent, colors = scene_extent(cameras), capture.point_colors
+    extent = scene_extent(cameras)
     deviations = np.stack([prior_deviations(camera, extent, how.priors) for camera in cameras])
     changes, tracks = _matched(capture, list(seen), config, extent)
     judge = config.refine_cameras == "auto"
     estimates = [0 * changes] * judge + [changes] * bool(tracks)
     fits = how.rounds + len(estimates) + bool(estimates)
     given = [View(*view) for view in zip(cameras, seen.values(), masks, strict=True)]
-    views, unseen = withheld_blocks(given, how.width, seed)
+    views, unseen = withheld_blocks(given, how.width, rng_of(seed, Stream.WITHHELD_BLOCKS))
     unseen = [view for view in unseen if np.any(view.mask)]
-    fit = partial(_fit, views=views, extent=extent, config=config, render=render, seed=seed)
-    gaussians = _start(_changed(views, changes), _moved(capture.points, cameras, changes), colors, config, seed)
+
+    def started(changes: np.ndarray, points: np.ndarray) -> FirstFrameProblem:
+        return _problem(_changed(views, changes), (points, capture.point_colors), config, render, seed)
+
+    def fit(problem: FirstFrameProblem, later: bool = False) -> Gaussians:
+        return fit_first_frame(problem, _short(config, later), rng_of(seed, Stream.REFINEMENT)).gaussians
+
+    problem = started(changes, _moved(capture.points, cameras, changes))
     for done in range(how.rounds):
         report(done, fits)
-        gaussians = fit(gaussians, changes, later=done > 0)
+        gaussians = fit(replace(problem, views=tuple(_changed(views, changes))), later=done > 0)
         blur = _BLURS[done] if done < len(_BLURS) else 0.0
         for _ in range(_STEPS):
             gaussians, changes = _joint_step(gaussians, views, changes, deviations, extent, blur, render)
+        problem = replace(problem, start=gaussians)
     estimates.append(changes)
     points, scores = [_moved(capture.points, cameras, change) for change in estimates], [float("nan")] * len(estimates)
     if len(estimates) > 1:
         for k, (change, start) in enumerate(zip(estimates, points, strict=True)):
             report(how.rounds + k, fits)
-            fitted = fit(_start(_changed(views, change), start, colors, config, seed), change)
-            scores[k] = mean_psnr(fitted, _changed(unseen, change), render)
+            scores[k] = mean_psnr(fit(started(change, start)), _changed(unseen, change), render)
     calibrated = scores[0] if judge else float("nan")
     best = judge + int(np.argmax(scores[judge:]))
     taken = not scores[best] < calibrated + how.least_gain
@@ -274,45 +279,30 @@ def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -
     return moved.astype(np.float32)
 
 
-def _start(views: Sequence[View], points: np.ndarray, colors: np.ndarray, config: FitConfig, seed: int) -> Gaussians:
-    """Return the Gaussians that a fit starts from, without view-dependent colours, which would hide wrong poses."""
-    cameras, images, masks = (list(part) for part in zip(*views, strict=True))
-    count, rng = config.refinement.gaussians, rng_of(seed, Stream.REFINED_POINTS)
-    given = (points, colors) if len(points) else None
-    start = (
-        seed_points(cameras, images, masks, count, rng)
-        if given is None
-        else fill_points(*given, cameras, images, masks, count, rng)
-    )
-    return from_points(*resample_points(*start, count, rng), 0, config.initial_opacity)
+def _problem(
+    views: Sequence[View], points: Points, config: FitConfig, render: RenderConfig, seed: int
+) -> FirstFrameProblem:
+    """Return the problem of a short fit."""
+    return FirstFrameProblem.of(views, points, _short(config), render, rng_of(seed, Stream.REFINED_POINTS))
 
 
-def _fit(
-    gaussians: Gaussians,
-    changes: np.ndarray,
-    views: Sequence[View],
-    extent: float,
-    config: FitConfig,
-    render: RenderConfig,
-    seed: int,
-    later: bool = False,
-) -> Gaussians:
-    """Return the Gaussians after a short fit; a later one continues with half the steps and lower rates."""
+def _short(config: FitConfig, later: bool = False) -> FitConfig:
+    """Return the settings of a short fit; a later one continues with half the steps and lower rates.
+
+    It has no view-dependent colours, which would hide wrong poses.
+    """
     how, rates = config.refinement, config.first_frame_rates
     if later:
         rates = replace(rates, **{name: factor * getattr(rates, name) for name, factor in _LATER_RATES.items()})
-    short = replace(
+    return replace(
         config,
+        sh_degree=0,
         num_gaussians=how.gaussians,
         first_frame_steps=how.steps // 2 if later else how.steps,
         first_frame_rates=rates,
         dropping=0.0,
         density=replace(config.density, rounds=0),
     )
-    changed = _changed(views, changes)
-    targets, cameras = [view.target for view in changed], [view.camera for view in changed]
-    rng = rng_of(seed, Stream.REFINEMENT)
-    return fit_first_frame(gaussians, cameras, targets, extent, short, render, rng).gaussians
 
 
 def _joint_step(

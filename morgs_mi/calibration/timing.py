@@ -34,10 +34,10 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.random_streams import Stream, rng_of
-from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.cross_validation import reduced
+from morgs_mi.fit.config import DensityConfig, FitConfig
 from morgs_mi.fit.first_frame import fit_first_frame
-from morgs_mi.fit.initialise import fill_points, from_points, resample_points, scene_extent, seed_points
+from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.view import View
 from morgs_mi.io.video import ImageOrError
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.flow import observe_key_views
@@ -254,7 +254,7 @@ class _Clips:
     def of(cls, capture: Capture, count: int, width: int) -> _Clips:
         clips = [[_checked(image) for image in capture.images(v, 0, count)] for v in range(len(capture.cameras))]
         views = zip(capture.cameras, (clip[0] for clip in clips), capture.masks, strict=True)
-        small, _, masks = zip(*(reduced(*view, width) for view in views), strict=True)
+        small, _, masks = zip(*(View(*view).reduced(width) for view in views), strict=True)
         # The images are whole frames: rendered at the time that the capture gives them, they would be displaced twice.
         cameras = tuple(camera.without_delays() for camera in small)
         images = tuple(tuple(_resized(i, c) for i in clip) for clip, c in zip(clips, cameras, strict=True))
@@ -289,7 +289,7 @@ def _equations_at(clips: _Clips, times: np.ndarray, blur: float, config: TimingC
     """Return the equations of an instant, which each view shows at a time of its own [V]."""
     images, after = clips.at(times), clips.at(times + 1)
     targets = [Target(image, mask) for image, mask in zip(images, clips.masks, strict=True)]
-    gaussians = _fitted(clips, images, targets, config, seed)
+    gaussians = _fitted(clips, images, config, seed)
     pairs = {v: FramePair(after[v], images[v], valid=clips.masks[v]) for v in clips.train}
     views = [ActiveView(camera) for camera in clips.cameras]
     lifted = lift_flow(gaussians, {v: views[v] for v in clips.train}, observe_key_views(pairs))
@@ -297,20 +297,19 @@ def _equations_at(clips: _Clips, times: np.ndarray, blur: float, config: TimingC
     return offset_equations(replace(gaussians, motion=lifted.displacement), views, targets, train, blur)
 
 
-def _fitted(
-    clips: _Clips, images: Sequence[np.ndarray], targets: Sequence[Target], config: TimingConfig, seed: int
-) -> Gaussians:
+def _fitted(clips: _Clips, images: Sequence[np.ndarray], config: TimingConfig, seed: int) -> Gaussians:
     """Return Gaussians that are fitted to the images of the training views at one instant."""
-    rng, count = rng_of(seed, Stream.TIMING), config.num_gaussians
-    cameras, masks = [clips.cameras[v] for v in clips.train], [clips.masks[v] for v in clips.train]
-    own, shown = [images[v] for v in clips.train], [targets[v] for v in clips.train]
-    if len(clips.points):
-        points, colors = fill_points(clips.points, clips.point_colors, cameras, own, masks, count, rng)
-    else:
-        points, colors = seed_points(cameras, own, masks, count, rng)
-    start = from_points(*resample_points(points, colors, count, rng), 0)
-    fit = FitConfig(sh_degree=0, num_gaussians=count, first_frame_steps=config.steps, dropping=0.0)
-    return fit_first_frame(start, cameras, shown, scene_extent(cameras), fit, RenderConfig(), rng).gaussians
+    fit = FitConfig(
+        sh_degree=0,
+        num_gaussians=config.num_gaussians,
+        first_frame_steps=config.steps,
+        dropping=0.0,
+        density=DensityConfig(rounds=0),
+    )
+    views = [View(clips.cameras[v], images[v], clips.masks[v]) for v in clips.train]
+    rng, points = rng_of(seed, Stream.TIMING), (clips.points, clips.point_colors)
+    problem = FirstFrameProblem.of(views, points, fit, RenderConfig(), rng)
+    return fit_first_frame(problem, fit, rng).gaussians
 
 
 def _relative(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from datetime import timedelta
 from typing import Any
@@ -16,11 +16,12 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from rich.table import Table
 from rich.text import Text
 
+from morgs_mi.core.progress import Report
+
 __all__ = [
     "ERR",
     "OUT",
     "LogHandler",
-    "Report",
     "naming_output",
     "print_result",
     "print_table",
@@ -56,7 +57,7 @@ class _Console(Console):
 
 OUT = _Console(soft_wrap=True)
 ERR = _Console(stderr=True, soft_wrap=True)
-Report = Callable[[str, float, float], None]
+
 # Errors that the user can correct; any other is a fault of the package, or of a library.
 _EXPECTED = (ValueError, OSError, MemoryError, ArithmeticError)
 _PERIOD = 30.0  # seconds between two lines of progress without a terminal
@@ -167,8 +168,9 @@ def progress() -> Iterator[Report]:
     with Progress(*columns, console=ERR) as bars:
 
         def report(stage: str, done: float, total: float) -> None:
-            if stage not in tasks:
+            if stage not in tasks:  # what was done before is not part of its pace
                 tasks[stage] = bars.add_task(stage, count=0)
+                bars.tasks[-1].completed = done
             bars.update(tasks[stage], completed=done, total=total, count=int(done))
 
         yield report
@@ -176,17 +178,18 @@ def progress() -> Iterator[Report]:
 
 def _line_report() -> Report:
     """Return a function that prints the progress of a stage if no line was printed for 30 s."""
-    begin: dict[str, float] = {}
+    begin: dict[str, tuple[float, float]] = {}
     last = time.monotonic()
 
     def report(stage: str, done: float, total: float) -> None:
         nonlocal last
         now = time.monotonic()
-        begin.setdefault(stage, now)
+        begin.setdefault(stage, (now, done))
         if now - last < _PERIOD:
             return
-        last, seconds = now, now - begin[stage]
-        left = f", about {_clock(seconds * (total - done) / done)} left" if done > 0 else ""
+        start, before = begin[stage]
+        last, seconds = now, now - start
+        left = f", about {_clock(seconds * (total - done) / (done - before))} left" if done > before else ""
         print_warning(f"{stage}: {int(done)}/{total:.0f}, {_clock(seconds)} elapsed{left}.")
 
     return report

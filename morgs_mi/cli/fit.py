@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -68,14 +69,9 @@ class Fit:
         if any(option is not None for option in (self.segments, self.scheduler)):
             self._fit_in_segments(capture, config)
             return
-        count, stream, started = capture.num_frames, self.out / "stream.morgs", []
-        with progress() as report, _noting_frames(stream, count, started):
-
-            def on_step(frame: int, step: int, steps: int) -> None:
-                started.append(frame)
-                report("Fitting frames", frame + step / steps, count)
-
-            reports = stream_capture(capture, self.out, config, on_step, self.resume, report)
+        stream = self.out / "stream.morgs"
+        with progress() as report, _noting_frames(stream, capture.num_frames, self.resume):
+            reports = stream_capture(capture, self.out, config, self.resume, report)
         _print_summary(stream, reports)
 
     def _fit_in_segments(self, capture: Capture, config: StreamConfig) -> None:
@@ -123,16 +119,17 @@ def first_frame_sentences(validation: Mapping[str, Any]) -> Iterator[str]:
 
 
 @contextmanager
-def _noting_frames(stream: Path, count: int, started: list[int]) -> Iterator[None]:
-    """Add to an interruption or a failed write which frames the stream holds, if the fit has `started` to write it."""
+def _noting_frames(stream: Path, count: int, resume: bool) -> Iterator[None]:
+    """Add the frames that the stream holds to an interruption or a failed write, unless it is an earlier fit's."""
     from morgs_mi.codec.reader import StreamReader
 
+    begin = time.time()
     try:
         yield
     except (KeyboardInterrupt, OSError) as error:
         with suppress(OSError, ValueError):
-            if started and (index := StreamReader(stream).index()):
-                error.add_note(f"{stream} holds frames 0 to {index[-1][1]} of {count}; continue with `--resume`.")
-            elif started:
-                error.add_note(f"{stream} holds no frame yet.")
+            if resume or stream.stat().st_mtime >= begin:
+                index = StreamReader(stream).index()
+                held = f"frames 0 to {index[-1][1]} of {count}; continue with `--resume`" if index else "no frame yet"
+                error.add_note(f"{stream} holds {held}.")
         raise

@@ -18,7 +18,7 @@ flicker. With the share s of the next segment, which grows from 0 to 1 with a sl
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
 
@@ -32,6 +32,7 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.progress import Report
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.evaluate.results import VariationScores
 from morgs_mi.evaluate.temporal import StillVariation, recorded_change
@@ -117,7 +118,7 @@ def fit_seam_frame(
     frame: int,
     images: Images,
     config: SeamConfig,
-    on_step: Callable[[int, int], None] | None = None,
+    progress: Report | None = None,
 ) -> tuple[CodedFrame, FrameReport]:
     """Fit a frame far from the common model, and return its state and its report.
 
@@ -128,7 +129,7 @@ def fit_seam_frame(
         frame: index of the frame.
         images: its images, by view index.
         config: settings.
-        on_step: called with (steps done, steps) of each pass.
+        progress: called with (stage, steps done, steps) of each pass.
     """
     # Motion over many frames is no speed.
     setup = replace(setup, cameras=tuple(camera.without_delays() for camera in setup.cameras))
@@ -136,7 +137,7 @@ def fit_seam_frame(
     for number in range(config.passes):
         repeated = replace(setup, config=config.fit_config(setup.config, number))
         state = StreamState(frame, replace(coded, frame=frame - 1), Seen(last, earlier))
-        state, _, report = step(repeated, state, [images.get(view) for view in range(len(setup.cameras))], on_step)
+        state, _, report = step(repeated, state, [images.get(view) for view in range(len(setup.cameras))], progress)
         assert state.coded is not None
         coded, last, seconds = state.coded, images, seconds + report.seconds
     return coded, replace(report, seconds=seconds)

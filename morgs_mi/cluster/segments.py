@@ -39,6 +39,7 @@ from morgs_mi.codec.packets import decode, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import atomic_path, locked_folder, write_json
+from morgs_mi.core.progress import Progress, Report
 from morgs_mi.recorder import (
     FILES,
     about_cameras,
@@ -80,7 +81,6 @@ class SegmentedFit:
 
 Entry = tuple[int, int, int]
 """(kind, frame, offset) of a packet."""
-OnStage = Callable[[str, float, float], None]
 OnPart = Callable[[Part], None]
 
 
@@ -92,7 +92,7 @@ def stream_segments(
     segments: int = 1,
     seams: SeamConfig | None = None,
     resume: bool = False,
-    on_stage: OnStage | None = None,
+    on_stage: Report | None = None,
 ) -> SegmentedFit:
     """Fit a capture in segments, side by side, into the files that `stream_capture` writes.
 
@@ -143,7 +143,7 @@ async def fit_in_segments(
     segments: int = 1,
     seams: SeamConfig | None = None,
     resume: bool = False,
-    on_stage: OnStage | None = None,
+    on_stage: Report | None = None,
     on_part: OnPart | None = None,
 ) -> SegmentedFit:
     """Fit a capture in segments as `stream_segments`; `on_part` is called with the result of every task."""
@@ -183,7 +183,7 @@ class _Run:
         config: StreamConfig,
         seams: SeamConfig,
         starts: Sequence[int],
-        on_stage: OnStage,
+        on_stage: Report,
         on_part: OnPart | None,
     ) -> None:
         self.capture, self.out, self.workers, self.seams = capture, out, workers, seams
@@ -217,8 +217,9 @@ class _Run:
         self.segments = [_Segment(self, k) for k in range(len(self.starts) - 1)]
         points = None
         if not self.segments[0].num_fitted:
+            progress = Progress(self.on_stage)
             capture, self.refinement = with_refined_cameras(
-                with_points(self.capture, self.task.config.seed, self.on_stage), self.task.config, self.on_stage
+                with_points(self.capture, self.task.config.seed, progress), self.task.config, progress
             )
             points = None if capture is self.capture else (capture.points, capture.point_colors)
             self._use(capture)

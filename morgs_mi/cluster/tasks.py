@@ -288,7 +288,7 @@ def _logged(messages: list[str]) -> Iterator[None]:
         log.removeHandler(handler)
 
 
-def _check_memory(step: int, steps: int) -> None:
+def _check_memory(stage: str, done: float, total: float) -> None:
     """Raise an error if this process has more memory than its share; called after every step.
 
     Raises:

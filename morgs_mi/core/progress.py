@@ -1,18 +1,49 @@
-"""Progress bars of long calls, in notebooks and on terminals."""
+"""Progress of long calls, and bars that show it in notebooks and on terminals."""
 
 from __future__ import annotations
 
 import html
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from datetime import timedelta
 from typing import Any
 
-__all__ = ["ProgressBar"]
+__all__ = ["Progress", "ProgressBar", "Report"]
+
+Report = Callable[[str, float, float], None]
+"""Function that is called with (stage, done, total)."""
 
 _PERIOD = 0.2  # seconds between two updates
 _WIDTH = 30
 _HTML = '<div>{title} <progress value="{done}" max="{total}" style="width:20em"></progress> {text}</div>'
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Progress of a stage of a long call; to be called with (done, total).
+
+    Attributes:
+        report: function that is called with (stage, done, total); None: nothing is reported.
+        stage: name of the stage.
+    """
+
+    report: Report | None = None
+    stage: str = ""
+
+    def __call__(self, done: float, total: float) -> None:
+        """Report that `done` of `total` is done."""
+        if self.report is not None:
+            self.report(self.stage, done, total)
+
+    def of(self, stage: str) -> Progress:
+        """Return the progress of another stage."""
+        return replace(self, stage=stage)
+
+    def part(self, done: float, total: float) -> Progress:
+        """Return the progress of one of `total` equal parts of this stage, after `done` others."""
+        return Progress(lambda _, inner, inner_total: self(done + inner / inner_total, total))
 
 
 class ProgressBar:
@@ -26,11 +57,11 @@ class ProgressBar:
 
     Example:
         >>> evaluate_stream("out/fit", progress=ProgressBar("Evaluating"))
-        >>> stream_capture(capture, "out/fit", on_step=ProgressBar("Fitting", capture.num_frames).on_step)
+        >>> stream_capture(capture, "out/fit", progress=ProgressBar("Fitting").report)
     """
 
     def __init__(self, title: str, total: float | None = None) -> None:
-        self._title, self._total = title, total
+        self._title, self._total, self._stage = title, total, ""
         self._begin, self._shown = time.monotonic(), -_PERIOD
         self._output: Any = None
         self._is_notebook = _is_notebook()
@@ -47,18 +78,24 @@ class ProgressBar:
         elif sys.stderr.isatty():
             filled = round(_WIDTH * done / total) if total else 0
             end = "\n" if done == total else ""
-            sys.stderr.write(f"\r{self._title} {'━' * filled:{_WIDTH}} {text}{end}")
+            sys.stderr.write(f"\r{self._name} {'━' * filled:{_WIDTH}} {text}{end}")
             sys.stderr.flush()
 
-    def on_step(self, frame: int, step: int, steps: int) -> None:
-        """Show that a fit has done a step of a frame; to be passed to `stream_capture`."""
-        self(frame + step / steps)
+    def report(self, stage: str, done: float, total: float) -> None:
+        """Show that `done` of `total` is done in a stage; for calls that report stages."""
+        if stage != self._stage:
+            self._begin, self._shown, self._stage = time.monotonic(), -_PERIOD, stage
+        self(done, total)
+
+    @property
+    def _name(self) -> str:
+        return f"{self._title}: {self._stage}" if self._stage else self._title
 
     def _show_html(self, done: float, total: float | None, text: str) -> None:
         from IPython.display import HTML, display  # type: ignore[import-not-found]
 
         value = done if total else 0
-        content = HTML(_HTML.format(title=html.escape(self._title), done=value, total=total or 1, text=text))
+        content = HTML(_HTML.format(title=html.escape(self._name), done=value, total=total or 1, text=text))
         if self._output is None:
             self._output = display(content, display_id=True)
         elif self._output is not None:

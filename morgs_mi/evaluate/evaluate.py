@@ -38,10 +38,9 @@ from morgs_mi.evaluate.results import (
 from morgs_mi.evaluate.temporal import StillVariation, recorded_change, slope
 from morgs_mi.evaluate.tracking import evaluate_tracks
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.cross_validation import mean_psnr
 from morgs_mi.fit.forecast import forecast
 from morgs_mi.fit.initialise import scene_extent
-from morgs_mi.fit.view import View
+from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.io.bounded import read_json
 from morgs_mi.method.exposure import follow_exposure
 from morgs_mi.playback.player import (

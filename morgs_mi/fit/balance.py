@@ -7,22 +7,24 @@ is compared by pixels that no fit has seen: blocks that are withheld from every 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.progress import Progress
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.cross_validation import mean_psnr, rendered, shifted, withheld_blocks
 from morgs_mi.fit.first_frame import fit_first_frame
-from morgs_mi.fit.view import View
-from morgs_mi.losses.ssim import Target
+from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.view import View, mean_psnr, rendered, withheld_blocks
 from morgs_mi.method.exposure import Exposure, centred, fit_exposure
-from morgs_mi.render.config import RenderConfig
 
 __all__ = ["Balance", "balance_cameras", "balance_config"]
+
+# Fits that are compared: to the images as recorded and to the balanced ones.
+_COMPARED = 2
 
 
 @dataclass(frozen=True)
@@ -34,14 +36,12 @@ class Balance:
         taken: whether they are used.
         recorded_psnr: of withheld pixels in a fit to the images as recorded, dB; NaN where they were not compared.
         balanced_psnr: of the same pixels in a fit to the balanced images, dB; likewise.
-        steps: optimisation steps.
     """
 
     exposures: tuple[Exposure, ...]
     taken: bool
-    recorded_psnr: float
-    balanced_psnr: float
-    steps: int
+    recorded_psnr: float = float("nan")
+    balanced_psnr: float = float("nan")
 
     @property
     def sentence(self) -> str:
@@ -69,38 +69,31 @@ def balance_config(config: FitConfig) -> FitConfig:
 
 
 def balance_cameras(
-    start: Gaussians,
-    views: Sequence[View],
-    extent: float,
-    config: FitConfig,
-    render: RenderConfig,
-    seed: int,
-    on_step: Callable[[int], None] | None = None,
+    problem: FirstFrameProblem, config: FitConfig, seed: int, progress: Progress | None = None
 ) -> Balance:
     """Return the exposures with which the cameras agree, and whether withheld pixels show that they are better.
 
     Args:
-        start: Gaussians that a fit starts from, as for `balance_config`.
-        views: V views.
-        extent: of the scene in world units.
+        problem: what is fitted, with a start as for `balance_config`.
         config: of the fit; `exposure` "on" takes the exposures in any case.
-        render: cut-offs.
         seed: of all random choices.
-        on_step: called with the number of steps done, in all fits.
+        progress: of the fits, in one stage.
     """
     how, short = config.exposures, balance_config(config)
-    kept, unseen = withheld_blocks(views, how.width, seed)
-    exposures, gaussians, done = {v: Exposure() for v in range(len(views))}, start, 0
+    progress, render, done = (progress or Progress()).of("Balancing cameras"), problem.render, 0
+    kept, unseen = withheld_blocks(problem.views, how.width, rng_of(seed, Stream.WITHHELD_BLOCKS))
+    as_recorded = {v: Exposure() for v in range(len(kept))}
 
-    def fit(gaussians: Gaussians, exposures: Mapping[int, Exposure], steps: int) -> Gaussians:
+    def fit(start: Gaussians, exposures: Mapping[int, Exposure], steps: int) -> Gaussians:
         nonlocal done
-        targets = [Target(exposures[v].corrected(image), mask) for v, (_, image, mask) in enumerate(kept)]
-        tick = None if on_step is None else shifted(on_step, done)
-        settings, rng = replace(short, first_frame_steps=steps), rng_of(seed, Stream.BALANCE)
-        reduced = [view.camera for view in kept]
-        done += steps
-        return fit_first_frame(gaussians, reduced, targets, extent, settings, render, rng, tick).gaussians
+        corrected = [view._replace(image=exposures[v].corrected(view.image)) for v, view in enumerate(kept)]
+        posed = replace(problem, start=start, views=tuple(corrected))
+        fitted = fit_first_frame(posed, replace(short, first_frame_steps=steps), rng_of(seed, Stream.BALANCE))
+        done += 1
+        progress(done, how.rounds + _COMPARED)
+        return fitted.gaussians
 
+    exposures, gaussians = as_recorded, problem.start
     for k in range(how.rounds):
         gaussians = fit(gaussians, exposures, how.steps // 2 if k else how.steps)
         exposures = centred(
@@ -111,15 +104,15 @@ def balance_cameras(
         )
     differ = max(exposure.change for exposure in exposures.values()) >= how.least_difference
     if config.exposure == "on" or not differ:
-        return Balance(tuple(exposures.values()), config.exposure == "on", float("nan"), float("nan"), done)
+        return Balance(tuple(exposures.values()), config.exposure == "on")
     scores = []
-    for candidate in ({v: Exposure() for v in exposures}, exposures):
-        fitted = fit(start, candidate, how.steps)
-        judged = [
+    for candidate in (as_recorded, exposures):
+        fitted = fit(problem.start, candidate, how.steps)
+        compared = [
             View(camera, candidate[v].corrected(image), mask)
             for v, (camera, image, mask) in enumerate(unseen)
             if mask is not None and mask.any()
         ]
-        scores.append(mean_psnr(fitted, judged, render))
+        scores.append(mean_psnr(fitted, compared, render))
     taken = scores[1] >= scores[0] + how.least_gain
-    return Balance(tuple(exposures.values()), taken, scores[0], scores[1], done)
+    return Balance(tuple(exposures.values()), taken, scores[0], scores[1])

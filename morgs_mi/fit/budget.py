@@ -3,19 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 
-from morgs_mi.core.camera import Camera
-from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.random_streams import Stream, rng_of
-from morgs_mi.fit.agreement import NUM_FITS
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_first_frame
-from morgs_mi.losses.ssim import Target
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.fit.problem import FirstFrameProblem
 
-__all__ = ["planned_trials", "steps_within"]
+__all__ = ["steps_within"]
 
 # Steps that are timed, and the least number that a first frame gets.
 _TIMED, _LEAST = 20, 100
@@ -23,16 +18,7 @@ _TIMED, _LEAST = 20, 100
 _GROWTH = 1.5
 
 
-def steps_within(
-    seconds: float,
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    targets: Sequence[Target],
-    extent: float,
-    config: FitConfig,
-    render: RenderConfig,
-    seed: int,
-) -> int:
+def steps_within(seconds: float, problem: FirstFrameProblem, config: FitConfig, trials: int, seed: int) -> int:
     """Return the number of steps of the first frame, at least 100, that this machine makes in a time.
 
     The time of the measurement and of the trials is part of it. The same number as `first_frame_steps` gives the
@@ -40,12 +26,9 @@ def steps_within(
 
     Args:
         seconds: the time.
-        gaussians: the start.
-        cameras: V views.
-        targets: their images.
-        extent: of the scene in world units.
+        problem: what is fitted.
         config: settings of the fit.
-        render: cut-offs.
+        trials: number of trials before the first frame, at most.
         seed: of the steps that are timed.
     """
     begin = time.perf_counter()
@@ -55,15 +38,7 @@ def steps_within(
     took = 0.0
     for _ in range(2):  # the first time, kernels are compiled
         start = time.perf_counter()
-        fit_first_frame(gaussians, cameras, targets, extent, timed, render, rng_of(seed, Stream.BUDGET))
+        fit_first_frame(problem, timed, rng_of(seed, Stream.BUDGET))
         took = time.perf_counter() - start
-    per_step = _GROWTH * took / _TIMED * (1 + planned_trials(config, len(cameras)) * config.cross_validation.steps)
+    per_step = _GROWTH * took / _TIMED * (1 + trials * config.cross_validation.steps)
     return max(_LEAST, int((seconds - (time.perf_counter() - begin)) / per_step))
-
-
-def planned_trials(config: FitConfig, views: int) -> int:
-    """Return the number of trials before the first frame of some views, at most."""
-    if config.dropping is not None or views < 2:
-        return 0
-    how = config.cross_validation
-    return len(how.candidates) if views >= how.min_views else NUM_FITS

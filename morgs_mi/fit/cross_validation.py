@@ -1,53 +1,32 @@
-"""Cross-validation of the first frame: how well views between the cameras will look, and which prior helps them.
+"""Cross-validation of the first frame: the quality of views between the cameras, and the dropping that improves it.
 
-Some training views are withheld, and a short fit to the others is judged by the PSNR of the withheld ones. It chooses
-the probability of dropping (see `dropping`): where images are noisy or few, dropping helps; where they are many and
-clean, it only costs. Candidates are tried in rising order until one is no better than the last. Of few views none can
-be spared: there the noise of the images decides.
+Some training views are withheld, and a short fit to the others is evaluated by their PSNR. Among six views and more it
+chooses the probability of dropping (see `dropping`): where images are noisy or few, dropping helps; where they are many
+and clean, it only costs. Candidates are tried in rising order until one is no better than the last. Of fewer views, the
+noise of the images chooses it, as a rig that lacks one of them is too different.
 
-The error that a withheld view has more than the others grows with its angle to them. Views halfway between neighbouring
-cameras are nearer, and have as much less of it (see `docs/experiments/first-frame.md`).
+A withheld view has more error than the others. This excess grows with its angle to them, until the view shows nothing
+that they show. Views halfway between neighbouring cameras are nearer, and have less of it (see `excess_share`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.progress import Progress
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.dropping import dropping_by_noise
 from morgs_mi.fit.first_frame import fit_first_frame
-from morgs_mi.fit.forecast import POOR_LOSS, angles_to, forecast, scene_depths
-from morgs_mi.fit.view import View
-from morgs_mi.render.config import RenderConfig
-from morgs_mi.render.rasterize import rasterize
+from morgs_mi.fit.forecast import angles_to, forecast, scene_depths, verdict
+from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.view import decibels
 
-__all__ = [
-    "CrossValidation",
-    "Trial",
-    "cross_validate",
-    "decibels",
-    "mean_psnr",
-    "reduced",
-    "rendered",
-    "shifted",
-    "squared_errors",
-    "trial_steps",
-    "verdict",
-    "withheld_blocks",
-    "withheld_views",
-]
-
-_MIN_SIDE = 32  # px
-# Withheld blocks: side in px, and one of how many.
-_BLOCK, _SHARE = 12, 8
-POOR_PSNR = 22.0
-"""PSNR in dB below which views between the cameras look poor."""
+__all__ = ["CrossValidation", "Trial", "candidates_of", "cross_validate", "trial_steps", "withheld_views"]
 
 
 @dataclass(frozen=True)
@@ -67,7 +46,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class CrossValidation:
-    """What cross-validation found.
+    """Result of cross-validation.
 
     Attributes:
         withheld: names of the withheld views.
@@ -92,88 +71,72 @@ class CrossValidation:
     def expected_psnr(self) -> float:
         """Estimate of the mean PSNR of views halfway between neighbouring cameras, dB.
 
-        What the withheld views have more error than the others in the trial, in proportion to the angles, and the error
-        of the first frame in its training views, which has more steps than the trial.
+        The error of the first frame in its training views, which has more steps than the trial, and the share of the
+        withheld views' excess that views halfway between cameras have.
         """
         best = self.best
         training_psnr = best.training_psnr if self.training_psnr is None else self.training_psnr
         withheld, trained, own = (
             10 ** (-psnr / 10) for psnr in (best.withheld_psnr, best.training_psnr, training_psnr)
         )
-        nearer = min(0.5 * self.spacing, self.withheld_angle) / max(self.withheld_angle, 1e-6)
-        return float(decibels(np.array(nearer * max(withheld - trained, 0.0) + own)))
+        share = excess_share(0.5 * self.spacing, self.withheld_angle)
+        return float(decibels(np.array(share * max(withheld - trained, 0.0) + own)))
 
     @property
     def sentence(self) -> str:
         """What to expect of views between the cameras."""
-        gap = (self.training_psnr or self.best.training_psnr) - self.expected_psnr
-        estimate = f"about {self.expected_psnr:.0f} dB, estimated from {', '.join(self.withheld)} in a trial without it"
-        if len(self.withheld) > 1:
-            estimate = estimate.removesuffix("it") + "them"
-        return verdict(self.expected_psnr, gap, estimate, self.spacing)
+        training_psnr = self.training_psnr or self.best.training_psnr
+        them = "them" if len(self.withheld) > 1 else "it"
+        source = f"estimated from {', '.join(self.withheld)} in a trial without {them}"
+        return verdict(self.expected_psnr, training_psnr, self.spacing, source)
+
+
+def excess_share(angle: float, withheld_angle: float) -> float:
+    """Return the excess of error at an angle to the nearest training view, relative to that at another angle.
+
+    Args:
+        angle: in degrees, at most `withheld_angle` counts.
+        withheld_angle: in degrees.
+    """
+    return min(angle, withheld_angle) / max(withheld_angle, 1e-6)
 
 
 def cross_validate(
-    start: Gaussians,
-    views: Sequence[View],
-    extent: float,
-    config: FitConfig,
-    render: RenderConfig,
-    seed: int,
-    on_step: Callable[[int], None] | None = None,
+    problem: FirstFrameProblem, config: FitConfig, seed: int, progress: Progress | None = None
 ) -> CrossValidation:
-    """Return what cross-validation of the first frame finds.
+    """Return the result of cross-validation of the first frame.
 
     Args:
-        start: Gaussians that each fit starts from.
-        views: the V training views, at least two.
-        extent: of the scene in world units.
+        problem: at least three views.
         config: settings of the fit.
-        render: cut-offs.
         seed: of every fit.
-        on_step: called with the number of steps done, in all fits.
+        progress: of the trials, a stage each.
     """
-    how = config.cross_validation
-    cameras = [camera for camera, *_ in views]
-    withheld, steps = withheld_views(cameras, how.share), trial_steps(config)
-    small = [reduced(*view, how.width) for view in views]
-    kept = [index for index in range(len(small)) if index not in withheld]
-    trained, judged = [small[index] for index in kept], [small[index] for index in withheld]
-    rig, targets = [view.camera for view in trained], [view.target for view in trained]
-    trials: list[Trial] = []
-    for dropping in how.candidates:
-        trial, rng = replace(config, dropping=dropping, first_frame_steps=steps), rng_of(seed, Stream.TRIALS)
-        tick = None if on_step is None else shifted(on_step, len(trials) * steps)
-        fitted = fit_first_frame(start, rig, targets, extent, trial, render, rng, tick).gaussians
-        trials.append(Trial(dropping, mean_psnr(fitted, judged, render), mean_psnr(fitted, trained, render)))
+    progress = progress or Progress()
+    how, cameras = config.cross_validation, problem.cameras
+    withheld = withheld_views(cameras, how.share)
+    kept = [view for view in range(len(cameras)) if view not in withheld]
+    small = problem.reduced(how.width)
+    trained, unseen = small.only(kept), small.only(withheld)
+    candidates, trials = candidates_of(problem, config), []
+    for number, dropping in enumerate(candidates, 1):
+        trial = replace(config, dropping=dropping, first_frame_steps=trial_steps(config))
+        stage = progress.of(f"Trial {number} of {len(candidates)}" if len(candidates) > 1 else "Trial")
+        fitted = fit_first_frame(trained, trial, rng_of(seed, Stream.TRIALS), stage).gaussians
+        trials.append(Trial(dropping, unseen.psnr(fitted), trained.psnr(fitted)))
         if len(trials) > 1 and trials[-1].withheld_psnr <= trials[-2].withheld_psnr:
             break
-    names, points = tuple(cameras[v].name for v in withheld), np.asarray(start.means)
-    depths, others = scene_depths(cameras, points), [cameras[v] for v in kept]
-    angle = float(np.mean([angles_to(cameras[v], depths[v], others).min() for v in withheld]))
+    points = np.asarray(problem.start.means)
+    depths, others = scene_depths(cameras, points), [cameras[view] for view in kept]
+    angle = float(np.mean([angles_to(cameras[view], depths[view], others).min() for view in withheld]))
+    names = tuple(cameras[view].name for view in withheld)
     return CrossValidation(names, forecast(cameras, points).spacing, angle, tuple(trials))
 
 
-def verdict(expected_psnr: float, loss: float, estimate: str, spacing: float) -> str:
-    """Return the sentence on views between the cameras.
-
-    Args:
-        expected_psnr: of these views, dB.
-        loss: what they have less than the training views, dB.
-        estimate: their PSNR and how it was estimated, in words.
-        spacing: mean angle from a camera to its nearest one, degrees.
-    """
-    if expected_psnr >= POOR_PSNR and loss <= POOR_LOSS:
-        return f"Views between the cameras will have {estimate}."
-    return (
-        f"Views between the cameras will be poor: {estimate}, {loss:.0f} dB below the other views; the cameras are "
-        f"{spacing:.0f} degrees apart."
-    )
-
-
-def shifted(on_step: Callable[[int], None], done: int) -> Callable[[int, int], None]:
-    """Return what a fit calls with (steps, steps in all), after `done` steps of other fits."""
-    return lambda step, _: on_step(done + step)
+def candidates_of(problem: FirstFrameProblem, config: FitConfig) -> tuple[float, ...]:
+    """Return the probabilities of dropping that are tried."""
+    how = config.cross_validation
+    return how.candidates if len(problem.views) >= how.min_views else (dropping_by_noise(problem.images),)
 
 
 def trial_steps(config: FitConfig) -> int:
@@ -194,59 +157,3 @@ def withheld_views(cameras: Sequence[Camera], share: int) -> tuple[int, ...]:
         distance = np.linalg.norm(positions[inner][:, None] - positions[chosen], axis=-1).min(axis=1)
         chosen.append(int(inner[np.argmax(distance)]))
     return tuple(sorted(chosen))
-
-
-def reduced(camera: Camera, image: np.ndarray, mask: np.ndarray | None, width: int) -> View:
-    """Return a view reduced by the largest whole factor that leaves a width.
-
-    A pixel is valid if all that it covers is.
-    """
-    factor = camera.width // width
-    if factor < 2 or camera.height // factor < _MIN_SIDE:
-        return View(camera, image, mask)
-    size = (camera.width // factor, camera.height // factor)
-    smaller = np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
-    valid = None if mask is None else cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
-    return View(camera.resized(*size), smaller, valid)
-
-
-def withheld_blocks(views: Sequence[View], width: int, seed: int) -> tuple[list[View], list[View]]:
-    """Return the reduced views without withheld blocks of pixels, and with these alone, which may be none in a view.
-
-    Args:
-        views: V views.
-        width: least width of the reduced images, px.
-        seed: of the choice of the blocks.
-    """
-    rng, kept, unseen = rng_of(seed, Stream.WITHHELD_BLOCKS), [], []
-    for camera, image, mask in (reduced(*view, width) for view in views):
-        rows, columns = (np.arange(size) // _BLOCK for size in image.shape[:2])
-        withheld = (rng.random((rows[-1] + 1, columns[-1] + 1)) < 1 / _SHARE)[rows][:, columns]
-        valid = np.ones_like(withheld) if mask is None else mask
-        kept.append(View(camera, image, valid & ~withheld))
-        unseen.append(View(camera, image, valid & withheld))
-    return kept, unseen
-
-
-def squared_errors(gaussians: Gaussians, views: Sequence[View], render: RenderConfig) -> np.ndarray:
-    """Return the mean square error of each view [V], of its valid pixels."""
-    errors = []
-    for camera, image, mask in views:
-        squares = ((rendered(gaussians, camera, render) - image / 255.0) ** 2).mean(axis=-1)
-        errors.append(squares[slice(None) if mask is None else mask].mean())
-    return np.array(errors)
-
-
-def rendered(gaussians: Gaussians, camera: Camera, render: RenderConfig) -> np.ndarray:
-    """Return the image of a view [H, W, 3] in [0, 1]."""
-    return np.clip(np.asarray(rasterize(gaussians, camera, ("color",), config=render).color), 0, 1)
-
-
-def decibels(squares: np.ndarray) -> np.ndarray:
-    """Return the PSNR of mean square errors, dB."""
-    return -10 * np.log10(np.maximum(squares, 1e-10))
-
-
-def mean_psnr(gaussians: Gaussians, views: Sequence[View], render: RenderConfig) -> float:
-    """Return the mean PSNR of some views in dB, of their valid pixels."""
-    return float(decibels(squared_errors(gaussians, views, render)).mean())

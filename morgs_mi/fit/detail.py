@@ -8,40 +8,36 @@ views see is counted once: the details of all views are divided by the mean numb
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
-from morgs_mi.core.camera import Camera
-from morgs_mi.fit.config import DetailConfig
+from morgs_mi.fit.config import DetailConfig, FitConfig
 from morgs_mi.fit.forecast import mean_views
 from morgs_mi.fit.noise import noise_of
+from morgs_mi.fit.view import View
 
-__all__ = ["count_details", "gaussians_for"]
+__all__ = ["count_details", "with_num_gaussians"]
 
 # A value of a block follows from its mean and the other three.
 _INDEPENDENT = 3 / 4
 
 
-def gaussians_for(
-    cameras: Sequence[Camera],
-    images: Sequence[np.ndarray],
-    masks: Sequence[np.ndarray | None],
-    points: np.ndarray,
-    config: DetailConfig,
-) -> int:
-    """Return the number of Gaussians for a first frame.
+def with_num_gaussians(config: FitConfig, views: Sequence[View], points: np.ndarray) -> FitConfig:
+    """Return the settings of a first frame with a number of Gaussians, which follows from the views if none is given.
 
     Args:
-        cameras: V views.
-        images: their images [H, W, 3], uint8.
-        masks: valid pixels of each [H, W], or None.
+        config: settings of the fit.
+        views: V views.
         points: [P, 3] of the scene, world units, or none.
-        config: threshold and limits.
     """
-    details = sum(count_details(image, mask, config) for image, mask in zip(images, masks, strict=True))
-    wanted = config.per_detail * details / mean_views(cameras, points)
-    return int(np.clip(round(wanted), config.least_gaussians, config.most_gaussians))
+    if config.num_gaussians is not None:
+        return config
+    how = config.detail
+    details = sum(count_details(view.image, view.mask, how) for view in views)
+    wanted = how.per_detail * details / mean_views([view.camera for view in views], points)
+    return replace(config, num_gaussians=int(np.clip(round(wanted), how.least_gaussians, how.most_gaussians)))
 
 
 def count_details(image: np.ndarray, mask: np.ndarray | None, config: DetailConfig) -> float:

@@ -8,9 +8,8 @@ is part of the loss, so that noisy captures end early.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import islice, pairwise
 
 import drjit as dr
@@ -22,14 +21,15 @@ from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
+from morgs_mi.core.progress import Progress
 from morgs_mi.core.types import Tensor
 from morgs_mi.fit.config import ConvergenceConfig, FitConfig
 from morgs_mi.fit.density import plan_growth, resize_optimizer
 from morgs_mi.fit.dropping import dropped
 from morgs_mi.fit.optimise import adam, optimise, replace_parameter, values_of, view_order
+from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.losses.attribution import densification_scores
 from morgs_mi.losses.losses import mask_loss, recon_loss
-from morgs_mi.losses.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
@@ -56,14 +56,7 @@ class FirstFrame:
 
 
 def fit_first_frame(
-    gaussians: Gaussians,
-    cameras: Sequence[Camera],
-    targets: Sequence[Target],
-    extent: float,
-    config: FitConfig,
-    render: RenderConfig,
-    rng: np.random.Generator,
-    on_step: Callable[[int, int], None] | None = None,
+    problem: FirstFrameProblem, config: FitConfig, rng: np.random.Generator, progress: Progress | None = None
 ) -> FirstFrame:
     """Fit Gaussians to the images of one instant by L_recon (eq. 2); the confidence stays unchanged.
 
@@ -72,79 +65,87 @@ def fit_first_frame(
     needed.
 
     Args:
-        gaussians: the start, e.g. from SfM points.
-        cameras: V views.
-        targets: their images.
-        extent: of the scene in world units.
+        problem: views and initial Gaussians.
         config: steps and rates.
-        render: cut-offs.
         rng: draws the views and the means of births.
-        on_step: called with (steps done, steps in all).
+        progress: of the steps.
     """
-    steps, bands = config.planned_steps, range(1, gaussians.sh_degree + 1)
-    band_steps, rounds = [int(b * steps * config.sh_band_fraction + 1e-9) for b in bands], density_rounds(config)
-    rates = config.first_frame_rates.by_parameter(extent)
-    optimizer = adam(_start(gaussians))
-    views = [ActiveView(camera, render) for camera in cameras]
-
-    def losses_at(values: Mapping[str, Tensor], view: int) -> dict[str, Tensor]:
-        image = views[view].render(dropped(gaussians.with_parameters(values), config.dropping or 0.0, rng), ("color",))
-        return {"recon": recon_loss(image.color, targets[view], config.objective.dssim_weight)}
-
-    done, losses = 0, {}
+    fit, steps, done, losses = _Fit(problem, config, rng, progress), config.planned_steps, 0, {}
     while done < steps:
-        order = iter(view_order(len(views), steps - done, rng))
-        stops = {*band_steps, *rounds, 2 * steps // 3, steps}
-        for start, stop in pairwise([done, *sorted(stop for stop in stops if stop > done)]):
-            for _ in range(band_steps.count(start)):
-                _add_band(optimizer, gaussians)
-            if start in rounds:
-                share = len(rounds) - rounds.index(start)
-                gaussians = _grown(gaussians, optimizer, views, targets, share, extent, config, rng)
-            before = losses
-            losses = optimise(
-                optimizer,
-                rates,
-                islice(order, stop - start),
-                losses_at,
-                {},
-                partial(_decay, config.final_rate, steps),
-                None if on_step is None else partial(_with_total, on_step, steps),
-                start,
-                max(_LEAST, _PASSES * len(views)),
-            )
+        order = iter(view_order(len(problem.views), steps - done, rng))
+        for start, stop in fit.stretches(done, steps):
+            fit.prepare(start)
+            before, losses = losses, fit.run(islice(order, stop - start), start, steps)
         done = steps
         if config.first_frame_steps is None and _still_falls(before, losses, config.convergence):
             steps = min(2 * steps, config.convergence.most_steps)
-    return FirstFrame(gaussians.with_parameters(values_of(optimizer)), losses, steps)
+    return FirstFrame(fit.gaussians, losses, steps)
 
 
-def _grown(
-    gaussians: Gaussians,
-    optimizer: Adam,
-    views: Sequence[ActiveView],
-    targets: Sequence[Target],
-    rounds: int,
-    extent: float,
-    config: FitConfig,
-    rng: np.random.Generator,
-) -> Gaussians:
-    """Return the Gaussians after a round of density control, and resize the optimiser; `rounds` are left, with this."""
-    now = gaussians.with_parameters(values_of(optimizer))
-    births = -(-max(config.planned_gaussians - len(now), 0) // rounds)
-    scores = densification_scores(now, views, targets)
-    plan = plan_growth(now, scores, births, config.planned_gaussians, extent, config.density, rng)
-    resize_optimizer(optimizer, plan, plan.edits)
-    return gaussians.select(plan.parent)
+class _Fit:
+    """Optimiser of the first frame, and the events of its schedule: SH bands and rounds of density control."""
 
+    def __init__(
+        self, problem: FirstFrameProblem, config: FitConfig, rng: np.random.Generator, progress: Progress | None
+    ) -> None:
+        self._problem, self._config, self._rng, self._progress = problem, config, rng, progress
+        self._base, self._optimizer = problem.start, adam(_start(problem.start))
+        self._views = [ActiveView(camera, problem.render) for camera in problem.cameras]
+        self._targets = [view.target for view in problem.views]
+        self._rates = config.first_frame_rates.by_parameter(problem.extent)
+        self._bands = [
+            int(band * config.planned_steps * config.sh_band_fraction + 1e-9)
+            for band in range(1, problem.start.sh_degree + 1)
+        ]
+        self._rounds = density_rounds(config)
 
-def _decay(final: float, steps: int, step: int) -> float:
-    """Return the factor on the learning rates at a step of `steps`."""
-    return final ** (step / steps)
+    @property
+    def gaussians(self) -> Gaussians:
+        """The Gaussians with the current parameters."""
+        return self._base.with_parameters(values_of(self._optimizer))
 
+    def stretches(self, done: int, steps: int) -> list[tuple[int, int]]:
+        """Return (first step, end) of the stretches of steps without an event, and of the last third."""
+        stops = {*self._bands, *self._rounds, 2 * steps // 3, steps}
+        return list(pairwise([done, *sorted(stop for stop in stops if stop > done)]))
 
-def _with_total(on_step: Callable[[int, int], None], steps: int, done: int) -> None:
-    on_step(done, steps)
+    def prepare(self, step: int) -> None:
+        """Add the SH bands, and do the round of density control, that are due before a step."""
+        for _ in range(self._bands.count(step)):
+            _add_band(self._optimizer, self._base)
+        if step in self._rounds:
+            self._grow(len(self._rounds) - self._rounds.index(step))
+
+    def run(self, views: Iterable[int], first: int, steps: int) -> dict[str, float]:
+        """Make the steps of some views, from step `first` of `steps`, and return the losses by name."""
+        progress = self._progress
+        return optimise(
+            self._optimizer,
+            self._rates,
+            views,
+            self._losses_at,
+            {},
+            lambda step: self._config.final_rate ** (step / steps),
+            None if progress is None else lambda done: progress(done, steps),
+            first,
+            max(_LEAST, _PASSES * len(self._views)),
+        )
+
+    def _losses_at(self, values: Mapping[str, Tensor], view: int) -> dict[str, Tensor]:
+        drawn = dropped(self._base.with_parameters(values), self._config.dropping or 0.0, self._rng)
+        image = self._views[view].render(drawn, ("color",))
+        return {"recon": recon_loss(image.color, self._targets[view], self._config.objective.dssim_weight)}
+
+    def _grow(self, rounds: int) -> None:
+        """Add and prune Gaussians by density control; `rounds` are left, with this one."""
+        now, config = self.gaussians, self._config
+        births = -(-max(config.planned_gaussians - len(now), 0) // rounds)
+        scores = densification_scores(now, self._views, self._targets)
+        plan = plan_growth(
+            now, scores, births, config.planned_gaussians, self._problem.extent, config.density, self._rng
+        )
+        resize_optimizer(self._optimizer, plan, plan.edits)
+        self._base = self._base.select(plan.parent)
 
 
 def _still_falls(before: Mapping[str, float], losses: Mapping[str, float], config: ConvergenceConfig) -> bool:

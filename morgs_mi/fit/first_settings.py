@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
-
-from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.fit.agreement import NUM_FITS, Agreement, compare_fits
-from morgs_mi.fit.budget import planned_trials, steps_within
+from morgs_mi.core.progress import Progress
+from morgs_mi.fit.budget import steps_within
 from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, trial_steps
+from morgs_mi.fit.cross_validation import CrossValidation, candidates_of, cross_validate
 from morgs_mi.fit.dropping import dropping_by_noise
 from morgs_mi.fit.forecast import Forecast, forecast
 from morgs_mi.fit.noise import is_noisy
-from morgs_mi.fit.view import View
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.fit.problem import FirstFrameProblem
 
 __all__ = ["Expected", "FirstSettings", "first_settings"]
 
-Expected = CrossValidation | Agreement | Forecast
+# Number of views from which one can be withheld.
+_VALIDATED = 3
+
+Expected = CrossValidation | Forecast
 
 
 @dataclass(frozen=True)
@@ -29,59 +27,38 @@ class FirstSettings:
 
     Attributes:
         config: with a number of steps, a strength of dropping, and the weights of the losses.
-        expected: what to expect of views between the cameras; None for a single camera or a single Gaussian.
-        steps_before: number of steps that trials have made.
+        expected: expected quality of views between the cameras; None for a single camera.
     """
 
     config: FitConfig
     expected: Expected | None
-    steps_before: int = 0
 
 
 def first_settings(
-    gaussians: Gaussians,
-    views: Sequence[View],
-    points: np.ndarray,
-    extent: float,
-    config: FitConfig,
-    render: RenderConfig,
-    seed: int,
-    on_step: Callable[[int, int], None] | None = None,
+    problem: FirstFrameProblem, config: FitConfig, seed: int, progress: Progress | None = None
 ) -> FirstSettings:
     """Return the settings of the first frame.
 
-    What to expect of other views follows from cross-validation or, for fewer than `min_views`, from the comparison of
-    two fits; where the strength of dropping is given, from a forecast.
+    The quality of views between the cameras is estimated by cross-validation of three views and more; where the
+    strength of dropping is given, and of two views, it is a forecast.
 
     Args:
-        gaussians: the start.
-        views: V views.
-        points: [P, 3] of the capture, world units.
-        extent: of the scene in world units.
+        problem: what is fitted.
         config: settings of the fit.
-        render: cut-offs.
         seed: of the trials.
-        on_step: called with (steps of the trials done, steps of trials and first frame).
+        progress: of the trials, a stage each.
     """
-    cameras, images = [view.camera for view in views], [view.image for view in views]
-    if config.noise_aware and is_noisy(images):
+    if config.noise_aware and is_noisy(problem.images):
         config = replace(config, objective=replace(config.objective, dssim_weight=0.0))
+    views, is_chosen = len(problem.views), config.dropping is None
+    validated = is_chosen and views >= _VALIDATED
     if config.first_frame_seconds is not None:
-        targets = [view.target for view in views]
-        steps = steps_within(config.first_frame_seconds, gaussians, cameras, targets, extent, config, render, seed)
+        trials = len(candidates_of(problem, config)) if validated else 0
+        steps = steps_within(config.first_frame_seconds, problem, config, trials, seed)
         config = replace(config, first_frame_steps=steps)
-    if config.dropping is not None:
-        return FirstSettings(config, forecast(cameras, points) if len(cameras) > 1 else None)
-    before = trial_steps(config) * planned_trials(config, len(cameras))
-
-    def tick(done: int) -> None:
-        if on_step is not None:
-            on_step(done, before + config.planned_steps)
-
-    if len(cameras) >= config.cross_validation.min_views:
-        found = cross_validate(gaussians, views, extent, config, render, seed, tick)
-        return FirstSettings(replace(config, dropping=found.best.dropping), found, before)
-    config, found = replace(config, dropping=dropping_by_noise(images)), None
-    if len(cameras) > 1 and len(gaussians) >= NUM_FITS:
-        found = compare_fits(gaussians, views, extent, config, render, seed, tick)
-    return FirstSettings(config, found, before)
+    if validated:
+        found = cross_validate(problem, config, seed, progress)
+        return FirstSettings(replace(config, dropping=found.best.dropping), found)
+    if is_chosen:
+        config = replace(config, dropping=dropping_by_noise(problem.images))
+    return FirstSettings(config, forecast(problem.cameras, problem.points) if views > 1 else None)

@@ -4,20 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.fit.initialise import focus_depths, scene_extent, seen_points
 
-__all__ = ["POOR_LOSS", "Forecast", "angles_to", "forecast", "mean_views", "overlaps", "scene_depths"]
+__all__ = ["Forecast", "angles_to", "forecast", "mean_views", "overlaps", "quality_of", "scene_depths", "verdict"]
 
-# dB below the training views above which views between the cameras look poor.
-POOR_LOSS = 8.0
-# Degrees of `Forecast.reach` up to which they are good, and above which they are poor, by the measurements in
-# `docs/experiments/generalise.md`: the loss is less than half of `POOR_LOSS`, or more than that.
-_GOOD, _POOR = 9.5, 18.0
+_WORDS = ("good", "fair", "poor")
+# Limits of good and of fair views between the cameras: loss against the training views in dB, PSNR in dB, and the angle
+# in degrees, of `Forecast.reach`, at which the loss is about as large (`docs/experiments/generalise.md`).
+_LOSSES, _LEAST_PSNR, _ANGLES = (4.0, 8.0), (22.0, 16.0), (9.5, 18.0)
 # Angle that stands for a point that no other camera sees, degrees.
 _UNSEEN = 90.0
 # Rows and columns of the points of each view.
@@ -26,33 +24,68 @@ _GRID = 16
 
 @dataclass(frozen=True)
 class Forecast:
-    """What a rig lets expect of views between its cameras.
+    """Expected quality of views between the cameras of a rig.
 
     Attributes:
         cameras: number of cameras.
         spacing: mean angle from a camera to its nearest one, as seen from what they look at, degrees.
         overlap: mean share of a camera's image that its nearest one sees as well.
         reach: mean angle from a camera to the nearest one that sees the same point, degrees, 90 where there is none.
+        training_psnr: mean PSNR of the first frame in the training views, dB; None: not fitted yet.
     """
 
     cameras: int
     spacing: float
     overlap: float
     reach: float
-    expected_psnr: ClassVar[None] = None
+    training_psnr: float | None = None
+
+    @property
+    def expected_psnr(self) -> None:
+        """PSNR of these views: unknown."""
 
     @property
     def quality(self) -> str:
         """Quality to expect of views between the cameras: good, fair or poor."""
-        return "good" if self.reach <= _GOOD else "fair" if self.reach <= _POOR else "poor"
+        return _WORDS[sum(self.reach > limit for limit in _ANGLES)]
 
     @property
     def sentence(self) -> str:
         """What to expect of views between the cameras."""
+        bound = "" if self.training_psnr is None else f" They have at most {self.training_psnr:.0f} dB."
         return (
             f"Views between the cameras will be {self.quality}: {self.cameras} cameras, {self.spacing:.0f} degrees "
-            f"apart, neighbours share {100 * self.overlap:.0f} % of what they see."
+            f"apart, neighbours share {100 * self.overlap:.0f} % of what they see.{bound}"
         )
+
+
+def verdict(expected_psnr: float, training_psnr: float, spacing: float, source: str) -> str:
+    """Return the sentence on views between the cameras.
+
+    Args:
+        expected_psnr: of these views, dB.
+        training_psnr: of the training views, dB.
+        spacing: mean angle from a camera to its nearest one, degrees.
+        source: how the PSNR was estimated, in words.
+    """
+    loss = max(training_psnr - expected_psnr, 0.0)
+    return (
+        f"Views between the cameras will be {quality_of(expected_psnr, loss, spacing)}: about {expected_psnr:.0f} dB, "
+        f"{source}, {loss:.0f} dB below the training views; the cameras are {spacing:.0f} degrees apart."
+    )
+
+
+def quality_of(psnr: float, loss: float, spacing: float) -> str:
+    """Return the quality of views between the cameras: the worst that their PSNR, their loss and the angle allow.
+
+    Args:
+        psnr: of these views, dB.
+        loss: difference from the training views, dB.
+        spacing: mean angle from a camera to its nearest one, degrees.
+    """
+    by_psnr = sum(psnr < limit for limit in _LEAST_PSNR)
+    by_loss, by_angle = (sum(x > limit for limit in limits) for x, limits in ((loss, _LOSSES), (spacing, _ANGLES)))
+    return _WORDS[max(by_psnr, by_loss, by_angle)]
 
 
 def forecast(cameras: Sequence[Camera], points: np.ndarray) -> Forecast:

@@ -12,18 +12,28 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.fit.view import View
 
 __all__ = [
+    "MIN_POINTS",
+    "Points",
     "fill_points",
     "focus_depths",
     "focus_point",
     "from_points",
+    "initial_points",
     "resample_points",
     "scene_extent",
     "seed_points",
     "seen_points",
 ]
 
+Points = tuple[np.ndarray, np.ndarray]
+"""Points [P, 3] in world units, and their colours [P, 3] in [0, 1], display-referred."""
+MIN_POINTS = 20
+"""Number of points below which Gaussians start from random ones."""
+# Number of points below which random ones are added where views show none.
+_MANY_POINTS = 1000
 # Rows and columns into which a view is divided to find where it shows no points.
 _CELLS = 8
 # Distance of random points from cameras with parallel axes, scene extents.
@@ -78,21 +88,40 @@ def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int, opacity:
     )
 
 
-def resample_points(
-    points: np.ndarray, colors: np.ndarray, count: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def initial_points(views: Sequence[View], points: Points, count: int, rng: np.random.Generator) -> Points:
+    """Return `count` points [count, 3] that Gaussians start from, and their colours [count, 3] in [0, 1].
+
+    Fewer than `MIN_POINTS` given ones are replaced by random points inside the views; where there are few, random ones
+    are added where the views show none.
+
+    Args:
+        views: V views, at least one.
+        points: P points and their colours.
+        count: number of points.
+        rng: draws points.
+    """
+    known = len(points[0])
+    if known < MIN_POINTS:
+        points = seed_points(views, count, rng)
+    elif known < _MANY_POINTS:
+        points = fill_points(points, views, count, rng)
+    return resample_points(points, count, rng)
+
+
+def resample_points(points: Points, count: int, rng: np.random.Generator) -> Points:
     """Return `count` points [count, 3] and colours: a random subset, or with points added between near neighbours."""
-    if len(points) >= count:
-        chosen = np.sort(rng.choice(len(points), count, replace=False))
-        return points[chosen], colors[chosen]
-    if len(points) < 2:
-        return points, colors
-    parent = rng.integers(0, len(points), count - len(points))
-    neighbours = np.asarray(KDTree(points).query(points[parent], k=min(4, len(points)))[1])
+    positions, colors = points
+    if len(positions) >= count:
+        chosen = np.sort(rng.choice(len(positions), count, replace=False))
+        return positions[chosen], colors[chosen]
+    if len(positions) < 2:
+        return points
+    parent = rng.integers(0, len(positions), count - len(positions))
+    neighbours = np.asarray(KDTree(positions).query(positions[parent], k=min(4, len(positions)))[1])
     partner = neighbours[np.arange(len(parent)), rng.integers(1, neighbours.shape[1], len(parent))]
     blend = rng.uniform(0.2, 0.8, (len(parent), 1))
-    added = [(1 - blend) * values[parent] + blend * values[partner] for values in (points, colors)]
-    return np.concatenate([points, added[0]]), np.concatenate([colors, added[1]])
+    added = [(1 - blend) * values[parent] + blend * values[partner] for values in points]
+    return np.concatenate([positions, added[0]]), np.concatenate([colors, added[1]])
 
 
 def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
@@ -116,13 +145,7 @@ def focus_depths(cameras: Sequence[Camera]) -> np.ndarray:
     return np.where(depths > least, depths, np.inf)
 
 
-def seed_points(
-    cameras: Sequence[Camera],
-    images: Sequence[np.ndarray],
-    masks: Sequence[np.ndarray | None],
-    count: int,
-    rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray]:
+def seed_points(views: Sequence[View], count: int, rng: np.random.Generator) -> Points:
     """Return random points [count, 3] inside the views, and their colours [count, 3] in [0, 1].
 
     Each view with valid pixels gets the same number of points: random ones of these pixels at random depths, uniform in
@@ -130,18 +153,17 @@ def seed_points(
     focus point is not in front of the camera, as with parallel axes, the distance is ten scene extents.
 
     Args:
-        cameras: C views.
-        images: per view uint8 [H, W, 3], RGB.
-        masks: per view [H, W] bool of valid pixels, or None.
+        views: V views.
         count: number of points.
         rng: draws pixels and depths.
     """
+    cameras = [view.camera for view in views]
     depths = focus_depths(cameras)
     depths[np.isinf(depths)] = _PARALLEL * scene_extent(cameras)
-    views = [v for v in zip(cameras, images, masks, depths, strict=True) if v[2] is None or v[2].any()]
+    shown = [pair for pair in zip(views, depths, strict=True) if pair[0].mask is None or pair[0].mask.any()]
     points, colors = [np.zeros((0, 3))], [np.zeros((0, 3))]
-    for view, (camera, image, mask, depth) in enumerate(views):
-        n = _share(count, view, len(views))
+    for index, ((camera, image, mask), depth) in enumerate(shown):
+        n = _share(count, index, len(shown))
         distance = max(depth, 10 * camera.near)
         rows, columns = np.nonzero(np.ones(image.shape[:2], bool) if mask is None else mask)
         pixels = rng.integers(0, len(rows), n)
@@ -152,50 +174,39 @@ def seed_points(
     return np.concatenate(points), np.concatenate(colors)
 
 
-def fill_points(
-    points: np.ndarray,
-    colors: np.ndarray,
-    cameras: Sequence[Camera],
-    images: Sequence[np.ndarray],
-    masks: Sequence[np.ndarray | None],
-    count: int,
-    rng: np.random.Generator,
-) -> tuple[np.ndarray, np.ndarray]:
+def fill_points(points: Points, views: Sequence[View], count: int, rng: np.random.Generator) -> Points:
     """Return points [count, 3] and their colours: the given ones, resampled, and random ones where views show none.
 
     A view is divided into cells. Those that show no point get random pixels, at the mean depth of the nearest points
     in the image, which is far better than a random depth (see `docs/experiments/generalise.md`).
 
     Args:
-        points: [P, 3], world units.
-        colors: [P, 3] in [0, 1].
-        cameras: C views.
-        images: per view uint8 [H, W, 3], RGB.
-        masks: per view [H, W] bool of valid pixels, or None.
+        points: P points and their colours.
+        views: V views.
         count: number of points.
         rng: draws pixels and depths.
     """
     added, added_colors = [], []
-    for view, (camera, image, mask) in enumerate(zip(cameras, images, masks, strict=True)):
-        _, seen, depths = seen_points(camera, points)
+    for index, (camera, image, mask) in enumerate(views):
+        _, seen, depths = seen_points(camera, points[0])
         if not len(seen):
             continue
-        pixels = rng.uniform(0, (camera.width, camera.height), (_share(count, view, len(cameras)), 2))
+        pixels = rng.uniform(0, (camera.width, camera.height), (_share(count, index, len(views)), 2))
         columns, rows = pixels.astype(int).T
         free = ~_shown_cells(camera, seen)[_cells_of(camera, pixels)] & (True if mask is None else mask[rows, columns])
         k = min(_NEIGHBOURS, len(seen))
-        distance, index = (np.reshape(found, (-1, k)) for found in KDTree(seen).query(pixels[free], k=k))
+        distance, near = (np.reshape(found, (-1, k)) for found in KDTree(seen).query(pixels[free], k=k))
         weights = 1 / (distance + 1e-3)
-        depth = weights.sum(axis=1) / (weights / depths[index]).sum(axis=1)
+        depth = weights.sum(axis=1) / (weights / depths[near]).sum(axis=1)
         added.append(camera.unproject(pixels[free], depth * rng.uniform(1 - _SPREAD, 1 + _SPREAD, len(depth))))
         added_colors.append(image[rows[free], columns[free]] / 255.0)
-    points, colors = resample_points(points, colors, count - sum(map(len, added)), rng)
-    return np.concatenate([points, *added]), np.concatenate([colors, *added_colors])
+    kept, colors = resample_points(points, count - sum(map(len, added)), rng)
+    return np.concatenate([kept, *added]), np.concatenate([colors, *added_colors])
 
 
-def _share(count: int, view: int, views: int) -> int:
-    """Return the share of a view in `count` things."""
-    return count // views + (view < count % views)
+def _share(count: int, index: int, views: int) -> int:
+    """Return the number of points of one of the views, of `count` in all."""
+    return count // views + (index < count % views)
 
 
 def seen_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

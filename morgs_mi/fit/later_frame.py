@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
+from morgs_mi.core.progress import Progress
 from morgs_mi.core.types import Tensor
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.density import apply_plan, plan_additions, resize_optimizer
@@ -74,7 +75,7 @@ def fit_later_frame(
     config: FitConfig,
     motion: MotionConfig,
     rng: np.random.Generator,
-    on_step: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> LaterFrame:
     """Fit one frame's residual (eq. 12) by L_recon + L_mask + L_flow + L_off (eq. 13).
 
@@ -83,7 +84,7 @@ def fit_later_frame(
         config: epochs, rates, weights of the losses, density control.
         motion: which modules are on.
         rng: draws the order of the views and the positions of births.
-        on_step: called with (steps done, steps in all).
+        progress: of the steps.
     """
     previous, active = problem.previous, problem.active
     views = sorted(active.views)
@@ -92,7 +93,7 @@ def fit_later_frame(
     base, source = active.select(previous), np.arange(len(active.indices))
     losses_at = partial(_losses_at, problem, _on_active_views(problem), config, motion)
     order = [views[k] for k in view_order(len(views), config.epochs * len(views), rng)]
-    tick = None if on_step is None else lambda done: on_step(done, len(order))
+    tick = None if progress is None else lambda done: progress(done, len(order))
     density_epoch = round(config.density.later_round * config.epochs)
     start, losses, first_epoch = problem.start, {}, 0
     if (model := motion_model(base, problem.extent, motion, rng)) is not None:

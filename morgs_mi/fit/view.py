@@ -1,15 +1,24 @@
-"""A view of the first frame: a camera, its image, and the pixels of it that count."""
+"""Views that Gaussians are fitted to and compared with."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.losses.ssim import Target
+from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.rasterize import rasterize
 
-__all__ = ["View"]
+__all__ = ["View", "decibels", "mean_psnr", "rendered", "squared_errors", "withheld_blocks"]
+
+_MIN_SIDE = 32  # px, of a reduced image
+# Withheld blocks: side in px, and one of how many.
+_BLOCK, _SHARE = 12, 8
 
 
 class View(NamedTuple):
@@ -29,3 +38,60 @@ class View(NamedTuple):
     def target(self) -> Target:
         """The image as a fit compares with it."""
         return Target(self.image, self.mask)
+
+    def reduced(self, width: int) -> View:
+        """Return the view reduced by the largest whole factor that leaves a width.
+
+        A reduced pixel is valid if all pixels that it covers are.
+        """
+        factor = self.camera.width // width
+        if factor < 2 or self.camera.height // factor < _MIN_SIDE:
+            return self
+        size = (self.camera.width // factor, self.camera.height // factor)
+        image = np.asarray(cv2.resize(self.image, size, interpolation=cv2.INTER_AREA))
+        if self.mask is None:
+            return View(self.camera.resized(*size), image)
+        share = cv2.resize(self.mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        return View(self.camera.resized(*size), image, share > 0.999)
+
+
+def withheld_blocks(views: Sequence[View], width: int, rng: np.random.Generator) -> tuple[list[View], list[View]]:
+    """Return the reduced views without withheld blocks of pixels, and with these alone, which may be none in a view.
+
+    Args:
+        views: V views.
+        width: least width of the reduced images, px.
+        rng: draws the blocks.
+    """
+    kept, unseen = [], []
+    for camera, image, mask in (view.reduced(width) for view in views):
+        rows, columns = (np.arange(size) // _BLOCK for size in image.shape[:2])
+        withheld = (rng.random((rows[-1] + 1, columns[-1] + 1)) < 1 / _SHARE)[rows][:, columns]
+        valid = np.ones_like(withheld) if mask is None else mask
+        kept.append(View(camera, image, valid & ~withheld))
+        unseen.append(View(camera, image, valid & withheld))
+    return kept, unseen
+
+
+def squared_errors(gaussians: Gaussians, views: Sequence[View], render: RenderConfig) -> np.ndarray:
+    """Return the mean square error of each view [V], of its valid pixels."""
+    errors = []
+    for camera, image, mask in views:
+        squares = ((rendered(gaussians, camera, render) - image / 255.0) ** 2).mean(axis=-1)
+        errors.append(squares[slice(None) if mask is None else mask].mean())
+    return np.array(errors)
+
+
+def rendered(gaussians: Gaussians, camera: Camera, render: RenderConfig) -> np.ndarray:
+    """Return the image of a view [H, W, 3] in [0, 1]."""
+    return np.clip(np.asarray(rasterize(gaussians, camera, ("color",), config=render).color), 0, 1)
+
+
+def decibels(squares: np.ndarray) -> np.ndarray:
+    """Return the PSNR of mean square errors, dB."""
+    return -10 * np.log10(np.maximum(squares, 1e-10))
+
+
+def mean_psnr(gaussians: Gaussians, views: Sequence[View], render: RenderConfig) -> float:
+    """Return the mean PSNR of some views in dB, of their valid pixels."""
+    return float(decibels(squared_errors(gaussians, views, render)).mean())

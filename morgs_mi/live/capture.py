@@ -6,7 +6,7 @@ It is a capture like any other, so that a stream can be evaluated, and its frame
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +18,7 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.registry import find_layout
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.files import write_json
+from morgs_mi.core.progress import Report
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.io.png import png_bytes
 from morgs_mi.live.config import LiveConfig
@@ -42,7 +43,7 @@ def begin_capture(
     images: Sequence[np.ndarray | None],
     config: LiveConfig,
     calibration: Calibration | None = None,
-    on_stage: Callable[[str, int, int], None] | None = None,
+    on_stage: Report | None = None,
 ) -> Capture:
     """Write the first images and the calibration of live cameras, and return the capture, which has one frame.
 
@@ -88,7 +89,7 @@ def write_images(folder: Path, names: Sequence[str], images: Sequence[np.ndarray
     map_in_threads(write, range(len(names)))
 
 
-def _calibrate(folder: Path, on_stage: Callable[[str, int, int], None] | None) -> None:
+def _calibrate(folder: Path, on_stage: Report | None) -> None:
     try:
         calibrate(folder, progress=on_stage)
     except ValueError as error:

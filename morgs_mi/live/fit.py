@@ -21,6 +21,7 @@ from morgs_mi.capture.outputs import check_output
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import locked_folder, write_json
+from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.threads import in_background, map_in_threads
 from morgs_mi.live.capture import begin_capture, read_calibration, write_images
 from morgs_mi.live.config import LiveConfig
@@ -71,7 +72,7 @@ def fit_live(
     live: LiveConfig | None = None,
     config: StreamConfig | None = None,
     on_frame: Callable[[LiveFrame, FrameReport], None] | None = None,
-    on_stage: Callable[[str, int, int], None] | None = None,
+    on_stage: Report | None = None,
 ) -> list[LiveFrame]:
     """Fit live cameras into OUT/stream.morgs until they end, or until Ctrl-C after the first frame.
 
@@ -171,13 +172,14 @@ def _fit(
     out: Path,
     config: StreamConfig,
     on_frame: Callable[[LiveFrame, FrameReport], None] | None,
-    on_stage: Callable[[str, int, int], None],
+    on_stage: Report,
 ) -> list[LiveFrame]:
     """Fit live frames into a locked folder."""
     capture, train = frames.capture, frames.capture.train_views
     metadata = stream_metadata(capture, next(capture.partial_frames()), config)
     del metadata["num_frames"]  # not known yet
-    capture, refinement = with_refined_cameras(with_points(capture, config.seed, on_stage), config, on_stage)
+    progress = Progress(on_stage)
+    capture, refinement = with_refined_cameras(with_points(capture, config.seed, progress), config, progress)
     frames.capture, metadata = capture, metadata | about_lenses(capture)
     masks = [capture.masks[v] for v in train]
     loop = StreamLoop([capture.cameras[v] for v in train], capture.points, capture.point_colors, config, masks)
@@ -188,8 +190,7 @@ def _fit(
         try:
             for bundle, frame in frames:
                 recorded = in_background(partial(_record, frames, out, bundle, frame))
-                tick = None if rows else partial(on_stage, "Fitting the first frame")
-                packet, report = push_frame(loop, frame, train, tick)
+                packet, report = push_frame(loop, frame, train, None if rows else on_stage)
                 if refinement is not None and not rows:
                     assert loop.gaussians is not None
                     about = about_cameras(loop.gaussians, capture, frame, refinement, config)

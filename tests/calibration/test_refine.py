@@ -19,9 +19,8 @@ from morgs_mi.calibration.refine import (
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.fit.config import CameraPriors, FitConfig, RefinementConfig
-from morgs_mi.fit.cross_validation import rendered
 from morgs_mi.fit.initialise import scene_extent
-from morgs_mi.fit.view import View
+from morgs_mi.fit.view import View, rendered
 from morgs_mi.playback.visualise import write_png
 from morgs_mi.recorder import with_points
 from morgs_mi.render.config import RenderConfig

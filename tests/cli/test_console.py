@@ -39,6 +39,23 @@ def test_progress__prints_a_line_every_30_seconds_without_a_terminal(
     ]
 
 
+def test_progress__estimates_the_time_left_from_the_pace_of_the_stage_alone(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 1000.0
+    monkeypatch.setattr(time, "monotonic", lambda: now)
+    with progress() as report:
+        report("First frame", 0, 1)
+        now += 3600.0
+        for done in (6.5, 7, 7.5, 8):  # a resumed fit: six frames were there before
+            report("Later frames", done, 10)
+            now += 20.0
+    assert capsys.readouterr().err.splitlines() == [
+        "Later frames: 6/10, 0:00:00 elapsed.",
+        "Later frames: 7/10, 0:00:40 elapsed, about 0:01:40 left.",
+    ]
+
+
 def test_progress__prints_nothing_without_a_terminal_for_short_work(capsys: pytest.CaptureFixture[str]) -> None:
     with progress() as report:
         report("Rendering", 1, 2)

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import pytest
 
 from morgs_mi.core import progress
-from morgs_mi.core.progress import ProgressBar
+from morgs_mi.core.progress import Progress, ProgressBar
 
 
 class Terminal(io.StringIO):
@@ -32,7 +32,7 @@ def test_progress_bar__draws_on_a_terminal_and_ends_the_line(monkeypatch):
 
 def test_progress_bar__writes_nothing_into_a_file(monkeypatch):
     monkeypatch.setattr(sys, "stderr", io.StringIO())
-    ProgressBar("Fitting", 2).on_step(1, 1, 1)
+    ProgressBar("Fitting").report("First frame", 1, 1)
     assert sys.stderr.getvalue() == ""
 
 
@@ -47,10 +47,19 @@ def test_progress_bar__updates_one_element_of_a_notebook(monkeypatch):
 
     monkeypatch.setattr(display, "display", show)
     monkeypatch.setattr(progress, "_is_notebook", lambda: True)
-    bar = ProgressBar("Fitting <arm>", 3)
-    bar.on_step(0, 3, 6)
-    bar.on_step(2, 6, 6)
+    bar = ProgressBar("Fitting <arm>")
+    bar.report("First frame", 0.5, 3)
+    bar.report("First frame", 3, 3)
     assert "Fitting &lt;arm&gt;" in shown[0]
     assert 'value="0.5" max="3"' in shown[0]
     assert shown[1].startswith("updated: ")
-    assert 'value="3.0" max="3"' in shown[1]
+    assert 'value="3" max="3"' in shown[1]
+
+
+def test_progress__reports_its_stage():
+    reported = []
+    progress = Progress(lambda *now: reported.append(now))
+    progress.of("Trial")(1, 4)
+    progress.of("Later frames").part(2, 9)(3, 6)
+    Progress()(1, 2)  # reports nothing
+    assert reported == [("Trial", 1, 4), ("Later frames", 2.5, 9)]

@@ -111,15 +111,18 @@ def test_evaluate_stream__scores_the_held_out_view_registered_too(fitted_clip: P
     assert f"{result.registered_psnr:.2f} dB registered" in " ".join(evaluation_summary(result))
 
 
-def test_evaluate_stream__repeats_what_the_fit_expects_of_other_views(fitted_clip: Path, tmp_path: Path) -> None:
-    shutil.copy(fitted_clip / "stream.morgs", tmp_path)
+@pytest.mark.parametrize("test_view", [None, 0])
+def test_evaluate_stream__repeats_the_estimate_of_the_fit_without_a_held_out_view(
+    fitted_clip: Path, tmp_path: Path, test_view: int | None
+) -> None:
+    write_stream(tmp_path / "stream.morgs", {"test_view": test_view})
     validation = {"sentence": "Views between the cameras will be fine.", "expected_psnr": 33.5}
     rows = [{"frame": 0, "seconds": 1.0, "validation": validation}, {"frame": 1, "seconds": 1.0, "validation": {}}]
     (tmp_path / "report.json").write_text(json.dumps({"frames": rows}))
     result = evaluate_stream(tmp_path, fitted_clip / "capture")
     assert (result.expected, result.expected_psnr) == tuple(validation.values())
     assert result.as_dict()["expected_psnr"] == 33.5
-    assert result.expected in evaluation_summary(result)
+    assert (result.expected in evaluation_summary(result)) == (test_view is None)
 
 
 def test_evaluate_stream__forecasts_other_views_without_a_report(fitted_clip: Path, tmp_path: Path) -> None:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from morgs_mi import RenderConfig
 from morgs_mi.fit import budget
 from morgs_mi.fit.budget import steps_within
 from morgs_mi.fit.config import CrossValidationConfig, FitConfig
+from tests.scenes.ball import problem
 
 
 @pytest.fixture
@@ -15,27 +15,23 @@ def steps(monkeypatch):
     """A function that returns the steps within a time, if the first ones take 0.01 s each and later ones 0.015 s."""
     now = [0.0]
 
-    def fit(gaussians, cameras, targets, extent, config, *_):
+    def fit(problem, config, *_):
         now[0] += 0.01 * config.first_frame_steps
 
     monkeypatch.setattr(budget.time, "perf_counter", lambda: now[0])
     monkeypatch.setattr(budget, "fit_first_frame", fit)
-    return lambda seconds, views=4, **settings: steps_within(
-        seconds, None, [None] * views, [None] * views, 1.0, FitConfig(**settings), RenderConfig(), 0
-    )
+    return lambda seconds, trials=0, **settings: steps_within(seconds, problem([]), FitConfig(**settings), trials, 0)
 
 
 def test_steps_within__fill_the_time_that_the_measurement_leaves(steps):
-    assert steps(15.4, dropping=0.0) == pytest.approx(1000, abs=1)  # 0.4 s were measured
-    assert steps(30.4, dropping=0.0) == pytest.approx(2000, abs=1)
+    assert steps(15.4) == pytest.approx(1000, abs=1)  # 0.4 s were measured
+    assert steps(30.4) == pytest.approx(2000, abs=1)
 
 
 def test_steps_within__leave_time_for_the_trials(steps):
-    trials = CrossValidationConfig(candidates=(0.0, 0.2, 0.3, 0.4), steps=0.5, min_views=4)
-    assert steps(45.4, cross_validation=trials) == pytest.approx(1000, abs=1)
-    assert steps(30.4, views=3, cross_validation=trials) == pytest.approx(1000, abs=1)
-    assert steps(30.4, views=1, cross_validation=trials) == pytest.approx(2000, abs=1)
-    assert steps(30.4, dropping=0.2, cross_validation=trials) == pytest.approx(2000, abs=1)
+    half = CrossValidationConfig(steps=0.5)
+    assert steps(45.4, trials=4, cross_validation=half) == pytest.approx(1000, abs=1)
+    assert steps(30.4, trials=2, cross_validation=half) == pytest.approx(1000, abs=1)
 
 
 def test_steps_within__are_a_hundred_at_least(steps):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import RenderConfig
+from morgs_mi.core.progress import Progress
 from morgs_mi.fit.config import CrossValidationConfig, FitConfig
 from morgs_mi.fit.cross_validation import (
     CrossValidation,
@@ -16,22 +17,17 @@ from morgs_mi.fit.cross_validation import (
     trial_steps,
     withheld_views,
 )
-from morgs_mi.fit.view import View
-from tests.scenes.ball import ball, images_of, opaque_ball, views
+from morgs_mi.fit.view import View, rendered
+from tests.scenes.ball import ball, bytes_of, images_of, opaque_ball, problem, views
 from tests.scenes.cameras import arc, look_at_cameras
 
 CONFIG = FitConfig(sh_degree=0, first_frame_steps=100, num_gaussians=150)
+# Among four views.
+CHOOSING = dataclasses.replace(CONFIG, cross_validation=CrossValidationConfig(min_views=4))
 
 
-def validate(images, masks=None, config=CONFIG, on_step=None, render=None):
-    masks = [None] * len(images) if masks is None else masks
-    given = [View(*view) for view in zip(views(), images, masks, strict=True)]
-    return cross_validate(ball(80), given, 3.0, config, render or RenderConfig(), 0, on_step)
-
-
-def bytes_of(images, noise=0.0):
-    rng = np.random.default_rng(0)
-    return [np.uint8(np.clip(255 * (image + rng.normal(0, noise, image.shape)) + 0.5, 0, 255)) for image in images]
+def validate(images, masks=None, config=CONFIG, report=None, render=None):
+    return cross_validate(problem(images, masks=masks, render=render), config, 0, Progress(report))
 
 
 def test_withheld_views__lie_in_the_inner_half_of_the_rig():
@@ -44,12 +40,30 @@ def test_withheld_views__lie_in_the_inner_half_of_the_rig():
 
 def test_cross_validate__tries_candidates_until_one_is_no_better():
     done = []
-    found = validate(bytes_of(images_of(opaque_ball())), on_step=done.append)
+    found = validate(bytes_of(images_of(opaque_ball())), config=CHOOSING, report=lambda *now: done.append(now))
     values = [trial.withheld_psnr for trial in found.trials]
     assert len(values) == 3 or values[-1] <= values[-2]
     assert found.best.withheld_psnr == max(values)
-    assert done == list(range(1, len(found.trials) * trial_steps(CONFIG) + 1))
     assert all(trial.training_psnr > trial.withheld_psnr > 15 for trial in found.trials)
+    steps = trial_steps(CONFIG)
+    stages = [f"Trial {number} of 3" for number in range(1, len(found.trials) + 1)]
+    assert done == [(stage, step, steps) for stage in stages for step in range(1, steps + 1)]
+
+
+@pytest.mark.parametrize(("noise", "dropping"), [(0.0, 0.0), (0.05, 0.2)])
+def test_cross_validate__lets_the_noise_choose_the_dropping_of_few_views(noise: float, dropping: float):
+    grey = [0.2 + 0.6 * image for image in images_of(opaque_ball())]
+    found = validate(bytes_of(grey, noise), config=dataclasses.replace(CONFIG, first_frame_steps=5))
+    assert [trial.dropping for trial in found.trials] == [dropping]
+
+
+def test_cross_validate__withholds_one_of_three_views_of_different_sizes():
+    cameras, (start, gaussians) = views()[:3], (ball(80), opaque_ball())
+    cameras[1] = cameras[1].resized(cameras[1].width // 2, cameras[1].height // 2)
+    given = [View(c, bytes_of([rendered(gaussians, c, RenderConfig())])[0]) for c in cameras]
+    found = cross_validate(dataclasses.replace(problem([]), start=start, views=tuple(given)), CONFIG, 0)
+    assert len(found.withheld) == 1
+    assert found.expected_psnr > 10
 
 
 def test_cross_validate__measures_the_angle_of_the_withheld_view_to_the_others():
@@ -83,14 +97,24 @@ def test_cross_validate__judges_reduced_images_with_their_masks():
 
 
 @pytest.mark.parametrize(
-    ("withheld", "training", "poor"), [(33.0, 35.0, False), (15.0, 18.0, True), (24.0, 33.0, True)]
+    ("withheld", "training", "spacing", "quality"),
+    [
+        (33.0, 35.0, 8.0, "good"),
+        (33.0, 35.0, 12.0, "fair"),
+        (20.0, 23.0, 8.0, "fair"),  # photos with fine texture
+        (20.0, 35.0, 56.0, "poor"),  # fog between cameras far apart
+        (15.0, 18.0, 8.0, "poor"),
+        (24.0, 33.0, 8.0, "poor"),
+    ],
 )
-def test_sentence__says_what_to_expect(withheld: float, training: float, poor: bool):
+def test_sentence__follows_from_the_figure_and_the_angle(withheld, training, spacing, quality):
     trials = Trial(0.0, withheld - 1, 36.0), Trial(0.2, withheld, training)
-    found = CrossValidation(("cam03",), 40.0, 20.0, trials)
-    assert f"about {withheld:.0f} dB, estimated from cam03" in found.sentence
-    assert ("will be poor" in found.sentence) == poor
-    assert ("40 degrees apart" in found.sentence) == poor
+    found = CrossValidation(("cam03",), spacing, 0.5 * spacing, trials)
+    assert found.sentence == (
+        f"Views between the cameras will be {quality}: about {withheld:.0f} dB, estimated from cam03 in a trial "
+        f"without it, {training - withheld:.0f} dB below the training views; the cameras are {spacing:.0f} degrees "
+        "apart."
+    )
 
 
 def test_expected_psnr__adds_the_excess_of_withheld_views_to_the_error_of_the_first_frame():

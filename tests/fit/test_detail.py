@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morgs_mi.fit.config import DetailConfig
-from morgs_mi.fit.detail import count_details, gaussians_for
+from morgs_mi.fit.config import DetailConfig, FitConfig
+from morgs_mi.fit.detail import count_details, with_num_gaussians
 from morgs_mi.fit.forecast import mean_views
+from morgs_mi.fit.view import View
 from tests.scenes.cameras import arc, look_at_cameras
 
 CONFIG = DetailConfig(per_detail=1.0, least_gaussians=10, most_gaussians=10**6)
@@ -43,21 +44,32 @@ def test_count_details__counts_valid_pixels_only():
     assert count_details(image, mask, CONFIG) == pytest.approx(count_details(image, None, CONFIG) / 2, rel=0.1)
 
 
-def test_gaussians_for__counts_what_several_views_see_once():
+def count(cameras, image: np.ndarray, points: np.ndarray, config: DetailConfig = CONFIG) -> int | None:
+    """Return the number of Gaussians of views that all show one image."""
+    return with_num_gaussians(
+        FitConfig(detail=config), [View(camera, image) for camera in cameras], points
+    ).num_gaussians
+
+
+def test_with_num_gaussians__counts_what_several_views_see_once():
     (camera,), image = look_at_cameras([(0, 0, -4)], 40), texture()
-    one = gaussians_for([camera], [image], [None], POINTS, CONFIG)
-    assert gaussians_for([camera] * 3, [image] * 3, [None] * 3, POINTS, CONFIG) == pytest.approx(one, abs=1)
+    one = count([camera], image, POINTS)
+    assert count([camera] * 3, image, POINTS) == pytest.approx(one, abs=1)
     beside = [c for x in (0, 9) for c in look_at_cameras([(x, 0, -4)], 40, target=(x, 0, 0))]
     points = np.concatenate([POINTS, POINTS + np.array([9, 0, 0])])
     assert mean_views(beside, points) == 1
-    assert gaussians_for(beside, [image] * 2, [None] * 2, points, CONFIG) == 2 * one
+    assert count(beside, image, points) == 2 * one
 
 
-def test_gaussians_for__stays_within_its_limits():
+def test_with_num_gaussians__stays_within_its_limits():
     cameras, image = look_at_cameras(arc((-0.2, 0, 0.2), 3), 60), texture()
     for limit in ({"least_gaussians": 5000}, {"most_gaussians": 20}):
-        found = gaussians_for(cameras, [image] * 3, [None] * 3, POINTS, replace(CONFIG, **limit))
-        assert found == next(iter(limit.values()))
+        assert count(cameras, image, POINTS, replace(CONFIG, **limit)) == next(iter(limit.values()))
+
+
+def test_with_num_gaussians__keeps_a_given_number():
+    config = FitConfig(num_gaussians=123)
+    assert with_num_gaussians(config, [], POINTS) is config
 
 
 @pytest.mark.parametrize(

@@ -7,22 +7,18 @@ import dataclasses
 import numpy as np
 import pytest
 
-from morgs_mi import RenderConfig
+from morgs_mi.core.progress import Progress
 from morgs_mi.fit.config import ConvergenceConfig, DensityConfig, FitConfig
 from morgs_mi.fit.first_frame import density_rounds, fit_first_frame
-from morgs_mi.losses.ssim import Target
-from tests.scenes.ball import ball, images_of, mean_psnr, opaque_ball, views
-
-RENDER, EXTENT = RenderConfig(), 3.0
+from tests.scenes.ball import ball, images_of, mean_psnr, opaque_ball, problem
 
 
 def fit(images, start, config, seed=0):
     return fit_counted(images, start, config, seed).gaussians
 
 
-def fit_counted(images, start, config, seed=0, on_step=None):
-    targets = [Target(image) for image in images]
-    return fit_first_frame(start, views(), targets, EXTENT, config, RENDER, np.random.default_rng(seed), on_step)
+def fit_counted(images, start, config, seed=0, progress=None):
+    return fit_first_frame(problem(images, start), config, np.random.default_rng(seed), progress)
 
 
 def test_fit_first_frame__grows_from_too_few():
@@ -39,10 +35,11 @@ UNTIL_CONVERGED = FitConfig(sh_degree=0, num_gaussians=300, convergence=Converge
 
 def test_fit_first_frame__doubles_its_steps_while_the_loss_falls():
     images, done = images_of(opaque_ball()), []
-    found = fit_counted(images, ball(150), UNTIL_CONVERGED, on_step=lambda *steps: done.append(steps))
+    progress = Progress(lambda *steps: done.append(steps), "First frame")
+    found = fit_counted(images, ball(150), UNTIL_CONVERGED, progress=progress)
     assert found.steps == 150
     totals = [60] * 60 + [120] * 60 + [150] * 30
-    assert done == list(enumerate(totals, 1))
+    assert done == [("First frame", *steps) for steps in enumerate(totals, 1)]
     few = fit(images, ball(150), dataclasses.replace(UNTIL_CONVERGED, first_frame_steps=60))
     assert mean_psnr(found.gaussians, images) > mean_psnr(few, images) + 3
 

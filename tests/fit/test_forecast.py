@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.fit.forecast import forecast, overlaps
+from morgs_mi.fit.forecast import forecast, overlaps, quality_of
 from tests.scenes.cameras import arc, look_at_cameras
 
 NO_POINTS = np.zeros((0, 3))
@@ -52,3 +52,19 @@ def test_overlaps__are_the_shares_of_an_image_that_each_camera_sees():
     # Half the width and half the height.
     expected = [[1, 0.25, 0], [1, 1, 0], [0, 0, 1]]
     np.testing.assert_allclose(overlaps([wide, narrow, away], np.zeros((1, 3))), expected, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("psnr", "loss", "spacing", "quality"),
+    [
+        (40.0, 3.9, 9.0, "good"),
+        (40.0, 4.1, 9.0, "fair"),
+        (40.0, 8.1, 9.0, "poor"),
+        (21.9, 0.0, 9.0, "fair"),
+        (15.9, 0.0, 9.0, "poor"),
+        (40.0, 0.0, 10.0, "fair"),
+        (40.0, 0.0, 19.0, "poor"),
+    ],
+)
+def test_quality_of__is_the_worst_that_figures_and_angle_allow(psnr, loss, spacing, quality):
+    assert quality_of(psnr, loss, spacing) == quality

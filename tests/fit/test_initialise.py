@@ -8,23 +8,36 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera
-from morgs_mi.fit.initialise import fill_points, focus_point, scene_extent, seed_points, seen_points
+from morgs_mi.fit.initialise import (
+    MIN_POINTS,
+    fill_points,
+    focus_point,
+    initial_points,
+    scene_extent,
+    seed_points,
+    seen_points,
+)
+from morgs_mi.fit.view import View
 from tests.scenes.cameras import arc, look_at_cameras
 
 
 def few_points():
-    """Return 40 points of a wall at z = 2 that fill the right half of the views, cameras in front of it, and images."""
+    """Return 40 points of a wall at z = 2 that fill the right half of the views, with their colours, and the views."""
     rng, cameras = np.random.default_rng(0), look_at_cameras(arc((-0.2, 0.0, 0.2), 3), 60)
     points = np.stack([rng.uniform(0.2, 2, 40), rng.uniform(-2, 2, 40), np.full(40, 2.0)], axis=1)
-    images = [np.full((c.height, c.width, 3), 51, np.uint8) for c in cameras]
-    return points, np.full((40, 3), 0.8), cameras, images
+    return (points, np.full((40, 3), 0.8)), [grey_view(camera) for camera in cameras]
+
+
+def grey_view(camera: Camera, mask: np.ndarray | None = None) -> View:
+    """Return a view that is dark grey."""
+    return View(camera, np.full((camera.height, camera.width, 3), 51, np.uint8), mask)
 
 
 def test_fill_points__adds_points_at_the_depth_of_the_others_where_views_show_none():
-    points, colors, cameras, images = few_points()
-    filled, filled_colors = fill_points(points, colors, cameras, images, [None] * 3, 1000, np.random.default_rng(1))
+    points, views = few_points()
+    filled, filled_colors = fill_points(points, views, 1000, np.random.default_rng(1))
     assert filled.shape == filled_colors.shape == (1000, 3)
-    np.testing.assert_array_equal(filled[:40], points)
+    np.testing.assert_array_equal(filled[:40], points[0])
     added = np.isclose(filled_colors, 0.2).all(axis=1)
     assert 300 < added.sum() < 900
     assert np.mean(filled[added, 0] < 0.2) > 0.7
@@ -33,11 +46,23 @@ def test_fill_points__adds_points_at_the_depth_of_the_others_where_views_show_no
 
 
 def test_fill_points__adds_none_where_pixels_are_not_valid():
-    points, colors, cameras, images = few_points()
-    masks = [np.zeros((c.height, c.width), bool) for c in cameras]
-    filled, filled_colors = fill_points(points, colors, cameras, images, masks, 100, np.random.default_rng(1))
+    points, views = few_points()
+    views = [grey_view(view.camera, np.zeros(view.image.shape[:2], bool)) for view in views]
+    filled, filled_colors = fill_points(points, views, 100, np.random.default_rng(1))
     assert len(filled) == 100
     np.testing.assert_allclose(filled_colors, 0.8)
+
+
+@pytest.mark.parametrize("known", [0, MIN_POINTS - 1, MIN_POINTS, 40, 2000])
+def test_initial_points__are_given_ones_with_random_ones_where_these_are_few(known: int):
+    (points, colors), views = few_points()
+    given = np.resize(points, (known, 3)), np.resize(colors, (known, 3))
+    found, found_colors = initial_points(views, given, 1000, np.random.default_rng(1))
+    assert found.shape == found_colors.shape == (1000, 3)
+    random = np.isclose(found_colors, 0.2).all(axis=1)
+    expected = 1 if known < MIN_POINTS else 0.3 if known < 1000 else 0
+    assert random.mean() >= expected
+    assert (random.mean() > 0) == (expected > 0)
 
 
 def moved(camera: Camera, shift: np.ndarray) -> Camera:
@@ -69,8 +94,7 @@ def test_focus_point__is_where_converging_cameras_look():
 
 def test_seed_points__are_far_before_parallel_cameras():
     cameras = parallel_cameras()
-    images = [np.zeros((c.height, c.width, 3), np.uint8) for c in cameras]
-    points, _ = seed_points(cameras, images, [None] * 3, 300, np.random.default_rng(0))
+    points, _ = seed_points([grey_view(camera) for camera in cameras], 300, np.random.default_rng(0))
     depths = cameras[0].project(points)[1] / scene_extent(cameras)
     assert 3 < depths.min() < 4
     assert 20 < depths.max() < 31
@@ -83,7 +107,8 @@ def test_seed_points__lie_on_valid_pixels_in_their_colours():
     for mask, image in zip(masks[:2], images, strict=False):
         mask[10:20, 30:50] = True
         image[10:20, 30:50] = 51
-    points, colors = seed_points(cameras, images, masks, 101, np.random.default_rng(0))
+    views = [View(*view) for view in zip(cameras, images, masks, strict=True)]
+    points, colors = seed_points(views, 101, np.random.default_rng(0))
     assert len(points) == len(colors) == 101
     np.testing.assert_allclose(colors, 0.2)
     shown = np.zeros(101, bool)

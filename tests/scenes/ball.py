@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 
-from morgs_mi import Camera, Gaussians, rasterize
+from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.fit.initialise import from_points
+from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.view import View
 from tests.scenes.cameras import QUAD, look_at_cameras
 
 
@@ -32,6 +35,24 @@ def views() -> list[Camera]:
 def images_of(gaussians: Gaussians) -> list[np.ndarray]:
     """Return the images [H, W, 3] of the Gaussians in `views`."""
     return [np.clip(np.asarray(rasterize(gaussians, c, ("color",)).color), 0, 1) for c in views()]
+
+
+def bytes_of(images: Sequence[np.ndarray], noise: float = 0.0) -> list[np.ndarray]:
+    """Return images as uint8, with normal noise of a standard deviation relative to white."""
+    rng = np.random.default_rng(0)
+    return [np.uint8(np.clip(255 * (image + rng.normal(0, noise, image.shape)) + 0.5, 0, 255)) for image in images]
+
+
+def problem(
+    images: Sequence[np.ndarray],
+    start: Gaussians | None = None,
+    masks: Sequence[np.ndarray | None] | None = None,
+    render: RenderConfig | None = None,
+) -> FirstFrameProblem:
+    """Return the problem of a first frame with some or all of the `views`."""
+    masks = [None] * len(images) if masks is None else masks
+    given = [View(*view) for view in zip(views()[: len(images)], images, masks, strict=True)]
+    return FirstFrameProblem(start or ball(80), tuple(given), np.zeros((0, 3)), 3.0, render or RenderConfig())
 
 
 def mean_psnr(gaussians: Gaussians, images: list[np.ndarray]) -> float:

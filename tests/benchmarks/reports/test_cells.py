@@ -47,7 +47,7 @@ REPORTS = {
     generalise: {"seeds": (1, 2), "steps": 3},
     few_views: {**SMALL, "rigs": ("random",), "views": (2,), "points": ("random",)},
     first_frame: {"seeds": (1,), "steps": 3, "gaussians": 60},
-    estimates: {**SMALL, "views": (2,)},
+    estimates: {**SMALL, "views": (3,)},
     drift: {"scenes": ("random-1",), "frames": 3, "fit_seeds": (0,)},
     live: {"scenes": ("random-1",), "frames": 3, "strides": (1,), "gap": 1, "gap_epochs": (2,), "steps": 3},
     masks: {"frames": 1, "loops": ("none",)},

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from benchmarks.reports.few_views import dropping_table, forecast_table, points_table, turned_out
+from benchmarks.reports.few_views import dropping_table, forecast_table, points_table
 from tests.benchmarks.reports.pages import ROOT, page
 
 
@@ -27,10 +27,3 @@ def test_generalise_page__quotes_the_committed_forecasts() -> None:
     others = [fit for fit in fits if fit not in chosen_on and fit not in real]
     assert forecast_table(chosen_on) in page("generalise.md")
     assert forecast_table(others) + forecast_table(real).splitlines()[-1] in page("generalise.md")
-
-
-def test_turned_out__is_poor_below_a_psnr_or_from_a_loss_on() -> None:
-    assert turned_out(40.0, 3.9) == "good"
-    assert turned_out(40.0, 4.1) == "fair"
-    assert turned_out(40.0, 8.1) == "poor"
-    assert turned_out(21.9, 0.0) == "poor"

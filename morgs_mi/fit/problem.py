@@ -1,0 +1,80 @@
+"""The problem of the first frame: the views of one instant, and the Gaussians that a fit to them starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.initialise import Points, from_points, initial_points, scene_extent
+from morgs_mi.fit.view import View, mean_psnr
+from morgs_mi.render.config import RenderConfig
+
+__all__ = ["FirstFrameProblem"]
+
+
+@dataclass(frozen=True, eq=False)
+class FirstFrameProblem:
+    """What the first frame is fitted to.
+
+    Attributes:
+        start: initial Gaussians.
+        views: V views of one instant.
+        points: [P, 3] of the scene, world units, or none.
+        extent: of the scene in world units.
+        render: cut-offs.
+    """
+
+    start: Gaussians
+    views: tuple[View, ...]
+    points: np.ndarray
+    extent: float
+    render: RenderConfig
+
+    @classmethod
+    def of(
+        cls,
+        views: Sequence[View],
+        points: Points,
+        config: FitConfig,
+        render: RenderConfig,
+        rng: np.random.Generator,
+    ) -> FirstFrameProblem:
+        """Return the problem whose Gaussians start from points, and from random ones where the views show none.
+
+        Args:
+            views: V views, at least one.
+            points: P points and their colours; P may be 0.
+            config: number, opacity and SH degree of the Gaussians.
+            render: cut-offs.
+            rng: draws points.
+        """
+        chosen = initial_points(views, points, config.first_count, rng)
+        start = from_points(*chosen, config.sh_degree, config.initial_opacity)
+        return cls(start, tuple(views), points[0], scene_extent([view.camera for view in views]), render)
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """Cameras of the views."""
+        return [view.camera for view in self.views]
+
+    @property
+    def images(self) -> list[np.ndarray]:
+        """Images of the views, [H, W, 3] uint8."""
+        return [view.image for view in self.views]
+
+    def reduced(self, width: int) -> FirstFrameProblem:
+        """Return the problem with reduced views, see `View.reduced`."""
+        return replace(self, views=tuple(view.reduced(width) for view in self.views))
+
+    def only(self, indices: Sequence[int]) -> FirstFrameProblem:
+        """Return the problem of some of the views."""
+        return replace(self, views=tuple(self.views[index] for index in indices))
+
+    def psnr(self, gaussians: Gaussians) -> float:
+        """Return the mean PSNR of the views in dB, of their valid pixels."""
+        return mean_psnr(gaussians, self.views, self.render)
