@@ -9,6 +9,6 @@ from morgs_mi.synth.synthesize import synthesize
 
 @pytest.fixture(scope="session")
 def clip(tmp_path_factory):
-    """The balls from 4 cameras in 3 tiny frames."""
+    """The balls from 5 cameras in 3 tiny frames."""
     folder = tmp_path_factory.mktemp("clip") / "spheres"
-    return synthesize("spheres", folder, num_cameras=4, num_frames=3, width=48, height=36, spp=1)
+    return synthesize("spheres", folder, num_cameras=5, num_frames=3, width=48, height=36, spp=1)

@@ -94,7 +94,7 @@ def test_report_method__continues_an_interrupted_report(interrupted):
         ("default", 1, 1.0),
         ("default", 2, 1.0),
     ]
-    assert {row.key_views for row in found.key_view_rows} == {1, 2, 3}
+    assert {row.key_views for row in found.key_view_rows} == {1, 2, 4}
 
 
 def test_method_command__repeats_a_finished_report_without_a_fit(clip, interrupted, tmp_path, capsys, monkeypatch):
@@ -352,7 +352,7 @@ def test_report_method__runs_later_seeds_at_the_best_rate_only(clip, tmp_path, m
         return {"psnr": psnr + 10 * cell.seed, "by_frame": {}}
 
     def from_scratch(clip, frame, base, steps, version, out):
-        assert (frame, steps) == (2, 20 * 8 * 3)
+        assert (frame, steps) == (2, 20 * 8 * 4)
         return ScratchRow(frame, steps, 30.0, 25.0, 31.0, 0.9, 1.0)
 
     monkeypatch.setattr("benchmarks.reports.method.scores_of", scores)
