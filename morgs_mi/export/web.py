@@ -9,6 +9,7 @@ from __future__ import annotations
 import gzip
 import html
 import io
+import re
 from collections.abc import Callable, Iterable, Iterator
 from importlib.metadata import version
 from importlib.resources import files
@@ -130,9 +131,8 @@ def _page(title: str, data: str, connect: str) -> bytes:
         "{notice}": (player / "NOTICE").read_text(encoding="utf-8").replace("--", "- "),
         "{data}": data + "\n" + _script("code", code),
     }
-    for name, value in values.items():
-        page = page.replace(name, value)
-    return page.encode()
+    page = re.sub("|".join(map(re.escape, values)), lambda match: values[match[0]], page)
+    return page.encode(errors="replace")
 
 
 def _script(name: str, data: bytes) -> str:

@@ -6,6 +6,7 @@ pixel grid and holds x_t - x_{t-1}, like the ground truth. Keyframes store no di
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -97,9 +98,13 @@ def open_stream(out: str | Path) -> StreamReader:
 
 
 def stream_name(stream: StreamReader) -> str:
-    """Return the name of a stream: that of its folder or file, without `.morgs`."""
+    """Return the name of a stream: that of its folder or file, without `.morgs`.
+
+    Bytes of the name that are not UTF-8 are replaced, because pages and messages to a browser cannot contain them.
+    """
     path = stream.path.resolve()
-    return path.parent.name if path.name == _STREAM else path.stem
+    name = path.parent.name if path.name == _STREAM else path.stem
+    return os.fsencode(name).decode(errors="replace")
 
 
 def find_camera(stream: StreamReader, camera: int | str) -> Camera:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import http.server
 import itertools
+import os
 import shutil
 import threading
 from pathlib import Path
@@ -17,6 +18,7 @@ from morgs_mi.cli import main
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import CodedFrame, coded_frames, reemitted_keyframe
 from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.export.notebook import stream_html
 from morgs_mi.export.web import text_of_bytes, write_web_folder, write_web_page
 from morgs_mi.playback.player import channel_image, open_stream, render, render_config
 from tests.scenes.changing_splats import rig, splats, write_stream
@@ -88,6 +90,26 @@ def test_write_web_page__refuses_a_second_residual_of_a_frame(tmp_path):
             writer.write(packet)
     with pytest.raises(ValueError, match="its frame must be above 3, that of the state before, got 3"):
         write_web_page(open_stream(tmp_path), tmp_path / "page.html")
+
+
+@pytest.mark.parametrize("placeholder", ["{data}", "{notice}", "{title}"])
+def test_write_web_page__fills_nothing_into_the_title(tmp_path, placeholder):
+    write_stream(tmp_path / "stream.morgs")
+    size = write_web_page(open_stream(tmp_path), tmp_path / "page.html", title="A clip")
+    longer = write_web_page(open_stream(tmp_path), tmp_path / "page.html", title=placeholder)
+    assert f"<title>{placeholder}</title>".encode() in (tmp_path / "page.html").read_bytes()
+    assert abs(longer - size) < 100
+
+
+def test_write_web_page__replaces_bytes_of_a_name_that_are_not_utf_8(tmp_path):
+    folder = tmp_path / os.fsdecode(b"clip\xff")
+    folder.mkdir()
+    write_stream(folder / "stream.morgs")
+    write_web_page(open_stream(folder), tmp_path / "named.html")
+    write_web_page(open_stream(folder), tmp_path / "titled.html", title="clip\udcff")
+    assert "<title>clip\N{REPLACEMENT CHARACTER}</title>" in (tmp_path / "named.html").read_text(encoding="utf-8")
+    assert "<title>clip?</title>" in (tmp_path / "titled.html").read_text(encoding="utf-8")
+    assert "clip\N{REPLACEMENT CHARACTER}" in stream_html(open_stream(folder)).encode().decode()
 
 
 def test_write_web_page__escapes_the_title(tmp_path):
