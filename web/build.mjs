@@ -6,7 +6,8 @@ import { resolve } from "node:path";
 import asc from "assemblyscript/asc";
 import * as esbuild from "esbuild";
 
-const BUNDLED = ["three", "@sparkjsdev/spark", "fflate"];
+// AssemblyScript's compiler adds its runtime to the compiled range code.
+const BUNDLED = ["three", "@sparkjsdev/spark", "fflate", "assemblyscript"];
 const settings = {
   absWorkingDir: import.meta.dirname,
   bundle: true,
@@ -50,10 +51,11 @@ async function notice() {
     BUNDLED.map(async (name) => {
       const folder = `node_modules/${name}`;
       const { version, license } = JSON.parse(await readFile(`${folder}/package.json`, "utf8"));
-      return `${name} ${version} (${license})\n\n${(await readFile(`${folder}/LICENSE`, "utf8")).trim()}\n`;
+      const texts = ["LICENSE", "NOTICE"].map((file) => readFile(`${folder}/${file}`, "utf8").catch(() => ""));
+      return `${name} ${version} (${license})\n\n${(await Promise.all(texts)).join("\n\n").trimEnd()}\n`;
     }),
   );
-  return `The web player contains these libraries.\n\n${parts.join("\n" + "-".repeat(80) + "\n\n")}`;
+  return `The web player contains these libraries; of assemblyscript, it contains the runtime.\n\n${parts.join("\n" + "-".repeat(80) + "\n\n")}`;
 }
 
 const folder = resolve(process.argv[2]);

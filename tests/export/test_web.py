@@ -6,8 +6,10 @@ import functools
 import http.server
 import itertools
 import os
+import re
 import shutil
 import threading
+from importlib.resources import files
 from pathlib import Path
 
 import cv2
@@ -110,6 +112,12 @@ def test_write_web_page__replaces_bytes_of_a_name_that_are_not_utf_8(tmp_path):
     assert "<title>clip\N{REPLACEMENT CHARACTER}</title>" in (tmp_path / "named.html").read_text(encoding="utf-8")
     assert "<title>clip?</title>" in (tmp_path / "titled.html").read_text(encoding="utf-8")
     assert "clip\N{REPLACEMENT CHARACTER}" in stream_html(open_stream(folder)).encode().decode()
+
+
+def test_notice__names_the_runtime_of_assemblyscript():
+    notice = (files("morgs_mi.export") / "web_player" / "NOTICE").read_text(encoding="utf-8")
+    assert re.search(r"^assemblyscript [\d.]+ \(Apache-2.0\)$", notice, re.MULTILINE)
+    assert "Apache License" in notice
 
 
 def test_write_web_page__escapes_the_title(tmp_path):
