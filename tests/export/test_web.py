@@ -299,6 +299,55 @@ def test_page__steps_to_frames_that_are_being_decoded(page):
     assert page.page.evaluate("player.playback.decodeTimes.length") <= decoded + 3
 
 
+def test_page__opens_on_the_first_frame_with_motion(browser, clip):
+    with Page(browser, (clip[0] / "page.html").as_uri() + "#pause") as page:
+        assert page.text("#count") == f"1 / {FRAMES - 1}"
+    with Page(browser, (clip[0] / "page.html").as_uri() + "#pause&frame=0&mode=motion") as page:
+        assert page.text("#count") == f"0 / {FRAMES - 1}"
+        assert "The first frame has no motion." in page.text("#legend")
+
+
+@pytest.mark.parametrize("mode", ["Motion", "Confidence"])
+def test_page__leaves_the_first_frame_when_a_mode_is_chosen_that_shows_motion(page, mode):
+    page.page.get_by_text(mode, exact=True).first.click()
+    page.wait("player.playback.position === 1 && player.settled")
+    assert "first frame" not in page.text("#legend").lower()
+
+
+# Sorting waits for `sortAll`.
+HOLD_SORTING = """() => {
+  const { sortWorker: worker } = player.splats.spark;
+  const held = new Promise((resolve) => (window.sortAll = resolve));
+  const call = worker.call.bind(worker);
+  worker.call = (...request) => held.then(() => { worker.call = call; return call(...request); });
+}"""
+
+
+def test_page__draws_a_new_mode_when_its_values_arrive(browser, clip):
+    with Page(browser, (clip[0] / "page.html").as_uri() + "#pause") as page:
+        page.show(3)
+        colors = page.image()
+        page.page.evaluate(HOLD_SORTING)
+        page.page.evaluate("player.playback.seek(1)")
+        page.wait("player.playback.position === 1")
+        for mode in ("motion", "confidence"):
+            page.page.evaluate(f"player.selectMode('{mode}')")
+            page.page.wait_for_timeout(300)
+            # The colours of frame 3 are displayed until those of frame 1 are sorted.
+            assert psnr(page.image() / 255, colors / 255) > 40
+            assert not page.page.locator("#legend").is_visible()
+        page.page.evaluate("sortAll()")
+        page.wait("player.settled")
+        arrived = page.image()
+        assert page.page.locator("#legend").is_visible()
+        assert psnr(arrived / 255, colors / 255) < 20
+        page.page.evaluate("player.selectMode('color')")
+        page.wait("player.settled")
+        page.page.evaluate("player.selectMode('confidence')")
+        page.wait("player.settled")
+        assert psnr(page.image() / 255, arrived / 255) > 40
+
+
 def test_page__repeats(page):
     page.page.evaluate("player.selectSpeed(5)")
     shown = page.page.evaluate("player.playback.decodeTimes.length")
@@ -327,8 +376,10 @@ def test_page__is_operated_by_keyboard(page):
     press("ArrowRight")
     page.wait("player.playback.position === 1 && player.settled")
     press("2")
+    page.wait("player.settled")
     assert "3 % of the width" in page.text("#legend")
     press("3")
+    page.wait("player.settled")
     assert "moving" in page.text("#legend")
     press("c")
     assert page.page.locator("#camera").input_value() == "1"
@@ -345,6 +396,7 @@ def test_page__fits_a_phone_and_is_operated_by_touch(browser, clip):
     with Page(browser, (clip[0] / "page.html").as_uri() + "#pause&frame=1&mode=motion", **phone) as page:
         assert page.text("#count") == f"1 / {FRAMES - 1}"
         page.page.get_by_text("Confidence", exact=True).first.tap()
+        page.wait("player.settled")
         assert "moving" in page.text("#legend")
         for control in page.page.locator("#bar button, #bar select, #bar input").all():
             box = control.bounding_box()
@@ -367,7 +419,7 @@ def test_page__names_a_damaged_packet(browser, hosted):
     stream.path.write_bytes(data)
     with Page(browser, address) as page:
         page.page.keyboard.press("End")
-        page.page.get_by_text("Frame 2: the packet at byte").wait_for()
+        page.page.get_by_text("This stream is damaged: frame 2: the packet at byte").wait_for()
         page.show(1)
         assert not page.errors
 
@@ -379,15 +431,29 @@ def test_page__names_a_truncated_stream(browser, hosted):
     stream.path.write_bytes(data[: stream.index()[2][2] + 100])
     with Page(browser, address) as page:
         assert "truncated or damaged at byte" in page.text("#message")
-        assert page.text("#count") == "0 / 1"
+        assert page.text("#count") == "1 / 1"
+
+
+@pytest.mark.slow
+def test_page__shows_the_frames_before_a_damaged_one_that_the_address_asks_for(browser, hosted):
+    address, stream = hosted
+    data = bytearray(stream.path.read_bytes())
+    data[stream.index()[2][2] + 100] ^= 1
+    stream.path.write_bytes(data)
+    with Page(browser, f"{address}&frame=3") as page:
+        page.page.get_by_text("The frames before that play.").wait_for()
+        page.show(1)
 
 
 @pytest.mark.slow
 def test_page__names_what_is_no_stream(browser, hosted):
     address, stream = hosted
-    stream.path.write_bytes(b"something else")
-    with Page(browser, address, "this is not a .morgs stream"):
-        pass
+    data = bytearray(stream.path.read_bytes())
+    data[stream.index()[0][2] + 100] ^= 1
+    for content, reason in ((b"something else", "this is not a .morgs stream"), (data, "frame 0: the packet at byte")):
+        stream.path.write_bytes(content)
+        with Page(browser, address, f"This page could not start: {reason}") as page:
+            assert "frames before" not in page.text("#message")
     stream.path.unlink()
     with Page(browser, address, "stream.morgs cannot be read: 404"):
         pass

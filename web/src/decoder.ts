@@ -88,7 +88,7 @@ export class Decoder {
     try {
       return decode(openArrays(openPacket(this.stream.bytes, packet)));
     } catch (error) {
-      throw new Error(`Frame ${packet.frame}: ${error instanceof Error ? error.message : error}.`);
+      throw new Error(`frame ${packet.frame}: ${error instanceof Error ? error.message : error}`);
     }
   }
 

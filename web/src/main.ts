@@ -57,6 +57,8 @@ class Player {
   /** What the address asks for: #frame=12&camera=left&mode=motion&pause */
   private readonly wishes = new URLSearchParams(location.hash.slice(1));
   private started = false;
+  /** Mode of the legend. */
+  private legend: Mode = "color";
   private lastInput = 0;
 
   constructor(bytes: Uint8Array<ArrayBuffer>) {
@@ -74,7 +76,10 @@ class Player {
         this.count();
         if (!this.started) this.start(update.confidence);
       },
-      failed: (message) => say(`This stream is damaged. ${message} The frames before play.`),
+      failed: (message) => {
+        if (this.started) say(`This stream is damaged: ${message}. The frames before that play.`);
+        else sayFailure(message);
+      },
       playing: (playing) => {
         element("play").ariaLabel = playing ? "Pause" : "Play";
         element("play").querySelector("path")!.setAttribute("d", playing ? PAUSE : PLAY);
@@ -96,7 +101,7 @@ class Player {
     this.view = new View(this.cameras, unit, canvas, () => this.followView());
     cameraList.replaceChildren(...this.cameras.map(({ name }, i) => new Option(name, String(i))));
     slider.max = String(this.frames.length - 1);
-    this.playback.seek(Math.max(0, this.frames.indexOf(Number(this.wishes.get("frame") ?? this.frames[0]))));
+    this.playback.seek(0);
   }
 
   /** Begin with the first frame that is shown. */
@@ -107,6 +112,8 @@ class Player {
     this.resize();
     const wished = this.cameras.findIndex(({ name }) => name === this.wishes.get("camera"));
     this.selectCamera(Math.max(0, wished));
+    if (this.wishes.has("frame")) this.playback.seek(this.frames.indexOf(Number(this.wishes.get("frame"))));
+    else this.leaveFirst();
     this.selectMode(MODES.find((mode) => mode === this.wishes.get("mode")) ?? "color");
     this.listen();
     this.lastInput = performance.now();
@@ -119,6 +126,7 @@ class Player {
     this.playback.tick(now);
     this.view.update();
     this.splats.draw(this.view.camera);
+    if (this.legend !== this.splats.shown) this.showLegend(this.splats.shown);
     element("player").classList.toggle("idle", this.playback.playing && now - this.lastInput > IDLE);
     requestAnimationFrame((next) => this.tick(next));
   }
@@ -126,6 +134,7 @@ class Player {
   private count(): void {
     const { position, last } = this.playback;
     element("count").textContent = `${this.frames[position]} / ${this.frames[last]}`;
+    element("player").classList.toggle("first", position === 0);
   }
 
   private followView(): void {
@@ -149,6 +158,17 @@ class Player {
     this.splats.setMode(mode);
     this.followView();
     for (const button of modeButtons) button.ariaPressed = String(button.dataset.mode === mode);
+    if (mode !== "color") this.leaveFirst();
+  }
+
+  /** Go from the first frame, which has no motion and whose confidence is not learned, to the next. */
+  private leaveFirst(): void {
+    const { position, last, busy } = this.playback;
+    if (position === 0 && last > 0 && !busy) this.playback.seek(1);
+  }
+
+  private showLegend(mode: Mode): void {
+    this.legend = mode;
     const legend = element("legend");
     legend.hidden = mode === "color";
     legend.replaceChildren(element<HTMLTemplateElement>(`legend-${mode}`)?.content.cloneNode(true) ?? "");

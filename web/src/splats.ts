@@ -66,12 +66,14 @@ vec3 motionSeenFrom(mat4 view, vec3 mean, vec3 displacement, float saturation) {
 const POST = /* glsl */ `
 uniform sampler2D image;
 uniform sampler2D colors;
-uniform bool motion;
+uniform int mode;
 varying vec2 at;
 
 void main() {
   vec4 blended = texture2D(image, at);
-  if (motion) {
+  if (mode == 0) {
+    gl_FragColor = vec4(blended.rgb, 1.0);
+  } else if (mode == 1) {
     vec2 m = blended.b > 0.0 ? blended.rg / blended.b - ${SHIFT}.0 : vec2(0.0);
     float sixth = fract(atan(m.y, m.x) / 6.283185307179586) * 6.0;
     vec3 hue = clamp(abs(mod(sixth + vec3(0.0, 4.0, 2.0), 6.0) - 3.0) - 1.0, 0.0, 1.0);
@@ -90,6 +92,10 @@ export class Splats {
   readonly renderer: THREE.WebGLRenderer;
   readonly spark: SparkRenderer;
   mode: Mode = "color";
+  /** Mode of the values that are displayed; after a jump, those before are until the new ones are sorted. */
+  shown: Mode = "color";
+  /** Mode of the values in each of Spark's buffers. */
+  private readonly modes = new WeakMap<object, Mode>();
   private readonly scene = new THREE.Scene();
   private readonly generator: SplatGenerator;
   private readonly uniforms;
@@ -172,7 +178,7 @@ export class Splats {
     const colors = new THREE.DataTexture(CONFIDENCE_COLORS, CONFIDENCE_COLORS.length / 4, 1);
     colors.minFilter = colors.magFilter = THREE.LinearFilter;
     colors.needsUpdate = true;
-    const values = { image: { value: this.target.texture }, colors: { value: colors }, motion: { value: false } };
+    const values = { image: { value: this.target.texture }, colors: { value: colors }, mode: { value: 0 } };
     this.post = new FullScreenQuad(
       new THREE.ShaderMaterial({ uniforms: values, vertexShader: POST_VERTEX, fragmentShader: POST }),
     );
@@ -219,20 +225,26 @@ export class Splats {
   draw(camera: THREE.PerspectiveCamera): void {
     if (!this.changed) return;
     this.changed = false;
-    if (this.mode === "color") {
-      this.renderer.render(this.scene, camera);
-      return;
-    }
-    this.renderer.setRenderTarget(this.target);
+    const direct = this.mode === "color" && this.displayedMode() === "color";
+    this.renderer.setRenderTarget(direct ? null : this.target);
     this.renderer.render(this.scene, camera);
     this.renderer.setRenderTarget(null);
-    (this.post.material as THREE.ShaderMaterial).uniforms.motion.value = this.mode === "motion";
+    this.shown = this.displayedMode();
+    if (direct) return;
+    (this.post.material as THREE.ShaderMaterial).uniforms.mode.value = MODES.indexOf(this.shown);
     this.post.render(this.renderer);
+  }
+
+  /** Return the mode of the values that Spark displays. */
+  private displayedMode(): Mode {
+    const { current, display } = this.spark;
+    if (current.mapping[0]?.version === this.generator.version) this.modes.set(current, this.mode);
+    return this.modes.get(display) ?? this.mode;
   }
 
   /** Whether the image shows all that was applied, in the right order. */
   get settled(): boolean {
-    return !this.changed && !this.spark.sorting && !this.spark.sortDirty;
+    return !this.changed && !this.spark.sorting && !this.spark.sortDirty && this.shown === this.mode;
   }
 
   private allocate(capacity: number, degree: number): void {
