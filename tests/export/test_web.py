@@ -9,6 +9,7 @@ import os
 import re
 import shutil
 import threading
+from collections.abc import Sequence
 from importlib.resources import files
 from pathlib import Path
 
@@ -19,10 +20,12 @@ import pytest
 from morgs_mi.cli import main
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import CodedFrame, coded_frames, reemitted_keyframe
+from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.export.notebook import stream_html
 from morgs_mi.export.web import text_of_bytes, write_web_folder, write_web_page
 from morgs_mi.playback.player import channel_image, open_stream, render, render_config
+from tests.scenes.cameras import look_at_cameras
 from tests.scenes.changing_splats import rig, splats, write_stream
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
@@ -369,6 +372,51 @@ def test_page__orbits_and_returns_to_the_camera(page):
     page.page.wait_for_timeout(500)
     page.wait("player.settled")
     assert psnr(page.image() / 255, before / 255) > 40
+
+
+VIEW = ("camera.position", "controls.target")
+AT_REST = """new Promise((resolve) => {
+  let before = null;
+  const look = () => {
+    const now = player.view.camera.matrixWorldInverse.elements.join();
+    if (now === before && player.settled) resolve(true);
+    else { before = now; setTimeout(look, 300); }
+  };
+  look();
+})"""
+
+
+def drag(page: Page, pixels: int, cameras: Sequence[Camera]) -> float:
+    """Return the angle in degrees from the view at rest after a drag to the nearest camera."""
+    page.page.mouse.move(WIDTH / 2, HEIGHT / 2)
+    page.page.mouse.down()
+    page.page.mouse.move(WIDTH / 2 + pixels, HEIGHT / 2, steps=4)
+    page.page.mouse.up()
+    page.wait(AT_REST)
+    position, target = (np.array(page.page.evaluate(f"player.view.{name}.toArray()")) for name in VIEW)
+    unit = page.page.evaluate("player.view.unit")
+    offset, directions = position - target, unit * np.stack([camera.position for camera in cameras]) - target
+    cosines = directions @ offset / np.linalg.norm(directions, axis=1) / np.linalg.norm(offset)
+    return float(np.degrees(np.arccos(cosines.max())))
+
+
+def test_page__draws_orbits_back_to_the_cameras_unless_it_is_switched_off(page):
+    assert drag(page, -8, rig()) > 1  # 8 degrees are free
+    page.page.keyboard.press("r")
+    assert drag(page, -90, rig()) == pytest.approx(8, abs=0.2)
+    page.page.keyboard.press("b")
+    assert page.page.get_by_label("Keep the view near the cameras").get_attribute("aria-pressed") == "false"
+    assert drag(page, -30, rig()) > 20
+    page.page.get_by_label("Keep the view near the cameras").click()
+    assert drag(page, 0, rig()) == pytest.approx(8, abs=0.2)
+
+
+def test_page__draws_orbits_back_farther_to_cameras_without_neighbours(browser, tmp_path):
+    cameras = tuple(look_at_cameras([(0, -4, 1), (4, 0, 1)], 45, WIDTH, HEIGHT, ("front", "side"), up=(0, 0, 1)))
+    write_stream(tmp_path / "stream.morgs", 2, cameras=cameras)
+    write_web_page(open_stream(tmp_path), tmp_path / "page.html")
+    with Page(browser, (tmp_path / "page.html").as_uri() + "#pause") as page:
+        assert drag(page, -20, cameras) == pytest.approx(4, abs=0.2)
 
 
 def test_page__is_operated_by_keyboard(page):

@@ -196,6 +196,11 @@ class Player {
     element("loop").ariaPressed = String(this.playback.loop);
   }
 
+  private bound(): void {
+    this.view.bounded = !this.view.bounded;
+    element("bound").ariaPressed = String(this.view.bounded);
+  }
+
   private fullScreen(): void {
     if (document.fullscreenElement) void document.exitFullscreen();
     else void element("player").requestFullscreen().catch(() => {});
@@ -206,6 +211,7 @@ class Player {
     const on = (id: string, action: () => void) => element(id).addEventListener("click", action);
     on("play", () => this.toggle());
     on("loop", () => this.repeat());
+    on("bound", () => this.bound());
     on("full", () => this.fullScreen());
     on("about", () => help.showModal());
     on("close", () => help.close());
@@ -254,6 +260,7 @@ class Player {
       "<": () => this.selectSpeed(speedList.selectedIndex - 1),
       ">": () => this.selectSpeed(speedList.selectedIndex + 1),
       l: () => this.repeat(),
+      b: () => this.bound(),
       f: () => this.fullScreen(),
       "?": () => element<HTMLDialogElement>("help").showModal(),
     };

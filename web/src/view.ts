@@ -4,6 +4,15 @@ import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import type { CameraFields } from "./stream";
 
+/**
+ * Angle around the direction of each camera in which orbits are free. Views between cameras that are twice as far apart
+ * are fair, and between cameras farther apart poor (morgs_mi/fit/forecast.py). A camera without such a neighbour has half
+ * of it, because a fit of few views falls apart sooner.
+ */
+const REACH = THREE.MathUtils.degToRad(8);
+/** Share of the angle beyond it by which a frame turns the view back. */
+const PULL = 0.5;
+
 /** Mean up direction of the cameras; that of the first one where they cancel out. */
 function upDirection(cameras: CameraFields[]): THREE.Vector3 {
   const up = new THREE.Vector3();
@@ -23,9 +32,13 @@ export function positionOf({ viewmat }: CameraFields): THREE.Vector3 {
 
 export class View {
   readonly camera = new THREE.PerspectiveCamera();
+  /** Whether orbits are drawn back to the directions of the rig's cameras. */
+  bounded = true;
   private controls: OrbitControls | null = null;
   private current: CameraFields;
   private size = { width: 1, height: 1 };
+  /** Positions of the rig's cameras. */
+  private readonly positions: THREE.Vector3[];
 
   constructor(
     private readonly cameras: CameraFields[],
@@ -34,6 +47,7 @@ export class View {
     private readonly onChange: () => void,
   ) {
     this.current = cameras[0];
+    this.positions = cameras.map((camera) => positionOf(camera).multiplyScalar(unit));
   }
 
   /** Show what a camera of the rig sees; orbits turn around the point on its axis at a distance. */
@@ -67,9 +81,27 @@ export class View {
     this.onChange();
   }
 
-  /** Continue a movement that slows down. */
+  /** Continue a movement that slows down, and draw an orbit back that has left the rig. */
   update(): void {
-    this.controls?.update();
+    if (this.controls === null) return;
+    this.controls.update();
+    if (this.bounded) this.drawBack(this.controls);
+  }
+
+  /** Turn towards the nearest camera of the rig, as seen from what the view orbits around, where it is too far away. */
+  private drawBack(controls: OrbitControls): void {
+    const { target } = controls;
+    const offset = this.camera.position.clone().sub(target);
+    const directions = this.positions.map((position) => position.clone().sub(target));
+    const angles = directions.map((direction) => direction.angleTo(offset));
+    const angle = Math.min(...angles);
+    const nearest = directions[angles.indexOf(angle)];
+    const around = directions.filter((direction) => direction.angleTo(nearest) < 2 * REACH); // itself included
+    const beyond = angle - (around.length > 1 ? REACH : REACH / 2);
+    if (beyond < 1e-3) return;
+    offset.applyAxisAngle(offset.clone().cross(nearest).normalize(), PULL * beyond);
+    this.camera.position.copy(target).add(offset);
+    controls.update();
   }
 
   /** Turn by angles in radians, positive to the right and up. */
