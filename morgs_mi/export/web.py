@@ -10,18 +10,20 @@ import gzip
 import html
 import io
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.codec.container import Packet, StreamWriter
+from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import coded_frames
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_folder, atomic_path
-from morgs_mi.playback.player import metadata_entry, stream_name
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.playback.player import MOTION_SCALE, metadata_entry, stream_name
 
 __all__ = ["text_of_bytes", "web_page", "write_web_folder", "write_web_page"]
 
@@ -30,6 +32,10 @@ Progress = Callable[[int], None]
 # What an HTML parser replaces (NUL, carriage return) or could take for the end of a script (<).
 _UNSAFE = (0x00, 0x0D, 0x3C)
 _STREAM = "stream.morgs"
+# Gaussians per frame and camera from which the scale of the motion is estimated.
+_SAMPLES = 500
+# Smallest scale, as a fraction of the width per frame; with a smaller one, a still scene would show the fit's noise.
+_LEAST_SCALE = 0.001
 
 
 def write_web_page(
@@ -38,7 +44,7 @@ def write_web_page(
     """Write a self-contained page that plays a stream, and return its number of bytes.
 
     It is one HTML file that runs from a disk and requests nothing. The stream's metadata is left out, except for the
-    renderer's settings, because it contains paths of the machine that made the fit.
+    renderer's settings, because it contains paths of the machine that made the fit; the scale of the motion is added.
 
     Args:
         stream: the file.
@@ -102,22 +108,52 @@ def text_of_bytes(data: bytes) -> str:
 
 def _published(stream: StreamReader, progress: Progress | None) -> bytes:
     """Return the stream with the metadata that the page reads, after decoding it once."""
-    sink, frames = io.BytesIO(), 0
-    metadata = {"config": {"render": metadata_entry(stream, "config.render", {}, dict)}}
-    with StreamWriter(sink, stream.cameras, stream.fps, metadata) as writer:
-        for frames, _ in enumerate(coded_frames(_copied(stream, writer)), start=1):
-            if progress is not None:
-                progress(frames)
-    if not frames:
+    render = metadata_entry(stream, "config.render", {}, dict)
+    packets, speeds = list(stream), []
+    for coded in coded_frames(packets):
+        speeds.append(_speeds(coded.gaussians, stream.cameras))
+        if progress is not None:
+            progress(len(speeds))
+    if not speeds:
         raise ValueError(f"{stream.path}: expected at least one frame to show, got none.")
+    sink, metadata = io.BytesIO(), {"config": {"render": render}, "motion_scale": _motion_scale(*np.hstack(speeds))}
+    with StreamWriter(sink, stream.cameras, stream.fps, metadata) as writer:
+        for packet in packets:
+            writer.write(packet)
     return sink.getvalue()
 
 
-def _copied(packets: Iterable[Packet], writer: StreamWriter) -> Iterator[Packet]:
-    """Yield packets after writing them."""
-    for packet in packets:
-        writer.write(packet)
-        yield packet
+def _motion_scale(speeds: np.ndarray, weights: np.ndarray) -> float:
+    """Return the speed that the page draws fully saturated: the 99th percentile of speeds [S] with weights [S].
+
+    It is not the maximum, because a few Gaussians that the fit has lost are several times as fast as the scene.
+    """
+    if not weights.any():
+        return MOTION_SCALE
+    return max(_LEAST_SCALE, float(np.percentile(speeds, 99, weights=weights, method="inverted_cdf")))
+
+
+def _speeds(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
+    """Return speeds of moving Gaussians in the images of the cameras, and their weights there [2, S].
+
+    A speed is a fraction of the image's width per frame. A weight is the opacity times the area on the screen.
+    """
+    if gaussians.motion is None:
+        return np.zeros((2, 0))
+    motion = np.asarray(gaussians.motion)
+    rows = np.flatnonzero(motion.any(axis=1))
+    rows = rows[:: len(rows) // _SAMPLES + 1]
+    motion, raw = motion[rows], gaussians.numpy()
+    means, log_sizes = raw["means"][rows], raw["log_scales"][rows].mean(axis=1)
+    # A stream may contain any scale; the bound keeps the weights finite.
+    weights, found = np.asarray(gaussians.opacities)[rows] * np.exp(2 * np.minimum(log_sizes, 20)), []
+    for camera in cameras:
+        pixels, depths = camera.project(means)
+        seen = (depths > camera.near) & ((pixels > 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+        motions = np.einsum("nij,nj->ni", camera.projection_jacobian(means[seen]), motion[seen])
+        speeds = np.linalg.norm(motions, axis=1) / camera.width
+        found.append([speeds, weights[seen] / depths[seen] ** 2])
+    return np.hstack(found)
 
 
 def _page(title: str, data: str, connect: str) -> bytes:

@@ -10,6 +10,7 @@ import re
 import shutil
 import threading
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -19,8 +20,9 @@ import pytest
 
 from morgs_mi.cli import main
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.codec.packets import CodedFrame, coded_frames, reemitted_keyframe
+from morgs_mi.codec.packets import CodedFrame, coded_frames, reemitted_keyframe, residual_packet
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.export.notebook import stream_html
 from morgs_mi.export.web import text_of_bytes, write_web_folder, write_web_page
@@ -115,6 +117,50 @@ def test_write_web_page__replaces_bytes_of_a_name_that_are_not_utf_8(tmp_path):
     assert "<title>clip\N{REPLACEMENT CHARACTER}</title>" in (tmp_path / "named.html").read_text(encoding="utf-8")
     assert "<title>clip?</title>" in (tmp_path / "titled.html").read_text(encoding="utf-8")
     assert "clip\N{REPLACEMENT CHARACTER}" in stream_html(open_stream(folder)).encode().decode()
+
+
+def test_write_web_page__scales_motion_by_its_99th_percentile(tmp_path):
+    start = splats(600)
+    means, log_scales = start.numpy()["means"].copy(), start.numpy()["log_scales"].copy()
+    means[0], log_scales[0] = (0, -3.4, 0.9), -5  # small and close to the camera in the middle
+    states = write_stream(tmp_path / "stream.morgs", start=replace(start, means=means, log_scales=log_scales))
+    write_web_folder(open_stream(tmp_path), tmp_path / "folder")
+    speeds = np.hstack([screen_speeds(state.gaussians, camera) for state in states[1:] for camera in rig()])
+    speed, weight = speeds[:, np.argsort(speeds[0])]
+    expected = speed[np.searchsorted(np.cumsum(weight), 0.99 * weight.sum())]
+    scale = open_stream(tmp_path / "folder").metadata["motion_scale"]
+    assert scale == pytest.approx(expected, rel=0.02)
+    assert speed.max() > 2 * scale
+
+
+def test_write_web_page__keeps_a_still_scene_still(tmp_path):
+    cameras = rig(1920, 1440)
+    state = write_stream(tmp_path / "stream.morgs", 1, cameras=cameras)[0]
+    noise = replace(state.gaussians, means=state.gaussians.numpy()["means"] + np.float32([0.0005, 0, 0]))
+    packets = [*open_stream(tmp_path), residual_packet(state, noise, np.arange(len(state)), cameras)]
+    with StreamWriter(tmp_path / "stream.morgs", cameras, 30) as writer:
+        for packet in packets:
+            writer.write(packet)
+    write_web_folder(open_stream(tmp_path), tmp_path / "folder")
+    assert open_stream(tmp_path / "folder").metadata["motion_scale"] == 0.001
+
+
+def screen_speeds(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """Return the speeds of moving Gaussians in an image, by differences, and their weights [2, S].
+
+    Speeds are fractions of the image's width per frame; weights are opacity times area.
+    """
+    motion = np.asarray(gaussians.motion, np.float64)
+    moves = motion.any(axis=1)
+    means, motion = gaussians.numpy()["means"][moves].astype(np.float64), motion[moves]
+    pixels, depths = camera.project(means)
+    seen = (depths > camera.near) & (pixels > 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+    step = 1e-4 * motion[seen]
+    ahead, behind = camera.project(means[seen] + step)[0], camera.project(means[seen] - step)[0]
+    scales = np.asarray(gaussians.scales, np.float64)[moves][seen]
+    areas = np.prod(scales, axis=1) ** (2 / 3) / depths[seen] ** 2
+    speeds = np.linalg.norm(ahead - behind, axis=1) / 2e-4 / camera.width
+    return np.stack([speeds, np.asarray(gaussians.opacities)[moves][seen] * areas])
 
 
 def test_notice__names_the_runtime_of_assemblyscript():
@@ -273,7 +319,8 @@ def test_page__shows_the_images_of_the_renderer(page, clip, mode, least):
         page.page.locator("#camera").select_option(str(camera))
         page.show(frame)
         image = render(states[frame].gaussians, stream.cameras[camera], (mode,), render_config(stream))[mode]
-        assert psnr(page.image() / 255, channel_image(mode, image) / 255) > least
+        scale = WIDTH * page.page.evaluate("player.motionScale")
+        assert psnr(page.image() / 255, channel_image(mode, image, scale) / 255) > least
 
 
 def test_page__plays_to_the_end_and_scrubs_back(page, clip):
@@ -425,7 +472,8 @@ def test_page__is_operated_by_keyboard(page):
     page.wait("player.playback.position === 1 && player.settled")
     press("2")
     page.wait("player.settled")
-    assert "3 % of the width" in page.text("#legend")
+    percent = 100 * page.page.evaluate("player.motionScale")
+    assert f"rim: {percent:.2g} % of the width" in page.text("#legend")
     press("3")
     page.wait("player.settled")
     assert "moving" in page.text("#legend")

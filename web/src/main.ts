@@ -9,8 +9,6 @@ import type { Opened } from "./worker";
 
 declare function embedded(id: string): Uint8Array<ArrayBuffer>;
 
-/** As MOTION_SCALE in morgs_mi/playback/player.py. */
-const MOTION_SCALE = 0.03;
 const PLAY = "M7 4v16l13-8z";
 const PAUSE = "M6 4h4v16H6zM14 4h4v16h-4z";
 /** The controls fade after so many milliseconds without input while the clip plays. */
@@ -57,6 +55,8 @@ class Player {
   /** What the address asks for: #frame=12&camera=left&mode=motion&pause */
   private readonly wishes = new URLSearchParams(location.hash.slice(1));
   private started = false;
+  /** Motion that is fully saturated, as a fraction of the image's width per frame. */
+  private motionScale = 0;
   /** Mode of the legend. */
   private legend: Mode = "color";
   private lastInput = 0;
@@ -96,8 +96,9 @@ class Player {
     ({ cameras: this.cameras, frames: this.frames } = stream);
     if (stream.damage !== null) say(`This stream is damaged: ${stream.damage}. The frames before that play.`);
     const unit = unitOf(this.cameras);
-    const config = stream.metadata?.config as { render?: object } | undefined;
-    this.splats = new Splats(canvas, { eps2d: 0.3, alpha_min: 1 / 255, ...config?.render }, unit);
+    const metadata = stream.metadata as { config?: { render?: object }; motion_scale?: number } | undefined;
+    this.motionScale = metadata?.motion_scale ?? 0.03;
+    this.splats = new Splats(canvas, { eps2d: 0.3, alpha_min: 1 / 255, ...metadata?.config?.render }, unit);
     this.view = new View(this.cameras, unit, canvas, () => this.followView());
     cameraList.replaceChildren(...this.cameras.map(({ name }, i) => new Option(name, String(i))));
     slider.max = String(this.frames.length - 1);
@@ -138,7 +139,7 @@ class Player {
   }
 
   private followView(): void {
-    this.splats.setView(this.view.camera, this.view.tangent(MOTION_SCALE));
+    this.splats.setView(this.view.camera, this.view.tangent(this.motionScale));
   }
 
   private resize(): void {
@@ -174,6 +175,8 @@ class Player {
     legend.replaceChildren(element<HTMLTemplateElement>(`legend-${mode}`)?.content.cloneNode(true) ?? "");
     const ramp = legend.querySelector<HTMLElement>(".ramp");
     if (ramp) ramp.style.backgroundImage = `linear-gradient(to top, ${CONFIDENCE_GRADIENT})`;
+    const scale = legend.querySelector(".scale");
+    if (scale) scale.textContent = (100 * this.motionScale).toPrecision(2);
   }
 
   private selectSpeed(index: number): void {
