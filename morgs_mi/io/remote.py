@@ -2,27 +2,47 @@
 
 A capture is mirrored in a folder of ``~/.cache/morgs_mi/captures``. Calibrations are fetched when it is opened; videos
 and images are empty files there until they are read, so that a process fetches only what it decodes. The name of the
-folder depends on names, sizes and times of the remote files, so that a capture that has changed is fetched again.
-Ground truth is not fetched.
+folder depends on names, sizes and versions of the remote files (time, ETag or checksum): a capture that has changed is
+fetched again, and one without versions at every opening. Ground truth is not fetched.
 """
 
 from __future__ import annotations
 
+import atexit
+import json
 import os
+import shutil
 import threading
+import uuid
 from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
 
+from morgs_mi.core.files import write_json
+
 __all__ = ["fetched", "is_url", "mirrored", "url_of"]
 
-# Entries of fsspec's listings that change with a file, by file system.
-_VERSION = ("size", "mtime", "created", "LastModified", "ETag", "etag", "last_modified", "md5Hash", "generation")
-_FETCHED_LATER = (".mp4", ".mkv", ".avi", ".mov", ".webm", ".png", ".jpg", ".jpeg")
+# Entries of fsspec's listings that change with a file, by file system. A size alone does not prove that it is the same.
+_VERSION = (
+    *("mtime", "created", "LastModified", "ETag", "etag", "last_modified", "md5Hash", "generation"),  # disks and clouds
+    *("Last-Modified", "Content-MD5", "Digest"),  # http
+    *("modify", "modificationTime", "date_time", "sha"),  # ftp, webhdfs, archives, GitHub
+)
+# One of these is among the first bytes of an image, a video or another file of a suffix.
+_IMAGE, _VIDEO = (b"\x89PNG", b"\xff\xd8"), (b"ftyp", b"moov", b"mdat", b"free", b"wide", b"\x1aE\xdf\xa3", b"RIFF")
+_FETCHED_LATER = {
+    **dict.fromkeys((".mp4", ".mkv", ".avi", ".mov", ".webm"), _VIDEO),
+    **dict.fromkeys((".png", ".jpg", ".jpeg"), _IMAGE),
+}
+_MAGIC = {**_FETCHED_LATER, ".npy": (b"\x93NUMPY",), ".npz": (b"PK",), ".ply": (b"ply",)}
+_PAGE = (b"<!doctype html", b"<html")
 _IGNORED = "truth"
-_URL = ".url"  # file in a mirrored folder
+_INDEX = ".remote.json"  # file in a mirrored folder: its URL, and the sizes of the files
+# Seconds to wait for a connection and for each further piece of a file, and requests at a time.
+_PATIENCE, _REQUESTS = 60, 16
 
 
 def is_url(path: str | Path) -> bool:
@@ -40,26 +60,29 @@ def mirrored(url: str) -> Path:
         ValueError: fsspec does not know the protocol, or it or a package for it is missing.
     """
     system, root = _file_system(url)
+    base = root.rstrip("/")
     with _failures(url):
         system.invalidate_cache()
-        listing: Mapping[str, Mapping[str, Any]] = system.find(root, detail=True)
-    files = {path.removeprefix(root).lstrip("/"): about for path, about in sorted(listing.items())}
-    files = {name: about for name, about in files.items() if name and name.split("/")[0] != _IGNORED}
+        files = {path.removeprefix(base).lstrip("/"): about for path, about in _listing(system, base).items()}
+    # A name with a query is a link of a server's listing, by which it is sorted.
+    files = {name: files[name] for name in sorted(files) if name and "?" not in name}
     if not files:
         raise FileNotFoundError(f"{url}: expected a capture folder, found no files; check the URL.")
     if outside := next((name for name in files if ".." in name.split("/")), None):
         raise ValueError(f"{url}: expected files in the folder, got {outside}; rename it.")
-    versions = [(name, [str(about.get(key)) for key in _VERSION]) for name, about in files.items()]
-    digest = blake2b(repr((url, versions)).encode(), digest_size=8).hexdigest()
-    folder = _cache() / digest / root.rstrip("/").rpartition("/")[2]
-    for name in files:
+    if not all(map(_versions, files.values())):
+        with _failures(url), ThreadPoolExecutor(_REQUESTS) as requests:
+            files = dict(zip(files, requests.map(lambda name: system.info(f"{base}/{name}"), files), strict=True))
+    folder = _folder(url, files) / base.rpartition("/")[2]
+    sizes = {name: about.get("size") for name, about in files.items()}
+    for name, size in sizes.items():
         file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
         if file.suffix.lower() in _FETCHED_LATER:
             file.touch()
         elif not file.exists():
-            _fetch(system, url, f"{root.rstrip('/')}/{name}", file)
-    (folder / _URL).write_text(url, encoding="utf-8")
+            _fetch(system, url, f"{base}/{name}", file, size)
+    write_json(folder / _INDEX, {"url": url, "sizes": sizes})
     return folder
 
 
@@ -70,16 +93,15 @@ def fetched(file: Path) -> Path:
         OSError, ValueError: as for `mirrored`.
     """
     if file.is_file() and not file.stat().st_size and (folder := _mirror_of(file)) is not None:
-        url = (folder / _URL).read_text(encoding="utf-8")
-        system, root = _file_system(url)
-        _fetch(system, url, f"{root.rstrip('/')}/{file.relative_to(folder).as_posix()}", file)
+        index, name = _index(folder), file.relative_to(folder).as_posix()
+        system, root = _file_system(index["url"])
+        _fetch(system, index["url"], f"{root.rstrip('/')}/{name}", file, index["sizes"].get(name))
     return file
 
 
 def url_of(folder: Path) -> str | None:
     """Return the URL of a mirrored folder, None for any other."""
-    mirror = _mirror_of(folder / _URL)
-    return (folder / _URL).read_text(encoding="utf-8") if mirror == folder else None
+    return _index(folder)["url"] if _mirror_of(folder / _INDEX) == folder else None
 
 
 def _cache() -> Path:
@@ -87,12 +109,45 @@ def _cache() -> Path:
     return cache.resolve()
 
 
+def _listing(system: Any, base: str) -> dict[str, Mapping[str, Any]]:
+    """Return the files below a folder by path; fsspec's `find` would leave out folders that it cannot list."""
+    found, folders = {}, [base]
+    for folder in folders:  # which grows
+        for about in system.ls(folder, detail=True):
+            path = about["name"].rstrip("/")
+            if about["type"] != "directory":
+                found[path] = about
+            elif path not in (*folders, f"{base}/{_IGNORED}"):
+                folders.append(path)
+    return found
+
+
+def _folder(url: str, files: Mapping[str, Mapping[str, Any]]) -> Path:
+    """Return the folder of these versions of files; a new one, until the process ends, if one has no version."""
+    known = all(map(_versions, files.values()))
+    versions = [(name, about.get("size"), _versions(about)) for name, about in files.items()]
+    content = repr((url, versions)) if known else uuid.uuid4().hex
+    folder = _cache() / blake2b(content.encode(), digest_size=8).hexdigest()
+    if not known:
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+def _versions(about: Mapping[str, Any]) -> list[str]:
+    """Return what changes with a file, by an entry of a listing; empty if it has none of `_VERSION`."""
+    return [f"{key} {about[key]}" for key in _VERSION if about.get(key)]
+
+
 def _mirror_of(file: Path) -> Path | None:
     """Return the mirrored folder that a file is in."""
     cache = _cache()
     if cache not in file.parents:
         return None
-    return next((folder for folder in file.parents if (folder / _URL).is_file()), None)
+    return next((folder for folder in file.parents if (folder / _INDEX).is_file()), None)
+
+
+def _index(folder: Path) -> dict[str, Any]:
+    return json.loads((folder / _INDEX).read_text(encoding="utf-8"))
 
 
 def _file_system(url: str) -> tuple[Any, str]:
@@ -103,22 +158,51 @@ def _file_system(url: str) -> tuple[Any, str]:
         raise ValueError(f"{url}: reading it needs the package fsspec; pip install 'morgs-mi[cluster]'.") from None
     try:
         with _failures(url):
-            return url_to_fs(url)
+            return url_to_fs(url, **_options(url))
     except ImportError as error:
         raise ValueError(f"{url}: reading it needs another package: {error}.") from None
     except ValueError as error:
         raise ValueError(f"{url}: expected a URL that fsspec can open, got an error: {error}.") from None
 
 
-def _fetch(system: Any, url: str, remote: str, file: Path) -> None:
-    """Copy a remote file; several processes may fetch the same one."""
+def _options(url: str) -> dict[str, Any]:
+    """Return the options of the file system of a URL: http's own would wait for minutes."""
+    if not url.startswith(("http://", "https://")):
+        return {}
+    from aiohttp import ClientTimeout
+
+    return {"client_kwargs": {"timeout": ClientTimeout(sock_connect=_PATIENCE, sock_read=_PATIENCE)}}
+
+
+def _fetch(system: Any, url: str, remote: str, file: Path, size: int | None) -> None:
+    """Copy a remote file of `size` bytes, None if unknown; several processes may fetch the same one."""
     partial = file.with_name(f".{file.name}-{os.getpid()}-{threading.get_ident()}")
+    place = remote if is_url(remote) else f"{url}: {remote}"
     try:
-        with _failures(f"{url}: {remote}"):
+        with _failures(place):
             system.get_file(remote, str(partial))
+        _check_content(place, partial, file.suffix.lower(), size)
         partial.replace(file)
     finally:
         partial.unlink(missing_ok=True)
+
+
+def _check_content(place: str, file: Path, suffix: str, size: int | None) -> None:
+    """Check that a fetched file has its size and the first bytes of its kind.
+
+    Raises:
+        ConnectionError: it has another size, or is a page of HTML.
+        ValueError: it is of another kind.
+    """
+    with file.open("rb") as opened:
+        head = opened.read(512)
+    got, kinds = file.stat().st_size, _MAGIC.get(suffix)
+    if any(mark in head.lower() for mark in _PAGE):
+        raise ConnectionError(f"{place}: expected a file, got a page of HTML; check the URL, or log in, and try again.")
+    if size is not None and got != size:
+        raise ConnectionError(f"{place}: expected {size} bytes, got {got}; it has changed or was cut short, try again.")
+    if head and kinds and not any(kind in head[:12] for kind in kinds):
+        raise ValueError(f"{place}: expected a {suffix} file, got {got} bytes of another kind; copy it there again.")
 
 
 @contextmanager
@@ -130,6 +214,10 @@ def _failures(place: str) -> Iterator[None]:
         raise FileNotFoundError(f"{place}: expected a file or a folder, found none; check the URL.") from None
     except PermissionError as error:
         raise PermissionError(f"{place}: expected to be allowed to read it, got {error}; check the rights.") from None
+    except TimeoutError:
+        raise ConnectionError(
+            f"{place}: expected an answer, got none in time; check the connection, try again."
+        ) from None
     except (ImportError, ValueError):
         raise
     except Exception as error:  # the libraries of the protocols have errors of their own

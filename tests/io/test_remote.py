@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import threading
 from collections.abc import Iterator
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -81,7 +85,7 @@ class Refusing(fsspec.AbstractFileSystem):
 
     protocol, error = "refusing", PermissionError("Access Denied")
 
-    def find(self, path, **options):
+    def ls(self, path, detail=True, **options):
         raise self.error
 
 
@@ -94,9 +98,9 @@ class Silent(Refusing):
     [
         ("nothing://a/b", ValueError, r"nothing://a/b: expected a URL that fsspec can open, .*not known: nothing"),
         ("s3://a/b", ValueError, r"s3://a/b: reading it needs another package: Install s3fs"),
-        ("memory://none", FileNotFoundError, r"memory://none: expected a capture folder, found no files"),
+        ("memory://none", FileNotFoundError, r"memory://none: expected a file or a folder, found none"),
         ("refusing://a", PermissionError, r"refusing://a: expected to be allowed to read it, got Access Denied"),
-        ("silent://a", ConnectionError, r"silent://a: expected to read it, got TimeoutError"),
+        ("silent://a", ConnectionError, r"silent://a: expected an answer, got none in time"),
     ],
 )
 def test_mirrored__refuses_in_one_sentence(url, kind, message, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -123,3 +127,119 @@ def test_fetched__names_a_file_that_has_gone(folder: Path) -> None:
 def test_fit__names_an_unknown_protocol(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["fit", "nothing://a/b", str(tmp_path / "out")]) == 1
     assert "nothing://a/b: expected a URL that fsspec can open" in " ".join(capsys.readouterr().err.split())
+
+
+class Server(ThreadingHTTPServer):
+    """An HTTP server of a folder.
+
+    Attributes:
+        versions: header fields of every file that has its time, e.g. ``ETag``.
+        instead: body that is sent once in place of a file, by the end of its path; None: it is never finished.
+        fetched: paths whose body was requested.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(("127.0.0.1", 0), partial(Handler, directory=str(folder)))
+        self.versions: tuple[str, ...] = ("Last-Modified",)
+        self.instead: dict[str, bytes | None] = {}
+        self.fetched: list[str] = []
+        self.stop = threading.Event()
+        self.url = f"http://127.0.0.1:{self.server_port}/clip"
+
+
+class Handler(SimpleHTTPRequestHandler):
+    server: Server
+
+    def log_message(self, *args) -> None: ...
+
+    def send_header(self, keyword: str, value: str) -> None:
+        if keyword != "Last-Modified":
+            super().send_header(keyword, value)
+            return
+        for name in self.server.versions:
+            super().send_header(name, value)  # a time is a good ETag, too
+
+    def do_GET(self) -> None:
+        if Path(self.path).suffix:
+            self.server.fetched.append(self.path)
+        end = next((end for end in self.server.instead if self.path.endswith(end)), None)
+        if end is None:
+            super().do_GET()
+            return
+        body = self.server.instead.pop(end)
+        self.send_response(200)
+        self.send_header("Content-Length", str(1000 if body is None else len(body)))
+        self.end_headers()
+        if body is None:
+            self.wfile.write(b"half")
+            self.wfile.flush()
+            self.server.stop.wait(20)
+        else:
+            self.wfile.write(body)
+
+
+@pytest.fixture
+def server(tmp_path: Path, cache: Path) -> Iterator[Server]:
+    pytest.importorskip("aiohttp", reason="comes with the extra `cluster`")
+    write_recording(tmp_path / "clip", 2)
+    with Server(tmp_path) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True)
+        thread.start()
+        yield server
+        server.stop.set()
+        server.shutdown()
+        thread.join()
+
+
+def first_images(url: str) -> list[np.ndarray]:
+    return list(next(iter(load_capture(url, max_frames=1).frames())).images)
+
+
+@pytest.mark.parametrize("versions", [("Last-Modified",), ("ETag",), ("ETag", "Last-Modified"), ()])
+def test_mirrored__reuses_http_files_only_while_their_versions_are_equal(server: Server, tmp_path, versions) -> None:
+    server.versions = versions
+    before = load_capture(server.url).cameras[0].K[0, 0]
+    server.fetched.clear()
+    assert load_capture(server.url).cameras[0].K[0, 0] == before
+    assert bool(server.fetched) == (not versions)
+    file = tmp_path / "clip" / "sparse" / "0" / "cameras.txt"
+    text, old = file.read_text(), f" {before:g}"[:2]
+    file.write_text(text.replace(f"PINHOLE 32 24{old}", "PINHOLE 32 24 9"))  # as many bytes as before
+    os.utime(file, (1e9, 1e9))
+    assert load_capture(server.url).cameras[0].K[0, 0] > 90
+
+
+PAGE = b"<!DOCTYPE html><html><body>Log in"
+
+
+def test_mirrored__leaves_out_no_folder_that_cannot_be_listed(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    system = type(fsspec.filesystem("memory"))
+    whole = system.ls
+
+    def ls(self, path, detail=True, **options):
+        if path.endswith("cam1"):
+            raise TimeoutError
+        return whole(self, path, detail, **options)
+
+    with monkeypatch.context() as stalled:
+        stalled.setattr(system, "ls", ls)
+        with pytest.raises(ConnectionError, match="memory://bucket/clip: expected an answer, got none in time"):
+            mirrored(URL)
+
+
+@pytest.mark.parametrize(
+    ("name", "body", "kind", "message"),
+    [
+        ("0000.png", PAGE, ConnectionError, "expected a file, got a page of HTML; check the URL, or log in"),
+        ("cameras.txt", PAGE, ConnectionError, "cameras.txt: expected a file, got a page of HTML"),
+        ("cameras.txt", b"# Camera list\n", ConnectionError, r"expected \d+ bytes, got 14; it has changed or was cut"),
+        ("0000.png", None, ConnectionError, "0000.png: expected an answer, got none in time; check the connection"),
+    ],
+)
+def test_fetched__keeps_no_wrong_answer(server: Server, monkeypatch, name, body, kind, message) -> None:
+    monkeypatch.setattr("morgs_mi.io.remote._PATIENCE", 2)
+    server.instead[name] = body
+    with pytest.raises(kind, match=message):
+        first_images(server.url)
+    assert not server.instead
+    assert len(first_images(server.url)) == 3
