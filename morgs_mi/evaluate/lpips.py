@@ -1,4 +1,4 @@
-"""LPIPS with a user-supplied ONNX network, run by OpenCV; the package includes neither weights nor PyTorch.
+"""LPIPS with a user-supplied ONNX network, run by `onnxruntime`; the package has neither weights nor PyTorch.
 
 Zhang, Isola, Efros, Shechtman and Wang, "The unreasonable effectiveness of deep features as a perceptual metric",
 CVPR 2018. With PyTorch and the authors' package ``lpips`` installed, this writes the file:
@@ -14,12 +14,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from morgs_mi.evaluate.metrics import unit_pair
+from morgs_mi.io.onnx_file import OnnxNetwork
 
 __all__ = ["Lpips"]
+
+_INPUTS = ("in0", "in1")
+_ADVICE = "export the network as the documentation of morgs_mi.evaluate.lpips shows"
 
 
 class Lpips:
@@ -33,20 +36,16 @@ class Lpips:
 
     Raises:
         FileNotFoundError: the file is missing.
-        ValueError: OpenCV cannot read the file.
+        ValueError: `onnxruntime` is not installed or cannot load the file, or the network has other inputs.
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
-        if not self.path.is_file():
-            raise FileNotFoundError(f"{path}: expected an LPIPS network as ONNX, found none; check the path.")
-        try:
-            self._net = cv2.dnn.readNetFromONNX(str(path))
-        except cv2.error as error:
+        self.path, self._network = Path(path), OnnxNetwork(path)
+        if {*self._network.inputs} != {*_INPUTS}:
             raise ValueError(
-                f"{path}: expected an ONNX network, got a file that OpenCV cannot read ({_reason(error)}); "
-                "export it again."
-            ) from None
+                f"{path}: expected a network with inputs {' and '.join(_INPUTS)}, got "
+                f"{', '.join(self._network.inputs)}; {_ADVICE}."
+            )
 
     def distance_map(self, image: np.ndarray, truth: np.ndarray) -> np.ndarray:
         """Return the distance per pixel [H, W], or of the whole image [1, 1] if the network returns a single number.
@@ -56,27 +55,18 @@ class Lpips:
             truth: likewise.
 
         Raises:
-            ValueError: the sizes differ, or the network does not accept images of that size, has other inputs or
-                another output.
+            ValueError: the sizes differ, or the network does not accept images of that size, has another output, or
+                returns NaN or infinity.
         """
         pair = unit_pair("Lpips", image, truth)
         H, W = pair[0].shape[:2]
-        try:
-            for name, array in zip(("in0", "in1"), pair, strict=True):
-                self._net.setInput(np.ascontiguousarray(2 * array.transpose(2, 0, 1)[None] - 1, np.float32), name)
-            distance = np.asarray(self._net.forward())
-        except cv2.error as error:
-            raise ValueError(
-                f"{self.path}: expected a network with inputs in0 and in1 that take {W}x{H} pixels, got one that does "
-                f"not ({_reason(error)}); export it for that size."
-            ) from None
+        blobs = (np.ascontiguousarray(2 * each.transpose(2, 0, 1)[None] - 1, np.float32) for each in pair)
+        distance = next(iter(self._network.run(dict(zip(_INPUTS, blobs, strict=True))).values()))
         if distance.size not in (1, H * W):
             raise ValueError(
                 f"{self.path}: expected one distance, or one for each of {W}x{H} pixels, got {list(distance.shape)}; "
-                "export the network as the documentation of morgs_mi.evaluate.lpips shows."
+                f"{_ADVICE}."
             )
+        if not np.isfinite(distance).all():
+            raise ValueError(f"{self.path}: expected finite distances, got NaN or infinity; export it in float32.")
         return distance.reshape((H, W) if distance.size > 1 else (1, 1))
-
-
-def _reason(error: cv2.error) -> str:
-    return (str(error.err or error).strip().splitlines() or ["no reason given"])[0]

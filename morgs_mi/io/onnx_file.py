@@ -1,77 +1,99 @@
-"""Networks in ONNX files, run by `cv2.dnn`: their signature, their input and their output."""
+"""Networks in ONNX files, run on the CPU by `onnxruntime`."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from threading import Lock
 
 import cv2
 import numpy as np
 
-__all__ = ["OnnxNetwork", "Signature", "imagenet_blob", "read_signature", "written_shapes"]
+__all__ = ["OnnxNetwork", "imagenet_blob", "written_shapes"]
 
 # Mean and standard deviation of ImageNet's colours, by which most networks for images normalise their input.
 _MEAN = np.array([0.485, 0.456, 0.406], np.float32)
 _DEVIATION = np.array([0.229, 0.224, 0.225], np.float32)
-
-
-@dataclass(frozen=True)
-class Signature:
-    """Inputs and outputs of a network.
-
-    Attributes:
-        inputs: shape of each input by name; None for a size that the network leaves open.
-        outputs: names of the outputs.
-    """
-
-    inputs: dict[str, tuple[int | None, ...]]
-    outputs: tuple[str, ...]
+# Largest input that a file may fix: an image of 4096 x 4096, to which smaller ones would be enlarged.
+_MAX_VALUES = 3 * 4096**2
+# Of its own messages, `onnxruntime` prints only those before it ends the process: errors are raised.
+_FATAL = 4
 
 
 class OnnxNetwork:
-    """Network in `cv2.dnn`, which several threads may share.
+    """Network in an ONNX file, which several threads may share.
+
+    Weights in further files are read only from the folder of the network, which `onnxruntime` checks.
 
     Args:
         path: the ONNX file.
-        signature: its inputs and outputs, as `read_signature` returns them.
-        instead: what error messages name as another way, e.g. " or use its flow from files".
+        instead: another way that error messages name, e.g. " or use its flow from files".
+
+    Attributes:
+        path: the ONNX file.
+        inputs: shape of each input by name; None for a size that the network leaves open.
+        outputs: names of the outputs.
 
     Raises:
-        ValueError: OpenCV cannot load the network.
+        FileNotFoundError: there is no such file.
+        ValueError: `onnxruntime` is not installed or cannot load the network, or an input has too many values.
     """
 
-    def __init__(self, path: str | Path, signature: Signature, instead: str = "") -> None:
-        self.path, self.signature, self._instead, self._lock = path, signature, instead, Lock()
+    def __init__(self, path: str | Path, instead: str = "") -> None:
+        self.path, self._instead = Path(path), instead
+        if not self.path.is_file():
+            raise FileNotFoundError(f"{path}: expected an ONNX file, found none; check the path.")
         try:
-            self._net = cv2.dnn.readNetFromONNX(str(path))
-        except cv2.error as error:
+            import onnxruntime
+        except ImportError:
             raise ValueError(
-                f"{path}: OpenCV {cv2.__version__} cannot load this network ({_reason(error)}); export it with other "
-                f"operators{instead}."
+                f"{path}: running a network needs the package onnxruntime; pip install 'morgs-mi[networks]'."
+            ) from None
+        self._runtime = f"onnxruntime {onnxruntime.__version__}"
+        options = onnxruntime.SessionOptions()
+        options.log_severity_level = _FATAL
+        options.intra_op_num_threads = cv2.getNumThreads()  # which limits a worker to its share of the cores
+        try:
+            # A fallback would try the same again, and print.
+            self._session = onnxruntime.InferenceSession(
+                str(path), options, providers=["CPUExecutionProvider"], enable_fallback=0
+            )
+            self.inputs = {value.name: _shape(value.shape) for value in self._session.get_inputs()}
+            self.outputs = tuple(value.name for value in self._session.get_outputs())
+        except Exception as error:  # its errors have no class in common
+            raise ValueError(
+                f"{path}: {self._runtime} cannot load this network ({_reason(error)}); export it again{instead}."
             ) from error
+        if large := [s for s in self.inputs.values() if math.prod(size or 1 for size in s) > _MAX_VALUES]:
+            raise ValueError(
+                f"{path}: expected inputs of at most {_MAX_VALUES} values, got {written_shapes(large)}; export it for "
+                "smaller images."
+            )
 
-    def run(self, inputs: Mapping[str, np.ndarray]) -> Sequence[np.ndarray]:
-        """Return all outputs in their order.
+    def run(self, inputs: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return all outputs by name, in their order.
 
         Args:
-            inputs: by name, [1, C, H, W] float32, all of one size.
+            inputs: arrays by name.
 
         Raises:
-            ValueError: OpenCV cannot run the network on them.
+            ValueError: `onnxruntime` cannot run the network on them, or it returns something else than numbers.
         """
-        height, width = next(iter(inputs.values())).shape[2:]
         try:
-            with self._lock:
-                for name, value in inputs.items():
-                    self._net.setInput(value, name)
-                return self._net.forward(list(self.signature.outputs))
-        except cv2.error as error:
+            results = self._session.run(None, dict(inputs))
+        except Exception as error:  # its errors have no class in common
+            given = ", ".join(f"{name} {list(value.shape)}" for name, value in inputs.items())
             raise ValueError(
-                f"{self.path}: OpenCV {cv2.__version__} cannot run this network on {width}x{height} pixels "
-                f"({_reason(error)}); export it for this size{self._instead}."
+                f"{self.path}: {self._runtime} cannot run this network on {given} ({_reason(error)}); export it for "
+                f"these sizes{self._instead}."
             ) from error
+        named = zip(self.outputs, results, strict=True)
+        arrays = {name: x for name, x in named if isinstance(x, np.ndarray) and x.dtype.kind in "biuf"}
+        if others := [name for name in self.outputs if name not in arrays]:
+            raise ValueError(
+                f"{self.path}: expected arrays of numbers, got others from {', '.join(others)}; export again."
+            )
+        return arrays
 
 
 def imagenet_blob(image: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -88,71 +110,17 @@ def imagenet_blob(image: np.ndarray, width: int, height: int) -> np.ndarray:
     return np.ascontiguousarray(np.moveaxis((unit - _MEAN) / _DEVIATION, 2, 0)[None])
 
 
-def read_signature(path: str | Path) -> Signature:
-    """Return the inputs and outputs of the network in an ONNX file, which `cv2.dnn` does not report.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: it is not an ONNX file.
-    """
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"{path}: expected an ONNX file, found none; check the path.")
-    try:
-        # Field numbers are those of onnx.proto: ModelProto.graph; GraphProto.initializer, .input and .output.
-        graph = next(_fields(memoryview(Path(path).read_bytes()), 7))
-        weights = {_text(next(_fields(tensor, 8))) for tensor in _fields(graph, 5)}
-        inputs = {_text(next(_fields(value, 1))): _shape(value) for value in _fields(graph, 11)}
-        outputs = tuple(_text(next(_fields(value, 1))) for value in _fields(graph, 12))
-    except (StopIteration, IndexError, ValueError) as error:
-        raise ValueError(f"{path}: expected an ONNX file, got another format; export the network again.") from error
-    return Signature({name: shape for name, shape in inputs.items() if name not in weights}, outputs)
-
-
-def _shape(value: memoryview) -> tuple[int | None, ...]:
-    """Return the shape in a ValueInfoProto: type, tensor_type, shape, its dims, and their dim_value if there is one."""
-    shape = next(_fields(next(_fields(next(_fields(value, 2)), 1)), 2), memoryview(b""))
-    return tuple(next(_fields(size, 1), None) or None for size in _fields(shape, 1))
-
-
-def _fields(message: memoryview, wanted: int) -> Iterator:
-    """Yield the values of one field of a protobuf message: bytes, or an int for a varint."""
-    at = 0
-    while at < len(message):
-        key, at = _varint(message, at)
-        kind, value = key & 7, None
-        if kind == 0:
-            value, at = _varint(message, at)
-        elif kind in (1, 5):
-            at += 8 if kind == 1 else 4
-        elif kind == 2:
-            length, at = _varint(message, at)
-            value, at = message[at : at + length], at + length
-        else:
-            raise ValueError("not a protobuf message")
-        if at > len(message):
-            raise ValueError("cut short")
-        if key >> 3 == wanted:
-            yield value
-
-
-def _varint(message: memoryview, at: int) -> tuple[int, int]:
-    value = shift = 0
-    while True:
-        byte = message[at]
-        value, shift, at = value | (byte & 127) << shift, shift + 7, at + 1
-        if byte < 128:
-            return value, at
-
-
-def written_shapes(shapes: list[tuple]) -> str:
+def written_shapes(shapes: Iterable[tuple[int | None, ...]]) -> str:
     """Return shapes as in an error message, with ? for a size that is left open."""
     written = ("[" + ", ".join("?" if size is None else str(size) for size in shape) + "]" for shape in shapes)
     return " and ".join(written) or "none"
 
 
-def _text(value: memoryview) -> str:
-    return bytes(value).decode()
+def _shape(sizes: Iterable[int | str | None]) -> tuple[int | None, ...]:
+    """Return a shape with None for sizes that have a name, or no number."""
+    return tuple(size if isinstance(size, int) and size > 0 else None for size in sizes)
 
 
-def _reason(error: cv2.error) -> str:
-    return " ".join(str(error).split("error: ")[-1].split())
+def _reason(error: Exception) -> str:
+    """Return the message of an error of `onnxruntime` in one line, without its number."""
+    return " ".join(str(error).split(" : ")[-1].split())

@@ -1,4 +1,4 @@
-"""Optical flow from a trained network in an ONNX file, run by `cv2.dnn`.
+"""Optical flow from a trained network in an ONNX file, run by `onnxruntime`.
 
 The network takes two images [1, 3, H, W], RGB, and returns the flow [1, 2, H, W] in pixels from the first to the
 second, like RAFT (Teed and Deng, ECCV 2020), SEA-RAFT (Wang, Lipson and Deng, ECCV 2024) and similar networks. It may
@@ -17,7 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from morgs_mi.io.onnx_file import OnnxNetwork, read_signature, written_shapes
+from morgs_mi.io.onnx_file import OnnxNetwork, written_shapes
 from morgs_mi.method.flow_sources.config import FlowConfig
 from morgs_mi.method.flow_sources.registry import FLOW_SOURCES, FlowSource, both_directions
 
@@ -40,13 +40,13 @@ class FlowNetwork:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not an ONNX file, OpenCV cannot run it, or it does not take two images.
+        ValueError: `onnxruntime` is not installed or cannot load it, or it does not take two images.
     """
 
     def __init__(self, path: str | Path, low: float = 0.0, high: float = 255.0) -> None:
         self.path, self.low, self.high = Path(path), low, high
-        self.signature = read_signature(path)
-        shapes = list(self.signature.inputs.values())
+        self._net = OnnxNetwork(path, " or use its flow from files")
+        shapes = list(self._net.inputs.values())
         images = all(len(s) == 4 and s[0] in (1, None) and s[1] in (3, None) for s in shapes)
         if len(shapes) != 2 or not images or shapes[0] != shapes[1]:
             raise ValueError(
@@ -59,7 +59,6 @@ class FlowNetwork:
                 f"{path}: expected height and width both fixed or both open, got {written_shapes(shapes[:1])}."
             )
         self._size = None if height is None or width is None else (width, height)
-        self._net = OnnxNetwork(path, self.signature, " or use its flow from files")
 
     def __call__(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
         """Return the flow [H, W, 2] in pixels, float32, from `image` to `other` on the grid of `image`.
@@ -95,7 +94,7 @@ class FlowNetwork:
     def _run(self, image: np.ndarray, other: np.ndarray) -> np.ndarray:
         height, width = image.shape[:2]
         blobs = (self._blob(each) for each in (image, other))
-        outputs = self._net.run(dict(zip(self.signature.inputs, blobs, strict=True)))
+        outputs = self._net.run(dict(zip(self._net.inputs, blobs, strict=True))).values()
         # A network that returns the flow of each of its iterations returns the best one last.
         flows = [output for output in outputs if output.shape == (1, 2, height, width)]
         if not flows:

@@ -15,14 +15,12 @@ weights; docs/masks.md explains how to export them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
-from morgs_mi.io.onnx_file import imagenet_blob
+from morgs_mi.io.onnx_file import OnnxNetwork, imagenet_blob, written_shapes
 from morgs_mi.method.mask_refiners.config import MaskConfig, PromptConfig
 from morgs_mi.method.mask_refiners.opencv import clean_mask
 from morgs_mi.method.mask_refiners.registry import MASK_REFINERS, MaskRefiner
@@ -54,14 +52,14 @@ class SegmentNetwork:
 
     def __init__(self, encoder: str | Path, decoder: str | Path, config: PromptConfig | None = None) -> None:
         self._config = config or PromptConfig()
-        self._encoder, self._decoder = _Network(encoder), _Network(decoder)
+        self._encoder, self._decoder = OnnxNetwork(encoder), OnnxNetwork(decoder)
         shapes = list(self._encoder.inputs.values())
         if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
             raise ValueError(
                 f"{encoder}: expected an image encoder with one input [1, 3, {_SIZE}, {_SIZE}], got "
-                f"{self._encoder.inputs}; give the encoder first, then the decoder."
+                f"{written_shapes(shapes)}; give the encoder first, then the decoder."
             )
-        height, width = (side if isinstance(side, int) else _SIZE for side in shapes[0][2:])
+        height, width = (side or _SIZE for side in shapes[0][2:])
         self._size = width, height
         known = {*self._encoder.outputs, *_PROMPTS}
         missing = {*_PROMPTS[:2]} - {*self._decoder.inputs}
@@ -153,47 +151,6 @@ def _components(mask: np.ndarray, most: int) -> list[np.ndarray]:
     return [labels == label for label in order[:most]]
 
 
-class _Network:
-    """ONNX file in `onnxruntime`; inputs and outputs are arrays by name."""
-
-    def __init__(self, path: str | Path) -> None:
-        try:
-            import onnxruntime
-
-            state = import_module("onnxruntime.capi.onnxruntime_pybind11_state")
-        except ImportError as error:
-            raise ValueError(
-                "SegmentNetwork(): expected onnxruntime, found none; install it: pip install 'morgs-mi[sam2]'."
-            ) from error
-        # onnxruntime's exceptions have no base class of their own.
-        kinds = [kind for kind in vars(state).values() if isinstance(kind, type) and issubclass(kind, Exception)]
-        self._errors: tuple[type[Exception], ...] = tuple(kinds)
-        self.path = Path(path)
-        if not self.path.is_file():
-            raise FileNotFoundError(f"{path}: expected an ONNX file, found none; check the path.")
-        try:
-            self._session: Any = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-        except self._errors as error:
-            raise ValueError(
-                f"{path}: onnxruntime {onnxruntime.__version__} cannot load this network ({_reason(error)}); export it "
-                "again."
-            ) from error
-        self.inputs: dict[str, list[int | str | None]] = {
-            value.name: value.shape for value in self._session.get_inputs()
-        }
-        self.outputs = [value.name for value in self._session.get_outputs()]
-
-    def run(self, values: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        try:
-            return dict(zip(self.outputs, self._session.run(None, dict(values)), strict=True))
-        except self._errors as error:
-            shapes = ", ".join(f"{name} {list(value.shape)}" for name, value in values.items())
-            raise ValueError(
-                f"{self.path}: expected a network that takes {shapes}, got an error of onnxruntime "
-                f"({_reason(error)}); export encoder and decoder from one model."
-            ) from error
-
-
 @MASK_REFINERS.register("sam2", "ENCODER.onnx,DECODER.onnx")
 def _make(files: str, config: MaskConfig) -> MaskRefiner:
     encoder, _, decoder = files.partition(",")
@@ -203,7 +160,3 @@ def _make(files: str, config: MaskConfig) -> MaskRefiner:
         )
     network = SegmentNetwork(encoder, decoder, config.prompts)
     return lambda image, mask: mask | network(image, clean_mask(mask, config))
-
-
-def _reason(error: Exception) -> str:
-    return " ".join(str(error).split())

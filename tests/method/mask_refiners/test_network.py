@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -162,12 +160,6 @@ def test_segment_network__rejects_masks_that_are_not_finite(tmp_path, files):
     image, (disc,) = discs(60, 80, (40, 30))
     with pytest.raises(ValueError, match=r"decoder\.onnx: expected finite masks"):
         SegmentNetwork(files[0], export_decoder(tmp_path / "decoder.onnx", scale=float("inf")))(image, disc)
-
-
-def test_segment_network__names_the_remedy_without_onnxruntime(files, monkeypatch):
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(ValueError, match=r"expected onnxruntime, found none; .*morgs-mi\[sam2\]"):
-        SegmentNetwork(*files)
 
 
 def test_prompt_config__limits_points_and_their_spacing():
