@@ -22,7 +22,6 @@ import inspect
 import json
 import re
 import textwrap
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
@@ -35,6 +34,7 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.fit.config import FitConfig
+from morgs_mi.io.bounded import read_toml
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.render.config import RenderConfig
 
@@ -151,16 +151,14 @@ def read_config(path: str | Path) -> dict[str, Any]:
 
     Raises:
         FileNotFoundError: the file is missing.
-        ValueError: the file is not valid TOML, or is nested too deeply.
+        ValueError: as for `read_toml`.
     """
     try:
-        return tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        return read_toml(path)
     except FileNotFoundError:
         raise FileNotFoundError(
             f"{path}: expected a TOML file with settings, found none; write one with `morgs-mi fit --print-config`."
         ) from None
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: expected valid TOML, got an error: {error}.") from None
 
 
 def config_toml(config: Any) -> str:

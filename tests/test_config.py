@@ -256,9 +256,9 @@ def test_apply_values__names_file_key_expected_and_given(config: Any, text: str,
     ("content", "error", "message"),
     [
         (None, FileNotFoundError, "expected a TOML file with settings, found none; write one with"),
-        (b"fit = ", ValueError, "expected valid TOML, got an error: Invalid value"),
-        (b"a = 1\na = 2", ValueError, "expected valid TOML, got an error: Cannot overwrite a value"),
-        (b"\xff", ValueError, "expected valid TOML, got an error: 'utf-8' codec"),
+        (b"fit = ", ValueError, r"expected TOML, got a broken file \(Invalid value"),
+        (b"a = 1\na = 2", ValueError, r"expected TOML, got a broken file \(Cannot overwrite a value"),
+        (b"\xff", ValueError, r"expected TOML, got a broken file \('utf-8' codec"),
     ],
 )
 def test_read_config__names_a_file_that_cannot_be_read(content, error, message, tmp_path: Path) -> None:

@@ -1,14 +1,17 @@
 """Readers whose memory is bounded by the size of the file, whatever its header claims.
 
 A file may make its reader use 10 times its size plus 200 MB. The allowance is for small files that decode to large
-data without being broken, such as an image of one colour.
+data without being broken, such as an image of one colour. Only regular files are read: a pipe in a folder would keep
+its reader waiting, and a device may have no end.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import re
 import tokenize
+import tomllib
 import zipfile
 import zlib
 from io import BytesIO
@@ -17,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["array_names", "check_claim", "read_array", "read_json"]
+__all__ = ["MAX_TOML", "array_names", "check_claim", "read_array", "read_bytes", "read_json", "read_toml", "regular"]
 
 _FACTOR, _ALLOWANCE = 10, 200_000_000
 # What NumPy and zipfile raise for broken files. NumPy parses headers as Python.
@@ -27,6 +30,11 @@ _BROKEN = (
 )
 # At most, in bytes: an empty dict or list as the value of a list, and a number or a short key with its reference.
 _DICT_BYTES, _LIST_BYTES, _VALUE_BYTES = 240, 64, 40
+# Size of a TOML file, bytes that its parser takes for a table, and parts of a key: memory and time grow with the square
+# of their number.
+MAX_TOML, _TABLE_BYTES, _MAX_PARTS = 1_000_000, 1000, 32
+# What is between the keys and values of a TOML file, and the end of a part of a key; ornaments of dots are not keys.
+_BETWEEN, _PART = re.compile(rb"[=,\[\]{}#\n]"), re.compile(rb"[^.\s][ \t]*\.")
 
 
 def check_claim(path: str | Path, claimed: int, content: str) -> None:
@@ -48,14 +56,59 @@ def check_claim(path: str | Path, claimed: int, content: str) -> None:
         )
 
 
+def regular(path: str | Path) -> Path:
+    """Return the path of a file, which may be missing.
+
+    Raises:
+        ValueError: it is a folder, a pipe or a device.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{path}: expected a file, got a folder, a pipe or a device; remove it.")
+    return path
+
+
+def read_bytes(path: str | Path, most: int | None = None) -> bytes:
+    """Return the content of a regular file.
+
+    Raises:
+        OSError: there is no such file, or it cannot be read.
+        ValueError: it is no regular file, or has more bytes than `most`.
+    """
+    path = regular(path)
+    if most is not None and path.stat().st_size > most:
+        raise ValueError(
+            f"{path}: expected at most {most} bytes, got {path.stat().st_size}; leave out what is not needed."
+        )
+    return path.read_bytes()
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Return the content of a TOML file.
+
+    Raises:
+        OSError: there is no such file, or it cannot be read.
+        ValueError: the file is broken, too large, nested too deeply, or has too many tables.
+    """
+    data = read_bytes(path, MAX_TOML)
+    tables = sum(map(data.count, (b".", b"[", b"{")))
+    check_claim(path, _TABLE_BYTES * tables, f"{tables} tables")
+    try:
+        if any(len(_PART.findall(piece)) >= _MAX_PARTS for piece in _BETWEEN.split(data)):
+            raise ValueError(f"a key has more than {_MAX_PARTS} parts")
+        return tomllib.loads(data.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: expected TOML, got a broken file ({error}); write it again.") from None
+
+
 def read_json(path: str | Path) -> Any:
     """Return the content of a JSON file.
 
     Raises:
         OSError: there is no such file, or it cannot be read.
-        ValueError: the file is broken, nested too deeply, or has too many tiny values.
+        ValueError: it is no regular file, is broken, nested too deeply, or has too many tiny values.
     """
-    data = Path(path).read_bytes()
+    data = read_bytes(path)
     counts = data.count(b"{"), data.count(b"["), data.count(b",")
     values = counts[0] * _DICT_BYTES + counts[1] * _LIST_BYTES + counts[2] * _VALUE_BYTES
     check_claim(path, values, f"{sum(counts)} values")
@@ -72,7 +125,7 @@ def read_array(path: str | Path, name: str | None = None) -> np.ndarray:
         ValueError: the file is broken, claims more numbers than it holds, or holds Python objects.
     """
     try:
-        data = Path(path).read_bytes() if name is None else _member(path, f"{name}.npy")
+        data = read_bytes(path) if name is None else _member(path, f"{name}.npy")
         stream = BytesIO(data)
         version = np.lib.format.read_magic(stream)
         read_header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
@@ -97,14 +150,14 @@ def array_names(path: str | Path) -> list[str]:
         ValueError: the file is broken.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        with zipfile.ZipFile(regular(path)) as archive:
             return [name.removesuffix(".npy") for name in archive.namelist()]
     except _BROKEN as error:
         raise ValueError(f"{path}: expected a NumPy archive, got a broken file ({error}); export it again.") from None
 
 
 def _member(path: str | Path, name: str) -> bytes:
-    with zipfile.ZipFile(path) as archive:
+    with zipfile.ZipFile(regular(path)) as archive:
         size = archive.getinfo(name).file_size
         check_claim(path, size, f"{size} bytes of {name}")
         return archive.read(name)

@@ -461,6 +461,8 @@ def decode_image(file: Path, data: np.ndarray, mode: int) -> np.ndarray:
 
 def _opaque(file: Path) -> np.ndarray | None:
     """Return the mask of an image's opaque pixels [H, W], None if it has no alpha channel or is not readable."""
+    if not file.is_file():
+        return None
     try:
         with fetched(file).open("rb") as opened:
             header = opened.read(26)

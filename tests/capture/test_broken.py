@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -22,6 +23,16 @@ Damage = Callable[[Path], object]
 
 def missing(name: str) -> Damage:
     return lambda path: (path / name).unlink()
+
+
+def pipe(name: str) -> Damage:
+    """Put a named pipe, from which nothing ever comes, in the place of a file."""
+
+    def damage(path: Path) -> None:
+        (path / name).unlink(missing_ok=True)
+        os.mkfifo(path / name)
+
+    return damage
 
 
 def truncated(name: str) -> Damage:
@@ -134,6 +145,8 @@ OPTIONS: list[str] = []
 NAN = float("nan")
 POSES_BOUNDS = {
     "no file": (missing("poses_bounds.npy"), "expected a calibration .*poses_bounds.npy.* run `morgs-mi calibrate`"),
+    "pipe": (pipe("poses_bounds.npy"), "expected a calibration"),
+    "pipe beside": (pipe("capture.json"), "capture.json: expected a file, got a folder, a pipe or a device; remove it"),
     "no clip": (missing("cam02.mkv"), r"expected one row per camera, got 3 rows for 2 videos \(cam00, cam11\)"),
     "fewer rows": (rows(lambda values: values[:2]), r"got 2 rows for 3 videos \(cam00, cam02, cam11\)"),
     "other columns": (rows(lambda values: values[:, :15]), r"expected a float array \[C, 17\], got float64 \(3, 15\)"),
@@ -162,6 +175,7 @@ POSES_BOUNDS = {
 }
 BY_FRAME = {
     "no image": (missing("frame000002/cam_2.png"), "frame000002/cam_2.png: expected an image, found none"),
+    "pipe": (pipe("frame000002/cam_2.png"), "frame000002/cam_2.png: expected an image, found none"),
     "no camera": (missing("frame000000/cam_10.png"), "got 3 rows for 4 videos"),
     "no image at all": (
         lambda path: ([f.write_bytes(b"") for f in path.glob("frame*/cam_2.png")], with_options("--gaps")(path)),
@@ -175,6 +189,7 @@ BY_FRAME = {
 }
 COLMAP = {
     "no file": (missing("sparse/0/images.txt"), "images.txt is missing; export the whole model"),
+    "pipe": (pipe("sparse/0/images.txt"), "images.txt: expected a file, got a folder, a pipe or a device; remove it"),
     "no clip": (missing("cam2.mkv"), "its image 'cam2.png' needs a clip called cam2, found cam1, cam10"),
     "fewer parameters": (replace("sparse/0/cameras.txt", " 34.0 20.0\n", "\n"), "PINHOLE takes 4 parameters, got 2"),
     "no such camera": (replace("sparse/0/cameras.txt", "\n2 ", "\n7 "), "refers to camera 2, cameras.txt has"),
@@ -240,6 +255,11 @@ DYNAMIC3DGS = {
 }
 ANIPOSE = {
     "broken file": (truncated("calibration.toml"), "calibration.toml: expected TOML, got a broken file"),
+    "pipe": (pipe("calibration.toml"), "expected a calibration"),
+    "long key": (
+        lambda path: (path / "calibration.toml").write_text("matrix=1\nrotation=1\nx." + "a." * 20_000 + "b=1\n"),
+        r"calibration.toml: expected TOML, got a broken file \(a key has more than 32 parts\)",
+    ),
     "no clip": (missing("trial_1-camB.mkv"), "its image 'camB' needs a clip called camB, found trial_1-camA"),
     "no pose": (
         replace("calibration.toml", "translation", "translate"),
@@ -269,6 +289,15 @@ ANIPOSE = {
 QUALISYS = {
     "broken file": (truncated("rig.qca.txt"), "rig.qca.txt: expected XML, got a broken file"),
     "no cameras": (replace("rig.qca.txt", "<cameras>", "<cameras/><!--"), "expected XML, got a broken file"),
+    "pipe": (pipe("rig.qca.txt"), "rig.qca.txt: expected a file, got a folder, a pipe or a device; remove it"),
+    "document type in UTF-16": (
+        lambda path: (path / "rig.qca.txt").write_text("<!DOCTYPE a [<!ENTITY b 'c'>]><a>&b;</a>", encoding="utf-16"),
+        "declares a document type",
+    ),
+    "many elements": (
+        lambda path: (path / "rig.qca.txt").write_text("<a>" + "<b/>" * 2_000_000 + "</a>"),
+        "got a claim of 2000002 elements and attributes",
+    ),
     "document type": (replace("rig.qca.txt", "<calibration>", "<!DOCTYPE a><calibration>"), "declares a document type"),
     "no transform": (
         replace("rig.qca.txt", "transform", "moved"),

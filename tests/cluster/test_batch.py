@@ -55,7 +55,7 @@ def test_read_jobs__has_default_settings_and_one_seed(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("seeds = [0]\nout = @", r"jobs\.toml: expected valid TOML, got an error: .*line 2"),
+        ("seeds = [0]\nout = @", r"jobs\.toml: expected TOML, got a broken file \(.*line 2"),
         ("seeds = [0]", r"jobs\.toml: `captures` must be one or more that differ, got none"),
         ('captures = ["a/x", "b/x"]', r"jobs\.toml: `captures` must be one or more that differ, got x, x"),
         ('captures = ["x"]\nseeds = [1, 1]', r"jobs\.toml: `seeds` must be one or more that differ, got 1, 1"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import struct
 import tracemalloc
 import zipfile
@@ -14,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.io.bounded import array_names, read_array, read_json
+from morgs_mi.io.bounded import MAX_TOML, array_names, read_array, read_json, read_toml
 from morgs_mi.io.exr import read_exr, write_exr
 from morgs_mi.io.ply import read_vertices
 from morgs_mi.io.splats import read_splats
@@ -104,6 +105,11 @@ CASES = {
     "deep JSON": (read_json, b"[" * 100_000, "expected JSON, got a broken file"),
     "JSON of empty lists": (read_json, b"[" + b"[]," * 3_000_000 + b"0]", "got a claim of 6000001 values"),
     "JSON of long number": (read_json, b"9" * 5000, "expected JSON, got a broken file"),
+    "TOML of a long key": (read_toml, b"x." + b"a." * 20_000 + b"b = 1", r"broken file \(a key has more than 32 parts"),
+    "TOML of a long table": (read_toml, b"[a" + b" .\t'b'" * 99 + b"]", r"broken file \(a key has more than 32 parts"),
+    "TOML of many tables": (read_toml, b"[a.b.c]\n" * 90_000, "got a claim of 270000 tables"),
+    "TOML of many rows": (read_toml, b"x = [" + b"1," * MAX_TOML + b"]", "expected at most 1000000 bytes, got 2000006"),
+    "deep TOML": (read_toml, b"x = " + b"[" * 5000, "expected TOML, got a broken file"),
     "PLY of many vertices": (
         read_vertices,
         ply(BINARY + LARGE),
@@ -146,6 +152,20 @@ def test_readers__refuse_a_hostile_file_in_one_sentence(tmp_path: Path, read, co
     with pytest.raises((ValueError, OSError), match=message) as caught:
         read(path)
     assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("read", [read_array, archived, array_names, read_json, read_toml])
+def test_readers__refuse_pipes_and_folders(tmp_path: Path, read) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", tmp_path):
+        with pytest.raises(ValueError, match=f"^{path}: expected a.*got a folder, a pipe or a device"):
+            read(path)
+
+
+def test_read_toml__reads_long_comments_and_many_numbers(tmp_path: Path) -> None:
+    text = "# " + "." * 200 + "\n# " + "A sentence. " * 20 + f"\nx = {[0.5] * 1000}\na.b.c.d = '...'\n"
+    (tmp_path / "a.toml").write_text(text)
+    assert read_toml(tmp_path / "a.toml") == {"x": [0.5] * 1000, "a": {"b": {"c": {"d": "..."}}}}
 
 
 @pytest.mark.parametrize("order", "CF")

@@ -12,7 +12,6 @@ in for Anipose and FreeMoCap, metres for Pose2Sim and caliscope.
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -33,12 +32,13 @@ from morgs_mi.capture.layouts.calibration import (
 from morgs_mi.capture.layouts.clips import clip_of_camera
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.io.bounded import MAX_TOML, read_bytes, read_toml
 
 __all__ = ["LAYOUT", "read_anipose"]
 
 _KEYS = ("matrix", "distortions", "rotation", "translation")
 # Recognises a calibration without parsing it, so that a broken one is reported as such.
-_MARKS = [re.compile(rf"^\s*{key}\s*=", re.MULTILINE) for key in ("matrix", "rotation")]
+_MARKS = [re.compile(rf"^[ \t]*{key}[ \t]*=".encode(), re.MULTILINE) for key in ("matrix", "rotation")]
 
 
 def read_anipose(path: Path) -> tuple[list[Camera], list[Lens]]:
@@ -47,10 +47,7 @@ def read_anipose(path: Path) -> tuple[list[Camera], list[Lens]]:
     Raises:
         ValueError: the file is broken, a key of a camera is missing or has another form, or a rotation is none.
     """
-    try:
-        content = tomllib.loads(path.read_bytes().decode("utf-8"))
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: expected TOML, got a broken file ({error}); export it again.") from None
+    content = read_toml(path)
     nested = content.get("cameras")
     tables = nested if isinstance(nested, dict) else content
     entries = {
@@ -116,10 +113,10 @@ def _calibration_files(path: Path) -> list[Path]:
 
 def _is_calibration(file: Path) -> bool:
     try:
-        text = file.read_text(encoding="utf-8", errors="replace")
-    except OSError:  # a folder, or a file without read permission
+        content = read_bytes(file, MAX_TOML)
+    except (OSError, ValueError):  # not readable, a folder or a pipe, or more than a calibration
         return False
-    return all(mark.search(text) for mark in _MARKS)
+    return all(mark.search(content) for mark in _MARKS)
 
 
 def _read_calibration(path: Path) -> Calibration:

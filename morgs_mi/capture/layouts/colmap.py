@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from morgs_mi.capture.layouts.calibration import Calibration, Layout, match_clips, required_clips
 from morgs_mi.capture.lens import MODELS, Lens, lens_and_intrinsics
 from morgs_mi.core.camera import Camera
-from morgs_mi.io.bounded import check_claim
+from morgs_mi.io.bounded import check_claim, read_bytes, regular
 
 __all__ = ["LAYOUT", "ColmapModel", "find_colmap", "read_colmap", "write_colmap"]
 
@@ -192,7 +192,7 @@ LAYOUT = Layout("COLMAP", ("sparse/0", "sparse"), lambda path: find_colmap(path)
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """Yield the number, from 1, and the text of all lines that are not comments, including blank ones."""
-    with path.open(encoding="utf-8", errors="replace") as file:
+    with regular(path).open(encoding="utf-8", errors="replace") as file:
         for i, line in enumerate(file, start=1):
             if not line.startswith("#"):
                 yield i, line.rstrip("\n")
@@ -252,7 +252,7 @@ class _Bytes:
     """A binary file that is read sequentially; reads past its end raise ValueError."""
 
     def __init__(self, path: Path) -> None:
-        self.path, self.data, self.at = path, path.read_bytes(), 0
+        self.path, self.data, self.at = path, read_bytes(path), 0
 
     def take(self, layout: str) -> tuple:
         """Return the fields of one little-endian record."""

@@ -35,6 +35,7 @@ from morgs_mi.capture.layouts.calibration import (
 from morgs_mi.capture.layouts.clips import clip_of_camera, clips_by_frame
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.io.bounded import check_claim, read_bytes
 
 __all__ = ["LAYOUT", "read_qualisys"]
 
@@ -42,6 +43,8 @@ _LOG = logging.getLogger(__name__)
 
 _PATTERN = "*.qca.txt"
 _SUBPIXELS = 64
+# Memory of an element or an attribute, which a few characters may describe.
+_VALUE_BYTES = 200
 _METRES = 1e-3
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 _DISTORTION = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2")
@@ -54,11 +57,11 @@ def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
         ValueError: the file is broken, an element or attribute of a camera is missing or is no number, or its axes are
             not orthonormal.
     """
-    data = path.read_bytes()
+    data = read_bytes(path)
+    values = data.count(b"<") + data.count(b"=")
+    check_claim(path, _VALUE_BYTES * values, f"{values} elements and attributes")
     try:
-        if b"<!DOCTYPE" in data:
-            raise ValueError("it declares a document type")  # whose entities could expand without bound
-        root = ElementTree.fromstring(data)
+        root = ElementTree.fromstring(data, ElementTree.XMLParser(target=_Plain()))
     except (ElementTree.ParseError, ValueError) as error:
         raise ValueError(f"{path}: expected XML, got a broken file ({error}); export it again.") from None
     active = [element for element in root.iter("camera") if element.get("active", "1") != "0"]
@@ -73,6 +76,13 @@ def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
         )
     found = [_camera(path, element) for element in active]
     return [camera for camera, _ in found], [lens for _, lens in found]
+
+
+class _Plain(ElementTree.TreeBuilder):
+    """Builder of a document without a document type, whose entities could expand without bound."""
+
+    def doctype(self, *_: str | None) -> None:
+        raise ValueError("it declares a document type")
 
 
 def _camera(path: Path, element: Element) -> tuple[Camera, Lens]:
