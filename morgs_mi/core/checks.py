@@ -8,7 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["check_mask", "check_number", "check_points", "check_size", "check_type", "numbers"]
+__all__ = ["LARGEST", "check_mask", "check_number", "check_points", "check_size", "check_type", "numbers"]
+
+
+LARGEST = 1e12
+"""Largest coordinate or coefficient that is read, in its own unit: its cube is still a float32."""
 
 
 def check_number(place: str, name: str, value: Any, interval: str) -> None:

@@ -37,18 +37,19 @@ MAX_TOML, _TABLE_BYTES, _MAX_PARTS = 1_000_000, 1000, 32
 _BETWEEN, _PART = re.compile(rb"[=,\[\]{}#\n]"), re.compile(rb"[^.\s][ \t]*\.")
 
 
-def check_claim(path: str | Path, claimed: int, content: str) -> None:
+def check_claim(path: str | Path, claimed: int, content: str, beside: int = 0) -> None:
     """Check that decoding a file takes no more memory than its size allows.
 
     Args:
         path: the file.
         claimed: bytes that the decoded content takes.
         content: what the file claims to hold, for the message, e.g. ``an image of 20000x20000 pixels``.
+        beside: bytes of further files that it names.
 
     Raises:
         ValueError: it takes more.
     """
-    size = Path(path).stat().st_size
+    size = Path(path).stat().st_size + beside
     if claimed > _FACTOR * size + _ALLOWANCE:
         raise ValueError(
             f"{path}: expected content that fits its {size} bytes, got a claim of {content}, which takes "

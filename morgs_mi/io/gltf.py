@@ -28,7 +28,12 @@ _INTERPOLATIONS = ("LINEAR", "STEP", "CUBICSPLINE")
 # Quantised accessors are read like all others. Materials look different without their extensions, but move as they do.
 _READ_EXTENSIONS = ("KHR_mesh_quantization", "KHR_materials_")
 _WRAPS = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
-_BROKEN = (KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError, RecursionError, struct.error)
+_BROKEN = (
+    *(KeyError, IndexError, TypeError, AttributeError, ValueError, OverflowError, RecursionError, MemoryError),
+    *(OSError, struct.error),
+)
+# Nodes of a file, and bytes of a posed vertex: its position and normal as float64.
+_MAX_NODES, _VERTEX_BYTES = 5000, 48
 
 
 @dataclass(frozen=True)
@@ -169,7 +174,7 @@ class Animation:
         return max((float(channel.times[-1]) for channel in self.channels), default=0.0)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Gltf:
     """The content of a file.
 
@@ -235,10 +240,13 @@ class _Reader(GltfData):
     def nodes(self, meshes: Sequence[Sequence[Primitive]], skins: Sequence[Skin]) -> tuple[tuple[Node, ...], Any]:
         """Return the nodes, and their indices with parents before children."""
         items = self.all("nodes")
+        if len(items) > _MAX_NODES:
+            raise self.refused(f"expected at most {_MAX_NODES} nodes, got {len(items)}; export fewer objects")
         parents = np.full(len(items), -1)
         for index, item in enumerate(items):
             for child in item.get("children", ()):
-                if not 0 <= child < len(items) or parents[child] >= 0:
+                self.check_index("nodes", child)
+                if parents[child] >= 0:
                     raise self.refused(f"expected a node {child} with one parent, got another; export it again")
                 parents[child] = index
         order = [int(root) for root in np.flatnonzero(parents < 0)]
@@ -246,8 +254,11 @@ class _Reader(GltfData):
             order += items[index].get("children", ())
         if len(order) < len(items):
             raise self.refused("expected a hierarchy of nodes, got a cycle; export it again")
-        scenes = self.all("scenes")
-        drawn = set(scenes[self.document.get("scene", 0)].get("nodes", ()) if scenes else order)
+        drawn = set(order)
+        if self.all("scenes"):
+            drawn = set(self.entry("scenes", self.document.get("scene", 0)).get("nodes", ()))
+        for index in drawn:
+            self.check_index("nodes", index)
         for index in order:
             if parents[index] in drawn:
                 drawn.add(index)
@@ -257,20 +268,24 @@ class _Reader(GltfData):
         return tuple(found), tuple(order)
 
     def node(self, item: dict[str, Any], parent: int, drawn: bool, meshes: Sequence[Sequence[Primitive]]) -> Node:
-        mesh = item.get("mesh", -1)
-        count = len(meshes[mesh][0].targets) if mesh >= 0 else 0
-        default = self.all("meshes")[mesh].get("weights", [0.0] * count) if mesh >= 0 else []
-        matrix = np.array(item["matrix"], float).reshape(4, 4).T if "matrix" in item else None
+        mesh, skin, count, default = item.get("mesh", -1), item.get("skin", -1), 0, []
+        if "skin" in item:
+            self.check_index("skins", skin)
+        if "mesh" in item:
+            default = self.entry("meshes", mesh).get("weights")
+            count = len(meshes[mesh][0].targets)
+            self.claim(_VERTEX_BYTES * sum(len(primitive.positions) for primitive in meshes[mesh]), "a mesh of a node")
+        where = f"node {item.get('name', '')!r}"
         return Node(
             str(item.get("name", "")),
             parent,
-            matrix,
-            np.array(item.get("translation", (0, 0, 0)), float).reshape(3),
-            np.array(item.get("rotation", (0, 0, 0, 1)), float).reshape(4),
-            np.array(item.get("scale", (1, 1, 1)), float).reshape(3),
+            self.numbers(where, item["matrix"], 4, 4).T if "matrix" in item else None,
+            self.numbers(where, item.get("translation", (0, 0, 0)), 3),
+            self.numbers(where, item.get("rotation", (0, 0, 0, 1)), 4),
+            self.numbers(where, item.get("scale", (1, 1, 1)), 3),
             mesh,
-            item.get("skin", -1),
-            np.array(item.get("weights", default), float).reshape(count),
+            skin,
+            self.numbers(where, item.get("weights", default or [0.0] * count), count),
             drawn,
         )
 
@@ -294,9 +309,11 @@ class _Reader(GltfData):
                 )
 
     def skin(self, item: dict[str, Any]) -> Skin:
+        for joint in item["joints"]:
+            self.check_index("nodes", joint)
         joints = np.array(item["joints"], int)
-        if not len(joints) or joints.min() < 0 or joints.max() >= len(self.all("nodes")):
-            raise self.refused(f"expected joints that are nodes, got {joints.tolist()[:8]}; export it again")
+        if not len(joints):
+            raise self.refused("expected skins with joints, got one without; export it again")
         if "inverseBindMatrices" not in item:
             return Skin(joints, np.tile(np.eye(4), (len(joints), 1, 1)))
         # glTF stores matrices by columns.
@@ -310,13 +327,13 @@ class _Reader(GltfData):
             raise self.refused(
                 f"mesh {mesh}: expected triangles, got primitives of mode {item['mode']}; export triangles only"
             )
-        if (material := item.get("material", -1)) not in range(-1, len(self.all("materials"))):
-            raise self.refused(f"mesh {mesh}: expected a material of the file, got {material}; export it again")
+        if "material" in item:
+            self.check_index("materials", item["material"])
         attributes = item["attributes"]
         positions = self.accessor(attributes["POSITION"], "VEC3")
         count = len(positions)
-        faces = self.accessor(item["indices"], "SCALAR") if "indices" in item else np.arange(count)
-        faces = faces.astype(int).reshape(-1, 3)
+        faces = self.indices(item["indices"], "SCALAR") if "indices" in item else np.arange(count)
+        faces = faces.reshape(-1, 3)
         if not len(faces) or faces.max() >= count:
             raise self.refused(f"mesh {mesh}: expected faces with its {count} vertices, got others; export it again")
 
@@ -324,7 +341,7 @@ class _Reader(GltfData):
             return self.accessor(attributes[name], kind, count) if name in attributes else None
 
         sets = [i for i in range(len(attributes)) if f"JOINTS_{i}" in attributes]
-        joints = [self.accessor(attributes[f"JOINTS_{i}"], "VEC4", count) for i in sets]
+        joints = [self.indices(attributes[f"JOINTS_{i}"], "VEC4", count) for i in sets]
         weights = [self.accessor(attributes[f"WEIGHTS_{i}"], "VEC4", count) for i in sets]
         targets = item.get("targets", [])
         return Primitive(
@@ -332,16 +349,17 @@ class _Reader(GltfData):
             faces,
             optional("TEXCOORD_0", "VEC2"),
             optional("NORMAL", "VEC3"),
-            np.concatenate(joints, axis=1).astype(int) if sets else None,
+            np.concatenate(joints, axis=1) if sets else None,
             _normalized(np.concatenate(weights, axis=1)) if sets else None,
             self.displacements(targets, "POSITION", count),
             self.displacements(targets, "NORMAL", count),
-            int(material),
+            item.get("material", -1),
         )
 
     def displacements(self, targets: list[dict[str, int]], name: str, count: int) -> np.ndarray:
         """Return an attribute of the morph targets [K, V, 3], zero in those that do not have it."""
         none = np.zeros((count, 3))
+        self.claim(none.nbytes * len(targets), f"{len(targets)} morph targets")
         found = [self.accessor(target[name], "VEC3", count) if name in target else none for target in targets]
         return np.stack(found) if found else np.zeros((0, count, 3))
 
@@ -349,16 +367,23 @@ class _Reader(GltfData):
         name = str(item.get("name") or f"animation{index}")
         # Channels without a node, and those of extensions, have no effect.
         own = [c for c in item["channels"] if c["target"]["path"] in _PATHS and "node" in c["target"]]
+        if len({(c["target"]["node"], c["target"]["path"]) for c in own}) < len(own):
+            raise self.refused(
+                f"animation {name!r}: expected one channel for a property of a node, got several; export it again"
+            )
+        if wrong := [c["sampler"] for c in own if c["sampler"] < 0]:
+            raise self.refused(f"animation {name!r}: expected samplers of its own, got {wrong[0]}; export it again")
         channels = (self.channel(name, c["target"], item["samplers"][c["sampler"]], nodes) for c in own)
         return Animation(name, tuple(channels))
 
     def channel(self, name: str, target: dict[str, Any], sampler: dict[str, Any], nodes: Sequence[Node]) -> Channel:
         node, path, interpolation = target["node"], target["path"], sampler.get("interpolation", "LINEAR")
+        self.check_index("nodes", node)
         times = self.accessor(sampler["input"], "SCALAR")[:, 0]
         values = self.accessor(sampler["output"])
         columns = len(nodes[node].weights) if path == "weights" else _PATHS[path]
         shape = (len(times), 3, columns) if interpolation == "CUBICSPLINE" else (len(times), columns)
-        fits = interpolation in _INTERPOLATIONS and node >= 0 and values.size == np.prod(shape)
+        fits = interpolation in _INTERPOLATIONS and values.size == np.prod(shape)
         if not fits or not len(times) or (np.diff(times) <= 0).any():
             raise self.refused(
                 f"animation {name!r}, {path} of node {node}: expected ascending times with a value of {columns} "
@@ -376,12 +401,12 @@ class _Reader(GltfData):
 
     def material(self, item: dict[str, Any]) -> Material:
         surface = item.get("pbrMetallicRoughness", {})
-        red, green, blue, _ = map(float, surface.get("baseColorFactor", (1, 1, 1, 1)))
+        red, green, blue, _ = self.numbers("material", surface.get("baseColorFactor", (1, 1, 1, 1)), 4).tolist()
         return Material(
             (red, green, blue),
             self.texture(surface.get("baseColorTexture")),
-            float(surface.get("roughnessFactor", 1)),
-            float(surface.get("metallicFactor", 1)),
+            self.numbers("material", surface.get("roughnessFactor", 1)).item(),
+            self.numbers("material", surface.get("metallicFactor", 1)).item(),
             self.texture(surface.get("metallicRoughnessTexture")),
         )
 
@@ -390,11 +415,12 @@ class _Reader(GltfData):
             return None
         if item.get("texCoord", 0):
             raise self.refused("expected textures that use TEXCOORD_0, got another set; export one set only")
-        texture = self.all("textures")[item["index"]]
-        image = self.all("images")[texture["source"]]
+        texture = self.entry("textures", item["index"])
+        image = self.entry("images", texture["source"])
         data = self.view(image["bufferView"]) if "bufferView" in image else self.resource(image["uri"])
         pixels = decode_image(self.path, np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        wrap = self.all("samplers")[texture["sampler"]].get("wrapS", 10497) if "sampler" in texture else 10497
+        self.claim(pixels.nbytes, "an image")
+        wrap = self.entry("samplers", texture["sampler"]).get("wrapS", 10497) if "sampler" in texture else 10497
         return Texture(cv2.cvtColor(pixels, cv2.COLOR_BGR2RGB), _WRAPS[wrap])
 
 

@@ -7,6 +7,7 @@ skinned vertex is at sum_j w_j W_j B_j x, and any other one at W_n x. Morph targ
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -56,13 +57,20 @@ def pose_at(model: Gltf, animation: Animation, time: float) -> Posed:
     moved: dict[int, dict[str, np.ndarray]] = {}
     for channel in animation.channels:
         moved.setdefault(channel.node, {})[channel.path] = sample(channel, time)
-    matrices = np.zeros((len(model.nodes), 4, 4))
+    matrices = _at_rest(model).copy()
+    for index in moved:
+        matrices[index] = _local(model.nodes[index], moved[index])
     for index in model.order:
-        node = model.nodes[index]
-        local = _local(node, moved.get(index, {}))
-        matrices[index] = local if node.parent < 0 else matrices[node.parent] @ local
+        if (parent := model.nodes[index].parent) >= 0:
+            matrices[index] = matrices[parent] @ matrices[index]
     weights = (moved.get(index, {}).get("weights", node.weights) for index, node in enumerate(model.nodes))
     return Posed(matrices, tuple(weights))
+
+
+@lru_cache(maxsize=4)
+def _at_rest(model: Gltf) -> np.ndarray:
+    """Return the matrices [N, 4, 4] of the nodes to their parents, without animation."""
+    return np.array([_local(node, {}) for node in model.nodes]).reshape(-1, 4, 4)
 
 
 def _local(node: Node, moved: dict[str, np.ndarray]) -> np.ndarray:

@@ -80,9 +80,10 @@ def _placement(
     """Return the matrix [4, 4] that puts what a model sweeps on the floor, as large as fits."""
     turned = rotate("y", _TURN)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    for time in np.linspace(0, duration, _NUM_TIMES, endpoint=False):
-        points = np.concatenate([deform(model, i, posed(float(time)), turned).vertices for i in drawn])
-        low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
+    with np.errstate(over="ignore", invalid="ignore"):  # products of many scales, which are refused below
+        for time in np.linspace(0, duration, _NUM_TIMES, endpoint=False):
+            points = np.concatenate([deform(model, i, posed(float(time)), turned).vertices for i in drawn])
+            low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
     size = high - low
     if not np.isfinite(size).all() or not size.max() > 0:
         raise ValueError(f"{path}: expected a model with an extent, got the size {size.tolist()}; export it again.")
@@ -139,13 +140,13 @@ def _bitmap(texture: Texture, values: np.ndarray) -> dict[str, Any]:
 def _names(names: Iterable[str], taken: set[str]) -> list[str]:
     """Return names that differ from one another and from `taken`, without what Mitsuba does not accept."""
     found: list[str] = []
+    counts: dict[str, int] = {}
     for name in names:
         base = re.sub(r"[^\w-]", "_", name) or "node"
-        count = 1
         name = base
         while name in taken:
-            count += 1
-            name = f"{base}_{count}"
+            counts[base] = counts.get(base, 1) + 1
+            name = f"{base}_{counts[base]}"
         taken.add(name)
         found.append(name)
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -77,6 +78,23 @@ def primitive(b: Builder) -> dict:
     return b.document["meshes"][0]["primitives"][0]
 
 
+def zeros(b: Builder, count: int) -> int:
+    """Append an accessor [count, 3] that takes no bytes of the file."""
+    b.document["accessors"].append({"count": count, "type": "VEC3", "componentType": 5126})
+    return len(b.document["accessors"]) - 1
+
+
+def sparse(b: Builder, dtype: str) -> None:
+    """Replace the last vertex of the skinned mesh, by a place before the first."""
+    places, values = b.view(np.array([-1], dtype).tobytes()), b.view(np.zeros(3, "<f4").tobytes())
+    kind = {"i1": 5120, "f4": 5126}[dtype]
+    b.document["accessors"][0]["sparse"] = {
+        "count": 1,
+        "indices": {"bufferView": places, "componentType": kind},
+        "values": {"bufferView": values},
+    }
+
+
 # What is wrong, how, and what is said about it.
 WRONG: dict[str, tuple[Callable[[Builder], object], str]] = {
     "draco": (
@@ -99,7 +117,7 @@ WRONG: dict[str, tuple[Callable[[Builder], object], str]] = {
     ),
     "material": (
         lambda b: primitive(b).update(material=2),
-        "mesh 0: expected a material of the file, got 2",
+        "expected one of its 2 materials, got number 2",
     ),
     "vertices": (
         lambda b: primitive(b)["attributes"].update(TEXCOORD_0=0),
@@ -119,7 +137,7 @@ WRONG: dict[str, tuple[Callable[[Builder], object], str]] = {
     ),
     "nan": (
         lambda b: setattr(b, "data", np.float32(np.nan).tobytes() + b.data[4:]),
-        "accessor 0: expected finite numbers, got NaN",
+        "accessor 0: expected finite numbers of at most 1e\\+12, got others",
     ),
     "cycle": (lambda b: b.document["nodes"][2].update(children=[1]), "expected a hierarchy of nodes, got a cycle"),
     "parents": (lambda b: b.document["nodes"][0].update(children=[2]), "expected a node 2 with one parent"),
@@ -137,6 +155,63 @@ WRONG: dict[str, tuple[Callable[[Builder], object], str]] = {
             or primitive(b)["attributes"].update(POSITION=len(b.document["accessors"]) - 1)
         ),
         "a claim of an accessor of 1000000000000 elements",
+    ),
+    "shared accessor": (
+        lambda b: b.document["meshes"][0].update(primitives=40 * [{"attributes": {"POSITION": zeros(b, 3_000_000)}}]),
+        "got a claim of an accessor of 3000000 elements, with all before it",
+    ),
+    "shared target": (
+        lambda b: primitive(b).update(targets=200 * [{"POSITION": 0}] + [{}] * 400_000),
+        "got a claim of 400200 morph targets, with all before it",
+    ),
+    "shared mesh": (
+        lambda b: (
+            b.document["meshes"][2].update(primitives=[{"attributes": {"POSITION": zeros(b, 300_000)}}])
+            or b.document["nodes"].extend(40 * [{"mesh": 2}])
+        ),
+        "got a claim of a mesh of a node, with all before it",
+    ),
+    "signed faces": (lambda b: primitive(b).update(indices=b.array([0, 1, -1], "i1")), "unsigned integers .* got int8"),
+    "real faces": (lambda b: primitive(b).update(indices=b.array([0, 1, 1e30])), "unsigned integers .* got float32"),
+    "normalized faces": (
+        lambda b: primitive(b).update(indices=b.array([0, 1, 2], "u1", normalized=True)),
+        "expected unsigned integers as indices",
+    ),
+    "signed joints": (
+        lambda b: primitive(b)["attributes"].update(JOINTS_0=b.array(-column()["joints"], "i2")),
+        "unsigned integers as indices, got int16",
+    ),
+    "signed places": (lambda b: sparse(b, "i1"), "accessor 0: expected unsigned integers as indices, got int8"),
+    "real places": (lambda b: sparse(b, "f4"), "accessor 0: expected unsigned integers as indices, got float32"),
+    "many nodes": (lambda b: b.document["nodes"].extend(5000 * [{}]), "expected at most 5000 nodes, got 5006"),
+    "nan place": (
+        lambda b: b.document["nodes"][1].update(translation=[0, float("nan"), 0]),
+        "node 'hip': expected finite numbers of at most",
+    ),
+    "huge scale": (lambda b: b.document["nodes"][1].update(scale=[1e300, 1, 1]), "node 'hip': expected finite numbers"),
+    "huge matrix": (lambda b: b.document["nodes"][1].update(matrix=[1e13] * 16), "node 'hip': expected finite numbers"),
+    "nan color": (
+        lambda b: b.document["materials"][1]["pbrMetallicRoughness"].update(metallicFactor=float("nan")),
+        "material: expected finite numbers",
+    ),
+    "scene": (lambda b: b.document.update(scene=-1), "expected one of its 1 scenes, got number -1"),
+    "root": (lambda b: b.document["scenes"][0].update(nodes=[9]), "expected one of its 6 nodes, got number 9"),
+    "skin": (lambda b: b.document["nodes"][0].update(skin=-3), "expected one of its 1 skins, got number -3"),
+    "mesh": (lambda b: b.document["nodes"][0].update(mesh=-1), "expected one of its 3 meshes, got number -1"),
+    "joint": (lambda b: b.document["skins"][0].update(joints=[1, 6]), "expected one of its 6 nodes, got number 6"),
+    "image": (lambda b: b.document["textures"][0].update(source=-1), "expected one of its 1 images, got number -1"),
+    "half": (lambda b: primitive(b).update(indices=0.5), "expected one of its [0-9]+ accessors, got number 0.5"),
+    "animated node": (
+        lambda b: b.document["animations"][0]["channels"][0]["target"].update(node=9),
+        "expected one of its 6 nodes, got number 9",
+    ),
+    "sampler": (
+        lambda b: b.document["animations"][0]["channels"][0].update(sampler=-1),
+        "animation 'bend': expected samplers of its own, got -1",
+    ),
+    "channels": (
+        lambda b: b.document["animations"][0].update(channels=2 * b.document["animations"][0]["channels"]),
+        "animation 'bend': expected one channel for a property of a node, got several",
     ),
     "missing key": (
         lambda b: b.document["meshes"][0].pop("primitives"),
@@ -162,6 +237,28 @@ def test_read_gltf__names_missing_files(tmp_path: Path) -> None:
         read_gltf(path)
     with pytest.raises(FileNotFoundError, match=r"nowhere\.glb: expected a glTF file, got none"):
         read_gltf(tmp_path / "nowhere.glb")
+
+
+@pytest.mark.parametrize("uri", ["../secret.bin", "%2e%2e/secret.bin", "{}/secret.bin", "a/../../secret.bin", "link"])
+def test_read_gltf__reads_no_file_outside_its_folder(tmp_path: Path, uri: str) -> None:
+    folder, b = tmp_path / "model", model()
+    (folder / "a").mkdir(parents=True)
+    (tmp_path / "secret.bin").write_bytes(b.data)
+    (folder / "link").symlink_to("../secret.bin")
+    b.document["buffers"] = [{"byteLength": len(b.data), "uri": uri.format(tmp_path)}]
+    path = folder / "model.gltf"
+    path.write_text(json.dumps(b.document))
+    with pytest.raises(ValueError, match=f"^{path}: expected files in its folder, got .*{uri[-4:]}; copy it there"):
+        read_gltf(path)
+
+
+def test_read_gltf__counts_the_files_that_it_names(tmp_path: Path) -> None:
+    """A text of 2 kB with 30 MB beside it may hold as much as one file of 30 MB."""
+    b = model()
+    many = b.array(np.zeros((2_500_000, 3)))
+    b.document["meshes"][2]["primitives"] = 2 * [{"attributes": {"POSITION": many}, "indices": primitive(b)["indices"]}]
+    found = read_gltf(write_gltf(tmp_path / "model.gltf", b))
+    assert [len(part.positions) for part in found.meshes[2]] == 2 * [2_500_000]
 
 
 def test_read_gltf__refuses_damaged_files_with_one_sentence(tmp_path: Path) -> None:

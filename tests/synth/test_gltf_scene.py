@@ -213,3 +213,22 @@ def test_read_gltf__agrees_with_the_scene_on_the_number_of_vertices(scene: Scene
     found = read_gltf(write_glb(tmp_path / "model.glb"))
     for (primitive,), item in zip(found.meshes, moving_objects(scene).values(), strict=True):
         assert len(item.shape(0.0).vertices) == len(primitive.positions)
+
+
+@pytest.mark.filterwarnings("error")
+def test_gltf_scene__refuses_scales_whose_product_overflows(tmp_path: Path) -> None:
+    b = model()
+    count = len(b.document["nodes"])
+    b.document["nodes"] += [{"scale": [1e12] * 3, "children": [count + i + 1]} for i in range(60)] + [{"mesh": 2}]
+    b.document["scenes"][0]["nodes"].append(count)
+    path = write_glb(tmp_path / "model.glb", b)
+    with pytest.raises(ValueError, match=f"^{path}: expected a model with an extent, got the size"):
+        gltf_scene(path)
+
+
+def test_gltf_scene__numbers_nodes_of_one_name(tmp_path: Path) -> None:
+    b = model()
+    for node in b.document["nodes"]:
+        node["name"] = "a b"
+    b.document["nodes"][5]["name"] = "a_b_2"
+    assert [*moving_objects(gltf_scene(write_glb(tmp_path / "model.glb", b)))] == ["a_b", "a_b_2", "a_b_2_2"]
