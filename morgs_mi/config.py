@@ -55,6 +55,7 @@ PresetName = Literal[
 ]
 Config = TypeVar("Config")
 _NONE = "none"
+_MOST = 2**64  # of a whole number; the header of a stream has no longer ones
 _COMMENT_WIDTH = 110
 
 
@@ -245,7 +246,9 @@ def _converted(value: Any, kind: Any) -> Any:
     for arm in arms:
         if arm is float and isinstance(value, (int, float)) and not isinstance(value, bool):
             return float(value)
-        if arm in (int, bool, str) and type(value) is arm:
+        if arm is int and type(value) is int and -_MOST // 2 <= value < _MOST:
+            return value
+        if arm in (bool, str) and type(value) is arm:
             return value
         if is_dataclass(arm) and isinstance(arm, type) and isinstance(value, arm):
             return value
@@ -265,7 +268,13 @@ def _converted(value: Any, kind: Any) -> Any:
 
 def _described(kind: Any) -> str:
     """Return a field's type in words."""
-    words = {int: "a whole number", float: "a number", bool: "true or false", str: "a string", NoneType: f"'{_NONE}'"}
+    words = {
+        int: "a whole number below 2^64",
+        float: "a number",
+        bool: "true or false",
+        str: "a string",
+        NoneType: f"'{_NONE}'",
+    }
     described = []
     for arm in _arms(kind):
         origin, kinds = get_origin(arm) or arm, get_args(arm)

@@ -107,7 +107,10 @@ def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
         (["--config", "[fit]\na = " + "[" * 5000], ("bad.toml: expected TOML, got a broken file",)),
         (["--config", "[fit]\na = " + "9" * 5000], ("bad.toml: expected TOML, got a broken file",)),
         (["--config", "[fit]\nepoch = 1"], ("bad.toml: `fit.epoch` is unknown, expected `fit.epochs`",)),
-        (["--config", "[fit]\nepochs = 'many'"], ("bad.toml: `fit.epochs` must be a whole number, got 'many'",)),
+        (
+            ["--config", "[fit]\nepochs = 'many'"],
+            ("bad.toml: `fit.epochs` must be a whole number below 2^64, got 'many'",),
+        ),
         (["--config", "[fit.rates]\nmeans = nan"], ("bad.toml: `fit.rates.means` must be finite and not negative",)),
         (["--config", "[render]\nblock_width = 17"], ("bad.toml: `render.block_width` must be 4, 8, 12 or 16",)),
         (["--config", "[motion]\nflow_method = 'no'"], ("bad.toml: `motion.flow_method` must be one of dis,",)),

@@ -59,7 +59,10 @@ def test_read_jobs__has_default_settings_and_one_seed(tmp_path: Path) -> None:
         ("seeds = [0]", r"jobs\.toml: `captures` must be one or more that differ, got none"),
         ('captures = ["a/x", "b/x"]', r"jobs\.toml: `captures` must be one or more that differ, got x, x"),
         ('captures = ["x"]\nseeds = [1, 1]', r"jobs\.toml: `seeds` must be one or more that differ, got 1, 1"),
-        ('captures = ["x"]\nseeds = ["a"]', r"jobs\.toml: `seeds` must be a list \(each a whole number\), got \['a'\]"),
+        (
+            'captures = ["x"]\nseeds = ["a"]',
+            r"jobs\.toml: `seeds` must be a list \(each a whole number below 2\^64\), got \['a'\]",
+        ),
         ('captures = ["x"]\nseed = 1', r"jobs\.toml: `seed` is unknown, expected `seeds`"),
         ('captures = ["x"]\nsettings = 3', r"jobs\.toml: `settings` must be tables such as \[settings\.quick\], got 3"),
         ('captures = ["x"]\n[settings]\nq = 3', r"jobs\.toml: \[settings\.q\]: expected a table, got 3"),
