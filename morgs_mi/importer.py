@@ -45,6 +45,7 @@ _DIRECTIONS: dict[Axes, tuple[np.ndarray, np.ndarray]] = {
 _WIDTH, _HEIGHT, _FOV_X = 1280, 720, 50.0
 _FRAMES_IN_VIEW = 3  # first, middle and last
 _MARGIN = 1.1
+_LEAST_EXTENT = 1e-6  # of the distance from the origin
 _PERCENT_OUTSIDE = 2.0  # of the centres, on each side: floaters far from the scene
 # With rows of other Gaussians the share is about a half; with the same ones, only near-duplicates reduce it.
 _LEAST_SHARE = 0.95
@@ -97,12 +98,18 @@ def import_frames(
         OSError: the stream cannot be written.
     """
     check_number("import_frames()", "fps", fps, "[1e-6, 1e6]")
+    _directions(axes)
     config, paths = config or CodecConfig(), find_frames(sources)
     path = Path(out) if Path(out).suffix.lower() == ".morgs" else Path(out) / "stream.morgs"
     if path.exists():
         raise FileExistsError(f"{path}: expected a new stream, got a file that exists; remove it, or name another.")
     in_view = np.unique(np.linspace(0, len(paths) - 1, _FRAMES_IN_VIEW).astype(int))
-    cameras = [default_camera([read_splats(paths[t]) for t in in_view], axes)]
+    try:
+        cameras = [default_camera([read_splats(paths[t]) for t in in_view], axes)]
+    except ValueError as error:
+        if any(str(error).startswith(f"{path}: ") for path in paths):
+            raise
+        raise ValueError(f"{paths[0].parent}: {error}") from None
     path.parent.mkdir(parents=True, exist_ok=True)
     coded, order, keyframes = None, np.zeros(0, np.int64), 0
     metadata = {"num_frames": len(paths), "config": {"codec": asdict(config)}}
@@ -214,7 +221,7 @@ def default_camera(frames: Sequence[Gaussians], axes: Axes = "y-down") -> Camera
     """Return a camera in front of the scene that sees the box around nearly all centres in these frames.
 
     Raises:
-        ValueError: there is no Gaussian in any of the frames.
+        ValueError: there is no Gaussian in any of the frames, or `axes` is unknown.
     """
     means = np.concatenate([gaussians.numpy()["means"] for gaussians in frames]).astype(np.float64)
     sizes = np.concatenate([gaussians.numpy()["log_scales"].max(axis=1, initial=-69) for gaussians in frames])
@@ -224,15 +231,23 @@ def default_camera(frames: Sequence[Gaussians], axes: Axes = "y-down") -> Camera
             "frames that are empty."
         )
     low, high = np.percentile(means, (_PERCENT_OUTSIDE, 100 - _PERCENT_OUTSIDE), axis=0)
-    # A single Gaussian has no extent but its own.
-    half = _MARGIN * 0.5 * (high - low) + 3 * np.exp(np.median(sizes))
-    up, forward = _DIRECTIONS[axes]
+    # A single Gaussian has no extent but its own, and one without extent is at least larger than rounding errors.
+    least = _LEAST_EXTENT * (1 + np.abs((low, high)).max())
+    half = np.maximum(_MARGIN * 0.5 * (high - low) + 3 * np.exp(np.median(sizes)), least)
+    up, forward = _directions(axes)
     width, height, depth = (np.abs(direction) @ half for direction in (np.cross(forward, up), up, forward))
     tangent = np.tan(np.deg2rad(_FOV_X / 2))
     distance = depth + max(width, height * _WIDTH / _HEIGHT) / tangent
     center = (low + high) / 2
     origin = center - distance * forward
     return Camera.look_at(origin, center, up, _FOV_X, _WIDTH, _HEIGHT, "front", near=min(0.01, float(distance) / 1000))
+
+
+def _directions(axes: Axes) -> tuple[np.ndarray, np.ndarray]:
+    """Return the directions [3] up and forward of the camera."""
+    if axes not in _DIRECTIONS:
+        raise ValueError(f"import_frames(): `axes` must be one of {', '.join(_DIRECTIONS)}, got {axes!r}; choose one.")
+    return _DIRECTIONS[axes]
 
 
 def _scaled_features(before: Gaussians, now: Gaussians) -> tuple[np.ndarray, np.ndarray]:

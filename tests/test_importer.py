@@ -223,6 +223,31 @@ def test_import_frames__refuses_to_replace_a_stream(clip, tmp_path):
     assert (tmp_path / "s.morgs").read_bytes() == before
 
 
+def test_import_frames__reads_gaussians_without_extent(tmp_path):
+    (tmp_path / "0.splat").write_bytes(2 * (bytes(24) + bytes([9, 9, 9, 9, 255, 128, 128, 128])))
+    assert import_frames([tmp_path], tmp_path / "out").num_frames == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"means": np.full((2, 3), 1e30)}, r"0\.ply: expected centres of at most 1e\+12, got larger ones"),
+        ({"log_scales": np.full((2, 3), 1000.0)}, r"0\.ply: expected sizes of at most 1e\+12"),
+        ({"sh_coeffs": np.full((2, 1, 3), -1e20)}, r"0\.ply: expected coefficients of colour of at most 1e\+12"),
+        ({"means": np.array([[-9e11] * 3, [9e11] * 3])}, r"Camera\('front'\).*the pose must be finite, with numbers"),
+    ],
+)
+def test_import_frames__names_the_file_of_huge_numbers(tmp_path, change, message):
+    write_ply(tmp_path / "0.ply", replace(splats(2, 0), **change))
+    with pytest.raises(ValueError, match=f"^{tmp_path}.*{message}"):
+        import_frames([tmp_path], tmp_path / "out")
+
+
+def test_import_frames__names_unknown_axes(tmp_path):
+    with pytest.raises(ValueError, match=r"`axes` must be one of y-down, y-up, z-up, got 'bogus'"):
+        import_frames([tmp_path], tmp_path / "out", axes="bogus")
+
+
 def test_import_frames__refuses_frames_without_gaussians(tmp_path):
     clip = write_frames(tmp_path / "clip", [splats(0)])
     with pytest.raises(ValueError, match="expected at least one Gaussian in the first, middle or last frame"):

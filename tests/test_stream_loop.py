@@ -357,7 +357,7 @@ def masked(masks):
         (lambda clip: new_loop().push([i / 255 for i in clip[0][:4]]), "got float64"),
         (
             lambda clip: StreamLoop(cameras(), np.full((200, 3), np.nan), np.zeros((200, 3))),
-            r"`points` must be finite, got .* at 0",
+            r"`points` must be finite and at most 1e\+12, got .* at 0",
         ),
         (
             lambda clip: StreamLoop(cameras(), np.zeros((200, 3)), np.zeros((10, 3))),

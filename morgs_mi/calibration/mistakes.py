@@ -17,12 +17,11 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts import poses_bounds
 from morgs_mi.capture.layouts.calibration import PoseConvention
 from morgs_mi.capture.layouts.registry import layout_called
-from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.core.camera import Camera
 
 __all__ = [
     "best_focal_factor",
     "camera_candidates",
-    "improper_poses",
     "rig_candidates",
     "same_poses",
     "with_focal_factor",
@@ -40,17 +39,6 @@ _SAME = 1e-3
 _MAX_EXCHANGED, _MAX_PERMUTED = 12, 4
 # Factors of the focal length that are tried, and their step: at a wrong focal length the error has several minima.
 _FACTOR_OCTAVES, _FACTOR_STEP = 2.0, 0.25
-
-
-def improper_poses(cameras: Sequence[Camera]) -> dict[int, str]:
-    """Return a sentence for each camera whose rotation block is not a rotation, but scaled, sheared or mirrored."""
-    found = {}
-    for view, camera in enumerate(cameras):
-        try:
-            rigid("its pose is no rotation and translation", np.asarray(camera.viewmat, np.float64))
-        except ValueError as error:
-            found[view] = str(error).rstrip(".")
-    return found
 
 
 def same_poses(cameras: Sequence[Camera]) -> list[tuple[int, int]]:

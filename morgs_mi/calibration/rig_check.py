@@ -19,7 +19,6 @@ import numpy as np
 from morgs_mi.calibration.mistakes import (
     best_focal_factor,
     camera_candidates,
-    improper_poses,
     rig_candidates,
     same_poses,
     with_focal_factor,
@@ -148,10 +147,10 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
     """Return how well the capture's cameras fit the matches between its views."""
     capture = capture.at_recorded_size()
     pairs, views = _Pairs.of(shared, capture.cameras), range(len(capture.cameras))
-    group, improper = pairs.agreeing(), improper_poses(capture.cameras)
+    group = pairs.agreeing()
     checks = [_check(view, pairs, group) for view in views]
     errors = np.concatenate([np.zeros(0), *pairs.errors])
-    correction = None if improper or not len(errors) else _correct_rig(capture, pairs.sampled(), checks)
+    correction = _correct_rig(capture, pairs.sampled(), checks) if len(errors) else None
     if correction:
         cameras, explanation = correction
         changed = {view for view in views if cameras[view] is not capture.cameras[view]}
@@ -161,7 +160,7 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
         ]
         advice = f"the poses do not fit the images: {explanation}."
     else:
-        reasons = _copies(shared, checks, capture.cameras) | improper
+        reasons = _copies(shared, checks, capture.cameras)
         checks = [_with_reason(view, check, pairs.sampled(), group, reasons) for view, check in enumerate(checks)]
         advice = _summary(checks)
     fits = False if any(c.fits is False for c in checks) else None if any(c.fits is None for c in checks) else True

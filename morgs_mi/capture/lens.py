@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import LARGEST, bounded
 
 __all__ = ["Lens", "Undistortion", "lens_and_intrinsics", "opencv_lens", "undistortion"]
 
@@ -64,8 +65,8 @@ def lens_and_intrinsics(model: str, params: Sequence[float]) -> tuple[Lens, np.n
             f"the camera model {model} takes {focals + 2 + coefficients} parameters, "
             f"got {len(params)}; write the model again."
         )
-    if not np.isfinite(params).all():
-        raise ValueError(f"its parameters must be finite, got {[*params]}; calibrate again.")
+    if not bounded(params):
+        raise ValueError(f"its parameters must be finite and at most {LARGEST:g}, got {[*params]}; calibrate again.")
     fx, fy, (cx, cy) = params[0], params[focals - 1], params[focals : focals + 2]
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=np.float64)
     return Lens(model, tuple(map(float, params[focals + 2 :]))), K

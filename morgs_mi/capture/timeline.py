@@ -311,14 +311,12 @@ def read_settings(path: Path) -> dict[str, Any]:
     if not isinstance(settings, dict):
         raise ValueError(f"{path}: expected a JSON object, got {type(settings).__name__}; correct it.")
     view = settings.get("test_view")
-    for name in ("fps", "meters_per_unit"):
-        value = settings.get(name)
-        if value is not None and not (isinstance(value, int | float) and value > 0):
-            raise ValueError(f"{path}: `{name}` must be a positive number, got {value!r}; correct it.")
+    for name, interval in (("fps", "[1e-6, 1e6]"), ("meters_per_unit", "[1e-12, 1e12]")):
+        if (value := settings.get(name)) is not None:
+            check_number(str(path), name, value, interval)
     readout = settings.get("readout", 0.0)
     for value in readout.values() if isinstance(readout, dict) else [readout]:
-        if type(value) not in (int, float) or not -1 <= value <= 1:
-            raise ValueError(f"{path}: `readout` must be a number of frames in [-1, 1], got {value!r}; correct it.")
+        check_number(str(path), "readout", value, "[-1, 1]")
     if view is not None and type(view) is not int:
         raise ValueError(f"{path}: `test_view` must be a camera's index or null, got {view!r}; correct it.")
     return settings

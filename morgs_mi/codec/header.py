@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import LARGEST
 
 __all__ = ["header_fields", "header_json", "load_json"]
 
@@ -21,7 +22,6 @@ _MAX_BYTES = 2**22
 _MAX_LEVELS = 32  # of JSON; recursive programs must be able to visit it
 _MAX_PIXELS = 2**26  # of a camera
 _MAX_FPS = 1e6
-_MAX_LENGTH = 1e12  # world units or pixels
 _IN_WORDS = {
     dict: "an object",
     list: "a list",
@@ -131,7 +131,7 @@ def _camera(fields: Any, where: str) -> Camera:
         _within(_entry(fields, key, int, where), 1, _MAX_PIXELS, f"{where}.{key}") for key in ("width", "height")
     )
     _within(width * height, 1, _MAX_PIXELS, f"{where}.width * height")
-    near = _within(_entry(fields, "near", float, where), 1 / _MAX_LENGTH, _MAX_LENGTH, f"{where}.near")
+    near = _within(_entry(fields, "near", float, where), 1 / LARGEST, LARGEST, f"{where}.near")
     return Camera(_matrix(fields, "K", 3, where), _matrix(fields, "viewmat", 4, where), width, height, name, near)
 
 
@@ -139,7 +139,7 @@ def _matrix(fields: dict[str, Any], key: str, size: int, where: str) -> np.ndarr
     rows, what = _entry(fields, key, list, where), f"{where}.{key}"
     if len(rows) != size or any(not isinstance(row, list) or len(row) != size for row in rows):
         raise ValueError(f"`{what}` must be a matrix [{size}][{size}]")
-    return np.array([[_within(_typed(x, float, what), -_MAX_LENGTH, _MAX_LENGTH, what) for x in row] for row in rows])
+    return np.array([[_within(_typed(x, float, what), -LARGEST, LARGEST, what) for x in row] for row in rows])
 
 
 def _entry(fields: dict[str, Any], key: str, kind: type, where: str = "") -> Any:

@@ -13,7 +13,7 @@ import drjit as dr
 import numpy as np
 from numpy.typing import ArrayLike
 
-from morgs_mi.core.checks import check_number, check_size, numbers
+from morgs_mi.core.checks import LARGEST, bounded, check_number, check_size, numbers
 from morgs_mi.core.types import Tensor
 
 __all__ = ["Camera", "rigid"]
@@ -43,8 +43,9 @@ class Camera:
         >>> pixels, depths = camera.project(points)
 
     Raises:
-        ValueError: a size below 1x1, matrices of another shape or with numbers that are not finite, a focal length or
-            `near` that is not positive. A Dr.Jit `viewmat` is checked by `rasterize`.
+        ValueError: a size below 1x1, matrices of another shape or with numbers that are not finite or above 1e12, a
+            focal length or `near` that is not positive, or a `viewmat` that is no rotation and translation. Only the
+            shape of a Dr.Jit `viewmat` is checked here; `rasterize` checks that it is finite.
     """
 
     K: np.ndarray
@@ -72,12 +73,12 @@ class Camera:
             raise ValueError(
                 f"{where}: `viewmat` must be [4, 4], got {tuple(viewmat.shape)}; pass one world-to-camera matrix."
             )
-        if not np.isfinite(K).all() or not K[0, 0] > 0 or not K[1, 1] > 0:
+        if not bounded(K) or not K[0, 0] > 0 or not K[1, 1] > 0:
             raise ValueError(
                 f"{where}: `K` must be finite with positive focal lengths, got {K.tolist()}; check the calibration."
             )
-        if isinstance(viewmat, np.ndarray) and not np.isfinite(viewmat).all():
-            raise ValueError(f"{where}: `viewmat` must be finite, got {viewmat.tolist()}; check the calibration.")
+        if isinstance(viewmat, np.ndarray):
+            viewmat = rigid(f"{where}, `viewmat`", viewmat)
         if K[0, 1] or K[1, 0] or not np.array_equal(K[2], (0, 0, 1)):
             raise ValueError(
                 f"{where}: `K` must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], got {K.tolist()}; resample the images to "
@@ -214,13 +215,21 @@ def rigid(where: str, matrix: np.ndarray) -> np.ndarray:
     matrix = np.asarray(matrix, dtype=np.float64)
     if matrix.shape not in ((3, 4), (4, 4)):
         raise ValueError(f"{where}: the pose must be a matrix [4, 4], got {matrix.shape}; calibrate again.")
-    if not np.isfinite(matrix).all():
-        raise ValueError(f"{where}: the pose must be finite, got {matrix.tolist()}; calibrate again.")
+    if not bounded(matrix):
+        raise ValueError(
+            f"{where}: the pose must be finite, with numbers of at most {LARGEST:g}, got {matrix.tolist()}; calibrate "
+            "again."
+        )
     R = matrix[:3, :3]
     # Files with six digits are off by 1e-6, scaled or sheared poses by far more than 1e-3.
     if not np.allclose(R @ R.T, np.eye(3), atol=1e-3) or np.linalg.det(R) < 0:
         raise ValueError(
             f"{where}: the axes must be a right-handed orthonormal frame, got {R.round(4).tolist()}; "
             "undo any scaling or mirroring of the poses."
+        )
+    if not np.allclose(matrix[3:], (0, 0, 0, 1), atol=1e-6):
+        raise ValueError(
+            f"{where}: the last row must be [0, 0, 0, 1], got {matrix[3].tolist()}; transpose the matrix if its "
+            "translation is there."
         )
     return np.vstack([matrix[:3], [0, 0, 0, 1.0]])

@@ -8,11 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-__all__ = ["LARGEST", "check_mask", "check_number", "check_points", "check_size", "check_type", "numbers"]
+__all__ = ["LARGEST", "bounded", "check_mask", "check_number", "check_points", "check_size", "check_type", "numbers"]
 
 
 LARGEST = 1e12
 """Largest coordinate or coefficient that is read, in its own unit: its cube is still a float32."""
+
+
+def bounded(values: ArrayLike) -> bool:
+    """Return whether all numbers are finite, and at most `LARGEST` in absolute value."""
+    return bool((np.abs(values) <= LARGEST).all())
 
 
 def check_number(place: str, name: str, value: Any, interval: str) -> None:
@@ -29,7 +34,7 @@ def check_number(place: str, name: str, value: Any, interval: str) -> None:
     """
     low, high = map(float, interval[1:-1].split(","))
     if isinstance(value, Real) and not isinstance(value, bool):
-        x = float(value)
+        x: Any = value  # not as a float, which cannot hold an integer of hundreds of digits
         above = low <= x if interval[0] == "[" else low < x
         if above and (x <= high if interval[-1] == "]" else x < high):
             return
@@ -107,7 +112,7 @@ def check_points(place: str, points: ArrayLike, colors: ArrayLike) -> tuple[np.n
             "colour for each point."
         )
     for name, values, good, expected, remedy in (
-        ("points", points, np.isfinite(points), "finite", "remove this point"),
+        ("points", points, np.abs(points) <= LARGEST, f"finite and at most {LARGEST:g}", "remove this point"),
         ("point_colors", colors, (colors >= 0) & (colors <= 1), "in [0, 1]", "divide colours of 8 bits by 255"),
     ):
         if not good.all():

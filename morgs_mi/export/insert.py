@@ -11,6 +11,7 @@ seconds. World space and its units are those of the stream.
 from __future__ import annotations
 
 import importlib.util
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -22,7 +23,7 @@ import numpy as np
 from morgs_mi.codec.packets import play
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_number
+from morgs_mi.core.checks import LARGEST, bounded, check_number
 from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.export.clips import frame_numbers
@@ -202,6 +203,11 @@ def _render(
         inserted: Any = mi.load_dict({"type": "scene", **entries})
         if not (inserted.shapes() or inserted.emitters()):
             raise ValueError("The inserted scene: expected at least one shape, got none; add one.")
+        if inserted.shapes() and not bounded(np.array([inserted.bbox().min, inserted.bbox().max])):
+            raise ValueError(
+                f"The inserted scene: expected shapes within {LARGEST:g} world units, got {inserted.bbox().min} to "
+                f"{inserted.bbox().max}; correct their places and sizes."
+            )
         lit = inserted
         if not inserted.emitters():
             lamp = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel())
@@ -218,7 +224,7 @@ def _render(
             with traced(nested, rays_for(nested, dark), srgb=True):
                 images["surfaces"] = np.asarray(nested.render(inserted, _sensor(camera), spp=samples))
     except RuntimeError as error:
-        raise ValueError(f"The inserted scene: {str(error).strip().splitlines()[0]}") from error
+        raise ValueError(f"The inserted scene: {_reason(error)}; correct it.") from error
     if {"splats", "shadow"} & set(channels):
         alone, less = (rasterize(part, camera) for part in (gaussians, dark))
         bright, less = (srgb_to_linear(np.asarray(image.color)) for image in (alone, less))
@@ -261,11 +267,16 @@ def _xml_entries(path: Path) -> dict[str, Any]:
     try:
         scene: Any = mi.load_file(str(path))
     except RuntimeError as error:
-        raise ValueError(f"{path}: {str(error).strip().splitlines()[0]}; correct the scene file.") from error
+        raise ValueError(f"{path}: {_reason(error)}; correct the scene file.") from error
     parts = {part.id() or f"part{i}": part for i, part in enumerate(_parts(scene))}
     # Mitsuba adds an integrator to files without one.
     chosen = ElementTree.parse(path).find("integrator") is not None
     return {**parts, "integrator": scene.integrator()} if chosen else parts
+
+
+def _reason(error: RuntimeError) -> str:
+    """Return Mitsuba's reason in one line, without the places in its own source."""
+    return re.sub(r"\[\w+\.\w+:\d+\] ", "", " ".join(str(error).split())).rstrip(".")
 
 
 def _parts(scene: Any) -> list[Any]:

@@ -12,7 +12,7 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from morgs_mi.core.checks import LARGEST
+from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.io.bounded import check_claim
 
 __all__ = ["GltfData"]
@@ -69,7 +69,7 @@ class GltfData:
 
     def checked(self, where: str, values: np.ndarray) -> np.ndarray:
         """Return numbers if they are finite and not huge."""
-        if not (np.abs(values) <= LARGEST).all():
+        if not bounded(values):
             raise self.refused(f"{where}: expected finite numbers of at most {LARGEST:g}, got others; export it again")
         return values
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.compressed_ply import read_compressed_ply
@@ -36,7 +37,8 @@ def read_splats(path: str | Path) -> Gaussians:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the name has another suffix, the file is broken or truncated, or it has a number that is not finite.
+        ValueError: the name has another suffix, the file is broken or truncated, or it has a number that is not finite,
+            or a centre, size or coefficient above 1e12.
     """
     suffix = suffix_of(path)
     if suffix is None:
@@ -46,8 +48,20 @@ def read_splats(path: str | Path) -> Gaussians:
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path}: expected a file with Gaussians, found none; check the path.")
     if suffix == ".splat":
-        return _read_splat(Path(path))
-    return read_compressed_ply(path) if suffix == ".compressed.ply" or _is_compressed(Path(path)) else read_ply(path)
+        gaussians = _read_splat(Path(path))
+    elif suffix == ".compressed.ply" or _is_compressed(Path(path)):
+        gaussians = read_compressed_ply(path)
+    else:
+        gaussians = read_ply(path)
+    raw = gaussians.numpy()
+    for name, values in (
+        ("centres", raw["means"]),
+        ("sizes", np.exp(np.float64(raw["log_scales"]).clip(max=99))),
+        ("coefficients of colour", raw["sh_coeffs"]),
+    ):
+        if not bounded(values):
+            raise ValueError(f"{path}: expected {name} of at most {LARGEST:g}, got larger ones; clean the Gaussians.")
+    return gaussians
 
 
 def _is_compressed(path: Path) -> bool:

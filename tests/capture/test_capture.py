@@ -257,7 +257,7 @@ def square(camera: Camera) -> Camera:
         ),
         (missing_video_of_a_row, ValueError, r"got 3 rows for 2 videos \(cam01, cam02\)"),
         (bad_settings, ValueError, "capture.json: `test_view` must be a camera's index or null, got 'cam01'"),
-        (bad_readout, ValueError, r"capture.json: `readout` must be a number of frames in \[-1, 1\], got 2"),
+        (bad_readout, ValueError, r"capture.json: `readout` must be a number in \[-1, 1\], got 2"),
         (readout_of_another, ValueError, "capture.json: `readout` must name cameras of cam01, cam02, .*got cam07"),
         (broken_settings, ValueError, "capture.json: expected JSON"),
     ],

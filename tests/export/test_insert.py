@@ -151,6 +151,7 @@ def test_selected__refuses_missing_frames(stream):
         selected(stream, (1, 7))
 
 
+SPHERE = "def build(frame, time):\n    return {'a': {'type': 'sphere', %s}}\n"
 BAD = {
     "missing.py": (None, "expected a scene to insert, FILE.xml or FILE.py, got none"),
     "a.json": ("{}", "FILE.xml or FILE.py, got '.json'"),
@@ -159,6 +160,13 @@ BAD = {
     "none.py": ("def build(frame, time):\n    pass\n", "`build` must return a dict, got a NoneType"),
     "fails.py": ("def build(frame, time):\n    return 1 / 0\n", "fails.py, line 2: ZeroDivisionError"),
     "plugin.py": ("def build(frame, time):\n    return {'a': {'type': 'bal'}}\n", "The inserted scene: .*bal"),
+    "nan.py": (SPHERE % "'center': [float('nan'), 0, 0]", "expected shapes within 1e.12 world units, got .*nan"),
+    "endless.py": (SPHERE % "'radius': float('inf')", "expected shapes within 1e.12 world units"),
+    "far.py": (SPHERE % "'center': [1e30, 0, 0]", "expected shapes within 1e.12 world units, got .*1e.30"),
+    "misspelt.py": (
+        SPHERE % "'colour': 3",
+        "The inserted scene: While loading .*unreferenced property .*colour.*; correct",
+    ),
     "bare.py": ("def build(frame, time):\n    return {}\n", "expected at least one shape, got none"),
     "broken.xml": ("<scene", "broken.xml: "),
 }

@@ -32,6 +32,7 @@ from morgs_mi.capture.layouts.calibration import (
 from morgs_mi.capture.layouts.clips import clip_of_camera
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.io.bounded import MAX_TOML, read_bytes, read_toml
 
 __all__ = ["LAYOUT", "read_anipose"]
@@ -89,12 +90,12 @@ def _array(where: str, entry: Mapping[str, Any], key: str, *shapes: tuple[int, .
         value = np.squeeze(np.array(entry.get(key), np.float64))
     except (TypeError, ValueError, OverflowError):
         value = np.zeros(0)
-    if value.shape not in shapes or not np.isfinite(value).all():
+    if value.shape not in shapes or not bounded(value):
         expected = " or ".join(str([*shape]) for shape in shapes)
         got = shortened(entry[key]) if key in entry else "none"
         raise ValueError(
-            f"{where}: `{key}` must be finite numbers {expected}, got {got}; calibrate this camera, or remove its "
-            "table and its clip."
+            f"{where}: `{key}` must be finite numbers {expected} of at most {LARGEST:g}, got {got}; calibrate this "
+            "camera, or remove its table and its clip."
         )
     return value
 

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 from morgs_mi.capture.layouts.calibration import Calibration, Layout, match_clips, required_clips
 from morgs_mi.capture.lens import MODELS, Lens, lens_and_intrinsics
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.io.bounded import check_claim, read_bytes, regular
 
 __all__ = ["LAYOUT", "ColmapModel", "find_colmap", "read_colmap", "write_colmap"]
@@ -103,8 +104,10 @@ def read_colmap(folder: str | Path) -> ColmapModel:
         raise ValueError(f"{images_path}: expected at least one image, got none; register the images.")
     rows = (_text_points if text else _binary_points)(points_path)
     points = np.asarray(np.fromiter(rows, np.dtype((np.float64, 6))), np.float64)
-    if not np.isfinite(points).all():
-        raise ValueError(f"{points_path}: the points must be finite, got NaN or Inf; export the model again.")
+    if not bounded(points):
+        raise ValueError(
+            f"{points_path}: the points must be finite and at most {LARGEST:g}, got others; export the model again."
+        )
     return ColmapModel(
         tuple(cameras),
         tuple(lenses),

@@ -19,6 +19,7 @@ import numpy as np
 from morgs_mi.capture.layouts.calibration import NO_POINTS, Calibration, Layout
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.core.checks import bounded
 from morgs_mi.io.bounded import read_array, read_json
 from morgs_mi.io.video import natural_key
 
@@ -111,7 +112,7 @@ def read_point_cloud(path: Path) -> tuple[np.ndarray, np.ndarray]:
         ValueError: it is not a NumPy archive with an array `data` [P, 6 or more] of finite numbers.
     """
     rows = read_array(path, "data")
-    if rows.ndim != 2 or rows.shape[1] < 6 or rows.dtype.kind not in "fiu" or not np.isfinite(rows).all():
+    if rows.ndim != 2 or rows.shape[1] < 6 or rows.dtype.kind not in "fiu" or not bounded(rows):
         raise ValueError(f"{path}: `data` must be [P, 7], finite, got {rows.dtype} {rows.shape}; export it again.")
     return rows[:, :3].astype(np.float32), rows[:, 3:6].astype(np.float32)
 

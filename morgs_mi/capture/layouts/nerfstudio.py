@@ -8,7 +8,6 @@ and `applied_scale` are not undone.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ from morgs_mi.capture.layouts.calibration import (
 )
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.io.bounded import read_json
 from morgs_mi.io.ply import read_vertices
 
@@ -99,9 +99,12 @@ def _lens(where: str, values: Mapping[str, Any]) -> Lens:
 
 def _number(where: str, values: Mapping[str, Any], key: str, default: float | None = None) -> float:
     value = values.get(key, default)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) < sys.float_info.max:
+    if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) <= LARGEST:
         got = "none" if value is None else repr(value)[:80]
-        raise ValueError(f"{where}: `{key}` must be a finite number, here or at the top of the file, got {got}.")
+        raise ValueError(
+            f"{where}: `{key}` must be a finite number of at most {LARGEST:g}, here or at the top of the file, got "
+            f"{got}."
+        )
     return float(value)
 
 
@@ -121,8 +124,8 @@ def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
             "export it again."
         )
     points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float32)
-    if not np.isfinite(points).all():
-        raise ValueError(f"{path}: the points must be finite, got NaN or Inf; export them again.")
+    if not bounded(points):
+        raise ValueError(f"{path}: the points must be finite and at most {LARGEST:g}, got others; export them again.")
     if not {"red", "green", "blue"} <= vertices.keys():
         return points, np.full(points.shape, 0.5, np.float32)
     colors = np.stack([vertices[band] for band in ("red", "green", "blue")], axis=1)

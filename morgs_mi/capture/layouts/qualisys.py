@@ -35,6 +35,7 @@ from morgs_mi.capture.layouts.calibration import (
 from morgs_mi.capture.layouts.clips import clip_of_camera, clips_by_frame
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.io.bounded import check_claim, read_bytes
 
 __all__ = ["LAYOUT", "read_qualisys"]
@@ -121,10 +122,11 @@ def _numbers(where: str, camera: Element, name: str, *keys: str) -> list[float]:
             numbers.append(float(text or "nan"))
         except ValueError:
             numbers.append(np.nan)
-        if not np.isfinite(numbers[-1]):
+        if not bounded(numbers[-1]):
             got = "none" if text is None else repr(text)
             raise ValueError(
-                f"{where}: `{key}` of `{name}` must be a finite number, got {got}; calibrate in QTM and export again."
+                f"{where}: `{key}` of `{name}` must be a finite number of at most {LARGEST:g}, got {got}; calibrate in "
+                "QTM and export again."
             )
     return numbers
 
