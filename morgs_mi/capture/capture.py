@@ -15,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 
 from morgs_mi.capture.camera_source import CameraSource, at_clip_size
-from morgs_mi.capture.color_correction import ColorCorrection, ColorFit, fit_colors
+from morgs_mi.capture.color_correction import COLOR_METHODS, ColorCorrection, ColorFit, fit_colors
 from morgs_mi.capture.layouts.calibration import Calibration
 from morgs_mi.capture.layouts.clips import EXAMPLE
 from morgs_mi.capture.layouts.registry import find_layout
@@ -389,16 +389,15 @@ def _check_downscale(downscale: float, cameras: Sequence[Camera], recorded: Sequ
 
 def _color_corrected(capture: Capture, reading: ReadConfig) -> Capture:
     """Return the capture with colours corrected between cameras and over time, as `reading` requests."""
-    if reading.color_reference not in ("", *capture.names):
+    method, _, name = reading.color.partition(":")
+    if method not in ("none", *COLOR_METHODS) or (name and name not in capture.names):
         raise ValueError(
-            f"{capture.path}: `color_reference` must be one of {', '.join(capture.names)}, got "
-            f"{reading.color_reference!r}."
+            f"{capture.path}: `color` must be none, {', '.join(COLOR_METHODS)}, or one of these with a camera of "
+            f"{', '.join(capture.names)}, such as linear:{capture.names[0]}, got {reading.color!r}."
         )
     images = next(capture.partial_frames(0, 1)).images
-    reference = capture.names.index(reading.color_reference) if reading.color_reference else None
-    fit = None
-    if reading.color != "none":
-        fit = fit_colors(capture.cameras, images, capture.masks, reading.color, reference)
+    reference = capture.names.index(name) if name else None
+    fit = fit_colors(capture.cameras, images, capture.masks, method, reference) if method != "none" else None
     corrections = [ColorCorrection.of(fit, v, image if reading.exposure else None) for v, image in enumerate(images)]
     sources = tuple(replace(s, color_correction=c) for s, c in zip(capture._sources, corrections, strict=True))
     return replace(capture, _sources=sources, colors=fit)

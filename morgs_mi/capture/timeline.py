@@ -16,7 +16,7 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -46,10 +46,10 @@ class ReadConfig:
     are used, and `Camera.delay` is the rest; only the first images are interpolated between two frames."""
     gaps: bool = False
     """Whether images may be missing; a camera is left out of the frames that it lacks."""
-    color: Literal["none", "linear", "root-polynomial", "vandermonde"] = "none"
-    """Method that matches each camera's colours to those of a reference camera, fitted to points that both see."""
-    color_reference: str = ""
-    """Name of the reference camera; by default the one that shares most points with the others."""
+    color: str = "none"
+    """Method that matches each camera's colours to those of a reference camera, fitted to points that both see: linear,
+    root-polynomial, vandermonde, or none. linear:cam03 also names the reference camera; by default it is the one that
+    shares most points with the others."""
     exposure: bool = False
     """Whether to remove exposure changes over time: one gain per view and frame restores the brightness that static
     surfaces have in the first frame."""

@@ -120,10 +120,8 @@ class Reading:
     """Frame of a camera's clip, whole or not, that shows frame 0 of the others; negative if it began later."""
     gaps: Flag = False
     """Continue where images are missing, without their cameras."""
-    color: Annotated[Literal["none", "linear", "root-polynomial", "vandermonde"], arg(metavar="NAME")] = "none"
-    """Colour correction: none, linear, root-polynomial or vandermonde."""
-    color_reference: Annotated[str, arg(metavar="CAMERA", help_behavior_hint="")] = ""
-    """Reference camera of the correction; by default the best connected one."""
+    color: Annotated[str, arg(metavar="NAME")] = "none"
+    """Colour correction: none, linear, root-polynomial, vandermonde, or with a reference camera linear:CAMERA."""
     exposure: Flag = False
     """Compensation of exposure changes over time."""
 

@@ -166,8 +166,8 @@ POSES_BOUNDS = {
         "no instant in common, cam00 0.00 to 0.16 s, cam02 -0.36 to -0.20",
     ),
     "unknown reference": (
-        with_options("--color", "linear", "--color-reference", "cam01"),
-        "--color-reference must be one of cam00, cam02, cam11, got 'cam01'",
+        with_options("--color", "linear:cam01"),
+        "--color must be none, linear, .* with a camera of cam00, cam02, cam11, .*got 'linear:cam01'",
     ),
     "gaps and no clip": (lambda path: (empty("cam00.mkv")(path), with_options("--gaps")(path)), "got an empty file"),
     "empty clip": (empty("cam00.mkv"), "cam00.mkv: expected a video, got an empty file"),

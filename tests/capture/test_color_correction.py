@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
 
 from morgs_mi import cli
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.capture.color_correction import COLOR_METHODS, ColorCorrection, delta_e, fit_colors
+from morgs_mi.capture.color_correction import ColorCorrection, delta_e, fit_colors
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
@@ -129,7 +128,7 @@ def flickering(views, tmp_path_factory) -> Path:
 
 def test_load_capture__corrects_colors_and_reports_it(flickering: Path, views, capsys) -> None:
     _, true, recorded = views
-    config = ReadConfig(color="linear", color_reference="cam0", exposure=True)
+    config = ReadConfig(color="linear:cam0", exposure=True)
     capture = load_capture(flickering, reading=config)
     for frame in capture.frames():
         np.testing.assert_array_equal(frame.images[0], recorded[0])
@@ -144,7 +143,8 @@ def test_load_capture__corrects_colors_and_reports_it(flickering: Path, views, c
     assert "dE2000 before -> after: cam0 " in capsys.readouterr().out
 
 
-def test_load_capture__refuses_an_unknown_reference_camera(flickering: Path) -> None:
-    with pytest.raises(ValueError, match="`color_reference` must be one of cam0, cam1, cam2, cam3, got 'cam9'"):
-        load_capture(flickering, reading=ReadConfig(color="linear", color_reference="cam9"))
-    assert {"none", *COLOR_METHODS} == set(get_args(get_type_hints(ReadConfig)["color"]))
+@pytest.mark.parametrize("color", ["linear:cam9", "cubic", "cubic:cam0", ""])
+def test_load_capture__refuses_an_unknown_method_or_reference_camera(flickering: Path, color: str) -> None:
+    message = f"`color` must be none, linear, .*with a camera of cam0, cam1, cam2, cam3, .*got '{color}'"
+    with pytest.raises(ValueError, match=message):
+        load_capture(flickering, reading=ReadConfig(color=color))
