@@ -18,7 +18,7 @@ import numpy as np
 from morgs_mi.calibration.mistakes import same_poses
 from morgs_mi.calibration.rig_check import MAX_ERROR, CameraCheck
 from morgs_mi.capture.capture import opaque_pixels
-from morgs_mi.capture.layouts.clips import EXAMPLE, clips_by_camera, photos
+from morgs_mi.capture.layouts.clips import EXAMPLE, clips_by_camera, names_without, photos
 from morgs_mi.capture.timeline import nearest_frames
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path
@@ -78,6 +78,7 @@ def calibrate(
     config: CalibrateConfig | None = None,
     overwrite: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
+    without: Sequence[str] = (),
 ) -> CalibrationResult:
     """Calibrate a folder of clips, one per camera, and write ``sparse/0`` there; nothing is written on failure.
 
@@ -86,6 +87,7 @@ def calibrate(
         config: settings.
         overwrite: whether to replace an existing model.
         progress: called with (stage, done, total).
+        without: names of cameras that are left out.
 
     Raises:
         FileNotFoundError: there is no such folder.
@@ -103,7 +105,7 @@ def calibrate(
             f"{path / 'sparse'}: expected no model, got one; remove it, or overwrite it (--overwrite)."
         )
     report("Reading frames", 0, 1)
-    images, masks = _frames(path, config)
+    images, masks = _frames(path, config, without)
     report("Reading frames", 1, 1)
     with tempfile.TemporaryDirectory() as scratch, _quiet():
         model = _map(path, images, masks, Path(scratch), config, report)
@@ -150,9 +152,12 @@ def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
     return CameraCheck(name, len(seen), error, not advice, advice)
 
 
-def _frames(path: Path, config: CalibrateConfig) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+def _frames(
+    path: Path, config: CalibrateConfig, without: Sequence[str]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return one image of each camera by its name, and the masks of the opaque pixels where not all are."""
     clips = clips_by_camera(path) or photos(path)
+    clips = {name: clips[name] for name in names_without(path, clips, without)}
     if len(clips) < 2:
         found = ", ".join(clips) or "none"
         raise ValueError(

@@ -324,7 +324,9 @@ def _copies(shared: SharedFeatures, checks: Sequence[CameraCheck], cameras: Sequ
         wrong = [view for view in pair if not checks[view].fits] or pair
         for view in wrong:
             other = checks[pair[0] + pair[1] - view].name
-            found.setdefault(view, f"it has the same pose as {other}: give each camera its own, or remove the copy")
+            found.setdefault(
+                view, f"it has the same pose as {other}: give each camera its own, or leave the copy out (--without)"
+            )
     for match in shared.matches:
         a, b = (shared.features[view].points[match.features[:, k]] for k, view in enumerate(match.views))
         if np.median(np.linalg.norm(a - b, axis=1)) < _SAME_IMAGE:

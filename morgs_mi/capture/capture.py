@@ -172,7 +172,7 @@ class Capture:
             "filter": "none" if self.downscale == 1 else "area",
             "test_view": self.test_view,
             "points": len(self.points),
-            "reading": asdict(self.reading),
+            "reading": {**asdict(self.reading), "without": list(self.reading.without)},
             "colors": colors,
             "notes": list(self.notes),
             "cameras": [
@@ -287,7 +287,8 @@ def load_capture(
         raise ValueError(f"load_capture(): `max_frames` must be at least 1, got {max_frames}.")
     reading, settings = reading or ReadConfig(), read_settings(path / "capture.json")
     layout = find_layout(path)
-    calibration = layout.read(path)
+    every = layout.read(path)
+    calibration = every.without(path, reading.without)
     readers = open_clips(calibration.clips, reading.gaps)
     recorded = [at_clip_size(c, r) for c, r in zip(calibration.cameras, readers, strict=True)]
     if scaled := [new for old, new in zip(calibration.cameras, recorded, strict=True) if new is not old]:
@@ -310,7 +311,7 @@ def load_capture(
         )
         for c, (reader, lens, camera) in enumerate(zip(readers, calibration.lenses, recorded, strict=True))
     )
-    times = zip(common.delays, common.rates, _readouts(path, names, settings), strict=True)
+    times = zip(common.delays, common.rates, _readouts(path, every.names, names, settings), strict=True)
     cameras = tuple(
         replace(_resized(camera, downscale), delay=delay / rate, readout=readout / rate)
         for camera, (delay, rate, readout) in zip(recorded, times, strict=True)
@@ -324,7 +325,7 @@ def load_capture(
         points=calibration.points,
         point_colors=calibration.point_colors,
         masks=tuple(s.mask(c) for s, c in zip(sources, cameras, strict=True)),
-        test_view=_test_view(path, test_view, settings, calibration),
+        test_view=_test_view(path, test_view, settings, every, calibration),
         # The frames of the ground truth are numbered like those of the clips.
         truth=path / "truth" if common.unchanged and (path / "truth").is_dir() else None,
         _sources=sources,
@@ -336,8 +337,8 @@ def load_capture(
     return _color_corrected(capture, reading) if reading.color != "none" or reading.exposure else capture
 
 
-def _readouts(path: Path, names: Sequence[str], settings: dict[str, Any]) -> list[float]:
-    """Return the readout of each camera in its clip's frames.
+def _readouts(path: Path, every: Sequence[str], names: Sequence[str], settings: dict[str, Any]) -> list[float]:
+    """Return the readout of each camera called `names`, out of `every`, in its clip's frames.
 
     Raises:
         ValueError: the settings name an unknown camera.
@@ -345,9 +346,9 @@ def _readouts(path: Path, names: Sequence[str], settings: dict[str, Any]) -> lis
     readout = settings.get("readout", 0.0)
     if not isinstance(readout, dict):
         return [readout] * len(names)
-    if unknown := [name for name in readout if name not in names]:
+    if unknown := [name for name in readout if name not in every]:
         where = path / "capture.json"
-        raise ValueError(f"{where}: `readout` must name cameras of {', '.join(names)}, got {', '.join(unknown)}.")
+        raise ValueError(f"{where}: `readout` must name cameras of {', '.join(every)}, got {', '.join(unknown)}.")
     return [readout.get(name, 0.0) for name in names]
 
 
@@ -410,19 +411,32 @@ def _resized(camera: Camera, downscale: float) -> Camera:
 
 
 def _test_view(
-    path: Path, requested: int | str | None, settings: dict[str, Any], calibration: Calibration
+    path: Path, requested: int | str | None, settings: dict[str, Any], every: Calibration, used: Calibration
 ) -> int | None:
-    names = [camera.name for camera in calibration.cameras]
-    view = requested
-    if view == "auto":
-        default = 0 if len(names) >= 6 else None
-        view = settings.get("test_view", default if calibration.test_view is None else calibration.test_view)
+    """Return the index of the held-out camera among those that are used; a setting of the capture counts all."""
+    if requested != "auto":
+        return _view_called(path, requested, used.names)
+    own = every.test_view
+    if "test_view" in settings:
+        own = _view_called(path / "capture.json", settings["test_view"], every.names)
+        if own is None:
+            return None
+    if own is not None and every.names[own] in used.names:
+        return used.names.index(every.names[own])
+    return 0 if len(used.names) >= 6 else None
+
+
+def _view_called(place: Path, view: int | str | None, names: Sequence[str]) -> int | None:
+    """Return the index of a camera that is given by index or name, or None.
+
+    Raises:
+        ValueError: there is none; `place` is where it was requested.
+    """
     if view is None:
         return None
     index = names.index(view) if view in names else view
     if str(index).isdecimal() and int(index) < len(names):
         return int(index)
-    place = path / "capture.json" if requested == "auto" else path
     raise ValueError(
         f"{place}: `test_view` must be an index in 0..{len(names) - 1}, one of {', '.join(names)}, or none for no "
         f"held-out camera, got {view}."

@@ -53,6 +53,8 @@ class ReadConfig:
     exposure: bool = False
     """Whether to remove exposure changes over time: one gain per view and frame restores the brightness that static
     surfaces have in the first frame."""
+    without: tuple[str, ...] = ()
+    """Names of the cameras that are left out."""
 
     @property
     def aligns_clips(self) -> bool:
@@ -240,8 +242,8 @@ def _check_complete(reader: FrameReader, required: int) -> None:
     if required > reader.num_held:
         raise ValueError(
             f"{reader.path}: frame {reader.num_held} of {reader.num_frames} cannot be read: the file is truncated or "
-            f"broken; copy it again, use the first {reader.num_held} frames (`max_frames`), or leave its camera out of "
-            "the later ones (--gaps)."
+            f"broken; copy it again, use the first {reader.num_held} frames (`max_frames`), or leave its camera out, "
+            "of the later frames (--gaps) or of all (--without)."
         )
 
 
@@ -276,8 +278,8 @@ def _num_frames(path: Path, readers: Sequence[FrameReader], max_frames: int | No
         table = ", ".join(f"{r.path.name} {n}" for r, n in zip(readers, lengths, strict=True))
         raise ValueError(
             f"{path}: all cameras must have the same number of frames, got {table}; use the first frames with "
-            f"`max_frames={shortest}`, the instants that all clips cover with --trim, or align the clips with "
-            "--offset."
+            f"`max_frames={shortest}`, the instants that all clips cover with --trim, align the clips with --offset, "
+            "or leave cameras out with --without."
         )
     return shortest
 

@@ -13,7 +13,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, arg
 from morgs_mi.calibration.calibrate import CalibrateConfig
 from morgs_mi.cli.console import print_result, print_table, print_warning, progress
 from morgs_mi.cli.info import advice_lines, check_cells
-from morgs_mi.cli.settings import Flag
+from morgs_mi.cli.settings import Flag, Without
 
 __all__ = ["Calibrate"]
 
@@ -25,6 +25,8 @@ class Calibrate:
     folder: Positional[Path]
     """Folder of videos, or of one folder of images per camera."""
     config: Annotated[CalibrateConfig, arg(name=""), FlagCreatePairsOff] = field(default_factory=CalibrateConfig)
+    without: Without = ()
+    """Cameras that are left out, by name."""
     overwrite: Flag = False
     """Replace an earlier model in FOLDER/sparse."""
 
@@ -32,9 +34,7 @@ class Calibrate:
         from morgs_mi.calibration.calibrate import calibrate
 
         with progress() as report:
-            found = calibrate(
-                self.folder, self.config, self.overwrite, lambda stage, done, total: report(stage, done, total)
-            )
+            found = calibrate(self.folder, self.config, self.overwrite, lambda *stage: report(*stage), self.without)
         table = Table(title=str(found.model), box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
         for column in ("camera", "points", "error, px", "pose"):
             table.add_column(column, no_wrap=True)

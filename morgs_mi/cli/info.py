@@ -58,7 +58,7 @@ class Info:
     """File for all measurements of --deep."""
     reading: GivenReading = field(default_factory=Reading)
 
-    arguments: ClassVar[Mapping[str, str]] = {"max_frames": "--frames of morgs-mi fit"}
+    arguments: ClassVar[Mapping[str, str]] = {"max_frames": "morgs-mi fit --frames"}
 
     def run(self) -> None:
         from morgs_mi.calibration.deep_plot import draw_deep

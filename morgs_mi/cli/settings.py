@@ -22,6 +22,7 @@ __all__ = [
     "GivenSettings",
     "Reading",
     "Settings",
+    "Without",
     "optional",
     "setting",
 ]
@@ -49,6 +50,8 @@ ChannelName = Literal["color", "motion", "confidence", "depth", "alpha"]
 Refinement = Literal["off", "auto", "on"]
 # A switch that is off by default.
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
+# Names of cameras, none by default.
+Without = Annotated[tuple[str, ...], arg(metavar="CAMERA ...", help_behavior_hint="")]
 
 
 def optional(metavar: str, hint: str = "", text: str | None = None) -> Any:
@@ -124,6 +127,8 @@ class Reading:
     """Colour correction: none, linear, root-polynomial, vandermonde, or with a reference camera linear:CAMERA."""
     exposure: Flag = False
     """Compensation of exposure changes over time."""
+    without: Without = ()
+    """Cameras that are left out, by name."""
 
     def read_config(self) -> ReadConfig:
         """Return the options as `load_capture` takes them."""

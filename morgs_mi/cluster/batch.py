@@ -5,6 +5,9 @@
     seeds = [0, 1]
     segments = 4                        # of each fit; downscale, frames and test_view likewise
 
+    [reading]                           # of all captures, as the options of fit
+    without = ["cam04"]
+
     [settings.quick]                    # settings by name: a preset, and tables as in --config
     preset = "s"
 
@@ -25,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cluster.executor import Workers, wait_for
 from morgs_mi.cluster.segments import SegmentedFit, fit_in_segments
 from morgs_mi.cluster.tasks import Part
@@ -55,6 +59,8 @@ class BatchConfig:
     """Number of frames to fit, from the first one."""
     test_view: str = "auto"
     """Held-out camera, by index or name; none: all are fitted; auto: the capture's own."""
+    reading: ReadConfig = field(default_factory=ReadConfig)
+    """How clips that do not match are read, and which cameras are left out."""
 
 
 @dataclass(frozen=True)
@@ -210,7 +216,7 @@ async def _run(
 async def _fit(state: JobState, workers: Workers, changed: Callable[[], None]) -> SegmentedFit:
     job, batch = state.job, state.job.batch
     view = None if batch.test_view.lower() == "none" else batch.test_view
-    capture = load_capture(job.capture, batch.downscale, view, batch.frames)
+    capture = load_capture(job.capture, batch.downscale, view, batch.frames, batch.reading)
 
     def on_stage(stage: str, done: float, total: float) -> None:
         if stage == "Fitting frames":

@@ -16,6 +16,8 @@ class LiveConfig:
 
     calibration: Path | None = None
     """Folder of a calibrated capture of the same cameras; by default they are calibrated by their first images."""
+    without: tuple[str, ...] = ()
+    """Calibrated cameras that are left out, by name."""
     downscale: float = 1
     """Factor by which the images are reduced."""
     test_view: str | None = None
@@ -41,6 +43,11 @@ class LiveConfig:
         Raises:
             ValueError: one is out of range.
         """
+        if self.without and self.calibration is None:
+            raise ValueError(
+                f"{place}: `without` must name cameras of a calibration, got {', '.join(self.without)} and no "
+                "calibration; name the sources that are used (--camera)."
+            )
         for name, least in (("downscale", 1), ("frames", 1), ("warm_up", 0)):
             if (value := getattr(self, name)) is not None:
                 check_number(place, name, value, f"[{least}, inf)")

@@ -103,7 +103,7 @@ def fit_live(
         raise FileExistsError(
             f"{out / 'capture'}: expected no capture, got that of an earlier fit; choose another folder for this one."
         )
-    calibration = live.calibration and read_calibration(live.calibration)
+    calibration = live.calibration and read_calibration(live.calibration).without(live.calibration, live.without)
     names = calibration and [camera.name for camera in calibration.cameras]
     report = on_stage or (lambda *_: None)
     with locked_folder(out, "fit_live()"), closing(open_feed(sources, live, names)) as feed:

@@ -67,7 +67,10 @@ def test_calibrate__names_a_camera_with_another_scene(tmp_path: Path) -> None:
     ):
         calibrate(tmp_path)
     assert not (tmp_path / "sparse").exists()
-    found = calibrate(tmp_path, CalibrateConfig(partial=True))
+    with pytest.raises(ValueError, match="`without` must name cameras of cam1, cam2, cam3, cam4, other, got cam7"):
+        calibrate(tmp_path, without=["cam7"])
+    assert calibrate(tmp_path, without=["other"]).cameras == ("cam1", "cam2", "cam3", "cam4")
+    found = calibrate(tmp_path, CalibrateConfig(partial=True), overwrite=True)
     assert (found.cameras, found.left_out) == (("cam1", "cam2", "cam3", "cam4"), ("other",))
     assert found.error < 0.5
     assert load_capture(tmp_path).names == found.cameras
@@ -104,10 +107,10 @@ def test_calibrate__finds_no_features_in_transparent_pixels(tmp_path: Path) -> N
 def test_frames__are_the_nearest_in_time_at_a_variable_frame_rate(tmp_path: Path) -> None:
     for name, times in (("a", [0, 50, 100, 150, 200, 250, 300]), ("b", [0, 50, 100, 250, 300])):
         write_timed_video(tmp_path / f"{name}.mp4", [np.full((48, 64, 3), t // 2, np.uint8) for t in times], times)
-    images, _ = _frames(tmp_path, CalibrateConfig(frame=5))
+    images, _ = _frames(tmp_path, CalibrateConfig(frame=5), ())
     assert_close(images["b"].astype(float), images["a"], atol=2)
     with pytest.raises(ValueError, match="frame 7 is not in the clips of a, b"):
-        _frames(tmp_path, CalibrateConfig(frame=7))
+        _frames(tmp_path, CalibrateConfig(frame=7), ())
 
 
 def noise_clips(path: Path) -> None:

@@ -47,6 +47,11 @@ def empty(name: str) -> Damage:
     return lambda path: (path / name).write_bytes(b"")
 
 
+def renamed(path: Path) -> None:
+    for i, clip in enumerate(sorted(path.glob("*.mkv"))):
+        clip.rename(path / f"left{i}.mkv")
+
+
 def headers_only(name: str) -> Damage:
     """Cut a video after its headers, before the first frame."""
     return lambda path: (path / name).write_bytes((path / name).read_bytes()[:600])
@@ -190,7 +195,7 @@ BY_FRAME = {
 COLMAP = {
     "no file": (missing("sparse/0/images.txt"), "images.txt is missing; export the whole model"),
     "pipe": (pipe("sparse/0/images.txt"), "images.txt: expected a file, got a folder, a pipe or a device; remove it"),
-    "no clip": (missing("cam2.mkv"), "its image 'cam2.png' needs a clip called cam2, found cam1, cam10"),
+    "other clips": (renamed, r"clips named after its cameras cam1.png, cam2.png, cam10.png, found left0, left1, left2"),
     "fewer parameters": (replace("sparse/0/cameras.txt", " 34.0 20.0\n", "\n"), "PINHOLE takes 4 parameters, got 2"),
     "no such camera": (replace("sparse/0/cameras.txt", "\n2 ", "\n7 "), "refers to camera 2, cameras.txt has"),
     "unknown model": (replace("sparse/0/cameras.txt", "PINHOLE", "FOV"), "camera model must be one of .* got FOV"),
@@ -211,7 +216,10 @@ COLMAP = {
 }
 NERFSTUDIO = {
     "no file": (missing("transforms.json"), "expected a calibration .*transforms.json"),
-    "no clip": (missing("cam2.mkv"), "its image './images/cam2.png' needs a clip called cam2, found cam1, cam10"),
+    "other clips": (
+        renamed,
+        r"named after its cameras ./images/cam1.png, .*, found left0, left1, left2; name the clips",
+    ),
     "no frames": (transforms(lambda m: m.update(frames=[])), "expected an object with a list of `frames`, got none"),
     "broken file": (truncated("transforms.json"), "transforms.json: expected JSON, got a broken file"),
     "unnamed": (
@@ -270,7 +278,7 @@ ANIPOSE = {
         lambda path: (path / "calibration.toml").write_text("matrix=1\nrotation=1\nx." + "a." * 20_000 + "b=1\n"),
         r"calibration.toml: expected TOML, got a broken file \(a key has more than 32 parts\)",
     ),
-    "no clip": (missing("trial_1-camB.mkv"), "its image 'camB' needs a clip called camB, found trial_1-camA"),
+    "other clips": (renamed, "named after its cameras camA, camB, camC, found left0, left1, left2; name the clips"),
     "no pose": (
         replace("calibration.toml", "translation", "translate"),
         r"\[cam_0\]: `translation` must be .* got none",

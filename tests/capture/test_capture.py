@@ -17,6 +17,7 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import Lens
+from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
 from tests.assertions import assert_close
@@ -152,6 +153,43 @@ def test_load_capture__leaves_out_uncalibrated_clips_with_a_warning(
     assert "does not calibrate cam03" in caplog.text
 
 
+@pytest.mark.parametrize("without", [["cam02"], ["cam02", "cam03"]])
+def test_load_capture__leaves_cameras_out(tmp_path: Path, without: list[str]) -> None:
+    names = tuple(f"cam{i:02}" for i in range(8))
+    path = n3dv(tmp_path, names)
+    (path / "cam02.mp4").write_bytes(b"")  # a clip that is not used is not opened
+    (path / "capture.json").write_text('{"test_view": 4, "readout": {"cam02": 0.5, "cam05": 0.2}}')
+    capture = load_capture(path, reading=ReadConfig(without=tuple(without)))
+    kept = [name for name in names if name not in without]
+    assert capture.names == tuple(kept)
+    assert capture.test_view is not None
+    assert capture.names[capture.test_view] == "cam04", "the setting counts all cameras"
+    assert {c.name: c.readout for c in capture.cameras if c.readout} == {"cam05": 0.2}
+    assert [image[0, 0, 0] for image in next(capture.frames()).images] == [names.index(name) for name in kept]
+    assert load_capture(path, test_view=2, reading=ReadConfig(without=tuple(without))).test_view == 2
+
+
+def test_load_capture__holds_out_another_view_without_the_one_of_the_settings(tmp_path: Path) -> None:
+    path = n3dv(tmp_path, tuple(f"cam{i:02}" for i in range(8)))
+    (path / "capture.json").write_text('{"test_view": 4}')
+    assert load_capture(path, reading=ReadConfig(without=("cam04",))).test_view == 0
+    assert load_capture(path, reading=ReadConfig(without=("cam04", "cam06", "cam07"))).test_view is None
+
+
+@pytest.mark.parametrize(
+    ("without", "message"),
+    [
+        (("cam02", "cam09"), "`without` must name cameras of cam01, cam02, got cam09."),
+        (("cam02", "cam01"), "`without` must leave at least one camera, got all: cam01, cam02."),
+    ],
+)
+def test_load_capture__refuses_to_leave_out_unknown_or_all_cameras(
+    tmp_path: Path, without: tuple[str, ...], message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        load_capture(colmap(tmp_path), reading=ReadConfig(without=without))
+
+
 def no_folder(path: Path) -> None:
     shutil.rmtree(path)
 
@@ -164,8 +202,9 @@ def no_calibration(path: Path) -> None:
     shutil.rmtree(path / "sparse")
 
 
-def no_clip(path: Path) -> None:
-    (path / "cam02.mp4").unlink()
+def other_names(path: Path) -> None:
+    for i in (1, 2):
+        (path / f"cam0{i}.mp4").rename(path / f"left{i}.mp4")
 
 
 def other_size(path: Path) -> None:
@@ -241,7 +280,7 @@ def square(camera: Camera) -> Camera:
             FileNotFoundError,
             r"expected a calibration .*; run `morgs-mi calibrate`",
         ),
-        (no_clip, FileNotFoundError, "its image 'cam02.png' needs a clip called cam02, found cam01"),
+        (other_names, FileNotFoundError, "named after its cameras cam01.png, cam02.png, found left1, left2; name"),
         (
             other_size,
             ValueError,

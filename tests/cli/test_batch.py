@@ -17,6 +17,7 @@ JOBS = """
 captures = ["clip", "missing"]
 out = "sweep"
 seeds = [1]
+reading.without = ["cam1"]
 [settings.tiny.fit]
 num_gaussians = 80
 first_frame_steps = 4
@@ -40,6 +41,7 @@ def test_batch__names_the_jobs_that_failed_and_finishes_the_others(jobs: Path, r
     stream = StreamReader(out / "clip-tiny-s1" / "stream.morgs")
     assert [frame for _, frame, _ in stream.index()] == list(range(FRAMES))
     assert stream.metadata["config"]["seed"] == 1
+    assert "cam1" not in [camera.name for camera in stream.cameras]
     assert "frames 0 to 1: " in (out / "clip-tiny-s1" / "log.txt").read_text()
     assert rows["clip-tiny-s1"]["status"] == "done"
     sentence = f"{jobs.parent / 'missing'}: expected a capture folder, found none; check the path."

@@ -24,9 +24,10 @@ def no_capture(path: Path) -> tuple[str, ...]:
     return "expected a capture folder", str(path)
 
 
-def no_clip(path: Path) -> tuple[str, ...]:
-    (path / "cam1.mkv").unlink()
-    return "its image 'cam1.png' needs a clip called cam1", "found cam0, cam2"
+def other_names(path: Path) -> tuple[str, ...]:
+    for i in range(3):
+        (path / f"cam{i}.mkv").rename(path / f"left{i}.mkv")
+    return "expected clips named after its cameras cam0.png, cam1.png, cam2.png, found left0, left1, left2", "name the"
 
 
 def no_calibration(path: Path) -> tuple[str, ...]:
@@ -59,7 +60,7 @@ def broken_json(path: Path) -> tuple[str, ...]:
     return ("capture.json: expected JSON",)
 
 
-BROKEN = [no_capture, no_clip, no_calibration, other_length, empty_clip, no_video, truncated_clip, broken_json]
+BROKEN = [no_capture, other_names, no_calibration, other_length, empty_clip, no_video, truncated_clip, broken_json]
 
 
 @pytest.mark.parametrize("spoil", BROKEN)
@@ -68,6 +69,30 @@ def test_main__names_what_is_broken_in_a_capture(capture: Path, tmp_path: Path, 
     for args in (("info", capture), ("fit", capture, tmp_path / "out", *QUICK)):
         assert_refused(run(*args), *parts)
     assert not (tmp_path / "out").exists()
+
+
+def test_main__leaves_cameras_out(capture: Path, tmp_path: Path, run) -> None:
+    other_length(capture)
+    assert_refused(run("info", capture), "morgs-mi fit --frames 3,", "leave cameras out with --without.")
+    assert_refused(run("fit", capture, tmp_path / "out", *QUICK), "use the first frames with --frames 3,")
+    (capture / "cam2.mkv").write_bytes(b"")
+    status, out, _ = run("info", capture, "--without", "cam2")
+    assert (status, "cam2" in out, "3 frames" in out) == (0, False, True)
+    assert run("fit", capture, tmp_path / "out", *QUICK, "--without", "cam2")[0] == 0
+    assert run("fit", capture, tmp_path / "out", *QUICK, "--without", "cam2", "--resume")[0] == 0
+    status, out, _ = run("eval", tmp_path / "out", "--json", "-")
+    assert (status, list(json.loads(out)["views"])) == (0, ["cam0", "cam1"])
+    refused = "--without must name cameras of cam0, cam1, cam2, got cam7."
+    for args in (("info", capture), ("fit", capture, tmp_path / "other", *QUICK)):
+        assert_refused(run(*args, "--without", "cam7", "cam2"), refused)
+
+
+def test_main__leaves_out_a_camera_without_a_clip(capture: Path, tmp_path: Path, run, caplog) -> None:
+    (capture / "cam1.mkv").unlink()
+    status, out, _ = run("info", capture)
+    assert (status, "cam1" in out) == (0, False)
+    assert run("fit", capture, tmp_path / "out", *QUICK)[0] == 0
+    assert [m.endswith("sparse/0: no clip is named after cam1.png: left out.") for m in caplog.messages] == [True] * 2
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cluster.batch import JobState, read_jobs
 
 JOBS = """
@@ -17,6 +18,9 @@ segments = 2
 [settings.quick]
 preset = "s"
 motion.key_views = 2
+
+[reading]
+without = ["cam04"]
 
 [settings.fine.fit]
 num_gaussians = 40000
@@ -36,6 +40,7 @@ def test_read_jobs__combines_captures_settings_and_seeds(tmp_path: Path) -> None
         for settings in ("quick", "fine")
         for seed in (3, 4)
     ]
+    assert jobs[0].batch.reading == ReadConfig(without=("cam04",))
     assert jobs[0].capture == tmp_path / "clips/walk"
     assert jobs[0].out == tmp_path / "sweep" / "walk-quick-s3"
     assert jobs[-1].capture == Path("/elsewhere/dance")
@@ -64,6 +69,10 @@ def test_read_jobs__has_default_settings_and_one_seed(tmp_path: Path) -> None:
             r"jobs\.toml: `seeds` must be a list \(each a whole number below 2\^64\), got \['a'\]",
         ),
         ('captures = ["x"]\nseed = 1', r"jobs\.toml: `seed` is unknown, expected `seeds`"),
+        (
+            'captures = ["x"]\n[reading]\nwithout = 3',
+            r"jobs\.toml: `reading\.without` must be a list \(each a string\)",
+        ),
         ('captures = ["x"]\nsettings = 3', r"jobs\.toml: `settings` must be tables such as \[settings\.quick\], got 3"),
         ('captures = ["x"]\n[settings]\nq = 3', r"jobs\.toml: \[settings\.q\]: expected a table, got 3"),
         (

@@ -134,6 +134,13 @@ def test_fit_live__leaves_out_a_camera_that_stops(tmp_path: Path, rig: Path, ima
     assert [np.isnan(views[name].psnr) for name in NAMES] == [False, True, False, False]
 
 
+def test_fit_live__needs_no_images_of_a_camera_that_is_left_out(tmp_path: Path, rig: Path, images: Path) -> None:
+    with in_background(filling(images)):
+        fit_live([images], tmp_path / "out", LiveConfig(rig, without=("cam1",), downscale=4, frames=1), CONFIG)
+    assert load_capture(tmp_path / "out" / "capture").names == ("cam0", "cam2", "cam3")
+    assert not (tmp_path / "out" / "capture" / "cam1").exists()
+
+
 def test_fit_live__leaves_out_images_of_another_size(tmp_path: Path, rig: Path, images: Path) -> None:
     write(images, 0)
     live = LiveConfig(rig, downscale=4, frames=2, timeout=5)
@@ -226,6 +233,8 @@ def test_fit_live__does_not_replace_an_earlier_capture(tmp_path: Path, rig: Path
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"without": ("cam0",)}, r"`without` must name cameras of a calibration, got cam0 and no calibration"),
+        ({"calibration": Path("RIG"), "without": ("cam7",)}, "`without` must name cameras of cam0, cam1, .*, got cam7"),
         ({"downscale": 0.5}, r"`downscale` must be a number in \[1, inf\), got 0.5"),
         ({"frames": 0}, r"`frames` must be a number in \[1, inf\), got 0"),
         ({"seconds": 0.0}, r"`seconds` must be a number in \(0, inf\), got 0.0"),
@@ -234,6 +243,9 @@ def test_fit_live__does_not_replace_an_earlier_capture(tmp_path: Path, rig: Path
         ({"timeout": 0.0}, r"`timeout` must be a number in \(0, inf\), got 0.0"),
     ],
 )
-def test_fit_live__refuses_settings_out_of_range(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+def test_fit_live__refuses_settings_out_of_range(
+    tmp_path: Path, rig: Path, changes: dict[str, Any], message: str
+) -> None:
+    changes = {name: rig if value == Path("RIG") else value for name, value in changes.items()}
     with pytest.raises(ValueError, match=message):
         fit_live([0], tmp_path / "out", LiveConfig(**changes))

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from reprlib import repr as shortened
 from typing import Any
@@ -29,7 +28,6 @@ from morgs_mi.capture.layouts.calibration import (
     only_calibration,
     required_clips,
 )
-from morgs_mi.capture.layouts.clips import clip_of_camera
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import LARGEST, bounded
@@ -123,9 +121,7 @@ def _is_calibration(file: Path) -> bool:
 def _read_calibration(path: Path) -> Calibration:
     source = only_calibration(path, _calibration_files(path), "one calibration in TOML")
     cameras, lenses = read_anipose(source)
-    clips = required_clips(path)
-    named = [replace(camera, name=clip_of_camera(clips, camera.name) or camera.name) for camera in cameras]
-    return Calibration(*match_clips(path, source, clips, named, lenses))
+    return Calibration(*match_clips(path, source, required_clips(path), cameras, lenses))
 
 
 LAYOUT = Layout("Anipose", ("calibration.toml",), lambda path: bool(_calibration_files(path)), _read_calibration)

@@ -6,19 +6,20 @@ A reader module exposes a `Layout`, which `registry.py` lists.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 
 from morgs_mi.capture.layouts.clips import (
     EXAMPLE,
     check_frames,
+    clip_of_camera,
     clips_by_camera,
     clips_by_frame,
+    names_without,
     photos,
     view_of_image,
 )
@@ -39,6 +40,8 @@ __all__ = [
 
 _LOG = logging.getLogger(__name__)
 
+# Names in a message: a model may have hundreds of images.
+_MAX_LISTED = 10
 NO_POINTS = np.zeros((0, 3), np.float32)
 """The points, and their colours, of a layout without points."""
 
@@ -62,6 +65,26 @@ class Calibration:
     points: np.ndarray = field(default_factory=lambda: NO_POINTS)
     point_colors: np.ndarray = field(default_factory=lambda: NO_POINTS)
     test_view: int | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the cameras."""
+        return tuple(camera.name for camera in self.cameras)
+
+    def without(self, path: Path, names: Collection[str]) -> Calibration:
+        """Return the calibration without the cameras called `names`; `path` is the capture, for messages.
+
+        Raises:
+            ValueError: there is no such camera, or none is left.
+        """
+        kept = [self.names.index(name) for name in names_without(path, self.names, names)]
+        return replace(
+            self,
+            cameras=tuple(self.cameras[index] for index in kept),
+            lenses=tuple(self.lenses[index] for index in kept),
+            clips=tuple(self.clips[index] for index in kept),
+            test_view=kept.index(self.test_view) if self.test_view in kept else None,
+        )
 
 
 @dataclass(frozen=True)
@@ -132,29 +155,27 @@ def required_clips(path: Path) -> Mapping[str, Clip]:
 def match_clips(
     path: Path, source: Path, clips: Mapping[str, Clip], cameras: Sequence[Camera], lenses: Sequence[Lens]
 ) -> tuple[tuple[Camera, ...], tuple[Lens, ...], tuple[Clip, ...]]:
-    """Return one camera, lens and clip per fixed camera, in numerical order of the clips' names.
+    """Return one camera, lens and clip per fixed camera that has one, in numerical order of the clips' names.
+
+    Cameras without a clip, and clips without a camera, are left out with a warning.
 
     Args:
-        path: the capture folder; its photos and frame folders are tried if `clips` do not match.
+        path: the capture folder; its photos and frame folders are used if they match more cameras than `clips`.
         source: file or folder of the calibration, for messages.
         clips: from `required_clips`.
         cameras: one or more per fixed camera; their names are those of the calibration's images.
         lenses: one per camera.
 
     Raises:
-        FileNotFoundError: an image of the calibration has no clip.
+        FileNotFoundError: no camera has a clip.
         ValueError: two images of one clip have different poses or lenses, or a frame folder is missing.
     """
-    try:
-        index = _camera_of_clip(source, clips, cameras, lenses)
-    except (FileNotFoundError, ValueError) as error:
-        for clips in (photos(path), clips_by_frame(path)):
-            with suppress(FileNotFoundError, ValueError):
-                index = _camera_of_clip(source, clips, cameras, lenses)
-                break
-        else:
-            raise error from None
-        check_frames(path, clips)
+    match = _best_match(path, source, clips, cameras, lenses)
+    index, clips = match.index, match.clips
+    if match.without:
+        names, count = ", ".join(match.without[:_MAX_LISTED]), len(match.without) - _MAX_LISTED
+        rest = f" and {count} others" if count > 0 else ""
+        _LOG.warning("%s: no clip is named after %s%s: left out.", source, names, rest)
     if unused := [name for name in clips if name not in index]:
         _LOG.warning("%s does not calibrate %s: not used.", source, ", ".join(unused))
     names = sorted(index, key=natural_key)
@@ -165,23 +186,66 @@ def match_clips(
     )
 
 
-def _camera_of_clip(
-    source: Path, clips: Mapping[str, Clip], cameras: Sequence[Camera], lenses: Sequence[Lens]
-) -> dict[str, int]:
-    """Return, by the clip's name, the index of its first camera in `cameras`."""
-    found: dict[str, int] = {}
-    for index, camera in enumerate(cameras):
-        name = view_of_image(clips, camera.name)
-        if name is None:
-            raise FileNotFoundError(
-                f"{source}: its image {camera.name!r} needs a clip called {Path(camera.name).stem}, found "
-                f"{', '.join(clips) or 'none'}; name the clips after the calibration's images."
+@dataclass(frozen=True)
+class _Match:
+    """Clips and the cameras that they belong to.
+
+    Attributes:
+        clips: by name.
+        index: of the first camera of each clip that has one, by the clip's name.
+        without: names of the cameras that have no clip.
+    """
+
+    clips: Mapping[str, Clip]
+    index: dict[str, int]
+    without: list[str]
+
+
+def _best_match(
+    path: Path, source: Path, clips: Mapping[str, Clip], cameras: Sequence[Camera], lenses: Sequence[Lens]
+) -> _Match:
+    """Return the match of `clips`, photos or frame folders that has most cameras; see `match_clips`."""
+    found, errors = [], []
+    for find in (lambda _: clips, photos, clips_by_frame):
+        try:
+            found.append(_matched(source, find(path), cameras, lenses))
+        except ValueError as error:
+            errors.append(error)
+            continue
+        if not found[-1].without:
+            break
+    best = max(found, key=lambda match: len(match.index), default=None)
+    if best is None or not best.index:
+        expected = ", ".join(camera.name for camera in cameras[:_MAX_LISTED])
+        errors.append(
+            FileNotFoundError(
+                f"{source}: expected clips named after its cameras {expected}, found {', '.join(clips)}; name the "
+                "clips after the cameras."
             )
-        first = found.setdefault(name, index)
+        )
+        raise errors[0]
+    if any(isinstance(clip, tuple) and len(clip) > 1 for clip in best.clips.values()):
+        check_frames(path, cast(Mapping[str, tuple[Path, ...]], best.clips))
+    return best
+
+
+def _matched(source: Path, clips: Mapping[str, Clip], cameras: Sequence[Camera], lenses: Sequence[Lens]) -> _Match:
+    """Return which of some clips belong to which cameras.
+
+    Raises:
+        ValueError: two images of one clip have different poses or lenses.
+    """
+    match = _Match(clips, {}, [])
+    for index, camera in enumerate(cameras):
+        name = clip_of_camera(clips, camera.name) or view_of_image(clips, camera.name)
+        if name is None:
+            match.without.append(camera.name)
+            continue
+        first = match.index.setdefault(name, index)
         same = np.allclose(cameras[first].viewmat, camera.viewmat, atol=1e-6) and lenses[first] == lenses[index]
         if not (same and np.allclose(cameras[first].K, camera.K)):
             raise ValueError(
                 f"{source}: cameras must not move, but {cameras[first].name!r} and {camera.name!r}, both of {name}, "
                 "have different poses or lenses; keep one image of each fixed camera, and name the clips after them."
             )
-    return found
+    return match

@@ -24,6 +24,7 @@ __all__ = [
     "clip_of_camera",
     "clips_by_camera",
     "clips_by_frame",
+    "names_without",
     "photos",
     "view_of_image",
 ]
@@ -80,6 +81,20 @@ def check_frames(path: Path, clips: Mapping[str, Sequence[Path]]) -> None:
             f"{path}: the folders of the frames must be numbered without gaps, got {folders[gap - 1]} followed by "
             f"{folders[gap]}; extract the frames again."
         )
+
+
+def names_without(path: Path, names: Collection[str], without: Collection[str]) -> list[str]:
+    """Return the names of the cameras that are not among `without`; `path` is the capture, for messages.
+
+    Raises:
+        ValueError: a camera that is left out does not exist, or all are left out.
+    """
+    if unknown := [name for name in without if name not in names]:
+        raise ValueError(f"{path}: `without` must name cameras of {', '.join(names)}, got {', '.join(unknown)}.")
+    kept = [name for name in names if name not in without]
+    if without and not kept:
+        raise ValueError(f"{path}: `without` must leave at least one camera, got all: {', '.join(names)}.")
+    return kept
 
 
 def view_of_image(views: Collection[str], image: str) -> str | None:

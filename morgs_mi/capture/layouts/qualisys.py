@@ -16,7 +16,6 @@ metres.
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -32,7 +31,6 @@ from morgs_mi.capture.layouts.calibration import (
     only_calibration,
     required_clips,
 )
-from morgs_mi.capture.layouts.clips import clip_of_camera, clips_by_frame
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import LARGEST, bounded
@@ -135,17 +133,7 @@ def _read_calibration(path: Path) -> Calibration:
     """Return the cameras that have a clip; marker cameras have none."""
     source = only_calibration(path, calibration_files(path, _PATTERN), "one file *.qca.txt")
     cameras, lenses = read_qualisys(source)
-    clips = required_clips(path)
-    names = {camera.name: clip_of_camera([*clips, *clips_by_frame(path)], camera.name) for camera in cameras}
-    if not any(names.values()):
-        raise FileNotFoundError(
-            f"{source}: expected clips whose names contain the serial numbers {', '.join(names)}, found "
-            f"{', '.join(clips)}; name the clips after the cameras."
-        )
-    if without := [name for name, clip in names.items() if clip is None]:
-        _LOG.warning("%s: no clip is named after %s: left out, as marker cameras are.", source, ", ".join(without))
-    used = [(replace(c, name=clip), lens) for c, lens in zip(cameras, lenses, strict=True) if (clip := names[c.name])]
-    return Calibration(*match_clips(path, source, clips, [c for c, _ in used], [lens for _, lens in used]))
+    return Calibration(*match_clips(path, source, required_clips(path), cameras, lenses))
 
 
 LAYOUT = Layout(

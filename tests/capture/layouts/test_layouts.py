@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -131,6 +132,74 @@ def test_find_layout__follows_the_order_of_precedence(tmp_path: Path) -> None:
     (meta / "transforms.json").write_text((path / "transforms.json").read_text())
     layouts.videos(meta, ("cam1", "cam2", "cam10"))
     assert load_capture(meta).layout == "Nerfstudio"
+
+
+def removed_clip(path: Path) -> None:
+    (path / "cam2.mkv").unlink()
+
+
+def removed_images(path: Path) -> None:
+    shutil.rmtree(path / "ims" / "2")
+
+
+def removed_in_every_frame(path: Path) -> None:
+    for file in path.glob("frame*/cam2.png"):
+        file.unlink()
+
+
+def colmap_by_frame(path: Path) -> Path:
+    layouts.colmap(path)
+    for file in path.glob("*.mkv"):
+        file.unlink()
+    folder_per_frame(path, ("cam1", "cam2", "cam10"))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("build", "remove", "camera", "left"),
+    [
+        (layouts.colmap, removed_clip, "cam2.png", ("cam1", "cam10")),
+        (colmap_by_frame, removed_in_every_frame, "cam2.png", ("cam1", "cam10")),
+        (layouts.nerfstudio, removed_clip, "./images/cam2.png", ("cam1", "cam10")),
+        (layouts.dynamic3dgs, removed_images, "2", ("1", "10")),
+        (
+            layouts.anipose,
+            lambda path: (path / "trial_1-camB.mkv").unlink(),
+            "camB",
+            ("trial_1-camA", "trial_1-camC"),
+        ),
+        (
+            layouts.qualisys,
+            lambda path: (path / "trial_Miqus_1_28984.mkv").unlink(),
+            "28984, 31111",
+            ("trial_Miqus_0_26580", "trial_Miqus_2_29005"),
+        ),
+    ],
+)
+def test_load_capture__leaves_out_cameras_without_clips_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, build, remove, camera: str, left: tuple[str, ...]
+) -> None:
+    path = build(tmp_path / "a")
+    remove(path)
+    with caplog.at_level(logging.WARNING):
+        capture = load_capture(path)
+    (warning,) = caplog.messages
+    assert f"{camera}: left out." in warning or f"{camera} was found: left out." in warning
+    assert capture.names == left
+    whole = load_capture(build(tmp_path / "b"))
+    for camera_, expected in zip(capture.cameras, (whole.cameras[whole.names.index(n)] for n in left), strict=True):
+        assert_close(camera_.viewmat, expected.viewmat, atol=POSE_ABS)
+
+
+def test_load_capture__lists_some_of_many_cameras_without_clips(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    names = tuple(f"cam{i}" for i in range(30))
+    layouts.colmap_text(tmp_path / "sparse", rig(names), "PINHOLE", [[50.0, 50, 31, 23]], shared=True)
+    layouts.videos(tmp_path, names[:2])
+    with caplog.at_level(logging.WARNING):
+        assert load_capture(tmp_path).names == names[:2]
+    assert "cam11.png and 18 others: left out." in caplog.text
 
 
 def test_find_layout__finds_a_layout_that_is_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
