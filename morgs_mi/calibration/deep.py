@@ -7,19 +7,29 @@ and advice. The limits are far above what clips without faults show, so that a f
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from morgs_mi.calibration.rig_check import RigCheck, SharedFeatures
-from morgs_mi.calibration.signals import Lamp, Signals, brightness, known_median, lamp_flicker, repeated_frames
+from morgs_mi.calibration.signals import (
+    Lamp,
+    Signals,
+    brightness,
+    known_median,
+    lamp_flicker,
+    repeated_frames,
+    shrunk_mask,
+)
 from morgs_mi.calibration.synchrony import consensus, time_offsets
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.color_correction import matched_colors
+from morgs_mi.capture.features import detect, match_views
+from morgs_mi.core.camera import Camera
 from morgs_mi.fit.forecast import overlaps
 
-__all__ = ["MAX_FRAMES", "DeepCheck", "Finding", "check_deep"]
+__all__ = ["MAX_FRAMES", "DeepCheck", "Finding", "check_deep", "check_exposures"]
 
 # Frames that are read: the faults of a longer recording show in its beginning.
 MAX_FRAMES = 120
@@ -29,6 +39,9 @@ _ERROR, _TIMES_ERROR = 0.7, 3.0
 _OFFSET, _OFFSET_CHANGE, _MIN_HALF = 0.65, 0.75, 24
 # Differences of log gains: about 10 % of exposure, and 5 % of one channel against the mean of all.
 _EXPOSURE, _BALANCE, _MIN_SAMPLES = 0.1, 0.05, 16
+_CORRECTIONS = "--exposure auto or --color linear"
+# For a quick check of the exposures: width to which images are reduced, px, and near views with which each is matched.
+_QUICK_WIDTH, _QUICK_NEIGHBOURS = 480, 3
 # Error of a median log ratio that no number of points removes, because surfaces look different from two sides.
 _LOG_ERROR = 0.02
 # Threshold on the range of the log brightness over time, about 8 %: people walking through a room cause up to 5 %.
@@ -118,7 +131,7 @@ def check_deep(capture: Capture, shared: SharedFeatures, rig: RigCheck, signals:
         errors=np.array([camera.error for camera in rig.cameras]),
         offsets=time_offsets(capture.cameras, signals.thumbs),
         halves=np.array([time_offsets(capture.cameras, part) for part in parts]).reshape(-1, len(capture.cameras)),
-        gains=_gains(capture, shared),
+        gains=_gains(capture.cameras, next(capture.partial_frames(0, 1)).images, shared),
         brightness=known_median(bands, axis=2),
         sharpness=signals.sharpness,
         repeated=repeated_frames(signals),
@@ -128,7 +141,7 @@ def check_deep(capture: Capture, shared: SharedFeatures, rig: RigCheck, signals:
     found = [
         *_errors(measured),
         *_times(measured, capture),
-        *_exposures(measured),
+        *_exposures(measured.names, measured.gains),
         *_flicker(measured),
         *_variations(measured),
         *_blur(measured),
@@ -138,10 +151,32 @@ def check_deep(capture: Capture, shared: SharedFeatures, rig: RigCheck, signals:
     return DeepCheck(**{**vars(measured), "findings": tuple(found)})
 
 
-def _gains(capture: Capture, shared: SharedFeatures) -> np.ndarray:
-    """Return the log gains of all cameras [C, 3] that explain the colours of points that two of them see."""
+def check_exposures(capture: Capture, shared: SharedFeatures | None = None) -> list[Finding]:
+    """Return which cameras differ from the others in exposure or white balance, by the first frame.
+
+    Args:
+        capture: a capture.
+        shared: features of its first frame in its size; None: those of reduced images, in about 0.3 s per view.
+    """
+    capture = _reduced(capture) if shared is None else capture
     images = next(capture.partial_frames(0, 1)).images
-    pairs, colors = matched_colors(capture.cameras, images, shared.features, shared.matches)
+    if shared is None:
+        features = tuple(detect(image, mask) for image, mask in zip(images, capture.masks, strict=True))
+        shared = SharedFeatures(features, tuple(match_views(features, capture.cameras, _QUICK_NEIGHBOURS)))
+    return list(_exposures(capture.names, _gains(capture.cameras, images, shared)))
+
+
+def _reduced(capture: Capture) -> Capture:
+    """Return a capture with images that are at most `_QUICK_WIDTH` wide."""
+    sizes = [(min(c.width, _QUICK_WIDTH), round(c.height * min(1, _QUICK_WIDTH / c.width))) for c in capture.cameras]
+    cameras = tuple(camera.resized(*size) for camera, size in zip(capture.cameras, sizes, strict=True))
+    masks = tuple(None if m is None else shrunk_mask(m, s) for m, s in zip(capture.masks, sizes, strict=True))
+    return replace(capture, cameras=cameras, masks=masks)
+
+
+def _gains(cameras: Sequence[Camera], images: Sequence[np.ndarray | None], shared: SharedFeatures) -> np.ndarray:
+    """Return the log gains of all cameras [C, 3] that explain the colours of points that two of them see."""
+    pairs, colors = matched_colors(cameras, images, shared.features, shared.matches)
     pairs = [pair for pair in pairs if len(pair.features) >= _MIN_SAMPLES]
     ratios = []
     for pair in pairs:
@@ -190,26 +225,16 @@ def _times(check: DeepCheck, capture: Capture) -> Iterator[Finding]:
             )
 
 
-def _exposures(check: DeepCheck) -> Iterator[Finding]:
-    means = check.gains.mean(axis=1)
-    for view, (mean, gains) in enumerate(zip(means, check.gains, strict=True)):
+def _exposures(names: Sequence[str], gains: np.ndarray) -> Iterator[Finding]:
+    """Yield the cameras of other exposure or white balance; `gains` are the log gains of their channels [C, 3]."""
+    for name, own, mean in zip(names, gains, gains.mean(axis=1), strict=True):
         if abs(mean) > _EXPOSURE:
-            yield _finding(
-                check,
-                "exposure",
-                [view],
-                f"is {_percent(mean)} than the other cameras: set the same exposure and gain, or use --color linear or "
-                "fit.exposure",
-            )
-        if np.abs(gains - mean).max() > _BALANCE:
-            channels = ", ".join(f"{n} {100 * np.expm1(g - mean):+.0f} %" for n, g in zip("RGB", gains, strict=True))
-            yield _finding(
-                check,
-                "exposure",
-                [view],
-                f"has another white balance than the other cameras ({channels}): set a fixed one, or use "
-                "--color linear",
-            )
+            what = f"is {_percent(mean)} than the other cameras: set the same exposure and gain"
+            yield Finding("exposure", (name,), f"{name} {what}, or use {_CORRECTIONS}.")
+        if np.abs(own - mean).max() > _BALANCE:
+            channels = ", ".join(f"{n} {100 * np.expm1(g - mean):+.0f} %" for n, g in zip("RGB", own, strict=True))
+            what = f"has another white balance than the other cameras ({channels}): set a fixed one"
+            yield Finding("exposure", (name,), f"{name} {what}, or use {_CORRECTIONS}.")
 
 
 def _flicker(check: DeepCheck) -> Iterator[Finding]:
@@ -223,8 +248,8 @@ def _flicker(check: DeepCheck) -> Iterator[Finding]:
             "flicker",
             views,
             f"flicker by {100 * max(lamp.amplitude for lamp in lamps):.1f} % at {lamps[0].alias:.1f} Hz, as lamps on "
-            f"{hertz} Hz mains do: expose for a multiple of {exposure} s, use lamps without flicker, "
-            "--exposure or fit.exposure",
+            f"{hertz} Hz mains do: expose for a multiple of {exposure} s, use lamps without flicker, or "
+            "--exposure auto, which corrects what the cameras do not have in common",
         )
 
 
@@ -240,7 +265,7 @@ def _variations(check: DeepCheck) -> Iterator[Finding]:
             "variation",
             range(len(check.names)),
             f"change their brightness alike, by {100 * np.expm1(span):.0f} % over time: the light of the scene "
-            "changes; use constant light, or leave out --exposure",
+            "changes; use constant light",
         )
     for view, values in enumerate((check.brightness - common if lit else check.brightness).T):
         known = values[np.isfinite(values)]
@@ -251,7 +276,7 @@ def _variations(check: DeepCheck) -> Iterator[Finding]:
                 [view],
                 f"changes its brightness by {100 * np.expm1(own):.0f} % over time, up to "
                 f"{100 * np.expm1(np.abs(np.diff(known)).max()):.0f} % from frame to frame: fix the exposure, or use "
-                "--exposure if the light itself is constant",
+                "--exposure auto",
             )
 
 

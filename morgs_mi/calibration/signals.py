@@ -15,7 +15,16 @@ import numpy as np
 from morgs_mi.capture.capture import Capture
 from morgs_mi.core.color_space import srgb_to_linear
 
-__all__ = ["Lamp", "Signals", "brightness", "known_median", "lamp_flicker", "read_signals", "repeated_frames"]
+__all__ = [
+    "Lamp",
+    "Signals",
+    "brightness",
+    "known_median",
+    "lamp_flicker",
+    "read_signals",
+    "repeated_frames",
+    "shrunk_mask",
+]
 
 _WIDTH = 128  # of a thumbnail, px
 # Values of a thumbnail from which a gain follows; darker ones are noise, brighter ones clipped.
@@ -73,7 +82,7 @@ def read_signals(capture: Capture, max_frames: int, progress: Callable[[int, int
     thumbs = [np.full((count, *size[::-1]), np.nan, np.float32) for size in sizes]
     sharpness = np.full((count, len(sizes)), np.nan)
     inner = [None if m is None else cv2.erode(m.astype(np.uint8), np.ones((9, 9))) > 0 for m in capture.masks]
-    hidden = [None if m is None else ~_shrunk_mask(m, size) for m, size in zip(capture.masks, sizes, strict=True)]
+    hidden = [None if m is None else ~shrunk_mask(m, size) for m, size in zip(capture.masks, sizes, strict=True)]
     for t, frame in enumerate(capture.partial_frames(0, count)):
         for c, image in enumerate(frame.images):
             if image is None:
@@ -158,7 +167,7 @@ def _rms(amplitudes: np.ndarray) -> np.ndarray:
     return np.sqrt((np.abs(amplitudes) ** 2).mean(axis=-1))
 
 
-def _shrunk_mask(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def shrunk_mask(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Return the pixels of a thumbnail that contain only valid pixels."""
     return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.999
 

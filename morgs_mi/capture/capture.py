@@ -15,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 
 from morgs_mi.capture.camera_source import CameraSource, at_clip_size
-from morgs_mi.capture.color_correction import COLOR_METHODS, ColorCorrection, ColorFit, fit_colors
+from morgs_mi.capture.color_correction import COLOR_METHODS, ColorFit, fit_colors
 from morgs_mi.capture.layouts.calibration import Calibration
 from morgs_mi.capture.layouts.clips import EXAMPLE
 from morgs_mi.capture.layouts.registry import find_layout
@@ -334,7 +334,7 @@ def load_capture(
         reading=reading,
         notes=(*common.notes, *(note for _, note in opaque if note), *_photos(calibration.clips)),
     )
-    return _color_corrected(capture, reading) if reading.color != "none" or reading.exposure else capture
+    return capture if reading.color == "none" else _color_corrected(capture, reading.color)
 
 
 def _readouts(path: Path, every: Sequence[str], names: Sequence[str], settings: dict[str, Any]) -> list[float]:
@@ -388,19 +388,18 @@ def _check_downscale(downscale: float, cameras: Sequence[Camera], recorded: Sequ
         )
 
 
-def _color_corrected(capture: Capture, reading: ReadConfig) -> Capture:
-    """Return the capture with colours corrected between cameras and over time, as `reading` requests."""
-    method, _, name = reading.color.partition(":")
-    if method not in ("none", *COLOR_METHODS) or (name and name not in capture.names):
+def _color_corrected(capture: Capture, color: str) -> Capture:
+    """Return the capture with colours that are corrected between cameras; `color` is that of `ReadConfig`."""
+    method, _, name = color.partition(":")
+    if method not in COLOR_METHODS or (name and name not in capture.names):
         raise ValueError(
             f"{capture.path}: `color` must be none, {', '.join(COLOR_METHODS)}, or one of these with a camera of "
-            f"{', '.join(capture.names)}, such as linear:{capture.names[0]}, got {reading.color!r}."
+            f"{', '.join(capture.names)}, such as linear:{capture.names[0]}, got {color!r}."
         )
     images = next(capture.partial_frames(0, 1)).images
     reference = capture.names.index(name) if name else None
-    fit = fit_colors(capture.cameras, images, capture.masks, method, reference) if method != "none" else None
-    corrections = [ColorCorrection.of(fit, v, image if reading.exposure else None) for v, image in enumerate(images)]
-    sources = tuple(replace(s, color_correction=c) for s, c in zip(capture._sources, corrections, strict=True))
+    fit = fit_colors(capture.cameras, images, capture.masks, method, reference)
+    sources = tuple(replace(s, color_correction=fit.correction(view)) for view, s in enumerate(capture._sources))
     return replace(capture, _sources=sources, colors=fit)
 
 

@@ -1,4 +1,4 @@
-"""Colour correction between cameras and over time.
+"""Colour correction between cameras.
 
 Corrections are applied in linear light, where a different gain, white balance or sensor is a matrix on (R, G, B).
 They are fitted to the colours of points that views share: features that match and on which the poses agree. The
@@ -35,16 +35,9 @@ _MIN_SAMPLES, _MAX_ERROR = 30, 2.0
 # Well-exposed pixel values, of 0..255; those nearly black or white do not determine a gain.
 _DARK, _BRIGHT = 12, 243
 _BLUR = 0.008  # standard deviation of the blur around a feature, as a fraction of the width
-_THUMB = 96  # width of the thumbnail, px; enough for a median
-
-
-def _decoded(values: np.ndarray) -> np.ndarray:
-    """Return the linear light in [0, 1] of sRGB values in [0, 255], which need not be whole, in float32."""
-    return srgb_to_linear(values / np.float32(255)).astype(np.float32)
-
 
 # Tables: the light of each byte, and the byte of 65536 levels of light.
-_LINEAR = _decoded(np.arange(256, dtype=np.float32))
+_LINEAR = srgb_to_linear(np.arange(256, dtype=np.float32) / np.float32(255)).astype(np.float32)
 _ENCODED = np.rint(255 * linear_to_srgb(np.arange(65536) / 65535)).astype(np.uint8)
 
 
@@ -68,45 +61,27 @@ class ColorFit:
     before: tuple[float, ...]
     after: tuple[float, ...]
 
+    def correction(self, view: int) -> ColorCorrection | None:
+        """Return the correction of a view, None if it is not changed."""
+        matrix = self.matrices[view]
+        return None if matrix is None else ColorCorrection(self.method, matrix)
+
 
 @dataclass(frozen=True)
 class ColorCorrection:
-    """Colour correction of one camera's images, towards the other cameras and towards its own first image.
+    """Colour correction of one camera's images, towards the other cameras.
 
     Attributes:
         method: one of `COLOR_METHODS`.
-        matrix: matrix of the correction, or None.
-        first: thumbnail of the first image, to which changes of exposure are relative; None if they are not corrected.
+        matrix: matrix of the correction.
     """
 
-    method: str = "linear"
-    matrix: np.ndarray | None = None
-    first: np.ndarray | None = None
-
-    @classmethod
-    def of(cls, fit: ColorFit | None, view: int, first: np.ndarray | None) -> ColorCorrection:
-        """Return the correction of a view; exposure changes are corrected if its `first` image is given."""
-        matrix = None if fit is None else fit.matrices[view]
-        return cls(fit.method if fit else "linear", matrix, None if first is None else _thumb(first))
-
-    def gain(self, image: np.ndarray) -> float:
-        """Return the factor in linear light from the first image to this one: the median of well-exposed pixels.
-
-        The cameras are fixed, so most pixels show the same surface in both.
-        """
-        if self.first is None:
-            return 1.0
-        now = _thumb(image)
-        both = np.stack([self.first, now])
-        good = ((both > _DARK) & (both < _BRIGHT)).all((0, -1))
-        return float(np.median(_decoded(now[good]) / _decoded(self.first[good]))) if good.sum() >= _MIN_SAMPLES else 1.0
+    method: str
+    matrix: np.ndarray
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the corrected image, uint8 [H, W, 3]."""
-        gain = self.gain(image)
-        if self.matrix is None:
-            return image if gain == 1 else cv2.LUT(image, _encode(_LINEAR / gain))
-        return _encode(_corrected(_LINEAR[image] / np.float32(gain), self.matrix, self.method))
+        return _encode(_corrected(_LINEAR[image], self.matrix, self.method))
 
 
 def fit_colors(
@@ -246,15 +221,6 @@ def _differences(pairs: Sequence[Match], colors: Sequence[np.ndarray]) -> tuple[
             for view in pair.views:
                 found[view].append(delta_e(a, b))
     return tuple(float(np.mean(np.concatenate(values))) if values else float("nan") for values in found)
-
-
-def _thumb(image: np.ndarray) -> np.ndarray:
-    """Return a thumbnail in float32; rounded to bytes it would limit the gain's precision to 2 %."""
-    height, width = image.shape[:2]
-    across = min(_THUMB, width)
-    return cv2.resize(
-        image.astype(np.float32), (across, max(1, round(height * across / width))), interpolation=cv2.INTER_AREA
-    )
 
 
 def _encode(light: np.ndarray) -> np.ndarray:

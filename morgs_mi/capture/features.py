@@ -119,23 +119,30 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
     return Features(points, descriptors, image[rows, columns].astype(np.float32) / 255, axes)
 
 
-def match_views(features: Sequence[Features], cameras: Sequence[Camera]) -> list[Match]:
+def match_views(features: Sequence[Features], cameras: Sequence[Camera], neighbours: int | None = None) -> list[Match]:
     """Return the matches between all pairs of views, or between near views if there are many cameras.
 
     Only matches that are consistent with a common epipolar geometry are kept, whatever that geometry is.
+
+    Args:
+        features: per view.
+        cameras: per view.
+        neighbours: number of nearest views with which each is matched; None: all of up to 24 views, 8 of more.
     """
-    matches = (Match((i, j), _matches(features[i], features[j])) for i, j in _pairs(cameras))
+    if neighbours is None:
+        neighbours = len(cameras) if len(cameras) <= _ALL_PAIRS else _NEIGHBOURS
+    matches = (Match((i, j), _matches(features[i], features[j])) for i, j in _pairs(cameras, neighbours))
     return [match for match in matches if len(match.features)]
 
 
-def _pairs(cameras: Sequence[Camera]) -> Iterator[tuple[int, int]]:
+def _pairs(cameras: Sequence[Camera], neighbours: int) -> Iterator[tuple[int, int]]:
     count = len(cameras)
     positions = np.array([camera.position for camera in cameras])
     distances = np.linalg.norm(positions[:, None] - positions, axis=2)
     ranks = distances.argsort(axis=1).argsort(axis=1)
     for i in range(count):
         for j in range(i + 1, count):
-            if count <= _ALL_PAIRS or min(ranks[i, j], ranks[j, i]) <= _NEIGHBOURS:
+            if min(ranks[i, j], ranks[j, i]) <= neighbours:
                 yield i, j
 
 

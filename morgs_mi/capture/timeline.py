@@ -50,9 +50,6 @@ class ReadConfig:
     """Method that matches each camera's colours to those of a reference camera, fitted to points that both see: linear,
     root-polynomial, vandermonde, or none. linear:cam03 also names the reference camera; by default it is the one that
     shares most points with the others."""
-    exposure: bool = False
-    """Whether to remove exposure changes over time: one gain per view and frame restores the brightness that static
-    surfaces have in the first frame."""
     without: tuple[str, ...] = ()
     """Names of the cameras that are left out."""
 

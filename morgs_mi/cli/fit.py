@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import DisallowNone, Positional, arg
 
-from morgs_mi.cli.console import print_result, progress
+from morgs_mi.cli.console import print_result, print_warning, progress
 from morgs_mi.cli.settings import Flag, GivenReading, GivenSettings, Reading, Settings, optional
 from morgs_mi.config import StreamConfig, config_toml
 
@@ -54,6 +54,7 @@ class Fit:
     arguments: ClassVar[Mapping[str, str]] = {"max_frames": "--frames"}
 
     def run(self) -> None:
+        from morgs_mi.calibration.deep import check_exposures
         from morgs_mi.capture.capture import load_capture
         from morgs_mi.recorder import stream_capture
 
@@ -66,6 +67,9 @@ class Fit:
         self.settings.check_methods(config)
         view = None if self.test_view.lower() == "none" else self.test_view
         capture = load_capture(self.capture, self.downscale, view, self.frames, self.reading.read_config())
+        if config.fit.exposure == "off" and not self.resume:
+            for finding in check_exposures(capture):
+                print_warning(f"Warning: {finding.sentence}")
         if any(option is not None for option in (self.segments, self.scheduler)):
             self._fit_in_segments(capture, config)
             return

@@ -12,7 +12,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from tyro.conf import DisallowNone, Positional, arg
 
-from morgs_mi.calibration.deep import MAX_FRAMES, DeepCheck, check_deep
+from morgs_mi.calibration.deep import MAX_FRAMES, DeepCheck, Finding, check_deep, check_exposures
 from morgs_mi.calibration.rig_check import (
     CameraCheck,
     RigCheck,
@@ -72,6 +72,7 @@ class Info:
             if output is not None:
                 check_output(output)
         capture, found, deep = load_capture(self.capture, reading=self.reading.read_config()), None, None
+        exposures: Sequence[Finding] = ()
         origin = "" if len(capture.points) else "without points"
         if self.check:
             with progress() as report:
@@ -82,6 +83,8 @@ class Info:
                 origin += f" ({len(capture.points)} can be triangulated)"
             if self.deep:
                 deep = _deep_check(capture, common, found)
+            else:
+                exposures = check_exposures(capture, common)
         print_table(_camera_table(capture, found))
         points = origin or f"{len(capture.points)} points"
         truth = "with ground truth" if capture.truth else "without ground truth"
@@ -95,7 +98,7 @@ class Info:
                 )
             for line in _time_lines(offsets):
                 print_result(line)
-        for line in _deep_lines(deep):
+        for line in (*(finding.sentence for finding in exposures), *_deep_lines(deep)):
             print_result(line)
         if self.json is not None and deep:
             write_json(self.json, deep.as_dict())

@@ -41,13 +41,14 @@ SETTINGS = {
     "target_size": "codec.target_size",
     "keyframe_interval": "codec.keyframe_interval",
     "refine_cameras": "fit.refine_cameras",
+    "exposure": "fit.exposure",
     "reproducible": "render.reproducible",
 }
 
 # A channel that commands render.
 ChannelName = Literal["color", "motion", "confidence", "depth", "alpha"]
-# Whether cameras are refined.
-Refinement = Literal["off", "auto", "on"]
+# Whether something is estimated.
+Estimation = Literal["off", "auto", "on"]
 # A switch that is off by default.
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 # Names of cameras, none by default.
@@ -125,8 +126,6 @@ class Reading:
     """Continue where images are missing, without their cameras."""
     color: Annotated[str, arg(metavar="NAME")] = "none"
     """Colour correction: none, linear, root-polynomial, vandermonde, or with a reference camera linear:CAMERA."""
-    exposure: Flag = False
-    """Compensation of exposure changes over time."""
     without: Without = ()
     """Cameras that are left out, by name."""
 
@@ -165,8 +164,10 @@ class Settings:
     """Most bytes of a later frame; 0: no limit."""
     keyframe_interval: Annotated[int | None, setting("keyframe_interval")] = None
     """Frames between two keyframes; 0: the first only."""
-    refine_cameras: Annotated[Refinement | None, setting("refine_cameras"), _one_of(get_args(Refinement))] = None
+    refine_cameras: Annotated[Estimation | None, setting("refine_cameras"), _one_of(get_args(Estimation))] = None
     """Refinement of the cameras: off, on, or auto (if withheld pixels gain)."""
+    exposure: Annotated[Estimation | None, setting("exposure"), _one_of(get_args(Estimation))] = None
+    """Estimation of exposures and white balances: off, on, or auto (between cameras if withheld pixels gain)."""
     reproducible: Flag = False
     """Same bytes on every run; about half as fast."""
 

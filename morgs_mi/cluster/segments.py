@@ -150,7 +150,7 @@ async def fit_in_segments(
     if config.fit.exposure != "off":
         raise ValueError(
             f"stream_segments(): `fit.exposure` must be off, got {config.fit.exposure!r}: exposures follow from all "
-            "frames before; fit without segments, or read the capture with --color and --exposure."
+            "frames before; fit without segments, or match the colours of the cameras as the capture is read (--color)."
         )
     out, seams = Path(out), seams or SeamConfig()
     starts = _starts(capture.num_frames, segments)

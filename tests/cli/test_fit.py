@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shlex
 import signal
 import subprocess
@@ -20,8 +21,11 @@ from morgs_mi.cluster.seams import SeamConfig
 from morgs_mi.cluster.segments import _Segment
 from morgs_mi.cluster.tasks import Part
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.io.video_writer import write_video
 from morgs_mi.stream_loop import StreamLoop
+from tests.calibration.test_signals import brighter
 from tests.cli.commands import QUICK, assert_one_sentence, assert_refused, interrupt
+from tests.scenes import textured
 from tests.scenes.captures import colmap
 from tests.scenes.noise_capture import FRAMES, lengthen_clip, rig, truncate_clip
 from tests.scenes.recording import write_recording
@@ -51,9 +55,26 @@ def test_fit__reports_what_to_expect_of_views_between_the_cameras(capture: Path,
     assert first["validation"]["sentence"] in " ".join(output.split())
 
 
+def test_fit__names_cameras_of_other_exposure(tmp_path: Path, run) -> None:
+    path = textured.write_capture(tmp_path / "rig").path
+    sentence = r"cam2 is 2[3-6] % brighter than the other cameras: .*, or use --exposure auto or --color linear\."
+    camera, planes = textured.rig(shift=7)[2], textured.textures()
+    write_video(path / "cam2.mkv", [brighter(textured.render(camera, planes), 1.25)], 30)
+    status, out, error = run("fit", path, tmp_path / "out", *QUICK, "--downscale", 2)
+    assert (status, re.search(sentence, out)) == (0, None)
+    assert re.search(f"Warning: {sentence}", error)
+    for options in ((), ("--deep",)):
+        assert len(re.findall(sentence, run("info", path, *options)[1])) == 1
+    (tmp_path / "a.toml").write_text("[fit.exposures]\ngaussians = 40\nsteps = 2\nrounds = 1\n")
+    for options in (("--color", "linear"), ("--exposure", "on", "--config", tmp_path / "a.toml")):
+        status, out, error = run("fit", path, tmp_path / "out", *QUICK, "--downscale", 2, *options)
+        assert (status, "brighter" in error) == (0, False)
+    assert "The cameras were balanced: exposures differ by up to" in out
+
+
 def test_fit__and_eval_use_the_same_instants(capture: Path, tmp_path: Path, run) -> None:
     lengthen_clip(capture)
-    out, options = tmp_path / "out", ("--offset", "cam1", "-1", "cam2", "1", "--exposure")
+    out, options = tmp_path / "out", ("--offset", "cam1", "-1", "cam2", "1", "--gaps")
     assert run("info", capture, "--no-check", *options)[1].count("2 frames at 25 fps") == 1
     assert run("fit", capture, out, *options, *QUICK)[0] == 0
     record = json.loads((out / "capture.json").read_text())

@@ -70,7 +70,7 @@ def test_fit__overrides_defaults_by_preset_by_file_by_options(tmp_path: Path, ru
                 "--target-size",
                 99,
             ),
-            *("--keyframe-interval", 0, "--refine-cameras", "auto", "--reproducible"),
+            *("--keyframe-interval", 0, "--refine-cameras", "auto", "--exposure", "on", "--reproducible"),
         ),
     ],
 )
@@ -124,7 +124,7 @@ def test_offset__refuses_what_is_no_pair(words: list[str], sentence: str, capsys
     assert sentence in " ".join((captured.out + captured.err).replace("│", " ").split())
 
 
-@pytest.mark.parametrize("option", ["--preset", "--refine-cameras"])
+@pytest.mark.parametrize("option", ["--preset", "--refine-cameras", "--exposure"])
 def test_fit__lists_the_choices_of_an_option_without_none(option: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         cli.main(["fit", "capture", "out", option, "maybe"])
