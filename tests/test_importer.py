@@ -260,11 +260,11 @@ def test_import__reads_what_export_writes(clip, tmp_path, capsys):
         return status, *capsys.readouterr()
 
     assert run("import", *sorted(clip.iterdir()), tmp_path / "a", "--fps", 24, "--quality", 4)[0] == 0
-    assert run("export", "ply", tmp_path / "a", "--compressed")[0] == 0
+    assert run("export", "ply", tmp_path / "a", "--format", "compressed.ply")[0] == 0
     status, output, _ = run("import", tmp_path / "a/compressed-ply", tmp_path / "b", "--axes", "z-up")
     assert (status, output.startswith(f"{tmp_path}/b/stream.morgs: 5 frames, one set of Gaussians, ")) == (0, True)
     assert run("export", "gltf", tmp_path / "b")[0] == 0
-    assert run("render", tmp_path / "b", "--camera", "front", "--output", tmp_path / "png")[0] == 0
+    assert run("render", tmp_path / "b", tmp_path / "png", "--camera", "front")[0] == 0
     for args, part in (
         ([], "expected FRAMES and OUT, got fewer"),
         ([clip], "expected FRAMES and OUT, got fewer"),

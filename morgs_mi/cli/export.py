@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,11 +11,15 @@ from typing import Annotated, ClassVar
 import tyro
 from tyro.conf import DisallowNone, Positional, arg
 
-from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, progress
-from morgs_mi.cli.settings import ChannelName, Flag, optional
+from morgs_mi.cli.settings import ChannelName, Flag, one_of, optional, place
+from morgs_mi.export.formats import GLTF, PLY, TRACKS, USD, VIDEO, WEB, Format, destination
 
 __all__ = ["Export"]
+
+
+def _names(formats: Sequence[Format]) -> tuple[str, ...]:
+    return tuple(chosen.name for chosen in formats)
 
 
 @dataclass(frozen=True)
@@ -24,12 +28,12 @@ class Ply:
 
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
-    output: Annotated[Path | None, DisallowNone, optional("FOLDER")] = None
-    """New folder for 0000.ply, ...; by default OUT/ply, with --compressed OUT/compressed-ply."""
+    output: Annotated[Positional[Path | None], DisallowNone, place("FOLDER")] = None
+    """New folder for 0000.ply, ..., or FILE.ply for one frame; by default OUT/ply or OUT/compressed-ply."""
+    format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(_names(PLY))] = None
+    """Format: ply, or compressed.ply, PlayCanvas' layout, whose sequence SuperSplat plays. By default by the name."""
     frames: Annotated[str | None, DisallowNone, optional("FRAMES")] = None
     """Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."""
-    compressed: Flag = False
-    """Write 0000.compressed.ply, ... in PlayCanvas' layout, a sequence that SuperSplat plays."""
 
     arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
 
@@ -43,14 +47,13 @@ class Ply:
 
         stream = open_stream(self.out)
         frames = select_frames(stream, self.frames)
-        folder = "compressed-ply" if self.compressed else "ply"
-        output = check_output(self.output or stream.path.with_name(folder))
+        output, chosen = destination(stream.path, self.output, PLY, self.format)
         with progress() as report:
             tick = partial(report, "Writing")
-            if self.compressed:
-                write_each(by_place(stream), output, ".compressed.ply", write_compressed_ply, frames, tick)
+            if chosen.name == "compressed.ply":
+                write_each(by_place(stream), output, chosen.ending, write_compressed_ply, frames, tick)
             else:
-                write_each(play(stream), output, ".ply", write_ply, frames, tick)
+                write_each(play(stream), output, chosen.ending, write_ply, frames, tick)
         print_result(f"{output}: {len(frames)} PLY files.")
 
 
@@ -60,8 +63,8 @@ class Gltf:
 
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
-    output: Annotated[Path | None, DisallowNone, optional("FOLDER")] = None
-    """New folder for 0000.glb, ...; by default OUT/gltf."""
+    output: Annotated[Positional[Path | None], DisallowNone, place("FOLDER")] = None
+    """New folder for 0000.glb, ..., or FILE.glb for one frame; by default OUT/gltf."""
     frames: Annotated[str | None, DisallowNone, optional("FRAMES")] = None
     """Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."""
 
@@ -76,11 +79,11 @@ class Gltf:
 
         stream = open_stream(self.out)
         frames = select_frames(stream, self.frames)
-        output = check_output(self.output or stream.path.with_name("gltf"))
+        output, chosen = destination(stream.path, self.output, GLTF)
         axes = gltf_axes(stream.cameras)
         with progress() as report:
             write = partial(write_gltf, axes=axes)
-            write_each(play(stream), output, ".glb", write, frames, partial(report, "Writing"))
+            write_each(play(stream), output, chosen.ending, write, frames, partial(report, "Writing"))
         print_result(f"{output}: {len(frames)} glTF files.")
 
 
@@ -90,8 +93,10 @@ class Usd:
 
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
-    output: Positional[Path | None] = None
+    output: Annotated[Positional[Path | None], DisallowNone, place("FILE")] = None
     """FILE.usd, .usdc (binary), .usda (text) or .usdz (package); by default OUT/stream.usdc."""
+    format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(_names(USD))] = None
+    """Format: usdc, usd, usda or usdz; by default by the name."""
     frames: Annotated[str | None, DisallowNone, optional("FRAMES")] = None
     """Frames to write: 12, 10:20 (20 excluded) or 0:100:5; all by default."""
     half: Flag = False
@@ -106,7 +111,7 @@ class Usd:
 
         stream = open_stream(self.out)
         frames = select_frames(stream, self.frames)
-        output = check_output(self.output or stream.path.with_name("stream.usdc"))
+        output, _ = destination(stream.path, self.output, USD, self.format)
         with progress() as report:
             write_usd(stream, output, frames, self.half, partial(report, "Writing"))
         print_result(f"{output}: {len(frames)} frames, {output.stat().st_size / 1e6:.2f} MB.")
@@ -118,10 +123,10 @@ class Flight:
 
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
+    output: Annotated[Positional[Path | None], DisallowNone, place("FILE.mp4")] = None
+    """File for the video; by default OUT/PATH.mp4, e.g. OUT/orbit.mp4."""
     path: str = "between"
     """Camera path: between (through the rig's cameras), orbit (around the scene), or a JSON file (docs/exports.md)."""
-    output: Annotated[Path | None, DisallowNone, optional("FILE.mp4")] = None
-    """File for the video; by default OUT/PATH.mp4, e.g. OUT/orbit.mp4."""
     seconds: Annotated[float | None, DisallowNone, optional("FLOAT")] = None
     """Duration in seconds; by default that of the JSON file, or that of the clip, repeated to LEAST_SECONDS."""
     least_seconds: float = 5.0
@@ -163,7 +168,7 @@ class Flight:
         if self.width is not None:
             height = max(1, round(self.width * path.keys[0].height / path.keys[0].width))
             path = replace(path, keys=tuple(key.resized(self.width, height) for key in path.keys))
-        output = check_output(self.output or stream.path.with_name(f"{Path(self.path).stem}.mp4"))
+        output, _ = destination(stream.path, self.output, VIDEO, stem=Path(self.path).stem)
         with progress() as report:
             write_flight(
                 stream,
@@ -183,7 +188,7 @@ class Tracks:
 
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
-    output: Annotated[Path | None, DisallowNone, optional("FILE.npz")] = None
+    output: Annotated[Positional[Path | None], DisallowNone, place("FILE.npz")] = None
     """File for the tracks; by default OUT/tracks.npz."""
 
     def run(self) -> None:
@@ -192,7 +197,7 @@ class Tracks:
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
-        output = check_output(self.output or stream.path.with_name("tracks.npz"))
+        output, _ = destination(stream.path, self.output, TRACKS)
         total = len(frame_numbers(stream))
         with progress() as report:
             tracks = extract_tracks(stream, lambda done: report("Following", done, total))
@@ -203,14 +208,14 @@ class Tracks:
 
 @dataclass(frozen=True)
 class Web:
-    """Write a web page that plays the stream without a server, or a folder for one."""
+    """Write a web page that plays the stream without a server, or a folder for a server."""
 
     out: Positional[Path]
     """Folder of a fit, or a stream file."""
-    output: Annotated[Positional[Path | None], DisallowNone, arg(help_behavior_hint="")] = None
-    """FILE.html, or with --folder a new folder; by default OUT/player.html or OUT/web."""
-    folder: Flag = False
-    """Write a folder with the page and the stream as two files, for hosting."""
+    output: Annotated[Positional[Path | None], DisallowNone, place("FILE.html")] = None
+    """FILE.html, or a new folder with the page and the stream, for hosting; by default OUT/player.html or OUT/web."""
+    format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(_names(WEB))] = None
+    """Format: html or folder; by default by the name."""
     title: Annotated[str | None, DisallowNone, optional("TEXT")] = None
     """Title of the page; by default the name of the stream's folder or file."""
 
@@ -220,8 +225,8 @@ class Web:
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
-        output = check_output(self.output or stream.path.with_name("web" if self.folder else "player.html"))
-        total, write = len(frame_numbers(stream)), write_web_folder if self.folder else write_web_page
+        output, chosen = destination(stream.path, self.output, WEB, self.format)
+        total, write = len(frame_numbers(stream)), write_web_folder if chosen.folder else write_web_page
         with progress() as report:
             size = write(stream, output, self.title, lambda done: report("Checking", done, total))
         print_result(f"{output}: {total} frames, {size / 1e6:.2f} MB.")

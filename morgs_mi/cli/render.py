@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 
 from tyro.conf import DisallowNone, Positional, arg
 
-from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, progress
-from morgs_mi.cli.settings import ChannelName, optional
+from morgs_mi.cli.settings import ChannelName, one_of, optional
+from morgs_mi.export.formats import IMAGES, destination
 
 __all__ = ["Render"]
 
@@ -20,7 +20,8 @@ _CHANNELS = (
 )
 _OUTPUT = (
     "FILE.mp4; a new folder whose name ends in png, for PNG files; or another new folder, for multichannel EXR files "
-    "(R, G, B in linear light, motion.X and motion.Y in pixels, confidence.Y, depth.Y). By default OUT/CAMERA.mp4."
+    "(R, G, B in linear light, motion.X and motion.Y in pixels, confidence.Y, depth.Y). By default OUT/CAMERA.mp4, "
+    "OUT/CAMERA-png or OUT/CAMERA-exr."
 )
 _INSERT = (
     "Mitsuba scene whose objects stand among the Gaussians: FILE.xml, or FILE.py with a function build(frame, time) "
@@ -36,8 +37,12 @@ class Render:
     """Folder of a fit, or a stream file."""
     camera: Annotated[str, arg(metavar="CAMERA")]
     """Camera of the stream, by index or name; `morgs-mi info` lists those of a capture."""
+    output: Annotated[
+        Positional[Path | None], DisallowNone, arg(metavar="[FILE_OR_FOLDER]", help=_OUTPUT, help_behavior_hint="")
+    ] = None
+    format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(("mp4", "png", "exr"))] = None
+    """Format: mp4, png or exr; by default by the name of the output."""
     channels: Annotated[tuple[ChannelName, ...] | None, DisallowNone, optional("NAME ...", text=_CHANNELS)] = None
-    output: Annotated[Path | None, DisallowNone, optional("PATH", text=_OUTPUT)] = None
     insert: Annotated[Path | None, DisallowNone, optional("FILE", text=_INSERT)] = None
     at: Annotated[tuple[int, ...] | None, DisallowNone, optional("FRAME ...", "(default: all)")] = None
     """Frames to render with an inserted scene."""
@@ -52,13 +57,13 @@ class Render:
 
     def run(self) -> None:
         from morgs_mi.export.clips import frame_numbers
-        from morgs_mi.export.frames import is_layered, write_frames, write_images
+        from morgs_mi.export.frames import write_frames, write_images
         from morgs_mi.export.insert import inserted_channels, load_insert, render_inserted, selected
         from morgs_mi.playback.player import find_camera, open_stream
 
         stream = open_stream(self.out)
         camera = find_camera(stream, self.camera)
-        output = check_output(self.output or stream.path.with_name(f"{camera.name}.mp4"))
+        output, chosen = destination(stream.path, self.output, IMAGES, self.format, camera.name)
         if self.insert is None and self.at is not None:
             raise ValueError("--at selects frames of an inserted scene, got no scene; add --insert FILE.")
         frames = frame_numbers(stream) if self.at is None else selected(stream, self.at)
@@ -68,12 +73,12 @@ class Render:
                 report("Rendering", count, len(frames))
 
             if self.insert is None:
-                write_frames(stream, camera, output, self.channels, done)
+                write_frames(stream, camera, output, self.channels, done, chosen.name)
             else:
-                layers = inserted_channels(stream) if is_layered(output) else ("color",)
+                layers = inserted_channels(stream) if chosen.name == "exr" else ("color",)
                 channels, build = self.channels or layers, load_insert(self.insert)
                 images = render_inserted(
                     stream, camera, build, frames, channels, self.samples, self.shadows, self.light
                 )
-                write_images(images, stream.fps, output, done)
+                write_images(images, stream.fps, output, done, chosen.name)
         print_result(f"{output}: {len(frames)} frames of camera {camera.name}, {camera.width}x{camera.height}.")

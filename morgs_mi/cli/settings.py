@@ -23,7 +23,9 @@ __all__ = [
     "Reading",
     "Settings",
     "Without",
+    "one_of",
     "optional",
+    "place",
     "setting",
 ]
 
@@ -66,6 +68,11 @@ def optional(metavar: str, hint: str = "", text: str | None = None) -> Any:
     return arg(metavar=metavar, help_behavior_hint=hint, help=text)
 
 
+def place(metavar: str) -> Any:
+    """Return the help of a positional argument for an output that has a default place."""
+    return arg(metavar=f"[{metavar}]", help_behavior_hint="")
+
+
 def setting(option: str, config: StreamConfig | None = None) -> Any:
     """Return the help of an option that is None where it is not given: the type of its setting, and the default."""
     default = reduce(getattr, SETTINGS[option].split("."), config or StreamConfig())
@@ -102,7 +109,7 @@ _OFFSETS = PrimitiveConstructorSpec(
 )
 
 
-def _one_of(names: tuple[str, ...]) -> PrimitiveConstructorSpec[Any]:
+def one_of(names: tuple[str, ...]) -> PrimitiveConstructorSpec[Any]:
     """Return how an option that may be missing is read, so that messages list these names, without None, in order."""
     return PrimitiveConstructorSpec(
         nargs=1,
@@ -138,7 +145,7 @@ class Reading:
 class Settings:
     """Settings of a fit. Later ones override: defaults, --preset, --config, the other options."""
 
-    preset: Annotated[PresetName | None, optional("NAME"), _one_of(get_args(PresetName))] = None
+    preset: Annotated[PresetName | None, optional("NAME"), one_of(get_args(PresetName))] = None
     """Preset: l, s (the paper's variants, 8 and 5 epochs), baseline, ml, ml-mo, ml-mo-mc (its ablation), or paper."""
     config: Annotated[Path | None, optional("FILE.toml")] = None
     """File with any settings, as --print-config writes it."""
@@ -164,9 +171,9 @@ class Settings:
     """Most bytes of a later frame; 0: no limit."""
     keyframe_interval: Annotated[int | None, setting("keyframe_interval")] = None
     """Frames between two keyframes; 0: the first only."""
-    refine_cameras: Annotated[Estimation | None, setting("refine_cameras"), _one_of(get_args(Estimation))] = None
+    refine_cameras: Annotated[Estimation | None, setting("refine_cameras"), one_of(get_args(Estimation))] = None
     """Refinement of the cameras: off, on, or auto (if withheld pixels gain)."""
-    exposure: Annotated[Estimation | None, setting("exposure"), _one_of(get_args(Estimation))] = None
+    exposure: Annotated[Estimation | None, setting("exposure"), one_of(get_args(Estimation))] = None
     """Estimation of exposures and white balances: off, on, or auto (between cameras if withheld pixels gain)."""
     reproducible: Flag = False
     """Same bytes on every run; about half as fast."""

@@ -42,7 +42,8 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
             final.rename(old)  # deleting takes time, and a half-deleted folder would look complete
         partial.replace(final)
     except OSError as error:
-        raise _write_error(f"{place}: cannot write {path}, the partial output was removed", error, partial) from error
+        removed = ", the partial output was removed" if os.path.lexists(partial) else ""
+        raise _write_error(f"{place}: cannot write {path}{removed}", error, partial) from error
     finally:
         if os.path.exists(old) and not os.path.exists(final):
             old.rename(final)

@@ -10,8 +10,9 @@ import numpy as np
 
 from morgs_mi.codec.packets import CodedFrame, frames_near, play, seek
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.files import atomic_folder
+from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.export.formats import VIDEO, choose_format
 from morgs_mi.export.frames import pad_to_even
 from morgs_mi.export.paths import CameraPath
 from morgs_mi.io.video_writer import playable_format, write_video
@@ -63,31 +64,36 @@ def select_frames(stream: StreamReader, span: str | None) -> list[int]:
 
 def write_each(
     clip: Iterable[tuple[int, Gaussians]],
-    folder: str | Path,
+    output: str | Path,
     suffix: str,
     write: Callable[[Path, Gaussians], None],
     frames: Sequence[int],
     progress: Progress = None,
 ) -> None:
-    """Write frames as ``0000.ply``, ``0001.ply``, ... into a new folder, which is written atomically.
+    """Write frames as ``0000.ply``, ``0001.ply``, ... into a new folder, or one frame as a file; atomically.
 
     Args:
         clip: (frame, Gaussians) of all frames, as `play` and `by_place` yield them.
-        folder: must not exist.
+        output: a folder that does not exist, or for one frame a file whose name ends in `suffix`.
         suffix: of the files, e.g. ``.ply``.
         write: function that writes the Gaussians of one frame.
         frames: indices of the frames, ascending.
         progress: called with (files done, total number of files).
 
     Raises:
-        ValueError: a broken packet.
+        ValueError: a broken packet, or several frames for one file.
         OSError: the folder exists, or a file cannot be written.
     """
     wanted, done = set(frames), 0
-    with atomic_folder(folder, "write_each()") as partial:
+    single = Path(output).name.lower().endswith(suffix)
+    if single and len(wanted) > 1:
+        raise ValueError(
+            f"{output}: expected one frame for one file, got {len(wanted)}; select one (--frames), or name a folder."
+        )
+    with (atomic_path if single else atomic_folder)(output, "write_each()") as partial:
         for frame, gaussians in clip:
             if frame in wanted:
-                write(partial / f"{frame:04d}{suffix}", gaussians)
+                write(partial if single else partial / f"{frame:04d}{suffix}", gaussians)
                 done += 1
                 if progress is not None:
                     progress(done, len(wanted))
@@ -122,8 +128,7 @@ def write_flight(
         ValueError: another type of file, an unknown channel or frame, or a broken packet.
         OSError: the file cannot be written.
     """
-    if Path(output).suffix.lower() != ".mp4":
-        raise ValueError(f"{output}: the output must be FILE.mp4, got {Path(output).suffix!r}.")
+    choose_format(VIDEO, output)
     frame_numbers(stream)
     count, config = max(1, round(path.seconds * stream.fps)), render_config(stream)
 

@@ -11,13 +11,14 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import srgb_to_linear
 from morgs_mi.core.files import atomic_folder
+from morgs_mi.export.formats import IMAGES, choose_format
 from morgs_mi.io.cryptomatte import cryptomatte
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import playable_format, write_video
 from morgs_mi.playback.player import channel_image, render_stream
 from morgs_mi.playback.visualise import side_by_side, write_png
 
-__all__ = ["MATTE", "exr_channels", "exr_layers", "is_layered", "pad_to_even", "write_frames", "write_images"]
+__all__ = ["MATTE", "exr_channels", "exr_layers", "pad_to_even", "write_frames", "write_images"]
 
 MATTE = "matte:"
 """Beginning of the name of a matte among rendered images."""
@@ -29,6 +30,7 @@ def write_frames(
     output: str | Path,
     channels: Sequence[str] | None = None,
     progress: Callable[[int], None] | None = None,
+    format: str | None = None,
 ) -> None:
     """Render a stream for one camera into files, which are written atomically.
 
@@ -39,6 +41,7 @@ def write_frames(
             ``0000.png`` ..., any other folder for multichannel ``0000.exr`` ... (see `exr_channels`).
         channels: out of `CHANNELS`; default: the colour, for EXR files all channels that the stream stores.
         progress: called with the number of frames done.
+        format: mp4, png or exr; None: that of the output's name.
 
     Raises:
         ValueError: an unknown channel, a channel that the stream does not store, another type of video, or a stream
@@ -47,13 +50,9 @@ def write_frames(
     """
     if not stream.index():
         raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has only a header.")
-    channels = channels or (None if is_layered(output) else ("color",))
-    write_images(render_stream(stream, camera, channels), stream.fps, output, progress)
-
-
-def is_layered(output: str | Path) -> bool:
-    """Return whether an output of `write_images` is a folder of EXR files, which hold all channels of a stream."""
-    return not Path(output).name.lower().endswith((".mp4", "png"))
+    chosen = choose_format(IMAGES, output, format).name
+    channels = channels or (None if chosen == "exr" else ("color",))
+    write_images(render_stream(stream, camera, channels), stream.fps, output, progress, chosen)
 
 
 def write_images(
@@ -61,6 +60,7 @@ def write_images(
     fps: float,
     output: str | Path,
     progress: Callable[[int], None] | None = None,
+    format: str | None = None,
 ) -> None:
     """Write rendered frames, pairs of index and channels [H, W, C] by name, into files as `write_frames` does.
 
@@ -68,13 +68,7 @@ def write_images(
         ValueError: another type of video.
         OSError: the folder exists, or a file cannot be written.
     """
-    output = Path(output)
-    name = output.name.lower()
-    video, png = name.endswith(".mp4"), name.endswith("png")
-    if output.suffix.lower() not in ("", ".mp4", ".png", ".exr"):
-        raise ValueError(
-            f"{output}: the output must be FILE.mp4, or a folder ending in png or exr, got {output.suffix!r}."
-        )
+    chosen = choose_format(IMAGES, output, format).name
 
     def frames() -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
         for done, (frame, images) in enumerate(rendered, start=1):
@@ -82,13 +76,13 @@ def write_images(
             if progress is not None:
                 progress(done)
 
-    if video:
+    if chosen == "mp4":
         padded = (pad_to_even(_combined_image(images)) for _, images in frames())
         write_video(output, padded, fps, playable_format()[1])
         return
     with atomic_folder(output, "write_frames()") as folder:
         for frame, images in frames():
-            if png:
+            if chosen == "png":
                 write_png(folder / f"{frame:04d}.png", _combined_image(images))
             else:
                 write_exr(folder / f"{frame:04d}.exr", *exr_layers(images))

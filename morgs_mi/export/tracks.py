@@ -11,6 +11,7 @@ import numpy as np
 from morgs_mi.codec.packets import frames_with_lasting_ids
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import atomic_path
+from morgs_mi.export.formats import TRACKS, choose_format
 
 __all__ = ["Tracks", "extract_tracks", "write_tracks"]
 
@@ -72,8 +73,7 @@ def write_tracks(path: str | Path, tracks: Tracks) -> None:
         ValueError: `path` does not end in .npz.
         OSError: the file cannot be written.
     """
-    if Path(path).suffix.lower() != ".npz":
-        raise ValueError(f"{path}: the output must be FILE.npz, got {Path(path).suffix!r}.")
+    choose_format(TRACKS, path)
     with atomic_path(path, "write_tracks()") as partial, open(partial, "wb") as file:
         np.savez_compressed(
             file, ids=tracks.ids, frames=tracks.frames, positions=tracks.positions, confidence=tracks.confidence

@@ -44,11 +44,9 @@ from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances, rotated, unit_quats
 from morgs_mi.export.axes import gltf_axes
+from morgs_mi.export.formats import USD, choose_format
 
-__all__ = ["SUFFIXES", "write_usd"]
-
-SUFFIXES = (".usd", ".usdc", ".usda", ".usdz")
-"""Ends of the names of files that `write_usd` writes: binary, text (usda), or a package (usdz)."""
+__all__ = ["write_usd"]
 
 _COEFFICIENTS, _DEGREE = "radiance:sphericalHarmonicsCoefficients", "radiance:sphericalHarmonicsDegree"
 # Types of the arrays in pxr.Vt, as float and as half. Half positions would have steps of a thousandth of the scene.
@@ -77,7 +75,7 @@ def write_usd(
 
     Args:
         stream: the file.
-        path: the stage, a name with one of `SUFFIXES`.
+        path: the stage, ``FILE.usdc`` or ``.usd`` (binary), ``.usda`` (text) or ``.usdz`` (package).
         frames: indices of the frames, ascending.
         half: write all attributes but the positions in half precision, in the attributes that the schema has for it.
         progress: called with (frames done, number of frames).
@@ -87,8 +85,7 @@ def write_usd(
         OSError: the file cannot be written.
     """
     path = Path(path)
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"{path}: the output must be FILE with one of {', '.join(SUFFIXES)}, got {path.suffix!r}.")
+    choose_format(USD, path)
     pxr = _pxr()
     with atomic_path(path, "write_usd()") as partial, _system_errors(pxr):
         if path.suffix.lower() != ".usdz":

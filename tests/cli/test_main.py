@@ -147,10 +147,10 @@ def test_main__names_an_output_that_cannot_be_written(capture: Path, stream: Pat
         for args in (
             ("fit", capture, folder / "out", *QUICK),
             ("synth", "spheres", folder / "out", *size),
-            ("render", stream, "--camera", 0, "--output", folder / "a.mp4"),
-            ("render", stream, "--camera", 0, "--output", folder / "exr"),
-            ("export", "ply", stream, "--output", folder / "ply"),
-            ("export", "tracks", stream, "--output", folder / "a.npz"),
+            ("render", stream, folder / "a.mp4", "--camera", 0),
+            ("render", stream, folder / "exr", "--camera", 0),
+            ("export", "ply", stream, folder / "ply"),
+            ("export", "tracks", stream, folder / "a.npz"),
             ("export", "web", stream, folder / "page.html"),
             ("salvage", stream, folder / "a.morgs"),
             ("info", capture, "--no-check", "--plot", folder / "rig.png"),
@@ -177,16 +177,16 @@ def test_main__writes_nothing_into_a_capture(capture: Path, stream: Path, tmp_pa
         ("fit", capture, capture / "new" / "out", *QUICK),
         ("demo", place),
         ("synth", "spheres", place / "clip"),
-        ("render", stream, "--camera", 0, "--output", place / "cam0.mkv.mp4"),
-        ("render", stream, "--camera", 0, "--output", place / "cam0"),
-        ("export", "ply", stream, "--output", place / "ply"),
-        ("export", "gltf", stream, "--output", place / "gltf"),
+        ("render", stream, place / "cam0.mkv.mp4", "--camera", 0),
+        ("render", stream, place / "cam0", "--camera", 0),
+        ("export", "ply", stream, place / "ply"),
+        ("export", "gltf", stream, place / "gltf"),
         ("export", "usd", stream, place / "a.usda"),
         ("import", tmp_path, place / "new.morgs"),
-        ("export", "video", stream, "--output", place / "cam0.mp4"),
-        ("export", "tracks", stream, "--output", place / "a.npz"),
+        ("export", "video", stream, place / "cam0.mp4"),
+        ("export", "tracks", stream, place / "a.npz"),
         ("export", "web", stream, place / "page.html"),
-        ("export", "web", stream, place / "page", "--folder"),
+        ("export", "web", stream, place / "page"),
         ("eval", stream, "--capture", capture, "--json", place / "capture.json"),
         ("eval", stream, "--capture", capture, "--figures", place / "figures"),
         ("info", capture, "--plot", place / "cam0.png"),
@@ -230,7 +230,7 @@ def test_main__reports_an_unexpected_error_in_one_sentence(capture: Path, run, m
 def test_main__names_what_is_broken_in_a_stream(stream: Path, tmp_path: Path, run, damage, parts) -> None:
     stream.write_bytes(damage(stream.read_bytes()))
     outputs = [tmp_path / "a.mp4", tmp_path / "exr", tmp_path / "png"]
-    commands = [("render", stream, "--camera", 0, "--output", output) for output in outputs]
+    commands = [("render", stream, output, "--camera", 0) for output in outputs]
     for args in (*commands, ("eval", stream, "--capture", tmp_path)):
         assert_refused(run(*args), str(stream), *parts)
     assert list(tmp_path.iterdir()) == [stream]
@@ -242,9 +242,7 @@ def test_main__names_a_missing_or_empty_stream(stream: Path, tmp_path: Path, run
     with StreamWriter(stream, rig(), 25):
         pass
     for output in (tmp_path / "a.mp4", tmp_path / "exr"):
-        assert_refused(
-            run("render", stream, "--camera", 0, "--output", output), "at least one frame was expected, got none"
-        )
+        assert_refused(run("render", stream, output, "--camera", 0), "at least one frame was expected, got none")
         assert not output.exists()
 
 
@@ -286,9 +284,9 @@ def test_main__goes_from_a_scene_to_an_evaluation(tmp_path: Path, run) -> None:
     video = cv2.VideoCapture(str(out / "cam02.mp4"))
     assert [video.read()[1].shape for _ in range(3)] == [(48, 64, 3)] * 3
     assert not video.read()[0]
-    assert run("render", out, "--camera", 0, "--output", tmp_path / "exr")[0] == 0
+    assert run("render", out, tmp_path / "exr", "--camera", 0)[0] == 0
     channels = read_exr(tmp_path / "exr" / "0002.exr")
     assert set(channels) == {"R", "G", "B", "motion.X", "motion.Y", "depth.Y", "confidence.Y"}
-    both = ("--channels", "color", "depth", "--output", tmp_path / "png")
-    assert run("render", out, "--camera", 0, *both)[0] == 0
+    both = ("--channels", "color", "depth")
+    assert run("render", out, tmp_path / "png", "--camera", 0, *both)[0] == 0
     assert cv2.imread(str(tmp_path / "png" / "0002.png")).shape == (48, 132, 3)

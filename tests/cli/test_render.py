@@ -25,7 +25,12 @@ from tests.scenes.noise_capture import rig
             ["--camera", "0", "--channels", "confidence"],
             ("channel 'confidence' requires Gaussians with `logit_confidence`",),
         ),
-        (["--camera", "0", "--output", "a.gif"], ("must be FILE.mp4, or a folder", "'.gif'")),
+        (
+            ["a.gif", "--camera", "0"],
+            ("must be FILE.mp4, a folder ending in exr or a folder ending in png, got '.gif'.",),
+        ),
+        (["a.mp4", "--camera", "0", "--format", "png", "--at", "1"], ("--at selects frames",)),
+        (["png", "--camera", "0", "--format", "mp4"], ("the output must be FILE.mp4, got 'png'",)),
         (["--camera", "0", "--insert", "no.xml"], ("no.xml", "expected a scene to insert")),
         (["--camera", "0", "--at", "1"], ("--at selects frames of an inserted scene", "add --insert FILE")),
     ],
@@ -39,27 +44,25 @@ def test_render__draws_a_stream_without_gaussians_black(tmp_path: Path, run) -> 
     empty = Gaussians(*(np.zeros((0, *tail)) for tail in ((3,), (3,), (4,), (), (1, 3))))
     with StreamWriter(tmp_path / "s.morgs", rig(), 25) as writer:
         writer.write(keyframe_packet(empty, 0))
-    assert run("render", tmp_path / "s.morgs", "--camera", 0, "--output", tmp_path / "exr")[0] == 0
+    assert run("render", tmp_path / "s.morgs", tmp_path / "exr", "--camera", 0)[0] == 0
     assert not any(channel.any() for channel in read_exr(tmp_path / "exr" / "0000.exr").values())
 
 
 def test_render__inserts_a_scene_into_some_frames(stream: Path, tmp_path: Path, run) -> None:
     (tmp_path / "ball.py").write_text('def build(frame, time):\n    return {"ball": {"type": "sphere"}}\n')
     args = ("--camera", 0, "--insert", tmp_path / "ball.py", "--at", 1, "--samples", 1)
-    assert run("render", stream, *args, "--output", tmp_path / "exr")[0] == 0
+    assert run("render", stream, tmp_path / "exr", *args)[0] == 0
     assert [path.name for path in (tmp_path / "exr").iterdir()] == ["0001.exr"]
     assert {"R", "A", "depth.Y"} <= read_exr(tmp_path / "exr" / "0001.exr").keys()
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "exr", "png"])
 def test_render__removes_its_output_on_a_full_disk(stream: Path, tmp_path: Path, run, name: str) -> None:
-    run(
-        "render", stream, "--camera", 0, "--output", tmp_path / f"warm-{name}"
-    )  # compiled kernels are cached on disk too
+    run("render", stream, tmp_path / f"warm-{name}", "--camera", 0)  # compiled kernels are cached on disk too
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (200, hard))
     try:
-        status, _, error = run("render", stream, "--camera", 0, "--output", tmp_path / name)
+        status, _, error = run("render", stream, tmp_path / name, "--camera", 0)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert status == 1

@@ -13,6 +13,7 @@ from morgs_mi import cli
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import srgb_to_linear
 from morgs_mi.export.clips import _frames_backwards, repeated_seconds, select_frames, write_flight
+from morgs_mi.export.formats import IMAGES, PLY, USD, WEB, choose_format
 from morgs_mi.export.frames import exr_channels, pad_to_even, write_frames
 from morgs_mi.export.paths import through_cameras
 from morgs_mi.io.ply import read_ply
@@ -49,7 +50,7 @@ def test_export_ply__writes_every_frame(stream, tmp_path):
 
 
 def test_export_ply__writes_compressed_files(stream, tmp_path):
-    assert run("export", "ply", tmp_path, "--compressed", "--frames", "2:") == 0
+    assert run("export", "ply", tmp_path, "--format", "compressed.ply", "--frames", "2:") == 0
     files = sorted((tmp_path / "compressed-ply").iterdir())
     assert [path.name for path in files] == ["0002.compressed.ply", "0003.compressed.ply"]
     for path, state in zip(files, stream[2:], strict=True):
@@ -57,8 +58,57 @@ def test_export_ply__writes_compressed_files(stream, tmp_path):
         assert_close(read, expected, atol=2e-3)
 
 
+@pytest.mark.parametrize(("kind", "name"), [("ply", "a.ply"), ("ply", "a.compressed.ply"), ("gltf", "a.glb")])
+def test_export__writes_one_frame_into_a_file(stream, tmp_path, kind, name):
+    suffix = name.removeprefix("a")
+    assert run("export", kind, tmp_path, tmp_path / name, "--frames", 2) == 0
+    assert run("export", kind, tmp_path, tmp_path / "folder", "--frames", 2, *format_of(name)) == 0
+    assert (tmp_path / name).read_bytes() == (tmp_path / "folder" / f"0002{suffix}").read_bytes()
+
+
+def format_of(name: str) -> tuple[str, ...]:
+    return ("--format", "compressed.ply") if "compressed" in name else ()
+
+
+@pytest.mark.parametrize(
+    ("formats", "output", "name", "expected"),
+    [
+        (WEB, None, None, "html"),
+        (WEB, None, "folder", "folder"),
+        (WEB, "a/site", None, "folder"),
+        (WEB, "a/Page.HTML", None, "html"),
+        (WEB, "a/page.html", "folder", "folder"),
+        (PLY, "a/v1.2", None, "ply"),
+        (PLY, "a/v1.2", "compressed.ply", "compressed.ply"),
+        (PLY, "a/b.compressed.ply", None, "compressed.ply"),
+        (IMAGES, "a/b", None, "exr"),
+        (IMAGES, "a/frames-png", None, "png"),
+        (IMAGES, "a/b", "png", "png"),
+        (IMAGES, "b.mp4", None, "mp4"),
+        (USD, "b.usda", "usda", "usda"),
+    ],
+)
+def test_choose_format__follows_the_name_of_the_format_or_of_the_output(formats, output, name, expected):
+    assert choose_format(formats, output, name).name == expected
+
+
+def test_choose_format__names_the_formats():
+    with pytest.raises(ValueError, match="`format` must be mp4, exr or png, got 'gif'"):
+        choose_format(IMAGES, "a", "gif")
+
+
+def test_export__refuses_a_folder_in_place_of_a_file_before_it_begins(stream, tmp_path, capsys):
+    (tmp_path / "page.html").mkdir()
+    for args in (("web", tmp_path, tmp_path / "page.html"), ("web", tmp_path, "--format", "folder")):
+        (tmp_path / "web").mkdir(exist_ok=True)
+        assert run("export", *args) == 1
+    errors = capsys.readouterr().err.splitlines()
+    assert errors[0] == f"{tmp_path}/page.html: expected a file to write, got a folder; choose another name."
+    assert errors[-1] == f"{tmp_path}/web: expected a new folder, got one that exists; remove it first."
+
+
 def test_export_gltf__writes_selected_frames(stream, tmp_path):
-    assert run("export", "gltf", tmp_path / "stream.morgs", "--frames", "1:4:2", "--output", tmp_path / "g") == 0
+    assert run("export", "gltf", tmp_path / "stream.morgs", tmp_path / "g", "--frames", "1:4:2") == 0
     assert [path.name for path in sorted((tmp_path / "g").iterdir())] == ["0001.glb", "0003.glb"]
 
 
@@ -141,8 +191,17 @@ def test_write_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
     [
         (("ply", "--frames", "9"), "stream.morgs, 0 to 3, got '9'"),
         (("ply", "--frames", "a:b"), "--frames must be like 12, 10:20 or 0:100:5, got 'a:b'"),
-        (("video", "--output", "x.avi"), "the output must be FILE.mp4"),
-        (("tracks", "--output", "stream.morgs"), "stream.morgs: the output must be FILE.npz, got '.morgs'"),
+        (("video", "x.avi"), "x.avi: the output must be FILE.mp4, got '.avi'."),
+        (("tracks", "stream.morgs"), "stream.morgs: the output must be FILE.npz, got '.morgs'."),
+        (("tracks", "folder"), "folder: the output must be FILE.npz, got 'folder'."),
+        (
+            ("ply", "a.glb"),
+            "must be a folder, FILE.ply for one frame or FILE.compressed.ply for one frame, got '.glb'.",
+        ),
+        (("ply", "a.ply"), "a.ply: expected one frame for one file, got 4; select one (--frames), or name a folder."),
+        (("gltf", "a.usd"), "a.usd: the output must be a folder or FILE.glb for one frame, got '.usd'."),
+        (("web", "a.htm"), "a.htm: the output must be FILE.html or a folder, got '.htm'."),
+        (("usd", "a.usdz", "--format", "usda"), "a.usdz: the output must be FILE.usda, got '.usdz'."),
         (("video", "--freeze", "7"), "--freeze must be in 0 to 3, got 7"),
         (("video", "--width", "0"), "--width must be at least 1, got 0"),
         (("video", "--seconds", "-1"), "--seconds must be positive"),
@@ -162,7 +221,7 @@ def test_select_frames__like_slices(stream, tmp_path):
 
 
 def test_exr_channels__are_read_by_mitsuba(stream, tmp_path):
-    assert run("render", tmp_path, "--camera", "middle", "--output", tmp_path / "exr") == 0
+    assert run("render", tmp_path, tmp_path / "exr", "--camera", "middle") == 0
     image = mi.Bitmap(str(tmp_path / "exr" / "0001.exr"))
     names = [field.name for field in image.struct_()]
     assert sorted(names) == sorted(["R", "G", "B", "motion.X", "motion.Y", "confidence.Y", "depth.Y"])

@@ -178,7 +178,7 @@ def test_write_web_page__escapes_the_title(tmp_path):
 def test_export_web__writes_a_page_or_a_folder(tmp_path, capsys):
     write_stream(tmp_path / "stream.morgs")
     assert main(["export", "web", str(tmp_path)]) == 0
-    assert main(["export", "web", str(tmp_path), str(tmp_path / "site"), "--folder", "--title", "A clip"]) == 0
+    assert main(["export", "web", str(tmp_path), str(tmp_path / "site"), "--title", "A clip"]) == 0
     assert (tmp_path / "player.html").stat().st_size > 1e6
     assert b"<title>A clip</title>" in (tmp_path / "site" / "index.html").read_bytes()
     assert "player.html: 4 frames" in " ".join(capsys.readouterr().out.split())

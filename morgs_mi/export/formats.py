@@ -1,0 +1,97 @@
+"""Formats of exports: files, or folders of files, chosen by the name of the output or by the name of the format."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from morgs_mi.capture.outputs import check_output
+
+__all__ = ["GLTF", "IMAGES", "PLY", "TRACKS", "USD", "VIDEO", "WEB", "Format", "choose_format", "destination"]
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format of an export.
+
+    Attributes:
+        name: of the format.
+        ending: end of the names of its outputs; empty: of names without a suffix.
+        default: name of the output beside a stream; ``{}`` stands for that of a camera or a path.
+        folder: whether it is a folder with a file per frame, or for a web server. With an `ending` that begins with a
+            dot, the file of a single frame is one, too.
+    """
+
+    name: str
+    ending: str
+    default: str
+    folder: bool = False
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Outputs of this format in words."""
+        if not self.folder:
+            return (f"FILE{self.ending}",)
+        if self.ending.startswith("."):
+            return ("a folder", f"FILE{self.ending} for one frame")
+        return (f"a folder ending in {self.ending}" if self.ending else "a folder",)
+
+
+PLY = (Format("ply", ".ply", "ply", True), Format("compressed.ply", ".compressed.ply", "compressed-ply", True))
+GLTF = (Format("glb", ".glb", "gltf", True),)
+USD = tuple(Format(name, f".{name}", f"stream.{name}") for name in ("usdc", "usd", "usda", "usdz"))
+VIDEO = (Format("mp4", ".mp4", "{}.mp4"),)
+TRACKS = (Format("npz", ".npz", "tracks.npz"),)
+WEB = (Format("html", ".html", "player.html"), Format("folder", "", "web", True))
+IMAGES = (*VIDEO, Format("exr", "exr", "{}-exr", True), Format("png", "png", "{}-png", True))
+
+
+def choose_format(formats: Sequence[Format], output: str | Path | None = None, name: str | None = None) -> Format:
+    """Return the format of an output: the one called `name`, or the one that the output's name determines.
+
+    Without either, it is the first one. A name without a suffix is a folder of the first format with folders.
+
+    Raises:
+        ValueError: no format is called `name`, or the output has another ending.
+    """
+    named = [chosen for chosen in formats if name in (None, chosen.name)]
+    if not named:
+        raise ValueError(f"choose_format(): `format` must be {_listed([f.name for f in formats])}, got {name!r}.")
+    if output is None or (name is not None and named[0].folder):
+        return named[0]
+    given = Path(output).name.lower()
+    if found := [chosen for chosen in named if chosen.ending and given.endswith(chosen.ending)]:
+        return max(found, key=lambda chosen: len(chosen.ending))
+    suffix = re.search(r"\.[a-z]\w*$", given)
+    if suffix is None and (folders := [chosen for chosen in named if chosen.folder]):
+        return folders[0]
+    expected = _listed(list(dict.fromkeys(text for chosen in named for text in chosen.outputs)))
+    raise ValueError(f"{output}: the output must be {expected}, got {suffix[0] if suffix else given!r}.")
+
+
+def destination(
+    stream: Path, output: Path | None, formats: Sequence[Format], name: str | None = None, stem: str = ""
+) -> tuple[Path, Format]:
+    """Return the path of an export and its format.
+
+    Args:
+        stream: path of the stream, beside which an output without a name is written.
+        output: the given file or folder, or None.
+        formats: those of the export.
+        name: that of the given format, or None.
+        stem: name of a camera or a path, for the name of the output.
+
+    Raises:
+        ValueError: as `choose_format` and `check_output`, or a folder stands where a file is to be written.
+    """
+    chosen = choose_format(formats, output, name)
+    path = check_output(output or stream.with_name(chosen.default.format(stem)))
+    if not chosen.folder and path.is_dir():
+        raise ValueError(f"{path}: expected a file to write, got a folder; choose another name.")
+    return path, chosen
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " or ".join([", ".join(names[:-1]), names[-1]] if len(names) > 1 else names)
