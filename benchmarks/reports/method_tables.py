@@ -20,6 +20,7 @@ __all__ = [
     "comparison_table",
     "epochs_table",
     "gains_table",
+    "key_views_rows",
     "key_views_table",
     "method_page",
     "plot_method",
@@ -77,11 +78,15 @@ def epochs_table(clip: MethodClip) -> str:
     return _table(titles, best_rows(clip), lambda row: (f"`{row.preset}`", str(row.epochs), f"{row.rates:g}x"))
 
 
+def key_views_rows(clip: MethodClip) -> list[SettingRow]:
+    """Return the rows that compare numbers of key views, by preset and number."""
+    return sorted(clip.key_view_rows, key=lambda row: (row.preset, row.key_views))
+
+
 def key_views_table(clip: MethodClip) -> str:
     """Return the paper's Table 5 on a clip: motion without and with offset by key views."""
     titles = {"ml": "without offset", "ml-mo": "with offset"}
-    rows = sorted(clip.key_view_rows, key=lambda row: (row.preset, row.key_views))
-    return _table(("", "key views"), rows, lambda row: (titles[row.preset], str(row.key_views)))
+    return _table(("", "key views"), key_views_rows(clip), lambda row: (titles[row.preset], str(row.key_views)))
 
 
 def gains_table(clips: Sequence[MethodClip]) -> str:

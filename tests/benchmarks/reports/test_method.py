@@ -22,6 +22,7 @@ from benchmarks.reports.method_tables import (
     comparison_table,
     epochs_table,
     gains_table,
+    key_views_rows,
     key_views_table,
     method_page,
 )
@@ -94,7 +95,8 @@ def test_report_method__continues_an_interrupted_report(interrupted):
         ("default", 1, 1.0),
         ("default", 2, 1.0),
     ]
-    assert {row.key_views for row in found.key_view_rows} == {1, 2, 4}
+    order = [(row.preset, row.key_views) for row in key_views_rows(found)]
+    assert order == [(preset, views) for preset in ("ml", "ml-mo") for views in (1, 2, 4)]
 
 
 def test_method_command__repeats_a_finished_report_without_a_fit(clip, interrupted, tmp_path, capsys, monkeypatch):
