@@ -33,6 +33,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from morgs_mi.codec.config import CodecConfig
+from morgs_mi.core.documentation import with_pages
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.io.bounded import read_toml
 from morgs_mi.method.config import MotionConfig
@@ -310,7 +311,9 @@ def _table(config: Any, key: str) -> Iterator[str]:
 
 def _comment(text: str) -> list[str]:
     """Return a docstring as lines of comment."""
-    lines = textwrap.wrap(" ".join(text.split()), _COMMENT_WIDTH, break_long_words=False, break_on_hyphens=False)
+    lines = textwrap.wrap(
+        with_pages(" ".join(text.split())), _COMMENT_WIDTH, break_long_words=False, break_on_hyphens=False
+    )
     return [f"# {line}" for line in lines]
 
 

@@ -280,7 +280,8 @@ def load_capture(
     """
     path = mirrored(str(path)) if is_url(path) else Path(path)
     if not path.is_dir():
-        raise FileNotFoundError(f"{path}: expected a capture folder, found none; check the path.")
+        found = "a file" if path.is_file() else "none"
+        raise FileNotFoundError(f"{path}: expected a capture folder, found {found}; check the path.")
     if not downscale >= 1:
         raise ValueError(f"load_capture(): `downscale` must be at least 1, got {downscale}.")
     if max_frames is not None and max_frames < 1:

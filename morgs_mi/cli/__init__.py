@@ -18,6 +18,8 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, is_dataclass
+from functools import partial
+from importlib.metadata import version
 from typing import Annotated, Any, Literal
 
 import tyro
@@ -25,7 +27,8 @@ from tyro.conf import arg
 
 from morgs_mi.cli.batch import Batch
 from morgs_mi.cli.calibrate import Calibrate
-from morgs_mi.cli.console import ERR, LogHandler, naming_output, print_warning, sentence_of
+from morgs_mi.cli.completion import completion_script, suggesting_command
+from morgs_mi.cli.console import ERR, LogHandler, naming_output, print_result, print_warning, sentence_of
 from morgs_mi.cli.demo import Demo
 from morgs_mi.cli.evaluate import Eval
 from morgs_mi.cli.export import Export
@@ -70,7 +73,10 @@ class Common:
 
 @dataclass(frozen=True)
 class Options(Common):
-    """Dynamic Gaussian splatting in Mitsuba 3: from a multi-view clip to a stream of moving Gaussians."""
+    """Dynamic Gaussian splatting in Mitsuba 3: from a multi-view clip to a stream of moving Gaussians.
+
+    Alone, --version prints the version, and --completion bash, zsh or fish the completion of commands for this shell.
+    """
 
     command: Annotated[Command, arg(name="")] = tyro.MISSING
 
@@ -85,17 +91,13 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
     args = sys.argv[1:] if args is None else list(args)
     command: Any = None
     try:
-        with naming_output():  # the help goes there
-            options: Any = tyro.cli(
-                options_type,
-                prog=prog,
-                args=args,
-                config=(
-                    tyro.conf.CascadeSubcommandArgs,
-                    tyro.conf.OmitSubcommandPrefixes,
-                    tyro.conf.PositionalMetavarFromFieldName,
-                ),
-            )
+        if options_type is Options and (answer := _answer(prog, args)):
+            print_result(answer)
+            with naming_output():
+                sys.stdout.flush()
+            return 0
+        with naming_output(), suggesting_command(options_type, prog, args):  # the help goes there
+            options = _parse(options_type, prog, args)
         command = options.command
         with _terminable():
             _set_up(options)
@@ -115,6 +117,30 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
             ERR.print_exception()
         _drop_output()
         return 130 if interrupted else 1
+
+
+def _answer(prog: str, args: Sequence[str]) -> str:
+    """Return what --version or --completion print; nothing with other arguments."""
+    match args:
+        case ["--version"]:
+            return f"{prog} {version('morgs-mi')}"
+        case ["--completion", ("bash" | "zsh" | "fish") as shell]:
+            return completion_script(partial(_parse, Options, prog), shell)
+    return ""
+
+
+def _parse(options_type: type[Common], prog: str, args: Sequence[str]) -> Any:
+    """Return the options that arguments set."""
+    return tyro.cli(
+        options_type,
+        prog=prog,
+        args=args,
+        config=(
+            tyro.conf.CascadeSubcommandArgs,
+            tyro.conf.OmitSubcommandPrefixes,
+            tyro.conf.PositionalMetavarFromFieldName,
+        ),
+    )
 
 
 @contextmanager

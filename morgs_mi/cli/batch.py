@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Annotated
 from rich.box import SIMPLE_HEAD
 from rich.live import Live
 from rich.table import Table
-from tyro.conf import DisallowNone, Positional
+from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import ERR, print_result, print_table, print_warning, sentence_of
 from morgs_mi.cli.settings import optional
+from morgs_mi.core.documentation import page
 
 if TYPE_CHECKING:
     from morgs_mi.cluster.batch import JobState
@@ -30,8 +31,7 @@ class Batch:
     Jobs that are finished are skipped, and others continue where they stopped.
     """
 
-    jobs: Positional[Path]
-    """TOML file with captures, settings and seeds (docs/cluster.md)."""
+    jobs: Annotated[Positional[Path], arg(help=f"TOML file with captures, settings and seeds ({page('cluster')}).")]
     workers: Annotated[int | None, DisallowNone, optional("INT", "(default: one per core)")] = None
     """Number of processes on this machine, which share its cores and memory equally."""
     scheduler: Annotated[str | None, DisallowNone, optional("ADDRESS")] = None

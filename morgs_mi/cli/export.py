@@ -13,9 +13,14 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.settings import ChannelName, Flag, one_of, optional, place
+from morgs_mi.core.documentation import page
 from morgs_mi.export.formats import GLTF, PLY, TRACKS, USD, VIDEO, WEB, Format, destination
 
 __all__ = ["Export"]
+
+_PATH = (
+    f"Camera path: between (through the rig's cameras), orbit (around the scene), or a JSON file ({page('exports')})."
+)
 
 
 def _names(formats: Sequence[Format]) -> tuple[str, ...]:
@@ -125,8 +130,7 @@ class Flight:
     """Folder of a fit, or a stream file."""
     output: Annotated[Positional[Path | None], DisallowNone, place("FILE.mp4")] = None
     """File for the video; by default OUT/PATH.mp4, e.g. OUT/orbit.mp4."""
-    path: str = "between"
-    """Camera path: between (through the rig's cameras), orbit (around the scene), or a JSON file (docs/exports.md)."""
+    path: Annotated[str, arg(help=_PATH)] = "between"
     seconds: Annotated[float | None, DisallowNone, optional("FLOAT")] = None
     """Duration in seconds; by default that of the JSON file, or that of the clip, repeated to LEAST_SECONDS."""
     least_seconds: float = 5.0

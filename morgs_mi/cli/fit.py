@@ -14,12 +14,15 @@ from tyro.conf import DisallowNone, Positional, arg
 from morgs_mi.cli.console import print_result, print_warning, progress
 from morgs_mi.cli.settings import Flag, GivenReading, GivenSettings, Reading, Settings, optional
 from morgs_mi.config import StreamConfig, config_toml
+from morgs_mi.core.documentation import page
 
 if TYPE_CHECKING:
     from morgs_mi.capture.capture import Capture
     from morgs_mi.stream_loop import FrameReport
 
 __all__ = ["Fit"]
+
+_SCHEDULER = f"Dask scheduler whose workers fit them, such as tcp://host:8786, or local ({page('cluster')})."
 
 
 @dataclass(frozen=True)
@@ -30,8 +33,10 @@ class Fit:
     both.
     """
 
-    capture: Annotated[Positional[str | None], arg(help_behavior_hint="", metavar="[CAPTURE]")] = None
-    """Folder of the capture, or its URL (docs/cluster.md)."""
+    capture: Annotated[
+        Positional[str | None],
+        arg(help_behavior_hint="", metavar="[CAPTURE]", help=f"Folder of the capture, or its URL ({page('cluster')})."),
+    ] = None
     out: Annotated[Positional[Path | None], arg(help_behavior_hint="")] = None
     """Folder for stream.morgs, capture.json and report.json; an earlier stream there is replaced without --resume."""
     frames: Annotated[int | None, DisallowNone, optional("INT", "(default: all)")] = None
@@ -46,8 +51,7 @@ class Fit:
     """Continue an interrupted fit in OUT; capture and settings must be the same."""
     segments: Annotated[int | None, DisallowNone, optional("INT", "(default: 1)")] = None
     """Number of stretches of the recording that are fitted side by side; each begins with a keyframe."""
-    scheduler: Annotated[str | None, DisallowNone, optional("ADDRESS")] = None
-    """Dask scheduler whose workers fit them, such as tcp://host:8786, or local (docs/cluster.md)."""
+    scheduler: Annotated[str | None, DisallowNone, optional("ADDRESS", text=_SCHEDULER)] = None
     print_config: Flag = False
     """Print all settings as TOML and exit."""
 

@@ -13,6 +13,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.config import PresetName, StreamConfig, apply_preset, apply_values, read_config, relocated
+from morgs_mi.core.documentation import page
 
 __all__ = [
     "SETTINGS",
@@ -47,6 +48,12 @@ SETTINGS = {
     "reproducible": "render.reproducible",
 }
 
+_PRESET = (
+    "Preset: l, s (the paper's variants, 8 and 5 epochs), paper (its scheme), baseline, ml, ml-mo, ml-mo-mc (its "
+    f"ablation), or of other publications hicom, rigidity, gates, cache, grid, anchors ({page('experiments/field')})."
+)
+_FLOW = f"Optical flow: a method, files:FOLDER or onnx:FILE ({page('flow')})."
+_MASKS = f"Refinement of the motion masks ({page('masks')})."
 # A channel that commands render.
 ChannelName = Literal["color", "motion", "confidence", "depth", "alpha"]
 # Whether something is estimated.
@@ -73,10 +80,13 @@ def place(metavar: str) -> Any:
     return arg(metavar=f"[{metavar}]", help_behavior_hint="")
 
 
-def setting(option: str, config: StreamConfig | None = None) -> Any:
-    """Return the help of an option that is None where it is not given: the type of its setting, and the default."""
+def setting(option: str, config: StreamConfig | None = None, text: str | None = None) -> Any:
+    """Return the help of an option that is None where it is not given: the type of its setting, and the default.
+
+    The text of the help is the field's docstring, or `text` with the places of the pages that it cites.
+    """
     default = reduce(getattr, SETTINGS[option].split("."), config or StreamConfig())
-    return arg(metavar=type(default).__name__.upper(), help_behavior_hint=f"(default: {default})")
+    return arg(metavar=type(default).__name__.upper(), help_behavior_hint=f"(default: {default})", help=text)
 
 
 def _offsets(words: list[str]) -> dict[str, float]:
@@ -145,8 +155,7 @@ class Reading:
 class Settings:
     """Settings of a fit. Later ones override: defaults, --preset, --config, the other options."""
 
-    preset: Annotated[PresetName | None, optional("NAME"), one_of(get_args(PresetName))] = None
-    """Preset: l, s (the paper's variants, 8 and 5 epochs), baseline, ml, ml-mo, ml-mo-mc (its ablation), or paper."""
+    preset: Annotated[PresetName | None, optional("NAME", text=_PRESET), one_of(get_args(PresetName))] = None
     config: Annotated[Path | None, optional("FILE.toml")] = None
     """File with any settings, as --print-config writes it."""
     seed: Annotated[int | None, setting("seed")] = None
@@ -161,10 +170,8 @@ class Settings:
     """Passes over the views for every later frame."""
     sh_degree: Annotated[int | None, setting("sh_degree")] = None
     """Degree of the spherical harmonics, 0 to 3."""
-    flow: Annotated[str | None, setting("flow")] = None
-    """Optical flow: a method, files:FOLDER or onnx:FILE (docs/flow.md)."""
-    masks: Annotated[str | None, setting("masks")] = None
-    """Refinement of the motion masks (docs/masks.md)."""
+    flow: Annotated[str | None, setting("flow", text=_FLOW)] = None
+    masks: Annotated[str | None, setting("masks", text=_MASKS)] = None
     quality: Annotated[float | None, setting("quality")] = None
     """Precision of the stream; 2 halves all errors."""
     target_size: Annotated[int | None, setting("target_size")] = None

@@ -33,6 +33,7 @@ from morgs_mi.cluster.executor import Workers, wait_for
 from morgs_mi.cluster.segments import SegmentedFit, fit_in_segments
 from morgs_mi.cluster.tasks import Part
 from morgs_mi.config import StreamConfig, apply_preset, apply_values, read_config
+from morgs_mi.core.documentation import page
 from morgs_mi.io.remote import is_url
 
 __all__ = ["BatchConfig", "Job", "JobState", "read_jobs", "run_batch"]
@@ -130,7 +131,7 @@ def read_jobs(path: str | Path) -> list[Job]:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a TOML file with jobs, found none; see docs/cluster.md.")
+        raise FileNotFoundError(f"{path}: expected a TOML file with jobs, found none; see {page('cluster')}.")
     values = read_config(path)
     settings = values.pop("settings", {"default": {}})
     batch = apply_values(BatchConfig(), values, str(path))

@@ -21,6 +21,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.core.documentation import page
 
 __all__ = [
     "Deformed",
@@ -257,7 +258,7 @@ def check_scene(scene: Scene, times: Sequence[float]) -> None:
             where = f"{place}, {kind} {name!r}"
             if not isinstance(item, types):
                 expected, found = f"{types[0].__name__}(...)", type(item).__name__
-                raise ValueError(f"{where}: expected {expected}, got a value of type {found}; see docs/scenes.md.")
+                raise ValueError(f"{where}: expected {expected}, got a value of type {found}; see {page('scenes')}.")
             for used in item_ids(name, item):
                 if used in names:
                     raise ValueError(f"{where}: the name {used!r} is used twice; rename one of the two.")
@@ -291,7 +292,8 @@ def item_ids(name: str, item: Object | DeformingObject | Light) -> list[str]:
 def _check_node(where: str, node: Any) -> None:
     """Check a Mitsuba dictionary, whose errors would not name the object, or end the process."""
     if not isinstance(node, Mapping) or "type" not in node:
-        raise ValueError(f"{where}: expected a Mitsuba dictionary with a `type`, got {node!r:.60}; see docs/scenes.md.")
+        expected = "expected a Mitsuba dictionary with a `type`"
+        raise ValueError(f"{where}: {expected}, got {node!r:.60}; see {page('scenes')}.")
     for key, value in node.items():
         if value is None:
             raise ValueError(f"{where}: `{key}` must have a value, got None; leave it out.")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from morgs_mi.capture.layouts.calibration import Layout, required_clips
 from morgs_mi.capture.layouts.clips import EXAMPLE
+from morgs_mi.io.bounded import read_json
 
 __all__ = ["LAYOUTS", "find_layout", "layout_called"]
 
@@ -34,6 +35,11 @@ def find_layout(path: Path) -> Layout:
     """
     if layout := next((layout for layout in LAYOUTS if layout.find(path)), None):
         return layout
+    if (path / "stream.morgs").is_file():
+        raise FileNotFoundError(
+            f"{path}: expected a capture, found a fit; `morgs-mi eval {path}` scores it, `morgs-mi view {path}` shows "
+            f"it{_fitted_capture(path)}."
+        )
     clips = required_clips(path)  # without clips the path itself is likely wrong
     static = all(isinstance(clip, tuple) for clip in clips.values())
     recording = f" The {len(clips)} photos count as cameras with one frame each; a recording has {EXAMPLE}"
@@ -42,6 +48,16 @@ def find_layout(path: Path) -> Layout:
         f"{path}: expected a calibration ({', '.join(files)} or {last}), found none; run `morgs-mi calibrate` on the "
         f"folder.{recording if static else ''}"
     )
+
+
+def _fitted_capture(path: Path) -> str:
+    """Return what to do with the capture of a fit in the folder `path`; empty if it names none."""
+    try:
+        about = read_json(path / "capture.json")
+    except (OSError, ValueError):
+        about = {}
+    capture = about.get("capture") if isinstance(about, dict) else None
+    return f", and `morgs-mi info {capture}` describes its capture" if isinstance(capture, str) else ""
 
 
 def layout_called(name: str) -> Layout | None:

@@ -20,6 +20,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from morgs_mi.core.documentation import page
 from morgs_mi.io.onnx_file import OnnxNetwork, imagenet_blob, written_shapes
 from morgs_mi.method.mask_refiners.config import MaskConfig, PromptConfig
 from morgs_mi.method.mask_refiners.opencv import clean_mask
@@ -67,7 +68,7 @@ class SegmentNetwork:
             raise ValueError(
                 f"{decoder}: expected a mask decoder with inputs among {', '.join(sorted(known))} and outputs "
                 f"{' and '.join(_RESULTS)}, got {', '.join(self._decoder.inputs)} and "
-                f"{', '.join(self._decoder.outputs)}; export both networks as described in docs/masks.md."
+                f"{', '.join(self._decoder.outputs)}; export both networks as described in {page('masks')}."
             )
 
     def __call__(self, image: np.ndarray, mask: np.ndarray) -> np.ndarray:

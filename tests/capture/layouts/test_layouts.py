@@ -202,6 +202,23 @@ def test_load_capture__lists_some_of_many_cameras_without_clips(
     assert "cam11.png and 18 others: left out." in caplog.text
 
 
+def test_load_capture__names_what_reads_a_fit(tmp_path: Path) -> None:
+    (tmp_path / "stream.morgs").touch()
+    start = f"{tmp_path}: expected a capture, found a fit; `morgs-mi eval {tmp_path}` scores it, "
+    for content, rest in (
+        ('{"capture": "clips/walk"}', "shows it, and `morgs-mi info clips/walk` describes its capture."),
+        ("{}", f"`morgs-mi view {tmp_path}` shows it."),
+        ('{"capture": 3}', "shows it."),
+    ):
+        (tmp_path / "capture.json").write_text(content)
+        with pytest.raises(FileNotFoundError) as error:
+            load_capture(tmp_path)
+        assert str(error.value).startswith(start)
+        assert str(error.value).endswith(rest)
+    with pytest.raises(FileNotFoundError, match=r"stream\.morgs: expected a capture folder, found a file"):
+        load_capture(tmp_path / "stream.morgs")
+
+
 def test_find_layout__finds_a_layout_that_is_added(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A new layout costs its `Layout` and an entry in `LAYOUTS`."""
     names, path = ("cam1", "cam2", "cam10"), tmp_path / "a"
