@@ -59,7 +59,7 @@ class Ply:
                 write_each(by_place(stream), output, chosen.ending, write_compressed_ply, frames, tick)
             else:
                 write_each(play(stream), output, chosen.ending, write_ply, frames, tick)
-        print_result(f"{output}: {len(frames)} PLY files.")
+        print_result(f"{output}: {len(frames)} PLY {'file' if len(frames) == 1 else 'files'}.")
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Gltf:
         with progress() as report:
             write = partial(write_gltf, axes=axes)
             write_each(play(stream), output, chosen.ending, write, frames, partial(report, "Writing"))
-        print_result(f"{output}: {len(frames)} glTF files.")
+        print_result(f"{output}: {len(frames)} glTF {'file' if len(frames) == 1 else 'files'}.")
 
 
 @dataclass(frozen=True)

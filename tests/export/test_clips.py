@@ -59,9 +59,10 @@ def test_export_ply__writes_compressed_files(stream, tmp_path):
 
 
 @pytest.mark.parametrize(("kind", "name"), [("ply", "a.ply"), ("ply", "a.compressed.ply"), ("gltf", "a.glb")])
-def test_export__writes_one_frame_into_a_file(stream, tmp_path, kind, name):
+def test_export__writes_one_frame_into_a_file(stream, tmp_path, capsys, kind, name):
     suffix = name.removeprefix("a")
     assert run("export", kind, tmp_path, tmp_path / name, "--frames", 2) == 0
+    assert capsys.readouterr().out.rstrip().endswith(" file.")
     assert run("export", kind, tmp_path, tmp_path / "folder", "--frames", 2, *format_of(name)) == 0
     assert (tmp_path / name).read_bytes() == (tmp_path / "folder" / f"0002{suffix}").read_bytes()
 
