@@ -19,6 +19,7 @@ from morgs_mi.calibration.mistakes import same_poses
 from morgs_mi.calibration.rig_check import MAX_ERROR, CameraCheck
 from morgs_mi.capture.capture import opaque_pixels
 from morgs_mi.capture.layouts.clips import EXAMPLE, clips_by_camera, names_without, photos
+from morgs_mi.capture.layouts.colmap import write_reconstruction
 from morgs_mi.capture.timeline import nearest_frames
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path
@@ -119,8 +120,7 @@ def calibrate(
                 "calibrate on another frame (--frame), or accept the partial model (--partial)."
             )
         with atomic_path(path / "sparse", "calibrate()") as folder:
-            (folder / "0").mkdir(parents=True)
-            model.write_text(str(folder / "0"))
+            write_reconstruction(model, folder / "0")
     error, checks = float(model.compute_mean_reprojection_error()), _checks(model, list(images))
     return CalibrationResult(path / "sparse" / "0", names, left_out, model.num_points3D(), error, checks)
 

@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-__all__ = ["atomic_folder", "atomic_path", "is_same_file", "json_finite", "locked_folder", "write_json"]
+__all__ = ["atomic_folder", "atomic_path", "is_same_file", "json_finite", "locked_folder", "write_error", "write_json"]
 
 _LOCK = ".morgs-lock"
 
@@ -43,7 +43,7 @@ def atomic_path(path: str | os.PathLike[str], place: str) -> Generator[Path, Non
         partial.replace(final)
     except OSError as error:
         removed = ", the partial output was removed" if os.path.lexists(partial) else ""
-        raise _write_error(f"{place}: cannot write {path}{removed}", error, partial) from error
+        raise write_error(f"{place}: cannot write {path}{removed}", error, partial) from error
     finally:
         if os.path.exists(old) and not os.path.exists(final):
             old.rename(final)
@@ -87,7 +87,7 @@ def locked_folder(path: str | os.PathLike[str], place: str) -> Generator[None, N
         except FileExistsError:
             raise FileExistsError(f"{place}: {path} is a file; name a folder.") from None
         except OSError as error:
-            raise _write_error(f"{place}: cannot write into {path}", error, folder) from error
+            raise write_error(f"{place}: cannot write into {path}", error, folder) from error
         undo.callback(os.close, lock)
         # A writer that has just ended may have removed the file between its opening and its locking.
         if not _locked(lock) or not is_same_file(file, os.fstat(lock)):
@@ -128,11 +128,11 @@ def json_finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _write_error(start: str, error: OSError, own: Path) -> OSError:
+def write_error(start: str, error: Exception, own: Path) -> OSError:
     """Return an error with the reason of another one, and its file unless that is `own`."""
-    reason = (error.strerror or str(error)).rstrip(".")
-    if error.filename and str(error.filename) != str(own):
-        reason += f": {error.filename}"
+    reason = (getattr(error, "strerror", None) or str(error)).rstrip(".")
+    if (file := getattr(error, "filename", None)) and str(file) != str(own):
+        reason += f": {file}"
     failure = OSError(f"{start}: {reason}; check that its folder is writable and the disk has room.")
     failure.strerror = reason  # so that a folder's sentence does not contain that of a file in it
     return failure

@@ -17,7 +17,7 @@ from morgs_mi.capture.layouts.calibration import Calibration
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.registry import find_layout
 from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.core.files import write_json
+from morgs_mi.core.files import atomic_path, write_json
 from morgs_mi.core.progress import Report
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.io.png import png_bytes
@@ -56,19 +56,22 @@ def begin_capture(
         on_stage: called with (name, done, total) of the calibration.
 
     Raises:
+        OSError: the disk is full or not writable.
         ValueError: the cameras cannot be calibrated, or the images do not have the calibrated sizes.
     """
-    write_images(folder, names, images, 0)
-    write_json(folder / "capture.json", {"fps": config.fps})
-    if calibration is None:
-        _calibrate(folder, on_stage)
-        return _opened(folder, config)
     try:
-        model = folder / "sparse" / "0"
-        write_colmap(model, calibration.cameras, calibration.points, calibration.point_colors, calibration.lenses)
+        write_images(folder, names, images, 0)
+        write_json(folder / "capture.json", {"fps": config.fps})
+        if calibration is None:
+            _calibrate(folder, on_stage)
+        else:
+            model = folder / "sparse" / "0"
+            write_colmap(model, calibration.cameras, calibration.points, calibration.point_colors, calibration.lenses)
         return _opened(folder, config)
-    except ValueError:
-        shutil.rmtree(folder)  # so that the fit can be started again
+    except (OSError, ValueError) as error:
+        # The fit can be started again; images that cannot be calibrated stay.
+        if calibration is not None or isinstance(error, OSError):
+            shutil.rmtree(folder, ignore_errors=True)
         raise
 
 
@@ -84,7 +87,8 @@ def write_images(folder: Path, names: Sequence[str], images: Sequence[np.ndarray
         if image is not None:
             file = folder / names[view] / f"{frame:04d}.png"
             file.parent.mkdir(parents=True, exist_ok=True)
-            file.write_bytes(png_bytes(image))
+            with atomic_path(file, "fit_live()") as partial:
+                partial.write_bytes(png_bytes(image))
 
     map_in_threads(write, range(len(names)))
 

@@ -9,17 +9,20 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 
 from morgs_mi import cli
 from morgs_mi.calibration.calibrate import CalibrateConfig, _frames, calibrate
 from morgs_mi.calibration.rig_check import check_rig, match_capture
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
 from tests.assertions import assert_close
 from tests.scenes import textured
 from tests.scenes.captures import write_timed_video
+from tests.scenes.full_disk import files_end_at
 
 
 def film(path: Path, cameras: list[Camera], suffix: str = ".mkv") -> Path:
@@ -91,6 +94,16 @@ def test_calibrate__prints_a_verdict_per_camera(tmp_path: Path, capsys) -> None:
     assert re.match(r"0 +- +not checked", rows["other"])
     assert "cam9 does not fit: it has the same pose as cam1: one clip seems to be a copy" in printed.err
     assert "other not checked: it could not be registered and has no pose" in printed.err
+
+
+def test_calibrate__of_a_full_disk_leaves_no_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_colmap(tmp_path / "found", textured.rig(4), np.random.default_rng(0).normal(size=(60, 3)))
+    found, clips = pycolmap.Reconstruction(str(tmp_path / "found")), film(tmp_path / "clips", textured.rig(4))
+    monkeypatch.setattr("morgs_mi.calibration.calibrate._map", lambda *_: found)
+    size = (tmp_path / "found" / "points3D.txt").stat().st_size
+    with pytest.raises(OSError, match=r"cannot write .*sparse, the partial output was removed"), files_end_at(size - 1):
+        calibrate(clips)
+    assert not (clips / "sparse").exists()
 
 
 def test_calibrate__finds_no_features_in_transparent_pixels(tmp_path: Path) -> None:

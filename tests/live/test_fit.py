@@ -23,6 +23,7 @@ from morgs_mi.live.config import LiveConfig
 from morgs_mi.live.fit import fit_live
 from morgs_mi.playback.player import open_stream
 from morgs_mi.recorder import stream_capture
+from tests.scenes.full_disk import files_end_at
 from tests.scenes.live_clip import (
     CONFIG,
     FPS,
@@ -220,6 +221,17 @@ def test_fit_live__keeps_images_that_cannot_be_calibrated(tmp_path: Path, images
         fit_live([images], tmp_path / "out", LiveConfig(timeout=0.2), CONFIG)
     assert f"The images are in {tmp_path / 'out' / 'capture'}: calibrate them with" in failed.value.__notes__[0]
     assert (tmp_path / "out" / "capture" / "cam0" / "0000.png").exists()
+
+
+def test_fit_live__can_be_started_again_after_a_full_disk(tmp_path: Path, rig: Path, images: Path) -> None:
+    write(images, 0)
+    largest, least = (end(file.stat().st_size for file in images.rglob("*.png")) for end in (max, min))
+    assert (rig / "sparse" / "0" / "points3D.txt").stat().st_size > largest
+    live, full = LiveConfig(rig, timeout=0.2), "check that its folder is writable and the disk has room"
+    for limit in (largest, least - 1):  # the calibration does not fit, then not even the images
+        with pytest.raises(OSError, match=full), files_end_at(limit):
+            fit_live([images], tmp_path / "out", live, CONFIG)
+        assert not (tmp_path / "out").exists()
 
 
 def test_fit_live__does_not_replace_an_earlier_capture(tmp_path: Path, rig: Path, images: Path) -> None:

@@ -9,10 +9,13 @@ and silently drops every second image of a text model without blank lines.
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -21,9 +24,13 @@ from morgs_mi.capture.layouts.calibration import Calibration, Layout, match_clip
 from morgs_mi.capture.lens import MODELS, Lens, lens_and_intrinsics
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded
+from morgs_mi.core.files import write_error
 from morgs_mi.io.bounded import check_claim, read_bytes, regular
 
-__all__ = ["LAYOUT", "ColmapModel", "find_colmap", "read_colmap", "write_colmap"]
+if TYPE_CHECKING:
+    import pycolmap
+
+__all__ = ["LAYOUT", "ColmapModel", "find_colmap", "read_colmap", "write_colmap", "write_reconstruction"]
 
 _FILES = ("cameras", "images", "points3D")
 # More than any camera model's line of a text file has.
@@ -137,8 +144,6 @@ def write_colmap(
     """
     import pycolmap  # takes 0.3 s to import, and only the writer needs it
 
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     model = pycolmap.Reconstruction()
     lenses = [Lens()] * len(cameras) if lenses is None else lenses
     for i, (camera, lens) in enumerate(zip(cameras, lenses, strict=True), start=1):
@@ -161,10 +166,42 @@ def write_colmap(
     bytes_ = np.rint(np.clip(colors, 0, 1) * 255).astype(np.uint8)
     for xyz, rgb in zip(points, bytes_, strict=True):
         model.add_point3D(xyz.astype(np.float64), pycolmap.Track(), rgb)
+    write_reconstruction(model, folder)
+
+
+def write_reconstruction(model: pycolmap.Reconstruction, folder: str | Path) -> None:
+    """Write a model as text, all of its files or none; the folder is created if it is missing.
+
+    Raises:
+        OSError: a file could not be written.
+    """
+    folder = Path(folder)
+    images, frames = model.num_reg_images(), model.num_reg_frames()
+    lines = {"rigs": model.num_rigs(), "frames": frames, "images": 2 * images, "points3D": model.num_points3D()}
+    lines["cameras"] = model.num_cameras()  # the last one that is renamed, because readers look for it
     try:
-        model.write_text(str(folder))
-    except (RuntimeError, ValueError) as error:
-        raise OSError(f"{folder}: the COLMAP model could not be written ({error}).") from None
+        folder.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory(prefix=".partial-", dir=folder) as partial:
+            model.write_text(partial)
+            for name, count in lines.items():
+                _check_written(Path(partial) / f"{name}.txt", count)
+            for name in lines:
+                (Path(partial) / f"{name}.txt").replace(folder / f"{name}.txt")
+    except (OSError, RuntimeError, ValueError) as error:
+        raise write_error(f"{folder}: the COLMAP model could not be written", error, folder) from error
+
+
+def _check_written(file: Path, expected: int) -> None:
+    """Check that a text file reached the disk with all its lines: pycolmap does not report a full disk.
+
+    Raises:
+        OSError: it did not.
+    """
+    with file.open("rb") as opened:
+        os.fsync(opened.fileno())
+        written = [line for line in opened if not line.startswith(b"#")]
+    if len(written) != expected or (written and not written[-1].endswith(b"\n")):
+        raise OSError(f"{file.name} was cut off after {len(written)} of {expected} lines")
 
 
 def _viewmat(pose: Sequence[float]) -> np.ndarray:

@@ -8,6 +8,7 @@ whose columns are the camera's down, right and backward axes, its centre (all in
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from morgs_mi.capture.layouts.calibration import Calibration, Layout, required_c
 from morgs_mi.capture.layouts.clips import check_frames, clips_by_frame
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.core.files import atomic_path
 from morgs_mi.io.bounded import read_array
 from morgs_mi.io.video import Clip
 
@@ -93,8 +95,10 @@ def write_poses_bounds(path: str | Path, cameras: Sequence[Camera], bounds: np.n
         right, down, forward = np.asarray(camera.viewmat, dtype=np.float64)[:3, :3]
         hwf = [camera.height, camera.width, K[0, 0]]
         rows.append([*np.stack([down, right, -forward, camera.position, hwf], axis=1).ravel(), *near_far])
-    with open(path, "wb") as file:
-        np.save(file, np.array(rows))
+    data = BytesIO()  # np.save() into a file does not report that the disk has no room for the last few kB
+    np.save(data, np.array(rows))
+    with atomic_path(path, "write_poses_bounds()") as partial:
+        partial.write_bytes(data.getvalue())
 
 
 def _read_calibration(path: Path) -> Calibration:

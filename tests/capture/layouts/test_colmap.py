@@ -15,6 +15,7 @@ from morgs_mi.capture.lens import MODELS, Lens
 from morgs_mi.core.camera import Camera
 from tests.assertions import assert_close
 from tests.scenes.captures import HEIGHT, WIDTH, rig
+from tests.scenes.full_disk import files_end_at
 
 RNG = np.random.default_rng(1)
 POINTS = RNG.normal(size=(7, 3))
@@ -76,6 +77,21 @@ def test_read_colmap__accepts_blank_lines_and_no_points(tmp_path: Path) -> None:
     model = read_colmap(tmp_path / "sparse" / "0")
     assert len(model.cameras) == 3
     assert model.points.shape == model.point_colors.shape == (0, 3)
+
+
+def test_write_colmap__of_a_full_disk_leaves_the_model_before(tmp_path: Path) -> None:
+    points = RNG.normal(size=(100, 3))
+    write_colmap(tmp_path / "new", cameras(), points)
+    sizes = [file.stat().st_size for file in (tmp_path / "new").iterdir()]
+    size, before = max(sizes), {file.name: file.read_bytes() for file in write(tmp_path / "sparse").iterdir()}
+    assert sorted(sizes)[-2] < size // 2, "of the points"
+    for limit in (0, 100, size // 2, *range(size - 200, size, 7), size - 1):
+        with pytest.raises(OSError, match="sparse: the COLMAP model could not be written: "), files_end_at(limit):
+            write_colmap(tmp_path / "sparse", cameras(), points)
+        assert {file.name: file.read_bytes() for file in (tmp_path / "sparse").iterdir()} == before
+    with files_end_at(size):
+        write_colmap(tmp_path / "sparse", cameras(), points)
+    assert len(read_colmap(tmp_path / "sparse").points) == 100
 
 
 @pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])

@@ -10,6 +10,7 @@ import pytest
 from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds, write_poses_bounds
 from morgs_mi.core.camera import Camera
 from tests.assertions import assert_close
+from tests.scenes.full_disk import files_end_at
 
 BOUNDS = np.array([[1.0, 9.0], [2.0, 8.0]])
 
@@ -31,6 +32,16 @@ def test_read_poses_bounds__reads_what_write_poses_bounds_writes(tmp_path: Path)
         assert (got.name, got.width, got.height) == (expected.name, expected.width, expected.height)
         np.testing.assert_allclose(got.K, expected.K, rtol=1e-12)
         assert_close(got.viewmat, expected.viewmat, atol=1e-12)
+
+
+def test_write_poses_bounds__of_a_full_disk_leaves_the_file_before(tmp_path: Path) -> None:
+    path = tmp_path / "poses_bounds.npy"
+    write_poses_bounds(path, cameras(), BOUNDS)
+    before = path.read_bytes()
+    for limit in (0, len(before) // 2, len(before) - 1):
+        with pytest.raises(OSError, match=r"cannot write .*poses_bounds.npy"), files_end_at(limit):
+            write_poses_bounds(path, cameras(), BOUNDS + 1)
+        assert [file.read_bytes() for file in tmp_path.iterdir()] == [before]
 
 
 def test_read_poses_bounds__columns_are_down_right_back(tmp_path: Path) -> None:
