@@ -6,7 +6,6 @@ from morgs_mi.core.llvm import ensure_llvm
 ensure_llvm()
 
 from morgs_mi.capture.capture import Capture, load_capture  # noqa: E402
-from morgs_mi.capture.live import live_frames  # noqa: E402
 from morgs_mi.codec.config import CodecConfig  # noqa: E402
 from morgs_mi.codec.reader import StreamReader  # noqa: E402
 from morgs_mi.config import StreamConfig  # noqa: E402
@@ -20,6 +19,7 @@ from morgs_mi.export.notebook import stream_html  # noqa: E402
 from morgs_mi.export.tracks import extract_tracks  # noqa: E402
 from morgs_mi.fit.config import FitConfig  # noqa: E402
 from morgs_mi.gaussian_integrator import ellipsoids  # noqa: E402  (registers the integrator `gaussian_splat`)
+from morgs_mi.live.live_frames import live_frames  # noqa: E402
 from morgs_mi.method.config import MotionConfig  # noqa: E402
 from morgs_mi.playback.player import channel_image, open_stream, render_stream  # noqa: E402
 from morgs_mi.playback.visualise import confidence_image, depth_image, motion_image  # noqa: E402

@@ -1,1 +1,1 @@
-"""Fits of scenes while they happen: the newest synchronous images of live cameras, calibrated once."""
+"""Live cameras: fits of the newest synchronous images, calibrated once, and frames for a loop of one's own."""

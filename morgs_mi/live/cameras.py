@@ -5,26 +5,19 @@ from __future__ import annotations
 import atexit
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
 from threading import Condition, Thread
 
-import cv2
 import numpy as np
 
-from morgs_mi.capture.live import open_source
 from morgs_mi.live.feed import Bundle, Shot, bundled
 
-__all__ = ["CameraFeed", "read_camera"]
+__all__ = ["CameraFeed"]
 
 # Images of a camera from which the one that agrees best with the others is chosen: networks deliver them in bursts.
 _KEPT = 4
 # Largest skew of a bundle, s: that of unsynchronised cameras with one image per second.
 _MAX_SKEW = 0.5
-# Reads that may fail in succession before a source counts as ended, and the pause after each, s.
-_FAILURES, _PAUSE = 10, 0.02
-_RETRY = 1.0  # pause before a connection is opened again, s
 # Time to wait for a thread that ends, s; a source may hang.
 _CLOSING = 1.0
 
@@ -182,45 +175,3 @@ def _nearest(new: Sequence[Sequence[Shot]], expected: Sequence[bool]) -> list[Sh
     ]
     times = [shot.time for shot in chosen if shot is not None]
     return chosen if max(times) - min(times) <= _MAX_SKEW else None
-
-
-def read_camera(source: int | str | Path, size: tuple[int, int] | None = None) -> Iterator[np.ndarray | None]:
-    """Yield the images of a source, RGB uint8 [H, W, 3], as they arrive, with None where a read has failed.
-
-    A video file is played at its own speed. A connection that breaks is opened again.
-
-    Args:
-        source: a camera of this machine, by OpenCV's index; or a path or URL that FFmpeg opens.
-        size: width and height that are requested of a camera of this machine.
-
-    Raises:
-        OSError: the source cannot be opened.
-    """
-    yield from _read(open_source(source), source, size)
-    while "://" in str(source):
-        time.sleep(_RETRY)
-        yield None
-        with suppress(OSError):
-            yield from _read(open_source(source), source, size)
-
-
-def _read(
-    stream: cv2.VideoCapture, source: int | str | Path, size: tuple[int, int] | None
-) -> Iterator[np.ndarray | None]:
-    """Yield the images of an opened source until it ends; see `read_camera`."""
-    if isinstance(source, int) and size is not None:
-        stream.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
-        stream.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
-    is_file = not isinstance(source, int) and Path(source).is_file()
-    failures, start = 0, time.monotonic()
-    try:
-        while failures < _FAILURES:
-            read, image = stream.read()
-            if read and is_file:
-                time.sleep(max(0.0, start + stream.get(cv2.CAP_PROP_POS_MSEC) / 1000 - time.monotonic()))
-            failures = 0 if read else failures + 1
-            yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if read else None
-            if not read:
-                time.sleep(_PAUSE)
-    finally:
-        stream.release()

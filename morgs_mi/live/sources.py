@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from morgs_mi.live.cameras import CameraFeed, read_camera
+from morgs_mi.live.cameras import CameraFeed
 from morgs_mi.live.config import LiveConfig
 from morgs_mi.live.feed import Feed
 from morgs_mi.live.folder import FolderFeed
+from morgs_mi.live.reading import read_camera
 
 __all__ = ["Source", "open_feed"]
 

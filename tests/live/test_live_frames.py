@@ -16,8 +16,8 @@ import pytest
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
-from morgs_mi.capture.live import live_frames
 from morgs_mi.io.video_writer import write_video
+from morgs_mi.live.live_frames import live_frames
 from tests.scenes import captures as layouts
 
 NAMES = ("cam1", "cam2", "cam3")

@@ -1,4 +1,4 @@
-"""Live images of a calibrated rig, in place of recorded clips.
+"""Frames of synchronised live cameras for a loop of your own, in place of those of recorded clips.
 
 A source yields the images of one camera, at the size of its recorded clip:
 
@@ -16,13 +16,13 @@ from itertools import count
 from pathlib import Path
 from typing import BinaryIO, cast
 
-import cv2
 import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.io.prefetch import prefetched
+from morgs_mi.live.reading import open_source, raw_images, read_opened
 
-__all__ = ["Source", "live_frames", "open_source"]
+__all__ = ["Source", "live_frames"]
 
 Source = int | str | Path | BinaryIO | Iterable[np.ndarray | None]
 
@@ -79,42 +79,7 @@ def _check_size(rig: Capture, view: int, image: np.ndarray | None) -> None:
 
 def _images(source: Source, width: int, height: int) -> Iterator[np.ndarray | None]:
     if isinstance(source, int | str | Path):
-        return _captured(open_source(source))
+        return read_opened(open_source(source), source)
     if hasattr(source, "read"):
-        return _raw(cast(BinaryIO, source), width, height)
+        return raw_images(cast(BinaryIO, source), width, height)
     return iter(cast(Iterable[np.ndarray | None], source))
-
-
-def open_source(source: int | str | Path) -> cv2.VideoCapture:
-    """Return OpenCV's reader of a camera, by its index, or of anything that FFmpeg opens.
-
-    Raises:
-        OSError: it cannot be opened.
-    """
-    stream = cv2.VideoCapture(source) if isinstance(source, int) else cv2.VideoCapture(str(source), cv2.CAP_FFMPEG)
-    if not stream.isOpened():
-        raise OSError(f"live_frames(): cannot open the source {source}; check that it exists and is not in use.")
-    return stream
-
-
-def _captured(stream: cv2.VideoCapture) -> Iterator[np.ndarray | None]:
-    try:
-        while True:
-            ok, image = stream.read()
-            yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if ok else None
-    finally:
-        stream.release()
-
-
-def _raw(pipe: BinaryIO, width: int, height: int) -> Iterator[np.ndarray]:
-    size = 3 * width * height
-    while len(data := _exactly(pipe, size)) == size:
-        yield np.frombuffer(data, np.uint8).reshape(height, width, 3)
-
-
-def _exactly(pipe: BinaryIO, size: int) -> bytes:
-    """Return `size` bytes, fewer only at the end of the file: one read of a pipe may return fewer."""
-    data = bytearray()
-    while len(data) < size and (chunk := pipe.read(size - len(data))):
-        data += chunk
-    return bytes(data)
