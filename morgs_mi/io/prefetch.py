@@ -13,6 +13,7 @@ __all__ = ["prefetched"]
 
 T = TypeVar("T")
 _POLL_SECONDS = 0.1  # interval at which the thread checks whether the consumer has closed
+_CLOSING_SECONDS = 12.0  # longest wait for the thread; a connection may take 10 s to break
 
 
 class _End:
@@ -22,16 +23,19 @@ class _End:
         self.error = error
 
 
-def prefetched(items: Iterable[T], ahead: int = 2, newest: bool = False) -> Generator[T, None, None]:
+def prefetched(
+    items: Iterable[T], ahead: int = 2, newest: bool = False, closed: Event | None = None
+) -> Generator[T, None, None]:
     """Yield the items of `items`, in order; an error that it raises is raised here.
 
     Args:
         items: iterated in a separate thread, from the first `next` until this generator is closed.
         ahead: maximum number of items that wait, while one more is being produced.
         newest: whether a new item replaces the one that waits, for sources that cannot wait.
+        closed: is set when this generator is closed; `items` ends then, if it waits for something.
     """
     ready: Queue[T | _End] = Queue(1 if newest else ahead)
-    closed = Event()
+    closed = closed or Event()
 
     def put(item: T | _End) -> None:
         while not closed.is_set():
@@ -62,7 +66,7 @@ def prefetched(items: Iterable[T], ahead: int = 2, newest: bool = False) -> Gene
 
     def stop() -> None:
         closed.set()
-        worker.join(timeout=10 * _POLL_SECONDS)  # a source may hang
+        worker.join(timeout=_CLOSING_SECONDS)
 
     # A thread that executes library code when the interpreter ends aborts the process.
     atexit.register(stop)

@@ -6,7 +6,7 @@ import atexit
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from threading import Condition, Thread
+from threading import Condition, Event, Thread
 
 import numpy as np
 
@@ -18,8 +18,7 @@ __all__ = ["CameraFeed"]
 _KEPT = 4
 # Largest skew of a bundle, s: that of unsynchronised cameras with one image per second.
 _MAX_SKEW = 0.5
-# Time to wait for a thread that ends, s; a source may hang.
-_CLOSING = 1.0
+_CLOSING = 12.0  # longest wait for the threads, s; a connection or a driver may take 10 s to fail
 
 
 class CameraFeed:
@@ -33,13 +32,19 @@ class CameraFeed:
             iterators wait for the next image.
         timeout: seconds to wait for a camera before it is left out.
         warm_up: seconds that the cameras have, after the first image of the last of them, to adjust their exposure.
+        closed: is set when the feed is closed; an iterator that waits ends then.
     """
 
     def __init__(
-        self, cameras: Mapping[str, Iterable[np.ndarray | None]], timeout: float, warm_up: float = 0.0
+        self,
+        cameras: Mapping[str, Iterable[np.ndarray | None]],
+        timeout: float,
+        warm_up: float = 0.0,
+        closed: Event | None = None,
     ) -> None:
         self.names, self._timeout, self._warm_up, self._changed = tuple(cameras), timeout, warm_up, Condition()
-        self._cameras = [_Camera(images, self._changed) for images in cameras.values()]
+        self._closed = closed or Event()
+        self._cameras = [_Camera(images, self._changed, self._closed) for images in cameras.values()]
         # A thread that executes library code when the interpreter ends aborts the process.
         atexit.register(self.close)
         for camera in self._cameras:
@@ -80,10 +85,10 @@ class CameraFeed:
     def close(self) -> None:
         """End the reading."""
         atexit.unregister(self.close)
+        self._closed.set()
+        deadline = time.monotonic() + _CLOSING
         for camera in self._cameras:
-            camera.closed = True
-        for camera in self._cameras:
-            camera.join(_CLOSING)
+            camera.join(max(0.0, deadline - time.monotonic()))
 
     def _expected(self, new: Sequence[Sequence[Shot]], after: Bundle, late: bool) -> list[bool]:
         """Return for each camera whether the bundle has to have its image.
@@ -123,16 +128,15 @@ class CameraFeed:
 class _Camera(Thread):
     """Thread that reads the images of a camera; its state is guarded by `changed`."""
 
-    def __init__(self, images: Iterable[np.ndarray | None], changed: Condition) -> None:
+    def __init__(self, images: Iterable[np.ndarray | None], changed: Condition, closed: Event) -> None:
         super().__init__(daemon=True, name="camera")
         self.shots: deque[Shot] = deque(maxlen=_KEPT)
         self.ended: str | None = None  # why there are no images any more
         self.error: Exception | None = None
-        self.closed = False
-        self._images, self._changed = images, changed
+        self._images, self._changed, self._closed = images, changed, closed
 
     def run(self) -> None:
-        """Read until the source ends or `closed` is set."""
+        """Read until the source ends or the feed is closed."""
         number = 0
         try:
             for image in self._images:
@@ -141,7 +145,7 @@ class _Camera(Thread):
                         self.shots.append(Shot(image, time.monotonic(), number))
                         self._changed.notify_all()
                     number += 1
-                if self.closed:
+                if self._closed.is_set():
                     break
         except Exception as error:
             self.error = error

@@ -14,13 +14,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import count
 from pathlib import Path
+from threading import Event
 from typing import BinaryIO, cast
 
 import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.io.prefetch import prefetched
-from morgs_mi.live.reading import open_source, raw_images, read_opened
+from morgs_mi.live.reading import raw_images, read_camera
 
 __all__ = ["Source", "live_frames"]
 
@@ -47,8 +48,9 @@ def live_frames(rig: Capture, sources: Sequence[Source], newest: bool = False) -
             f"live_frames(): `sources` must be one for each of {len(rig.cameras)} cameras ({', '.join(rig.names)}), "
             f"got {len(sources)}."
         )
-    streams = [_images(source, *size) for source, size in zip(sources, rig.recorded_sizes, strict=True)]
-    return prefetched(_frames(rig, streams), newest=newest)
+    closed = Event()
+    streams = [_images(source, *size, closed) for source, size in zip(sources, rig.recorded_sizes, strict=True)]
+    return prefetched(_frames(rig, streams), newest=newest, closed=closed)
 
 
 def _frames(rig: Capture, streams: Sequence[Iterator[np.ndarray | None]]) -> Iterator[PartialFrame]:
@@ -77,9 +79,9 @@ def _check_size(rig: Capture, view: int, image: np.ndarray | None) -> None:
         )
 
 
-def _images(source: Source, width: int, height: int) -> Iterator[np.ndarray | None]:
+def _images(source: Source, width: int, height: int, closed: Event) -> Iterator[np.ndarray | None]:
     if isinstance(source, int | str | Path):
-        return read_opened(open_source(source), source)
+        return read_camera(source, closed, reconnect=False)  # the other cameras would wait for it
     if hasattr(source, "read"):
         return raw_images(cast(BinaryIO, source), width, height)
     return iter(cast(Iterable[np.ndarray | None], source))

@@ -2,74 +2,144 @@
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Iterator
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from io import FileIO
 from pathlib import Path
+from select import select
+from threading import Event, Thread
 from typing import BinaryIO
 
 import cv2
 import numpy as np
 
-__all__ = ["open_source", "raw_images", "read_camera", "read_opened"]
+__all__ = ["raw_images", "read_camera"]
 
 # Reads that may fail in succession before a source counts as ended, and the pause after each, s.
 _FAILURES, _PAUSE = 10, 0.02
 _RETRY = 1.0  # pause before a connection is opened again, s
+# Longest wait of FFmpeg for a connection or its next bytes, s; some streams come in parts of a few seconds.
+_SILENCE = 10.0
+# Silence after which the reader of a pipe looks whether it is to end, s, and how many bytes it copies at most.
+_POLL, _CHUNK = 0.3, 1 << 20
 
 
-def read_camera(source: int | str | Path, size: tuple[int, int] | None = None) -> Iterator[np.ndarray | None]:
+def read_camera(
+    source: int | str | Path, closed: Event, size: tuple[int, int] | None = None, reconnect: bool = True
+) -> Iterator[np.ndarray | None]:
     """Yield the images of a source, RGB uint8 [H, W, 3], as they arrive, with None where a read has failed.
 
-    A video file is played at its own speed. A connection that breaks is opened again.
+    A video file is played at its own speed.
 
     Args:
         source: a camera of this machine, by OpenCV's index; or a path or URL that FFmpeg opens.
+        closed: is set by another thread to end the images, also of a source that is silent.
         size: width and height that are requested of a camera of this machine.
+        reconnect: whether a connection that breaks is opened again.
 
     Raises:
         OSError: the source cannot be opened.
     """
-    yield from read_opened(open_source(source), source, size)
-    while "://" in str(source):
-        time.sleep(_RETRY)
+    yield from _until_end(source, closed, size)
+    while reconnect and "://" in str(source) and not closed.wait(_RETRY):
         yield None
         with suppress(OSError):
-            yield from read_opened(open_source(source), source, size)
+            yield from _until_end(source, closed, size)
 
 
-def read_opened(
-    stream: cv2.VideoCapture, source: int | str | Path, size: tuple[int, int] | None = None
-) -> Iterator[np.ndarray | None]:
-    """Yield the images of an opened source until it ends, as `read_camera` does; `stream` is released."""
-    if isinstance(source, int) and size is not None:
-        stream.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
-        stream.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+def _until_end(source: int | str | Path, closed: Event, size: tuple[int, int] | None) -> Iterator[np.ndarray | None]:
+    """Yield the images of a source, which is opened once; see `read_camera`."""
     is_file = not isinstance(source, int) and Path(source).is_file()
-    failures, start = 0, time.monotonic()
-    try:
-        while failures < _FAILURES:
-            read, image = stream.read()
-            if read and is_file:
-                time.sleep(max(0.0, start + stream.get(cv2.CAP_PROP_POS_MSEC) / 1000 - time.monotonic()))
-            failures = 0 if read else failures + 1
-            yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if read else None
-            if not read:
-                time.sleep(_PAUSE)
-    finally:
-        stream.release()
+    with _place(source, closed) as place:
+        if closed.is_set():
+            return
+        stream = _opened(place, source)
+        if isinstance(source, int) and size is not None:
+            stream.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
+            stream.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
+        failures, start = 0, time.monotonic()
+        try:
+            while failures < _FAILURES and not closed.is_set():
+                read, image = stream.read()
+                if read and is_file:
+                    closed.wait(max(0.0, start + stream.get(cv2.CAP_PROP_POS_MSEC) / 1000 - time.monotonic()))
+                failures = 0 if read else failures + 1
+                yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if read else None
+                if not read:
+                    closed.wait(_PAUSE)
+        finally:
+            stream.release()
 
 
-def open_source(source: int | str | Path) -> cv2.VideoCapture:
-    """Return OpenCV's reader of a camera, by its index, or of anything that FFmpeg opens.
+def _opened(place: int | str, source: int | str | Path) -> cv2.VideoCapture:
+    """Return OpenCV's reader of a source at a place.
 
     Raises:
         OSError: it cannot be opened.
     """
-    stream = cv2.VideoCapture(source) if isinstance(source, int) else cv2.VideoCapture(str(source), cv2.CAP_FFMPEG)
+    if isinstance(place, int):
+        stream = cv2.VideoCapture(place)
+    else:
+        limits = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC) if "://" in place else ()
+        stream = cv2.VideoCapture(place, cv2.CAP_FFMPEG, [n for key in limits for n in (key, int(1000 * _SILENCE))])
     if not stream.isOpened():
-        raise OSError(f"open_source(): cannot open the source {source}; check that it exists and is not in use.")
+        raise OSError(f"read_camera(): cannot open the source {source}; check that it exists and is not in use.")
     return stream
+
+
+@contextmanager
+def _place(source: int | str | Path, closed: Event) -> Iterator[int | str]:
+    """Yield what OpenCV is to open for a source; a named pipe is relayed.
+
+    FFmpeg itself waits for a silent named pipe, or for one without a writer, and cannot be interrupted. A thread that
+    returns from OpenCV when the interpreter has ended aborts the process.
+    """
+    if isinstance(source, int) or not Path(source).is_fifo():
+        yield source if isinstance(source, int) else str(source)
+        return
+    done = Event()
+    with open(source, "rb", 0, opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)) as pipe:
+        first = _next_bytes(pipe, False, closed.is_set)
+        reading, writing = os.pipe()
+        ended = lambda: closed.is_set() or done.is_set()  # noqa: E731
+        relay = Thread(target=_relay, args=(pipe, first, writing, ended), daemon=True, name="pipe")
+        relay.start()
+        try:
+            yield f"/dev/fd/{reading}"
+        finally:
+            done.set()
+            os.close(reading)  # so a relay that waits for its reader ends, too
+            relay.join()
+
+
+def _relay(pipe: FileIO, data: bytes, writing: int, ended: Callable[[], bool]) -> None:
+    """Write `data` and the further bytes of a pipe to the file descriptor `writing` until one side ends."""
+    with suppress(BrokenPipeError), open(writing, "wb", 0) as copy:
+        while data:
+            rest = memoryview(data)
+            while rest:
+                rest = rest[copy.write(rest) :]
+            data = _next_bytes(pipe, True, ended)
+
+
+def _next_bytes(pipe: FileIO, begun: bool, ended: Callable[[], bool]) -> bytes:
+    """Wait for the next bytes of a pipe and return them; none if its writer has ended, or if it is silent and `ended`.
+
+    Args:
+        pipe: is opened without waiting for its writer.
+        begun: whether there was a writer before.
+        ended: returns whether to give up.
+    """
+    while True:
+        data = pipe.read(_CHUNK) if select([pipe], [], [], _POLL)[0] else None
+        if data or (begun and data == b""):
+            return data
+        if ended():
+            return b""
+        if data == b"":
+            time.sleep(_POLL)  # on some systems, a pipe without a writer is readable
 
 
 def raw_images(pipe: BinaryIO, width: int, height: int) -> Iterator[np.ndarray]:

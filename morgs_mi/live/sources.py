@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from threading import Event
 
 from morgs_mi.live.cameras import CameraFeed
 from morgs_mi.live.config import LiveConfig
@@ -48,8 +49,9 @@ def open_feed(sources: Sequence[Source], config: LiveConfig, names: Sequence[str
             f"open_feed(): `camera` must have a source for each of the {len(names)} calibrated cameras "
             f"({', '.join(names)}), got {_listed(sources)}; name them in that order."
         )
-    cameras = {name: read_camera(source, config.size) for name, source in zip(names, sources, strict=True)}
-    return CameraFeed(cameras, config.timeout, config.warm_up)
+    closed = Event()
+    cameras = {name: read_camera(source, closed, config.size) for name, source in zip(names, sources, strict=True)}
+    return CameraFeed(cameras, config.timeout, config.warm_up, closed)
 
 
 def _listed(sources: Sequence[Source]) -> str:
