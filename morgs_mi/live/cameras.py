@@ -67,7 +67,7 @@ class CameraFeed:
                 if shots := _nearest(new, expected):
                     times = [shot.time for shot in shots if shot is not None]
                     numbers = [camera.shots[-1].number for camera in self._cameras]
-                    return bundled(shots, numbers, max(times) - min(times), after)
+                    return bundled(shots, numbers, max(times) - min(times), _dropped(shots, after))
                 if running and left > 0:
                     self._changed.wait(left)
                 elif after is not None:
@@ -81,6 +81,13 @@ class CameraFeed:
     def problem(self, camera: int) -> str:
         """Return why a camera has no image in the last bundle."""
         return self._cameras[camera].ended or f"no image for {self._timeout:g} s"
+
+    def ended(self) -> str:
+        """Return why no camera delivers images any more."""
+        names: dict[str, list[str]] = {}
+        for k, name in enumerate(self.names):
+            names.setdefault(self.problem(k), []).append(name)
+        return "; ".join(f"{', '.join(those)}: {problem}" for problem, those in names.items())
 
     def close(self) -> None:
         """End the reading."""
@@ -179,3 +186,10 @@ def _nearest(new: Sequence[Sequence[Shot]], expected: Sequence[bool]) -> list[Sh
     ]
     times = [shot.time for shot in chosen if shot is not None]
     return chosen if max(times) - min(times) <= _MAX_SKEW else None
+
+
+def _dropped(shots: Sequence[Shot | None], after: Bundle | None) -> int:
+    """Return the number of images that each camera delivered between two bundles."""
+    if after is None:
+        return 0
+    return min(shot.number - last - 1 for shot, last in zip(shots, after.numbers, strict=True) if shot is not None)

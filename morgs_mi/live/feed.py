@@ -62,7 +62,7 @@ class Feed(Protocol):
             after: the bundle before; all images of the new one are newer.
 
         Raises:
-            OSError, ValueError: a camera cannot be opened, or has no first image.
+            OSError, ValueError: a camera cannot be opened, or has no first image; the folder of the images was removed.
         """
         ...
 
@@ -70,26 +70,28 @@ class Feed(Protocol):
         """Return why a camera has no image in the last bundle."""
         ...
 
+    def ended(self) -> str:
+        """Return why no camera delivers images any more."""
+        ...
+
     def close(self) -> None:
         """End the reading."""
         ...
 
 
-def bundled(shots: Sequence[Shot | None], numbers: Sequence[int], skew: float, after: Bundle | None) -> Bundle:
+def bundled(shots: Sequence[Shot | None], numbers: Sequence[int], skew: float, dropped: int = 0) -> Bundle:
     """Return the bundle of at least one shot.
 
     Args:
         shots: per camera its image, None where it has none.
         numbers: per camera the number of its newest image.
         skew: largest difference in time between two of the images, s.
-        after: the bundle before.
+        dropped: number of images of each camera after the bundle before.
     """
-    before = after.numbers if after else [0] * len(shots)
-    dropped = [shot.number - number - 1 for shot, number in zip(shots, before, strict=True) if shot is not None]
     return Bundle(
         tuple(shot and shot.image for shot in shots),
         tuple(shot.number if shot else number for shot, number in zip(shots, numbers, strict=True)),
         max(shot.time for shot in shots if shot is not None),
         skew,
-        min(dropped) if after else 0,
+        dropped,
     )

@@ -91,7 +91,8 @@ def fit_live(
 
     Raises:
         FileExistsError: OUT has the capture of an earlier fit.
-        OSError: a source cannot be opened, or the output cannot be written; the stream ends with a complete frame.
+        OSError: a source cannot be opened, the folder of the images is removed, or the output cannot be written; the
+            stream ends with a complete frame.
         ValueError: a setting is out of range, a camera has no first image, or the cameras cannot be calibrated or do
             not have the calibrated sizes.
     """
@@ -103,6 +104,7 @@ def fit_live(
         raise FileExistsError(
             f"{out / 'capture'}: expected no capture, got that of an earlier fit; choose another folder for this one."
         )
+    _check_outside(out, sources)
     calibration = live.calibration and read_calibration(live.calibration).without(live.calibration, live.without)
     names = calibration and [camera.name for camera in calibration.cameras]
     report = on_stage or (lambda *_: None)
@@ -114,6 +116,20 @@ def fit_live(
         report("Waiting for the cameras", 1, 1)
         capture = begin_capture(out / "capture", feed.names, first.images, live, calibration, on_stage)
         return _fit(_LiveFrames(feed, capture, first, live), out, config or StreamConfig(), on_frame, report)
+
+
+def _check_outside(out: Path, sources: Sequence[Source]) -> None:
+    """Check that an output is in no folder of images: its folders would count as cameras.
+
+    Raises:
+        ValueError: it is.
+    """
+    for folder in (Path(source) for source in sources if isinstance(source, str | Path)):
+        if folder.is_dir() and out.resolve().is_relative_to(folder.resolve()):
+            raise ValueError(
+                f"{out}: expected a folder outside of {folder}, into which another program writes images; choose a "
+                "different one."
+            )
 
 
 class _LiveFrames:
@@ -136,7 +152,10 @@ class _LiveFrames:
         while bundle is not None and bundle.time - begin <= (self.config.seconds or float("inf")):
             yield bundle, self._processed(bundle, frame)
             frame, begin = frame + 1, min(begin, time.monotonic())
-            bundle = None if frame == self.config.frames else self._feed.newest(bundle)
+            if frame == self.config.frames:
+                return
+            if (bundle := self._feed.newest(bundle)) is None:
+                _LOG.warning("the fit ends after frame %d: %s", frame - 1, self._feed.ended())
 
     def report(self, bundle: Bundle, frame: PartialFrame) -> LiveFrame:
         """Return the report of a frame whose fit has ended."""
@@ -208,6 +227,10 @@ def _fit(
         except KeyboardInterrupt:
             if not rows:
                 raise
+        except OSError as error:
+            if rows:
+                error.add_note(f"{out / 'stream.morgs'} ends with frame {rows[-1].frame}.")
+            raise
     return rows
 
 

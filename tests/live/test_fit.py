@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Sequence
 from contextlib import ExitStack
 from itertools import pairwise
@@ -180,6 +181,20 @@ def test_fit_live__ends_with_a_whole_stream_when_it_is_interrupted(tmp_path: Pat
             fit_live([images], tmp_path / "first", LiveConfig(rig, downscale=2), CONFIG, on_stage=interrupt_first)
 
 
+def test_fit_live__ends_with_a_reason(tmp_path: Path, rig: Path, images: Path, caplog) -> None:
+    """Without further images, and with an error when the folder of the images is removed."""
+    write(images, 0)
+    live = LiveConfig(rig, downscale=4, timeout=0.2)
+    assert len(fit_live([images], tmp_path / "out", live, CONFIG)) == 1
+    (message,) = (record.message for record in caplog.records if record.name == "morgs_mi.live.fit")
+    assert message == f"the fit ends after frame 0: no complete new images in {images} for 0.2 s"
+    with pytest.raises(FileNotFoundError, match="but the folder was removed") as failed:
+        fit_live([images], tmp_path / "gone", live, CONFIG, lambda *_: shutil.rmtree(images))
+    assert failed.value.__notes__ == [f"{tmp_path / 'gone' / 'stream.morgs'} ends with frame 0."]
+    assert open_stream(tmp_path / "gone").closed()
+    assert len(packets(tmp_path / "gone")) == 1
+
+
 def other_size(images: Path) -> None:
     for name in NAMES:
         size = (120, 90) if name != "cam2" else (90, 90)
@@ -213,6 +228,14 @@ def test_fit_live__names_what_is_wrong(tmp_path: Path, rig: Path, images: Path, 
     with pytest.raises((ValueError, OSError), match=message):
         fit_live(sources, tmp_path / "out", LiveConfig(rig, timeout=0.2), CONFIG)
     assert not (tmp_path / "out").exists()
+
+
+def test_fit_live__refuses_an_output_among_the_images(tmp_path: Path, rig: Path, images: Path) -> None:
+    write(images, 0)
+    for out in (images, images / "out", images / "cam0" / "out"):
+        with pytest.raises(ValueError, match=f"expected a folder outside of {images}, into which another program"):
+            fit_live([images], out, LiveConfig(rig, timeout=0.2), CONFIG)
+    assert sorted(file.name for file in images.iterdir()) == list(NAMES)
 
 
 def test_fit_live__keeps_images_that_cannot_be_calibrated(tmp_path: Path, images: Path) -> None:
