@@ -33,6 +33,7 @@ class CameraFeed:
         timeout: seconds to wait for a camera before it is left out.
         warm_up: seconds that the cameras have, after the first image of the last of them, to adjust their exposure.
         closed: is set when the feed is closed; an iterator that waits ends then.
+        ended: why there are no images any more of a camera that ends without an error.
     """
 
     def __init__(
@@ -41,10 +42,11 @@ class CameraFeed:
         timeout: float,
         warm_up: float = 0.0,
         closed: Event | None = None,
+        ended: str = "it has ended",
     ) -> None:
         self.names, self._timeout, self._warm_up, self._changed = tuple(cameras), timeout, warm_up, Condition()
         self._closed = closed or Event()
-        self._cameras = [_Camera(images, self._changed, self._closed) for images in cameras.values()]
+        self._cameras = [_Camera(images, self._changed, self._closed, ended) for images in cameras.values()]
         # A thread that executes library code when the interpreter ends aborts the process.
         atexit.register(self.close)
         for camera in self._cameras:
@@ -135,12 +137,12 @@ class CameraFeed:
 class _Camera(Thread):
     """Thread that reads the images of a camera; its state is guarded by `changed`."""
 
-    def __init__(self, images: Iterable[np.ndarray | None], changed: Condition, closed: Event) -> None:
+    def __init__(self, images: Iterable[np.ndarray | None], changed: Condition, closed: Event, ended: str) -> None:
         super().__init__(daemon=True, name="camera")
         self.shots: deque[Shot] = deque(maxlen=_KEPT)
         self.ended: str | None = None  # why there are no images any more
         self.error: Exception | None = None
-        self._images, self._changed, self._closed = images, changed, closed
+        self._images, self._changed, self._closed, self._ended = images, changed, closed, ended
 
     def run(self) -> None:
         """Read until the source ends or the feed is closed."""
@@ -160,7 +162,7 @@ class _Camera(Thread):
             if (close := getattr(self._images, "close", None)) is not None:
                 close()
             with self._changed:
-                self.ended = str(self.error or "it has ended")
+                self.ended = str(self.error or self._ended)
                 self._changed.notify_all()
 
     def newer(self, number: int) -> list[Shot]:

@@ -33,7 +33,9 @@ class LiveConfig:
     timeout: float = 10
     """Seconds to wait for a camera before it is left out."""
     warm_up: float = 1
-    """Seconds in which the cameras adjust their exposure before the first images are taken; not of a folder."""
+    """Seconds in which the cameras adjust their exposure before the first images are taken; not of files."""
+    loop: bool = False
+    """Repeat videos until the fit is ended; by default they are played once."""
     size: tuple[int, int] | None = None
     """Width and height of the images that cameras of this machine are asked for; by default they choose."""
 

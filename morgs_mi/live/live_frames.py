@@ -21,6 +21,7 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.io.prefetch import prefetched
+from morgs_mi.live.playing import ClipClock, is_video, play
 from morgs_mi.live.reading import raw_images, read_camera
 
 __all__ = ["Source", "live_frames"]
@@ -81,6 +82,8 @@ def _check_size(rig: Capture, view: int, image: np.ndarray | None) -> None:
 
 def _images(source: Source, width: int, height: int, closed: Event) -> Iterator[np.ndarray | None]:
     if isinstance(source, int | str | Path):
+        if is_video(source):
+            return play(source, ClipClock(), closed)
         return read_camera(source, closed, reconnect=False)  # the other cameras would wait for it
     if hasattr(source, "read"):
         return raw_images(cast(BinaryIO, source), width, height)

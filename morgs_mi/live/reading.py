@@ -15,7 +15,7 @@ from typing import BinaryIO
 import cv2
 import numpy as np
 
-__all__ = ["raw_images", "read_camera"]
+__all__ = ["open_stream", "raw_images", "read_camera"]
 
 # Reads that may fail in succession before a source counts as ended, and the pause after each, s.
 _FAILURES, _PAUSE = 10, 0.02
@@ -30,8 +30,6 @@ def read_camera(
     source: int | str | Path, closed: Event, size: tuple[int, int] | None = None, reconnect: bool = True
 ) -> Iterator[np.ndarray | None]:
     """Yield the images of a source, RGB uint8 [H, W, 3], as they arrive, with None where a read has failed.
-
-    A video file is played at its own speed.
 
     Args:
         source: a camera of this machine, by OpenCV's index; or a path or URL that FFmpeg opens.
@@ -51,20 +49,17 @@ def read_camera(
 
 def _until_end(source: int | str | Path, closed: Event, size: tuple[int, int] | None) -> Iterator[np.ndarray | None]:
     """Yield the images of a source, which is opened once; see `read_camera`."""
-    is_file = not isinstance(source, int) and Path(source).is_file()
     with _place(source, closed) as place:
         if closed.is_set():
             return
-        stream = _opened(place, source)
+        stream = open_stream(place, source)
         if isinstance(source, int) and size is not None:
             stream.set(cv2.CAP_PROP_FRAME_WIDTH, size[0])
             stream.set(cv2.CAP_PROP_FRAME_HEIGHT, size[1])
-        failures, start = 0, time.monotonic()
+        failures = 0
         try:
             while failures < _FAILURES and not closed.is_set():
                 read, image = stream.read()
-                if read and is_file:
-                    closed.wait(max(0.0, start + stream.get(cv2.CAP_PROP_POS_MSEC) / 1000 - time.monotonic()))
                 failures = 0 if read else failures + 1
                 yield cv2.cvtColor(image, cv2.COLOR_BGR2RGB) if read else None
                 if not read:
@@ -73,7 +68,7 @@ def _until_end(source: int | str | Path, closed: Event, size: tuple[int, int] | 
             stream.release()
 
 
-def _opened(place: int | str, source: int | str | Path) -> cv2.VideoCapture:
+def open_stream(place: int | str, source: int | str | Path) -> cv2.VideoCapture:
     """Return OpenCV's reader of a source at a place.
 
     Raises:
@@ -85,7 +80,7 @@ def _opened(place: int | str, source: int | str | Path) -> cv2.VideoCapture:
         limits = (cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, cv2.CAP_PROP_READ_TIMEOUT_MSEC) if "://" in place else ()
         stream = cv2.VideoCapture(place, cv2.CAP_FFMPEG, [n for key in limits for n in (key, int(1000 * _SILENCE))])
     if not stream.isOpened():
-        raise OSError(f"read_camera(): cannot open the source {source}; check that it exists and is not in use.")
+        raise OSError(f"open_stream(): cannot open the source {source}; check that it exists and is not in use.")
     return stream
 
 

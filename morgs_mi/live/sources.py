@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from threading import Event
+
+import numpy as np
 
 from morgs_mi.live.cameras import CameraFeed
 from morgs_mi.live.config import LiveConfig
 from morgs_mi.live.feed import Feed
 from morgs_mi.live.folder import FolderFeed
+from morgs_mi.live.playing import ClipClock, is_video, play
 from morgs_mi.live.reading import read_camera
 
 __all__ = ["Source", "open_feed"]
@@ -28,7 +31,8 @@ def open_feed(sources: Sequence[Source], config: LiveConfig, names: Sequence[str
 
     Raises:
         FileNotFoundError: there is no such folder.
-        ValueError: there is no source, one occurs twice, or their number is not that of the names.
+        ValueError: there is no source, one occurs twice, their number is not that of the names, or there is no video to
+            repeat.
     """
     if not sources:
         raise ValueError("open_feed(): `camera` must have a source per camera, or a folder, got none; name them.")
@@ -49,9 +53,20 @@ def open_feed(sources: Sequence[Source], config: LiveConfig, names: Sequence[str
             f"open_feed(): `camera` must have a source for each of the {len(names)} calibrated cameras "
             f"({', '.join(names)}), got {_listed(sources)}; name them in that order."
         )
-    closed = Event()
-    cameras = {name: read_camera(source, closed, config.size) for name, source in zip(names, sources, strict=True)}
-    return CameraFeed(cameras, config.timeout, config.warm_up, closed)
+    closed, videos = Event(), [source for source in sources if is_video(source)]
+    if config.loop and not videos:
+        raise ValueError(f"open_feed(): `loop` repeats videos, got none in {_listed(sources)}; leave it out.")
+    clock = ClipClock(len(videos))
+
+    def images(source: Source) -> Iterator[np.ndarray | None]:
+        if is_video(source):
+            return play(source, clock, closed, videos.index(source), config.loop)
+        return read_camera(source, closed, config.size)
+
+    ended = "it has ended; --loop repeats videos" if videos and not config.loop else "it has ended"
+    cameras = {name: images(source) for name, source in zip(names, sources, strict=True)}
+    warm_up = 0.0 if len(videos) == len(sources) else config.warm_up
+    return CameraFeed(cameras, config.timeout, warm_up, closed, ended)
 
 
 def _listed(sources: Sequence[Source]) -> str:

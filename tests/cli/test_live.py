@@ -27,7 +27,9 @@ def videos(tmp_path: Path) -> list[Path]:
     return paths
 
 
-def test_Live__fits_videos_until_they_end(capture: Path, tmp_path: Path, videos: list[Path], run, monkeypatch) -> None:
+def test_Live__fits_videos_until_they_end(
+    capture, tmp_path: Path, videos: list[Path], run, monkeypatch, caplog
+) -> None:
     started = []
     monkeypatch.setattr(module, "_start_viewer", lambda *args: started.append(args))
     monkeypatch.setattr(module, "_stop", started.append)
@@ -39,9 +41,21 @@ def test_Live__fits_videos_until_they_end(capture: Path, tmp_path: Path, videos:
         printed,
     )
     assert "Frame 0: 0.0 s after the first, latency " in error
+    assert re.search(
+        r"the fit ends after frame \d+: cam0, cam1, cam2: it has ended; --loop repeats videos", caplog.text
+    )
     assert started == [(out, True), None]
     assert open_stream(out).closed()
     assert {path.name for path in out.iterdir()} == {"stream.morgs", "report.json", "capture.json", "capture"}
+
+
+def test_Live__repeats_videos(capture: Path, tmp_path: Path, videos: list[Path], run, caplog) -> None:
+    args = ("--camera", *videos, "--calibration", capture, "--loop", "--seconds", 1, *QUICK)
+    status, printed, _ = run("live", tmp_path / "out", *args)
+    assert status == 0
+    frames = int(re.findall(r"fitted \d+ of (\d+) frames", printed)[0])
+    assert frames > 14, "the videos have 10"
+    assert not caplog.messages, "it is ended by the time"
 
 
 def test_Live__ends_with_a_summary_on_ctrl_c(capture: Path, tmp_path: Path, videos, run, monkeypatch) -> None:

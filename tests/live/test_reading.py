@@ -1,4 +1,4 @@
-"""Images of files, connections and cameras of this machine as they arrive."""
+"""Images of pipes, connections and cameras of this machine as they arrive."""
 
 from __future__ import annotations
 
@@ -21,15 +21,6 @@ from morgs_mi.live import reading as module
 from morgs_mi.live.reading import read_camera
 
 IMAGE = np.zeros((4, 6, 3), np.uint8)
-
-
-def test_read_camera__plays_a_file_at_its_own_speed(tmp_path: Path) -> None:
-    write_video(tmp_path / "clip.mkv", [IMAGE] * 6, 20)
-    start = time.monotonic()
-    times = [time.monotonic() - start for image in read_camera(tmp_path / "clip.mkv", Event()) if image is not None]
-    assert len(times) == 6
-    assert times[-1] >= 5 / 20 - 0.01
-    assert np.all(np.diff(times) > 0.02), "not all at once"
 
 
 class Connection:
