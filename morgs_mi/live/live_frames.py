@@ -1,4 +1,4 @@
-"""Frames of synchronised live cameras for a loop of your own, in place of those of recorded clips.
+"""Frames of synchronised live cameras for a loop of your own, in place of recorded clips.
 
 A source yields the images of one camera, at the size of its recorded clip:
 

@@ -31,8 +31,8 @@ def open_feed(sources: Sequence[Source], config: LiveConfig, names: Sequence[str
 
     Raises:
         FileNotFoundError: there is no such folder.
-        ValueError: there is no source, one occurs twice, their number is not that of the names, or there is no video to
-            repeat.
+        ValueError: there is no source, one occurs twice, their number differs from the number of names, or the settings
+            repeat videos and there is none.
     """
     if not sources:
         raise ValueError("open_feed(): `camera` must have a source per camera, or a folder, got none; name them.")
