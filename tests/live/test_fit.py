@@ -174,7 +174,7 @@ def test_fit_live__ends_with_a_whole_stream_when_it_is_interrupted(tmp_path: Pat
         assert len(packets(tmp_path / "out")) == 2
 
         def interrupt_first(stage: str, done: int, total: int) -> None:
-            if stage == "Fitting the first frame" and done:
+            if stage == "First frame" and done:
                 raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
