@@ -1,0 +1,64 @@
+"""The commands of the README and of the pages run as they stand there, on small clips with few steps."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.playback.visualise import write_png
+from morgs_mi.synth.synthesize import synthesize
+
+ROOT = Path(__file__).parents[2]
+# Appended to a command, so that it takes seconds.
+SMALLER = {
+    "synth": "--cameras 7 --frames 3 --width 160 --height 120 --spp 4",
+    "fit": "--num-gaussians 1500 --first-frame-steps 60 --epochs 1",
+    "live": "--calibration CAPTURE --frames 2 --loop --first-frame-steps 30 --epochs 1",
+    "demo": "--frames 3 --cameras 7",
+}
+# Commands that never end, or write outside of the folder.
+LEFT_OUT = ("morgs-mi view", "morgs-mi --completion")
+
+
+def commands(page: str) -> list[str]:
+    """Return the commands of a page, without comments."""
+    lines = re.findall(r"^    (morgs-mi .*)$", (ROOT / page).read_text(encoding="utf-8"), re.MULTILINE)
+    return [line.partition("#")[0].strip() for line in lines if not line.startswith(LEFT_OUT)]
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with what stands for the names in capitals: a capture, its first images, and the clips alone."""
+    folder = tmp_path_factory.mktemp("recordings")
+    synthesize("spheres", folder / "CAPTURE", num_cameras=7, num_frames=6, width=320, height=240, spp=8)
+    (folder / "FOLDER").mkdir()
+    capture = load_capture(folder / "CAPTURE")
+    for name, image in zip(capture.names, next(capture.frames(0, 1)).images, strict=True):
+        shutil.copy(folder / "CAPTURE" / f"{name}.mp4", folder / "FOLDER")
+        write_png(folder / "PHOTOS" / f"{name}.png", image)
+    shutil.copytree(folder / "CAPTURE", folder / "my_capture")
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", ["README.md", "docs/quickstart.md", "docs/captures.md"])
+def test_commands__of_a_page_run_to_the_end(page: str, recordings: Path, tmp_path: Path, run, monkeypatch) -> None:
+    shutil.copytree(recordings, tmp_path / "there")
+    monkeypatch.chdir(tmp_path / "there")
+    cameras = " ".join(str(clip) for clip in sorted(Path("CAPTURE").glob("*.mp4")))
+    found = commands(page)
+    assert len(found) >= 2
+    for command in found:
+        given = command.replace("--camera 0 1 2 3", f"--camera {cameras}").replace(" > settings.toml", "")
+        if given.startswith("morgs-mi import frames"):
+            assert run("export", "ply", "out/arm_fit", "frames")[0] == 0
+        name, *rest = shlex.split(given)[1:]
+        status, output, error = run(name, *rest, *shlex.split(SMALLER.get(name, "")))
+        assert status == 0, f"{given}\n{error}"
+        if command.endswith("settings.toml"):
+            Path("settings.toml").write_text(output, encoding="utf-8")
