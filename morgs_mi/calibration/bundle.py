@@ -7,9 +7,13 @@ pixel
 
 so that the change of a camera has eleven numbers: a small rotation w [3], a displacement d [3] of its centre, the
 relative change s of its focal lengths, the displacement p [2] of its principal point in image widths W, and the radial
-distortion k [2] that is left in its images. They have independent normal priors around zero. Images do not determine a
-common similarity of cameras and points: there the priors alone decide, and leave the rig where the sum of the squared
-changes is least.
+distortion k [2] that is left in its images. They have independent normal priors around zero.
+
+Images do not determine a common similarity of cameras and points, and hardly a common change of the focal lengths,
+which depths compensate. Left to the priors, all cameras would turn where that costs less than displacements, away from
+every camera that takes no part. Constraints therefore fix the gauge: changes have no common part. By that, the shifts
+of pixels that changes cause for fixed points are orthogonal to the shifts by any similarity of the points, to first
+order and in the metric of the equations, and the mean of s is zero.
 
 Reprojection errors have Cauchy's loss in units of their own scale, so that wrong matches do not count.
 """
@@ -64,8 +68,10 @@ def bundle_adjust(
     errors = _errors(cameras, changes, points, tracks)
     scale = _scale(errors)
     loss = _loss(errors, changes, scale, deviations)
+    frame = _equations(cameras, changes, points, tracks, errors, scale).frame(points)
     for _ in range(_STEPS):
-        of_changes, of_points = _step(cameras, changes, points, tracks, errors, scale, deviations, damping)
+        equations = _equations(cameras, changes, points, tracks, errors, scale)
+        of_changes, of_points = equations.step(changes, deviations, damping, frame)
         tried = changes + of_changes, points + of_points
         found = _errors(cameras, *tried, tracks)
         new = _loss(found, tried[0], scale, deviations)
@@ -131,12 +137,9 @@ def camera_jacobian(
     by_point = camera.projection_jacobian(points)
     R = np.asarray(camera.viewmat, np.float64)[:3, :3]
     x = (points - camera.position) @ R.T
-    cross = np.zeros((len(x), 3, 3))  # d(exp([w]) x) / dw = -[x]
-    cross[:, [1, 2, 0], [2, 0, 1]] = x
-    cross -= cross.transpose(0, 2, 1)
     front = x[:, 2] > camera.near
     J = np.zeros((len(x), 2, CHANGES))
-    J[:, :, :3], J[:, :, 3:6] = by_point @ R.T @ cross, -by_point
+    J[:, :, :3], J[:, :, 3:6] = by_point @ R.T @ -_cross(x), -by_point
     from_centre = camera.project(points[front])[0] - camera.K[:2, 2]
     J[front, :, 6] = from_centre / factor
     ray = from_centre / camera.K[[0, 1], [0, 1]]
@@ -190,13 +193,30 @@ class NormalEquations:
         self._cameras[view] += np.tensordot(left, of_camera, axes=((0, 2), (0, 1)))
         self._right[view] += np.einsum("nij,ni->j", of_camera, b)
 
-    def step(self, changes: np.ndarray, deviations: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return the step of Levenberg and Marquardt for cameras [V, 9] and points [P, 3], by Schur's complement.
+    def frame(self, points: np.ndarray) -> np.ndarray:
+        """Return the constraints of the gauge as rows a [8, V 11]: changes c without a common part have a c = 0.
 
         Args:
-            changes: of the cameras so far [V, 9].
-            deviations: of their priors [V, 9].
+            points: [P, 3], world units.
+        """
+        from_centre = points - points.mean(axis=0)
+        shifts = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+        of_similarity = np.concatenate([-_cross(from_centre), shifts, from_centre[..., None]], axis=2)
+        rows = np.zeros((8, *self._right.shape))
+        rows[:7] = np.einsum("pij,pvki->jvk", of_similarity, self._across)
+        rows[7, :, 6] = 1
+        return rows.reshape(8, -1)
+
+    def step(
+        self, changes: np.ndarray, deviations: np.ndarray, damping: float, frame: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the step of Levenberg and Marquardt for cameras [V, 11] and points [P, 3], by Schur's complement.
+
+        Args:
+            changes: of the cameras so far [V, 11].
+            deviations: of their priors [V, 11].
             damping: relative increase of the diagonal.
+            frame: constraints that the changes meet after the step, as from `frame`; None: none.
         """
         views, size = changes.shape
         precision = deviations**-2.0
@@ -208,9 +228,26 @@ class NormalEquations:
         full[np.arange(views), :, np.arange(views)] = system
         reduced = full.reshape(views * size, -1) - np.tensordot(solved, across, axes=((0, 2), (0, 2)))
         right = (self._right + precision * changes).ravel() - np.einsum("pij,pj->i", solved, self._right_points)
-        step = -np.linalg.solve(reduced, right)
+        frame = np.zeros((0, right.size)) if frame is None else frame
+        step = _solved(reduced, -right, frame, -frame @ changes.ravel())
         rest = -self._right_points - np.einsum("pij,i->pj", across, step)
         return step.reshape(views, size), np.linalg.solve(points, rest[..., None])[..., 0]
+
+
+def _solved(A: np.ndarray, b: np.ndarray, rows: np.ndarray, value: np.ndarray) -> np.ndarray:
+    """Return the x of least x' A x / 2 - b' x for which `rows` x = `value`; rows of zeros count for nothing."""
+    scale = np.diag(A).mean()
+    lengths = np.maximum(np.linalg.norm(rows, axis=1), 1e-30) / scale
+    rows, value = rows / lengths[:, None], value / lengths
+    system = np.block([[A, rows.T], [rows, -1e-9 * scale * np.eye(len(rows))]])
+    return np.linalg.solve(system, np.concatenate([b, value]))[: len(b)]
+
+
+def _cross(vectors: np.ndarray) -> np.ndarray:
+    """Return the matrices [n, 3, 3] of the cross products by vectors [n, 3] from the left."""
+    cross = np.zeros((len(vectors), 3, 3))
+    cross[:, [2, 0, 1], [1, 2, 0]] = vectors
+    return cross - cross.transpose(0, 2, 1)
 
 
 def _damped(blocks: np.ndarray, damping: float) -> np.ndarray:
@@ -220,17 +257,15 @@ def _damped(blocks: np.ndarray, damping: float) -> np.ndarray:
     return blocks + added[..., None] * np.eye(blocks.shape[-1])
 
 
-def _step(
+def _equations(
     cameras: Sequence[Camera],
     changes: np.ndarray,
     points: np.ndarray,
     tracks: Tracks,
     errors: np.ndarray,
     scale: float,
-    deviations: np.ndarray,
-    damping: float,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return a step of iteratively reweighted least squares, in units of the errors' scale."""
+) -> NormalEquations:
+    """Return the equations of a step of iteratively reweighted least squares, in units of the errors' scale."""
     equations = NormalEquations(len(cameras), tracks.count)
     weights = 1 / (scale**2 + (errors**2).sum(axis=1, keepdims=True) / _CAUCHY**2)
     for view, (camera, change) in enumerate(zip(cameras, changes, strict=True)):
@@ -239,7 +274,7 @@ def _step(
         jacobians = camera_jacobian(now, 1 + change[6], seen, change[9:])
         w = weights[here]
         equations.add(view, tracks.ids[here], jacobians, w[..., None] * np.eye(2), w * errors[here])
-    return equations.step(changes, deviations, damping)
+    return equations
 
 
 def _errors(cameras: Sequence[Camera], changes: np.ndarray, points: np.ndarray, tracks: Tracks) -> np.ndarray:

@@ -16,9 +16,9 @@ compared by the PSNR of these pixels: where features are many and sharp, the rou
 
 Distortion is removed from the images, by what is known of it in each round, so that Gaussians see pinhole cameras.
 
-The calibration's priors fix what images leave open, which is where the rig is, how it is turned, and its scale. Points
-move so that their projections stay. The held-out view keeps its calibrated camera; `register_camera` fits a camera to
-its image while the Gaussians are frozen.
+Cameras stay in the frame of reference of the calibration, and keep their mean focal length (see `bundle`), so that a
+camera that is not refined fits as before. Points move so that their projections stay. The held-out view keeps its
+calibrated camera; `register_camera` fits a camera to its image while the Gaussians are frozen.
 """
 
 from __future__ import annotations
@@ -321,7 +321,7 @@ def _joint_step(
     variance, equations = _ALIKE * np.mean([error for *_, error in shifts]), NormalEquations(len(views), len(means))
     for v, ((camera, *_), (G, b, _)) in enumerate(zip(changed, shifts, strict=True)):
         equations.add(v, slice(None), camera_jacobian(camera, 1 + changes[v, 6], means), G / variance, b / variance)
-    of_changes, of_means = equations.step(changes, deviations, _DAMPING)
+    of_changes, of_means = equations.step(changes, deviations, _DAMPING, equations.frame(means))
     length = np.linalg.norm(of_means, axis=1, keepdims=True)
     of_means *= np.minimum(1, _LONGEST * extent / np.maximum(length, 1e-30))
     return replace(gaussians, means=(means + of_means).astype(np.float32)), changes + of_changes

@@ -6,25 +6,28 @@ import numpy as np
 import pytest
 
 from morgs_mi.calibration.bundle import bundle_adjust, camera_jacobian, changed_camera, distorted, undistorted
-from morgs_mi.capture.features import Tracks
+from morgs_mi.capture.features import Tracks, intersect
 from morgs_mi.fit.config import CameraPriors
 from morgs_mi.fit.initialise import scene_extent
 from tests.assertions import assert_close
+from tests.scenes.cameras import look_at_cameras
 from tests.scenes.textured import rig
 
 POINTS = np.random.default_rng(0).uniform((-2, -1.5, 3), (2, 1.5, 6), (300, 3))
 
 
-def seen_by(cameras) -> Tracks:
+DEVIATIONS = np.array([0.005] * 3 + [0.01] * 3 + [0.01, 0, 0, 0, 0])
+
+
+def seen_by(cameras, points=POINTS) -> Tracks:
     """Return the exact features of all points in all cameras."""
-    views, ids = (grid.ravel() for grid in np.mgrid[: len(cameras), : len(POINTS)])
-    pixels = np.concatenate([camera.project(POINTS)[0] for camera in cameras])
+    views, ids = (grid.ravel() for grid in np.mgrid[: len(cameras), : len(points)])
+    pixels = np.concatenate([camera.project(points)[0] for camera in cameras])
     return Tracks(ids, views, pixels, np.zeros((len(ids), 3)))
 
 
 def disturbed(cameras, rng):
-    deviations = np.array([0.005] * 3 + [0.01] * 3 + [0.01, 0, 0, 0, 0])
-    return [changed_camera(camera, deviations * rng.normal(size=11)) for camera in cameras]
+    return [changed_camera(camera, DEVIATIONS * rng.normal(size=11)) for camera in cameras]
 
 
 @pytest.mark.parametrize("distortion", [(0, 0), (-0.15, 0.04)])
@@ -77,7 +80,28 @@ def test_bundle_adjust__finds_the_reprojections_despite_wrong_matches():
     assert np.rad2deg(np.arccos((np.trace(relative[0].T @ relative[1]) - 1) / 2)) < 0.02
 
 
-def test_bundle_adjust__leaves_the_gauge_to_the_priors():
+def test_bundle_adjust__leaves_cameras_that_fit():
     true = rig()
     changes, _ = bundle_adjust(true, seen_by(true), scene_extent(true), CameraPriors())
     assert np.abs(changes).max() < 1e-6
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_bundle_adjust__keeps_points_in_place_for_a_camera_that_takes_no_part(seed):
+    places, rng = [(x, y, 0) for y in (-0.5, 0, 0.5) for x in (-1, 0, 1)], np.random.default_rng(seed)
+    nine = look_at_cameras(places, 50, 320, 240, target=(0, 0, 10))
+    given, unseen, points = nine[:4] + nine[5:], nine[4], rng.uniform((-3, -2, 6), (3, 2, 14), (300, 3))
+    tracks = seen_by(given, points)
+    tracks.pixels[:] += rng.normal(scale=0.3, size=tracks.pixels.shape)
+    before = intersect(tracks.ids, tracks.views, tracks.pixels, given, tracks.count)
+    _, after = bundle_adjust(given, tracks, scene_extent(given), CameraPriors())
+    shifts = [unseen.project(found)[0] - unseen.project(points)[0] for found in (before, after)]
+    errors = [np.median(np.linalg.norm(shift, axis=1)) for shift in shifts]
+    assert errors[1] < errors[0] + 0.03
+
+
+def test_bundle_adjust__changes_focal_lengths_by_zero_on_average():
+    given = disturbed(rig(shift=7), np.random.default_rng(1))
+    changes, _ = bundle_adjust(given, seen_by(rig(shift=7)), scene_extent(given), CameraPriors())
+    assert np.abs(changes[:, 6]).max() > 1e-3
+    assert abs(changes[:, 6].mean()) < 1e-6

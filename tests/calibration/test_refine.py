@@ -13,15 +13,17 @@ from morgs_mi.calibration.refine import (
     _joint_step,
     _matched,
     _moved,
+    _problem,
+    _short,
     refine_cameras,
     register_camera,
 )
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.fit.config import CameraPriors, FitConfig, RefinementConfig
-from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.view import View, rendered
-from morgs_mi.playback.visualise import write_png
+from morgs_mi.playback.visualise import to_uint8, write_png
 from morgs_mi.recorder import with_points
 from morgs_mi.render.config import RenderConfig
 from tests.assertions import assert_close
@@ -30,6 +32,8 @@ from tests.scenes.gaussians import isotropic
 
 # Too little to find a gain.
 LEAST = FitConfig(refine_cameras="auto", refinement=RefinementConfig(gaussians=50, steps=2, rounds=1, width=40))
+SHORT = RefinementConfig(gaussians=300, steps=200, rounds=3, width=96)
+REPRODUCIBLE = RenderConfig(reproducible=True)
 WRONG = np.array([0.006, -0.008, 0.004, 0.01, 0.008, -0.01, 0.004, 0, 0, 0, 0])
 PLACES = [(x, y, -4) for x, y in ((-1, 0), (0, 0.5), (1, 0), (0, -0.7))]
 CAMERAS = look_at_cameras(PLACES, 60, 64, 48)
@@ -69,6 +73,44 @@ def splat_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return load_capture(path, test_view=0)
 
 
+@pytest.fixture(scope="module")
+def far_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    """A capture of distant splats in nine noisy views on a plane, the middle one of which is held out."""
+    path, rng = tmp_path_factory.mktemp("far"), np.random.default_rng(0)
+    means, sh = rng.uniform((-3, -2.2, 6), (3, 2.2, 12), (150, 3)), rng.uniform(-1, 1.5, (150, 1, 3))
+    gaussians = isotropic(means.astype(np.float32), 0.35, 0.9, sh.astype(np.float32))
+    places = [(x, y, 0) for y in (-0.5, 0, 0.5) for x in (-1, 0, 1)]
+    cameras = look_at_cameras(places, 45, 96, 72, target=(0, 0, 10))
+    write_colmap(path / "sparse", cameras, means, np.full((150, 3), 0.5))
+    for camera in cameras:
+        image = 255 * rendered(gaussians, camera, RenderConfig()) + rng.normal(scale=5, size=(72, 96, 3))
+        write_png(path / camera.name / "0000.png", to_uint8(image / 255))
+    return load_capture(path, test_view=4)
+
+
+def held_out_psnr(capture: Capture, seed: int) -> float:
+    """Return the PSNR of the held-out view in a short fit, dB."""
+    images, config = next(capture.frames(0, 1)).images, FitConfig(refinement=SHORT)
+    views = [View(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]
+    assert capture.test_view is not None
+    view = views.pop(capture.test_view)
+    problem = _problem(views, (capture.points, capture.point_colors), config, REPRODUCIBLE, seed)
+    found = fit_first_frame(problem, _short(config), np.random.default_rng(seed)).gaussians
+    return replace(problem, views=(view,)).psnr(found)
+
+
+@pytest.mark.parametrize(("scale", "seed", "gain"), [(0.0, 3, -0.25), (1.0, 1, 0.4)])
+def test_refine_cameras__keeps_what_a_camera_that_takes_no_part_sees(far_capture, scale, seed, gain):
+    deviations = scale * np.array([0.005] * 3 + [0.006] * 3 + [0.008, 0, 0, 0, 0])
+    errors = deviations * np.random.default_rng(seed).normal(size=(9, 11))
+    errors[far_capture.test_view] = 0
+    cameras = [changed_camera(*pair) for pair in zip(far_capture.cameras, errors, strict=True)]
+    capture = replace(far_capture, cameras=tuple(cameras))
+    config = FitConfig(refine_cameras="on", refinement=replace(SHORT, steps=100))
+    refined, _ = refine_cameras(capture, config, REPRODUCIBLE, seed)
+    assert held_out_psnr(refined, seed) > held_out_psnr(capture, seed) + gain
+
+
 def test_joint_step__turns_cameras_to_where_the_images_were_taken():
     given, gaussians, changes = disturbed(CAMERAS), splats(), np.zeros((4, 11))
     views = [View(camera, image_of(true)) for camera, true in zip(given, CAMERAS, strict=True)]
@@ -78,6 +120,7 @@ def test_joint_step__turns_cameras_to_where_the_images_were_taken():
     found = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
     errors = [np.abs(relative_turns(rig) - relative_turns(CAMERAS)).max() for rig in (given, found)]
     assert errors[1] < 0.15 * errors[0]
+    assert abs(changes[:, 6].mean()) < 1e-6, "a camera that takes no part keeps its focal length"
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0])
