@@ -37,6 +37,7 @@ __all__ = [
     "camera_jacobian",
     "changed_camera",
     "distorted",
+    "likely_deviations",
     "prior_deviations",
     "undistorted",
 ]
@@ -47,23 +48,21 @@ CHANGES = 11
 _STEPS, _LEAST_DECREASE = 60, 1e-6
 # Damping of Levenberg and Marquardt at the start and at most.
 _DAMPING, _MOST_DAMPING = 1e-3, 1e6
+# px, the scale of reprojection errors that cameras with the errors of the priors have, at least.
+_LARGE_ERROR = 1.7
 # px, the least scale of the reprojection errors. Cauchy's loss halves the weight of an error of 2.4 deviations.
 _LEAST_SCALE, _CAUCHY = 0.05, 2.4
 
 
-def bundle_adjust(
-    cameras: Sequence[Camera], tracks: Tracks, extent: float, priors: CameraPriors
-) -> tuple[np.ndarray, np.ndarray]:
+def bundle_adjust(cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the changes [V, 11] of the cameras, and the points [P, 3] in world units, that fit the tracks best.
 
     Args:
         cameras: V views as calibrated.
         tracks: features of P > 0 points, each with at most one in a view.
-        extent: of the scene, world units.
-        priors: of the changes.
+        deviations: of the priors of a camera's changes [11], as from `likely_deviations`.
     """
-    deviations, damping = np.stack([prior_deviations(camera, extent, priors) for camera in cameras]), _DAMPING
-    changes = np.zeros((len(cameras), CHANGES))
+    damping, changes = _DAMPING, np.zeros((len(cameras), CHANGES))
     points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
     errors = _errors(cameras, changes, points, tracks)
     scale = _scale(errors)
@@ -89,6 +88,21 @@ def bundle_adjust(
     return changes, points
 
 
+def likely_deviations(cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndarray) -> np.ndarray:
+    """Return the deviations [11] of the errors of calibrated cameras, which are small where features reproject well.
+
+    What such features leave open, for example a slow bend of the whole rig, would follow their noise otherwise.
+
+    Args:
+        cameras: V views as calibrated.
+        tracks: features of P > 0 points.
+        deviations: of the priors [11], the most that is returned.
+    """
+    points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
+    errors = _errors(cameras, np.zeros((len(cameras), CHANGES)), points, tracks)
+    return deviations * min(1.0, _scale(errors) / _LARGE_ERROR)
+
+
 def changed_camera(camera: Camera, changes: np.ndarray) -> Camera:
     """Return a camera with the changes [11] of the module docstring, without the distortion."""
     K, V = camera.K.copy(), np.eye(4)
@@ -99,7 +113,7 @@ def changed_camera(camera: Camera, changes: np.ndarray) -> Camera:
     return replace(camera, K=K, viewmat=V)
 
 
-def prior_deviations(camera: Camera, extent: float, priors: CameraPriors) -> np.ndarray:
+def prior_deviations(extent: float, priors: CameraPriors) -> np.ndarray:
     """Return the standard deviations [11] of the changes of a camera; `extent` of the scene, world units."""
     of_pose = np.deg2rad(priors.rotation), priors.position * extent
     terms = priors.distortion, 0.2 * priors.distortion
@@ -214,13 +228,13 @@ class NormalEquations:
 
         Args:
             changes: of the cameras so far [V, 11].
-            deviations: of their priors [V, 11].
+            deviations: of the priors of a camera's changes [11].
             damping: relative increase of the diagonal.
             frame: constraints that the changes meet after the step, as from `frame`; None: none.
         """
         views, size = changes.shape
         precision = deviations**-2.0
-        system = _damped(self._cameras + precision[..., None] * np.eye(size), damping)
+        system = _damped(self._cameras + np.diag(precision), damping)
         points = _damped(self._points, damping)
         across = self._across.reshape(len(points), views * size, 3)
         solved = across @ np.linalg.inv(points)

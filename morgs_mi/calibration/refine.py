@@ -35,6 +35,7 @@ from morgs_mi.calibration.bundle import (
     camera_jacobian,
     changed_camera,
     distorted,
+    likely_deviations,
     prior_deviations,
     undistorted,
 )
@@ -144,8 +145,7 @@ def refine_cameras(
     report = progress or (lambda done, count: None)
     cameras, masks = [capture.cameras[v] for v in seen], [capture.masks[v] for v in seen]
     extent = scene_extent(cameras)
-    deviations = np.stack([prior_deviations(camera, extent, how.priors) for camera in cameras])
-    changes, tracks = _matched(capture, list(seen), config, extent)
+    changes, tracks, deviations = _matched(capture, list(seen), prior_deviations(extent, how.priors))
     judge = config.refine_cameras == "auto"
     estimates = [0 * changes] * judge + [changes] * bool(tracks)
     fits = how.rounds + len(estimates) + bool(estimates)
@@ -212,7 +212,7 @@ def register_camera(
     """
     render, target = render or RenderConfig(), Target(image, mask)
     priors = replace(config.refinement.priors, distortion=_NO_DISTORTION)  # the image stays as it is
-    deviations, best = prior_deviations(camera, extent, priors)[None], np.zeros((1, CHANGES))
+    deviations, best = prior_deviations(extent, priors), np.zeros((1, CHANGES))
     means = np.asarray(gaussians.means, np.float64)
     for blur in (*_BLURS, 0.0):
         changes, error = best, np.inf
@@ -231,15 +231,19 @@ def register_camera(
     return changed_camera(camera, best[0])
 
 
-def _matched(capture: Capture, train: Sequence[int], config: FitConfig, extent: float) -> tuple[np.ndarray, int]:
-    """Return the changes [V, 11] by bundle adjustment, and the number of its points; no change without enough."""
+def _matched(capture: Capture, train: Sequence[int], deviations: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
+    """Return the changes [V, 11] by bundle adjustment, the number of its points, and the likely deviations [11].
+
+    Without enough points, there are no changes, and the deviations are those of the priors.
+    """
     recorded = capture.at_recorded_size()
     images, cameras = next(recorded.partial_frames(0, 1)).images, [recorded.cameras[v] for v in train]
     features = [detect(images[v], recorded.masks[v]) for v in train]
     tracks = join_matches(match_views(features, cameras), features)
     if np.bincount(tracks.views, minlength=len(train)).min() < _MIN_TRACKS:
-        return np.zeros((len(train), CHANGES)), 0
-    return bundle_adjust(cameras, tracks, extent, config.refinement.priors)[0], tracks.count
+        return np.zeros((len(train), CHANGES)), 0, deviations
+    deviations = likely_deviations(cameras, tracks, deviations)
+    return bundle_adjust(cameras, tracks, deviations)[0], tracks.count, deviations
 
 
 def _changed(views: Sequence[View], changes: np.ndarray) -> list[View]:

@@ -5,7 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.calibration.bundle import bundle_adjust, camera_jacobian, changed_camera, distorted, undistorted
+from morgs_mi.calibration.bundle import (
+    bundle_adjust,
+    camera_jacobian,
+    changed_camera,
+    distorted,
+    likely_deviations,
+    prior_deviations,
+    undistorted,
+)
 from morgs_mi.capture.features import Tracks, intersect
 from morgs_mi.fit.config import CameraPriors
 from morgs_mi.fit.initialise import scene_extent
@@ -24,6 +32,10 @@ def seen_by(cameras, points=POINTS) -> Tracks:
     views, ids = (grid.ravel() for grid in np.mgrid[: len(cameras), : len(points)])
     pixels = np.concatenate([camera.project(points)[0] for camera in cameras])
     return Tracks(ids, views, pixels, np.zeros((len(ids), 3)))
+
+
+def priors_of(cameras) -> np.ndarray:
+    return prior_deviations(scene_extent(cameras), CameraPriors())
 
 
 def disturbed(cameras, rng):
@@ -60,7 +72,7 @@ def test_bundle_adjust__finds_the_distortion_of_each_camera():
     for v, (camera, k) in enumerate(zip(true, terms, strict=True)):
         here = tracks.views == v
         tracks.pixels[here] = distorted(camera, tracks.pixels[here], k)
-    changes, _ = bundle_adjust(true, tracks, scene_extent(true), CameraPriors())
+    changes, _ = bundle_adjust(true, tracks, priors_of(true))
     for camera, change, k in zip(true, changes, terms, strict=True):
         corner = np.array([[0.0, 0.0]])
         shifts = [distorted(camera, corner, terms) - corner for terms in (change[9:], k)]
@@ -72,7 +84,7 @@ def test_bundle_adjust__finds_the_reprojections_despite_wrong_matches():
     tracks, given = seen_by(true), disturbed(true, rng)
     wrong = rng.random(len(tracks.ids)) < 0.1
     tracks.pixels[wrong] += rng.normal(scale=30, size=(wrong.sum(), 2))
-    changes, points = bundle_adjust(given, tracks, scene_extent(given), CameraPriors())
+    changes, points = bundle_adjust(given, tracks, priors_of(given))
     found = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
     projected = np.concatenate([camera.project(points)[0] for camera in found])
     assert np.median(np.linalg.norm(projected - tracks.pixels, axis=1)[~wrong]) < 0.02
@@ -82,7 +94,7 @@ def test_bundle_adjust__finds_the_reprojections_despite_wrong_matches():
 
 def test_bundle_adjust__leaves_cameras_that_fit():
     true = rig()
-    changes, _ = bundle_adjust(true, seen_by(true), scene_extent(true), CameraPriors())
+    changes, _ = bundle_adjust(true, seen_by(true), priors_of(true))
     assert np.abs(changes).max() < 1e-6
 
 
@@ -94,7 +106,7 @@ def test_bundle_adjust__keeps_points_in_place_for_a_camera_that_takes_no_part(se
     tracks = seen_by(given, points)
     tracks.pixels[:] += rng.normal(scale=0.3, size=tracks.pixels.shape)
     before = intersect(tracks.ids, tracks.views, tracks.pixels, given, tracks.count)
-    _, after = bundle_adjust(given, tracks, scene_extent(given), CameraPriors())
+    _, after = bundle_adjust(given, tracks, priors_of(given))
     shifts = [unseen.project(found)[0] - unseen.project(points)[0] for found in (before, after)]
     errors = [np.median(np.linalg.norm(shift, axis=1)) for shift in shifts]
     assert errors[1] < errors[0] + 0.03
@@ -102,6 +114,14 @@ def test_bundle_adjust__keeps_points_in_place_for_a_camera_that_takes_no_part(se
 
 def test_bundle_adjust__changes_focal_lengths_by_zero_on_average():
     given = disturbed(rig(shift=7), np.random.default_rng(1))
-    changes, _ = bundle_adjust(given, seen_by(rig(shift=7)), scene_extent(given), CameraPriors())
+    changes, _ = bundle_adjust(given, seen_by(rig(shift=7)), priors_of(given))
     assert np.abs(changes[:, 6]).max() > 1e-3
     assert abs(changes[:, 6].mean()) < 1e-6
+
+
+@pytest.mark.parametrize(("noise", "most"), [(0.0, 0.05), (0.3, 0.3), (3.0, 1.0)])
+def test_likely_deviations__are_small_where_features_reproject_well(noise, most):
+    tracks = seen_by(rig())
+    tracks.pixels[:] += np.random.default_rng(0).normal(scale=noise, size=tracks.pixels.shape)
+    shares = likely_deviations(rig(), tracks, priors_of(rig())) / priors_of(rig())
+    assert 0.4 * most < shares.max() <= most

@@ -13,15 +13,13 @@ from morgs_mi.calibration.refine import (
     _joint_step,
     _matched,
     _moved,
-    _problem,
-    _short,
     refine_cameras,
     register_camera,
 )
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.fit.config import CameraPriors, FitConfig, RefinementConfig
-from morgs_mi.fit.first_frame import fit_first_frame
+from morgs_mi.fit.initialise import scene_extent
 from morgs_mi.fit.view import View, rendered
 from morgs_mi.playback.visualise import to_uint8, write_png
 from morgs_mi.recorder import with_points
@@ -88,19 +86,17 @@ def far_capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
     return load_capture(path, test_view=4)
 
 
-def held_out_psnr(capture: Capture, seed: int) -> float:
-    """Return the PSNR of the held-out view in a short fit, dB."""
-    images, config = next(capture.frames(0, 1)).images, FitConfig(refinement=SHORT)
-    views = [View(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]
-    assert capture.test_view is not None
-    view = views.pop(capture.test_view)
-    problem = _problem(views, (capture.points, capture.point_colors), config, REPRODUCIBLE, seed)
-    found = fit_first_frame(problem, _short(config), np.random.default_rng(seed)).gaussians
-    return replace(problem, views=(view,)).psnr(found)
+def shift_of_splats(capture: Capture, true: Capture) -> float:
+    """Return how far the training cameras show the splats from where the true ones do, px, median."""
+    means = np.asarray(true.points, float)
+    pairs = [(capture.cameras[v], true.cameras[v]) for v in true.train_views]
+    return float(np.median([np.linalg.norm(a.project(means)[0] - b.project(means)[0], axis=1) for a, b in pairs]))
 
 
-@pytest.mark.parametrize(("scale", "seed", "gain"), [(0.0, 3, -0.25), (1.0, 1, 0.4)])
-def test_refine_cameras__keeps_what_a_camera_that_takes_no_part_sees(far_capture, scale, seed, gain):
+@pytest.mark.parametrize(("scale", "most"), [(0.0, 0.35), (1.0, 0.35)])
+@pytest.mark.parametrize("seed", [1, 3])
+def test_refine_cameras__stays_in_the_frame_of_what_takes_no_part(far_capture, scale, most, seed):
+    """Noise alone moves correct cameras by 0.2 to 0.3 px; disturbed ones show the splats 0.6 to 0.8 px off."""
     deviations = scale * np.array([0.005] * 3 + [0.006] * 3 + [0.008, 0, 0, 0, 0])
     errors = deviations * np.random.default_rng(seed).normal(size=(9, 11))
     errors[far_capture.test_view] = 0
@@ -108,13 +104,14 @@ def test_refine_cameras__keeps_what_a_camera_that_takes_no_part_sees(far_capture
     capture = replace(far_capture, cameras=tuple(cameras))
     config = FitConfig(refine_cameras="on", refinement=replace(SHORT, steps=100))
     refined, _ = refine_cameras(capture, config, REPRODUCIBLE, seed)
-    assert held_out_psnr(refined, seed) > held_out_psnr(capture, seed) + gain
+    before, after = (shift_of_splats(each, far_capture) for each in (capture, refined))
+    assert after < max(most, 0.9 * before)
 
 
 def test_joint_step__turns_cameras_to_where_the_images_were_taken():
     given, gaussians, changes = disturbed(CAMERAS), splats(), np.zeros((4, 11))
     views = [View(camera, image_of(true)) for camera, true in zip(given, CAMERAS, strict=True)]
-    deviations = np.stack([prior_deviations(camera, 1.0, CameraPriors()) for camera in given])
+    deviations = prior_deviations(1.0, CameraPriors())
     for _ in range(8):
         gaussians, changes = _joint_step(gaussians, views, changes, deviations, 1.0, 0.0, RenderConfig())
     found = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
@@ -186,7 +183,7 @@ def test_matched__finds_the_cameras_by_features(textured_capture, monkeypatch):
     monkeypatch.setattr("morgs_mi.capture.features._MAX_FEATURES", 300)
     capture = replace(textured_capture, cameras=tuple(disturbed(textured_capture.cameras)))
     given, true = ([c.cameras[v] for v in capture.train_views] for c in (capture, textured_capture))
-    changes, tracks = _matched(capture, capture.train_views, LEAST, scene_extent(given))
+    changes, tracks, _ = _matched(capture, capture.train_views, prior_deviations(scene_extent(given), CameraPriors()))
     found = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
     errors = [np.abs(relative_turns(rig) - relative_turns(true)).max() for rig in (given, found)]
     assert tracks > 100
@@ -198,7 +195,7 @@ def test_matched__finds_the_distortion_that_is_left(textured_capture, monkeypatc
     terms = [(0.08 * (-1) ** v, 0.0) for v in range(len(textured_capture.cameras))]
     bent = textured_capture.with_cameras(textured_capture.cameras, terms)
     cameras = [bent.cameras[v] for v in bent.train_views]
-    changes, _ = _matched(bent, bent.train_views, LEAST, scene_extent(cameras))
+    changes, *_ = _matched(bent, bent.train_views, prior_deviations(scene_extent(cameras), CameraPriors()))
     # Images that were undistorted without need have the opposite distortion.
     assert_close(changes[:, 9], [-terms[v][0] for v in bent.train_views], atol=0.03)
 
