@@ -58,7 +58,7 @@ class LaterFrame:
     """Result of fitting one later frame.
 
     Attributes:
-        gaussians: M Gaussians, with the flow-guided `motion` and the learned `offset` that moved them.
+        gaussians: M Gaussians, with the `motion` that moved them and the learned `offset` that is part of it.
         source: int [M], index of each Gaussian in the previous frame, ascending; -1 for births, which come last.
         losses: means over the last epoch, by the names of the terms.
         epochs: number of epochs that were run.

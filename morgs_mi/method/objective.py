@@ -148,8 +148,8 @@ TERMS: tuple[Term, ...] = (
     Term(  # eq. 7
         "flow",
         lambda config: config.flow_weight,
-        lambda p, o, config: flow_loss(p.image.motion, o["motion"], o["reliable"], p.num_pixels),
-        channels=("motion",),
+        lambda p, o, config: flow_loss(p.image["guided_motion"], o["motion"], o["reliable"], p.num_pixels),
+        channels=("guided_motion",),
         observations=("motion", "reliable"),
     ),
     Term(  # eq. 11

@@ -73,7 +73,9 @@ def residual_parameters(previous: Gaussians, config: MotionConfig, start: Lift |
 
 
 def apply_residual(previous: Gaussians, parameters: Mapping[str, Tensor], config: MotionConfig) -> Gaussians:
-    """Return A_{t-1} + m R_t (eq. 12); its `motion` and `offset` are the gated displacements of the means (eq. 8).
+    """Return A_{t-1} + m R_t (eq. 12); its `motion` is the displacement of the means.
+
+    The displacement is the sum of the flow-guided motion and the learned offset (eq. 8), which is `offset`.
 
     Args:
         previous: N Gaussians of the previous frame.
@@ -100,5 +102,6 @@ def apply_residual(previous: Gaussians, parameters: Mapping[str, Tensor], config
     known = previous.parameters()
     others = [name for name in parameters if name in known and name not in ("motion", "offset", "logit_confidence")]
     updated = {name: known[name] + gated(name) for name in others}
-    updated |= {"means": known["means"] + (motion + offset), "motion": motion, "offset": offset}
+    displacement = motion + offset
+    updated |= {"means": known["means"] + displacement, "motion": displacement, "offset": offset}
     return previous.with_parameters(updated if logit is None else {**updated, "logit_confidence": logit})

@@ -1,7 +1,7 @@
 """The renderer's channels.
 
-`color`, `depth` and `motion` have a rule of their own. Every attribute with a `channel` in the table of attributes is a
-further channel, blended like a colour. `alpha` is blended with every call that needs it.
+`color`, `depth`, `motion` and `guided_motion` have a rule of their own. Every attribute with a `channel` in the table
+of attributes is a further channel, blended like a colour. `alpha` is blended with every call that needs it.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from morgs_mi.core.attributes import BY_ACTIVATED_NAME, Attribute
 
 __all__ = ["NORMALISED", "attribute_channels", "channel_sizes", "exr_names"]
 
-_OWN_RULE = {"color": 3, "depth": 1, "motion": 2}
+_OWN_RULE = {"color": 3, "depth": 1, "motion": 2, "guided_motion": 2}
 
-NORMALISED = ("depth", "motion")
+NORMALISED = ("depth", "motion", "guided_motion")
 """Channels that are divided by alpha: expected values, not sums."""
 
 

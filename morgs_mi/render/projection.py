@@ -135,7 +135,7 @@ def project(
     if (camera.delay or camera.readout) and gaussians.motion is not None:
         _, y, z = _transformed(world, pose)
         delay = _delays(dr.fma(fy, y / dr.maximum(z, near), cy), camera)
-        world = [v + mi.Float64(delay * d) for v, d in zip(world, _displacement(gaussians, rows), strict=True)]
+        world = [v + mi.Float64(delay * d) for v, d in zip(world, gaussians.rows("motion", rows), strict=True)]
     x, y, z = _transformed(world, pose)
     probe = dr.detach(x + y + z)
     front = dr.detach((z >= near) & (dr.maximum(dr.maximum(dr.abs(x), dr.abs(y)), z) < FARTHEST))
@@ -164,8 +164,9 @@ def project(
             blended[name] = _colors(direction, gaussians.rows("sh_coeffs", rows))
         elif name == "depth":
             blended[name] = (z,)
-        elif name == "motion":
-            blended[name] = _screen_motion(gaussians.rows("motion", rows), x * rz, y * rz, fx * rz, fy * rz, R)
+        elif name in ("motion", "guided_motion"):
+            motion = gaussians.rows("motion", rows) if name == "motion" else _guided_motion(gaussians, rows)
+            blended[name] = _screen_motion(motion, x * rz, y * rz, fx * rz, fy * rz, R)
         elif name == "features":
             blended[name] = tuple(tensor_rows(features, rows))
         elif name in attributes:
@@ -188,12 +189,12 @@ def _transformed(world: list[Float], pose: list[list[Float]]) -> tuple[Float, Fl
     return x, y, z
 
 
-def _displacement(gaussians: ActivatedGaussians, rows: UInt32) -> list[Float]:
-    """Return the displacement of Gaussians from frame to frame: their motion, with the learned offset."""
+def _guided_motion(gaussians: ActivatedGaussians, rows: UInt32) -> list[Float]:
+    """Return the part of the motion of Gaussians that flow guides: without the learned offset (eq. 8)."""
     motion = gaussians.rows("motion", rows)
     if getattr(gaussians, "offset", None) is None:
         return motion
-    return [a + b for a, b in zip(motion, gaussians.rows("offset", rows), strict=True)]
+    return [a - b for a, b in zip(motion, gaussians.rows("offset", rows), strict=True)]
 
 
 def _delays(row: Float, camera: Camera) -> Float:

@@ -106,9 +106,9 @@ def rasterize(
     Args:
         gaussians: N Gaussians, usually a `Gaussians`, or any object with its activated attributes.
         camera: the view.
-        channels: out of ``color``, ``alpha``, ``depth``, ``motion``, and the channels of the table of attributes
-            (``confidence``). Colour and the channels of attributes are sums weighted by T alpha; depth and motion are
-            divided by the sum of those weights.
+        channels: out of ``color``, ``alpha``, ``depth``, ``motion``, ``guided_motion`` (motion without the learned
+            offset), and the channels of the table of attributes (``confidence``). Colour and the channels of attributes
+            are sums weighted by T alpha; depth and motion are divided by the sum of those weights.
         background: display-referred colour [3] behind all Gaussians; None: black.
         detach_weights: channels whose gradient reaches only the blended values, not opacity and geometry.
         region: the blocks of pixels to draw; None: the whole view. Gaussians that touch none of its blocks are only
@@ -309,14 +309,15 @@ def _check(
             f"got {mi.variant()!r}; call mi.set_variant() first."
         )
     attributes = attribute_channels()
-    known = ("color", "alpha", "depth", "motion", *attributes)
+    known = ("color", "alpha", "depth", "motion", "guided_motion", *attributes)
     for name in (*channels, *detach_weights):
         if name not in known and not (name == "features" and name not in channels):
             raise ValueError(
                 f"rasterize(): `channels` must be out of {', '.join(known)}, got {name!r}; use one of these, or pass "
                 "other values as `features`."
             )
-    for name, attribute in {"motion": BY_ACTIVATED_NAME["motion"], **attributes}.items():
+    motions = dict.fromkeys(("motion", "guided_motion"), BY_ACTIVATED_NAME["motion"])
+    for name, attribute in {**motions, **attributes}.items():
         if name in channels and getattr(gaussians, attribute.activated_name, None) is None:
             raise ValueError(
                 f"rasterize(): channel {name!r} requires Gaussians with `{attribute.name}`, got none; set it or remove "

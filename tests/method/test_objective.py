@@ -54,7 +54,7 @@ def test_observe__follows_the_modules(motion, mask, expected):
 def test_channels_of__are_those_of_the_terms_that_act():
     everything = {"motion": 0, "reliable": 0, "mask": 0}
     assert channels_of({}, ObjectiveConfig()) == ("color",)
-    assert channels_of(everything, ObjectiveConfig()) == ("color", "motion", "confidence")
+    assert channels_of(everything, ObjectiveConfig()) == ("color", "guided_motion", "confidence")
     assert channels_of(everything, ObjectiveConfig(flow_weight=0)) == ("color", "confidence")
 
 
@@ -66,12 +66,13 @@ def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
         dr.enable_grad(values)
         return values
 
-    image = Image(color=tensor(H, W, 3), motion=tensor(H, W, 2), confidence=tensor(H, W, 1))
+    guided = {"guided_motion": tensor(H, W, 2)}
+    image = Image(color=tensor(H, W, 3), confidence=tensor(H, W, 1), others=guided)
     before, moved = (
         to_gaussians(make_scene()),
         replace(to_gaussians(make_scene()), means=tensor(10, 3), quats=tensor(10, 4)),
     )
-    inputs = {"recon": image.color, "flow": image.motion, "mask": image.confidence, "offset": tensor(5, 3)}
+    inputs = {"recon": image.color, "flow": image["guided_motion"], "mask": image.confidence, "offset": tensor(5, 3)}
     inputs |= {"rigid": moved.means, "rotation": moved.quats, "isometry": moved.means, "gates": tensor(10)}
     assert list(inputs) == NAMES, "a new term needs an input here"
     prediction = Prediction(

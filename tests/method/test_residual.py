@@ -44,9 +44,10 @@ def test_apply_residual__gate_scales_every_attribute(degree, two_gates):
     m = 1 / (1 + np.exp(-np.asarray(parameters["logit_confidence"], np.float64)))
     current, before = apply_residual(previous, parameters, config).numpy(), previous.numpy()
     R = {name: np.asarray(value) for name, value in parameters.items()}
-    for name in ("motion", "offset"):
-        assert_close(current[name], m[:, None] * R[name], atol=1e-6)
-    assert_close(current["means"] - before["means"], m[:, None] * (R["motion"] + R["offset"]), atol=1e-6)
+    displacement = m[:, None] * (R["motion"] + R["offset"])
+    assert_close(current["motion"], displacement, atol=1e-6)
+    assert_close(current["offset"], m[:, None] * R["offset"], atol=1e-6)
+    assert_close(current["means"] - before["means"], displacement, atol=1e-6)
     assert_close(current["quats"] - before["quats"], m[:, None] * R["quats"], atol=1e-6)
     change = current["sh_coeffs"] - before["sh_coeffs"]
     m = np.ones_like(m) if two_gates else m
