@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import exp
 
 import numpy as np
 
@@ -26,7 +27,21 @@ from morgs_mi.fit.forecast import angles_to, forecast, scene_depths, verdict
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import decibels
 
-__all__ = ["CrossValidation", "Trial", "candidates_of", "cross_validate", "trial_steps", "withheld_views"]
+__all__ = [
+    "CrossValidation",
+    "Trial",
+    "candidates_of",
+    "cross_validate",
+    "excess_share",
+    "trial_steps",
+    "withheld_views",
+]
+
+# Angle in degrees at which the excess of error ends, and power of the angle, times the number of views, with which it
+# grows in trials with few views.
+_FAR, _POWER = 20.0, 6.0
+# Number of cameras from which one is hardly missed, and the error of the estimate with fewer, dB.
+_CERTAIN, _UNCERTAINTY = 6, 4
 
 
 @dataclass(frozen=True)
@@ -50,6 +65,7 @@ class CrossValidation:
 
     Attributes:
         withheld: names of the withheld views.
+        cameras: number of cameras, with the withheld ones.
         spacing: mean angle from a camera to its nearest one, as seen from what they look at, in degrees.
         withheld_angle: mean angle from a withheld view to the nearest of the others, in degrees.
         trials: the fits, by rising probability of dropping.
@@ -57,6 +73,7 @@ class CrossValidation:
     """
 
     withheld: tuple[str, ...]
+    cameras: int
     spacing: float
     withheld_angle: float
     trials: tuple[Trial, ...]
@@ -79,7 +96,7 @@ class CrossValidation:
         withheld, trained, own = (
             10 ** (-psnr / 10) for psnr in (best.withheld_psnr, best.training_psnr, training_psnr)
         )
-        share = excess_share(0.5 * self.spacing, self.withheld_angle)
+        share = excess_share(0.5 * self.spacing, self.withheld_angle, self.cameras - len(self.withheld))
         return float(decibels(np.array(share * max(withheld - trained, 0.0) + own)))
 
     @property
@@ -88,17 +105,26 @@ class CrossValidation:
         training_psnr = self.training_psnr or self.best.training_psnr
         them = "them" if len(self.withheld) > 1 else "it"
         source = f"estimated from {', '.join(self.withheld)} in a trial without {them}"
+        if self.cameras < _CERTAIN:
+            source = f"give or take {_UNCERTAINTY} dB, {source}"
         return verdict(self.expected_psnr, training_psnr, self.spacing, source)
 
 
-def excess_share(angle: float, withheld_angle: float) -> float:
-    """Return the excess of error at an angle to the nearest training view, relative to that at another angle.
+def excess_share(angle: float, withheld_angle: float, trained: int) -> float:
+    """Return the excess of error at an angle to the nearest view, relative to that of withheld views.
+
+    The excess grows in proportion to the angle and ends at about 20 degrees, where neighbours show something else. Few
+    views lose more with the withheld one: its excess is larger then, by a power of the angle (measured, see
+    `docs/experiments/first-frame.md`).
 
     Args:
         angle: in degrees, at most `withheld_angle` counts.
-        withheld_angle: in degrees.
+        withheld_angle: of the withheld views, in degrees.
+        trained: number of views that were not withheld.
     """
-    return min(angle, withheld_angle) / max(withheld_angle, 1e-6)
+    power = max(1.0, _POWER / trained)
+    near, far = (1 - exp(-((max(x, 1e-6) / _FAR) ** power)) for x in (min(angle, withheld_angle), withheld_angle))
+    return near / far
 
 
 def cross_validate(
@@ -130,7 +156,7 @@ def cross_validate(
     depths, others = scene_depths(cameras, points), [cameras[view] for view in kept]
     angle = float(np.mean([angles_to(cameras[view], depths[view], others).min() for view in withheld]))
     names = tuple(cameras[view].name for view in withheld)
-    return CrossValidation(names, forecast(cameras, points).spacing, angle, tuple(trials))
+    return CrossValidation(names, len(cameras), forecast(cameras, points).spacing, angle, tuple(trials))
 
 
 def candidates_of(problem: FirstFrameProblem, config: FitConfig) -> tuple[float, ...]:

@@ -14,6 +14,7 @@ from morgs_mi.fit.cross_validation import (
     CrossValidation,
     Trial,
     cross_validate,
+    excess_share,
     trial_steps,
     withheld_views,
 )
@@ -109,7 +110,7 @@ def test_cross_validate__judges_reduced_images_with_their_masks():
 )
 def test_sentence__follows_from_the_figure_and_the_angle(withheld, training, spacing, quality):
     trials = Trial(0.0, withheld - 1, 36.0), Trial(0.2, withheld, training)
-    found = CrossValidation(("cam03",), spacing, 0.5 * spacing, trials)
+    found = CrossValidation(("cam03",), 8, spacing, 0.5 * spacing, trials)
     assert found.sentence == (
         f"Views between the cameras will be {quality}: about {withheld:.0f} dB, estimated from cam03 in a trial "
         f"without it, {training - withheld:.0f} dB below the training views; the cameras are {spacing:.0f} degrees "
@@ -117,15 +118,32 @@ def test_sentence__follows_from_the_figure_and_the_angle(withheld, training, spa
     )
 
 
+def test_sentence__names_the_uncertainty_of_few_views():
+    few = CrossValidation(("cam03",), 4, 8.0, 8.0, (Trial(0.0, 30.0, 33.0),))
+    assert "dB, give or take 4 dB, estimated from cam03 in a trial without it" in few.sentence
+
+
 def test_expected_psnr__adds_the_excess_of_withheld_views_to_the_error_of_the_first_frame():
     # An excess of 1e-3 - 0.4e-3 at 9 degrees.
     trials = (Trial(0.0, 30.0, 33.9794),)
-    assert CrossValidation(("cam03",), 18.0, 9.0, trials).expected_psnr == pytest.approx(30, abs=1e-3)
-    found = CrossValidation(("cam03",), 18.0, 9.0, trials, training_psnr=36.9897)
+    assert CrossValidation(("cam03",), 8, 18.0, 9.0, trials).expected_psnr == pytest.approx(30, abs=1e-3)
+    found = CrossValidation(("cam03",), 8, 18.0, 9.0, trials, training_psnr=36.9897)
     assert found.expected_psnr == pytest.approx(-10 * np.log10(0.6e-3 + 0.2e-3), abs=1e-3)
-    found = CrossValidation(("cam03",), 6.0, 9.0, trials, training_psnr=36.9897)
-    assert found.expected_psnr == pytest.approx(-10 * np.log10(0.2e-3 + 0.2e-3), abs=1e-3)
-    assert CrossValidation(("cam03",), 0.0, 0.0, trials).expected_psnr > 30
+    found = CrossValidation(("cam03",), 8, 6.0, 9.0, trials, training_psnr=36.9897)
+    share = (1 - np.exp(-3 / 20)) / (1 - np.exp(-9 / 20))
+    assert found.expected_psnr == pytest.approx(-10 * np.log10(share * 0.6e-3 + 0.2e-3), abs=1e-3)
+    assert CrossValidation(("cam03",), 8, 0.0, 0.0, trials).expected_psnr > 29.9
+
+
+@pytest.mark.parametrize(("trained", "power"), [(2, 3), (3, 2), (6, 1), (12, 1)])
+def test_excess_share__grows_by_a_power_of_the_angle_with_few_views(trained: int, power: int):
+    assert excess_share(0.4, 0.8, trained) == pytest.approx(0.5**power, rel=0.03)
+    assert excess_share(7.0, 7.0, trained) == excess_share(9.0, 7.0, trained) == 1
+
+
+def test_excess_share__ends_where_neighbours_show_something_else():
+    assert excess_share(40.0, 80.0, 2) > 0.99
+    assert excess_share(40.0, 80.0, 7) > 0.85
 
 
 @pytest.mark.parametrize(
