@@ -26,7 +26,7 @@ from morgs_mi.core.types import Tensor
 from morgs_mi.fit.config import ConvergenceConfig, FitConfig
 from morgs_mi.fit.density import plan_growth, resize_optimizer
 from morgs_mi.fit.dropping import dropped
-from morgs_mi.fit.optimise import adam, optimise, replace_parameter, values_of, view_order
+from morgs_mi.fit.optimise import Steps, adam, optimise, replace_parameter, values_of, view_order
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.losses.attribution import densification_scores
 from morgs_mi.losses.losses import mask_loss, recon_loss
@@ -119,17 +119,14 @@ class _Fit:
     def run(self, views: Iterable[int], first: int, steps: int) -> dict[str, float]:
         """Make the steps of some views, from step `first` of `steps`, and return the losses by name."""
         progress = self._progress
-        return optimise(
-            self._optimizer,
-            self._rates,
+        stretch = Steps(
             views,
-            self._losses_at,
-            {},
-            lambda step: self._config.final_rate ** (step / steps),
-            None if progress is None else lambda done: progress(done, steps),
             first,
-            max(_LEAST, _PASSES * len(self._views)),
+            decay=lambda step: self._config.final_rate ** (step / steps),
+            on_step=None if progress is None else lambda done: progress(done, steps),
+            last=max(_LEAST, _PASSES * len(self._views)),
         )
+        return optimise(self._optimizer, self._rates, self._losses_at, stretch)
 
     def _losses_at(self, values: Mapping[str, Tensor], view: int) -> dict[str, Tensor]:
         drawn = dropped(self._base.with_parameters(values), self._config.dropping or 0.0, self._rng)
@@ -212,5 +209,5 @@ def fit_confidence(
     rates = {"logit_confidence": config.first_frame_rates.confidence}
     order = view_order(len(views), config.confidence_steps, rng)
     optimizer = adam({"logit_confidence": gaussians.logit_confidence})
-    losses = optimise(optimizer, rates, order, losses_at, {})
+    losses = optimise(optimizer, rates, losses_at, Steps(order))
     return replace(gaussians, **values_of(optimizer)), losses

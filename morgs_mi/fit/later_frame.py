@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -17,7 +16,7 @@ from morgs_mi.core.types import Tensor
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.density import apply_plan, plan_additions, resize_optimizer
 from morgs_mi.fit.motion_stage import fit_motion, motion_model
-from morgs_mi.fit.optimise import adam, optimise, values_of, view_order
+from morgs_mi.fit.optimise import Steps, adam, optimise, values_of, view_order
 from morgs_mi.losses.attribution import densification_scores
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet, with_zero_motion
@@ -87,54 +86,118 @@ def fit_later_frame(
         progress: of the steps.
     """
     previous, active = problem.previous, problem.active
-    views = sorted(active.views)
-    if not views or not len(active.indices):
+    if not active.views or not len(active.indices):
         return LaterFrame(with_zero_motion(previous), np.arange(len(previous)), {}, 0)
-    base, source = active.select(previous), np.arange(len(active.indices))
-    losses_at = partial(_losses_at, problem, _on_active_views(problem), config, motion)
-    order = [views[k] for k in view_order(len(views), config.epochs * len(views), rng)]
-    tick = None if progress is None else lambda done: progress(done, len(order))
+    fit = _Fit(problem, config, motion, rng, progress)
     density_epoch = round(config.density.later_round * config.epochs)
-    start, losses, first_epoch = problem.start, {}, 0
-    if (model := motion_model(base, problem.extent, motion, rng)) is not None:
-        first_epoch = max(1, round(motion.model_share * config.epochs))
-        how = order[: first_epoch * len(views)], config.objective.dssim_weight, tick
-        start, losses = fit_motion(base, model, start, active.views, problem.targets, *how)
-    optimizer, done = adam(residual_parameters(base, motion, start)), first_epoch * len(views)
-    neighbours = _neighbours(base, problem, config)
-    for epoch in range(first_epoch, config.epochs):
+    for epoch in range(fit.start(), config.epochs):
         if epoch == density_epoch and config.density.later_frames:
-            now = _current(base, optimizer, motion)
-            scores = densification_scores(
-                now, *_spread(problem, config.density.later_views), config.density.noise_tolerance
-            )
-            plan = plan_additions(now, scores, config.density, rng, len(previous) - len(active.indices))
-            # A birth starts from its parent's past and shares its residual, so that its motion is the parent's.
-            base, source = apply_plan(base, plan), plan.source
-            neighbours = _neighbours(base, problem, config)
-            resize_optimizer(optimizer, plan)
-        last_recon = losses.get("recon", np.inf)
-        losses = optimise(
-            optimizer,
-            {**config.rates_at(epoch).by_parameter(problem.extent), "logit_gate": motion.gates.rate},
-            order[done : done + len(views)],
-            partial(losses_at, base, neighbours),
-            weights_of(config.objective),
-            on_step=tick,
-            first_step=done,
-            last=len(views),
-        )
-        done += len(views)
-        tolerance = config.early_stopping_tolerance
-        if tolerance and epoch >= density_epoch and losses["recon"] > (1 - tolerance) * last_recon:
+            fit.densify()
+        fit.run_epoch(epoch)
+        if epoch >= density_epoch and fit.has_converged:
             break
-    gaussians, source = _merge(previous, active, _current(base, optimizer, motion), source)
-    return LaterFrame(gaussians, source, losses, done // len(views))
+    gaussians, source = _merge(previous, active, fit.gaussians, fit.source)
+    return LaterFrame(gaussians, source, fit.losses, fit.steps // len(active.views))
 
 
-def _current(base: Gaussians, optimizer: Mapping[str, Tensor], motion: MotionConfig) -> Gaussians:
-    with dr.suspend_grad():
-        return apply_residual(base, values_of(optimizer), motion)
+class _Fit:
+    """Optimiser of a later frame's residual: the stage of a motion model, epochs, and a round of density control.
+
+    Attributes:
+        source: as in `LaterFrame`, among the active Gaussians.
+        losses: means over the last epoch, by name.
+        steps: number of steps that were made.
+    """
+
+    def __init__(
+        self,
+        problem: FrameProblem,
+        config: FitConfig,
+        motion: MotionConfig,
+        rng: np.random.Generator,
+        progress: Progress | None,
+    ) -> None:
+        self._problem, self._config, self._motion, self._rng, self._progress = problem, config, motion, rng, progress
+        self._views = sorted(problem.active.views)
+        count = len(self._views)
+        self._order = [self._views[k] for k in view_order(count, config.epochs * count, rng)]
+        self._observations = _on_active_views(problem)
+        self._base, self.source = problem.active.select(problem.previous), np.arange(len(problem.active.indices))
+        self._neighbours = self._found_neighbours()
+        self._last_recon, self.losses, self.steps = np.inf, dict[str, float](), 0
+
+    @property
+    def gaussians(self) -> Gaussians:
+        """The active Gaussians after the residual."""
+        with dr.suspend_grad():
+            return apply_residual(self._base, values_of(self._optimizer), self._motion)
+
+    @property
+    def has_converged(self) -> bool:
+        """Whether L_recon hardly decreased in the last epoch."""
+        tolerance = self._config.early_stopping_tolerance
+        return tolerance > 0 and self.losses["recon"] > (1 - tolerance) * self._last_recon
+
+    def start(self) -> int:
+        """Fit the motion model, if there is one, start the residual, and return the number of epochs that this took."""
+        problem, motion, start, epochs = self._problem, self._motion, self._problem.start, 0
+        model = motion_model(self._base, problem.extent, motion, self._rng)
+        if model is not None:
+            epochs = max(1, round(motion.model_share * self._config.epochs))
+            steps, weight = self._next_steps(epochs), self._config.objective.dssim_weight
+            given = self._base, model, start, problem.active.views, problem.targets
+            start, self.losses = fit_motion(*given, steps.views, weight, steps.on_step)
+        self._optimizer = adam(residual_parameters(self._base, motion, start))
+        return epochs
+
+    def run_epoch(self, epoch: int) -> None:
+        """Make one step in every active view."""
+        self._last_recon = self.losses.get("recon", np.inf)
+        rates = {
+            **self._config.rates_at(epoch).by_parameter(self._problem.extent),
+            "logit_gate": self._motion.gates.rate,
+        }
+        weights = weights_of(self._config.objective)
+        self.losses = optimise(self._optimizer, rates, self._losses_at, self._next_steps(1), weights)
+
+    def densify(self) -> None:
+        """Add and prune active Gaussians by density control."""
+        problem, density = self._problem, self._config.density
+        now, views = self.gaussians, _spread(problem, density.later_views)
+        scores = densification_scores(now, *views, density.noise_tolerance)
+        num_static = len(problem.previous) - len(problem.active.indices)
+        plan = plan_additions(now, scores, density, self._rng, num_static)
+        # A birth starts from its parent's past and shares its residual, so that its motion is the parent's.
+        self._base, self.source = apply_plan(self._base, plan), plan.source
+        self._neighbours = self._found_neighbours()
+        resize_optimizer(self._optimizer, plan)
+
+    def _next_steps(self, epochs: int) -> Steps:
+        """Return the steps of the next epochs."""
+        first, progress, total = self.steps, self._progress, len(self._order)
+        self.steps += epochs * len(self._views)
+        on_step = None if progress is None else lambda done: progress(done, total)
+        return Steps(self._order[first : self.steps], first, on_step=on_step, last=len(self._views))
+
+    def _losses_at(self, parameters: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
+        """Render one view and return its losses by name."""
+        problem, objective = self._problem, self._config.objective
+        view, observed = problem.active.views[index], {**self._observations[index], **self._neighbours}
+        channels = channels_of(observed, objective)
+        detached = [name for name in channels if name != "color"] if objective.detach_weights else ()
+        now = apply_residual(self._base, parameters, self._motion)
+        image = view.render(now, channels, detached)
+        num_pixels, num_gaussians = view.camera.width * view.camera.height, problem.active.num_gaussians
+        prediction = Prediction(image, parameters, view.region, num_pixels, num_gaussians, problem.extent, now)
+        return losses_of(prediction, observed, objective)
+
+    def _found_neighbours(self) -> Observations:
+        """Return the observation of all views that compares neighbours, if a term does."""
+        objective = self._config.objective
+        if not objective.is_rigid:
+            return {}
+        found = find_neighbours(self._base, self._problem.extent, objective.rigidity)
+        return {} if found is None else {"neighbours": found}
 
 
 def _spread(problem: FrameProblem, count: int) -> tuple[list[ActiveView], list[Target]]:
@@ -142,13 +205,6 @@ def _spread(problem: FrameProblem, count: int) -> tuple[list[ActiveView], list[T
     indices = sorted(problem.active.views)
     chosen = choose_key_views([problem.active.views[v].camera for v in indices], count)
     return [problem.active.views[indices[k]] for k in chosen], [problem.targets[indices[k]] for k in chosen]
-
-
-def _neighbours(base: Gaussians, problem: FrameProblem, config: FitConfig) -> Observations:
-    """Return the observation of all views that compares neighbours, if a term does."""
-    objective = config.objective
-    found = find_neighbours(base, problem.extent, objective.rigidity) if objective.is_rigid else None
-    return {} if found is None else {"neighbours": found}
 
 
 def _on_active_views(problem: FrameProblem) -> dict[int, Observations]:
@@ -161,27 +217,6 @@ def _on_active_views(problem: FrameProblem) -> dict[int, Observations]:
 
 def _tensor(array: np.ndarray, view: ActiveView) -> Tensor:
     return from_numpy(mi.TensorXf, view.crop(array))
-
-
-def _losses_at(
-    problem: FrameProblem,
-    observations: Mapping[int, Observations],
-    config: FitConfig,
-    motion: MotionConfig,
-    base: Gaussians,
-    neighbours: Observations,
-    parameters: Mapping[str, Tensor],
-    view_index: int,
-) -> dict[str, Tensor]:
-    """Render one view and return its losses by name."""
-    view, observed = problem.active.views[view_index], {**observations[view_index], **neighbours}
-    channels = channels_of(observed, config.objective)
-    detached = [name for name in channels if name != "color"] if config.objective.detach_weights else ()
-    now = apply_residual(base, parameters, motion)
-    image = view.render(now, channels, detached)
-    num_pixels, num_gaussians = view.camera.width * view.camera.height, problem.active.num_gaussians
-    prediction = Prediction(image, parameters, view.region, num_pixels, num_gaussians, problem.extent, now)
-    return losses_of(prediction, observed, config.objective)
 
 
 def _merge(

@@ -10,7 +10,7 @@ import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.core.types import Tensor
-from morgs_mi.fit.optimise import adam, optimise, values_of
+from morgs_mi.fit.optimise import Steps, adam, optimise, values_of
 from morgs_mi.losses.losses import recon_loss
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.anchors import anchored_motion
@@ -65,16 +65,8 @@ def fit_motion(
 
     optimizer = adam(model.parameters)
     # Adam's steps are as long as the rate; long ones find the motion, short ones settle it.
-    losses = optimise(
-        optimizer,
-        model.rates,
-        order,
-        losses_at,
-        {},
-        decay=lambda step: _FINAL_RATE ** (step / len(order)),
-        on_step=on_step,
-        last=len(views),
-    )
+    steps = Steps(order, decay=lambda step: _FINAL_RATE ** (step / len(order)), on_step=on_step, last=len(views))
+    losses = optimise(optimizer, model.rates, losses_at, steps)
     with dr.suspend_grad():
         displacement, rotation = model.motion(values_of(optimizer))
         change = moved(gaussians, displacement, rotation).quats - gaussians.quats

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -14,7 +15,7 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
 from morgs_mi.render.recording import render_lock
 
-__all__ = ["Losses", "adam", "optimise", "replace_parameter", "values_of", "view_order"]
+__all__ = ["Losses", "Steps", "adam", "optimise", "replace_parameter", "values_of", "view_order"]
 
 Losses = dict[str, Tensor]
 
@@ -48,29 +49,40 @@ def replace_parameter(optimizer: Adam, name: str, value: np.ndarray, carry: Call
     optimizer.state[name] = state
 
 
+@dataclass(frozen=True)
+class Steps:
+    """Steps of an optimisation, one view each.
+
+    Attributes:
+        views: the view of every step.
+        first: number of steps before these.
+        decay: step -> factor on all learning rates; None: 1.
+        on_step: called with the number of steps done.
+        last: number of steps over which the losses are averaged.
+    """
+
+    views: Iterable[int]
+    first: int = 0
+    decay: Callable[[int], float] | None = None
+    on_step: Callable[[int], None] | None = None
+    last: int = 8
+
+
 def optimise(
     optimizer: Adam,
     rates: Mapping[str, float],
-    views: Iterable[int],
     losses_at: Callable[[Mapping[str, Tensor], int], Losses],
-    weights: Mapping[str, float],
-    decay: Callable[[int], float] | None = None,
-    on_step: Callable[[int], None] | None = None,
-    first_step: int = 0,
-    last: int = 8,
+    steps: Steps,
+    weights: Mapping[str, float] | None = None,
 ) -> dict[str, float]:
     """Minimise the weighted sum of losses by one Adam step per view; the optimiser holds the parameters.
 
     Args:
         optimizer: as from `adam`.
         rates: learning rate of each parameter.
-        views: the view of every step.
         losses_at: (parameters, view) -> losses by name; a view may lack some of them.
+        steps: the steps.
         weights: of the losses by name; 1 where not named.
-        decay: step -> factor on all rates; None: 1.
-        on_step: called with the number of steps done.
-        first_step: number of steps before these.
-        last: number of steps over which the returned losses are averaged.
 
     Returns:
         The mean of each loss over the last steps that had it, by name.
@@ -81,10 +93,10 @@ def optimise(
     scale = {name: float(rates[name]) for name in optimizer}
     # As Python numbers: Dr.Jit 1.5 multiplies a rate that is an array in place, once per step.
     optimizer.set_learning_rate(scale)
-    history: dict[str, list[Tensor]] = {}
-    for step, view in enumerate(views, first_step):
-        if decay is not None:
-            factor = decay(step)
+    history, weights = dict[str, list[Tensor]](), weights or {}
+    for step, view in enumerate(steps.views, steps.first):
+        if steps.decay is not None:
+            factor = steps.decay(step)
             optimizer.set_learning_rate({name: factor * rate for name, rate in scale.items()})
         losses = losses_at(optimizer, view)
         total: Tensor = sum(weights.get(name, 1.0) * loss for name, loss in losses.items())
@@ -93,13 +105,15 @@ def optimise(
         optimizer.step()
         for name, loss in losses.items():
             history.setdefault(name, []).append(dr.detach(loss))
-        if on_step is not None:
-            on_step(step + 1)
-    final = {name: float(np.mean([np.asarray(v).item() for v in values[-last:]])) for name, values in history.items()}
+        if steps.on_step is not None:
+            steps.on_step(step + 1)
+    final = {
+        name: float(np.mean([np.asarray(v).item() for v in losses[-steps.last :]])) for name, losses in history.items()
+    }
     broken = [name for name, value in final.items() if not np.isfinite(value)]
     if broken:
         raise FloatingPointError(
-            f"optimise(): the losses {', '.join(broken)} are not finite after {first_step + len(history[broken[0]])} "
+            f"optimise(): the losses {', '.join(broken)} are not finite after {steps.first + len(history[broken[0]])} "
             "steps; lower the learning rates."
         )
     return final

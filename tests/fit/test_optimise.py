@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi.fit.optimise import adam, optimise, replace_parameter, values_of, view_order
+from morgs_mi.fit.optimise import Steps, adam, optimise, replace_parameter, values_of, view_order
 from tests.assertions import assert_close
 
 
@@ -20,11 +20,11 @@ def bowl(values, view):
 def test_optimise__minimises_the_weighted_sum(decay):
     start = {"x": mi.TensorXf(np.zeros(4, np.float32))}
     near = adam(start)
-    losses = optimise(near, {"x": 0.1}, [0] * 200, bowl, {"far": 0.0}, decay)
+    losses = optimise(near, {"x": 0.1}, bowl, Steps([0] * 200, decay=decay), {"far": 0.0})
     assert_close(values_of(near)["x"], np.ones(4), atol=0.02)
     assert losses["far"] == pytest.approx(16, rel=0.05)
     both = adam(start)
-    optimise(both, {"x": 0.1}, [0] * 200, bowl, {}, decay)
+    optimise(both, {"x": 0.1}, bowl, Steps([0] * 200, decay=decay))
     assert_close(values_of(both)["x"], np.full(4, 2.0), atol=0.02)
 
 
@@ -36,14 +36,16 @@ def test_optimise__steps_are_as_long_as_the_rate():
         path.append(np.asarray(dr.detach(values["x"])).item())
         return {"slope": dr.sum(values["x"], axis=None)}
 
-    optimise(adam(start), {"x": 0.5}, [0] * 12, slope, {})
+    optimise(adam(start), {"x": 0.5}, slope, Steps([0] * 12))
     assert_close(np.diff(path), np.full(11, -0.5), rtol=1e-3)
 
 
 def test_optimise__names_losses_that_are_not_finite():
     start = {"x": mi.TensorXf(np.zeros(1, np.float32))}
     with pytest.raises(FloatingPointError, match="recon are not finite after 3 steps"):
-        optimise(adam(start), {"x": 1.0}, [0] * 3, lambda v, _: {"recon": dr.log(dr.sum(v["x"], axis=None) - 100)}, {})
+        optimise(
+            adam(start), {"x": 1.0}, lambda v, _: {"recon": dr.log(dr.sum(v["x"], axis=None) - 100)}, Steps([0] * 3)
+        )
 
 
 def test_optimise__continues_where_it_ended():
@@ -52,7 +54,7 @@ def test_optimise__continues_where_it_ended():
     for stages in ([12], [5, 7]):
         optimizer, step = adam({"x": mi.TensorXf(np.zeros(3, np.float32))}), 0
         for length in stages:
-            optimise(optimizer, {"x": 0.1}, [0] * length, bowl, {}, lambda step: 0.9**step, first_step=step)
+            optimise(optimizer, {"x": 0.1}, bowl, Steps([0] * length, step, lambda step: 0.9**step))
             step += length
         ends.append(np.asarray(values_of(optimizer)["x"]))
     assert np.array_equal(*ends)
@@ -63,11 +65,11 @@ def test_replace_parameter__keeps_moments():
     ends = []
     for widens in (False, True):
         optimizer = adam({"x": mi.TensorXf(np.zeros((2, 1), np.float32))})
-        optimise(optimizer, {"x": 0.1}, [0] * 4, bowl, {})
+        optimise(optimizer, {"x": 0.1}, bowl, Steps([0] * 4))
         if widens:
             value = np.asarray(values_of(optimizer)["x"])
             replace_parameter(optimizer, "x", np.pad(value, [(0, 0), (0, 2)]), lambda m: np.pad(m, [(0, 0), (0, 2)]))
-        optimise(optimizer, {"x": 0.1}, [0] * 4, bowl, {}, first_step=4)
+        optimise(optimizer, {"x": 0.1}, bowl, Steps([0] * 4, 4))
         ends.append(np.asarray(values_of(optimizer)["x"]))
     assert np.array_equal(ends[0][:, 0], ends[1][:, 0])
     assert ends[1].shape == (2, 3)

@@ -12,7 +12,7 @@ PROGRAM = """
 import sys, threading
 import drjit as dr, mitsuba as mi, numpy as np
 from morgs_mi import rasterize, render_lock
-from morgs_mi.fit.optimise import adam, optimise
+from morgs_mi.fit.optimise import Steps, adam, optimise
 mi.set_variant("llvm_ad_rgb")
 from tests.scenes.cameras import make_camera
 from tests.scenes.gaussians import make_scene, to_gaussians
@@ -35,7 +35,7 @@ def losses_at(parameters, view):
 def fit():
     start.wait()
     parameters = gaussians.parameters()
-    optimise(adam(parameters), dict.fromkeys(parameters, 1e-3), range(count), losses_at, {})
+    optimise(adam(parameters), dict.fromkeys(parameters, 1e-3), losses_at, Steps(range(count)))
     finished.append("fit")
 
 def derive():
