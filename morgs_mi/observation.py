@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
@@ -21,10 +22,39 @@ from morgs_mi.method.flow import FlowObservation, choose_key_views, observe_key_
 from morgs_mi.method.flow_sources.registry import FramePair
 from morgs_mi.method.objective import KeyView
 
-__all__ = ["FrameObservation", "Images", "Seen", "Setup", "observe_frame", "prepare", "see_frame"]
+__all__ = ["FrameObservation", "Images", "Recorded", "Seen", "Setup", "observe_frame", "prepare", "see_frame"]
 
 # By view index: the images of those views that have one.
 Images = Mapping[int, np.ndarray]
+
+
+class Recorded(Protocol):
+    """Cameras and points of a recording, as a `Capture` has them."""
+
+    @property
+    def cameras(self) -> Sequence[Camera]:
+        """All cameras."""
+        ...
+
+    @property
+    def masks(self) -> Sequence[np.ndarray | None]:
+        """Per camera [H, W] bool of valid pixels, or None."""
+        ...
+
+    @property
+    def train_views(self) -> Sequence[int]:
+        """Indices of the cameras that are trained on."""
+        ...
+
+    @property
+    def points(self) -> np.ndarray:
+        """Points [P, 3], world units."""
+        ...
+
+    @property
+    def point_colors(self) -> np.ndarray:
+        """Their colours [P, 3] in [0, 1]."""
+        ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -41,7 +41,7 @@ from morgs_mi.method.exposure import Exposure
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.objective import Observations, channels_of, observe
-from morgs_mi.observation import FrameObservation, Images, Seen, Setup, observe_frame, prepare, see_frame
+from morgs_mi.observation import FrameObservation, Images, Recorded, Seen, Setup, observe_frame, prepare, see_frame
 
 __all__ = ["FrameReport", "StreamLoop", "StreamState", "step"]
 
@@ -85,7 +85,7 @@ class FrameReport:
 class StreamState:
     """State that one frame hands to the next.
 
-    It follows from the stream and the recording, so that an interrupted fit can be resumed exactly (see `recorder`).
+    It follows from the stream and the recording, so that an interrupted fit can be resumed exactly (see `recording`).
 
     Attributes:
         frame: index of the next frame.
@@ -305,6 +305,18 @@ class StreamLoop:
         self.setup = prepare(cameras, points, point_colors, config, masks)
         self.state = StreamState()
         self._ahead: tuple[int, Future[FrameObservation]] | None = None  # of the next frame, with its index
+
+    @classmethod
+    def of(cls, capture: Recorded, config: StreamConfig | None = None) -> StreamLoop:
+        """Return the loop of the training views of a capture.
+
+        Args:
+            capture: a `Capture`, or another value with its cameras, masks and points.
+            config: settings.
+        """
+        views = capture.train_views
+        cameras, masks = [capture.cameras[v] for v in views], [capture.masks[v] for v in views]
+        return cls(cameras, capture.points, capture.point_colors, config, masks)
 
     @property
     def gaussians(self) -> Gaussians | None:

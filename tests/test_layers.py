@@ -26,6 +26,7 @@ SUBPACKAGES = (
     "capture",
     "calibration",
     "synth",
+    "recording",
     "recorder",
     "live",
     "importer",

@@ -26,7 +26,8 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.fit.config import RefinementConfig
 from morgs_mi.method.exposure import ExposureConfig
 from morgs_mi.playback.player import open_stream_capture
-from morgs_mi.recorder import _without_folder, as_fitted, stream_capture, stream_metadata, with_next
+from morgs_mi.recorder import stream_capture, with_next
+from morgs_mi.recording import _without_folder, as_fitted, stream_metadata
 from morgs_mi.stream_loop import StreamLoop
 from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
 from tests.scenes.captures import colmap

@@ -104,7 +104,7 @@ def scores(capture: Capture, config: StreamConfig) -> dict[str, float]:
     assert gaussians is not None
     assert test is not None
     view = View(capture.cameras[test], images[test], capture.masks[test])
-    registered = register_camera(gaussians, *view, loop.setup.extent, config.fit, config.render)
+    registered = register_camera(gaussians, view, loop.setup.extent, config.fit, config.render)
     views = {
         "training": [View(capture.cameras[v], images[v], capture.masks[v]) for v in train],
         "calibrated": [view],

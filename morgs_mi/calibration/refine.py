@@ -191,26 +191,18 @@ def refine_cameras(
 
 
 def register_camera(
-    gaussians: Gaussians,
-    camera: Camera,
-    image: np.ndarray,
-    mask: np.ndarray | None,
-    extent: float,
-    config: FitConfig,
-    render: RenderConfig | None = None,
+    gaussians: Gaussians, view: View, extent: float, config: FitConfig, render: RenderConfig | None = None
 ) -> Camera:
     """Return the camera, near the given one, from which frozen Gaussians look most like an image.
 
     Args:
         gaussians: frozen.
-        camera: as calibrated.
-        image: [H, W, 3], uint8.
-        mask: valid pixels [H, W], or None.
+        view: the calibrated camera and its image.
         extent: of the scene, world units.
         config: has the priors of the changes.
         render: cut-offs.
     """
-    render, target = render or RenderConfig(), Target(image, mask)
+    render, camera, target = render or RenderConfig(), view.camera, view.target
     priors = replace(config.refinement.priors, distortion=_NO_DISTORTION)  # the image stays as it is
     deviations, best = prior_deviations(extent, priors), np.zeros((1, CHANGES))
     means = np.asarray(gaussians.means, np.float64)

@@ -15,7 +15,7 @@ from morgs_mi.cli.console import print_result, print_table, print_warning, progr
 from morgs_mi.cli.settings import optional
 from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.evaluate.tables import evaluation_summary, evaluation_tables
-from morgs_mi.recorder import FILES
+from morgs_mi.recording import FILES
 
 __all__ = ["Eval"]
 

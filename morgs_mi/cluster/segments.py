@@ -18,9 +18,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.calibration.refine import Refinement
 from morgs_mi.capture.capture import Capture
-from morgs_mi.capture.outputs import check_output
 from morgs_mi.cluster.executor import Workers, wait_for
 from morgs_mi.cluster.seams import COMMON_FRAMES, SeamConfig, SeamScores, score_seam
 from morgs_mi.cluster.tasks import (
@@ -40,18 +38,21 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import atomic_path, locked_folder, write_json
 from morgs_mi.core.progress import Progress, Report
-from morgs_mi.recorder import (
-    FILES,
-    about_cameras,
+from morgs_mi.recorder import Prepared
+from morgs_mi.recording import (
+    Entry,
+    FitFiles,
+    Interrupted,
+    Recording,
     about_lenses,
     as_fitted,
+    check_outputs,
     check_same_fit,
     described_capture,
-    due_keyframe,
+    interrupted_fit,
     read_reports,
+    restart_of,
     stream_metadata,
-    with_points,
-    with_refined_cameras,
 )
 from morgs_mi.stream_loop import FrameReport
 
@@ -79,8 +80,6 @@ class SegmentedFit:
     workers: Mapping[str, int] = field(default_factory=dict)
 
 
-Entry = tuple[int, int, int]
-"""(kind, frame, offset) of a packet."""
 OnPart = Callable[[Part], None]
 
 
@@ -154,8 +153,7 @@ async def fit_in_segments(
         )
     out, seams = Path(out), seams or SeamConfig()
     starts = _starts(capture.num_frames, segments)
-    for name in FILES:
-        check_output(out / name)
+    check_outputs(out)
     with locked_folder(out, "stream_segments()"):
         run = _Run(capture, out, workers, config, seams, starts, on_stage or (lambda *_: None), on_part)
         return await run.fit(resume)
@@ -192,14 +190,14 @@ class _Run:
         self.metadata = stream_metadata(capture, next(capture.partial_frames(0, 1)), config)
         if len(starts) > 2:
             self.metadata["segments"] = {"starts": list(starts[:-1]), **asdict(seams)}
-        self.refinement: Refinement | None = None
+        self.prepared: Prepared | None = None  # where this run begins the recording
         self.peaks: dict[str, int] = {}
         self.active = 0  # segments whose later frames are being fitted
         self.starting = 0  # segments whose start is fitted, or waits for a worker
 
     async def fit(self, resume: bool) -> SegmentedFit:
         """Fit, or continue, all segments and join them."""
-        with ExitStack() as self.files:
+        with ExitStack() as self.recordings:
             if (reports := await self._fit_all(resume)) is not None:
                 return SegmentedFit(tuple(reports))
         return self._joined(self.out / "stream.morgs")
@@ -217,14 +215,12 @@ class _Run:
         self.segments = [_Segment(self, k) for k in range(len(self.starts) - 1)]
         points = None
         if not self.segments[0].num_fitted:
-            progress = Progress(self.on_stage)
-            capture, self.refinement = with_refined_cameras(
-                with_points(self.capture, self.task.config.seed, progress), self.task.config, progress
-            )
+            self.prepared = Prepared.of(self.capture, self.task.config, Progress(self.on_stage))
+            capture = self.prepared.capture
             points = None if capture is self.capture else (capture.points, capture.point_colors)
             self._use(capture)
         elif self.task.config.fit.refine_cameras != "off":
-            self._use(as_fitted(self.capture, StreamReader(self.segments[0].path)))
+            self._use(as_fitted(self.capture, StreamReader(self.segments[0].files.stream)))
         loop = asyncio.get_running_loop()
         self.base: asyncio.Future[tuple[bytes, int]] = loop.create_future()  # common model and number of its ids
         self.begun: list[asyncio.Future[tuple[bytes, ...]]] = [loop.create_future() for _ in self.segments]
@@ -292,12 +288,18 @@ class _Segment:
     def __init__(self, run: _Run, number: int) -> None:
         self.run, self.number = run, number
         self.start, self.stop = run.starts[number], run.starts[number + 1]
-        self.path = run.out / FOLDER / f"{number}.morgs"
-        self.reports: list[FrameReport] = []
+        self.files = FitFiles(run.out / FOLDER / f"{number}.morgs", run.out / FOLDER / f"{number}.json")
         self.restart: tuple[bytes, ...] = ()
-        self.writer: StreamWriter | None = None
-        with suppress(FileNotFoundError, TruncatedStreamError):
-            self._read()
+        self.recording: Recording | None = None
+        earlier = interrupted_fit(self.files, run.capture, run.metadata, self._finished, self.start)
+        if earlier is not None:
+            self.restart = restart_of(earlier.before, earlier.last)
+            self._open(earlier)
+
+    @property
+    def reports(self) -> list[FrameReport]:
+        """Reports of the frames that are fitted."""
+        return [] if self.recording is None else self.recording.reports
 
     @property
     def num_fitted(self) -> int:
@@ -324,10 +326,10 @@ class _Segment:
             if self.num_fitted < common:
                 frames = FrameRange(0, self.num_fitted, common)
                 part = await self.run.run(fit_frames, frames, self.restart, None, points)
-                self._add(part if self.num_fitted else self._with_refinement(part))
-            coded = seek(StreamReader(self.path), common - 1)
+                self._add(part if self.num_fitted else self._completed(part))
+            coded = seek(StreamReader(self.files.stream), common - 1)
             self.run.base.set_result((reemitted_keyframe(coded).encoded, coded.next_id))
-        overlap = takewhile(lambda packet: packet.frame < self.start, StreamReader(self.path))
+        overlap = takewhile(lambda packet: packet.frame < self.start, StreamReader(self.files.stream))
         self.run.begun[self.number].set_result(tuple(packet.encoded for packet in overlap))
         # A worker continues the loop of one segment, not of many.
         await self._until(lambda: self.run.active < self.run.workers.count)
@@ -350,28 +352,9 @@ class _Segment:
 
     def packets(self) -> Iterator[Packet]:
         """Yield the packets of the segment, without those of the overlap before it."""
-        return dropwhile(lambda p: (p.kind, p.frame) != (PacketKind.KEYFRAME, self.start), StreamReader(self.path))
-
-    def _read(self) -> None:
-        """Read an earlier fit of the segment."""
-        stream = StreamReader(self.path)
-        check_same_fit(stream, self.run.capture, self.run.metadata)
-        index, end = self._finished(*stream.check())
-        if not index:
-            return
-        coded = before = last = None
-        with suppress(TruncatedStreamError):
-            for packet in takewhile(lambda packet: packet.frame <= index[-1][1], stream):
-                if coded is None or packet.frame > coded.frame:
-                    before, coded, last = coded, decode(coded, packet), packet
-        assert coded is not None
-        assert last is not None
-        self.reports = read_reports(self.path.with_suffix(".json"), range(self.start, coded.frame + 1))
-        self.restart = (last.encoded,) if before is None else (reemitted_keyframe(before).encoded, last.encoded)
-        self.writer = self.run.files.enter_context(StreamWriter.continued(self.path, index, end))
-        if index[-1][0] == PacketKind.RESIDUAL:
-            for packet in due_keyframe(coded, self.run.task.config.codec.keyframe_interval):
-                self.writer.write(packet)
+        return dropwhile(
+            lambda p: (p.kind, p.frame) != (PacketKind.KEYFRAME, self.start), StreamReader(self.files.stream)
+        )
 
     def _finished(self, index: Sequence[Entry], end: int) -> tuple[Sequence[Entry], int]:
         """Return the index and the end of the file without a beginning or a cross-fade that is incomplete."""
@@ -382,25 +365,24 @@ class _Segment:
         kept = [entry for entry in index if entry[1] < self.fade]
         return kept, index[len(kept)][2]
 
-    def _with_refinement(self, part: Part) -> Part:
-        """Return the first part of the recording, whose first report says what was found about the cameras."""
-        capture, found = self.run.capture, self.run.refinement
-        if found is None:
+    def _completed(self, part: Part) -> Part:
+        """Return the first part of the recording, with what was found about the cameras in its first report."""
+        prepared, config = self.run.prepared, self.run.task.config
+        if prepared is None or prepared.refinement is None:
             return part
-        coded, frame = decode(None, decode_packet(part.packets[0])), next(capture.partial_frames(0, 1))
-        about = about_cameras(coded.gaussians, capture, frame, found, self.run.task.config)
-        first = replace(part.reports[0], validation=part.reports[0].validation | about)
+        coded, frame = decode(None, decode_packet(part.packets[0])), next(prepared.capture.partial_frames(0, 1))
+        first = prepared.completed(part.reports[0], coded.gaussians, frame, config)
         return replace(part, reports=(first, *part.reports[1:]))
 
+    def _open(self, earlier: Interrupted | None) -> Recording:
+        """Open the files of the segment, which the run closes."""
+        recording = Recording(self.files, self.run.capture, self.run.metadata, earlier)
+        self.recording = self.run.recordings.enter_context(recording)
+        return recording
+
     def _add(self, part: Part) -> None:
-        """Add the frames of a task: first to the report, then to the stream."""
-        reports = [*self.reports, *part.reports]
-        write_json(self.path.with_suffix(".json"), {"frames": [asdict(report) for report in reports]})
-        if self.writer is None:
-            capture = self.run.capture
-            writer = StreamWriter(self.path, capture.cameras, capture.fps, self.run.metadata)
-            self.writer = self.run.files.enter_context(writer)
-        for data in part.packets:
-            self.writer.write(decode_packet(data))
-        self.reports, self.restart = reports, part.restart
+        """Add the frames of a task."""
+        recording = self.recording or self._open(None)
+        recording.extend(map(decode_packet, part.packets), part.reports)
+        self.restart = part.restart
         self.run.show_progress()

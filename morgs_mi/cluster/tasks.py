@@ -34,7 +34,8 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.environment import versions
 from morgs_mi.io.remote import url_of
-from morgs_mi.recorder import due_keyframe, push_frame, with_next
+from morgs_mi.recorder import push_frame, with_next
+from morgs_mi.recording import due_keyframe, restart_of
 from morgs_mi.stream_loop import FrameReport, StreamLoop
 
 __all__ = [
@@ -186,7 +187,7 @@ def fit_frames(
             packets.append(packet)
             states.append(loop.state.coded)
             reports.append(report)
-        restart = _restart(before, packets[-1])
+        restart = restart_of(before, packets[-1])
         if following is None:
             _OPEN[_key(fit, frames.segment, frames.stop, restart)] = loop, capture, recorded
         else:
@@ -212,7 +213,7 @@ def fit_segment_start(fit: Fit, base: bytes, frame: int) -> Part:
     """
     with prepared(fit.variant, fit.versions) as messages:
         capture, coded = fit.open(), decode(None, decode_packet(base))
-        loop = _loop(capture, replace(fit, config=fit.seams.overlap_config(fit.config)), None)
+        loop = StreamLoop.of(capture, fit.seams.overlap_config(fit.config))
         first = max(frame - fit.seams.overlap, coded.frame + 1)
         earlier, now = (_images(capture, t) for t in (coded.frame, first))
         coded, report = fit_seam_frame(loop.setup, coded, earlier, first, now, fit.seams, _check_memory)
@@ -223,7 +224,7 @@ def fit_segment_start(fit: Fit, base: bytes, frame: int) -> Part:
             packet, report = push_frame(loop, recorded, capture.train_views, _check_memory, upcoming)
             packets.append(packet)
             seconds += report.seconds
-        restart = _restart(before, packets[-1])
+        restart = restart_of(before, packets[-1])
         if before is not None:
             assert loop.state.coded is not None
             packets.append(reemitted_keyframe(loop.state.coded))
@@ -235,11 +236,6 @@ def installed() -> tuple[tuple[str, str], ...]:
     """Return the versions that must be the same in client and workers."""
     python = ".".join(platform.python_version_tuple()[:2])
     return tuple(({**versions(), "python": python}).items())
-
-
-def _restart(before: CodedFrame | None, packet: Packet) -> tuple[bytes, ...]:
-    """Return the packets that lead a decoder to the state after a packet, see `Part`."""
-    return (packet.encoded,) if before is None else (reemitted_keyframe(before).encoded, packet.encoded)
 
 
 def _part(packets: list[Packet], reports: list[FrameReport], restart: tuple[bytes, ...], messages: list[str]) -> Part:
@@ -314,7 +310,9 @@ def _opened(
     if found is not None:
         return found
     capture = fit.open()
-    loop, recorded = _loop(capture, fit, points), capture.partial_frames(frames.segment)
+    if points is not None:
+        capture = replace(capture, points=points[0], point_colors=points[1])
+    loop, recorded = StreamLoop.of(capture, fit.config), capture.partial_frames(frames.segment)
     if restart:
         past = islice(recorded, frames.start - frames.segment)
         loop.resume(_decoded(restart), (frame.comparable(capture.train_views) for frame in past))
@@ -323,13 +321,6 @@ def _opened(
 
 def _key(fit: Fit, segment: int, start: int, restart: tuple[bytes, ...]) -> tuple[Any, ...]:
     return (repr(fit), segment, start, restart)
-
-
-def _loop(capture: Capture, fit: Fit, points: Points | None) -> StreamLoop:
-    train = capture.train_views
-    positions, colors = points or (capture.points, capture.point_colors)
-    masks = [capture.masks[v] for v in train]
-    return StreamLoop([capture.cameras[v] for v in train], positions, colors, fit.config, masks)
 
 
 def _decoded(packets: tuple[bytes, ...]) -> CodedFrame:

@@ -162,9 +162,9 @@ def _registered_psnr(stream: StreamReader, recording: Capture, coded: CodedFrame
     if image is None or test is None:
         return float("nan")
     extent = scene_extent([stream.cameras[v] for v in recording.train_views])
-    view = image, recording.masks[test]
-    found = register_camera(coded.gaussians, stream.cameras[test], *view, extent, FitConfig(), config)
-    return mean_psnr(coded.gaussians, [View(found, *view)], config)
+    view = View(stream.cameras[test], image, recording.masks[test])
+    registered = view._replace(camera=register_camera(coded.gaussians, view, extent, FitConfig(), config))
+    return mean_psnr(coded.gaussians, [registered], config)
 
 
 def _packets(stream: StreamReader) -> tuple[dict[int, tuple[PacketKind, int]], int]:

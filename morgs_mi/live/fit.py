@@ -10,15 +10,13 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
-from morgs_mi.capture.outputs import check_output
-from morgs_mi.codec.container import StreamWriter
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import locked_folder, write_json
 from morgs_mi.core.progress import Progress, Report
@@ -27,17 +25,8 @@ from morgs_mi.live.capture import begin_capture, read_calibration, write_images
 from morgs_mi.live.config import LiveConfig
 from morgs_mi.live.feed import Bundle, Feed
 from morgs_mi.live.sources import Source, open_feed
-from morgs_mi.recorder import (
-    FILES,
-    about_cameras,
-    about_lenses,
-    described_capture,
-    due_keyframe,
-    push_frame,
-    stream_metadata,
-    with_points,
-    with_refined_cameras,
-)
+from morgs_mi.recorder import Prepared, push_frame
+from morgs_mi.recording import FitFiles, Recording, check_outputs, described_capture, stream_metadata
 from morgs_mi.stream_loop import FrameReport, StreamLoop
 
 __all__ = ["LiveFrame", "fit_live"]
@@ -98,8 +87,7 @@ def fit_live(
     """
     out, live = Path(out), live or LiveConfig()
     live.check("fit_live()")
-    for name in FILES:
-        check_output(out / name)
+    check_outputs(out)
     if (out / "capture").exists():
         raise FileExistsError(
             f"{out / 'capture'}: expected no capture, got that of an earlier fit; choose another folder for this one."
@@ -197,30 +185,21 @@ def _fit(
     capture, train = frames.capture, frames.capture.train_views
     metadata = stream_metadata(capture, next(capture.partial_frames()), config)
     del metadata["num_frames"]  # not known yet
-    progress = Progress(on_stage)
-    capture, refinement = with_refined_cameras(with_points(capture, config.seed, progress), config, progress)
-    frames.capture, metadata = capture, metadata | about_lenses(capture)
-    masks = [capture.masks[v] for v in train]
-    loop = StreamLoop([capture.cameras[v] for v in train], capture.points, capture.point_colors, config, masks)
-    write_json(out / "capture.json", described_capture(capture, None))
+    prepared = Prepared.of(capture, config, Progress(on_stage))
+    frames.capture = prepared.capture
+    loop = StreamLoop.of(prepared.capture, config)
+    write_json(out / "capture.json", described_capture(prepared.capture, None))
     rows: list[LiveFrame] = []
-    reports: list[FrameReport] = []
-    with StreamWriter(out / "stream.morgs", capture.cameras, capture.fps, metadata) as writer:
+    with Recording(FitFiles.of(out), prepared.capture, metadata | prepared.metadata) as recording:
         try:
             for bundle, frame in frames:
                 recorded = in_background(partial(_record, frames, out, bundle, frame))
                 packet, report = push_frame(loop, frame, train, None if rows else on_stage)
-                if refinement is not None and not rows:
-                    assert loop.gaussians is not None
-                    about = about_cameras(loop.gaussians, capture, frame, refinement, config)
-                    report = replace(report, validation=report.validation | about)
+                report = prepared.completed(report, loop.gaussians, frame, config)
                 recorded.result()
-                reports.append(report)
                 row = frames.report(bundle, frame)
                 live = [asdict(r) for r in (*rows, row)]
-                write_json(out / "report.json", {**metadata, "frames": [asdict(r) for r in reports], "live": live})
-                for due in (packet, *due_keyframe(loop.state.coded, config.codec.keyframe_interval)):
-                    writer.write(due)
+                recording.push(packet, report, loop.state.coded, live=live)
                 rows.append(row)
                 if on_frame is not None:
                     on_frame(row, report)

@@ -31,7 +31,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Tensor
 from morgs_mi.io.bounded import read_json
 from morgs_mi.playback.visualise import confidence_image, depth_image, grey_image, motion_image, to_uint8
-from morgs_mi.recorder import as_fitted
+from morgs_mi.recording import as_fitted
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.synth.ground_truth import GroundTruth, load_truth

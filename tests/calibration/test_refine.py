@@ -124,13 +124,13 @@ def test_joint_step__turns_cameras_to_where_the_images_were_taken():
 def test_register_camera__finds_the_camera_of_an_image(scale):
     given = disturbed(CAMERAS[:1], scale)[0]
     image = image_of(CAMERAS[0])
-    found = register_camera(splats(), given, image, None, 1.0, FitConfig())
+    found = register_camera(splats(), View(given, image), 1.0, FitConfig())
     error = np.square(rendered(splats(), found, RenderConfig()) - image / 255).mean()
     assert error < 1e-5, "the rounding to 8 bits alone has 1e-6"
 
 
 def test_register_camera__keeps_a_camera_that_fits():
-    found = register_camera(splats(), CAMERAS[0], image_of(CAMERAS[0]), None, 1.0, FitConfig())
+    found = register_camera(splats(), View(CAMERAS[0], image_of(CAMERAS[0])), 1.0, FitConfig())
     assert_close(found.viewmat, CAMERAS[0].viewmat, rtol=0, atol=1e-3)
 
 

@@ -231,7 +231,7 @@ def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
 ) -> None:
     (tmp_path / "out").mkdir()
     stream.rename(tmp_path / "out" / "stream.morgs")
-    monkeypatch.setattr("morgs_mi.recorder.StreamLoop", interrupt)
+    monkeypatch.setattr("morgs_mi.recorder.StreamLoop.of", interrupt)
     status, _, error = run("fit", capture, tmp_path / "out", *QUICK)
     assert status == 130
     assert error.splitlines()[-1] == "Interrupted."
@@ -242,7 +242,7 @@ def test_fit__reports_progress_before_the_first_frame(capture: Path, tmp_path: P
     write_colmap(capture / "sparse" / "0", rig(), np.zeros((0, 3)), np.zeros((0, 3)))
     now = iter(range(0, 10**9, 40))
     monkeypatch.setattr("morgs_mi.cli.console.time.monotonic", lambda: float(next(now)))
-    monkeypatch.setattr("morgs_mi.recorder.StreamLoop", interrupt)
+    monkeypatch.setattr("morgs_mi.recorder.StreamLoop.of", interrupt)
     status, _, error = run("fit", capture, tmp_path / "out", *QUICK)
     assert status == 130
     assert error.startswith("Matching views: 0/3, 0:00:00 elapsed.\nMatching views: 1/3, ")

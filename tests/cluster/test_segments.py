@@ -26,7 +26,8 @@ from morgs_mi.codec.packets import coded_frames, frames_with_lasting_ids, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
 from morgs_mi.fit.config import RefinementConfig
-from morgs_mi.recorder import FILES, stream_capture
+from morgs_mi.recorder import stream_capture
+from morgs_mi.recording import FILES
 from tests.scenes.coded_clip import history
 from tests.scenes.recording import CONFIG, write_recording
 
@@ -252,7 +253,7 @@ def test_stream_segments__triangulates_points_where_there_are_few(
     capture: Capture, workers: Workers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     few = replace(capture, points=capture.points[:3], point_colors=capture.point_colors[:3])
-    monkeypatch.setattr("morgs_mi.cluster.segments.with_points", lambda *_: capture)
+    monkeypatch.setattr("morgs_mi.recorder.with_points", lambda *_: capture)
     fit(few, tmp_path / "few", workers, segments=1, config=StreamConfig(SETTINGS.fit, SETTINGS.motion))
     assert len(next(coded_frames(StreamReader(tmp_path / "few" / "stream.morgs")))) == SETTINGS.fit.num_gaussians
 
