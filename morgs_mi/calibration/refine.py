@@ -47,7 +47,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_first_frame
-from morgs_mi.fit.initialise import Points, scene_extent, seen_points
+from morgs_mi.fit.initialise import scene_extent, seen_points
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import View, mean_psnr, withheld_blocks
 from morgs_mi.losses.ssim import Target
@@ -134,60 +134,129 @@ def refine_cameras(
     Raises:
         ValueError: fewer than two training views have an image of the first frame.
     """
-    how, render = config.refinement, render or RenderConfig()
-    images = next(capture.partial_frames(0, 1)).images
-    seen = {v: image for v in capture.train_views if (image := images[v]) is not None}
-    if len(seen) < 2:
-        raise ValueError(
-            f"refine_cameras(): expected images of at least two training views, got {len(seen)}; record more, or set "
-            "`refine_cameras` to off."
-        )
-    report = progress or (lambda done, count: None)
-    cameras, masks = [capture.cameras[v] for v in seen], [capture.masks[v] for v in seen]
-    extent = scene_extent(cameras)
-    changes, tracks, deviations = _matched(capture, list(seen), prior_deviations(extent, how.priors))
-    judge = config.refine_cameras == "auto"
-    estimates = [0 * changes] * judge + [changes] * bool(tracks)
-    fits = how.rounds + len(estimates) + bool(estimates)
-    given = [View(*view) for view in zip(cameras, seen.values(), masks, strict=True)]
-    views, unseen = withheld_blocks(given, how.width, rng_of(seed, Stream.WITHHELD_BLOCKS))
-    unseen = [view for view in unseen if np.any(view.mask)]
-
-    def started(changes: np.ndarray, points: np.ndarray) -> FirstFrameProblem:
-        return _problem(_changed(views, changes), (points, capture.point_colors), config, render, seed)
-
-    def fit(problem: FirstFrameProblem, later: bool = False) -> Gaussians:
-        return fit_first_frame(problem, _short(config, later), rng_of(seed, Stream.REFINEMENT)).gaussians
-
-    problem = started(changes, _moved(capture.points, cameras, changes))
-    for done in range(how.rounds):
-        report(done, fits)
-        gaussians = fit(replace(problem, views=tuple(_changed(views, changes))), later=done > 0)
-        blur = _BLURS[done] if done < len(_BLURS) else 0.0
-        for _ in range(_STEPS):
-            gaussians, changes = _joint_step(gaussians, views, changes, deviations, extent, blur, render)
-        problem = replace(problem, start=gaussians)
-    estimates.append(changes)
-    points, scores = [_moved(capture.points, cameras, change) for change in estimates], [float("nan")] * len(estimates)
+    rounds, report = config.refinement.rounds, progress or (lambda done, count: None)
+    problem = _Problem.of(capture, config, render or RenderConfig(), seed)
+    matched, tracks, deviations = _matched(capture, problem.indices, problem.deviations)
+    # The calibrated cameras, those of the bundle adjustment, and those of the images; one alone is not compared.
+    compared = config.refine_cameras == "auto"
+    estimates = [0 * matched] * compared + [matched] * bool(tracks)
+    fits = rounds + len(estimates) + bool(estimates)
+    estimates.append(problem.refined(matched, deviations, lambda done: report(done, fits)))
+    scores = [float("nan")]
     if len(estimates) > 1:
-        for k, (change, start) in enumerate(zip(estimates, points, strict=True)):
-            report(how.rounds + k, fits)
-            scores[k] = mean_psnr(fit(started(change, start)), _changed(unseen, change), render)
-    calibrated = scores[0] if judge else float("nan")
-    best = judge + int(np.argmax(scores[judge:]))
-    taken = not scores[best] < calibrated + how.least_gain
-    changes = estimates[best]
-    rotation, position = (np.linalg.norm(changes[:, k : k + 3], axis=1).max() for k in (0, 3))
-    lens = max(_largest_shift(*pair) for pair in zip(cameras, changes, strict=True))
-    sizes = float(np.rad2deg(rotation)), float(position), float(np.abs(changes[:, 6]).max()), lens
-    found = Refinement(taken, calibrated, scores[best], tracks, *sizes)
-    if not taken:
-        return capture, found
-    refined = dict(zip(seen, (changed_camera(*pair) for pair in zip(cameras, changes, strict=True)), strict=True))
-    left = dict(zip(seen, changes[:, 9:].tolist(), strict=True))
-    every = [refined.get(v, camera) for v, camera in enumerate(capture.cameras)]
-    rig = capture.with_cameras(every, [left.get(v, (0.0, 0.0)) for v in range(len(every))])
-    return replace(rig, points=points[best]), found
+        scores = []
+        for done, changes in enumerate(estimates, rounds):
+            report(done, fits)
+            scores.append(problem.score(changes))
+    best = compared + int(np.argmax(scores[compared:]))
+    calibrated = scores[0] if compared else float("nan")
+    taken = not scores[best] < calibrated + config.refinement.least_gain
+    found = Refinement(taken, calibrated, scores[best], tracks, *problem.sizes(estimates[best]))
+    return problem.changed_capture(estimates[best]) if taken else capture, found
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """The cameras that are refined, and the images that this is judged by.
+
+    Attributes:
+        capture: with the calibrated cameras.
+        indices: of the V training views with an image.
+        views: these, reduced, without the withheld blocks.
+        unseen: their withheld blocks.
+        extent: of the scene, world units.
+        config: of the fit.
+        render: cut-offs.
+        seed: of all random choices.
+    """
+
+    capture: Capture
+    indices: tuple[int, ...]
+    views: tuple[View, ...]
+    unseen: tuple[View, ...]
+    extent: float
+    config: FitConfig
+    render: RenderConfig
+    seed: int
+
+    @classmethod
+    def of(cls, capture: Capture, config: FitConfig, render: RenderConfig, seed: int) -> _Problem:
+        """Return the problem of the first frame of a capture; raises as `refine_cameras`."""
+        images = next(capture.partial_frames(0, 1)).images
+        given = {
+            v: View(capture.cameras[v], image, capture.masks[v])
+            for v in capture.train_views
+            if (image := images[v]) is not None
+        }
+        if len(given) < 2:
+            raise ValueError(
+                f"refine_cameras(): expected images of at least two training views, got {len(given)}; record more, or "
+                "set `refine_cameras` to off."
+            )
+        rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
+        views, unseen = withheld_blocks(list(given.values()), config.refinement.width, rng)
+        extent = scene_extent([view.camera for view in given.values()])
+        return cls(capture, tuple(given), tuple(views), tuple(unseen), extent, config, render, seed)
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The calibrated cameras at the size of the capture."""
+        return [self.capture.cameras[v] for v in self.indices]
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """Standard deviations [11] of the priors."""
+        return prior_deviations(self.extent, self.config.refinement.priors)
+
+    def refined(self, changes: np.ndarray, deviations: np.ndarray, report: Callable[[int], None]) -> np.ndarray:
+        """Return the changes [V, 11] after rounds of fitting Gaussians to the images and of joint steps.
+
+        Args:
+            changes: to start from [V, 11].
+            deviations: of the priors [11].
+            report: called with the number of fits that are done.
+        """
+        problem = self._begun(changes)
+        for done in range(self.config.refinement.rounds):
+            report(done)
+            posed = replace(problem, views=tuple(_changed(self.views, changes)))
+            gaussians = self._fitted(posed, later=done > 0)
+            blur = _BLURS[done] if done < len(_BLURS) else 0.0
+            for _ in range(_STEPS):
+                gaussians, changes = _joint_step(gaussians, self.views, changes, deviations, blur, self.render)
+            problem = replace(problem, start=gaussians)
+        return changes
+
+    def score(self, changes: np.ndarray) -> float:
+        """Return the PSNR of the withheld pixels in a fit with changed cameras, dB."""
+        unseen = [view for view in _changed(self.unseen, changes) if np.any(view.mask)]
+        return mean_psnr(self._fitted(self._begun(changes)), unseen, self.render)
+
+    def sizes(self, changes: np.ndarray) -> tuple[float, float, float, float]:
+        """Return the largest change of a rotation, degrees, a position, a focal length, and a pixel by the lens."""
+        rotation, position = (np.linalg.norm(changes[:, k : k + 3], axis=1).max() for k in (0, 3))
+        lens = max(_largest_shift(*pair) for pair in zip(self.cameras, changes, strict=True))
+        return float(np.rad2deg(rotation)), float(position), float(np.abs(changes[:, 6]).max()), lens
+
+    def changed_capture(self, changes: np.ndarray) -> Capture:
+        """Return the capture with changed cameras and moved points."""
+        capture, pairs = self.capture, zip(self.cameras, changes, strict=True)
+        refined = dict(zip(self.indices, (changed_camera(*pair) for pair in pairs), strict=True))
+        left = dict(zip(self.indices, changes[:, 9:].tolist(), strict=True))
+        every = [refined.get(v, camera) for v, camera in enumerate(capture.cameras)]
+        rig = capture.with_cameras(every, [left.get(v, (0.0, 0.0)) for v in range(len(every))])
+        return replace(rig, points=self._points(changes))
+
+    def _points(self, changes: np.ndarray) -> np.ndarray:
+        return _moved(self.capture.points, self.cameras, changes)
+
+    def _begun(self, changes: np.ndarray) -> FirstFrameProblem:
+        """Return the problem of a short fit with changed cameras."""
+        points, rng = (self._points(changes), self.capture.point_colors), rng_of(self.seed, Stream.REFINED_POINTS)
+        return FirstFrameProblem.of(_changed(self.views, changes), points, _short(self.config), self.render, rng)
+
+    def _fitted(self, problem: FirstFrameProblem, later: bool = False) -> Gaussians:
+        return fit_first_frame(problem, _short(self.config, later), rng_of(self.seed, Stream.REFINEMENT)).gaussians
 
 
 def register_camera(
@@ -275,13 +344,6 @@ def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -
     return moved.astype(np.float32)
 
 
-def _problem(
-    views: Sequence[View], points: Points, config: FitConfig, render: RenderConfig, seed: int
-) -> FirstFrameProblem:
-    """Return the problem of a short fit."""
-    return FirstFrameProblem.of(views, points, _short(config), render, rng_of(seed, Stream.REFINED_POINTS))
-
-
 def _short(config: FitConfig, later: bool = False) -> FitConfig:
     """Return the settings of a short fit; a later one continues with half the steps and lower rates.
 
@@ -306,20 +368,19 @@ def _joint_step(
     views: Sequence[View],
     changes: np.ndarray,
     deviations: np.ndarray,
-    extent: float,
     blur: float,
     render: RenderConfig,
 ) -> tuple[Gaussians, np.ndarray]:
     """Return the Gaussians and the changes of the cameras [V, 11] after one Gauss-Newton step of both."""
-    means = np.asarray(gaussians.means, np.float64)
-    changed = _changed(views, changes)
+    means, changed = np.asarray(gaussians.means, np.float64), _changed(views, changes)
     shifts = [_shifts(gaussians, view.camera, view.target, blur, render) for view in changed]
     variance, equations = _ALIKE * np.mean([error for *_, error in shifts]), NormalEquations(len(views), len(means))
-    for v, ((camera, *_), (G, b, _)) in enumerate(zip(changed, shifts, strict=True)):
-        equations.add(v, slice(None), camera_jacobian(camera, 1 + changes[v, 6], means), G / variance, b / variance)
+    for v, (view, (G, b, _)) in enumerate(zip(changed, shifts, strict=True)):
+        jacobian = camera_jacobian(view.camera, 1 + changes[v, 6], means)
+        equations.add(v, slice(None), jacobian, G / variance, b / variance)
     of_changes, of_means = equations.step(changes, deviations, _DAMPING, equations.frame(means))
-    length = np.linalg.norm(of_means, axis=1, keepdims=True)
-    of_means *= np.minimum(1, _LONGEST * extent / np.maximum(length, 1e-30))
+    longest = _LONGEST * scene_extent([view.camera for view in views])
+    of_means *= np.minimum(1, longest / np.maximum(np.linalg.norm(of_means, axis=1, keepdims=True), 1e-30))
     return replace(gaussians, means=(means + of_means).astype(np.float32)), changes + of_changes
 
 

@@ -113,7 +113,7 @@ def test_joint_step__turns_cameras_to_where_the_images_were_taken():
     views = [View(camera, image_of(true)) for camera, true in zip(given, CAMERAS, strict=True)]
     deviations = prior_deviations(1.0, CameraPriors())
     for _ in range(8):
-        gaussians, changes = _joint_step(gaussians, views, changes, deviations, 1.0, 0.0, RenderConfig())
+        gaussians, changes = _joint_step(gaussians, views, changes, deviations, 0.0, RenderConfig())
     found = [changed_camera(*pair) for pair in zip(given, changes, strict=True)]
     errors = [np.abs(relative_turns(rig) - relative_turns(CAMERAS)).max() for rig in (given, found)]
     assert errors[1] < 0.15 * errors[0]
