@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
+from typing import NamedTuple
 
 import numpy as np
 
@@ -41,7 +42,16 @@ from morgs_mi.playback.player import render, render_config, truth_for_camera
 from morgs_mi.playback.visualise import to_uint8
 from morgs_mi.stream_loop import FrameReport, StreamState, step
 
-__all__ = ["COMMON_FRAMES", "SeamConfig", "SeamScores", "cross_fade", "fit_seam_frame", "score_seam"]
+__all__ = [
+    "COMMON_FRAMES",
+    "Moment",
+    "Overlap",
+    "SeamConfig",
+    "SeamScores",
+    "cross_fade",
+    "fit_seam_frame",
+    "score_seam",
+]
 
 COMMON_FRAMES = 2
 """Frames of the common model: the second one determines the confidence."""
@@ -111,12 +121,18 @@ class SeamScores:
         )
 
 
+class Moment(NamedTuple):
+    """A frame and its images, by view index."""
+
+    frame: int
+    images: Images
+
+
 def fit_seam_frame(
     setup: Setup,
     base: CodedFrame,
     earlier: Images,
-    frame: int,
-    images: Images,
+    now: Moment,
     config: SeamConfig,
     progress: Report | None = None,
 ) -> tuple[CodedFrame, FrameReport]:
@@ -126,14 +142,13 @@ def fit_seam_frame(
         setup: what all frames share.
         base: the common model.
         earlier: images of its last frame, by view index.
-        frame: index of the frame.
-        images: its images, by view index.
+        now: the frame.
         config: settings.
         progress: called with (stage, steps done, steps) of each pass.
     """
     # Motion over many frames is no speed.
     setup = replace(setup, cameras=tuple(camera.without_delays() for camera in setup.cameras))
-    coded, last, seconds = base, earlier, 0.0
+    (frame, images), coded, last, seconds = now, base, earlier, 0.0
     for number in range(config.passes):
         repeated = replace(setup, config=config.fit_config(setup.config, number))
         state = StreamState(frame, replace(coded, frame=frame - 1), Seen(last, earlier))
@@ -143,32 +158,57 @@ def fit_seam_frame(
     return coded, replace(report, seconds=seconds)
 
 
+@dataclass(frozen=True, eq=False)
+class Overlap:
+    """Two segments in the frames that both have.
+
+    Attributes:
+        ending: states of the segment that ends, of each frame.
+        beginning: states of the next segment, of the same frames.
+        shared_ids: number of ids of the common model; below it, both segments have the same Gaussians.
+        nearness: see `SeamConfig`.
+    """
+
+    ending: Sequence[CodedFrame]
+    beginning: Sequence[CodedFrame]
+    shared_ids: int
+    nearness: float
+
+    @property
+    def states(self) -> list[tuple[CodedFrame, CodedFrame]]:
+        """Both states of each frame."""
+        return list(zip(self.ending, self.beginning, strict=True))
+
+    @property
+    def common_ids(self) -> np.ndarray:
+        """Ids of the common model's Gaussians that both segments have at nearly the same place in all frames."""
+        return reduce(np.intersect1d, (self._near_ids(*states) for states in self.states))
+
+    def _near_ids(self, a: CodedFrame, b: CodedFrame) -> np.ndarray:
+        """Return these ids in one frame."""
+        ids, here, there = np.intersect1d(a.ids, b.ids, return_indices=True)
+        means = np.asarray(a.gaussians.means)[here], np.asarray(b.gaussians.means)[there]
+        largest = np.asarray(a.gaussians.scales).max(axis=1)[here]
+        near = np.linalg.norm(means[0] - means[1], axis=1) <= self.nearness * largest
+        return ids[near & (ids < self.shared_ids)]
+
+
 def cross_fade(
-    before: CodedFrame,
-    ending: Sequence[CodedFrame],
-    beginning: Sequence[CodedFrame],
-    shared_ids: int,
-    cameras: Sequence[Camera],
-    config: CodecConfig,
-    nearness: float,
+    before: CodedFrame, overlap: Overlap, cameras: Sequence[Camera], config: CodecConfig
 ) -> Iterator[tuple[Packet, CodedFrame]]:
     """Yield the packets of the frames of an overlap, with the states after them.
 
     Args:
         before: state of the stream before the overlap.
-        ending: states of the segment that ends, of each frame of the overlap.
-        beginning: states of the next segment, of the same frames.
-        shared_ids: number of ids of the common model; below it, both segments have the same Gaussians.
+        overlap: both segments.
         cameras: as for `residual_packet`.
         config: tolerated errors; changes are as precise as births, because the state of the next segment is, and what
             stayed a step behind it would appear at the seam.
-        nearness: see `SeamConfig`.
     """
     config = replace(config, quality=config.quality * config.birth_precision, birth_precision=1.0)
-    near = [_near_ids(a, b, shared_ids, nearness) for a, b in zip(ending, beginning, strict=True)]
-    common, keys = reduce(np.intersect1d, near), before.ids.astype(np.int64)
-    for number, (a, b) in enumerate(zip(ending, beginning, strict=True), start=1):
-        time = number / (len(ending) + 1)
+    common, keys = overlap.common_ids, before.ids.astype(np.int64)
+    for number, (a, b) in enumerate(overlap.states, start=1):
+        time = number / (len(overlap.ending) + 1)
         gaussians, drawn = _blended(a, b, common, time * time * (3 - 2 * time))
         source = np.full(len(drawn), len(keys))
         _, here, there = np.intersect1d(drawn, keys, return_indices=True)
@@ -178,15 +218,6 @@ def cross_fade(
         packet = residual_packet(before, gaussians.select(order), source[order], cameras, config)
         before, keys = decode(before, packet), drawn[order]
         yield packet, before
-
-
-def _near_ids(a: CodedFrame, b: CodedFrame, shared_ids: int, nearness: float) -> np.ndarray:
-    """Return the ids of the common model's Gaussians that are at nearly the same place in two states."""
-    ids, here, there = np.intersect1d(a.ids, b.ids, return_indices=True)
-    means = (np.asarray(coded.gaussians.means) for coded in (a, b))
-    distance = np.linalg.norm(np.subtract(*(m[rows] for m, rows in zip(means, (here, there), strict=True))), axis=1)
-    largest = np.asarray(a.gaussians.scales).max(axis=1)[here]
-    return ids[(distance <= nearness * largest) & (ids < shared_ids)]
 
 
 def _blended(a: CodedFrame, b: CodedFrame, common: np.ndarray, share: float) -> tuple[Gaussians, np.ndarray]:

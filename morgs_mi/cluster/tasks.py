@@ -27,7 +27,7 @@ import numpy as np
 from morgs_mi.capture.capture import Capture, PartialFrame, load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cluster.executor import share_of_machine
-from morgs_mi.cluster.seams import SeamConfig, cross_fade, fit_seam_frame
+from morgs_mi.cluster.seams import Moment, Overlap, SeamConfig, cross_fade, fit_seam_frame
 from morgs_mi.codec.container import Packet, decode_packet
 from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, reemitted_keyframe
 from morgs_mi.config import StreamConfig
@@ -215,9 +215,9 @@ def fit_segment_start(fit: Fit, base: bytes, frame: int) -> Part:
         capture, coded = fit.open(), decode(None, decode_packet(base))
         loop = StreamLoop.of(capture, fit.seams.overlap_config(fit.config))
         first = max(frame - fit.seams.overlap, coded.frame + 1)
-        earlier, now = (_images(capture, t) for t in (coded.frame, first))
-        coded, report = fit_seam_frame(loop.setup, coded, earlier, first, now, fit.seams, _check_memory)
-        loop.resume(coded, [[now.get(view) for view in range(len(loop.setup.cameras))]])
+        earlier, now = _images(capture, coded.frame), Moment(first, _images(capture, first))
+        coded, report = fit_seam_frame(loop.setup, coded, earlier, now, fit.seams, _check_memory)
+        loop.resume(coded, [[now.images.get(view) for view in range(len(loop.setup.cameras))]])
         before, packets, seconds = None, [reemitted_keyframe(coded)], report.seconds
         for recorded, upcoming in with_next(capture.partial_frames(first + 1, frame + 1)):
             before = loop.state.coded
@@ -343,6 +343,6 @@ def _faded(
     """Return packets and states of the last frames of a segment in the cross-fade to the next one."""
     frames = {state.frame for state in states}
     beginning = [coded for coded in coded_frames(map(decode_packet, following.packets)) if coded.frame in frames]
-    found = cross_fade(before, states, beginning, following.shared_ids, cameras, fit.config.codec, fit.seams.nearness)
-    packets, faded = zip(*found, strict=True)
+    overlap = Overlap(states, beginning, following.shared_ids, fit.seams.nearness)
+    packets, faded = zip(*cross_fade(before, overlap, cameras, fit.config.codec), strict=True)
     return list(packets), list(faded)

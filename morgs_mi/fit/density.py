@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import drjit as dr
 import numpy as np
@@ -26,7 +27,7 @@ from morgs_mi.fit.config import DensityConfig
 from morgs_mi.fit.optimise import replace_parameter
 from morgs_mi.losses.attribution import DensificationScores
 
-__all__ = ["DensityPlan", "apply_plan", "plan_additions", "plan_growth", "resize_optimizer"]
+__all__ = ["DensityPlan", "Room", "apply_plan", "plan_additions", "plan_growth", "resize_optimizer"]
 
 # float32 has no opacity closer to 1.
 _MAX_OPACITY = 1 - 1e-6
@@ -57,11 +58,17 @@ class DensityPlan:
         return len(self.source) - self.num_births
 
 
+class Room(NamedTuple):
+    """Largest number of births of a round, and of Gaussians after it."""
+
+    births: int
+    limit: int
+
+
 def plan_growth(
     gaussians: Gaussians,
     scores: DensificationScores,
-    births: int,
-    limit: int,
+    room: Room,
     extent: float,
     config: DensityConfig,
     rng: np.random.Generator,
@@ -71,13 +78,12 @@ def plan_growth(
     Args:
         gaussians: N Gaussians.
         scores: their densification scores.
-        births: largest number of births.
-        limit: largest number of Gaussians afterwards.
+        room: for births.
         extent: of the scene, world units.
         config: thresholds.
         rng: draws the means of the births.
     """
-    survivors, parents = _select(gaussians, scores, births, limit, 0, config)
+    survivors, parents = _select(gaussians, scores, room, 0, config)
     parent, opacity = np.concatenate([survivors, parents]), np.asarray(gaussians.opacities)
     touched, scales = np.isin(parent, parents), np.asarray(gaussians.scales).max(axis=1)[parent]
     split = touched & (scales > config.split_scale * extent)
@@ -102,8 +108,9 @@ def plan_additions(
         rng: draws the means of the births.
         num_static: number of Gaussians besides, which stay unchanged.
     """
-    births, limit = round(config.births * (len(gaussians) + num_static)), max(config.max_gaussians - num_static, 0)
-    survivors, parents = _select(gaussians, scores, births, limit, config.min_error, config)
+    births = round(config.births * (len(gaussians) + num_static))
+    room = Room(births, max(config.max_gaussians - num_static, 0))
+    survivors, parents = _select(gaussians, scores, room, config.min_error, config)
     born = np.arange(len(survivors) + len(parents)) >= len(survivors)
     logits = np.asarray(gaussians.logit_opacities)[np.concatenate([survivors, parents])]
     fainter = np.where(born, _logit(config.birth_opacity) - logits, 0)
@@ -115,19 +122,19 @@ def _log_shrink(config: DensityConfig) -> float:
 
 
 def _select(
-    gaussians: Gaussians, scores: DensificationScores, births: int, limit: int, min_error: float, config: DensityConfig
+    gaussians: Gaussians, scores: DensificationScores, room: Room, min_error: float, config: DensityConfig
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the indices of the survivors, and those of the parents among them: the ones with the largest error.
 
     Gaussians fainter than `min_opacity` are pruned, and so are those that cover least where births would exceed
-    `limit`.
+    the limit.
     """
     visible = np.asarray(gaussians.opacities) >= config.min_opacity
     # A scene cannot come back from no Gaussians at all.
     survivors = np.flatnonzero(visible) if visible.any() else np.arange(len(visible))
     candidates = survivors[scores.error[survivors] > min_error]
-    parents = candidates[np.argsort(-scores.error[candidates], kind="stable")][:births]
-    excess = min(max(len(survivors) + len(parents) - limit, 0), len(parents))
+    parents = candidates[np.argsort(-scores.error[candidates], kind="stable")][: room.births]
+    excess = min(max(len(survivors) + len(parents) - room.limit, 0), len(parents))
     others = np.setdiff1d(survivors, parents)
     pruned = others[np.argsort(scores.weight[others], kind="stable")][:excess]
     return np.setdiff1d(survivors, pruned), np.sort(parents[: len(parents) - (excess - len(pruned))])

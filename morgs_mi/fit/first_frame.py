@@ -24,7 +24,7 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.types import Tensor
 from morgs_mi.fit.config import ConvergenceConfig, FitConfig
-from morgs_mi.fit.density import plan_growth, resize_optimizer
+from morgs_mi.fit.density import Room, plan_growth, resize_optimizer
 from morgs_mi.fit.dropping import dropped
 from morgs_mi.fit.optimise import Steps, adam, optimise, replace_parameter, values_of, view_order
 from morgs_mi.fit.problem import FirstFrameProblem
@@ -136,11 +136,9 @@ class _Fit:
     def _grow(self, rounds: int) -> None:
         """Add and prune Gaussians by density control; `rounds` are left, with this one."""
         now, config = self.gaussians, self._config
-        births = -(-max(config.planned_gaussians - len(now), 0) // rounds)
+        room = Room(-(-max(config.planned_gaussians - len(now), 0) // rounds), config.planned_gaussians)
         scores = densification_scores(now, self._views, self._targets)
-        plan = plan_growth(
-            now, scores, births, config.planned_gaussians, self._problem.extent, config.density, self._rng
-        )
+        plan = plan_growth(now, scores, room, self._problem.extent, config.density, self._rng)
         resize_optimizer(self._optimizer, plan, plan.edits)
         self._base = self._base.select(plan.parent)
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morgs_mi.cluster.seams import SeamConfig, cross_fade, fit_seam_frame
+from morgs_mi.cluster.seams import Moment, Overlap, SeamConfig, cross_fade, fit_seam_frame
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, reemitted_keyframe
 from morgs_mi.config import StreamConfig
@@ -34,7 +34,7 @@ def segment(seed: int, first_id: int = 0) -> list[CodedFrame]:
 
 def faded(ending: list[CodedFrame], beginning: list[CodedFrame], shared_ids: int = COUNT) -> list[CodedFrame]:
     before = reemitted(replace(ending[0], frame=3))
-    found = cross_fade(before, ending, beginning, shared_ids, CAMERAS, CodecConfig(), 1.0)
+    found = cross_fade(before, Overlap(ending, beginning, shared_ids, 1.0), CAMERAS, CodecConfig())
     return [coded for _, coded in found]
 
 
@@ -60,7 +60,7 @@ def test_cross_fade__approaches_also_what_is_less_than_a_step_away() -> None:
     means = ending.gaussians.numpy()["means"] + (0.7 * step).astype(np.float32)
     beginning = replace(ending, gaussians=replace(ending.gaussians, means=means))
     before, count = replace(ending, frame=-1), 20
-    found = cross_fade(before, count * [ending], count * [beginning], COUNT, CAMERAS, config, 1.0)
+    found = cross_fade(before, Overlap(count * [ending], count * [beginning], COUNT, 1.0), CAMERAS, config)
     *_, (_, last) = found
     assert np.all(np.abs(last.gaussians.numpy()["means"] - means) < 0.3 * step)
 
@@ -99,7 +99,7 @@ def test_fit_seam_frame__leaves_what_is_static_as_it_is() -> None:
     base = loop.state.coded
     assert base is not None
     config = SeamConfig(passes=2, epochs=1)
-    coded, report = fit_seam_frame(loop.setup, base, images[1], 4, images[4], config)
+    coded, report = fit_seam_frame(loop.setup, base, images[1], Moment(4, images[4]), config)
     assert (coded.frame, report.frame) == (4, 4)
     _, then, now = np.intersect1d(base.ids, coded.ids, return_indices=True)
     same = np.all(base.grid.values[then] == coded.grid.values[now], axis=1)

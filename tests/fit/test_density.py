@@ -11,7 +11,7 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.fit.config import DensityConfig
-from morgs_mi.fit.density import DensityPlan, apply_plan, plan_additions, plan_growth, resize_optimizer
+from morgs_mi.fit.density import DensityPlan, Room, apply_plan, plan_additions, plan_growth, resize_optimizer
 from morgs_mi.fit.optimise import adam, values_of
 from morgs_mi.losses.attribution import DensificationScores, densification_scores
 from morgs_mi.losses.ssim import Target
@@ -42,7 +42,7 @@ def scores(error, weight=None):
 
 def growth(gaussians, error):
     n = len(gaussians)
-    return plan_growth(gaussians, scores(error), n, 2 * n, 10.0, CONFIG, np.random.default_rng(1))
+    return plan_growth(gaussians, scores(error), Room(n, 2 * n), 10.0, CONFIG, np.random.default_rng(1))
 
 
 def additions(gaussians, error, weight=None, **settings):
