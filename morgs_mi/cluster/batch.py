@@ -19,7 +19,6 @@ Each capture is fitted with all settings and seeds. A batch that is started agai
 
 from __future__ import annotations
 
-import asyncio
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -30,7 +29,7 @@ from typing import Any
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cluster.executor import Workers, wait_for
-from morgs_mi.cluster.segments import SegmentedFit, fit_in_segments
+from morgs_mi.cluster.segments import fit_in_segments
 from morgs_mi.cluster.tasks import Part
 from morgs_mi.config import StreamConfig, apply_preset, apply_values, read_config
 from morgs_mi.core.documentation import page
@@ -39,12 +38,11 @@ from morgs_mi.io.remote import is_url
 __all__ = ["BatchConfig", "Job", "JobState", "read_jobs", "run_batch"]
 
 LOG = "log.txt"
-_POLL = 0.1  # seconds between two looks for a worker that is free; their number may grow
 
 
 @dataclass(frozen=True)
 class BatchConfig:
-    """What the jobs of a batch share."""
+    """Captures, seeds and options of all jobs of a batch."""
 
     captures: tuple[str, ...] = ()
     """Folders or URLs of the captures, with distinct names."""
@@ -69,11 +67,11 @@ class Job:
     """One fit of a batch.
 
     Attributes:
-        name: of its capture, settings and seed.
+        name: names of its capture and settings, and its seed.
         capture: folder or URL.
         out: folder of the fit.
         config: settings.
-        batch: what all jobs share.
+        batch: options of all jobs.
     """
 
     name: str
@@ -111,7 +109,7 @@ class JobState:
     _begin: tuple[float, int] | None = field(default=None, repr=False)
 
     def progress(self, frames: int, num_frames: int) -> None:
-        """Note how many frames are fitted, and estimate the time left from those of this run."""
+        """Note how many frames are fitted, and estimate the time left from the frames of this run."""
         now = time.monotonic()
         self.frames, self.num_frames = frames, num_frames
         self._begin = self._begin or (now, frames)
@@ -119,6 +117,20 @@ class JobState:
         self.seconds = now - begin
         if frames > before:
             self.seconds_left = self.seconds * (num_frames - frames) / (frames - before)
+
+    def note(self, part: Part) -> None:
+        """Note the worker of a task, and append its frames and warnings to the log."""
+        self.worker = part.worker
+        frames = f"frames {part.reports[0].frame} to {part.reports[-1].frame}"
+        seconds = sum(report.seconds for report in part.reports)
+        self.log(f"{frames}: {seconds:.1f} s on {part.worker}, {part.peak_bytes / 1e9:.2f} GB at most", *part.messages)
+
+    def log(self, *lines: str) -> None:
+        """Append lines to the log of the job."""
+        self.job.out.mkdir(parents=True, exist_ok=True)
+        with open(self.job.out / LOG, "a", encoding="utf-8") as file:
+            for line in lines:
+                file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {' '.join(line.split())}\n")
 
 
 def read_jobs(path: str | Path) -> list[Job]:
@@ -182,39 +194,26 @@ def run_batch(
     Raises:
         ConnectionError: the scheduler was lost.
     """
-    return wait_for(_run(jobs, workers, on_change or (lambda _: None)))
-
-
-async def _run(
-    jobs: Sequence[Job], workers: Workers, on_change: Callable[[Sequence[JobState]], None]
-) -> list[JobState]:
-    states = [JobState(job) for job in jobs]
+    states, changed = [JobState(job) for job in jobs], on_change or (lambda _: None)
 
     async def run(state: JobState) -> None:
+        state.status = "fitting"
         try:
-            fit = await _fit(state, workers, lambda: on_change(states))
-            state.frames = state.num_frames = len(fit.reports)
-            state.status, state.num_bytes = "done", (state.job.out / "stream.morgs").stat().st_size
+            await _fit(state, workers, lambda: changed(states))
+            state.status = "done"
         except ConnectionError:
             raise
         except Exception as error:
             state.status, state.error = "failed", error
-            _log(state.job, f"failed: {error}")
-        on_change(states)
+            state.log(f"failed: {error}")
+        changed(states)
 
-    try:
-        async with asyncio.TaskGroup() as group:
-            for state in states:
-                while sum(other.status == "fitting" for other in states) >= workers.count:
-                    await asyncio.sleep(_POLL)
-                state.status = "fitting"
-                group.create_task(run(state))
-    except BaseExceptionGroup as errors:
-        raise errors.exceptions[0] from None
+    wait_for(workers.map(run, states))
     return states
 
 
-async def _fit(state: JobState, workers: Workers, changed: Callable[[], None]) -> SegmentedFit:
+async def _fit(state: JobState, workers: Workers, changed: Callable[[], None]) -> None:
+    """Fit a job, and note its progress and the size of its stream."""
     job, batch = state.job, state.job.batch
     view = None if batch.test_view.lower() == "none" else batch.test_view
     capture = load_capture(job.capture, batch.downscale, view, batch.frames, batch.reading)
@@ -224,21 +223,8 @@ async def _fit(state: JobState, workers: Workers, changed: Callable[[], None]) -
             state.progress(int(done), int(total))
             changed()
 
-    def on_part(part: Part) -> None:
-        state.worker = part.worker
-        frames = f"frames {part.reports[0].frame} to {part.reports[-1].frame}"
-        seconds = sum(report.seconds for report in part.reports)
-        _log(job, f"{frames}: {seconds:.1f} s on {part.worker}, {part.peak_bytes / 1e9:.2f} GB at most")
-        for message in part.messages:
-            _log(job, message)
-
-    return await fit_in_segments(
-        capture, job.out, workers, job.config, batch.segments, resume=True, on_stage=on_stage, on_part=on_part
+    fit = await fit_in_segments(
+        capture, job.out, workers, job.config, batch.segments, resume=True, on_stage=on_stage, on_part=state.note
     )
-
-
-def _log(job: Job, text: str) -> None:
-    """Append a line to the log of a job."""
-    job.out.mkdir(parents=True, exist_ok=True)
-    with open(job.out / LOG, "a", encoding="utf-8") as file:
-        file.write(f"{time.strftime('%Y-%m-%d %H:%M:%S')} {' '.join(text.split())}\n")
+    state.frames = state.num_frames = len(fit.reports)
+    state.num_bytes = (job.out / "stream.morgs").stat().st_size

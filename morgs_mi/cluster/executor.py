@@ -13,7 +13,7 @@ import os
 import signal
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
@@ -21,10 +21,11 @@ from typing import Any, TypeVar
 
 __all__ = ["Workers", "cores", "open_workers", "share_of_machine", "wait_for"]
 
+Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 _ATTEMPTS = 3
-_POLL = 0.02  # seconds between two looks for a process that is free
+_POLL = 0.02  # seconds between two looks for a worker that is free; their number may grow
 # Seconds after which a scheduler that does not answer counts as lost.
 _TIMEOUT = 10
 # Cores and bytes of this process as a worker on one machine, by name; set when it starts.
@@ -54,6 +55,24 @@ class Workers(ABC):
             ConnectionError: the scheduler was lost.
             Exception: what the task raised.
         """
+
+    async def map(self, function: Callable[[Item], Coroutine[Any, Any, None]], items: Iterable[Item]) -> None:
+        """Await a function of each item, of at most `count` items at once.
+
+        Raises:
+            Exception: the first that `function` raised; the others are cancelled.
+        """
+        running = set[asyncio.Task[None]]()
+        try:
+            async with asyncio.TaskGroup() as group:
+                for item in items:
+                    while len(running) >= self.count:
+                        await asyncio.wait(running, timeout=_POLL, return_when=asyncio.FIRST_COMPLETED)
+                    task = group.create_task(function(item))
+                    running.add(task)
+                    task.add_done_callback(running.discard)
+        except BaseExceptionGroup as errors:
+            raise errors.exceptions[0] from None
 
 
 class _Processes(Workers):
@@ -168,15 +187,18 @@ def open_workers(scheduler: str | None = None, count: int | None = None) -> Iter
     """
     if count is not None and count < 1:
         raise ValueError(f"open_workers(): `workers` must be at least 1, got {count}.")
-    if scheduler is None:
-        workers = _Processes(count or cores())
-        try:
-            yield workers
-        finally:
-            workers.close()
-        return
-    with ExitStack() as stack:
-        yield _dask_workers(scheduler, count, stack)
+    with _processes(count or cores()) if scheduler is None else _dask_workers(scheduler, count or cores()) as workers:
+        yield workers
+
+
+@contextmanager
+def _processes(count: int) -> Iterator[Workers]:
+    """Start processes on this machine."""
+    workers = _Processes(count)
+    try:
+        yield workers
+    finally:
+        workers.close()
 
 
 def _begin(share: dict[str, int]) -> None:
@@ -196,8 +218,9 @@ def _end(pool: ProcessPoolExecutor) -> None:
         process.terminate()
 
 
-def _dask_workers(scheduler: str, count: int | None, stack: ExitStack) -> Workers:
-    """Return the workers of a Dask cluster that `stack` disconnects from."""
+@contextmanager
+def _dask_workers(scheduler: str, count: int) -> Iterator[Workers]:
+    """Connect to a Dask cluster; `count` workers are started for a local one."""
     try:
         import dask.config
         from distributed import Client, LocalCluster
@@ -205,25 +228,27 @@ def _dask_workers(scheduler: str, count: int | None, stack: ExitStack) -> Worker
         raise ValueError(
             f"open_workers(): `scheduler={scheduler}` needs the package distributed; pip install 'morgs-mi[cluster]'."
         ) from None
-    stack.enter_context(dask.config.set({"distributed.comm.timeouts.connect": _TIMEOUT}))
-    address: Any = scheduler
-    if scheduler == "local":
-        count = count or cores()
-        threads = max(1, cores() // count)
-        address = LocalCluster(count, threads, dashboard_address=":0", silence_logs=logging.CRITICAL)
-        stack.enter_context(address)
-    elif "://" not in scheduler:
+    if scheduler != "local" and "://" not in scheduler:
         raise ValueError(
             f"open_workers(): `scheduler` must be local or an address such as tcp://host:8786, got {scheduler}."
         )
-    found = "none"
-    try:
-        client = stack.enter_context(Client(address, timeout=_TIMEOUT, set_as_default=False))
-        found = "no worker"
-        client.wait_for_workers(1, timeout=_TIMEOUT)
-    except (OSError, ValueError):
-        raise ConnectionError(f"{scheduler}: expected a scheduler with workers, got {found}; start it first.") from None
-    return _DaskWorkers(client, scheduler)
+    with ExitStack() as stack:
+        stack.enter_context(dask.config.set({"distributed.comm.timeouts.connect": _TIMEOUT}))
+        address: Any = scheduler
+        if scheduler == "local":
+            threads = max(1, cores() // count)
+            address = LocalCluster(count, threads, dashboard_address=":0", silence_logs=logging.CRITICAL)
+            stack.enter_context(address)
+        found = "none"
+        try:
+            client = stack.enter_context(Client(address, timeout=_TIMEOUT, set_as_default=False))
+            found = "no worker"
+            client.wait_for_workers(1, timeout=_TIMEOUT)
+        except (OSError, ValueError):
+            raise ConnectionError(
+                f"{scheduler}: expected a scheduler with workers, got {found}; start it first."
+            ) from None
+        yield _DaskWorkers(client, scheduler)
 
 
 def cores() -> int:

@@ -104,3 +104,34 @@ def test_open_workers__names_the_extra_that_is_missing(monkeypatch: pytest.Monke
         open_workers("local"),
     ):
         pass
+
+
+def test_workers_map__awaits_at_most_as_many_items_as_there_are_workers() -> None:
+    running, most, done = set[int](), [], []
+
+    async def note(item: int) -> None:
+        running.add(item)
+        most.append(len(running))
+        await asyncio.sleep(0.01 * (3 - item))
+        running.discard(item)
+        done.append(item)
+
+    with open_workers(count=2) as workers:
+        asyncio.run(workers.map(note, range(3)))
+    assert (max(most), sorted(done)) == (2, [0, 1, 2])
+
+
+def test_workers_map__raises_the_first_error_and_cancels_the_others() -> None:
+    ended = []
+
+    async def fail_or_wait(item: int) -> None:
+        if item:
+            raise ConnectionError("lost")
+        try:
+            await asyncio.sleep(60)
+        finally:
+            ended.append(item)
+
+    with open_workers(count=2) as workers, pytest.raises(ConnectionError, match="lost"):
+        asyncio.run(workers.map(fail_or_wait, range(4)))
+    assert ended == [0]
