@@ -48,7 +48,7 @@ _MEANS += ("true_motion_moving", "confidence_iou")
 _BY_FRAME = ("psnr", "psnr_moving", "motion_error_moving")
 _MOTION_3D = ("error", "relative_error", "length_ratio", "angle")
 _OPEN: dict[str, Clip] = {}  # the clip of a worker's last task
-_EVALUATION = ("evaluate.py", "metrics.py", "motion3d.py", "results.py", "temporal.py")
+_EVALUATION = ("comparison.py", "evaluate.py", "measures.py", "metrics.py", "motion3d.py", "results.py", "temporal.py")
 
 Scores = dict[str, Any]
 

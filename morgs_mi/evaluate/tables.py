@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from morgs_mi.evaluate.evaluate import REGIONS
+from morgs_mi.evaluate.measures import REGIONS
 from morgs_mi.evaluate.results import Evaluation
 
 __all__ = ["evaluation_summary", "evaluation_tables", "figure"]

@@ -16,8 +16,9 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, reemitted_keyframe, residual_packet
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import SH_C0
-from morgs_mi.evaluate.evaluate import IMAGE_SCORES, REGIONS, evaluate_stream
+from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.lpips import Lpips
+from morgs_mi.evaluate.measures import IMAGE_SCORES, REGIONS
 from morgs_mi.evaluate.results import known_mean
 from morgs_mi.evaluate.tables import evaluation_summary
 from morgs_mi.fit.forecast import forecast

@@ -1,0 +1,154 @@
+"""A stream beside its recording: clip, frames and views, as the measures compare them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.capture.capture import Capture
+from morgs_mi.codec.container import PacketKind, encode_packet
+from morgs_mi.codec.packets import CodedFrame, coded_frames
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.camera import Camera
+from morgs_mi.evaluate.temporal import recorded_change
+from morgs_mi.playback.player import has_confidence, open_stream_capture, render, render_config, truth_for_camera
+from morgs_mi.playback.visualise import to_uint8
+from morgs_mi.render.config import RenderConfig
+from morgs_mi.synth.ground_truth import GroundTruth
+
+__all__ = ["ComparedClip", "ComparedFrame", "ComparedView"]
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedClip:
+    """A stream and its recording.
+
+    Attributes:
+        stream: the stream.
+        recording: its capture.
+        packets: kind and size of each frame's packet.
+        num_packets: number of packets, re-emitted keyframes included.
+        views: the evaluated views: the held-out one, or otherwise all training views.
+        cameras: of all views, with the delays of the recording.
+        channels: rendered channels.
+        render: settings of the renderer, as in the fit.
+    """
+
+    stream: StreamReader
+    recording: Capture
+    packets: Mapping[int, tuple[PacketKind, int]]
+    num_packets: int
+    views: Sequence[int]
+    cameras: Sequence[Camera]
+    channels: Sequence[str]
+    render: RenderConfig
+
+    @classmethod
+    def of(cls, stream: StreamReader, capture: str | Path | None) -> ComparedClip:
+        """Return a stream beside `capture`; None: the capture that it was fitted to.
+
+        The sizes are read from the file and not from the fit's report, because a receiver has only the file.
+
+        Raises:
+            FileNotFoundError: the capture is missing.
+            ValueError: the stream is truncated, broken or empty, or was fitted to another capture.
+        """
+        packets, count = dict[int, tuple[PacketKind, int]](), 0
+        for packet in stream:
+            # Later packets of a frame are re-emitted keyframes.
+            packets.setdefault(packet.frame, (packet.kind, len(encode_packet(packet))))
+            count += 1
+        if not packets:
+            raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
+        recording = open_stream_capture(stream, capture, list(packets))
+        views = recording.train_views if recording.test_view is None else [recording.test_view]
+        channels = ("color", "motion", *(("confidence",) if has_confidence(stream) else ()))
+        cameras = recording.with_delays(stream.cameras)
+        return cls(stream, recording, packets, count, views, cameras, channels, render_config(stream))
+
+    def frames(self) -> Iterator[ComparedFrame]:
+        """Yield the decoded frames beside the recorded ones."""
+        last = None
+        # The file may have grown since it was read.
+        decoded = coded_frames(islice(self.stream, self.num_packets))
+        recorded = self.recording.partial_frames(min(self.packets), max(self.packets) + 1)
+        for coded, frame in zip(decoded, recorded, strict=True):
+            kind, num_bytes = self.packets[coded.frame]
+            yield ComparedFrame(self, coded, kind, num_bytes, frame.images, last)
+            last = frame.images
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedFrame:
+    """A decoded frame and the recorded one.
+
+    Attributes:
+        clip: their clip.
+        coded: state of the decoder.
+        kind: kind of the frame's packet.
+        num_bytes: its size.
+        images: recorded images of all views; None: missing.
+        last: likewise of the frame before; None in the first one.
+    """
+
+    clip: ComparedClip
+    coded: CodedFrame
+    kind: PacketKind
+    num_bytes: int
+    images: Sequence[np.ndarray | None]
+    last: Sequence[np.ndarray | None] | None
+
+    def views(self) -> Iterator[ComparedView]:
+        """Render and yield the evaluated views, except those without an image."""
+        clip = self.clip
+        for index in clip.views:
+            camera, image = clip.cameras[index], self.images[index]
+            if image is not None:
+                maps = render(self.coded.gaussians, camera, clip.channels, clip.render)
+                truth = truth_for_camera(clip.recording, camera, self.coded.frame)
+                moving = self._changed(index) if truth is None else truth.mask
+                yield ComparedView(self, index, maps, image, clip.recording.masks[index], moving, truth)
+
+    def _changed(self, view: int) -> np.ndarray | None:
+        """Return the mask of pixels that changed since the last image; None without one, and beside ground truth."""
+        before, now = None if self.last is None else self.last[view], self.images[view]
+        if before is None or now is None or self.clip.recording.truth is not None:
+            return None
+        return recorded_change(before, now)
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedView:
+    """One view of a frame, rendered and recorded.
+
+    Attributes:
+        frame: its frame.
+        index: of the view.
+        maps: rendered channels by name.
+        recorded: image [H, W, 3].
+        valid: valid pixels [H, W] bool; None: all.
+        moving: moving pixels [H, W] bool; None: unknown.
+        truth: ground truth; None: unknown.
+    """
+
+    frame: ComparedFrame
+    index: int
+    maps: Mapping[str, np.ndarray]
+    recorded: np.ndarray
+    valid: np.ndarray | None
+    moving: np.ndarray | None
+    truth: GroundTruth | None
+
+    @property
+    def camera(self) -> Camera:
+        """Camera of the view, with its delay."""
+        return self.frame.clip.cameras[self.index]
+
+    @property
+    def rendered(self) -> np.ndarray:
+        """Rendered image [H, W, 3], uint8 as a decoder shows it."""
+        return to_uint8(self.maps["color"])

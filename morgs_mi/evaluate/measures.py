@@ -1,0 +1,214 @@
+"""The measures of an evaluation, each of one kind of score.
+
+A measure is given the frames in order, each view by view. It returns the scores of a frame, as fields of `FrameScores`,
+and at the end the scores of the clip, as fields of `Evaluation`.
+
+Every score is one number per view and frame. Frames average over views and the clip over frames; NaN stands for an
+unknown score. A name with ``_moving`` or ``_still`` is the score of a region: the pixels whose surface moved since the
+last frame (in the first frame: until the next) according to ``truth/``, or the pixels in which the recording changed by
+more than its noise if there is no truth.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from morgs_mi.calibration.refine import register_camera
+from morgs_mi.codec.container import PacketKind
+from morgs_mi.codec.packets import CodedFrame
+from morgs_mi.evaluate.comparison import ComparedClip, ComparedFrame, ComparedView
+from morgs_mi.evaluate.lpips import Lpips
+from morgs_mi.evaluate.metrics import WINDOW, endpoint_error, iou, mean_over, psnr_of, ssim_map, unit_pair
+from morgs_mi.evaluate.motion3d import evaluate_motion
+from morgs_mi.evaluate.perception import delta_e_map, flip_map
+from morgs_mi.evaluate.results import Motion3DScores, VariationScores, ViewScores
+from morgs_mi.evaluate.temporal import StillVariation, slope
+from morgs_mi.evaluate.tracking import evaluate_tracks
+from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.fit.view import View, mean_psnr
+from morgs_mi.method.exposure import follow_exposure
+from morgs_mi.synth.ground_truth import GroundTruth, load_tracks, load_truth
+
+__all__ = [
+    "IMAGE_SCORES",
+    "REGIONS",
+    "Measure",
+    "Motion3D",
+    "Quality",
+    "Registration",
+    "Tracking",
+    "Variation",
+]
+
+REGIONS = ("", "_moving", "_still")
+IMAGE_SCORES = ("psnr", "ssim", "flip", "delta_e", "lpips")
+# Compression flickers: after a hundred frames half the pixels of a real recording have changed once.
+_FALSE_ALARMS = 0.02
+
+
+class Measure:
+    """Base of the measures."""
+
+    def add_view(self, view: ComparedView) -> None:
+        """Add a view of the next frame."""
+
+    def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
+        """Add the next frame, after its views; return its scores as fields of `FrameScores`."""
+        return {}
+
+    def result(self) -> dict[str, Any]:
+        """Return the scores of the clip as fields of `Evaluation`."""
+        return {}
+
+
+class Quality(Measure):
+    """Scores of the rendered images, motion and confidence, view by view.
+
+    Args:
+        lpips: network for LPIPS; without one there is no LPIPS.
+    """
+
+    def __init__(self, lpips: Lpips | None) -> None:
+        self._lpips = lpips
+        self._views: dict[str, ViewScores] = {}
+        self._psnr: list[float] = []
+
+    def add_view(self, view: ComparedView) -> None:
+        scores = _image_scores(view, self._lpips)
+        # A keyframe has no motion.
+        if view.frame.kind == PacketKind.RESIDUAL and view.truth is not None:
+            scores |= _motion_scores(view.maps, view.truth)
+        self._views[view.camera.name] = ViewScores(**scores)
+
+    def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
+        names = [frame.clip.cameras[view].name for view in frame.clip.views]
+        views = {name: self._views.pop(name, ViewScores()) for name in names}
+        mean = ViewScores.mean(list(views.values()))
+        self._psnr.append(mean.psnr)
+        return {"scores": mean, "views": views}
+
+    def result(self) -> dict[str, Any]:
+        return {"psnr_slope": slope(self._psnr)}
+
+
+class Variation(Measure):
+    """Variation of the static pixels, see `StillVariation`."""
+
+    def __init__(self, clip: ComparedClip) -> None:
+        false_alarms = _FALSE_ALARMS if clip.recording.truth is None else 0
+        self._views = {view: StillVariation(clip.recording.masks[view], false_alarms) for view in clip.views}
+
+    def add_view(self, view: ComparedView) -> None:
+        moving = np.zeros(view.recorded.shape[:2], bool) if view.moving is None else view.moving
+        self._views[view.index].add(view.rendered, view.recorded, moving)
+
+    def result(self) -> dict[str, Any]:
+        return {"variation": VariationScores.mean([view.result() for view in self._views.values()])}
+
+
+class Motion3D(Measure):
+    """Errors in 3D of the Gaussians that exist in a frame and in the frame before, see `evaluate_motion`."""
+
+    def __init__(self, clip: ComparedClip) -> None:
+        self._cameras, self._truth = clip.recording.cameras, clip.recording.truth
+        folder = self._truth
+        self._tracks = load_tracks(folder) if folder is not None and (folder / "tracks.npz").is_file() else None
+        self._before: CodedFrame | None = None
+
+    def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
+        before, self._before = self._before, frame.coded
+        if frame.kind != PacketKind.RESIDUAL or before is None:
+            return {"motion_3d": None}
+        return {"motion_3d": self._motion(before, frame.coded)}
+
+    def _motion(self, before: CodedFrame, now: CodedFrame) -> Motion3DScores | None:
+        """Return the errors between two frames; None without truth."""
+        frame, tracks = now.frame, self._tracks
+        if tracks is None or self._truth is None or frame >= tracks.points.shape[1]:
+            return None
+        views = []
+        for camera in self._cameras:
+            truth = load_truth(self._truth, camera.name, frame - 1)
+            views.append((camera.resized(*truth.mask.shape[::-1]), truth))
+        _, then, later = np.intersect1d(before.ids, now.ids, return_indices=True)
+        old = before.gaussians.numpy()["means"][then].astype(float)
+        new = now.gaussians.numpy()["means"][later].astype(float)
+        points = tracks.points[:, frame - 1], tracks.points[:, frame], tracks.ids
+        return evaluate_motion(old, new - old, np.asarray(before.gaussians.opacities)[then], points, views)
+
+
+class Registration(Measure):
+    """PSNR of the held-out view in the first frame, from the camera that fits its image best."""
+
+    def __init__(self) -> None:
+        self._psnr = float("nan")
+        self._begun = False
+
+    def add_view(self, view: ComparedView) -> None:
+        clip = view.frame.clip
+        if self._begun or view.index != clip.recording.test_view:
+            return
+        given = View(clip.stream.cameras[view.index], view.recorded, view.valid)
+        extent = scene_extent([clip.stream.cameras[v] for v in clip.recording.train_views])
+        gaussians = view.frame.coded.gaussians
+        found = given._replace(camera=register_camera(gaussians, given, extent, FitConfig(), clip.render))
+        self._psnr = mean_psnr(gaussians, [found], clip.render)
+
+    def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
+        self._begun = True
+        return {}
+
+    def result(self) -> dict[str, Any]:
+        return {"registered_psnr": self._psnr}
+
+
+class Tracking(Measure):
+    """3D point tracks, see `evaluate_tracks`."""
+
+    def __init__(self, clip: ComparedClip) -> None:
+        self._clip = clip
+
+    def result(self) -> dict[str, Any]:
+        return {"tracking": evaluate_tracks(self._clip.stream, self._clip.recording, self._clip.views)}
+
+
+def _image_scores(view: ComparedView, lpips: Lpips | None) -> dict[str, float]:
+    """Return the scores of a rendered image by metric and region."""
+    rendered, moving = view.rendered, view.moving
+    whole = np.ones(rendered.shape[:2], bool) if view.valid is None else view.valid
+    nothing = np.zeros_like(whole)
+    regions = (whole, *((nothing, nothing) if moving is None else (whole & moving, whole & ~moving)))
+    a, b = unit_pair("evaluate_stream", rendered, view.recorded)
+    maps = {"psnr": np.square(a - b), "flip": flip_map(a, b), "delta_e": delta_e_map(a, b)}
+    if min(whole.shape) >= WINDOW:
+        maps["ssim"] = ssim_map(a, b)
+    matched = follow_exposure(rendered, view.recorded, view.valid)(a).clip(0, 1)
+    scores = {"psnr_matched": psnr_of(mean_over(np.square(matched - b), whole))}
+    for name, values in maps.items():
+        finish = psnr_of if name == "psnr" else float
+        scores |= {name + r: finish(mean_over(values, mask)) for r, mask in zip(REGIONS, regions, strict=True)}
+    if lpips is not None:
+        distance = lpips.distance_map(rendered, view.recorded)
+        if distance.shape == whole.shape:
+            scores |= {f"lpips{r}": mean_over(distance, mask) for r, mask in zip(REGIONS, regions, strict=True)}
+        else:
+            scores["lpips"] = mean_over(distance)
+    return scores
+
+
+def _motion_scores(maps: Mapping[str, np.ndarray], truth: GroundTruth) -> dict[str, float]:
+    """Return the errors of the rendered motion and confidence."""
+    motion, true, moving = maps["motion"], truth.motion, truth.mask
+    scores = {
+        "motion_error": endpoint_error(motion, true),
+        "motion_error_moving": endpoint_error(motion, true, moving),
+        "motion_error_still": endpoint_error(motion, true, ~moving),
+        "true_motion_moving": endpoint_error(np.zeros_like(motion), true, moving),
+    }
+    if "confidence" in maps:
+        scores["confidence_iou"] = iou(maps["confidence"][..., 0] > 0.5, moving)
+    return scores
