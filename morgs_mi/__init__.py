@@ -32,6 +32,7 @@ from morgs_mi.surfaces.light_probe import light_probe  # noqa: E402
 from morgs_mi.surfaces.shadows import shadow_ratio, shadowed  # noqa: E402
 from morgs_mi.surfaces.splat_rays import SplatRays  # noqa: E402
 from morgs_mi.synth.ground_truth import load_tracks, load_truth  # noqa: E402
+from morgs_mi.synth.synth_config import SynthConfig  # noqa: E402
 from morgs_mi.synth.synthesize import synthesize  # noqa: E402
 
 # Here, because the reader cannot import what draws it.
@@ -53,6 +54,7 @@ __all__ = [
     "SplatRays",
     "StreamConfig",
     "StreamLoop",
+    "SynthConfig",
     "channel_image",
     "confidence_image",
     "depth_image",

@@ -26,9 +26,10 @@ from morgs_mi.io.video_writer import playable_format, write_video
 from morgs_mi.playback.player import channel_image, open_stream, render_stream, truth_for_camera
 from morgs_mi.playback.visualise import contact_sheet, label, motion_legend, side_by_side, write_png
 from morgs_mi.recorder import stream_capture
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
-__all__ = ["ClipConfig", "DemoConfig", "DemoReport", "run_demo"]
+__all__ = ["DemoConfig", "DemoReport", "run_demo"]
 
 _COMPARED = ("psnr", "ssim", "motion_error", "motion_error_moving", "motion_error_still", "true_motion_moving")
 # Factor on the error images: errors of a tenth are visible, typical ones are smaller.
@@ -38,31 +39,13 @@ _LEAST_SECONDS = 3
 
 
 @dataclass(frozen=True)
-class ClipConfig:
-    """The path-traced clip; the fields are arguments of `synthesize`."""
-
-    num_cameras: int = 10
-    """Number of cameras, including cam00, which is held out."""
-    num_frames: int = 10
-    """Frames per camera."""
-    width: int = 320
-    """Image width in pixels, even."""
-    height: int = 240
-    """Image height in pixels, even."""
-    spp: int = 16
-    """Samples per pixel; the noise of the default is like a good camera's."""
-    fps: float = 30.0
-    """Frames per second."""
-
-
-@dataclass(frozen=True)
 class DemoConfig:
     """Settings of the demonstration."""
 
     scene: str = "spheres"
     """Name or file of the scene."""
-    clip: ClipConfig = field(default_factory=ClipConfig)
-    """The clip."""
+    clip: SynthConfig = field(default_factory=lambda: SynthConfig(cameras=10, frames=10, spp=16))
+    """The path-traced clip, with the seed of the fit."""
     plain_frames: int = 5
     """Number of frames of the second fit, without learned motion, offset and confidence, for comparison."""
     stream: StreamConfig = field(
@@ -154,7 +137,7 @@ def _run(root: Path, config: DemoConfig, shown: Report | None) -> DemoReport:
     off = {"learn_motion": False, "learn_offset": False, "learn_confidence": False}
     plain = replace(config.stream, motion=replace(config.stream.motion, **off))
     run_step("Fitting", fit("stream", config.stream, None))
-    plain_frames = min(config.plain_frames, config.clip.num_frames)
+    plain_frames = min(config.plain_frames, config.clip.frames)
     run_step("Fitting without ML, MO, MC", fit("stream_plain", plain, plain_frames))
     results = {
         name: run_step(
@@ -173,16 +156,17 @@ def _run(root: Path, config: DemoConfig, shown: Report | None) -> DemoReport:
 
 def _synthesize_clip(folder: Path, config: DemoConfig, report: Callable[[float, float], None]) -> None:
     """Path-trace the clip unless `folder` has it already; captures are written atomically, so it is complete."""
-    wanted = {"scene": config.scene, "seed": config.stream.seed, **asdict(config.clip)}
+    clip = replace(config.clip, seed=config.stream.seed)
+    wanted = {"scene": config.scene, **clip.as_dict()}
+    given = {name: value for name, value in wanted.items() if value is not None}
     try:
         about = read_json(folder / "capture.json")
     except (OSError, ValueError):
         about = None
-    if isinstance(about, dict) and all(about.get(name) == value for name, value in wanted.items()):
+    if isinstance(about, dict) and all(about.get(name) == value for name, value in given.items()):
         report(1, 1)
         return
-    settings = {**asdict(config.clip), "seed": config.stream.seed}
-    synthesize(config.scene, folder, **settings, overwrite=True, progress=report)
+    synthesize(config.scene, folder, clip, overwrite=True, progress=report)
 
 
 def _compare(results: Mapping[str, Evaluation]) -> tuple[list[int], dict[str, dict[str, float | None]]]:

@@ -11,11 +11,12 @@ import pytest
 
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import locked_folder
-from morgs_mi.demo import ClipConfig, DemoConfig, _synthesize_clip, run_demo
+from morgs_mi.demo import DemoConfig, _synthesize_clip, run_demo
 from morgs_mi.fit.config import FitConfig
+from morgs_mi.synth.synth_config import SynthConfig
 
 SMALL = DemoConfig(
-    clip=ClipConfig(num_cameras=6, num_frames=4, width=64, height=48, spp=4),
+    clip=SynthConfig(cameras=6, frames=4, width=64, height=48, spp=4),
     plain_frames=3,
     stream=StreamConfig(fit=FitConfig(sh_degree=0, num_gaussians=500, first_frame_steps=20, epochs=1)),
 )
@@ -58,7 +59,7 @@ def test_run_demo__reuses_a_clip_with_the_same_settings(out: Path) -> None:
     marker.write_text("kept")
     _synthesize_clip(out / "capture", SMALL, lambda done, total: None)
     assert marker.exists()
-    _synthesize_clip(out / "capture", replace(SMALL, clip=replace(SMALL.clip, num_frames=1)), lambda done, total: None)
+    _synthesize_clip(out / "capture", replace(SMALL, clip=replace(SMALL.clip, frames=1)), lambda done, total: None)
     assert not marker.exists()
 
 

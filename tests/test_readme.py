@@ -10,6 +10,7 @@ from typing import get_args
 import pytest
 
 from morgs_mi.cli import Command
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 ROOT = Path(__file__).parent.parent
@@ -21,7 +22,7 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 def workplace(tmp_path_factory):
     """Return a folder that holds a small capture where the demo writes its own."""
     folder = tmp_path_factory.mktemp("readme")
-    synthesize("spheres", folder / "out/demo/capture", num_cameras=3, num_frames=2, width=64, height=48, spp=4)
+    synthesize("spheres", folder / "out/demo/capture", SynthConfig(cameras=3, frames=2, width=64, height=48, spp=4))
     return folder
 
 

@@ -39,6 +39,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.fit.initialise import scene_extent
 from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.synth.disturbances import Disturbances, load_disturbances
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 _FOCAL_ERROR = 0.01
@@ -137,7 +138,7 @@ def lens_clips(clips: Path, seed: int, distortion: float) -> tuple[Path, Path]:
     denied = true.with_name(f"{true.name}-denied")
     if not denied.exists():
         own = Disturbances(distortion=distortion)
-        synthesize("random", true, num_frames=1, seed=seed, disturbances=own, overwrite=True)
+        synthesize("random", true, SynthConfig(frames=1, seed=seed, disturbances=own), overwrite=True)
         capture, truth = load_capture(true), load_disturbances(true / "truth")
         lenses = [truth[n].lens if v == capture.test_view else Lens() for v, n in enumerate(capture.names)]
         shutil.copytree(true, denied)

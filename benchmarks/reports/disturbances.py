@@ -23,6 +23,7 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 from morgs_mi.synth.disturbances import Disturbances
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 __all__ = ["CELLS", "Options", "disturbance_table", "main"]
@@ -79,16 +80,8 @@ class Options(CellOptions):
         """Return the clip of a cell."""
         folder = self.clips / name.replace(" ", "-")
         if not folder.exists():
-            synthesize(
-                self.model,
-                folder,
-                num_cameras=self.cameras,
-                num_frames=self.frames,
-                width=self.width,
-                height=self.width * 3 // 4,
-                disturbances=disturbances,
-                animation=self.animation,
-            )
+            size = SynthConfig(self.cameras, self.frames, self.width, self.width * 3 // 4)
+            synthesize(self.model, folder, replace(size, disturbances=disturbances, animation=self.animation))
         return Source.of(load_capture(folder))
 
 

@@ -24,6 +24,7 @@ from benchmarks.reports.random_scenes import fitted_frames
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 
@@ -86,7 +87,7 @@ def main(options: Options) -> None:
     for name in options.scenes:
         clip, (scene, _, seed) = options.clips / name, name.partition("-")
         if not clip.exists():
-            synthesize(scene, clip, num_frames=options.frames, seed=int(seed or 0))
+            synthesize(scene, clip, SynthConfig(frames=options.frames, seed=int(seed or 0)))
         source = Source.of(load_capture(clip))
         cells |= {f"{name}/{own}": (source, replace(config, seed=own), options.frames) for own in options.fit_seeds}
     found = options.run(measure, cells)

@@ -30,6 +30,7 @@ from morgs_mi.method.exposure import follow_exposure
 from morgs_mi.playback.visualise import to_uint8
 from morgs_mi.synth.disturbances import Disturbances
 from morgs_mi.synth.ground_truth import load_truth
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 __all__ = ["Options", "exposure_table", "main"]
@@ -78,9 +79,9 @@ class Options(CellOptions):
         """Return the folder of a clip."""
         folder = self.clips / f"random-{seed}-{cameras}"
         if not folder.exists():
-            size = {"width": self.width, "height": self.width * 3 // 4}
-            given = {"num_frames": self.frames, "num_cameras": 7, "disturbances": _ROWS[cameras], "seed": seed}
-            synthesize("random", folder, **size, **given)
+            width, height = self.width, self.width * 3 // 4
+            own = SynthConfig(7, self.frames, width, height, disturbances=_ROWS[cameras], seed=seed)
+            synthesize("random", folder, own)
         return folder
 
 

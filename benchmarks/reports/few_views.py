@@ -31,6 +31,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.fit.forecast import angles_to, forecast, quality_of, scene_depths
 from morgs_mi.fit.noise import white_noise_of
 from morgs_mi.synth.scene import load_scene
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 Points = Literal["stereo", "triangulated", "random"]
@@ -71,7 +72,7 @@ def wide_capture(clips: Path, seed: int, downscale: float) -> Capture:
         scene = load_scene("random", seed)
         objects = {name: item for name, item in scene.objects.items() if name not in ("left", "right")}
         scene = replace(scene, objects=objects, rig=replace(scene.rig, spread=(60.0, 10.0)))
-        synthesize(scene, clip, num_cameras=13, num_frames=1, seed=seed)
+        synthesize(scene, clip, SynthConfig(cameras=13, frames=1, seed=seed))
     return load_capture(clip, downscale)
 
 

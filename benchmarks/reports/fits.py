@@ -13,6 +13,7 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.stream_loop import FrameReport
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 __all__ = ["first_frame", "new_loop", "random_capture"]
@@ -22,7 +23,7 @@ def random_capture(clips: Path, seed: int, downscale: float = 1) -> Capture:
     """Return the random scene of a seed, which is made in the folder `clips` if it is not there."""
     clip = clips / f"random-{seed}"
     if not clip.exists():
-        synthesize("random", clip, num_frames=8, seed=seed)
+        synthesize("random", clip, SynthConfig(frames=8, seed=seed))
     return load_capture(clip, downscale)
 
 

@@ -27,6 +27,7 @@ from benchmarks.reports.random_scenes import fitted_frames
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 
@@ -112,9 +113,8 @@ def main(options: Options) -> None:
         clip, (scene, _, number) = options.clips / name, name.partition("-")
         if not clip.exists():
             height = 3 * options.width // 4
-            synthesize(
-                scene, clip, num_frames=options.frames, width=options.width, height=height, seed=int(number or 0)
-            )
+            config = SynthConfig(frames=options.frames, width=options.width, height=height, seed=int(number or 0))
+            synthesize(scene, clip, config)
         cell = f"{name}, fit {seed}"
         cells[cell], about[cell] = (Source.of(load_capture(clip)), options, seed), {"clip": name, "seed": seed}
     rows = [{**about[cell], **row} for cell, found in options.run(measure, cells).items() for row in found]

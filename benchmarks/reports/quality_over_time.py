@@ -28,6 +28,7 @@ from benchmarks.reports.plots import blank_figure, save_figure
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 CASES = ((20, 16, 0.0), (21, 8, 0.0), (22, 4, 0.0), (23, 16, 0.02), (24, 8, 0.02), (25, 4, 0.02))
@@ -64,7 +65,7 @@ class CaseOptions(CellOptions):
             if not clip.exists():
                 # The mean over a block has less noise than its pixels.
                 noise_of_pixels = noise * self.downscale
-                synthesize("random", clip, num_cameras=20, num_frames=1, noise=noise_of_pixels, seed=seed)
+                synthesize("random", clip, SynthConfig(cameras=20, frames=1, noise=noise_of_pixels, seed=seed))
             capture = load_capture(clip, self.downscale)
             train = spread_views(capture.cameras, count, capture.train_views)
             yield f"{count} views{', noisy' if noise else ''}", with_points(capture, train, "stereo"), train

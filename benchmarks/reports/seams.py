@@ -27,6 +27,7 @@ from morgs_mi.cluster.segments import stream_segments
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
 from morgs_mi.fit.config import FitConfig
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 
@@ -69,15 +70,8 @@ def clip(name: str, seed: int, frames: int, options: Options) -> Capture:
     path = options.folder / f"{name}-{seed}-{options.cameras}x{frames}x{options.width}"
     if not path.exists():
         width, height = options.width, options.width * 3 // 4
-        synthesize(
-            name,
-            path,
-            num_cameras=options.cameras,
-            num_frames=frames,
-            width=width,
-            height=height,
-            seed=seed,
-        )
+        config = SynthConfig(cameras=options.cameras, frames=frames, width=width, height=height, seed=seed)
+        synthesize(name, path, config)
     return load_capture(path)
 
 

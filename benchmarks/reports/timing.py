@@ -31,6 +31,7 @@ from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.recorder import push_frame
 from morgs_mi.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.synth.ground_truth import load_truth
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 __all__ = ["Options", "main", "timing_table"]
@@ -78,9 +79,8 @@ class Options(CellOptions):
         folder = self.clips / f"random-{seed}-{own.time_offset:g}-{own.rolling_shutter:g}"
         if not folder.exists():
             width, height = self.width, self.width * 3 // 4
-            synthesize(
-                "random", folder, num_frames=self.frames, width=width, height=height, disturbances=own, seed=seed
-            )
+            config = SynthConfig(frames=self.frames, width=width, height=height, disturbances=own, seed=seed)
+            synthesize("random", folder, config)
         return folder
 
 

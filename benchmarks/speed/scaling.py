@@ -48,6 +48,7 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
 from morgs_mi.fit.config import FitConfig
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 _SHORTENED = {"reading", "frames", "tasks"}
@@ -289,14 +290,8 @@ def main(options: Options) -> None:
     mi.set_variant("llvm_ad_rgb")
     with TemporaryDirectory() as name:
         folder = Path(name)
-        synthesize(
-            options.scene,
-            folder / "clip",
-            num_cameras=options.cameras,
-            num_frames=options.frames,
-            width=options.width,
-            height=options.width * 3 // 4,
-        )
+        size = SynthConfig(options.cameras, options.frames, options.width, options.width * 3 // 4)
+        synthesize(options.scene, folder / "clip", size)
         capture = load_capture(folder / "clip")
         runs, costs = measure(capture, options, folder)
     figures = {

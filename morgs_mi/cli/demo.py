@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from rich.table import Table
 from tyro.conf import DisallowNone, Positional
@@ -31,22 +31,20 @@ class Demo:
     """Folder for all results; those of an earlier demo are replaced."""
     scene: str = _DEFAULT.scene
     """Name of a scene (spheres, arm, thin, flicker, random) or its Python file."""
-    cameras: int = _DEFAULT.clip.num_cameras
+    cameras: Annotated[int | None, DisallowNone] = _DEFAULT.clip.cameras
     """Number of cameras, the held-out cam00 included."""
-    frames: int = _DEFAULT.clip.num_frames
+    frames: int = _DEFAULT.clip.frames
     """Number of frames per camera."""
     width: int = _DEFAULT.clip.width
     """Width of the images in pixels, even."""
     height: int = _DEFAULT.clip.height
     """Height of the images in pixels, even."""
-    spp: int = _DEFAULT.clip.spp
+    spp: Annotated[int | None, DisallowNone] = _DEFAULT.clip.spp
     """Samples per pixel."""
     seed: Annotated[int | None, DisallowNone, setting("seed", _DEFAULT.stream)] = None
     """Seed of the clip and the fit."""
     config: Annotated[Path | None, DisallowNone, optional("FILE.toml")] = None
     """File with settings of the fit, as `morgs-mi fit --print-config` writes it."""
-
-    arguments: ClassVar[Mapping[str, str]] = {"num_cameras": "--cameras", "num_frames": "--frames"}
 
     def run(self) -> None:
         from morgs_mi.demo import run_demo
@@ -56,8 +54,8 @@ class Demo:
         settings.check_methods(stream)
         clip = replace(
             _DEFAULT.clip,
-            num_cameras=self.cameras,
-            num_frames=self.frames,
+            cameras=self.cameras,
+            frames=self.frames,
             width=self.width,
             height=self.height,
             spp=self.spp,

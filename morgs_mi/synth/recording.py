@@ -9,6 +9,7 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.synth.disturbances import CameraDisturbance
 from morgs_mi.synth.path_tracer import PathTracer
+from morgs_mi.synth.synth_config import SynthConfig
 
 __all__ = ["check_lenses", "record_light"]
 
@@ -35,7 +36,7 @@ def check_lenses(cameras: Sequence[Camera], disturbed: Sequence[CameraDisturbanc
 
 
 def record_light(
-    tracer: PathTracer, camera: Camera, own: CameraDisturbance, frame: int, fps: float, spp: int, seed: int
+    tracer: PathTracer, camera: Camera, own: CameraDisturbance, frame: int, config: SynthConfig
 ) -> np.ndarray:
     """Return the light of a frame as a camera with its clock, shutter and lens receives it, linear [H, W, 3].
 
@@ -44,18 +45,17 @@ def record_light(
         camera: the view without distortion.
         own: its disturbance, of which exposure and compression are not applied.
         frame: index of the frame.
-        fps: frames per second.
-        spp: samples per pixel.
-        seed: of the samples.
+        config: has the samples per pixel, their seed and the frame rate.
     """
+    assert config.spp is not None
     if not own.rolling_shutter and not own.distortion:
-        tracer.set_time((frame + own.time_offset) / fps)
-        return tracer.light(camera, spp, seed)
+        tracer.set_time((frame + own.time_offset) / config.fps)
+        return tracer.light(camera, config.spp, config.seed)
     bands = np.arange(camera.height), own.row_times(frame, camera.height)
     count = -(-camera.height // _BAND) if own.rolling_shutter else 1
     light = []
     for band, (rows, times) in enumerate(zip(*(np.array_split(values, count) for values in bands), strict=True)):
-        tracer.set_time(times.mean() / fps)
-        band_seed = int(np.random.SeedSequence([seed, band]).generate_state(1)[0])
-        light.append(tracer.light_of_rows(camera, rows, spp, band_seed, own.lens))
+        tracer.set_time(times.mean() / config.fps)
+        band_seed = int(np.random.SeedSequence([config.seed, band]).generate_state(1)[0])
+        light.append(tracer.light_of_rows(camera, rows, config.spp, band_seed, own.lens))
     return np.concatenate(light)

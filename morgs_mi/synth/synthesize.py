@@ -6,9 +6,10 @@ centres, so it has no noise and does not mix foreground and background.
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 
@@ -26,7 +27,6 @@ from morgs_mi.io.video import open_frames
 from morgs_mi.io.video_writer import playable_format, write_video
 from morgs_mi.synth.disturbances import (
     CameraDisturbance,
-    Disturbances,
     compressed,
     draw_disturbances,
     save_disturbances,
@@ -36,6 +36,7 @@ from morgs_mi.synth.ground_truth import Tracks, compute_ground_truth, move_with_
 from morgs_mi.synth.path_tracer import PathTracer, developed
 from morgs_mi.synth.recording import check_lenses, record_light
 from morgs_mi.synth.scene import DeformingObject, Scene, check_scene, load_scene
+from morgs_mi.synth.synth_config import SynthConfig
 
 __all__ = ["synthesize"]
 
@@ -47,18 +48,8 @@ _NUM_TRACKS = 2000
 def synthesize(
     scene: str | Path | Scene,
     out: str | Path,
+    config: SynthConfig | None = None,
     *,
-    num_cameras: int | None = None,
-    num_frames: int = 12,
-    width: int = 320,
-    height: int = 240,
-    spp: int | None = None,
-    noise: float | None = None,
-    fps: float = 30.0,
-    lossless: bool = True,
-    disturbances: Disturbances | None = None,
-    animation: str | None = None,
-    seed: int = 0,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Path:
@@ -74,20 +65,7 @@ def synthesize(
     Args:
         scene: a scene, its name, or the path of its Python file or of an animated glTF file (see `gltf_scene`).
         out: the folder to write.
-        num_cameras: including the test view, at least 2; None for the scene's own number, usually 10.
-        num_frames: at least 1.
-        width: in pixels, even.
-        height: in pixels, even.
-        spp: samples per pixel; the noise of 16 is at 42 dB, below that of a good camera. None for the scene's own
-            number, usually 16.
-        noise: standard deviation of the sensor noise, relative to white; 0.01 (2.5 grey levels) is typical of a camera
-            indoors. None for the scene's own, usually 0.
-        fps: frames per second.
-        lossless: write the frames also as PNG files, which `load_capture` reads in place of the videos; without them
-            the images and the colours of the points are those of the compressed videos.
-        disturbances: clocks, shutters, exposure, lenses and compression that make the recording hard; None for none.
-        animation: name of the animation of a glTF file; None for its first.
-        seed: of the textures, the sampling noise, the disturbances and the choice of points.
+        config: settings.
         overwrite: replace an earlier capture in `out`.
         progress: called with (images done, total number of images).
 
@@ -95,7 +73,7 @@ def synthesize(
         The folder `out`.
 
     Raises:
-        ValueError: an argument is out of range, there is no such scene, `out` lies in a capture, the scene is not as
+        ValueError: a setting is out of range, there is no such scene, `out` lies in a capture, the scene is not as
             `check_scene` requires, a camera sees none of its objects, or Mitsuba's variant is not vectorised.
         FileExistsError: `out` is not empty and `overwrite` is not set, or `out` is not a synthetic capture.
         OSError: a file cannot be written, or a mesh or texture of the scene does not exist.
@@ -105,66 +83,25 @@ def synthesize(
             f"synthesize(): a vectorised variant is needed, got {mi.variant()!r}; "
             'call mitsuba.set_variant("llvm_ad_rgb") first.'
         )
-    _check_arguments(num_cameras, num_frames, width, height, spp, noise, fps, seed)
-    scene = _loaded(scene, animation, seed)
-    num_cameras = scene.recording.num_cameras if num_cameras is None else num_cameras
-    spp = scene.recording.spp if spp is None else spp
-    noise = scene.recording.noise if noise is None else noise
-    cameras = scene.rig.cameras(num_cameras, width, height)
-    disturbances = disturbances or Disturbances()
-    disturbed = draw_disturbances(disturbances, num_cameras, num_frames, seed)
-    check_lenses(cameras, disturbed)
-    frames = np.arange(num_frames + 1)
-    # Each frame and the one after the last, and the first and the last row that any camera reads.
-    read = [d.row_times(f, height)[row] for d in disturbed for f, row in ((0, 0), (num_frames, -1))]
-    check_scene(scene, [float(frame) / fps for frame in sorted({*frames.tolist(), min(read), max(read)})])
+    config = config or SynthConfig()
+    config.check()
+    scene = _loaded(scene, config)
+    rig = _Rig.of(scene, config.completed(scene.recording))
+    check_lenses(rig.cameras, rig.disturbed)
+    check_scene(scene, rig.times())
     _check_folder(Path(out), overwrite)
     check_output(Path(out).resolve().parent)
     with atomic_path(out, "synthesize()") as folder:
         folder.mkdir(parents=True)
         tracer = PathTracer(scene)
-        _check_views(tracer, cameras)
-        done = 0
-
-        def render_view(index: int) -> Iterator[np.ndarray]:
-            nonlocal done
-            for frame in range(num_frames):
-                # The noise must differ between views and frames; otherwise it would look like a moving texture.
-                noise_seed = int(np.random.SeedSequence([seed, index, frame]).generate_state(1)[0])
-                light = record_light(tracer, cameras[index], disturbed[index], frame, fps, spp, noise_seed)
-                image = developed(disturbed[index].gains[frame] * light, noise, noise_seed)
-                yield compressed(image, disturbed[index].jpeg_quality)
-                done += 1
-                if progress is not None:
-                    progress(done, num_cameras * num_frames)
-
-        suffix, codec = playable_format()
-        clips = []
-        for index, (camera, own) in enumerate(zip(cameras, disturbed, strict=True)):
-            video, png = folder / f"{camera.name}{suffix}", folder / "frames" / camera.name
-            if lossless:
-                write_video(png, render_view(index), fps)
-            images = open_frames(png).frames() if lossless else render_view(index)
-            write_video(video, images, fps, codec)
-            clips.append(png if lossless else video)
-            _write_truth(tracer, camera, (frames[:-1] + own.time_offset) / fps, fps, folder / "truth")
-        times = frames[:-1] / fps
-        save_tracks(folder / "truth", _sample_tracks(tracer, cameras, times, np.random.default_rng([seed, 1])))
-        save_disturbances(folder / "truth", dict(zip((c.name for c in cameras), disturbed, strict=True)))
-        _write_calibration(tracer, cameras, disturbed, fps, clips, folder, np.random.default_rng([seed, 2]))
+        _check_views(tracer, rig.cameras)
+        clips = _write_clips(tracer, rig, folder, progress)
+        _write_truth(tracer, rig, folder / "truth")
+        _write_calibration(tracer, rig, clips, folder)
         about = {
             "scene": scene.name,
             "test_view": 0,
-            "fps": fps,
-            "num_cameras": num_cameras,
-            "num_frames": num_frames,
-            "width": width,
-            "height": height,
-            "spp": spp,
-            "noise": noise,
-            "disturbances": asdict(disturbances),
-            "animation": animation,
-            "seed": seed,
+            **rig.config.as_dict(),
             "objects": list(scene.objects),
             "versions": {name: metadata.version(name) for name in ("morgs-mi", "mitsuba", "drjit")},
         }
@@ -172,40 +109,75 @@ def synthesize(
     return Path(out)
 
 
-def _check_arguments(
-    num_cameras: int | None,
-    num_frames: int,
-    width: int,
-    height: int,
-    spp: int | None,
-    noise: float | None,
-    fps: float,
-    seed: int,
-) -> None:
-    lowest = {
-        "num_cameras": (num_cameras, 2),
-        "num_frames": (num_frames, 1),
-        "spp": (spp, 1),
-        "seed": (seed, 0),
-    }
-    for name, (value, least) in lowest.items():
-        if value is not None and value < least:
-            raise ValueError(f"synthesize(): `{name}` must be at least {least}, got {value}.")
-    if min(width, height) < 2 or width % 2 or height % 2:
-        raise ValueError(f"synthesize(): `width` and `height` must be even, got {width}x{height}.")
-    if not (np.isfinite(fps) and fps > 0):
-        raise ValueError(f"synthesize(): `fps` must be positive, got {fps}.")
-    if noise is not None and not 0 <= noise < 1:
-        raise ValueError(f"synthesize(): `noise` must be at least 0 and below 1, got {noise}.")
+@dataclass(frozen=True)
+class _Rig:
+    """Cameras that record a scene.
+
+    Attributes:
+        cameras: without distortion.
+        disturbed: disturbance of each camera.
+        config: complete settings.
+    """
+
+    cameras: Sequence[Camera]
+    disturbed: Sequence[CameraDisturbance]
+    config: SynthConfig
+
+    @classmethod
+    def of(cls, scene: Scene, config: SynthConfig) -> _Rig:
+        assert config.cameras is not None
+        cameras = scene.rig.cameras(config.cameras, config.width, config.height)
+        return cls(cameras, draw_disturbances(config.disturbances, config.cameras, config.frames, config.seed), config)
+
+    def times(self) -> list[float]:
+        """Return the times of the frames and after the last, and the extreme times of rows that are read, seconds."""
+        ends = (0, 0), (self.config.frames, -1)
+        read = [own.row_times(frame, self.config.height)[row] for own in self.disturbed for frame, row in ends]
+        return [float(t) / self.config.fps for t in sorted({*range(self.config.frames + 1), min(read), max(read)})]
 
 
-def _loaded(scene: str | Path | Scene, animation: str | None, seed: int) -> Scene:
-    """Return a scene, or load that of a file or a name."""
+def _write_clips(
+    tracer: PathTracer, rig: _Rig, folder: Path, progress: Callable[[int, int], None] | None
+) -> list[Path]:
+    """Write the images of all cameras; return the clips that `load_capture` reads."""
+    config, count = rig.config, itertools.count(1)
+    suffix, codec = playable_format()
+
+    def render_view(index: int) -> Iterator[np.ndarray]:
+        for image in _images(tracer, rig, index):
+            yield image
+            if progress is not None:
+                progress(next(count), len(rig.cameras) * config.frames)
+
+    clips = []
+    for index, camera in enumerate(rig.cameras):
+        video, png = folder / f"{camera.name}{suffix}", folder / "frames" / camera.name
+        if config.lossless:
+            write_video(png, render_view(index), config.fps)
+        images = open_frames(png).frames() if config.lossless else render_view(index)
+        write_video(video, images, config.fps, codec)
+        clips.append(png if config.lossless else video)
+    return clips
+
+
+def _images(tracer: PathTracer, rig: _Rig, index: int) -> Iterator[np.ndarray]:
+    """Yield the images of a camera."""
+    config, own = rig.config, rig.disturbed[index]
+    assert config.noise is not None
+    for frame in range(config.frames):
+        # The noise must differ between views and frames; otherwise it would look like a moving texture.
+        seed = int(np.random.SeedSequence([config.seed, index, frame]).generate_state(1)[0])
+        light = record_light(tracer, rig.cameras[index], own, frame, replace(config, seed=seed))
+        yield compressed(developed(own.gains[frame] * light, config.noise, seed), own.jpeg_quality)
+
+
+def _loaded(scene: str | Path | Scene, config: SynthConfig) -> Scene:
+    """Return a scene, or load it by its file or name."""
     if not isinstance(scene, Scene) and Path(scene).suffix.lower() in (".glb", ".gltf"):
-        return gltf_scene(scene, animation, seed)
-    if animation is not None:
+        return gltf_scene(scene, config.animation, config.seed)
+    if config.animation is not None:
         raise ValueError("synthesize(): `animation` is for glTF files, got another scene; leave it out.")
-    return scene if isinstance(scene, Scene) else load_scene(scene, seed)
+    return scene if isinstance(scene, Scene) else load_scene(scene, config.seed)
 
 
 def _check_views(tracer: PathTracer, cameras: Sequence[Camera]) -> None:
@@ -230,12 +202,19 @@ def _check_views(tracer: PathTracer, cameras: Sequence[Camera]) -> None:
         )
 
 
-def _write_truth(tracer: PathTracer, camera: Camera, times: np.ndarray, fps: float, folder: Path) -> None:
-    for frame, time in enumerate(times):
-        tracer.set_time(time)
-        surface, before = tracer.surface_points(camera), tracer.poses(times[frame - 1]) if frame else None
-        truth = compute_ground_truth(camera, surface, tracer.poses(time), before, tracer.poses(time + 1 / fps))
-        save_truth(folder, camera.name, frame, truth)
+def _write_truth(tracer: PathTracer, rig: _Rig, folder: Path) -> None:
+    """Write the ground truth of every camera, the tracks and the disturbances."""
+    fps, frames = rig.config.fps, np.arange(rig.config.frames)
+    for camera, own in zip(rig.cameras, rig.disturbed, strict=True):
+        times = (frames + own.time_offset) / fps
+        for frame, time in enumerate(times):
+            tracer.set_time(time)
+            surface, before = tracer.surface_points(camera), tracer.poses(times[frame - 1]) if frame else None
+            truth = compute_ground_truth(camera, surface, tracer.poses(time), before, tracer.poses(time + 1 / fps))
+            save_truth(folder, camera.name, frame, truth)
+    rng = np.random.default_rng([rig.config.seed, 1])
+    save_tracks(folder, _sample_tracks(tracer, rig.cameras, frames / fps, rng))
+    save_disturbances(folder, dict(zip((c.name for c in rig.cameras), rig.disturbed, strict=True)))
 
 
 def _sample_tracks(
@@ -269,22 +248,15 @@ def _sample_tracks(
     return Tracks(tracks, np.concatenate(owners), visible)
 
 
-def _write_calibration(
-    tracer: PathTracer,
-    cameras: Sequence[Camera],
-    disturbed: Sequence[CameraDisturbance],
-    fps: float,
-    clips: Sequence[Path],
-    folder: Path,
-    rng: np.random.Generator,
-) -> None:
+def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], folder: Path) -> None:
     """Write the cameras as `poses_bounds.npy` and as a COLMAP model with points from the training views.
 
     The colours of the points are those of the `clips`, one per camera.
     """
+    cameras, disturbed, rng = rig.cameras, rig.disturbed, np.random.default_rng([rig.config.seed, 2])
     points, colors, bounds = [], [], []
     for index, (camera, own) in enumerate(zip(cameras, disturbed, strict=True)):
-        tracer.set_time(own.time_offset / fps)
+        tracer.set_time(own.time_offset / rig.config.fps)
         visible, lens = tracer.surface_points(camera), undistortion(camera, own.lens)
         pixels = np.flatnonzero((visible.ids >= 0) & (lens is None or lens.mask))
         depths = camera.project(visible.pick(pixels).positions)[1]

@@ -11,6 +11,7 @@ from morgs_mi.calibration.timing import TimingConfig, estimate_time_offsets
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.synth.disturbances import Disturbances, load_disturbances
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 
@@ -35,7 +36,9 @@ def test_timing_config__refuses_numbers_out_of_range() -> None:
 @pytest.mark.slow
 def test_estimate_time_offsets__finds_the_offsets_of_a_clip(tmp_path: Path) -> None:
     clip = tmp_path / "clip"
-    synthesize("spheres", clip, num_cameras=7, width=128, height=96, disturbances=Disturbances(time_offset=1.5))
+    synthesize(
+        "spheres", clip, SynthConfig(cameras=7, width=128, height=96, disturbances=Disturbances(time_offset=1.5))
+    )
     found = estimate_time_offsets(load_capture(clip))
     truth = {name: -camera.time_offset for name, camera in load_disturbances(clip / "truth").items()}
     assert found.reference == "cam00"

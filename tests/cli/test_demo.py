@@ -26,6 +26,6 @@ def test_demo__passes_its_options_on(tmp_path: Path, run, monkeypatch: pytest.Mo
     default, small, seeded = calls
     assert default == DemoConfig()
     assert (small.scene, small.stream.seed, small.stream.fit.epochs) == ("arm", 7, 2)
-    assert small.clip == replace(default.clip, num_cameras=4, num_frames=5, width=64, height=48, spp=2)
+    assert small.clip == replace(default.clip, cameras=4, frames=5, width=64, height=48, spp=2)
     assert small.stream.fit.first_frame_steps == default.stream.fit.first_frame_steps
     assert (seeded.stream.seed, seeded.stream.fit.epochs) == (1, 2)

@@ -11,6 +11,7 @@ import pytest
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.playback.visualise import write_png
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 ROOT = Path(__file__).parents[2]
@@ -35,7 +36,7 @@ def commands(page: str) -> list[str]:
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what stands for the names in capitals: a capture, its first images, and the clips alone."""
     folder = tmp_path_factory.mktemp("recordings")
-    synthesize("spheres", folder / "CAPTURE", num_cameras=7, num_frames=6, width=320, height=240, spp=8)
+    synthesize("spheres", folder / "CAPTURE", SynthConfig(cameras=7, frames=6, width=320, height=240, spp=8))
     (folder / "FOLDER").mkdir()
     capture = load_capture(folder / "CAPTURE")
     for name, image in zip(capture.names, next(capture.frames(0, 1)).images, strict=True):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 PAGE = Path(__file__).parents[2] / "docs/experiments/index.md"
@@ -18,7 +19,9 @@ FRAMES = 3
 
 def stand_in(path: Path, width: int, height: int, number: str) -> None:
     """Write videos with camera numbers in this format, and `poses_bounds.npy`, as these recordings have them."""
-    synthesize("random", path, num_cameras=8, num_frames=FRAMES, width=width, height=height, seed=3, lossless=False)
+    synthesize(
+        "random", path, SynthConfig(cameras=8, frames=FRAMES, width=width, height=height, seed=3, lossless=False)
+    )
     for extra in ("sparse", "truth"):
         shutil.rmtree(path / extra)
     (path / "capture.json").unlink()

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import FitConfig, StreamConfig, open_stream, stream_capture, synthesize
+from morgs_mi import FitConfig, StreamConfig, SynthConfig, open_stream, stream_capture, synthesize
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.export.insert import render_inserted
@@ -28,7 +28,7 @@ BALL = {
 @pytest.mark.slow
 def test_render_inserted__agrees_with_the_path_traced_clip(tmp_path: Path):
     mi.set_log_level(mi.LogLevel.Error)
-    synthesize("spheres", tmp_path / "clip", num_cameras=7, num_frames=2, width=160, height=120, spp=16)
+    synthesize("spheres", tmp_path / "clip", SynthConfig(cameras=7, frames=2, width=160, height=120, spp=16))
     config = StreamConfig(fit=FitConfig(num_gaussians=6000, first_frame_steps=400, epochs=2))
     stream_capture(load_capture(tmp_path / "clip"), tmp_path / "fit", config)
     stream = open_stream(tmp_path / "fit")

@@ -8,6 +8,7 @@ import pytest
 
 from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import load_scene
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 
@@ -21,4 +22,4 @@ def tracer() -> PathTracer:
 def clip(tmp_path_factory) -> Path:
     """The scene `arm` from 3 cameras, 3 frames of 64x48, with lossless frames."""
     out = tmp_path_factory.mktemp("synth") / "arm"
-    return synthesize("arm", out, num_cameras=3, num_frames=3, width=64, height=48, spp=4, lossless=True)
+    return synthesize("arm", out, SynthConfig(cameras=3, frames=3, width=64, height=48, spp=4, lossless=True))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -27,18 +26,19 @@ from morgs_mi.synth.ground_truth import load_tracks, load_truth
 from morgs_mi.synth.path_tracer import PathTracer, srgb_bytes
 from morgs_mi.synth.scene import Light, Object, Rig, Scene, load_scene, translate
 from morgs_mi.synth.shapes import box
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 from tests.assertions import assert_close
 from tests.synth.frames import FPS, psnr
 
 ALL = Disturbances(0.5, 0.4, 0.2, 0.1, 0.02, 0.1, 80)
-SIZE: dict[str, Any] = {"num_cameras": 2, "num_frames": 2, "width": 64, "height": 48, "spp": 4}
+SIZE = SynthConfig(cameras=2, frames=2, width=64, height=48, spp=4)
 
 
 @pytest.fixture(scope="module")
 def clean(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The scene `spheres` without disturbances."""
-    return synthesize("spheres", tmp_path_factory.mktemp("synth") / "clip", **SIZE)
+    return synthesize("spheres", tmp_path_factory.mktemp("synth") / "clip", SIZE)
 
 
 def frame_of(clip: Path, camera: str, frame: int) -> np.ndarray:
@@ -121,7 +121,7 @@ def test_undistorted__is_the_inverse_of_the_lens(k: float) -> None:
 
 def test_synthesize__shows_a_camera_with_a_time_offset_at_its_own_time(tmp_path: Path) -> None:
     """The motion of a camera's truth leads between its own times; tracks are at those of the reference."""
-    clip = synthesize("arm", tmp_path / "clip", **SIZE, disturbances=Disturbances(time_offset=2))
+    clip = synthesize("arm", tmp_path / "clip", replace(SIZE, disturbances=Disturbances(time_offset=2)))
     offset = load_disturbances(clip / "truth")["cam01"].time_offset
     assert abs(offset) > 0.2
     scene = load_scene("arm")
@@ -153,8 +153,8 @@ def bar_scene(speed: float) -> Scene:
 def test_synthesize__reads_the_rows_of_a_rolling_shutter_at_their_times(tmp_path: Path) -> None:
     """A vertical bar is slanted: in every row, its middle is where the bar is at the time of that row."""
     scene = bar_scene(speed=6.0)
-    size = {**SIZE, "width": 128, "height": 64, "num_cameras": 2}
-    clip = synthesize(scene, tmp_path / "clip", **size, disturbances=Disturbances(rolling_shutter=0.8))
+    config = replace(SIZE, width=128, height=64, disturbances=Disturbances(rolling_shutter=0.8))
+    clip = synthesize(scene, tmp_path / "clip", config)
     own, camera = load_disturbances(clip / "truth")["cam00"], scene.rig.cameras(2, 128, 64)[0]
     image = frame_of(clip, "cam00", 1).astype(float).mean(axis=-1)
     found = (image * (np.arange(128) + 0.5)).sum(axis=1) / image.sum(axis=1)
@@ -169,8 +169,8 @@ def test_synthesize__reads_the_rows_of_a_rolling_shutter_at_their_times(tmp_path
 
 
 def test_synthesize__undistorted_images_are_those_of_the_pinhole_cameras(tmp_path: Path) -> None:
-    size = {**SIZE, "width": 96, "height": 72, "spp": 16, "num_frames": 1, "num_cameras": 2}
-    clip = synthesize("spheres", tmp_path / "clip", **size, disturbances=Disturbances(distortion=0.4))
+    config = replace(SIZE, width=96, height=72, spp=16, frames=1, disturbances=Disturbances(distortion=0.4))
+    clip = synthesize("spheres", tmp_path / "clip", config)
     assert abs(load_disturbances(clip / "truth")["cam01"].distortion) > 0.1
     assert not (clip / "poses_bounds.npy").exists(), "it cannot hold a lens"
     scene, capture = load_scene("spheres"), load_capture(clip)
@@ -189,12 +189,12 @@ def test_synthesize__refuses_a_lens_that_folds_its_corners(tmp_path: Path) -> No
     scene = bar_scene(0.0)
     wide = Scene("wide", scene.objects, scene.lights, Rig(center=(0, 0, 0), fov=80, elevation=0))
     with pytest.raises(ValueError, match="`distortion` must be small enough for the field of view, got -0"):
-        synthesize(wide, tmp_path / "clip", **{**SIZE, "num_cameras": 8}, disturbances=Disturbances(distortion=0.5))
+        synthesize(wide, tmp_path / "clip", replace(SIZE, cameras=8, disturbances=Disturbances(distortion=0.5)))
 
 
 def test_synthesize__exposes_frames_with_the_gains_of_the_truth(clean: Path, tmp_path: Path) -> None:
     hard = Disturbances(exposure_gain=0.3, exposure_drift=0.2, exposure_flicker=0.1)
-    dimmed = synthesize("spheres", tmp_path / "clip", **SIZE, disturbances=hard)
+    dimmed = synthesize("spheres", tmp_path / "clip", replace(SIZE, disturbances=hard))
     gains = load_disturbances(dimmed / "truth")
     for camera in ("cam00", "cam01"):
         for frame in (0, 1):
@@ -206,7 +206,7 @@ def test_synthesize__exposes_frames_with_the_gains_of_the_truth(clean: Path, tmp
 
 
 def test_synthesize__compresses_every_image(clean: Path, tmp_path: Path) -> None:
-    lossy = synthesize("spheres", tmp_path / "clip", **SIZE, disturbances=Disturbances(jpeg_quality=30))
+    lossy = synthesize("spheres", tmp_path / "clip", replace(SIZE, disturbances=Disturbances(jpeg_quality=30)))
     whole, found = frame_of(clean, "cam01", 1), frame_of(lossy, "cam01", 1)
     np.testing.assert_array_equal(found, compressed(whole, 30))
     assert 18 < psnr(found, whole) < 40
@@ -229,4 +229,4 @@ def test_synthesize__checks_a_scene_at_all_times_that_are_recorded(tmp_path: Pat
     late = bar_scene(0.0).objects["bar"].shapes
     scene = Scene("late", {"bar": Object(late, lambda t: translate(1 / (t >= 0), 0, 0))}, {}, Rig())
     with pytest.raises(ValueError, match=r"object 'bar': its pose at -0\.0083.* s fails with ZeroDivisionError"):
-        synthesize(scene, tmp_path / "clip", **{**SIZE, "height": 1000}, disturbances=Disturbances(rolling_shutter=0.5))
+        synthesize(scene, tmp_path / "clip", replace(SIZE, height=1000, disturbances=Disturbances(rolling_shutter=0.5)))

@@ -15,6 +15,7 @@ from morgs_mi.synth.gltf_scene import gltf_scene
 from morgs_mi.synth.ground_truth import load_tracks, load_truth
 from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import Deformed, DeformingObject, Mesh, Scene, check_scene
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 from morgs_mi.synth.textures import lights
 from tests.assertions import assert_close
@@ -33,8 +34,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 def bending(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The model from 3 cameras, 3 frames of 64x48 at 8 frames per second, so that it moves by several pixels."""
     folder = tmp_path_factory.mktemp("gltf")
-    size = {"num_cameras": 3, "num_frames": 3, "width": 64, "height": 48, "spp": 4}
-    return synthesize(write_glb(folder / "model.glb"), folder / "clip", **size, fps=8, animation="bend")
+    config = SynthConfig(cameras=3, frames=3, width=64, height=48, spp=4, fps=8, animation="bend")
+    return synthesize(write_glb(folder / "model.glb"), folder / "clip", config)
 
 
 def moving_objects(scene: Scene) -> dict[str, DeformingObject]:
@@ -64,7 +65,7 @@ def test_gltf_scene__names_the_animations_of_the_file(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=f"`animation` must be one of 'bend', 'rest' of {path}, got 'walk'"):
         gltf_scene(path, "walk")
     with pytest.raises(ValueError, match="`animation` is for glTF files, got another scene"):
-        synthesize("spheres", tmp_path / "clip", animation="walk")
+        synthesize("spheres", tmp_path / "clip", SynthConfig(animation="walk"))
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,14 @@ import pytest
 
 from morgs_mi.synth.ground_truth import load_truth
 from morgs_mi.synth.random_scene import MOTIONS, Body, RandomScene, draw_scene
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 from tests.assertions import assert_close
 
 NUM_SEEDS = 50
 FPS = 30.0
 TIMES = np.arange(90) / FPS
-SMALL = {"num_frames": 2, "width": 64, "height": 48}
+SMALL = SynthConfig(frames=2, width=64, height=48, seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +27,7 @@ def scenes() -> list[RandomScene]:
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory):
-    return synthesize("random", tmp_path_factory.mktemp("synth") / "random", seed=1, **SMALL)
+    return synthesize("random", tmp_path_factory.mktemp("synth") / "random", SMALL)
 
 
 def moving(scene: RandomScene) -> list[Body]:
@@ -153,7 +154,7 @@ def test_synthesize__records_a_random_scene_as_its_seed_determines(clip):
 
 @pytest.mark.slow
 def test_synthesize__writes_the_same_bytes_for_the_same_seed(clip, tmp_path):
-    again = synthesize("random", tmp_path / "again", seed=1, **SMALL)
+    again = synthesize("random", tmp_path / "again", SMALL)
     files = sorted(path.relative_to(clip) for path in clip.rglob("*") if path.is_file())
     assert files == sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file())
     assert [str(file) for file in files if (clip / file).read_bytes() != (again / file).read_bytes()] == []

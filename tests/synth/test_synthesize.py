@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -18,12 +17,13 @@ from morgs_mi.io.video import open_frames
 from morgs_mi.synth.ground_truth import load_truth
 from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import Light, Object, Scene, load_scene
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 from morgs_mi.synth.textures import lights, textured
 from tests.assertions import assert_close
 from tests.synth.frames import FPS, psnr
 
-TINY: dict[str, Any] = {"num_cameras": 2, "num_frames": 1, "width": 16, "height": 16, "spp": 1}
+TINY = SynthConfig(cameras=2, frames=1, width=16, height=16, spp=1)
 
 
 def test_synthesize__writes_the_layout_of_n3dv_with_a_colmap_model(clip):
@@ -75,21 +75,21 @@ def test_synthesize__colmap_points_lie_on_the_surface_within_their_noise(clip):
 def test_synthesize__rejects_a_non_empty_folder_and_replaces_a_capture_with_overwrite(tmp_path, clip):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(FileExistsError, match="not empty; choose another folder"):
-        synthesize("spheres", tmp_path, **TINY)
+        synthesize("spheres", tmp_path, TINY)
     for content in (None, "{", '{"layout": "COLMAP"}'):  # the last is that of a fit; a recording may have one too
         if content is not None:
             (tmp_path / "capture.json").write_text(content)
         with pytest.raises(FileExistsError, match="is not a synthetic capture"):
-            synthesize("spheres", tmp_path, **TINY, overwrite=True)
+            synthesize("spheres", tmp_path, TINY, overwrite=True)
     (tmp_path / "capture.json").unlink()
     out = shutil.copytree(clip, tmp_path / "clip")
     seen = []
-    synthesize("spheres", out, **TINY, overwrite=True, progress=lambda done, total: seen.append((done, total)))
+    synthesize("spheres", out, TINY, overwrite=True, progress=lambda done, total: seen.append((done, total)))
     assert json.loads((out / "capture.json").read_text())["scene"] == "spheres"
     assert not (out / "cam02.mp4").exists()
     assert seen == [(1, 2), (2, 2)]
     with pytest.raises(ValueError, match=f"expected an output outside of captures, .* in the capture {out}"):
-        synthesize("spheres", out / "clip", **TINY)
+        synthesize("spheres", out / "clip", TINY)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["clip", "notes.txt"]
 
 
@@ -99,26 +99,30 @@ def test_synthesize__removes_its_output_after_a_failure(tmp_path, monkeypatch):
 
     monkeypatch.setattr("morgs_mi.synth.synthesize.write_colmap", full)
     with pytest.raises(OSError, match=r"cannot write .*the partial output was removed.*No space left"):
-        synthesize("spheres", tmp_path / "clip", **TINY)
+        synthesize("spheres", tmp_path / "clip", TINY)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("settings", "message"),
     [
-        ({"num_cameras": 1}, "`num_cameras` must be at least 2, got 1"),
-        ({"num_frames": 0}, "`num_frames` must be at least 1, got 0"),
-        ({"spp": 0}, "`spp` must be at least 1"),
-        ({"seed": -1}, "`seed` must be at least 0"),
+        ({"cameras": 1}, r"`cameras` must be a number in \[2, inf\), got 1"),
+        ({"frames": 0}, r"`frames` must be a number in \[1, inf\), got 0"),
+        ({"spp": 0}, r"`spp` must be a number in \[1, inf\)"),
+        ({"seed": -1}, r"`seed` must be a number in \[0, inf\)"),
         ({"width": 63}, "must be even, got 63x240"),
-        ({"fps": 0}, "`fps` must be positive"),
-        ({"noise": -0.1}, "`noise` must be at least 0 and below 1, got -0.1"),
-        ({"scene": "nowhere"}, "no scene 'nowhere'; name one of .*'arm', 'flicker', 'random', 'spheres', 'thin'"),
+        ({"fps": 0}, r"`fps` must be a number in \(0, inf\)"),
+        ({"noise": -0.1}, r"`noise` must be a number in \[0, 1\), got -0.1"),
     ],
 )
-def test_synthesize__rejects_invalid_arguments(tmp_path, arguments, message):
+def test_synthesize__rejects_settings_out_of_range(tmp_path, settings, message):
     with pytest.raises(ValueError, match=message):
-        synthesize(**{"scene": "spheres", "out": tmp_path / "clip", **arguments})
+        synthesize("spheres", tmp_path / "clip", SynthConfig(**settings))
+
+
+def test_synthesize__names_the_scenes(tmp_path):
+    with pytest.raises(ValueError, match=r"no scene 'nowhere'; name one of .*'arm', 'flicker', 'random', 'spheres'"):
+        synthesize("nowhere", tmp_path / "clip")
 
 
 def sphere(**entries):
@@ -201,14 +205,14 @@ WRONG_SCENES = {
 def test_synthesize__refuses_a_wrong_scene_before_rendering(tmp_path, case):
     objects, lamps, message = WRONG_SCENES[case]
     with pytest.raises((ValueError, FileNotFoundError), match=message):
-        synthesize(Scene("mine", objects, lamps), tmp_path / "clip", **TINY)
+        synthesize(Scene("mine", objects, lamps), tmp_path / "clip", TINY)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_synthesize__warns_of_black_images(tmp_path, caplog):
     dark = Light({"type": "point", "position": [0, 0, 0]})
     synthesize(
-        Scene("mine", {"a": Object({"b": sphere(center=[0, 0.8, 0])})}, {"inside": dark}), tmp_path / "clip", **TINY
+        Scene("mine", {"a": Object({"b": sphere(center=[0, 0.8, 0])})}, {"inside": dark}), tmp_path / "clip", TINY
     )
     assert "scene 'mine': cam00 is black at 0 s: no lamp reaches" in caplog.text
 
@@ -223,8 +227,8 @@ def test_synthesize__writes_videos_that_browsers_play_beside_the_lossless_frames
 
 
 def test_synthesize__without_lossless_frames_records_the_videos(tmp_path):
-    size = {"num_cameras": 2, "num_frames": 2, "width": 32, "height": 32, "spp": 1}
-    out = synthesize("spheres", tmp_path / "clip", **size, lossless=False)
+    config = SynthConfig(cameras=2, frames=2, width=32, height=32, spp=1, lossless=False)
+    out = synthesize("spheres", tmp_path / "clip", config)
     assert not (out / "frames").exists()
     played = np.array(list(open_frames(out / "cam01.mp4").frames()))
     np.testing.assert_array_equal(np.array([f.images[1] for f in load_capture(out).frames()]), played)
@@ -232,6 +236,6 @@ def test_synthesize__without_lossless_frames_records_the_videos(tmp_path):
 
 def test_synthesize__writes_lossless_videos_where_opencv_has_no_playable_encoder(tmp_path, monkeypatch):
     monkeypatch.setattr("morgs_mi.synth.synthesize.playable_format", lambda: (".mkv", "FFV1"))
-    out = synthesize("spheres", tmp_path / "clip", **TINY)
+    out = synthesize("spheres", tmp_path / "clip", TINY)
     played, stored = (np.array(list(open_frames(out / name).frames())) for name in ("cam01.mkv", "frames/cam01"))
     np.testing.assert_array_equal(played, stored)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 
@@ -11,4 +12,4 @@ from morgs_mi.synth.synthesize import synthesize
 def clip(tmp_path_factory):
     """The balls from 5 cameras in 3 tiny frames."""
     folder = tmp_path_factory.mktemp("clip") / "spheres"
-    return synthesize("spheres", folder, num_cameras=5, num_frames=3, width=48, height=36, spp=1)
+    return synthesize("spheres", folder, SynthConfig(cameras=5, frames=3, width=48, height=36, spp=1))

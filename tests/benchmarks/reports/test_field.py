@@ -9,6 +9,7 @@ import pytest
 
 from benchmarks.reports import field
 from benchmarks.reports.field import METHODS, Options, field_table
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 from tests.benchmarks.reports.pages import ROOT, page
 
@@ -30,7 +31,7 @@ def test_settings__differ_between_methods_alone() -> None:
 @pytest.mark.slow
 def test_main__measures_a_tiny_clip(tmp_path: Path) -> None:
     clip = tmp_path / "clips" / "random-3"
-    synthesize("random", clip, num_frames=3, width=64, height=48, spp=1, seed=3)
+    synthesize("random", clip, SynthConfig(frames=3, width=64, height=48, spp=1, seed=3))
     work = {
         "num_gaussians": 200,
         "first_frame_steps": 10,

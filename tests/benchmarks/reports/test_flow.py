@@ -17,6 +17,7 @@ from morgs_mi.method.flow import observe_flow
 from morgs_mi.method.flow_sources.files import write_flow
 from morgs_mi.method.flow_sources.opencv import FLOW_METHODS
 from morgs_mi.synth.ground_truth import load_truth
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 from tests.benchmarks.reports.pages import ROOT, page
 
@@ -25,7 +26,7 @@ from tests.benchmarks.reports.pages import ROOT, page
 def clip(tmp_path_factory):
     """A clip of two cameras and two frames."""
     folder = tmp_path_factory.mktemp("clip") / "spheres"
-    synthesize("spheres", folder, num_cameras=2, num_frames=2, width=96, height=72, spp=4)
+    synthesize("spheres", folder, SynthConfig(cameras=2, frames=2, width=96, height=72, spp=4))
     return folder
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks.reports.masks import Options, loops_table, means, measure, overlap
 from morgs_mi.method.mask_refiners.registry import MASK_REFINERS
+from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 from tests.benchmarks.reports.pages import ROOT, page
 
@@ -40,7 +41,7 @@ def test_measure__refuses_a_capture_without_truth(fitted_clip: Path, tmp_path: P
 
 @pytest.mark.slow
 def test_measure__compares_masks_and_confidence_with_the_truth(tmp_path: Path):
-    clip = synthesize("spheres", tmp_path / "clip", num_cameras=6, num_frames=3, width=64, height=48, spp=4)
+    clip = synthesize("spheres", tmp_path / "clip", SynthConfig(cameras=6, frames=3, width=64, height=48, spp=4))
     options = Options(captures=(clip,), frames=2, first_frame_steps=20, num_gaussians=300, loops=("none",))
     result = measure(clip, options)
     assert result["masks"].keys() == {*MASK_REFINERS.names, "lifted"}
