@@ -11,10 +11,11 @@ ones.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import blake2b
+from itertools import chain
 from math import prod
 
 import numpy as np
@@ -34,11 +35,10 @@ from morgs_mi.codec.quantisation import (
     optional_names,
     real_values,
     split_groups,
-    step_sizes,
     stored_fields,
 )
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.codec.residuals import columns_of_change, take_change
+from morgs_mi.codec.residuals import Coder, offset_steps, take_change
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 
@@ -62,9 +62,6 @@ __all__ = [
 _PER_WORD = 16
 _FREE_INTEGERS = 2**22
 _DTYPES = {"head": "uint32", "code": "uint32", "parent": "uint8", "offset": "uint32"}
-# Changes below a step are jitter of the fit, but in the base colour every bit is visible. Slightly less than a step,
-# because a decoded state is rounded to float32 and must give the packet that it was decoded from.
-_THRESHOLD, _THRESHOLD_DC = 0.99, 0.5
 _COARSEST = 80  # quarter octaves: a million times the step
 
 
@@ -161,52 +158,19 @@ def residual_packet(
     config, grid = config or CodecConfig(), previous.grid
     _check_attributes(previous, gaussians.sh_degree, optional_mask(gaussians.items()))
     source = _checked(np.arange(len(grid)) if source is None else source, len(grid), len(gaussians))
-    survivors, births = source[source >= 0], int((source < 0).sum())
-    stored, count = finite_fields(gaussians), len(survivors)
-    touched = _touched(stored, stored_fields(previous.gaussians), survivors)
-    raw, rows = split_groups(stored), survivors[touched]
-    change = real_values({name: value[touched] for name, value in raw.items()}, grid.select(rows))
-    change -= grid.values[rows].T
-    born = new_grid({name: value[count:] for name, value in raw.items()}, cameras, config) if births else None
-    dead = np.ones(len(grid), bool)
-    dead[survivors] = False
-
-    def rounded(coarseness: int) -> np.ndarray:
-        r, scaled = np.zeros((len(change), len(grid)), np.int32), change / step_sizes(np.array(coarseness))
-        for name, at in grid.columns.items():
-            largest = np.max(np.abs(scaled[at]), axis=0)
-            scaled[at][:, largest < (_THRESHOLD_DC if name == "sh_dc" else _THRESHOLD)] = 0
-        r[:, rows] = np.clip(np.rint(scaled, out=scaled), 1 - LIMIT, LIMIT - 1, out=scaled)
-        return r
-
-    def offsets(r: np.ndarray, coarseness: int) -> Iterator[np.ndarray]:
-        moved = np.flatnonzero(np.any(r[grid.columns["means"]], axis=0)[survivors])
-        offset = np.zeros((len(gaussians), 3)) if gaussians.offset is None else np.asarray(gaussians.offset)
-        real = offset[moved] / _offset_steps(grid.select(survivors[moved]), coarseness)
-        yield from np.clip(np.rint(real), 1 - LIMIT, LIMIT - 1).astype(np.int32).T
-
-    def columns(coarseness: int) -> Iterator[np.ndarray]:
-        r = rounded(coarseness)
-        yield from columns_of_change(r, dead, grid)
-        if config.offset:
-            yield from offsets(r, coarseness)
-
-    coarseness = least = round(4 * np.log2(config.birth_precision))
+    stored, survivors = finite_fields(gaussians), source[source >= 0]
+    offset = np.zeros((len(gaussians), 3)) if gaussians.offset is None else np.asarray(gaussians.offset)
+    coder = _coder(previous, stored, survivors, offset if config.offset else None)
+    births, born = len(gaussians) - len(survivors), None
+    if births:
+        born = new_grid({n: v[len(survivors) :] for n, v in split_groups(stored).items()}, cameras, config)
+    coarseness = round(4 * np.log2(config.birth_precision))
     if config.target_size:
-        coarseness = _fitting(columns, least, config.target_size)
-    while True:
-        r, writer = rounded(coarseness), ColumnWriter()
-        for column in columns_of_change(r, dead, grid):
-            writer.put(column)
-        if born is not None:
-            _put_grid(writer, born)
-        codes = {"code": _padded(writer.words(), births, len(gaussians), grid)}
-        if config.offset:
-            codes["offset"] = _words(offsets(r, coarseness))
-        size = sum(code.nbytes for code in codes.values())
-        if not config.target_size or size <= config.target_size or coarseness >= _COARSEST:
-            break
+        coarseness = _fitting(coder, coarseness, config.target_size)
+    codes = _codes(coder, coarseness, born)
+    while config.target_size and coarseness < _COARSEST and sum(c.nbytes for c in codes.values()) > config.target_size:
         coarseness += 1
+        codes = _codes(coder, coarseness, born)
     arrays = {"parent": previous.digest, "head": np.array([births, coarseness], np.uint32), **codes}
     return Packet(PacketKind.RESIDUAL, previous.frame + 1, arrays)
 
@@ -338,7 +302,7 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
     _check_most(coarseness, _COARSEST, "its coarseness")
     _check_most(previous.next_id + births, LIMIT - 1, "its next id")
     reader = ColumnReader(code)
-    values, dead = take_change(reader, grid, float(step_sizes(np.array(coarseness))))
+    values, dead = take_change(reader, grid, coarseness)
     survivors = np.flatnonzero(~dead)
     _check_words(code, births, len(survivors) + births, grid.degree, grid.optional)
     new = replace(grid, values=values).select(survivors)
@@ -350,17 +314,12 @@ def _decoded_residual(previous: CodedFrame, packet: Packet) -> CodedFrame:
         offset, at, words = np.zeros_like(motion), grid.columns["means"], ColumnReader(packet.arrays["offset"])
         moved = np.flatnonzero(np.any(new.values[:, at] != grid.values[survivors, at], axis=1))
         r = np.stack([words.take(len(moved)) for _ in range(3)], axis=1)
-        offset[moved] = r * _offset_steps(new.select(moved), coarseness)
+        offset[moved] = r * offset_steps(new.select(moved), coarseness)
     if births:
         new = new.concatenate(_taken_grid(reader, births, grid.degree, grid.optional))
     ids = np.concatenate([previous.ids[survivors], previous.next_id + np.arange(births, dtype=np.uint32)])
     gaussians = new.gaussians(motion, offset)
     return CodedFrame(packet.frame, new, ids.astype(np.uint32), previous.next_id + births, gaussians)
-
-
-def _offset_steps(grid: Grid, coarseness: int) -> np.ndarray:
-    """Return the steps of the offsets, float64 [N, 1], world units: those of the changes of the means."""
-    return grid.steps("means") * step_sizes(np.array(coarseness))
 
 
 def _words(columns: Iterable[np.ndarray]) -> np.ndarray:
@@ -393,21 +352,42 @@ def _taken_grid(reader: ColumnReader, N: int, degree: int, optional: int) -> Gri
     return Grid(values, exponents, largest.astype(np.uint8), degree, optional)
 
 
-def _touched(now: Mapping[str, np.ndarray], before: Mapping[str, np.ndarray], survivors: np.ndarray) -> np.ndarray:
-    """Return the indices of the survivors with any attribute that differs: the others are skipped."""
-    differs = np.zeros(len(survivors), bool)
+def _coder(
+    previous: CodedFrame, now: Mapping[str, np.ndarray], survivors: np.ndarray, offset: np.ndarray | None
+) -> Coder:
+    """Return the coder of the changes to the stored fields `now`; survivors without any difference are skipped."""
+    grid, before, differs = previous.grid, stored_fields(previous.gaussians), np.zeros(len(survivors), bool)
     for name, value in now.items():
         different = value[: len(survivors)] != before[name][survivors]
         differs |= different.reshape(len(survivors), prod(value.shape[1:])).any(1)
-    return np.flatnonzero(differs)
+    touched = np.flatnonzero(differs)
+    rows = survivors[touched]
+    change = real_values({name: value[touched] for name, value in split_groups(now).items()}, grid.select(rows))
+    change -= grid.values[rows].T
+    return Coder(grid, survivors, rows, change, offset)
 
 
-def _fitting(columns: Callable[[int], Iterator[np.ndarray]], low: int, target: int) -> int:
-    """Return the least coarseness from `low` at which the columns are estimated to take `target` bytes."""
+def _codes(coder: Coder, coarseness: int, born: Grid | None) -> dict[str, np.ndarray]:
+    """Return the words of the changes in steps of a coarseness, and of the births."""
+    r, writer, births = coder.rounded(coarseness), ColumnWriter(), 0 if born is None else len(born)
+    for column in coder.columns(r):
+        writer.put(column)
+    if born is not None:
+        _put_grid(writer, born)
+    codes = {"code": _padded(writer.words(), births, len(coder.survivors) + births, coder.grid)}
+    if coder.offset is not None:
+        codes["offset"] = _words(coder.offsets(r, coarseness))
+    return codes
+
+
+def _fitting(coder: Coder, low: int, target: int) -> int:
+    """Return the least coarseness from `low` at which the changes are estimated to take `target` bytes."""
     high = _COARSEST
     while low < high:
         middle = (low + high) // 2
-        if sum(map(column_bits, columns(middle))) / 8 <= target:
+        r = coder.rounded(middle)
+        bits = sum(map(column_bits, chain(coder.columns(r), coder.offsets(r, middle))))
+        if bits / 8 <= target:
             high = middle
         else:
             low = middle + 1

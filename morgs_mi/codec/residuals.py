@@ -8,38 +8,83 @@ because their flags and residuals differ most.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from morgs_mi.codec.entropy import LIMIT, ColumnReader
-from morgs_mi.codec.quantisation import GROUPS, Grid, bounded
+from morgs_mi.codec.quantisation import GROUPS, Grid, bounded, step_sizes
 
-__all__ = ["columns_of_change", "take_change"]
+__all__ = ["Coder", "offset_steps", "take_change"]
 
 _GEOMETRY, _APPEARANCE, _DEAD = GROUPS[:3], GROUPS[3:], 8
+# Changes below a step are jitter of the fit, but in the base colour every bit is visible. Slightly less than a step,
+# because a decoded state is rounded to float32 and must give the packet that it was decoded from.
+_THRESHOLD, _THRESHOLD_DC = 0.99, 0.5
 
 
-def columns_of_change(r: np.ndarray, dead: np.ndarray, grid: Grid) -> Iterator[np.ndarray]:
-    """Yield the columns of changes by integers [C, N] and of deaths; `take_change` reads them."""
-    changed = {name: np.any(r[at], axis=0) for name, at in grid.columns.items()}
-    geometry = np.where(dead, _DEAD, _flags(changed, _GEOMETRY, len(grid)))
-    appearance = _flags(changed, _APPEARANCE, len(grid))
-    for rows in _classes(grid):
-        shape, shading = geometry[rows], appearance[rows]
-        yield shape
-        yield shading[shape == 0]
-        yield shading[(shape > 0) & (shape < _DEAD)]
-        for name, at in grid.columns.items():
-            yield from r[at].take(rows[changed[name][rows]], axis=1)
+@dataclass(frozen=True, eq=False)
+class Coder:
+    """Coder of the changes from a state to the next Gaussians, in steps of any coarseness.
+
+    Attributes:
+        grid: the N Gaussians of the state.
+        survivors: their indices in the state [S], ascending; the others die.
+        rows: indices of the M survivors that differ.
+        change: their differences by integer, in multiples of the grid's steps [C, M].
+        offset: offsets of the next Gaussians, survivors first [N', 3], world units; None: they are not stored.
+    """
+
+    grid: Grid
+    survivors: np.ndarray
+    rows: np.ndarray
+    change: np.ndarray
+    offset: np.ndarray | None
+
+    def rounded(self, coarseness: int) -> np.ndarray:
+        """Return the changes in whole steps, int32 [C, N]."""
+        r, scaled = np.zeros((len(self.change), len(self.grid)), np.int32), self.change / _step(coarseness)
+        for name, at in self.grid.columns.items():
+            largest = np.max(np.abs(scaled[at]), axis=0)
+            scaled[at][:, largest < (_THRESHOLD_DC if name == "sh_dc" else _THRESHOLD)] = 0
+        r[:, self.rows] = np.clip(np.rint(scaled, out=scaled), 1 - LIMIT, LIMIT - 1, out=scaled)
+        return r
+
+    def columns(self, r: np.ndarray) -> Iterator[np.ndarray]:
+        """Yield the columns of changes `r` [C, N] and of the deaths; `take_change` reads them."""
+        dead = np.ones(len(self.grid), bool)
+        dead[self.survivors] = False
+        changed = {name: np.any(r[at], axis=0) for name, at in self.grid.columns.items()}
+        geometry = np.where(dead, _DEAD, _flags(changed, _GEOMETRY, len(self.grid)))
+        appearance = _flags(changed, _APPEARANCE, len(self.grid))
+        for rows in _classes(self.grid):
+            shape, shading = geometry[rows], appearance[rows]
+            yield shape
+            yield shading[shape == 0]
+            yield shading[(shape > 0) & (shape < _DEAD)]
+            for name, at in self.grid.columns.items():
+                yield from r[at].take(rows[changed[name][rows]], axis=1)
+
+    def offsets(self, r: np.ndarray, coarseness: int) -> Iterator[np.ndarray]:
+        """Yield the columns of the offsets of the survivors with changed means; none if they are not stored."""
+        if self.offset is not None:
+            moved = np.flatnonzero(np.any(r[self.grid.columns["means"]], axis=0)[self.survivors])
+            real = self.offset[moved] / offset_steps(self.grid.select(self.survivors[moved]), coarseness)
+            yield from np.clip(np.rint(real), 1 - LIMIT, LIMIT - 1).astype(np.int32).T
 
 
-def take_change(reader: ColumnReader, grid: Grid, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the integers int32 [N, C] after changes in multiples of `step`, and the mask of deaths, bool [N].
+def offset_steps(grid: Grid, coarseness: int) -> np.ndarray:
+    """Return the steps of the offsets, float64 [N, 1], world units, which are the steps of the changes of the means."""
+    return grid.steps("means") * _step(coarseness)
+
+
+def take_change(reader: ColumnReader, grid: Grid, coarseness: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the integers int32 [N, C] after changes in steps of a coarseness, and the mask of deaths, bool [N].
 
     Raises:
         ValueError: the columns are not those of changes, or a value leaves its range.
     """
-    values, dead = grid.values.copy(), np.zeros(len(grid), bool)
+    values, dead, step = grid.values.copy(), np.zeros(len(grid), bool), float(_step(coarseness))
     for rows in _classes(grid):
         geometry, appearance = reader.take(len(rows)), np.zeros(len(rows), np.int64)
         for some in (geometry == 0, (geometry > 0) & (geometry < _DEAD)):
@@ -72,3 +117,8 @@ def _classes(grid: Grid) -> list[np.ndarray]:
     confidence = grid.columns.get("logit_confidence")
     moving = np.zeros(len(grid), bool) if confidence is None else grid.values[:, confidence.start] > 0
     return [np.flatnonzero(~moving), np.flatnonzero(moving)]
+
+
+def _step(coarseness: int) -> np.ndarray:
+    """Return the step of the changes in multiples of the grid's steps."""
+    return step_sizes(np.array(coarseness))
