@@ -17,8 +17,6 @@ from threading import Event, Lock
 from typing import Any
 from urllib.parse import urlsplit
 
-from morgs_mi.viewer.arrow_keys import with_arrow_keys
-
 __all__ = ["checked_connections", "refusal"]
 
 _PATCHING = Lock()
@@ -70,7 +68,7 @@ def checked_connections(names: Collection[str] = (), ready: Event | None = None)
             reason = refusal(request.headers.get("Host"), request.headers.get("Origin"), names)
             if reason is not None:
                 return connection.respond(HTTPStatus.FORBIDDEN, reason + "\n")
-            response = with_arrow_keys(process_request(connection, request))
+            response = process_request(connection, request)
             while response is None and ready is not None and not ready.is_set():
                 await asyncio.sleep(_WAIT)
             return response

@@ -22,7 +22,6 @@ _SEARCHED_FRAMES = 32
 
 Trails = tuple[np.ndarray, np.ndarray]
 """Trails of Gaussians as line segments: end points [S, 2, 3] and ages [S], from 0 (the current frame) to 1."""
-_NO_CENTRES = (np.zeros(0, np.uint32), np.zeros((0, 3), np.float32))
 NO_TRAILS: Trails = (np.zeros((0, 2, 3), np.float32), np.zeros(0))
 
 
@@ -125,30 +124,6 @@ class FrameCache:
         lines, line_ages = np.concatenate(segments)[shown], np.concatenate(ages)[shown]
         moved = (lines[:, 0] != lines[:, 1]).any(axis=1)
         return lines[moved], line_ages[moved]
-
-    def path(self, gaussian: int, frame: int, length: int) -> np.ndarray:
-        """Return the positions [P, 3] of the Gaussian with the number `gaussian` in successive frames around `frame`.
-
-        They begin at most `length` frames before, or earlier where those frames are cached, and end with the last frame
-        after it that is cached. There is none if it does not exist in `frame`.
-        """
-        end = self.frames.index(frame)
-        for index in self.frames[max(end - length, 0) : end + 1]:
-            self._centres_at(index)
-        after = self._cached_path(gaussian, self.frames[end:])
-        before = self._cached_path(gaussian, self.frames[:end][::-1]) if after else []
-        return np.array([*before[::-1], *after], np.float32).reshape(-1, 3)
-
-    def _cached_path(self, gaussian: int, frames: list[int]) -> list[np.ndarray]:
-        """Return the positions of a Gaussian in frames, up to the first that is not cached or lacks it."""
-        points = []
-        for frame in frames:
-            ids, centres = self._centres.get(frame, _NO_CENTRES)
-            row = np.searchsorted(ids, gaussian)
-            if row == len(ids) or ids[row] != gaussian:
-                break
-            points.append(centres[row])
-        return points
 
     def _reopen(self) -> None:
         self.stream = open_stream(self.stream.path)

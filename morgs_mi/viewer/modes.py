@@ -8,9 +8,10 @@ from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import colors_seen_from
-from morgs_mi.playback.player import CHANNELS, channel_image
+from morgs_mi.playback.player import CHANNELS, OFFSET_SCALE, channel_image
+from morgs_mi.playback.visualise import depth_range
 
-__all__ = ["BACKGROUNDS", "MODES", "available_modes", "sees_same", "splat_values", "value_colors"]
+__all__ = ["BACKGROUNDS", "MODES", "available_modes", "scale_text", "sees_same", "splat_values", "value_colors"]
 
 _ATTRIBUTE_MODES = {row.channel: row for row in ATTRIBUTES if row.channel is not None}
 
@@ -58,6 +59,25 @@ def splat_values(gaussians: Gaussians, camera: Camera, mode: str) -> np.ndarray:
             f"splat_values(): the mode must be one of {', '.join(MODES)} that the stream stores, got {mode!r}."
         )
     return np.asarray(getattr(gaussians, row.activated_name)).reshape(len(gaussians), -1)
+
+
+def scale_text(mode: str, values: np.ndarray, motion_scale: float) -> str:
+    """Return the meaning of a mode's colours; empty for colours.
+
+    Args:
+        mode: one of `MODES`.
+        values: the values that are shown, in the channel's units; they determine the range of the depth.
+        motion_scale: speed of full saturation in pixels, as for `channel_image`.
+    """
+    if mode == "color":
+        return ""
+    if mode in ("motion", "offset"):
+        scale = motion_scale * (OFFSET_SCALE if mode == "offset" else 1)
+        return f"Hue: direction on the screen; saturated: {scale:.3g} px per frame or more; white: no {mode}."
+    if mode == "depth":
+        near, far = depth_range(values)
+        return f"Red: {near:.3g}, blue: {far:.3g} world units; linear in 1 / depth."
+    return "Dark violet: 0, static; bright yellow: 1, moving." if mode == "confidence" else "Black: 0; white: 1."
 
 
 def value_colors(mode: str, values: np.ndarray, motion_scale: float) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What the page draws: Gaussians or an image behind them, trajectories, the cameras of the rig, the crop box."""
+"""What the page draws: Gaussians or an image behind them, trajectories, the cameras of the rig."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import covariances
-from morgs_mi.viewer.crop import box_edges
 from morgs_mi.viewer.modes import BACKGROUNDS, value_colors
 from morgs_mi.viewer.page_view import orientation
 from morgs_mi.viewer.splat_chunks import SplatChunks, packed_splats
@@ -20,7 +19,7 @@ __all__ = ["PageScene"]
 _HALF_MAX = 6e4
 # Size of a camera on the page.
 _FRUSTUM = 0.4
-_CAMERA, _HELD_OUT, _PATH = (90, 170, 255), (255, 160, 0), (255, 80, 200)
+_CAMERA, _HELD_OUT = (90, 170, 255), (255, 160, 0)
 
 
 class PageScene:
@@ -61,22 +60,13 @@ class PageScene:
 
     def show_trails(self, lines: np.ndarray, ages: np.ndarray) -> None:
         """Show trails, see `FrameCache.trails`."""
+        if not len(lines):
+            self._scene.remove_by_name("/trails")
+            return
         level = (255 * (1 - 0.8 * ages)).astype(np.uint8)
         colors = np.stack([level, level, np.full_like(level, 40)], axis=-1)[:, None]
-        self._show_lines("/trails", lines, colors)
-
-    def show_picked(self, path: np.ndarray, position: np.ndarray | None, text: str) -> None:
-        """Show the path [P, 3] of a Gaussian and a label at its position [3], or neither if there is none."""
-        segments = np.stack([path[:-1], path[1:]], axis=1)
-        self._show_lines("/path", segments, np.full((1, 1, 3), _PATH), thickness=5.0)
-        if position is None:
-            self._scene.remove_by_name("/picked")
-        else:
-            self._scene.add_label("/picked", text, position=self._scale * position)
-
-    def show_box(self, box: np.ndarray | None) -> None:
-        """Show the edges of a box with corners [2, 3], or no box."""
-        self._show_lines("/box", np.zeros((0, 2, 3)) if box is None else box_edges(box), np.full((1, 1, 3), 200))
+        colors = np.broadcast_to(colors, lines.shape)
+        self._scene.add_line_segments("/trails", self._scale * lines, colors, thickness=1.5, thickness_units="screen")
 
     def add_cameras(self, cameras: Sequence[Camera], held_out: int | None, go_to: Callable[[Any, int], None]) -> None:
         """Add the cameras with their names, hidden; `go_to` is called with (client, index) when one is clicked."""
@@ -106,13 +96,3 @@ class PageScene:
         for index, nodes in enumerate(self._cameras):
             for node in nodes:
                 node.visible = visible and index != at
-
-    def _show_lines(self, name: str, lines: np.ndarray, colors: np.ndarray, thickness: float = 1.5) -> None:
-        """Show line segments [S, 2, 3] with colours broadcastable to them, or none."""
-        if len(lines):
-            colors = np.broadcast_to(colors.astype(np.uint8), lines.shape)
-            self._scene.add_line_segments(
-                name, self._scale * lines, colors, thickness=thickness, thickness_units="screen"
-            )
-        else:
-            self._scene.remove_by_name(name)

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import cv2
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.core.camera import Camera
+from morgs_mi.playback.player import fitted_capture, num_frames, open_stream_capture
 from morgs_mi.playback.visualise import label
+from morgs_mi.viewer.frame_cache import FrameCache
 
-__all__ = ["RecordedImages", "seen_from", "wipe"]
+__all__ = ["RecordedImages", "Recording", "seen_from", "wipe"]
 
 _OUTSIDE = (40, 40, 40)
 # Frames that are decoded and dropped rather than seeking, which decodes from a keyframe of the video.
@@ -50,6 +53,39 @@ class RecordedImages:
             image = next(self._images, None)
         self._next, self._last = frame + 1, image if isinstance(image, np.ndarray) else None
         return self._last
+
+
+class Recording:
+    """Recorded images of a stream; its capture is opened when the first one is shown.
+
+    Args:
+        cache: frames of the stream.
+        folder: folder of the capture; None: the one that was fitted.
+    """
+
+    def __init__(self, cache: FrameCache, folder: Path | None) -> None:
+        self._cache, self._folder = cache, folder
+        self._images: RecordedImages | None = None
+
+    def problem(self) -> str | None:
+        """Return why there are no recorded images, without opening the capture; None if there are."""
+        try:
+            path = Path(self._folder or fitted_capture(self._cache.stream))
+        except (OSError, ValueError) as error:
+            return str(error)
+        return None if path.is_dir() else f"{path}: expected the capture, found none; pass its folder (--capture)."
+
+    def at(self, view: int, frame: int) -> np.ndarray | None:
+        """Return the image [H, W, 3] of a camera at a frame; None if it was not recorded.
+
+        Raises:
+            OSError, ValueError: the capture is missing, broken, or not the one of the stream.
+        """
+        if self._images is None or frame >= self._images.num_frames:  # the capture of a live fit grows
+            stream = self._cache.stream
+            count = max(num_frames(stream), self._cache.frames[-1] + 1)
+            self._images = RecordedImages(open_stream_capture(stream, self._folder, list(range(count))))
+        return self._images.at(view, frame)
 
 
 def seen_from(view: Camera, camera: Camera, image: np.ndarray) -> np.ndarray:

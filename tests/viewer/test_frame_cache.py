@@ -94,14 +94,3 @@ def test_frame_cache__returns_every_frame_that_plays(tmp_path, order):
         for frame in order:
             np.testing.assert_array_equal(cache.at(frame).digest, states[frame].digest)
             assert len(cache.trails(cache.frames[-1], 3)) == 2
-
-
-def test_frame_cache__path_of_a_gaussian_covers_the_frames_around(tmp_path, states):
-    cache = FrameCache(tmp_path)
-    centers = np.stack([state.gaussians.numpy()["means"][state.ids == 3][0] for state in states])
-    assert_close(cache.path(3, 4, 2), centers[:5], atol=0)  # frame 2 is decoded from the first
-    cache.at(5)
-    assert_close(cache.path(3, 1, 1), centers, atol=0)
-    assert len(cache.path(0, 5, 10)) == 0, "it has died"
-    assert len(cache.path(0, 0, 10)) == 2
-    assert len(cache.path(40, 5, 10)) == 4, "it was born in frame 2"

@@ -19,7 +19,7 @@ from morgs_mi.playback.visualise import confidence_image, motion_image
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import Image, rasterize
 from morgs_mi.viewer import modes
-from morgs_mi.viewer.modes import MODES, available_modes
+from morgs_mi.viewer.modes import MODES, available_modes, scale_text
 from tests.assertions import assert_close
 from tests.scenes.changing_splats import rig, write_stream
 
@@ -108,3 +108,21 @@ def test_available_modes__exclude_missing_attributes(states):
     assert available_modes(gaussians) == MODES
     bare = Gaussians(*(getattr(gaussians, n) for n in ("means", "log_scales", "quats", "logit_opacities", "sh_coeffs")))
     assert available_modes(bare) == tuple(mode for mode in MODES if mode != "confidence")
+
+
+@pytest.mark.parametrize(
+    ("mode", "texts"),
+    [
+        ("color", ()),
+        ("motion", ("direction on the screen", "12 px per frame", "no motion")),
+        ("offset", ("direction on the screen", "1.2 px per frame", "no offset")),
+        ("confidence", ("0, static", "1, moving")),
+        ("depth", ("Red: 2.06", "blue: 7.94 world units")),
+        ("wetness", ("Black: 0", "white: 1")),
+    ],
+)
+def test_scale_text__has_values_and_units(mode: str, texts: tuple[str, ...]) -> None:
+    depths = np.r_[np.linspace(2, 8, 101), np.nan, -1][:, None]
+    text = scale_text(mode, depths, 12.0)
+    assert all(part in text for part in texts), text
+    assert bool(text) == (mode != "color")
