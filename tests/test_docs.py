@@ -7,10 +7,9 @@ import inspect
 import json
 import pkgutil
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-
-import pytest
 
 import morgs_mi
 
@@ -23,6 +22,8 @@ PAGES = {
 }
 ROWS = re.findall(r"^\| (\d+) \| [^|]+ \| (`[\w.]+`(?:, `[\w.]+`)*) \|$", PAGES["docs/architecture.md"], re.MULTILINE)
 EQUATIONS = [(number, name) for number, names in ROWS for name in re.findall(r"`([\w.]+)`", names)]
+EXPERIMENTS = {page: text for page, text in PAGES.items() if page.startswith("docs/experiments/")}
+GUIDES = {page: text for page, text in PAGES.items() if re.fullmatch(r"docs/[\w-]+\.md", page)}
 RESULTS = ROOT / "benchmarks/results"
 
 
@@ -53,6 +54,19 @@ def exists(path: str) -> bool:
     return True
 
 
+def compiles(example: str) -> bool:
+    try:
+        compile(example, "example", "exec")
+    except SyntaxError:
+        return False
+    return True
+
+
+def offenders(pages: dict[str, str], wrong: Callable[[str, str], list]) -> dict[str, list]:
+    """Return what is wrong with each page; pages without mistakes are left out."""
+    return {page: found for page, text in pages.items() if (found := wrong(page, text))}
+
+
 def committed(name: str) -> Any:
     return json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
 
@@ -61,12 +75,13 @@ def test_equation_table__has_every_equation():
     assert [int(number) for number, _ in ROWS] == list(range(1, 14))
 
 
-@pytest.mark.parametrize(("number", "name"), EQUATIONS)
-def test_equation_table__functions_name_their_equation(number, name):
-    source = inspect.getsource(resolve(name))
-    # "eq. 12", or a list such as "eqs. 3, 8 and 12".
-    lists = re.findall(r"\beqs?\. ((?:\d+(?:, | and |-)?)+)", source)
-    assert number in {n for found in lists for n in re.findall(r"\d+", found)}, f"{name} does not name eq. {number}"
+def test_equation_table__functions_name_their_equation():
+    def named(name: str) -> set[str]:
+        # "eq. 12", or a list such as "eqs. 3, 8 and 12".
+        lists = re.findall(r"\beqs?\. ((?:\d+(?:, | and |-)?)+)", inspect.getsource(resolve(name)))
+        return {number for found in lists for number in re.findall(r"\d+", found)}
+
+    assert [f"{name} does not name eq. {number}" for number, name in EQUATIONS if number not in named(name)] == []
 
 
 def test_architecture__lists_every_subpackage():
@@ -74,37 +89,45 @@ def test_architecture__lists_every_subpackage():
     assert sorted(listed) == sorted(m.name for m in pkgutil.iter_modules(morgs_mi.__path__) if m.name != "__main__")
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_pages__name_only_what_exists(page):
-    paths = set(re.findall(r"\bmorgs_mi(?:\.[A-Za-z]\w*)+", PAGES[page]))
-    # The page describes how to write these files.
-    new = {file.replace("/", ".") for file in re.findall(r"<!-- new (\S+)\.py -->", PAGES[page])}
-    assert [path for path in sorted(paths - new) if not exists(path)] == []
+def test_pages__name_only_what_exists():
+    def missing(_: str, text: str) -> list[str]:
+        paths = set(re.findall(r"\bmorgs_mi(?:\.[A-Za-z]\w*)+", text))
+        # The page describes how to write these files.
+        new = {file.replace("/", ".") for file in re.findall(r"<!-- new (\S+)\.py -->", text)}
+        return [path for path in sorted(paths - new) if not exists(path)]
+
+    assert offenders(PAGES, missing) == {}
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_pages__link_only_to_what_exists(page):
-    targets = re.findall(r"\]\(([^)\s]+)\)", re.sub(r"```.*?```", "", PAGES[page], flags=re.DOTALL))
-    local = {target.partition("#")[0] for target in targets if not re.match(r"https?://|mailto:|#", target)}
-    assert [target for target in sorted(local) if not (ROOT / page).parent.joinpath(target).exists()] == []
+def test_pages__link_only_to_what_exists():
+    def missing(page: str, text: str) -> list[str]:
+        targets = re.findall(r"\]\(([^)\s]+)\)", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
+        local = {target.partition("#")[0] for target in targets if not re.match(r"https?://|mailto:|#", target)}
+        return [target for target in sorted(local) if not (ROOT / page).parent.joinpath(target).exists()]
+
+    assert offenders(PAGES, missing) == {}
 
 
-@pytest.mark.parametrize("page", PAGES)
-def test_pages__examples_compile(page):
-    # A fragment that is inserted after a line is no module; tests/test_extending.py runs it.
-    text = re.sub(r"<!-- after [^\n]*-->\n```python\n.*?```", "", PAGES[page], flags=re.DOTALL)
-    for example in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
-        compile(example, page, "exec")
+def test_pages__examples_compile():
+    def broken(_: str, text: str) -> list[str]:
+        # A fragment that is inserted after a line is no module; tests/test_extending.py runs it.
+        text = re.sub(r"<!-- after [^\n]*-->\n```python\n.*?```", "", text, flags=re.DOTALL)
+        return [example for example in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if not compiles(example)]
+
+    assert offenders(PAGES, broken) == {}
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if page.startswith("docs/experiments/")])
-def test_experiments__begin_with_date_commit_and_command(page):
-    text = PAGES[page].partition("## Summary\n")[2] if page.endswith("index.md") else PAGES[page].partition("\n")[2]
-    assert re.match(
+def test_experiments__begin_with_date_commit_and_command():
+    begin = re.compile(
         r"\s*\d+ (and \d+ )?[A-Z][a-z]+ \d{4},\s+commits?\s+`[0-9a-f]{7}`.*?\bby\b.*?(python -m benchmarks|make demo)",
-        text.strip()[:500],
         re.DOTALL,
     )
+
+    def wrong(page: str, text: str) -> list[str]:
+        text = text.partition("## Summary\n" if page.endswith("index.md") else "\n")[2].strip()[:500]
+        return [] if begin.match(text) else [text]
+
+    assert offenders(EXPERIMENTS, wrong) == {}
 
 
 def test_experiments__index_lists_every_page():
@@ -113,9 +136,8 @@ def test_experiments__index_lists_every_page():
     assert sorted(listed) == sorted(pages - {"index.md"})
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if re.fullmatch(r"docs/[\w-]+\.md", page)])
-def test_user_pages__hold_no_measurements(page):
-    assert re.findall(r"[^.\n]*\d (?:dB|ms|kB)\b[^.\n]*", PAGES[page]) == []
+def test_user_pages__hold_no_measurements():
+    assert offenders(GUIDES, lambda _, text: re.findall(r"[^.\n]*\d (?:dB|ms|kB)\b[^.\n]*", text)) == {}
 
 
 def test_experiments__quote_the_committed_demo():
@@ -155,13 +177,15 @@ def test_experiments__quote_the_committed_gains():
     assert expected in " ".join(PAGES["docs/experiments/index.md"].split())
 
 
-@pytest.mark.parametrize("workload", ["W1", "W2", "W2b"])
-def test_experiments__quote_the_committed_step_times(workload):
-    run = committed(f"render_speed_{workload}")
-    plain = f"{run['plain_step_ms']:.0f} ms" if run.get("plain_step_ms") else "not run"
-    steps = f"| {run['step_ms']:.0f} ms | {run['optimised_step_ms']:.0f} ms "
-    row = f"{steps}| {run['ratio_to_yardstick']:.2f} x | {plain} |"
-    assert row in PAGES["docs/experiments/index.md"]
+def test_experiments__quote_the_committed_step_times():
+    def row(workload: str) -> str:
+        run = committed(f"render_speed_{workload}")
+        plain = f"{run['plain_step_ms']:.0f} ms" if run.get("plain_step_ms") else "not run"
+        steps = f"| {run['step_ms']:.0f} ms | {run['optimised_step_ms']:.0f} ms "
+        return f"{steps}| {run['ratio_to_yardstick']:.2f} x | {plain} |"
+
+    rows = [row(workload) for workload in ("W1", "W2", "W2b")]
+    assert [row for row in rows if row not in PAGES["docs/experiments/index.md"]] == []
 
 
 def test_experiments__quote_the_committed_frame_times():

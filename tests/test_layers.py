@@ -5,8 +5,6 @@ from __future__ import annotations
 import ast
 from pathlib import Path
 
-import pytest
-
 import morgs_mi
 
 ROOT = Path(morgs_mi.__file__).parent
@@ -60,17 +58,20 @@ def imported_names(tree: ast.AST, package: list[str]) -> list[list[str]]:
     return names
 
 
-@pytest.mark.parametrize("path", MODULES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_layers__imports_go_down(path):
-    own = subpackage_of(path)
-    assert own in SUBPACKAGES, f"add {own} to SUBPACKAGES, after all that it imports"
-    package = ["morgs_mi", *path.relative_to(ROOT).parent.parts]
-    allowed = SUBPACKAGES[: SUBPACKAGES.index(own) + 1]
-    names = imported_names(ast.parse(path.read_text(encoding="utf-8")), package)
-    inside = [name[1] for name in names if name[0] == "morgs_mi" and len(name) > 1]
-    wrong = [target for target in inside if target in SUBPACKAGES and target not in allowed]
-    assert not wrong, f"{path.relative_to(ROOT)} imports from {wrong}, which come after `{own}`"
-    # A name imported from `morgs_mi` itself would hide its subpackage.
-    assert set(inside) <= set(SUBPACKAGES), (
-        f"{path.relative_to(ROOT)} imports {set(inside) - set(SUBPACKAGES)} from morgs_mi"
-    )
+def mistakes(path: Path) -> list[str]:
+    """Return a line for each of the module's imports from a later subpackage."""
+    own, place = subpackage_of(path), path.relative_to(ROOT)
+    if own not in SUBPACKAGES:
+        return [f"{place}: add {own} to SUBPACKAGES, after all that it imports"]
+    names = imported_names(ast.parse(path.read_text(encoding="utf-8")), ["morgs_mi", *place.parent.parts])
+    inside = sorted({name[1] for name in names if name[0] == "morgs_mi" and len(name) > 1})
+    later = SUBPACKAGES[SUBPACKAGES.index(own) + 1 :]
+    return [
+        *(f"{place} imports from {name}, which comes after {own}" for name in inside if name in later),
+        # A name imported from `morgs_mi` itself would hide its subpackage.
+        *(f"{place} imports {name} from morgs_mi itself" for name in inside if name not in SUBPACKAGES),
+    ]
+
+
+def test_layers__imports_go_down():
+    assert [mistake for path in MODULES for mistake in mistakes(path)] == []
