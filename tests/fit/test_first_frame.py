@@ -1,73 +1,80 @@
-"""The first frame: growth by density control, and the bands of the spherical harmonics."""
+"""The first frame: schedule of steps, SH bands, growth and learning rates; losses, masks, and the confidence."""
 
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 
+import drjit as dr
 import numpy as np
 import pytest
 
+from morgs_mi import Gaussians, RenderConfig
 from morgs_mi.core.progress import Progress
-from morgs_mi.fit.config import ConvergenceConfig, DensityConfig, FitConfig
-from morgs_mi.fit.first_frame import density_rounds, fit_first_frame
-from tests.scenes.ball import ball, images_of, mean_psnr, opaque_ball, problem
+from morgs_mi.fit.config import ConvergenceConfig, DensityConfig, FitConfig, LearningRates
+from morgs_mi.fit.first_frame import FirstFrame, density_rounds, fit_confidence, fit_first_frame
+from morgs_mi.fit.view import View, rendered
+from morgs_mi.method.objective import ObjectiveConfig
+from morgs_mi.render.active_view import ActiveView
+from tests.assertions import assert_close
+from tests.scenes.ball import ball, images_of, mean_psnr, opaque_ball, problem, views
 
-
-def fit(images, start, config, seed=0):
-    return fit_counted(images, start, config, seed).gaussians
-
-
-def fit_counted(images, start, config, seed=0, progress=None):
-    return fit_first_frame(problem(images, start), config, np.random.default_rng(seed), progress)
-
-
-def test_fit_first_frame__grows_from_too_few():
-    images, config = images_of(opaque_ball()), FitConfig(sh_degree=0, first_frame_steps=160, num_gaussians=250)
-    few = fit(images, ball(60), dataclasses.replace(config, density=DensityConfig(rounds=0)))
-    more = fit(images, ball(60), config)
-    assert len(few) == 60
-    assert 150 < len(more) <= 250
-    assert mean_psnr(more, images) > mean_psnr(few, images) + 1
-
-
+REPRODUCIBLE = RenderConfig(reproducible=True)
+NO_GROWTH = DensityConfig(rounds=0)
+CONFIG = FitConfig(sh_degree=0, num_gaussians=80, first_frame_steps=8, density=NO_GROWTH)
 UNTIL_CONVERGED = FitConfig(sh_degree=0, num_gaussians=300, convergence=ConvergenceConfig(steps=60, most_steps=150))
 
 
-def test_fit_first_frame__doubles_its_steps_while_the_loss_falls():
-    images, done = images_of(opaque_ball()), []
-    progress = Progress(lambda *steps: done.append(steps), "First frame")
-    found = fit_counted(images, ball(150), UNTIL_CONVERGED, progress=progress)
+def fit(images, start, config, seed=0, progress=None, **given) -> FirstFrame:
+    """Fit some or all of the views; `given` are masks and the cut-offs of the renderer."""
+    return fit_first_frame(problem(images, start, **given), config, np.random.default_rng(seed), progress)
+
+
+@pytest.fixture(scope="module")
+def images():
+    return images_of(opaque_ball())
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[Gaussians]:
+    """A list to which every step of a fit adds the Gaussians that it renders."""
+    steps, render = [], ActiveView.render
+
+    def spy(view, gaussians, *channels, **more):
+        if dr.grad_enabled(gaussians.sh_coeffs):  # rounds of density control render without gradients
+            steps.append(gaussians.detached())
+        return render(view, gaussians, *channels, **more)
+
+    monkeypatch.setattr(ActiveView, "render", spy)
+    return steps
+
+
+def values_of(gaussians: Gaussians) -> dict[str, bytes]:
+    return {name: value.tobytes() for name, value in gaussians.numpy().items()}
+
+
+# ---- number of steps -------------------------------------------------------------------------------------
+
+
+def test_fit_first_frame__doubles_its_steps_while_the_loss_falls(images):
+    done = []
+    found = fit(images, ball(150), UNTIL_CONVERGED, progress=Progress(lambda *now: done.append(now), "First frame"))
     assert found.steps == 150
     totals = [60] * 60 + [120] * 60 + [150] * 30
     assert done == [("First frame", *steps) for steps in enumerate(totals, 1)]
     few = fit(images, ball(150), dataclasses.replace(UNTIL_CONVERGED, first_frame_steps=60))
-    assert mean_psnr(found.gaussians, images) > mean_psnr(few, images) + 3
+    assert mean_psnr(found.gaussians, images) > mean_psnr(few.gaussians, images) + 3
 
 
-def test_fit_first_frame__ends_where_only_noise_is_left():
+def test_fit_first_frame__ends_where_only_noise_is_left(images):
     rng = np.random.default_rng(0)
-    noisy = [np.clip(image + rng.normal(0, 0.3, image.shape), 0, 1) for image in images_of(opaque_ball())]
-    assert fit_counted(noisy, ball(150), UNTIL_CONVERGED).steps == 60
+    noisy = [np.clip(image + rng.normal(0, 0.3, image.shape), 0, 1) for image in images]
+    assert fit(noisy, ball(150), UNTIL_CONVERGED).steps == 60
 
 
-def test_fit_first_frame__has_the_steps_that_are_given():
+def test_fit_first_frame__has_the_steps_that_are_given(images):
     config = dataclasses.replace(UNTIL_CONVERGED, first_frame_steps=20)
-    assert fit_counted(images_of(opaque_ball()), ball(150), config).steps == 20
-
-
-def test_fit_first_frame__adds_sh_bands_one_after_the_other():
-    images = images_of(opaque_ball())
-    for steps in (1, 40):
-        found = fit(images, ball(50, sh_degree=3), FitConfig(sh_degree=3, first_frame_steps=steps))
-        assert found.sh_degree == 3
-    bands = np.abs(np.asarray(found.sh_coeffs)).mean(axis=(0, 2))
-    assert bands[1:4].mean() > bands[4:9].mean() > bands[9:].mean() > 0
-
-
-def test_density_rounds__lie_between_a_tenth_and_a_half():
-    steps = density_rounds(FitConfig(first_frame_steps=1000, density=DensityConfig(rounds=5)))
-    assert steps == [100, 200, 300, 400, 500]
-    assert density_rounds(FitConfig(density=DensityConfig(rounds=0))) == []
+    assert fit(images, ball(150), config).steps == 20
 
 
 @pytest.mark.parametrize(
@@ -81,3 +88,189 @@ def test_density_rounds__lie_between_a_tenth_and_a_half():
 def test_convergence_config__names_bad_values(arguments, message):
     with pytest.raises(ValueError, match=message):
         ConvergenceConfig(**arguments)
+
+
+# ---- learning rates --------------------------------------------------------------------------------------
+
+# L1 of white images and of colours that stay dark: their gradient is constant, so Adam's steps are as long as the rate.
+COLOR_ALONE = LearningRates(means=0, scales=0, quats=0, opacities=0, sh_dc=0.05, sh_rest=0)
+L1 = ObjectiveConfig(dssim_weight=0.0)
+SCHEDULED = dataclasses.replace(CONFIG, first_frame_rates=COLOR_ALONE, objective=L1, final_rate=0.1)
+WHITE, DARK = [np.full((48, 64, 3), 255, np.uint8)], dataclasses.replace(ball(80), sh_coeffs=np.full((80, 1, 3), -1.0))
+
+
+def lengths(drawn: list[Gaussians], found: FirstFrame) -> np.ndarray:
+    """Return the length of each step of the colours."""
+    colors = np.array([np.asarray(gaussians.sh_coeffs) for gaussians in [*drawn, found.gaussians]])
+    return np.median(np.diff(colors, axis=0), axis=(1, 2, 3))
+
+
+def test_fit_first_frame__lets_the_rates_fall_to_the_final_one(drawn):
+    found = fit(WHITE, DARK, SCHEDULED)
+    assert_close(lengths(drawn, found), 0.05 * 0.1 ** (np.arange(8) / 8), rtol=1e-4)
+
+
+def test_fit_first_frame__continues_the_rates_on_the_schedule_of_all_steps(drawn):
+    convergence = ConvergenceConfig(steps=12, most_steps=30, least_decrease=1e-3)
+    found = fit(WHITE, DARK, dataclasses.replace(SCHEDULED, first_frame_steps=None, convergence=convergence))
+    totals = np.repeat([12, 24, 30], [12, 12, 6])
+    assert_close(lengths(drawn, found), 0.05 * 0.1 ** (np.arange(30) / totals), rtol=1e-4)
+
+
+def test_fit_first_frame__moves_means_by_fractions_of_the_extent(images, drawn):
+    rates = dataclasses.replace(CONFIG.first_frame_rates, means=1e-3)
+    found = fit(images, ball(80), dataclasses.replace(CONFIG, first_frame_steps=1, first_frame_rates=rates))
+    shift = np.abs(np.asarray(found.gaussians.means) - np.asarray(drawn[0].means))
+    # The extent is 3. The first step of Adam has the length of the rate where there is a gradient.
+    assert np.median(shift) == pytest.approx(3e-3, rel=1e-3)
+
+
+# ---- bands of the spherical harmonics --------------------------------------------------------------------
+
+
+def test_fit_first_frame__adds_sh_bands_at_equal_distances(images, drawn):
+    config = dataclasses.replace(CONFIG, sh_degree=3, first_frame_steps=20, sh_band_fraction=0.15)
+    found = fit(images, ball(50, sh_degree=3), config)
+    assert [gaussians.sh_degree for gaussians in drawn] == 3 * [0] + 3 * [1] + 3 * [2] + 11 * [3]
+    bands = np.abs(np.asarray(found.gaussians.sh_coeffs)).mean(axis=(0, 2))
+    assert bands[1:4].mean() > bands[4:9].mean() > bands[9:].mean() > 0
+
+
+def test_fit_first_frame__has_all_sh_bands_after_one_step(images):
+    found = fit(images, ball(50, sh_degree=3), FitConfig(sh_degree=3, first_frame_steps=1))
+    assert found.gaussians.sh_degree == 3
+
+
+# ---- growth ----------------------------------------------------------------------------------------------
+
+
+def test_density_rounds__lie_between_a_tenth_and_a_half():
+    steps = density_rounds(FitConfig(first_frame_steps=1000, density=DensityConfig(rounds=5)))
+    assert steps == [100, 200, 300, 400, 500]
+    assert density_rounds(FitConfig(density=NO_GROWTH)) == []
+
+
+def test_fit_first_frame__grows_in_the_rounds_alone_and_to_the_number_that_is_given(images, drawn):
+    config = FitConfig(sh_degree=0, first_frame_steps=20, num_gaussians=100, density=DensityConfig(rounds=3))
+    found = fit(images, ball(60), config)
+    counts = [len(gaussians) for gaussians in drawn]
+    assert [step for step, (a, b) in enumerate(pairwise(counts), 1) if a != b] == density_rounds(config) == [2, 6, 10]
+    assert counts == sorted(counts)
+    assert (counts[0], len(found.gaussians)) == (60, 100)
+
+
+def test_fit_first_frame__grows_from_too_few(images):
+    config = FitConfig(sh_degree=0, first_frame_steps=160, num_gaussians=250)
+    few = fit(images, ball(60), dataclasses.replace(config, density=NO_GROWTH)).gaussians
+    more = fit(images, ball(60), config).gaussians
+    assert len(few) == 60
+    assert 150 < len(more) <= 250
+    assert mean_psnr(more, images) > mean_psnr(few, images) + 1
+
+
+def test_fit_first_frame__does_not_grow_where_no_error_is_left():
+    black = [np.zeros_like(image) for image in WHITE]
+    invisible = dataclasses.replace(ball(60), sh_coeffs=np.full((60, 1, 3), -9.0))
+    config = FitConfig(sh_degree=0, first_frame_steps=10, num_gaussians=100)
+    assert len(fit(black, invisible, config).gaussians) == 60
+
+
+def test_fit_first_frame__prunes_what_is_invisible(images):
+    logits = np.where(np.arange(80) < 30, -12.0, 0.0)
+    start = dataclasses.replace(ball(80), logit_opacities=logits)
+    config = dataclasses.replace(CONFIG, num_gaussians=50, density=DensityConfig(rounds=1))
+    assert len(fit(images, start, config).gaussians) == 50
+
+
+# ---- images, masks and losses ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2])
+def test_fit_first_frame__reports_l1_where_dssim_has_no_weight(images, weight):
+    config = dataclasses.replace(CONFIG, first_frame_steps=1, objective=ObjectiveConfig(dssim_weight=weight))
+    loss = fit(images[:1], ball(80), config).losses["recon"]
+    l1 = np.abs(rendered(ball(80), views()[0], RenderConfig()) - images[0]).mean()
+    assert (loss == pytest.approx(l1, rel=1e-4)) == (weight == 0)
+
+
+def test_fit_first_frame__does_not_see_pixels_that_are_masked(images):
+    masks = [np.ones((48, 64), bool) for _ in images]
+    spoiled = [image.copy() for image in images]
+    for image, mask in zip(spoiled, masks, strict=True):
+        mask[10:30, 20:40], image[10:30, 20:40] = False, 1.0
+    config = FitConfig(sh_degree=1, num_gaussians=90, first_frame_steps=12)
+
+    def fitted(given):
+        return fit(given, ball(60, 1), config, masks=masks, render=REPRODUCIBLE)
+
+    assert values_of(fitted(spoiled).gaussians) == values_of(fitted(images).gaussians)
+
+
+def test_fit_first_frame__fits_views_of_different_sizes(images):
+    given, camera = problem(images, ball(80)), views()[1].resized(40, 30)
+    small = View(camera, rendered(opaque_ball(), camera, RenderConfig()))
+    mixed = dataclasses.replace(given, views=(given.views[0], small, *given.views[2:]))
+    found = fit_first_frame(
+        mixed, dataclasses.replace(CONFIG, first_frame_steps=60), np.random.default_rng(0)
+    ).gaussians
+    for view in mixed.views:
+        errors = [np.abs(rendered(now, view.camera, RenderConfig()) - view.image).mean() for now in (ball(80), found)]
+        assert errors[1] < 0.5 * errors[0]
+
+
+# ---- dropping, and what does not change ------------------------------------------------------------------
+
+
+def test_fit_first_frame__leaves_gaussians_out_of_its_steps_but_not_of_the_result(images, drawn):
+    found = fit(images, ball(80), dataclasses.replace(CONFIG, dropping=0.25))
+    left_out = np.array([np.asarray(gaussians.opacities) < 1e-6 for gaussians in drawn])
+    assert left_out.mean() == pytest.approx(0.25, abs=0.05)
+    assert len(np.unique(left_out, axis=0)) == len(drawn)  # others in each step
+    assert np.asarray(found.gaussians.opacities).min() > 0.01
+
+
+def test_fit_first_frame__keeps_the_confidence(images):
+    confidence = np.linspace(-2, 2, 80)
+    found = fit(images, dataclasses.replace(ball(80), logit_confidence=confidence), CONFIG).gaussians
+    assert_close(found.logit_confidence, np.float32(confidence))
+
+
+def test_fit_first_frame__is_the_same_for_a_seed_and_another_for_another(images):
+    config = FitConfig(sh_degree=1, num_gaussians=90, first_frame_steps=12, dropping=0.2)
+    first, second, other = (
+        values_of(fit(images, ball(60, 1), config, seed, render=REPRODUCIBLE).gaussians) for seed in (5, 5, 6)
+    )
+    assert first == second
+    assert first != other
+
+
+# ---- the confidence --------------------------------------------------------------------------------------
+
+
+def learned(steps: int, masks: dict[int, np.ndarray]) -> tuple[Gaussians, dict[str, float]]:
+    """Return the opaque ball with a confidence that follows masks, by view."""
+    config = dataclasses.replace(CONFIG, confidence_steps=steps)
+    cameras = {view: views()[view] for view in masks}
+    start = dataclasses.replace(opaque_ball(), logit_confidence=np.zeros(400))
+    return fit_confidence(start, cameras, masks, config, RenderConfig(), np.random.default_rng(0))
+
+
+def halves() -> dict[int, np.ndarray]:
+    """Return masks of two key views, which mark their right half."""
+    return {view: np.float32(np.tile(np.arange(64) >= 32, (48, 1))) for view in (0, 3)}
+
+
+def test_fit_confidence__follows_the_masks_of_its_key_views():
+    found, losses = learned(40, halves())
+    confidence, place = 1 / (1 + np.exp(-np.asarray(found.logit_confidence))), np.asarray(found.means)[:, 0]
+    front = np.asarray(found.means)[:, 2] < 0
+    assert confidence[front & (place > 0.3)].mean() > 0.8
+    assert confidence[front & (place < -0.3)].mean() < 0.2
+    assert 0 < losses["mask"] < learned(4, halves())[1]["mask"]
+
+
+def test_fit_confidence__freezes_everything_else():
+    before, after = values_of(opaque_ball()), values_of(learned(4, halves())[0])
+    assert {name: after[name] for name in before if name != "logit_confidence"} == {
+        name: value for name, value in before.items() if name != "logit_confidence"
+    }

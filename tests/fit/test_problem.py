@@ -1,0 +1,95 @@
+"""The problem of a first frame, and the views that it consists of."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morgs_mi import RenderConfig
+from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.fit.config import DensityConfig, FitConfig
+from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.view import View, rendered, withheld_blocks
+from tests.scenes.ball import ball, bytes_of, images_of, opaque_ball, problem, views
+from tests.scenes.cameras import look_at_cameras
+
+LARGE = look_at_cameras([(0, 0, -4)], 40, 160, 120)[0]
+
+
+def large_view(mask: np.ndarray | None = None) -> View:
+    """Return a view of 160x120 pixels, all of them white in even columns."""
+    return View(LARGE, np.uint8(255 * np.tile(np.arange(160) % 2, (120, 1)))[..., None].repeat(3, axis=2), mask)
+
+
+def test_first_frame_problem__starts_from_the_points_with_the_settings_of_the_fit():
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (300, 3)), np.full((300, 3), 0.25)
+    config = FitConfig(sh_degree=2, num_gaussians=100, initial_opacity=0.4, density=DensityConfig(rounds=1))
+    given = [View(*view) for view in zip(views(), bytes_of(images_of(opaque_ball())), strict=True)]
+    found = FirstFrameProblem.of(given, points, config, RenderConfig(), np.random.default_rng(0))
+    assert (len(found.start), found.start.sh_degree) == (50, 2)  # half, as it grows to all
+    np.testing.assert_allclose(found.start.opacities, 0.4, rtol=1e-6)
+    assert found.points is points[0]
+    assert found.extent == scene_extent(views())
+    assert [camera.name for camera in found.cameras] == [camera.name for camera in views()]
+
+
+def test_first_frame_problem__only_takes_some_of_the_views():
+    whole = problem(bytes_of(images_of(opaque_ball())))
+    some = whole.only([2, 0])
+    assert some.views == (whole.views[2], whole.views[0])
+    assert (some.start, some.extent) == (whole.start, whole.extent)
+
+
+def test_first_frame_problem__psnr_is_the_mean_over_its_views():
+    images = bytes_of(images_of(opaque_ball()))
+    shown = [rendered(ball(80), camera, RenderConfig()) for camera in views()]
+    expected = np.mean([psnr(a, image / 255) for a, image in zip(shown, images, strict=True)])
+    assert problem(images).psnr(ball(80)) == pytest.approx(expected, abs=1e-4)
+    assert problem(images).only([1]).psnr(ball(80)) == pytest.approx(psnr(shown[1], images[1] / 255), abs=1e-4)
+
+
+def test_first_frame_problem__psnr_does_not_count_masked_pixels():
+    images, mask = bytes_of(images_of(opaque_ball())), np.ones((48, 64), bool)
+    mask[:20] = False
+    spoiled = [np.where(mask[..., None], image, 255) for image in images]
+    masked = [problem(given, masks=[mask] * 4).psnr(ball(80)) for given in (images, spoiled)]
+    assert masked[0] == masked[1] > problem(spoiled).psnr(ball(80)) + 3
+
+
+@pytest.mark.parametrize(
+    ("width", "size"), [(160, (160, 120)), (81, (160, 120)), (80, (80, 60)), (50, (53, 40)), (10, (160, 120))]
+)
+def test_view__is_reduced_by_a_whole_factor_to_no_less_than_a_width(width: int, size: tuple[int, int]):
+    # A reduced image has 32 pixels at least on each side.
+    camera, image, mask = large_view().reduced(width)
+    assert (camera.width, camera.height) == size == image.shape[1::-1]
+    assert mask is None
+    assert image.mean() == pytest.approx(127.5, abs=1)
+    np.testing.assert_allclose(camera.K, np.diag([size[0] / 160, size[1] / 120, 1]) @ LARGE.K)
+
+
+def test_view__reduced_pixels_are_valid_if_all_that_they_cover_are():
+    mask = np.ones((120, 160), bool)
+    mask[7, 10] = mask[60:63, 80:85] = False
+    reduced = large_view(mask).reduced(80).mask
+    assert reduced is not None
+    np.testing.assert_array_equal(reduced, mask.reshape(60, 2, 80, 2).all(axis=(1, 3)))
+
+
+def test_first_frame_problem__reduces_all_views():
+    two = replace(problem([]), views=(large_view(), large_view()))
+    assert [image.shape for image in two.reduced(80).images] == [(60, 80, 3)] * 2
+
+
+def test_withheld_blocks__divide_the_valid_pixels():
+    valid = np.arange(160) < 120 * np.ones((120, 1))
+    kept, unseen = withheld_blocks([large_view(), large_view(valid)], 160, np.random.default_rng(0))
+    for allowed, a, b in zip((np.ones_like(valid), valid), kept, unseen, strict=True):
+        assert a.mask is not None
+        assert b.mask is not None
+        np.testing.assert_array_equal(a.mask ^ b.mask, allowed)
+        assert not (a.mask & b.mask).any()
+        assert b.mask.sum() / allowed.sum() == pytest.approx(1 / 8, abs=0.06)
