@@ -32,29 +32,33 @@ def dots(centres: np.ndarray) -> np.ndarray:
     return np.repeat((250 * np.clip(image, 0, 1))[..., None], 3, -1).astype(np.uint8)
 
 
-@pytest.mark.parametrize("model", LENSES)
-def test_undistortion__moves_points_to_their_pinhole_projections(model: str) -> None:
-    cam, lens = camera(), Lens(model, LENSES[model])
-    points = np.array([[x, y, 2.0] for x in (-0.9, -0.1, 0.8) for y in (-0.7, 0.05, 0.6)])
-    K = cam.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-    zero, coefficients = np.zeros(3), lens.opencv_coefficients
-    if model == "OPENCV_FISHEYE":
-        distorted, _ = cv2.fisheye.projectPoints(points[:, None], zero, zero, K, coefficients)
-    else:
-        distorted, _ = cv2.projectPoints(points, zero, zero, K, coefficients)
-    expected, _ = cam.project(points)
-    shift = np.abs(distorted[:, 0] + 0.5 - expected).max()
-    assert shift > 1, "the case must bend rays by more than a pixel"
+def project(model: str, lens: Lens, points: np.ndarray) -> np.ndarray:
+    """Return the positions [N, 2] of points in the frame of `camera`, seen through the lens, with centres at +0.5."""
+    K, zero = camera().K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], np.zeros(3)
+    through = cv2.fisheye.projectPoints if model == "OPENCV_FISHEYE" else cv2.projectPoints
+    return through(points[:, None], zero, zero, K, lens.opencv_coefficients)[0].reshape(-1, 2) + 0.5
 
-    found = undistortion(cam, lens)
-    assert found is not None
-    image = found(dots(distorted[:, 0] + 0.5)).astype(float)[..., 0]
+
+def assert_centred(image: np.ndarray, expected: np.ndarray) -> None:
+    """Assert that blobs [N, 2] lie where they are expected, as far from each other as these."""
     y, x = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     for u, v in expected:
         near = image * ((np.abs(x - u) < 7) & (np.abs(y - v) < 7))
         centre = np.array([(near * x).sum(), (near * y).sum()]) / near.sum()
         # 1/32 px of the maps, and the distortion of the blob itself.
         assert_close(centre, (u, v), atol=0.15)
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_undistortion__moves_points_to_their_pinhole_projections(model: str) -> None:
+    cam, lens = camera(), Lens(model, LENSES[model])
+    points = np.array([[x, y, 2.0] for x in (-0.9, -0.1, 0.8) for y in (-0.7, 0.05, 0.6)])
+    distorted, (expected, _) = project(model, lens, points), cam.project(points)
+    assert np.abs(distorted - expected).max() > 1, "the case must bend rays by more than a pixel"
+
+    found = undistortion(cam, lens)
+    assert found is not None
+    assert_centred(found(dots(distorted)).astype(float)[..., 0], expected)
 
 
 @pytest.mark.parametrize("model", ["PINHOLE", "OPENCV", "OPENCV_FISHEYE"])
@@ -67,18 +71,10 @@ def test_undistortion__removes_what_a_refined_lens_leaves(model: str) -> None:
     # Where the refined lens, and then the calibrated one, shows the points.
     rays = np.stack([x, y], axis=1) * (1 + left[0] * square + left[1] * square**2)[:, None]
     seen = (rays * refined.K[[0, 1], [0, 1]] + refined.K[:2, 2] - cam.K[:2, 2]) / cam.K[[0, 1], [0, 1]]
-    K, there = cam.K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], np.concatenate([seen, np.ones((len(seen), 1))], axis=1)
-    project = cv2.fisheye.projectPoints if model == "OPENCV_FISHEYE" else cv2.projectPoints
-    shape = (-1, 1, 3) if model == "OPENCV_FISHEYE" else (-1, 3)
-    distorted, _ = project(there.reshape(shape), np.zeros(3), np.zeros(3), K, lens.opencv_coefficients)
+    distorted = project(model, lens, np.concatenate([seen, np.ones((len(seen), 1))], axis=1))
     found = undistortion(cam, lens, (refined, Lens("RADIAL", left)))
     assert found is not None
-    image = found(dots(distorted[:, 0] + 0.5)).astype(float)[..., 0]
-    rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
-    for u, v in expected:
-        near = image * ((np.abs(columns - u) < 7) & (np.abs(rows - v) < 7))
-        centre = np.array([(near * columns).sum(), (near * rows).sum()]) / near.sum()
-        assert_close(centre, (u, v), atol=0.15)
+    assert_centred(found(dots(distorted)).astype(float)[..., 0], expected)
 
 
 def test_undistortion__is_none_without_distortion() -> None:

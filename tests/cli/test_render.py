@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.exr import read_exr
 from tests.cli.commands import assert_one_sentence, assert_refused, interrupt
+from tests.scenes.full_disk import files_end_at
 from tests.scenes.noise_capture import rig
 
 
@@ -59,12 +59,8 @@ def test_render__inserts_a_scene_into_some_frames(stream: Path, tmp_path: Path, 
 @pytest.mark.parametrize("name", ["a.mp4", "exr", "png"])
 def test_render__removes_its_output_on_a_full_disk(stream: Path, tmp_path: Path, run, name: str) -> None:
     run("render", stream, tmp_path / f"warm-{name}", "--camera", 0)  # compiled kernels are cached on disk too
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (200, hard))
-    try:
+    with files_end_at(200):
         status, _, error = run("render", stream, tmp_path / name, "--camera", 0)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert status == 1
     assert_one_sentence(error, name)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["good.morgs", f"warm-{name}"]

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
 from morgs_mi.core.files import atomic_folder, atomic_path, locked_folder, write_json
+from tests.scenes.full_disk import files_end_at
 
 
 def tree(path: Path) -> dict[str, str | None]:
@@ -26,17 +24,6 @@ def write(partial: Path, kind: str, text: str = "new") -> None:
     if kind == "folder":
         partial.mkdir()
     (partial / "a" if kind == "folder" else partial).write_text(text)
-
-
-@contextmanager
-def file_size_limit(size: int) -> Iterator[None]:
-    """Limit the file size, so that writes fail as on a full disk."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 @pytest.mark.parametrize("kind", ["file", "folder"])
@@ -73,7 +60,7 @@ def test_atomic_path__is_unchanged_after_an_error_in_the_body(tmp_path: Path, ki
 def test_write_json__leaves_the_old_file_on_a_full_disk(tmp_path: Path) -> None:
     write_json(tmp_path / "x.json", {"a": 1})
     before = tree(tmp_path)
-    with file_size_limit(100), pytest.raises(OSError, match=r"x\.json, .*: File too large; check"):
+    with files_end_at(100), pytest.raises(OSError, match=r"x\.json, .*: File too large; check"):
         write_json(tmp_path / "x.json", {"a": "b" * 1000})
     assert tree(tmp_path) == before
 
@@ -155,7 +142,7 @@ def test_atomic_folder__replaces_nothing_not_even_a_folder_created_meanwhile(tmp
 
 def test_atomic_folder__reports_a_failed_file_in_one_sentence(tmp_path: Path) -> None:
     with (
-        file_size_limit(10),
+        files_end_at(10),
         pytest.raises(OSError, match=r"^test\(\): .*/new/x, [^(]*: File too large; [^:]*$"),
         atomic_folder(tmp_path / "new" / "x", "test()") as folder,
     ):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import resource
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from morgs_mi.export.formats import USD
 from morgs_mi.export.usd import write_usd
 from tests.assertions import assert_close
 from tests.scenes.changing_splats import rig, splats, write_stream
+from tests.scenes.full_disk import files_end_at
 
 Usd = pytest.importorskip("pxr.Usd")
 UsdGeom = pytest.importorskip("pxr.UsdGeom")
@@ -208,12 +208,8 @@ def test_export_usd__names_an_output_that_does_not_fit(tmp_path, capfd, output, 
 @pytest.mark.parametrize("suffix", [usd.ending for usd in USD])
 def test_export_usd__removes_its_output_on_a_full_disk(tmp_path, capfd, suffix):
     write_stream(tmp_path / "stream.morgs")
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (3000, hard))
-    try:
+    with files_end_at(3000):
         status = cli.main(["export", "usd", str(tmp_path), str(tmp_path / f"a{suffix}")])
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     error = capfd.readouterr().err
     assert status == 1
     # A package is made in another folder first.

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -65,3 +67,47 @@ def scene(
 def render(scene: Any, spp: int = 4, **more: Any) -> np.ndarray:
     """Return the image of a scene in float64."""
     return np.asarray(mi.render(scene, spp=spp, **more), np.float64)
+
+
+def slopes_of(scene: Any, name: str, step: float, loss: Callable[[Any], Any], spp: int) -> tuple[float, float]:
+    """Return the slope of a loss of the image along a parameter, by its gradient and by central differences.
+
+    The direction is that in which every entry raises the loss, by a random length.
+    """
+    params = mi.traverse(scene)
+    start = dr.detach(params[name])
+    dr.enable_grad(params[name])
+    params.update()
+    dr.backward(loss(mi.render(scene, params, spp=spp, seed=1, seed_grad=2)))
+    gradient, losses = np.array(dr.grad(params[name]), np.float64), []
+    direction = np.sign(gradient) * np.random.default_rng(4).uniform(0.5, 1, gradient.shape)
+    for length in (step, -step):
+        params[name] = start + type(start)(np.float32(length * direction))
+        params.update()
+        losses.append(np.asarray(loss(mi.render(scene, spp=spp, seed=1))).item())
+    params[name] = start
+    params.update()
+    return float(np.vdot(gradient, direction)), (losses[0] - losses[1]) / (2 * step)
+
+
+def slopes_of_both_modes(scene: Any, names: Iterable[str], weights: Any, spp: int = 64) -> tuple[float, float]:
+    """Return the slope of the weighted sum of the image along all parameters, in reverse and in forward mode."""
+    params, slopes = mi.traverse(scene), []
+    for forward in (False, True):
+        for name in names:
+            params[name] = dr.detach(params[name])
+            dr.enable_grad(params[name])
+        params.update()
+        image = mi.render(scene, params, spp=spp, seed=1, seed_grad=2)
+        if forward:
+            for name in names:
+                dr.set_grad(params[name], 1)
+            dr.forward_to(image)
+            slopes.append(float(np.vdot(np.array(dr.grad(image), np.float64), np.array(weights))))
+        else:
+            dr.backward(dr.sum(image * weights, axis=None))
+            slopes.append(sum(np.array(dr.grad(params[name]), np.float64).sum() for name in names))
+    for name in names:
+        params[name] = dr.detach(params[name])
+    params.update()
+    return slopes[0], slopes[1]

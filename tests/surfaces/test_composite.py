@@ -15,7 +15,18 @@ from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
 from tests import tolerances as tol
 from tests.assertions import assert_close
 from tests.scenes.gaussians import isotropic
-from tests.scenes.surfaces import COLOR, LAMP, camera, cloud, glowing, render, scene, wall
+from tests.scenes.surfaces import (
+    COLOR,
+    LAMP,
+    camera,
+    cloud,
+    glowing,
+    render,
+    scene,
+    slopes_of,
+    slopes_of_both_modes,
+    wall,
+)
 
 
 def splats(gaussians: Gaussians) -> tuple[np.ndarray, np.ndarray]:
@@ -194,43 +205,13 @@ def loss(image, target):
 
 @pytest.mark.parametrize("name", DIFFERENTIATED)
 def test_surfaces__backward_agrees_with_central_differences(differentiated, target, name):
-    spp = 64
-    params = mi.traverse(differentiated)
-    start = dr.detach(params[name])
-    dr.enable_grad(params[name])
-    params.update()
-    dr.backward(loss(mi.render(differentiated, params, spp=spp, seed=1, seed_grad=2), target))
-    gradient = np.array(dr.grad(params[name]), np.float64)
-    direction = np.sign(gradient) * np.random.default_rng(4).uniform(0.5, 1, gradient.shape)
-    losses, h = [], DIFFERENTIATED[name]
-    for step in (h, -h):
-        params[name] = start + type(start)(np.float32(step * direction))
-        params.update()
-        losses.append(float(np.asarray(loss(mi.render(differentiated, spp=spp, seed=1), target)).item()))
-    params[name] = start
-    params.update()
-    slope = (losses[0] - losses[1]) / (2 * h)
-    assert slope == pytest.approx(np.vdot(gradient, direction), rel=2 * tol.CENTRAL_DIFFERENCE_REL)
+    gradient, difference = slopes_of(differentiated, name, DIFFERENTIATED[name], lambda image: loss(image, target), 64)
+    assert difference == pytest.approx(gradient, rel=2 * tol.CENTRAL_DIFFERENCE_REL)
 
 
 def test_surfaces__forward_mode_is_dual_to_reverse_mode(differentiated, target):
-    params = mi.traverse(differentiated)
-    slopes = []
-    for mode in ("reverse", "forward"):
-        for name in DIFFERENTIATED:
-            params[name] = dr.detach(params[name])
-            dr.enable_grad(params[name])
-        params.update()
-        image = mi.render(differentiated, params, spp=64, seed=1, seed_grad=2)
-        if mode == "reverse":
-            dr.backward(dr.sum(image * target, axis=None))
-            slopes.append(sum(np.sum(np.array(dr.grad(params[name]), np.float64)) for name in DIFFERENTIATED))
-        else:
-            for name in DIFFERENTIATED:
-                dr.set_grad(params[name], 1)
-            dr.forward_to(image)
-            slopes.append(float(np.vdot(np.array(dr.grad(image), np.float64), np.array(target))))
-    assert slopes[1] == pytest.approx(slopes[0], rel=1e-2)
+    reverse, forward = slopes_of_both_modes(differentiated, DIFFERENTIATED, target)
+    assert forward == pytest.approx(reverse, rel=1e-2)
 
 
 def test_surfaces__gradients_of_positions_warn(target, caplog):

@@ -15,7 +15,17 @@ from morgs_mi.core.color_space import SH_C0, srgb_to_linear
 from morgs_mi.evaluate.metrics import psnr
 from tests.assertions import assert_close
 from tests.scenes.gaussians import isotropic
-from tests.scenes.surfaces import LAMP, camera, cloud, glowing, render, scene, wall
+from tests.scenes.surfaces import (
+    LAMP,
+    camera,
+    cloud,
+    glowing,
+    render,
+    scene,
+    slopes_of,
+    slopes_of_both_modes,
+    wall,
+)
 
 # Light that falls on the middle of the wall at z = 1 from a place that the camera does not see.
 ASIDE, TO_WALL = np.array([3.0, 0, -1]), np.array([-3.0, 0, 2]) / np.sqrt(13)
@@ -171,49 +181,23 @@ def differentiated() -> Any:
     return scene(cloud(-0.2), traced, wall=board, ball=ball, lamp=LAMP, sky=sky)
 
 
+# A linear loss: noise in the image biases neither its derivative nor differences.
+WEIGHTS = np.float32(np.random.default_rng(0).uniform(size=(24, 32, 3)))
+
+
 def loss(image: Any) -> Any:
-    """Return a linear loss: noise in the image biases neither its derivative nor differences."""
-    weights = mi.TensorXf(np.float32(np.random.default_rng(0).uniform(size=(24, 32, 3))))
-    return dr.mean(image * weights, axis=None)
+    return dr.mean(image * mi.TensorXf(WEIGHTS), axis=None)
 
 
 @pytest.mark.parametrize("name", DIFFERENTIATED)
 def test_splat_path__gradients_agree_with_central_differences(differentiated, name):
-    params = mi.traverse(differentiated)
-    start, h = dr.detach(params[name]), DIFFERENTIATED[name]
-    dr.enable_grad(params[name])
-    params.update()
-    dr.backward(loss(mi.render(differentiated, params, spp=128, seed=1, seed_grad=2)))
-    gradient, values = np.array(dr.grad(params[name]), np.float64).sum(), []
-    for step in (h, -h):
-        params[name] = start + step
-        params.update()
-        values.append(float(loss(mi.render(differentiated, params, spp=128, seed=1)).array[0]))
-    params[name] = start
-    params.update()
-    assert gradient == pytest.approx((values[0] - values[1]) / (2 * h), rel=3e-2)
+    gradient, difference = slopes_of(differentiated, name, DIFFERENTIATED[name], loss, 128)
+    assert gradient == pytest.approx(difference, rel=3e-2)
 
 
 def test_splat_path__forward_mode_is_dual_to_reverse_mode(differentiated):
-    params, slopes = mi.traverse(differentiated), []
-    for forward in (False, True):
-        for name in DIFFERENTIATED:
-            params[name] = dr.detach(params[name])
-            dr.enable_grad(params[name])
-        params.update()
-        image = mi.render(differentiated, params, spp=64, seed=1, seed_grad=2)
-        if forward:
-            for name in DIFFERENTIATED:
-                dr.set_grad(params[name], 1)
-            dr.forward_to(image)
-            slopes.append(float(loss(dr.grad(image)).array[0]))
-        else:
-            dr.backward(loss(image))
-            slopes.append(sum(np.array(dr.grad(params[name]), np.float64).sum() for name in DIFFERENTIATED))
-    for name in DIFFERENTIATED:
-        params[name] = dr.detach(params[name])
-    params.update()
-    assert slopes[1] == pytest.approx(slopes[0], rel=1e-2)
+    reverse, forward = slopes_of_both_modes(differentiated, DIFFERENTIATED, mi.TensorXf(WEIGHTS))
+    assert forward == pytest.approx(reverse, rel=1e-2)
 
 
 def test_splat_path__gradients_of_gaussians_warn(caplog):
