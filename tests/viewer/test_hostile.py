@@ -45,15 +45,15 @@ def test_viewer__starts_whatever_a_header_calls_its_capture(tmp_path, monkeypatc
     assert any(report.startswith("Frame 0 of 0, 6 Gaussians") for report in watch(tmp_path / "s", monkeypatch))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("case", range(24))
-def test_viewer__shows_or_refuses_hostile_streams(tmp_path, monkeypatch, case):
-    forge = (damaged, with_forged_bytes, with_forged_packets, with_forged_header)[case % 4]
-    forged = forge(short_clip(), np.random.default_rng(case))
-    path = tmp_path / "s"
-    path.write_bytes(forged if isinstance(forged, bytes) else forged.data)
-    try:
-        reports = watch(path, monkeypatch)
-    except ValueError as error:
-        reports = {str(error)}
-    assert all(report.startswith(("Frame ", f"{path}: ")) for report in reports if report)
+@pytest.mark.parametrize("forge", [damaged, with_forged_bytes, with_forged_packets, with_forged_header])
+def test_viewer__shows_or_refuses_hostile_streams(tmp_path, monkeypatch, forge):
+    path, wrong = tmp_path / "s", {}
+    for seed in range(6):
+        forged = forge(short_clip(), np.random.default_rng(seed))
+        path.write_bytes(forged if isinstance(forged, bytes) else forged.data)
+        try:
+            reports = watch(path, monkeypatch)
+        except ValueError as error:
+            reports = {str(error)}
+        wrong[seed] = [report for report in reports if report and not report.startswith(("Frame ", f"{path}: "))]
+    assert not any(wrong.values()), wrong
