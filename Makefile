@@ -5,16 +5,20 @@ BIN := $(VENV)/bin
 WEB_PLAYER ?= morgs_mi/export/web_player
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-slow lint docs web setup clean
+.PHONY: demo test test-slow test-long lint docs web setup clean
 
 demo: setup
 	$(BIN)/morgs-mi demo out/demo
 
+# One process per core; the tests of a file share their fixtures, and stay in one.
 test: setup
-	$(BIN)/pytest
+	$(BIN)/pytest -n auto --dist loadfile
 
 test-slow: setup
 	$(BIN)/pytest -m "slow and not gpu"
+
+test-long: setup
+	$(BIN)/pytest -m "long and not gpu"
 
 lint: setup
 	$(BIN)/ruff check

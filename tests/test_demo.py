@@ -21,6 +21,7 @@ SMALL = DemoConfig(
     stream=StreamConfig(fit=FitConfig(sh_degree=0, num_gaussians=500, first_frame_steps=20, epochs=1)),
 )
 
+pytestmark = pytest.mark.slow
 FIT_STAGES = ("trial", "first frame", "later frames")
 
 

@@ -37,6 +37,7 @@ def edit(package: Path, directive: str, code: str) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("title", SECTIONS)
 def test_extending__example_works_within_its_number_of_files(title, tmp_path):
     section = SECTIONS[title]

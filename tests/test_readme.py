@@ -26,6 +26,7 @@ def workplace(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("example", EXAMPLES, ids=["mitsuba", "loop"])
 def test_readme__examples_run(example, workplace, monkeypatch):
     monkeypatch.chdir(workplace)

@@ -92,16 +92,17 @@ def kill_and_resume(whole: Path, folder: Path, kills: int) -> None:
         assert_same(out, whole)
 
 
+@pytest.mark.slow
 def test_stream_capture__killed_and_resumed_is_the_same(whole: Path, tmp_path: Path) -> None:
     kill_and_resume(whole, tmp_path, 3)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_stream_capture__killed_60_times_is_the_same(whole: Path, tmp_path: Path) -> None:
     kill_and_resume(whole, tmp_path, 60)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_stream_capture__300_frames_play_as_they_were_fitted(tmp_path: Path) -> None:
     """A reader gets the state of the loop after each frame, with births and deaths, from any frame on."""
     capture = recording(num_frames=300)

@@ -164,7 +164,7 @@ def base(clip) -> bytes:
     return stream(clip, BASE)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", [name for name in leaves(BASE) if not name.startswith(tuple(ELSEWHERE))])
 def test_settings__every_field_acts(clip, base, name):
     assert stream(clip, with_value(BASE, name, other(name))) != base

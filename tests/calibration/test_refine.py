@@ -159,7 +159,7 @@ def test_refine_cameras__takes_cameras_with_which_withheld_pixels_gain(splat_cap
     assert np.array_equal(refined.points, splat_capture.points) is not taken
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_refine_cameras__improves_withheld_pixels_of_disturbed_cameras(textured_capture):
     disturbed_capture = replace(textured_capture, cameras=tuple(disturbed(textured_capture.cameras, 1.5)))
     capture = with_points(disturbed_capture, 0, lambda *_: None)

@@ -22,7 +22,7 @@ def test_time_offsets__are_recovered_to_a_fraction_of_a_frame() -> None:
     assert_close(found, true, atol=0.15)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_time_offsets__are_those_of_a_path_traced_clip(tmp_path: Path) -> None:
     options = "--cameras 4 --frames 20 --width 160 --height 120 --spp 4 --no-lossless --time-offset 3 --seed 3"
     assert cli.main(["synth", "arm", str(tmp_path / "clip"), *options.split()]) == 0

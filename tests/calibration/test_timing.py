@@ -33,7 +33,7 @@ def test_timing_config__refuses_numbers_out_of_range() -> None:
         TimingConfig(blurs=(3, -1))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_estimate_time_offsets__finds_the_offsets_of_a_clip(tmp_path: Path) -> None:
     clip = tmp_path / "clip"
     synthesize(

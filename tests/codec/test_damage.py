@@ -47,7 +47,7 @@ def test_readers__survive_damaged_and_forged_streams() -> None:
     fuzz(0.3, *FUZZERS)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", FUZZERS)
 def test_readers__survive_minutes_of_damaged_and_forged_streams(name: str) -> None:
     fuzz(FUZZ_SECONDS, name)

@@ -189,7 +189,7 @@ def test_export_web__writes_a_page_or_a_folder(tmp_path, capsys):
 # --------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", params=[pytest.param("chromium", marks=pytest.mark.slow)])
 def browser():
     playwright = pytest.importorskip(
         "playwright.sync_api", reason="install it with pip install 'morgs-mi[viewer-test]'"
@@ -295,7 +295,6 @@ def test_page__decodes_the_same_integers(page, clip):
     assert all(decodes(page, position, clip[1][position]) for position in (0, 3, 1, 2))
 
 
-@pytest.mark.slow
 def test_page__plays_a_salvaged_stream(browser, clip, tmp_path):
     states, packets = clip[1], list(open_stream(clip[0]))
     # Frame 1 is lost; keyframes were re-emitted at frames 2 and 3.
@@ -520,7 +519,6 @@ def test_page__names_a_damaged_packet(browser, hosted):
         assert not page.errors
 
 
-@pytest.mark.slow
 def test_page__names_a_truncated_stream(browser, hosted):
     address, stream = hosted
     data = stream.path.read_bytes()
@@ -530,7 +528,6 @@ def test_page__names_a_truncated_stream(browser, hosted):
         assert page.text("#count") == "1 / 1"
 
 
-@pytest.mark.slow
 def test_page__shows_the_frames_before_a_damaged_one_that_the_address_asks_for(browser, hosted):
     address, stream = hosted
     data = bytearray(stream.path.read_bytes())
@@ -541,7 +538,6 @@ def test_page__shows_the_frames_before_a_damaged_one_that_the_address_asks_for(b
         page.show(1)
 
 
-@pytest.mark.slow
 def test_page__names_what_is_no_stream(browser, hosted):
     address, stream = hosted
     data = bytearray(stream.path.read_bytes())

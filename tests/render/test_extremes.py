@@ -176,6 +176,6 @@ def test_rasterize__fuzz():
     assert not fuzz(range(10))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rasterize__fuzz_with_many_seeds():
     assert not fuzz(range(10, 210))

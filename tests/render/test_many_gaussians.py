@@ -55,7 +55,7 @@ def test_rasterize__blends_many_equal_depths_in_the_order_of_the_input():
     assert np.abs(images[0] - images[1]).max() > 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rasterize__two_million_gaussians_mostly_out_of_view():
     """All but 1,000 are out of view: the image is that of the 1,000, and their gradients are complete and finite."""
     N, in_view = 2_000_000, 1_000
@@ -77,7 +77,7 @@ def test_rasterize__two_million_gaussians_mostly_out_of_view():
         assert np.abs(grads[name][away]).max() == 0, name
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_rasterize__two_million_gaussians_in_view():
     values = {name: np.repeat(value, 2000, axis=0) for name, value in cloud(1000).items()}
     values["means"] += np.random.default_rng(0).normal(size=values["means"].shape) * 0.3

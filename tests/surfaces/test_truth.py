@@ -25,7 +25,7 @@ BALL = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_render_inserted__agrees_with_the_path_traced_clip(tmp_path: Path):
     mi.set_log_level(mi.LogLevel.Error)
     synthesize("spheres", tmp_path / "clip", SynthConfig(cameras=7, frames=2, width=160, height=120, spp=16))

@@ -50,6 +50,7 @@ SMALL = ("--cameras", "2", "--frames", "2", "--width", "32", "--height", "24", "
 COMMANDS = [line.split() for line in re.findall(r"^    morgs-mi (synth .+)", TEXT, re.MULTILINE)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [c for c in COMMANDS if "gem.py" not in c[1]], ids=" ".join)
 def test_scenes_page__commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: list[str]) -> None:
     monkeypatch.chdir(tmp_path)

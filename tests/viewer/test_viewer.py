@@ -27,10 +27,13 @@ pytest.importorskip("viser", reason="install it with pip install 'morgs-mi[viewe
 playwright = pytest.importorskip("playwright.sync_api", reason="install it with pip install 'morgs-mi[viewer-test]'")
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 CHROMIUM = next(filter(None, map(shutil.which, BROWSERS)), None)
-pytestmark = pytest.mark.skipif(
-    CHROMIUM is None,
-    reason="no Chromium found; install it with tools/setup_browser.sh (apt-get install chromium)",
-)
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        CHROMIUM is None,
+        reason="no Chromium found; install it with tools/setup_browser.sh (apt-get install chromium)",
+    ),
+]
 
 WIDTH, HEIGHT = 480, 360
 # An error message of viser: three.js cannot compute a bounding sphere of its flat quads.
