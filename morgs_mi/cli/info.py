@@ -47,7 +47,7 @@ class Info:
     capture: Positional[Path]
     """Folder of the capture."""
     plot: Annotated[Path | None, DisallowNone, optional("FILE")] = None
-    """File for a plot of the rig, .png or .jpg."""
+    """File for a plot of the rig, .png, .jpg, .svg or .pdf."""
     check: Annotated[bool, arg(help_behavior_hint="(default: --check)")] = True
     """Check the poses against feature matches between the views of the first frame."""
     time: Flag = False
@@ -61,8 +61,7 @@ class Info:
     arguments: ClassVar[Mapping[str, str]] = {"max_frames": "morgs-mi fit --frames"}
 
     def run(self) -> None:
-        from morgs_mi.calibration.deep_plot import draw_deep
-        from morgs_mi.calibration.rig_plot import write_rig
+        from morgs_mi.calibration.rig_plot import check_plot, write_rig
 
         if self.deep and not self.check:
             raise ValueError("--deep: expected the check of the poses, on which it builds; leave out --no-check.")
@@ -71,6 +70,8 @@ class Info:
         for output in (self.plot, self.json):
             if output is not None:
                 check_output(output)
+        if self.plot is not None:
+            check_plot(self.plot)
         capture, found, deep = load_capture(self.capture, reading=self.reading.read_config()), None, None
         exposures: Sequence[Finding] = ()
         origin = "" if len(capture.points) else "without points"
@@ -104,7 +105,7 @@ class Info:
             write_json(self.json, deep.as_dict())
             print_result(f"All measurements: {self.json}")
         if self.plot is not None:
-            write_rig(self.plot, capture, *([draw_deep(deep)] if deep else []))
+            write_rig(self.plot, capture, deep)
             print_result(f"Plot of the rig: {self.plot}")
 
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from matplotlib.colors import same_color
+from matplotlib.figure import Figure
 
 from morgs_mi.calibration.deep import DeepCheck, Finding, check_deep
 from morgs_mi.calibration.deep_plot import draw_deep
@@ -101,16 +104,39 @@ def test_check_deep__states_what_it_cannot_measure(clips: Clips) -> None:
 def test_check_deep__finds_nothing_in_few_cameras_or_frames(cameras: int, frames: int, clips: Clips) -> None:
     check = checked([clip[:frames] for clip in clips[:cameras]])
     assert check.findings == ()
-    assert draw_deep(check).shape == (900, 1440, 3)
+    drawn(check).canvas.draw()
 
 
 def test_draw_deep__marks_the_cameras_with_findings(clips: Clips) -> None:
-    red = (210, 60, 40)
     sound = checked(clips)
-    assert not (draw_deep(sound) == red).all(-1).any()
+    assert red_names(drawn(sound)) == {}
     finding = Finding("time", (sound.names[1],), "cam1 is 1.4 frames ahead.")
-    plot = draw_deep(replace(sound, offsets=np.array([0, 1.4, 0, 0]), findings=(finding,)))
-    assert plot.shape == (900, 1440, 3)
-    rows, columns = np.nonzero((plot == red).all(-1))
-    assert rows.max() < 300
-    assert 480 < columns.min() < columns.max() < 960
+    found = replace(sound, offsets=np.array([0, 1.4, 0, np.nan]), findings=(finding,))
+    figure = drawn(found)
+    assert red_names(figure) == {"Time offset, frames": ["cam1"]}
+    time = panel_of(figure, "Time offset, frames")
+    heights = [bar.get_height() for bar in time.patches]
+    assert heights == [0, 1.4, 0, 0]
+    assert [same_color(bar.get_facecolor(), "tab:red") for bar in time.patches] == [False, True, False, False]
+    assert [(text.get_text(), text.xy[0]) for text in time.texts] == [("?", 3)]  # was not measured
+    assert panel_of(figure, "Findings: 1").texts[0].get_text() == f"{finding.sentence}\n{found.unmeasured}"
+
+
+def drawn(check: DeepCheck) -> Figure:
+    figure = Figure()
+    draw_deep(figure, check)
+    return figure
+
+
+def panel_of(figure: Figure, title: str) -> Any:
+    return next(panel for panel in figure.axes if panel.get_title(loc="left") == title)
+
+
+def red_names(figure: Figure) -> dict[str, list[str]]:
+    """Return the names of cameras that are red, by the title of the panel."""
+    found = {}
+    for panel in figure.axes:
+        labels = [*panel.get_xticklabels(), *panel.get_yticklabels()]
+        if names := [label.get_text() for label in labels if same_color(label.get_color(), "tab:red")]:
+            found[panel.get_title(loc="left")] = names
+    return found

@@ -70,8 +70,8 @@ def test_info__prints_the_check_and_draws_the_rig(textured_capture: Capture, tmp
     status, out, _ = run("info", textured_capture.path, "--no-check")
     assert status == 0
     assert "Reprojection" not in out
-    refused = run("info", textured_capture.path, "--plot", tmp_path / "rig.pdf")
-    assert_refused(refused, "the suffix of a plot must be .png or .jpg, got '.pdf'")
+    refused = run("info", textured_capture.path, "--plot", tmp_path / "rig.gif")
+    assert_refused(refused, "the suffix of a plot must be .png, .jpg, .svg or .pdf, got '.gif'")
 
 
 def test_info__prints_the_time_offsets_as_options(capture: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
