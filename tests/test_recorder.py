@@ -322,10 +322,12 @@ def test_stream_capture__refuses_a_hostile_report(whole: Path, tmp_path: Path, t
 
 def test_stream_capture__resumes_hostile_streams_or_refuses_them_in_one_sentence(whole: Path, tmp_path: Path) -> None:
     data = stream_of(whole)
-    ends = [offset for *_, offset in StreamReader(whole / "stream.morgs").index()] + [len(data)]
+    index = TRAILER.unpack(data[-TRAILER.size :])[0]
+    ends = [*(offset for *_, offset in StreamReader(whole / "stream.morgs").index()), index]
     packets = list(StreamReader(whole / "stream.morgs"))
     pieces = [Piece(-1, 0, 0, 12), Piece(0, 0, 12, ends[0])]
     pieces += [Piece(p.kind, p.frame, a, b) for p, (a, b) in zip(packets, pairwise(ends), strict=True)]
+    pieces.append(Piece(3, 0, index, len(data)))
     clip, out = Clip(data, pieces, {}), tmp_path / "out"
     for case in range(12):
         forge = (damaged, with_forged_bytes, with_forged_packets, with_forged_header)[case % 4]

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import struct
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from morgs_mi.codec.container import PAYLOAD, PREAMBLE, decode_packet
+from morgs_mi.codec.container import PAYLOAD, PREAMBLE, Packet, PacketKind, decode_packet
 from morgs_mi.codec.packets import decode, keyframe_packet
 from tests.scenes.coded_clip import CAMERAS, cloud
-from tests.scenes.short_clip import Clip, sealed
+from tests.scenes.short_clip import Clip, Piece, sealed
 
 HOSTILE_TEXT = (
     *("NaN", "-Infinity", "1e999", "-1e999", "1e308", "1e-320", "0", "-1", "1.5", "true", "null", '""', "[]", "{}"),
@@ -21,6 +24,7 @@ HOSTILE_TEXT = (
     *("[" * 200 + "]" * 200, "[" * 50_000, '{"a":' * 200 + "1" + "}" * 200, '"', "{", "[1,,2]", "\xff"),
 )
 HOSTILE_NUMBERS = (0, 1, 2, 3, 4, 5, 7, 16, 80, 81, 255, 2**16, 2**20, 2**24, 2**30 - 1, 2**30, 2**31, 2**32 - 1)
+NAMES = ("head", "code", "parent", "offset", "", "x")
 DTYPES = ("uint8", "uint32", "float32", "float64", "int8", "object", "O", "<U9", "f4,f4", "M8[s]", ">u4", "void", "")
 
 
@@ -59,14 +63,14 @@ def with_forged_bytes(clip: Clip, rng: np.random.Generator) -> Forgery:
 
 def with_forged_packets(clip: Clip, rng: np.random.Generator) -> Forgery:
     """Change numbers, tables, codes, kinds, frames and the order of packets; half of the time the parents fit again."""
-    packets = [(p.kind, p.frame, clip.data[p.start + PAYLOAD : p.stop]) for p in clip.pieces[2:]]
+    packets = [Draft.of(clip, piece) for piece in clip.pieces[2:]]
+    changes = (_table, _head, _head, _code, _code, _number, _order, _index)
     for _ in range(rng.integers(1, 4)):
-        changes = (_table, _head, _head, _code, _code, _number, _order, _index)
-        changes[rng.integers(len(changes))](packets, rng)
+        _any(changes, rng)(packets, rng)
     if rng.random() < 0.5:
-        packets = _with_right_parents(packets)
+        _continue(packets)
     header = clip.data[: clip.pieces[1].stop]
-    return Forgery(header + b"".join(sealed(payload, kind, frame) for kind, frame, payload in packets), None)
+    return Forgery(header + b"".join(packet.sealed() for packet in packets), None)
 
 
 def with_forged_header(clip: Clip, rng: np.random.Generator) -> Forgery:
@@ -74,10 +78,8 @@ def with_forged_header(clip: Clip, rng: np.random.Generator) -> Forgery:
     header = json.loads(clip.data[clip.pieces[1].start + PAYLOAD : clip.pieces[1].stop])
     marks = []
     for _ in range(rng.integers(1, 3)):
-        parents = [node for node in _nodes(header) if node]
-        parent = parents[rng.integers(len(parents))]
-        keys = list(parent) if isinstance(parent, dict) else list(range(len(parent)))
-        key: Any = keys[rng.integers(len(keys))]
+        parent = _any([node for node in _nodes(header) if node], rng)
+        key = _any(list(parent) if isinstance(parent, dict) else range(len(parent)), rng)
         if rng.random() < 0.1:
             del parent[key]
         else:
@@ -85,7 +87,7 @@ def with_forged_header(clip: Clip, rng: np.random.Generator) -> Forgery:
             parent["added" if isinstance(parent, dict) and rng.random() < 0.1 else key] = marks[-1]
     text = json.dumps(header)
     for mark in marks:
-        text = text.replace(f'"{mark}"', HOSTILE_TEXT[rng.integers(len(HOSTILE_TEXT))])
+        text = text.replace(f'"{mark}"', _any(HOSTILE_TEXT, rng))
     return Forgery(
         clip.data[: PREAMBLE.size] + sealed(text.encode("latin1"), 0) + clip.data[clip.pieces[1].stop :], None
     )
@@ -113,91 +115,71 @@ def _nodes(value: Any) -> list[Any]:
     return [] if children is None else [value, *(node for child in children for node in _nodes(child))]
 
 
-Packets = list[tuple[int, int, bytes]]
+def _any(choices: Sequence[Any], rng: np.random.Generator) -> Any:
+    return choices[rng.integers(len(choices))]
 
 
-def _parts(payload: bytes) -> tuple[list[Any], bytes]:
-    """Return the table of a payload and the bytes of its arrays."""
-    (size,) = struct.unpack_from("<I", payload)
-    return json.loads(payload[4 : 4 + size]), payload[4 + size :]
+@dataclass
+class Draft:
+    """A packet that is not sealed yet.
+
+    Attributes:
+        kind: of the packet.
+        frame: of the packet.
+        arrays: by name.
+        table: forged JSON of the arrays; empty: the true one.
+        index: payload in place of arrays.
+    """
+
+    kind: int
+    frame: int
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+    table: str = ""
+    index: bytes = b""
+
+    @classmethod
+    def of(cls, clip: Clip, piece: Piece) -> Draft:
+        if piece.kind == 3:
+            return cls(piece.kind, piece.frame, index=clip.data[piece.start + PAYLOAD : piece.stop])
+        arrays = decode_packet(clip.data[piece.start : piece.stop]).arrays
+        return cls(piece.kind, piece.frame, {name: array.copy() for name, array in arrays.items()})
+
+    def rows(self) -> list[Any]:
+        return [[name, array.dtype.name, list(array.shape)] for name, array in self.arrays.items()]
+
+    def sealed(self) -> bytes:
+        table = (self.table or json.dumps(self.rows())).encode("latin1")
+        arrays = b"".join(array.tobytes() for array in self.arrays.values())
+        return sealed(self.index or struct.pack("<I", len(table)) + table + arrays, self.kind, self.frame)
 
 
-def _joined(table: str, rest: bytes) -> bytes:
-    return struct.pack("<I", len(table)) + table.encode("latin1") + rest
+def _with_arrays(packets: list[Draft], rng: np.random.Generator) -> Draft:
+    return _any([packet for packet in packets if packet.arrays], rng)
 
 
-def _pick(packets: Packets, rng: np.random.Generator) -> int | None:
-    """Return the place of one of the packets that still have a table."""
-    places = []
-    for k, (kind, _, payload) in enumerate(packets):
-        with suppress(ValueError, struct.error, TypeError):
-            table = _parts(payload)[0]
-            if kind in (1, 2) and all(len(row) == 3 for row in table):
-                places.append(k)
-    return places[rng.integers(len(places))] if places else None
-
-
-def _table(packets: Packets, rng: np.random.Generator) -> None:
-    if (k := _pick(packets, rng)) is None:
-        return
-    kind, frame, payload = packets[k]
-    table, rest = _parts(payload)
-    row = table[rng.integers(len(table))] if table else ["a", "uint8", [0]]
-    choice = rng.integers(6)
+def _table(packets: list[Draft], rng: np.random.Generator) -> None:
+    packet = _with_arrays(packets, rng)
+    table, place, choice = packet.rows(), rng.integers(3), rng.integers(4)
+    row = _any(table, rng)
     if choice == 0:
-        row[1] = DTYPES[rng.integers(len(DTYPES))]
-    elif choice == 1:
-        row[2] = [int(n) for n in rng.choice(HOSTILE_NUMBERS, rng.integers(0, 4))]
-    elif choice == 2:
         table.append(row)
-    elif choice == 3:
-        row[0] = ("head", "code", "parent", "offset", "", "x")[rng.integers(6)]
-    elif choice == 4:
-        row[2] = [1] * int(10 ** rng.integers(1, 5)) + row[2]
-    text = json.dumps(table)
-    if choice == 5:
-        row[rng.integers(3)] = "MARK"
-        text = json.dumps(table).replace('"MARK"', HOSTILE_TEXT[rng.integers(len(HOSTILE_TEXT))])
-    packets[k] = (kind, frame, _joined(text, rest))
+    elif choice == 1:
+        row[place] = "MARK"
+    else:
+        shapes = [rng.choice(HOSTILE_NUMBERS, rng.integers(0, 4)).tolist(), [1] * 10 ** rng.integers(1, 5) + row[2]]
+        row[place] = _any((NAMES, DTYPES, shapes)[place], rng)
+    packet.table = json.dumps(table).replace('"MARK"', _any(HOSTILE_TEXT, rng))
 
 
-def _array(packets: Packets, rng: np.random.Generator, name: str) -> tuple[int, int, int] | None:
-    """Return the place of a packet that has an array, and the array's byte range in the payload."""
-    if (k := _pick(packets, rng)) is None:
-        return None
-    table, rest = _parts(packets[k][2])
-    at = len(packets[k][2]) - len(rest)
-    for found, dtype, shape in table:
-        size = int(np.prod([1, *shape], dtype=object)) * {"uint8": 1}.get(dtype, 4) if isinstance(shape, list) else 0
-        if found == name:
-            return k, at, at + size
-        at += size
-    return None
+def _head(packets: list[Draft], rng: np.random.Generator) -> None:
+    head = _with_arrays(packets, rng).arrays["head"]
+    head[rng.integers(len(head))] = _any(HOSTILE_NUMBERS, rng)
 
 
-def _head(packets: Packets, rng: np.random.Generator) -> None:
-    if found := _array(packets, rng, "head"):
-        k, start, stop = found
-        kind, frame, payload = packets[k]
-        spoilt, count = bytearray(payload), (min(stop, len(payload)) - start) // 4
-        if count > 0:
-            at = start + 4 * int(rng.integers(count))
-            spoilt[at : at + 4] = struct.pack("<I", HOSTILE_NUMBERS[rng.integers(len(HOSTILE_NUMBERS))])
-        packets[k] = (kind, frame, bytes(spoilt))
-
-
-def _code(packets: Packets, rng: np.random.Generator) -> None:
+def _code(packets: list[Draft], rng: np.random.Generator) -> None:
     """Replace the code by other words, of the same or another number."""
-    if (k := _pick(packets, rng)) is None:
-        return
-    kind, frame, payload = packets[k]
-    table, rest = _parts(payload)
-    row = next((row for row in table if row[:2] == ["code", "uint32"] and len(row[2]) == 1), None)
-    if row is None or row is not table[-1] or 4 * row[2][0] > len(rest):
-        return
-    start = len(rest) - 4 * row[2][0]
-    words = np.frombuffer(rest[start:], "<u4").copy()
-    choice = rng.integers(4)
+    arrays = _with_arrays(packets, rng).arrays
+    words, choice = arrays["code"], rng.integers(4)
     if choice == 0 and len(words):
         words[rng.integers(len(words), size=3)] ^= np.uint32(1 << int(rng.integers(32)))
     elif choice == 1:
@@ -206,53 +188,44 @@ def _code(packets: Packets, rng: np.random.Generator) -> None:
         words = np.concatenate([words, np.zeros(10 ** int(rng.integers(1, 5)), np.uint32)])
     else:
         words[:] = rng.choice(np.array([0, 2**32 - 1, 2**31], np.uint32))
-    row[2] = [len(words)]
-    packets[k] = (kind, frame, _joined(json.dumps(table), rest[:start] + words.tobytes()))
+    arrays["code"] = words
 
 
-def _number(packets: Packets, rng: np.random.Generator) -> None:
+def _number(packets: list[Draft], rng: np.random.Generator) -> None:
     """Change the kind or the frame of a packet."""
-    k = int(rng.integers(len(packets)))
-    kind, frame, payload = packets[k]
+    packet = _any(packets, rng)
     if rng.random() < 0.3:
-        kind = int(rng.choice([0, 1, 2, 3, 4, 2**32 - 1]))
+        packet.kind = _any((0, 1, 2, 3, 4, 2**32 - 1), rng)
     else:
-        frame = int(rng.choice([0, 1, 3, 5, 6, frame + 1, 2**31, 2**32 - 1]))
-    packets[k] = (kind, frame, payload)
+        packet.frame = _any((0, 1, 3, 5, 6, packet.frame + 1, 2**31, 2**32 - 1), rng) % 2**32
 
 
-def _order(packets: Packets, rng: np.random.Generator) -> None:
+def _order(packets: list[Draft], rng: np.random.Generator) -> None:
     """Drop, repeat or move a packet."""
     k, to = rng.integers(len(packets), size=2)
     packet = packets[k]
     if rng.random() < 0.6:
         del packets[k]
     if rng.random() < 0.6:
-        packets.insert(to, packet)
+        packets.insert(to, copy.deepcopy(packet))
 
 
-def _index(packets: Packets, rng: np.random.Generator) -> None:
-    """Replace the index by one with other entries, whose end is as it must be."""
-    packets[:] = [packet for packet in packets if packet[0] != 3]
+def _index(packets: list[Draft], rng: np.random.Generator) -> None:
+    """Replace the index by one with other entries, which ends as it must."""
     numbers = [*HOSTILE_NUMBERS, 12, 600, 2**63, 2**64 - 1]
     entries = b"".join(
-        struct.pack("<IIQ", int(rng.choice([0, 1, 1, 2])), int(rng.integers(9)), numbers[rng.integers(len(numbers))])
+        struct.pack("<IIQ", _any((0, 1, 1, 2), rng), rng.integers(9), _any(numbers, rng))
         for _ in range(rng.integers(6))
     )
-    packets.append((3, 0, entries + struct.pack("<Q8s", int(rng.integers(6000)), b"MORGSIDX")))
+    end = struct.pack("<Q8s", rng.integers(6000), b"MORGSIDX")
+    packets[:] = [*(packet for packet in packets if not packet.index), Draft(3, 0, index=entries + end)]
 
 
-def _with_right_parents(packets: Packets) -> Packets:
-    """Return the packets with the digest of the state before each residual, as far as they can be decoded."""
-    state, fitting = None, list(packets)
-    for k, (kind, frame, payload) in enumerate(packets):
-        with suppress(ValueError, MemoryError, struct.error, TypeError):
-            if kind == 2 and state is not None:
-                table, rest = _parts(payload)
-                at = len(payload) - len(rest)
-                if table and table[0] == ["parent", "uint8", [8]]:
-                    payload = payload[:at] + state.digest.tobytes() + payload[at + 8 :]
-                    fitting[k] = (kind, frame, payload)
-            if kind in (1, 2) and not (state is not None and kind == 1 and frame == state.frame):
-                state = decode(state, decode_packet(sealed(payload, kind, frame)))
-    return fitting
+def _continue(packets: list[Draft]) -> None:
+    """Replace the parents of residuals by the digests of the states before, as far as they can be decoded."""
+    state = None
+    for packet in packets:
+        if state is not None and "parent" in packet.arrays:
+            packet.arrays["parent"] = state.digest.copy()
+        with suppress(ValueError, MemoryError):
+            state = decode(state, Packet(PacketKind(packet.kind), packet.frame, packet.arrays))
