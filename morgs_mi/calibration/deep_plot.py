@@ -14,7 +14,7 @@ __all__ = ["draw_deep"]
 
 _USUAL, _FOUND, _CHANNELS = "tab:blue", "tab:red", ("indianred", "seagreen", "royalblue")
 _BAR = 0.7  # width of a bar or of a group of them, as a share of its place
-_MAX_LINES, _LINE = 26, 120
+_MAX_LINES, _LINE = 16, 140  # of the findings, and characters of each
 # Title, and the values that the vertical axis contains at least: differences that do not matter look small.
 _PANELS: dict[str, tuple[str, tuple[float, float] | None]] = {
     "error": ("Reprojection error, px", (0, 1)),
@@ -62,15 +62,13 @@ def draw_deep(figure: Any, check: DeepCheck) -> None:
 
 def _bars(panel: Any, check: DeepCheck, question: str, values: np.ndarray) -> None:
     """Draw a group of bars per camera, for values [C, K]."""
-    places, count = np.arange(len(values)), values.shape[1]
+    views, count = range(len(values)), values.shape[1]
     for k, column in enumerate(values.T):
-        at = places + _BAR * ((k + 0.5) / count - 0.5)
-        colors = (
-            [_CHANNELS[k]] * len(values) if count > 1 else [_color(check, (question,), v) for v in range(len(values))]
-        )
-        panel.bar(at, np.nan_to_num(column), _BAR / count, color=colors)
-        for x in at[~np.isfinite(column)]:
-            panel.annotate("?", (x, 0), ha="center", va="bottom", color="0.5")
+        places = np.array(views) + _BAR * ((k + 0.5) / count - 0.5)
+        colors = [_CHANNELS[k] if count > 1 else _color(check, (question,), view) for view in views]
+        panel.bar(places, np.nan_to_num(column), _BAR / count, color=colors)
+        for place in places[~np.isfinite(column)]:
+            panel.annotate("?", (place, 0), ha="center", va="bottom", color="0.5")
     panel.axhline(0, color="black", linewidth=0.8)
     _name_cameras(panel.xaxis, check, (question,), rotation=90 if len(values) > 8 else 0)
 
@@ -91,12 +89,10 @@ def _curves(panel: Any, check: DeepCheck, questions: Sequence[str], values: np.n
 
 def _events(panel: Any, check: DeepCheck) -> None:
     """Draw a row per camera with the frames that repeat another or are missing."""
-    missing, repeated = np.isnan(check.sharpness.T), np.zeros((len(check.names), check.frames), bool)
-    for own, frames in zip(repeated, check.repeated, strict=True):
-        own[list(frames)] = True
-    for marks, color in ((missing, "0.75"), (repeated, _FOUND)):
-        for view, own in enumerate(marks):
-            panel.broken_barh([(frame - 0.5, 1) for frame in np.flatnonzero(own)], (view - 0.45, 0.9), color=color)
+    for view, repeated in enumerate(check.repeated):
+        missing = np.flatnonzero(np.isnan(check.sharpness[:, view]))
+        for frames, color in ((missing, "0.75"), (repeated, _FOUND)):
+            panel.broken_barh([(frame - 0.5, 1) for frame in frames], (view - 0.45, 0.9), color=color)
     panel.set(xlim=(-0.5, check.frames - 0.5), ylim=(len(check.names) - 0.5, -0.5), xlabel="frame")
     panel.xaxis.get_major_locator().set_params(integer=True)
     _name_cameras(panel.yaxis, check, ("repeats",))
@@ -106,7 +102,8 @@ def _matrix(panel: Any, check: DeepCheck) -> None:
     """Draw the share of each row's image that each column's camera sees."""
     shares = np.where(np.eye(len(check.names), dtype=bool), np.nan, 100 * check.overlaps)
     panel.imshow(shares, cmap="Blues", vmin=0, vmax=100)
-    if len(shares) <= 12:
+    panel.set_anchor("W")
+    if len(shares) <= 8:
         for (row, column), share in np.ndenumerate(shares):
             if np.isfinite(share):
                 color = "white" if share > 60 else "black"
@@ -121,7 +118,8 @@ def _sentences(panel: Any, check: DeepCheck) -> None:
     lines = "\n".join(fill(sentence, _LINE, subsequent_indent="  ") for sentence in sentences).splitlines()
     lines = lines if len(lines) <= _MAX_LINES else [*lines[: _MAX_LINES - 1], "..."]
     panel.set_axis_off()
-    panel.text(0, 1, "\n".join(lines), va="top", fontsize=8, transform=panel.transAxes)
+    text = panel.text(0, 1, "\n".join(lines), va="top", fontsize=8, transform=panel.transAxes)
+    text.set_in_layout(False)  # it would shrink the other panels
 
 
 def _name_cameras(axis: Any, check: DeepCheck, questions: Sequence[str], rotation: float = 0) -> None:

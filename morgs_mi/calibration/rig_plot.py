@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from io import BytesIO
 from pathlib import Path
@@ -54,16 +55,19 @@ def write_rig(path: Path, capture: Capture, deep: DeepCheck | None = None) -> No
         OSError: the file cannot be written.
     """
     check_plot(path)
+    from matplotlib import rc_context
     from matplotlib.figure import Figure
 
-    heights = [_RIG_HEIGHT, *([_DEEP_HEIGHT] if deep else [])]
-    figure = Figure(figsize=(_WIDTH, sum(heights)), layout="constrained")
-    rows = figure.subfigures(len(heights), height_ratios=heights, squeeze=False)[:, 0]
-    draw_rig(rows[0], capture.cameras, (capture.points, capture.point_colors), capture.test_view)
-    if deep:
-        draw_deep(rows[1], deep)
-    data = BytesIO()
-    figure.savefig(data, format=path.suffix[1:].lower(), dpi=_DPI)
+    heights, data = [_RIG_HEIGHT, *([_DEEP_HEIGHT] if deep else [])], BytesIO()
+    # Names may contain dollars, and letters that the font has not, which are drawn as boxes.
+    with rc_context({"text.parse_math": False}), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")
+        figure = Figure(figsize=(_WIDTH, sum(heights)), layout="constrained")
+        rows = figure.subfigures(len(heights), height_ratios=heights, squeeze=False)[:, 0]
+        draw_rig(rows[0], capture.cameras, (capture.points, capture.point_colors), capture.test_view)
+        if deep:
+            draw_deep(rows[1], deep)
+        figure.savefig(data, format=path.suffix[1:].lower(), dpi=_DPI)
     with atomic_path(path, "write_rig()") as partial:
         partial.parent.mkdir(parents=True, exist_ok=True)
         partial.write_bytes(data.getbuffer())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -44,8 +45,10 @@ def test_draw_rig__draws_any_rig(count: int) -> None:
     figure.canvas.draw()
 
 
-def test_write_rig__writes_vector_graphics(textured_capture: Capture, tmp_path: Path) -> None:
-    write_rig(tmp_path / "new" / "rig.svg", textured_capture)
+@pytest.mark.filterwarnings("error")
+def test_write_rig__writes_vector_graphics_with_any_names(textured_capture: Capture, tmp_path: Path) -> None:
+    cameras = tuple(replace(camera, name="$\\frac$ カメラ") for camera in textured_capture.cameras)
+    write_rig(tmp_path / "new" / "rig.svg", replace(textured_capture, cameras=cameras))
     assert "<svg" in (tmp_path / "new" / "rig.svg").read_text()
 
 
