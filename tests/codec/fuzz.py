@@ -16,6 +16,7 @@ import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import drjit as dr
@@ -27,7 +28,7 @@ from morgs_mi.codec.packets import CodedFrame, coded_frames, frames_near, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.codec.salvage import DamagedRange, salvage, write_salvaged
 from morgs_mi.playback.player import has_confidence, has_offset, num_frames, open_stream_capture, render_config
-from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
+from tests.codec.forge import Forgery, damaged, with_forged_bytes, with_forged_header, with_forged_packets
 from tests.scenes.short_clip import FRAMES, Clip, short_clip
 
 # What a stream of a few kB may take: far less than a damaged length or count may request. A thread of a library that
@@ -116,15 +117,15 @@ def check_bytes(clip: Clip, path: Path, rng: np.random.Generator, refusals: Refu
     check_readers(path, refusals)
 
 
-def check_packets(clip: Clip, path: Path, rng: np.random.Generator, refusals: Refusals) -> None:
-    """Check the readers of a stream with forged packets."""
-    path.write_bytes(with_forged_packets(clip, rng).data)
-    check_readers(path, refusals)
-
-
-def check_header(clip: Clip, path: Path, rng: np.random.Generator, refusals: Refusals) -> None:
-    """Check the readers of a stream with a forged header."""
-    path.write_bytes(with_forged_header(clip, rng).data)
+def check_forged(
+    forge: Callable[[Clip, np.random.Generator], Forgery],
+    clip: Clip,
+    path: Path,
+    rng: np.random.Generator,
+    refusals: Refusals,
+) -> None:
+    """Check the readers of a forged stream."""
+    path.write_bytes(forge(clip, rng).data)
     check_readers(path, refusals)
 
 
@@ -197,8 +198,8 @@ def differs(state: CodedFrame, clip: Clip) -> bool:
 FUZZERS: dict[str, Callable[[Clip, Path, np.random.Generator, Refusals], None]] = {
     "damage": check_damage,
     "bytes": check_bytes,
-    "packets": check_packets,
-    "header": check_header,
+    "packets": partial(check_forged, with_forged_packets),
+    "header": partial(check_forged, with_forged_header),
 }
 
 
