@@ -6,7 +6,7 @@ and advice. The limits are far above what clips without faults show, so that a f
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -75,6 +75,8 @@ class DeepCheck:
     Attributes:
         names: of the C cameras.
         frames: number T of frames that were read.
+        fps: frames per second.
+        given: time offset that each camera was read with, frames.
         errors: median reprojection error of each camera [C], px.
         offsets: time offset of each camera from the median [C], frames.
         halves: the same in the first and the last half of the frames [2, C].
@@ -89,6 +91,8 @@ class DeepCheck:
 
     names: tuple[str, ...]
     frames: int
+    fps: float
+    given: tuple[float, ...]
     errors: np.ndarray
     offsets: np.ndarray
     halves: np.ndarray
@@ -128,6 +132,8 @@ def check_deep(capture: Capture, shared: SharedFeatures, rig: RigCheck, signals:
     measured = DeepCheck(
         names=capture.names,
         frames=len(bands),
+        fps=capture.fps,
+        given=tuple(capture.reading.offset.get(name, 0) for name in capture.names),
         errors=np.array([camera.error for camera in rig.cameras]),
         offsets=time_offsets(capture.cameras, signals.thumbs),
         halves=np.array([time_offsets(capture.cameras, part) for part in parts]).reshape(-1, len(capture.cameras)),
@@ -138,17 +144,8 @@ def check_deep(capture: Capture, shared: SharedFeatures, rig: RigCheck, signals:
         lamps=tuple(lamp_flicker(bands[:, c], capture.fps) for c in range(len(capture.cameras))),
         overlaps=overlaps(capture.cameras, capture.points),
     )
-    found = [
-        *_errors(measured),
-        *_times(measured, capture),
-        *_exposures(measured.names, measured.gains),
-        *_flicker(measured),
-        *_variations(measured),
-        *_blur(measured),
-        *_repeats(measured),
-        *_overlap(measured),
-    ]
-    return DeepCheck(**{**vars(measured), "findings": tuple(found)})
+    findings = [_finding(capture.names, q, found) for q, find in _QUESTIONS.items() for found in find(measured)]
+    return replace(measured, findings=tuple(findings))
 
 
 def check_exposures(capture: Capture, shared: SharedFeatures | None = None) -> list[Finding]:
@@ -163,7 +160,8 @@ def check_exposures(capture: Capture, shared: SharedFeatures | None = None) -> l
     if shared is None:
         features = tuple(detect(image, mask) for image, mask in zip(images, capture.masks, strict=True))
         shared = SharedFeatures(features, tuple(match_views(features, capture.cameras, _QUICK_NEIGHBOURS)))
-    return list(_exposures(capture.names, _gains(capture.cameras, images, shared)))
+    gains = _gains(capture.cameras, images, shared)
+    return [_finding(capture.names, "exposure", found) for found in _exposures(gains)]
 
 
 def _reduced(capture: Capture) -> Capture:
@@ -188,95 +186,91 @@ def _gains(cameras: Sequence[Camera], images: Sequence[np.ndarray | None], share
     return np.stack([consensus(len(colors), views, channel, weights) for channel in middles.T], axis=1)
 
 
-def _errors(check: DeepCheck) -> Iterator[Finding]:
+# The cameras that a finding concerns, and what is wrong with them.
+_Found = tuple[Sequence[int], str]
+
+
+def _finding(names: Sequence[str], question: str, found: _Found) -> Finding:
+    views, text = found
+    cameras = tuple(names[view] for view in views)
+    return Finding(question, cameras, f"{', '.join(cameras)} {text}.")
+
+
+def _errors(check: DeepCheck) -> Iterator[_Found]:
     for view, error in enumerate(check.errors):
         usual = _usual(np.delete(check.errors, view))
         if np.isfinite(error) and error > max(_ERROR, _TIMES_ERROR * usual):
-            yield _finding(
-                check,
-                "error",
+            yield (
                 [view],
                 f"has a reprojection error of {error:.2f} px, the others {usual:.2f} px: check its lens model and "
                 "focal length, or calibrate again (morgs-mi calibrate)",
             )
 
 
-def _times(check: DeepCheck, capture: Capture) -> Iterator[Finding]:
-    period = 1e3 / capture.fps
-    for view, offset in enumerate(check.offsets):
-        name, halves = check.names[view], check.halves[:, view]
+def _times(check: DeepCheck) -> Iterator[_Found]:
+    for view, offset in enumerate(check.offsets.tolist()):
+        halves = check.halves[:, view]
         if len(halves) and abs(change := halves[1] - halves[0]) >= _OFFSET_CHANGE:
-            yield _finding(
-                check,
-                "time",
+            yield (
                 [view],
                 f"moves {abs(change):.1f} frames {'ahead of' if change > 0 else 'behind'} the other cameras during "
                 f"the first {check.frames} frames: frames were lost or its clock runs at another rate; copy the clip "
                 "again, or convert it with its true time stamps",
             )
         elif abs(offset) >= _OFFSET and not (np.abs(halves - offset) > _OFFSET_CHANGE).any():
-            frame = capture.reading.offset.get(name, 0) - round(float(offset))
-            yield _finding(
-                check,
-                "time",
+            side, milliseconds = "ahead of" if offset > 0 else "behind", 1e3 / check.fps * abs(offset)
+            yield (
                 [view],
-                f"is {abs(offset):.1f} frames ({abs(offset) * period:.0f} ms) {'ahead of' if offset > 0 else 'behind'} "
-                f"the other cameras: use --offset {name} {frame}, or record with synchronised cameras",
+                f"is {abs(offset):.1f} frames ({milliseconds:.0f} ms) {side} the other cameras: use --offset "
+                f"{check.names[view]} {check.given[view] - round(offset)}, or record with synchronised cameras",
             )
 
 
-def _exposures(names: Sequence[str], gains: np.ndarray) -> Iterator[Finding]:
+def _exposures(gains: np.ndarray) -> Iterator[_Found]:
     """Yield the cameras of other exposure or white balance; `gains` are the log gains of their channels [C, 3]."""
-    for name, own, mean in zip(names, gains, gains.mean(axis=1), strict=True):
+    for view, (own, mean) in enumerate(zip(gains, gains.mean(axis=1), strict=True)):
         if abs(mean) > _EXPOSURE:
-            what = f"is {_percent(mean)} than the other cameras: set the same exposure and gain"
-            yield Finding("exposure", (name,), f"{name} {what}, or use {_CORRECTIONS}.")
+            amount = f"{100 * abs(np.expm1(mean)):.0f} % {'brighter' if mean > 0 else 'darker'}"
+            yield [view], f"is {amount} than the other cameras: set the same exposure and gain, or use {_CORRECTIONS}"
         if np.abs(own - mean).max() > _BALANCE:
             channels = ", ".join(f"{n} {100 * np.expm1(g - mean):+.0f} %" for n, g in zip("RGB", own, strict=True))
             what = f"has another white balance than the other cameras ({channels}): set a fixed one"
-            yield Finding("exposure", (name,), f"{name} {what}, or use {_CORRECTIONS}.")
+            yield [view], f"{what}, or use {_CORRECTIONS}"
 
 
-def _flicker(check: DeepCheck) -> Iterator[Finding]:
+def _flicker(check: DeepCheck) -> Iterator[_Found]:
     for mains in sorted({lamp.mains for lamp in check.lamps if lamp}):
-        views = [view for view, lamp in enumerate(check.lamps) if lamp and lamp.mains == mains]
-        lamps = [lamp for lamp in check.lamps if lamp and lamp.mains == mains]
-        hertz = " or ".join(str(frequency) for frequency in mains)
+        lamps = {view: lamp for view, lamp in enumerate(check.lamps) if lamp and lamp.mains == mains}
+        amplitude, alias = max((lamp.amplitude, lamp.alias) for lamp in lamps.values())
         exposure = " or ".join(f"1/{2 * frequency}" for frequency in mains)
-        yield _finding(
-            check,
-            "flicker",
-            views,
-            f"flicker by {100 * max(lamp.amplitude for lamp in lamps):.1f} % at {lamps[0].alias:.1f} Hz, as lamps on "
-            f"{hertz} Hz mains do: expose for a multiple of {exposure} s, use lamps without flicker, or "
-            "--exposure auto, which corrects what the cameras do not have in common",
+        yield (
+            list(lamps),
+            f"flicker by {100 * amplitude:.1f} % at {alias:.1f} Hz, as lamps on {' or '.join(map(str, mains))} Hz "
+            f"mains do: expose for a multiple of {exposure} s, use lamps without flicker, or --exposure auto, which "
+            "corrects what the cameras do not have in common",
         )
 
 
-def _variations(check: DeepCheck) -> Iterator[Finding]:
+def _variations(check: DeepCheck) -> Iterator[_Found]:
     common = known_median(check.brightness, axis=1)[:, None]
     span, rest = _span(common)[0], _usual(_span(check.brightness - common))
     # The range of a flicker is twice its amplitude; twice as much is no flicker alone.
-    flicker = np.array([4 * lamp.amplitude if lamp else 0 for lamp in check.lamps])
-    lit = len(check.names) > 2 and span > max(_VARIATION, flicker.max()) and rest < 0.5 * span
+    limits = np.array([max(_VARIATION, 4 * lamp.amplitude if lamp else 0) for lamp in check.lamps])
+    lit = len(check.names) > 2 and span > limits.max() and rest < 0.5 * span
     if lit:
-        yield _finding(
-            check,
-            "variation",
+        yield (
             range(len(check.names)),
             f"change their brightness alike, by {100 * np.expm1(span):.0f} % over time: the light of the scene "
             "changes; use constant light",
         )
     for view, values in enumerate((check.brightness - common if lit else check.brightness).T):
         known = values[np.isfinite(values)]
-        if len(known) and (own := np.ptp(known)) > max(_VARIATION, flicker[view]):
-            yield _finding(
-                check,
-                "variation",
+        if len(known) and (own := np.ptp(known)) > limits[view]:
+            jump = np.abs(np.diff(known)).max()
+            yield (
                 [view],
-                f"changes its brightness by {100 * np.expm1(own):.0f} % over time, up to "
-                f"{100 * np.expm1(np.abs(np.diff(known)).max()):.0f} % from frame to frame: fix the exposure, or use "
-                "--exposure auto",
+                f"changes its brightness by {100 * np.expm1(own):.0f} % over time, up to {100 * np.expm1(jump):.0f} % "
+                "from frame to frame: fix the exposure, or use --exposure auto",
             )
 
 
@@ -287,72 +281,63 @@ def _span(values: np.ndarray) -> np.ndarray:
     return np.where(known.any(axis=0), spans, np.nan)
 
 
-def _blur(check: DeepCheck) -> Iterator[Finding]:
-    levels = np.array([_usual(values) for values in check.sharpness.T])
+def _blur(check: DeepCheck) -> Iterator[_Found]:
+    levels = known_median(check.sharpness, axis=0)
     for view, level in enumerate(levels):
-        usual = _usual(np.delete(levels, view))
-        if usual - level > _BLUR:
-            share = 100 * 2.0 ** (level - usual)
-            yield _finding(
-                check,
-                "blur",
+        loss = _usual(np.delete(levels, view)) - level
+        if loss > _BLUR:
+            yield (
                 [view],
-                f"is less sharp than the other cameras, with {share:.0f} % of their fine detail: "
+                f"is less sharp than the other cameras, with {100 * 2.0**-loss:.0f} % of their fine detail: "
                 "check focus and lens, and that its clip is not enlarged or strongly compressed",
             )
     relative = check.sharpness - levels
     for view, values in enumerate(relative.T):
         # Compression changes from frame to frame, in all cameras alike if they share an encoder.
-        dips = values - np.array([_usual(row) for row in np.delete(relative, view, axis=1)])
+        dips = values - known_median(np.delete(relative, view, axis=1), axis=1)
         dips = dips if np.isfinite(dips).any() else values
         spread = 1.5 * _usual(np.abs(dips - _usual(dips)))
         frames = np.flatnonzero(dips < -max(_BLURRED_FRAME, _SPREADS * spread))
         if len(frames):
-            yield _finding(
-                check,
-                "blur",
-                [view],
-                f"is blurred in {_frames(frames)}: see whether it was touched, or focuses automatically",
-            )
+            yield [view], f"is blurred in {_frames(frames)}: see whether it was touched, or focuses automatically"
 
 
-def _repeats(check: DeepCheck) -> Iterator[Finding]:
+def _repeats(check: DeepCheck) -> Iterator[_Found]:
     for view, frames in enumerate(check.repeated):
         if frames:
-            yield _finding(
-                check,
-                "repeats",
+            yield (
                 [view],
                 f"repeats its last image in {_frames(frames)} while the other cameras see motion: frames were lost; "
                 "copy or record the clip again, without converting its frame rate",
             )
 
 
-def _overlap(check: DeepCheck) -> Iterator[Finding]:
+def _overlap(check: DeepCheck) -> Iterator[_Found]:
     for view, shares in enumerate(check.overlaps):
         others = np.delete(shares, view)
         if len(others) and others.max() < _OVERLAP:
-            yield _finding(
-                check,
-                "overlap",
+            yield (
                 [view],
                 f"shares at most {100 * others.max():.0f} % of its image with another camera: turn it towards what the "
                 "others see, or add a camera in between",
             )
 
 
-def _finding(check: DeepCheck, question: str, views: Sequence[int], text: str) -> Finding:
-    names = tuple(check.names[view] for view in views)
-    return Finding(question, names, f"{', '.join(names)} {text}.")
+_QUESTIONS: dict[str, Callable[[DeepCheck], Iterator[_Found]]] = {
+    "error": _errors,
+    "time": _times,
+    "exposure": lambda check: _exposures(check.gains),
+    "flicker": _flicker,
+    "variation": _variations,
+    "blur": _blur,
+    "repeats": _repeats,
+    "overlap": _overlap,
+}
 
 
 def _usual(values: np.ndarray) -> float:
     """Return the median of what is not NaN, or NaN."""
     return float(known_median(values, axis=0))
-
-
-def _percent(log_gain: float) -> str:
-    return f"{100 * abs(np.expm1(log_gain)):.0f} % {'brighter' if log_gain > 0 else 'darker'}"
 
 
 def _frames(frames: Sequence[int] | np.ndarray) -> str:
