@@ -22,7 +22,7 @@ from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet, with_zero_motion
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import choose_key_views
-from morgs_mi.method.lift import Lift
+from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.method.objective import Observations, Prediction, channels_of, losses_of, weights_of
 from morgs_mi.method.residual import apply_residual, residual_parameters
 from morgs_mi.method.rigidity import find_neighbours
@@ -48,7 +48,7 @@ class FrameProblem:
     active: ActiveSet
     targets: Mapping[int, Target]
     observations: Mapping[int, Mapping[str, np.ndarray]]
-    start: Lift | None
+    start: MotionStart | None
     extent: float
 
 

@@ -16,9 +16,9 @@ from morgs_mi.losses.ssim import Target
 from morgs_mi.method.anchors import anchored_motion
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.hicom import coherent_motion
-from morgs_mi.method.lift import Lift
 from morgs_mi.method.motion_grid import motion_grid
 from morgs_mi.method.motion_model import MotionModel, moved
+from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.method.transformation_cache import transformation_cache
 from morgs_mi.render.active_view import ActiveView
 
@@ -31,13 +31,13 @@ _FINAL_RATE = 0.1
 def fit_motion(
     gaussians: Gaussians,
     model: MotionModel,
-    start: Lift | None,
+    start: MotionStart | None,
     views: Mapping[int, ActiveView],
     targets: Mapping[int, Target],
     order: Sequence[int],
     dssim_weight: float,
     on_step: Callable[[int], None] | None = None,
-) -> tuple[Lift, dict[str, float]]:
+) -> tuple[MotionStart, dict[str, float]]:
     """Fit a motion model to the images by L_recon and the model's own losses.
 
     Args:
@@ -55,7 +55,7 @@ def fit_motion(
         the last round of views.
     """
     logit = np.zeros(len(gaussians)) if gaussians.logit_confidence is None else gaussians.logit_confidence
-    start = start or Lift(np.zeros((len(gaussians), 3), np.float32), np.array(logit, np.float32))
+    start = start or MotionStart(np.zeros((len(gaussians), 3), np.float32), np.array(logit, np.float32))
     begun = displaced(gaussians, start.displacement)
 
     def losses_at(parameters: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:

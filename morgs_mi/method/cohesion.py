@@ -20,10 +20,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.spatial import KDTree
 
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.method.neighbours import NeighbourIndex
 
 __all__ = ["CohesionConfig", "share_confidence"]
 
@@ -47,7 +47,12 @@ class CohesionConfig:
 
 
 def share_confidence(
-    gaussians: Gaussians, chosen: np.ndarray, logit: np.ndarray, still: float, config: CohesionConfig | None = None
+    gaussians: Gaussians,
+    chosen: np.ndarray,
+    logit: np.ndarray,
+    still: float,
+    config: CohesionConfig | None = None,
+    neighbours: NeighbourIndex | None = None,
 ) -> np.ndarray:
     """Return the logits z [M] of the chosen Gaussians (see the module).
 
@@ -57,24 +62,23 @@ def share_confidence(
         logit: u [M], their own logits.
         still: logit of all others.
         config: settings.
+        neighbours: index of all means; None: it is built.
     """
     config = config or CohesionConfig()
-    means = np.asarray(gaussians.means)
-    count = min(config.neighbours + 1, len(means))
-    if not len(chosen) or count < 2:
+    neighbours = neighbours or NeighbourIndex(np.asarray(gaussians.means))
+    near = neighbours.nearest_of(chosen, config.neighbours)
+    if not near.size:
         return logit
-    _, near = KDTree(means).query(means[chosen], count, workers=-1)
-    near = np.asarray(near)[:, 1:]  # the first is the Gaussian itself
     chroma, opacity = _chromaticity(gaussians), np.asarray(gaussians.opacities)
     affinity = np.exp(-np.sum((chroma[chosen][:, None] - chroma[near]) ** 2, axis=2) / (2 * config.chroma_scale**2))
     affinity = config.weight * (opacity[near] * affinity).astype(np.float32)
     starts = np.arange(0, near.size + 1, near.shape[1])
-    neighbours = csr_array((affinity.ravel(), near.ravel(), starts), (len(chosen), len(means)))
+    weights = csr_array((affinity.ravel(), near.ravel(), starts), (len(chosen), len(gaussians)))
     total = 1 + affinity.sum(axis=1)
-    everywhere = np.full(len(means), still, np.float32)
+    everywhere = np.full(len(gaussians), still, np.float32)
     everywhere[chosen] = logit
     for _ in range(config.rounds):
-        everywhere[chosen] = (logit + neighbours @ everywhere) / total
+        everywhere[chosen] = (logit + weights @ everywhere) / total
     return everywhere[chosen]
 
 

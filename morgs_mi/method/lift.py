@@ -36,9 +36,10 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.confidence import motion_floor
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.mask_refiners.config import MaskConfig
+from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.render.active_view import ActiveView
 
-__all__ = ["Lift", "LiftConfig", "lift_flow"]
+__all__ = ["LiftConfig", "lift_flow"]
 
 
 @dataclass(frozen=True)
@@ -62,23 +63,6 @@ class LiftConfig:
     """Logit of the confidence per unit of evidence above `min_evidence`."""
     max_logit: float = 2.0
     """Bound of that logit: confidences from 0.12 to 0.88, soft enough for the images to correct them."""
-
-
-@dataclass(frozen=True, eq=False)
-class Lift:
-    """Start of the motion, of the confidence, of the colour and of the rotation of N Gaussians.
-
-    Attributes:
-        displacement: d [N, 3] since the previous frame, world units; 0 for a Gaussian that does not move.
-        logit_confidence: logit of the confidence that it moves [N].
-        color_change: change of the constant SH coefficients [N, 3]; None: none.
-        rotation: change of the quaternions [N, 4]; None: none.
-    """
-
-    displacement: np.ndarray
-    logit_confidence: np.ndarray
-    color_change: np.ndarray | None = None
-    rotation: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +101,7 @@ def lift_flow(
     observations: Mapping[int, FlowObservation],
     config: LiftConfig | None = None,
     masks: MaskConfig | None = None,
-) -> Lift:
+) -> MotionStart:
     """Return the displacements that explain the flow of the key views best, and the confidence that follows from it.
 
     Args:
@@ -135,7 +119,7 @@ def lift_flow(
     ]
     top = config.max_logit
     if not seen:
-        return Lift(np.zeros((len(means), 3), np.float32), np.full(len(means), -top, np.float32))
+        return MotionStart(np.zeros((len(means), 3), np.float32), np.full(len(means), -top, np.float32))
     d = _solve(seen, [np.ones(len(means))] * len(seen), config)
     for _ in range(config.rounds):
         d = _solve(seen, [np.exp(-view.cost(d, view.project(d))) for view in seen], config)
@@ -147,7 +131,7 @@ def lift_flow(
         moves |= np.linalg.norm(motion, axis=1) > view.floor
     evidence = gain / total
     logit = np.where(moves, np.clip(config.confidence_slope * (evidence - config.min_evidence), -top, top), -top)
-    return Lift(np.where(logit[:, None] > 0, d, 0).astype(np.float32), logit.astype(np.float32))
+    return MotionStart(np.where(logit[:, None] > 0, d, 0).astype(np.float32), logit.astype(np.float32))
 
 
 def _lift_view(

@@ -1,24 +1,62 @@
-"""The start of each Gaussian's motion (eq. 5): lifted flow, proposals, search, refinement."""
+"""The start of each Gaussian's motion (eq. 5), in stages: lifted flow, proposals, search, refinement.
+
+A `Stage` returns a better start from the one before. `STAGES` lists them in their order; settings switch them off.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from morgs_mi.core.gaussians import Gaussians, displaced
+from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.method.cohesion import share_confidence
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation
-from morgs_mi.method.lift import Lift, lift_flow
-from morgs_mi.method.photometric import mean_color_error, refine_displacement
+from morgs_mi.method.lift import lift_flow
+from morgs_mi.method.motion_start import MotionProblem, MotionStart
+from morgs_mi.method.neighbours import NeighbourIndex
+from morgs_mi.method.photometric import refine_start
 from morgs_mi.method.propagation import propagate_motion
 from morgs_mi.method.search import search_motion
 
-__all__ = ["initial_motion"]
+__all__ = ["STAGES", "Stage", "initial_motion"]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of the start of the motion.
+
+    Attributes:
+        acts: whether it is on, by the settings.
+        run: (problem, start, settings) -> start.
+    """
+
+    acts: Callable[[MotionConfig], bool]
+    run: Callable[[MotionProblem, MotionStart, MotionConfig], MotionStart]
+
+
+STAGES: tuple[Stage, ...] = (
+    Stage(
+        lambda config: config.lift_flow,
+        lambda p, start, config: lift_flow(p.gaussians, p.views, p.flows, config.lift, config.masks),
+    ),
+    Stage(
+        lambda config: config.propagate_motion,
+        lambda p, start, config: propagate_motion(p, start, config.propagation),
+    ),
+    Stage(
+        lambda config: config.search_motion,
+        lambda p, start, config: search_motion(p, start, config.search),
+    ),
+    Stage(
+        lambda config: config.refine_start and config.two_gates,
+        lambda p, start, config: refine_start(p, start, config.photometric),
+    ),
+)
 
 
 def initial_motion(
@@ -28,7 +66,7 @@ def initial_motion(
     targets: Mapping[int, Target],
     config: MotionConfig,
     rng: np.random.Generator,
-) -> Lift | None:
+) -> MotionStart | None:
     """Return the start of the active Gaussians' motion (eq. 5), confidence and colour.
 
     None: all start as in the previous frame, without motion.
@@ -46,34 +84,34 @@ def initial_motion(
     gaussians = active.select(previous)
     if not (config.learn_motion and config.lift_flow):
         return _constant_velocity(gaussians) if config.constant_velocity else None
-    start = lift_flow(gaussians, active.views, flows, config.lift, config.masks)
     views = {v: active.views[v] for v in sorted(flows.keys() & active.views.keys())}
-    if config.propagate_motion:
-        start = propagate_motion(gaussians, start, views, targets, rng, config.propagation)
-    if config.search_motion:
-        start = search_motion(gaussians, start, views, targets, config.search)
-    if config.refine_start and config.two_gates:
-        start = refine_displacement(gaussians, start, views, targets, config.photometric)
-        moved = displaced(gaussians, start.displacement)
-        start = replace(start, color_change=mean_color_error(moved, views, targets, config.photometric))
-    return replace(start, logit_confidence=_initial_confidence(start, active, previous, config))
+    problem = MotionProblem(gaussians, views, targets, rng, flows)
+    start = _without_motion(gaussians)
+    for stage in STAGES:
+        if stage.acts(config):
+            start = stage.run(problem, start, config)
+    everyone = problem.neighbours if gaussians is previous else NeighbourIndex(np.asarray(previous.means))
+    logit = _carried_confidence(start, gaussians, config)
+    shared = share_confidence(previous, active.indices, logit, -config.lift.max_logit, config.cohesion, everyone)
+    return replace(start, logit_confidence=shared)
 
 
-def _constant_velocity(gaussians: Gaussians) -> Lift:
+def _without_motion(gaussians: Gaussians) -> MotionStart:
+    """Return a start without motion, with the confidence as it is."""
+    logit = gaussians.logit_confidence
+    confidence = np.zeros(len(gaussians), np.float32) if logit is None else np.asarray(logit)
+    return MotionStart(np.zeros((len(gaussians), 3), np.float32), confidence)
+
+
+def _constant_velocity(gaussians: Gaussians) -> MotionStart:
     """Return the motion into the previous frame as the start, with the confidence as it is."""
-    means, logit = np.asarray(gaussians.means), gaussians.logit_confidence
-    displacement = np.zeros_like(means) if gaussians.motion is None else np.asarray(gaussians.motion)
-    return Lift(displacement, np.zeros(len(means), np.float32) if logit is None else np.asarray(logit))
+    start = _without_motion(gaussians)
+    return start if gaussians.motion is None else replace(start, displacement=np.asarray(gaussians.motion))
 
 
-def _initial_confidence(lifted: Lift, active: ActiveSet, previous: Gaussians, config: MotionConfig) -> np.ndarray:
-    """Return the logits [M] that a frame's confidence starts from.
-
-    They are those of the previous frame, a little lower, or those of lifted flow where they are higher, shared among
-    neighbours.
-    """
-    logit = lifted.logit_confidence
-    if previous.logit_confidence is not None:
-        before = np.asarray(previous.logit_confidence)[active.indices]
-        logit = np.maximum(logit, before - np.float32(config.confidence_decay))
-    return share_confidence(previous, active.indices, logit, -config.lift.max_logit, config.cohesion)
+def _carried_confidence(start: MotionStart, gaussians: Gaussians, config: MotionConfig) -> np.ndarray:
+    """Return the logits [M] of the previous frame, a little lower, or those of the start where they are higher."""
+    if gaussians.logit_confidence is None:
+        return start.logit_confidence
+    before = np.asarray(gaussians.logit_confidence)
+    return np.maximum(start.logit_confidence, before - np.float32(config.confidence_decay))

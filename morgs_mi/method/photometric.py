@@ -27,11 +27,10 @@ from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.image_gradient import image_gradient
-from morgs_mi.method.lift import Lift
-from morgs_mi.method.propagation import narrowed_views, nearest_neighbours
+from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.render.active_view import ActiveView
 
-__all__ = ["PhotometricConfig", "mean_color_error", "refine_displacement"]
+__all__ = ["PhotometricConfig", "mean_color_error", "refine_displacement", "refine_start"]
 
 
 @dataclass(frozen=True)
@@ -57,29 +56,30 @@ class PhotometricConfig:
                 raise ValueError(f"PhotometricConfig(): `{name}` must be at least {low}, got {getattr(self, name)}.")
 
 
-def refine_displacement(
-    previous: Gaussians,
-    start: Lift,
-    views: Mapping[int, ActiveView],
-    targets: Mapping[int, Target],
-    config: PhotometricConfig | None = None,
-) -> Lift:
-    """Return a start whose moving Gaussians explain the images better.
+def refine_start(problem: MotionProblem, start: MotionStart, config: PhotometricConfig) -> MotionStart:
+    """Return a start with refined displacements, and with the change of colour at these displacements.
 
     Args:
-        previous: N Gaussians of the previous frame, detached.
-        start: of their motion.
-        views: active views of the key views, by view index.
-        targets: their images, by view index.
+        problem: N Gaussians, the key views and their images.
+        start: of the motion.
         config: settings.
     """
+    start = refine_displacement(problem, start, config)
+    moved = displaced(problem.gaussians, start.displacement)
+    return replace(start, color_change=mean_color_error(moved, problem.views, problem.targets, config))
+
+
+def refine_displacement(
+    problem: MotionProblem, start: MotionStart, config: PhotometricConfig | None = None
+) -> MotionStart:
+    """Return a start whose moving Gaussians explain the images better; see `refine_start`."""
     config, d = config or PhotometricConfig(), start.displacement
-    moves = np.any(d, axis=1)
-    views = narrowed_views(views, previous, moves, [d]) if moves.any() else {}
+    previous, targets, moves = problem.gaussians, problem.targets, np.any(d, axis=1)
+    views = problem.views_around(moves, [d]) if moves.any() else {}
     if not views:
         return start
     means = np.asarray(previous.means)
-    near = nearest_neighbours(means, config.neighbours)
+    near = problem.neighbours.nearest(config.neighbours)
     gradients = {v: _gradient(view, targets[v]) for v, view in views.items()}
 
     def sums_of(d: np.ndarray) -> np.ndarray:

@@ -13,20 +13,15 @@ A Gaussian whose error falls clearly accepts its proposal. Only the surroundings
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.losses.attribution import attribute_error
-from morgs_mi.losses.ssim import Target
-from morgs_mi.method.boxes import boxes_around
-from morgs_mi.method.lift import Lift
-from morgs_mi.render.active_view import ActiveView
+from morgs_mi.method.motion_start import MotionProblem, MotionStart
 
-__all__ = ["PropagationConfig", "narrowed_views", "nearest_neighbours", "propagate_motion"]
+__all__ = ["PropagationConfig", "propagate_motion"]
 
 
 @dataclass(frozen=True)
@@ -50,44 +45,32 @@ class PropagationConfig:
 
 
 def propagate_motion(
-    previous: Gaussians,
-    lifted: Lift,
-    views: Mapping[int, ActiveView],
-    targets: Mapping[int, Target],
-    rng: np.random.Generator,
-    config: PropagationConfig | None = None,
-) -> Lift:
-    """Return a start of the motion that explains the images at least as well as lifted flow does.
+    problem: MotionProblem, start: MotionStart, config: PropagationConfig | None = None
+) -> MotionStart:
+    """Return a start of the motion that explains the images at least as well as `start` does.
 
     Args:
-        previous: N Gaussians of the previous frame, detached; `motion` is their displacement into that frame.
-        lifted: start by lifted flow.
-        views: active views of the key views, by view index.
-        targets: their images, by view index.
-        rng: draws the neighbours.
+        problem: N Gaussians, the key views and their images.
+        start: by lifted flow.
         config: settings.
     """
     config = config or PropagationConfig()
-    d, logit = lifted.displacement, lifted.logit_confidence  # [N, 3], [N]
-    before = _previous_motion(previous)
-    if not views or not (d.any() or before.any()):
-        return lifted
-    means = np.asarray(previous.means)
-    near = nearest_neighbours(means, config.neighbours)
-    views = narrowed_views(
-        views, previous, _reached(near, np.any([d, before], axis=(0, 2)), config.rounds), (d, before)
-    )
+    d, logit = start.displacement, start.logit_confidence  # [N, 3], [N]
+    before = _previous_motion(problem.gaussians)
+    if not problem.views or not (d.any() or before.any()):
+        return start
+    near = problem.neighbours.nearest(config.neighbours)
+    rounds = config.rounds if near.size else 0
+    views = problem.views_around(_reached(near, np.any([d, before], axis=(0, 2)), rounds), (d, before))
 
     def error_of(d: np.ndarray) -> np.ndarray:
-        moved = displaced(previous, d)
-        sums = np.sum([attribute_error(moved, views[view], targets[view]) for view in views], axis=0)
+        moved = displaced(problem.gaussians, d)
+        sums = np.sum([attribute_error(moved, view, problem.targets[v]) for v, view in views.items()], axis=0)
         return (sums[:, 0] + config.floor_px) / (sums[:, 1] + 1)
 
-    error = error_of(d)
-    for k in range(1 + config.rounds):
-        proposal = (
-            d[_moving_neighbour(near, d, rng)] if k else np.where(np.any(before, axis=1, keepdims=True), before, d)
-        )
+    error, continues = error_of(d), np.any(before, axis=1, keepdims=True)
+    for k in range(1 + rounds):
+        proposal = d[_moving_neighbour(near, d, problem.rng)] if k else np.where(continues, before, d)
         differs = np.any(proposal != d, axis=1)
         if not differs.any():
             continue
@@ -97,7 +80,7 @@ def propagate_motion(
         d, error = np.where(accepted[:, None], proposal, d), np.where(accepted, new_error, error)
         moves = np.where(d.any(axis=1), np.maximum(logit, config.min_logit), np.minimum(logit, -config.min_logit))
         logit = np.where(accepted, moves, logit)
-    return Lift(d, logit.astype(np.float32))
+    return MotionStart(d, logit.astype(np.float32))
 
 
 def _previous_motion(gaussians: Gaussians) -> np.ndarray:
@@ -110,32 +93,11 @@ def _previous_motion(gaussians: Gaussians) -> np.ndarray:
     return np.where(np.asarray(gaussians.logit_confidence)[:, None] > 0, motion, 0)
 
 
-def nearest_neighbours(means: np.ndarray, count: int) -> np.ndarray:
-    """Return the indices of the nearest neighbours of each mean, [N, count], or fewer if there are no more."""
-    k = min(count + 1, len(means))
-    _, near = KDTree(means).query(means, k, workers=-1)
-    return np.asarray(near).reshape(len(means), k)[:, -count:]
-
-
 def _reached(near: np.ndarray, moving: np.ndarray, rounds: int) -> np.ndarray:
     """Return which Gaussians a motion can reach within some rounds, bool [N]."""
     for _ in range(rounds):
         moving = moving | moving[near].any(axis=1)
     return moving
-
-
-def narrowed_views(
-    views: Mapping[int, ActiveView], gaussians: Gaussians, chosen: np.ndarray, displacements: Sequence[np.ndarray]
-) -> dict[int, ActiveView]:
-    """Return the views with the blocks that the `chosen` Gaussians reach, in place or displaced; without empty ones."""
-    some = gaussians.select(np.flatnonzero(chosen))
-    places = [some, *(displaced(some, d[chosen]) for d in displacements if d.any())]
-    narrowed = {}
-    for index, view in views.items():
-        boxes = [boxes_around(place, view.camera, view.config, 1.0) for place in places]
-        shape, everyone = (view.camera.height, view.camera.width), np.ones(len(some), bool)
-        narrowed[index] = view.narrowed(np.any([box.union(everyone, shape) for box in boxes], axis=0))
-    return {index: view for index, view in narrowed.items() if view is not None}
 
 
 def _moving_neighbour(near: np.ndarray, d: np.ndarray, rng: np.random.Generator) -> np.ndarray:

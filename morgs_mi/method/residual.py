@@ -25,14 +25,16 @@ from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.gates import hard_gate, quantised
-from morgs_mi.method.lift import Lift
+from morgs_mi.method.motion_start import MotionStart
 
 __all__ = ["apply_residual", "residual_parameters"]
 
 _RESIDUALS = tuple(a.name for a in ATTRIBUTES if a.gate is not None)
 
 
-def residual_parameters(previous: Gaussians, config: MotionConfig, start: Lift | None = None) -> dict[str, Tensor]:
+def residual_parameters(
+    previous: Gaussians, config: MotionConfig, start: MotionStart | None = None
+) -> dict[str, Tensor]:
     """Return the parameters of one frame's residual at their start.
 
     Args:

@@ -24,7 +24,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, Jit, Tensor
 from morgs_mi.method.motion_model import quaternion_product, sparse_product
-from morgs_mi.method.propagation import nearest_neighbours
+from morgs_mi.method.neighbours import NeighbourIndex
 
 __all__ = ["Neighbours", "RigidityConfig", "find_neighbours", "isometry_loss", "rigid_loss", "rotation_loss"]
 
@@ -73,7 +73,7 @@ def find_neighbours(gaussians: Gaussians, extent: float, config: RigidityConfig)
     means = np.asarray(gaussians.means)
     if len(means) < 2:
         return None
-    near = nearest_neighbours(means, config.neighbours)
+    near = NeighbourIndex(means).nearest(config.neighbours)
     (N, k), pairs = near.shape, np.arange(near.size)
     ones = np.ones(near.size, np.float32)
     first, second = (

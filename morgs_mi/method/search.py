@@ -26,8 +26,8 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.losses.ssim import Target
-from morgs_mi.method.lift import Lift
-from morgs_mi.method.propagation import narrowed_views, nearest_neighbours
+from morgs_mi.method.motion_start import MotionProblem, MotionStart
+from morgs_mi.method.neighbours import NeighbourIndex
 from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["SearchConfig", "search_motion"]
@@ -65,33 +65,26 @@ class SearchConfig:
             raise ValueError(f"SearchConfig(): `reach` must be in (0, 1], got {self.reach}.")
 
 
-def search_motion(
-    previous: Gaussians,
-    start: Lift,
-    views: Mapping[int, ActiveView],
-    targets: Mapping[int, Target],
-    config: SearchConfig | None = None,
-) -> Lift:
+def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConfig | None = None) -> MotionStart:
     """Return a start of the motion in which parts that were not explained move to where they are found.
 
     If nothing is found, it is `start` itself.
 
     Args:
-        previous: N Gaussians of the previous frame, detached.
-        start: of their motion.
-        views: active views of the key views, by view index.
-        targets: their images, by view index.
+        problem: N Gaussians, the key views and their images.
+        start: of the motion.
         config: settings.
     """
     config = config or SearchConfig()
-    started = displaced(previous, start.displacement)
+    gaussians, views, targets = problem.gaussians, problem.views, problem.targets
+    started = displaced(gaussians, start.displacement)
     errors = _errors(started, views, targets)
     parts = _unexplained_parts(started, errors, views, config)
     displacement, logit = start.displacement, start.logit_confidence
-    for part, d in _find(previous, parts, views, targets, config):
+    for part, d in _find(problem, parts, config):
         proposal = np.where(part[:, None], d, displacement).astype(np.float32)
-        around = narrowed_views(views, previous, part, [displacement, proposal])
-        moved = displaced(previous, proposal)
+        around = problem.views_around(part, [displacement, proposal])
+        moved = displaced(gaussians, proposal)
         before = sum(float(errors[v][views[v].crop(_drawn(view))].sum()) for v, view in around.items())
         after = sum(float(error.sum()) for error in _errors(moved, around, targets).values())
         if after < config.max_error_ratio * before:
@@ -124,7 +117,9 @@ def _unexplained_parts(
     if not seen.any():
         return []
     unexplained = seen & (error > config.error_ratio * max(float(np.median(error[seen])), 1 / 255))
-    near = nearest_neighbours(np.asarray(gaussians.means), config.neighbours)
+    if np.count_nonzero(unexplained) < config.min_size:
+        return []
+    near = NeighbourIndex(np.asarray(gaussians.means)).nearest(config.neighbours)
     ends = unexplained[:, None] & unexplained[near]
     rows = np.broadcast_to(np.arange(len(near))[:, None], near.shape)[ends]
     graph = coo_array((np.ones(len(rows), bool), (rows, near[ends])), (len(near), len(near)))
@@ -135,16 +130,13 @@ def _unexplained_parts(
 
 
 def _find(
-    previous: Gaussians,
-    parts: Sequence[np.ndarray],
-    views: Mapping[int, ActiveView],
-    targets: Mapping[int, Target],
-    config: SearchConfig,
+    problem: MotionProblem, parts: Sequence[np.ndarray], config: SearchConfig
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return those parts that are found elsewhere, each with its displacement [3]."""
+    """Return the parts that are found elsewhere, each with its displacement [3]."""
     if not parts:
         return []
-    matched = {v: _MatchedView.of(previous, view, targets[v], config.reach) for v, view in views.items()}
+    previous, views = problem.gaussians, problem.views
+    matched = {v: _MatchedView.of(previous, view, problem.targets[v], config.reach) for v, view in views.items()}
     found = []
     for first in range(0, len(parts), 3):
         few = parts[first : first + 3]

@@ -15,8 +15,8 @@ from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.anchors import AnchorConfig
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.hicom import HicomConfig
-from morgs_mi.method.lift import Lift
 from morgs_mi.method.motion_grid import GridConfig
+from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.method.transformation_cache import CacheConfig
 from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
 
@@ -32,7 +32,9 @@ MODELS = {
 FIT = FitConfig(sh_degree=0, epochs=8, density=DensityConfig(later_frames=False))
 
 
-def fit(motion: MotionConfig, start: Lift | None = None, config: FitConfig = FIT) -> tuple[LaterFrame, Gaussians]:
+def fit(
+    motion: MotionConfig, start: MotionStart | None = None, config: FitConfig = FIT
+) -> tuple[LaterFrame, Gaussians]:
     """Fit a ball that has moved by `SHIFT`; return the result and the truth."""
     before = opaque_ball()
     truth = replace(before, means=np.asarray(before.means) + SHIFT)
@@ -58,7 +60,7 @@ def test_fit_later_frame__finds_the_motion_that_gaussians_share(motion):
 @pytest.mark.parametrize("motion", MODELS.values(), ids=MODELS)
 def test_fit_later_frame__continues_from_a_start(motion):
     """The steps after the start still move Gaussians that are seen badly, but the start is not lost."""
-    exact = Lift(np.tile(SHIFT, (400, 1)), np.zeros(400, np.float32))
+    exact = MotionStart(np.tile(SHIFT, (400, 1)), np.zeros(400, np.float32))
     (begun, _), (found, _) = (fit(motion, start, replace(FIT, epochs=2)) for start in (exact, None))
     assert motion_error(begun) < 0.5 * motion_error(found)
 

@@ -9,7 +9,7 @@ import pytest
 
 from morgs_mi import SH_C0
 from morgs_mi.losses.ssim import Target
-from morgs_mi.method.lift import Lift
+from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.photometric import PhotometricConfig, mean_color_error, refine_displacement
 from morgs_mi.render.active_view import ActiveView
 from tests.scenes.cameras import look_at_cameras
@@ -46,7 +46,11 @@ def with_colors(gaussians, change):
 def start(factor):
     displacement = np.zeros((MOVING + STATIC, 3), np.float32)
     displacement[:MOVING] = factor * SHIFT
-    return Lift(displacement, np.full(len(displacement), 1.0, np.float32))
+    return MotionStart(displacement, np.full(len(displacement), 1.0, np.float32))
+
+
+def refined_from(scene, start, config=None):
+    return refine_displacement(MotionProblem(*scene, np.random.default_rng(0)), start, config)
 
 
 def errors(lift):
@@ -56,30 +60,27 @@ def errors(lift):
 
 @pytest.mark.parametrize("factor", [0.6, 1.4])
 def test_refine_displacement__corrects_what_flow_left(scene, factor):
-    before, views, seen = scene
-    refined = refine_displacement(before, start(factor), views, seen)
+    refined = refined_from(scene, start(factor))
     assert np.median(errors(refined)) < 0.1  # 0.4 at the start
     assert not refined.displacement[MOVING:].any()
     assert np.array_equal(refined.logit_confidence, start(factor).logit_confidence)
 
 
 def test_refine_displacement__keeps_true_motion(scene):
-    before, views, seen = scene
-    assert np.median(errors(refine_displacement(before, start(1.0), views, seen))) < 0.01
+    assert np.median(errors(refined_from(scene, start(1.0)))) < 0.01
 
 
 def test_refine_displacement__takes_no_step_longer_than_the_limit(scene):
-    before, views, seen = scene
+    before, views, _ = scene
     config = PhotometricConfig(rounds=1, max_step_px=0.1)
-    step = refine_displacement(before, start(0.6), views, seen, config).displacement - start(0.6).displacement
+    step = refined_from(scene, start(0.6), config).displacement - start(0.6).displacement
     px = [view.camera.projection_jacobian(np.asarray(before.means)) @ step[..., None] for view in views.values()]
     assert 0.05 < np.linalg.norm(px, axis=2).max() < 0.11
 
 
 def test_refine_displacement__does_nothing_without_motion_or_views(scene):
-    before, views, seen = scene
-    assert refine_displacement(before, start(0.0), views, seen).displacement.any() == 0
-    assert np.array_equal(refine_displacement(before, start(0.6), {}, {}).displacement, start(0.6).displacement)
+    assert refined_from(scene, start(0.0)).displacement.any() == 0
+    assert np.array_equal(refined_from((scene[0], {}, {}), start(0.6)).displacement, start(0.6).displacement)
 
 
 def test_mean_color_error__follows_a_change_of_light(scene):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.losses.ssim import Target
-from morgs_mi.method.lift import Lift
+from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.propagation import propagate_motion
 from morgs_mi.render.active_view import ActiveView
 from tests.scenes.cameras import look_at_cameras
@@ -35,13 +35,13 @@ def scene():
 
 
 def still(n):
-    return Lift(np.zeros((n, 3), np.float32), np.full(n, -2, np.float32))
+    return MotionStart(np.zeros((n, 3), np.float32), np.full(n, -2, np.float32))
 
 
 def start(scene, lifted, motion=None):
     before, _, views, targets = scene
     known = before if motion is None else replace(before, motion=mi.TensorXf(motion.astype(np.float32)))
-    return propagate_motion(known, lifted, views, targets, np.random.default_rng(0))
+    return propagate_motion(MotionProblem(known, views, targets, np.random.default_rng(0)), lifted)
 
 
 def found(lift, moves):
@@ -74,7 +74,7 @@ def test_propagate_motion__ends_motion_that_has_stopped(scene):
 def test_propagate_motion__spreads_to_neighbours(scene):
     moves = scene[1]
     seen = moves & (np.arange(460) % 3 == 0)
-    lift = Lift((SHIFT * seen[:, None]).astype(np.float32), np.where(seen, 2, -2).astype(np.float32))
+    lift = MotionStart((SHIFT * seen[:, None]).astype(np.float32), np.where(seen, 2, -2).astype(np.float32))
     hit, static = found(start(scene, lift), moves)
     assert hit > 0.96  # a third to begin with
     assert static > 0.99
@@ -82,7 +82,7 @@ def test_propagate_motion__spreads_to_neighbours(scene):
 
 def test_propagate_motion__keeps_true_motion(scene):
     moves = scene[1]
-    lift = Lift((SHIFT * moves[:, None]).astype(np.float32), np.where(moves, 2, -2).astype(np.float32))
+    lift = MotionStart((SHIFT * moves[:, None]).astype(np.float32), np.where(moves, 2, -2).astype(np.float32))
     result = start(scene, lift, -SHIFT * moves[:, None])
     assert found(result, moves)[0] > 0.96
 
@@ -90,5 +90,12 @@ def test_propagate_motion__keeps_true_motion(scene):
 def test_propagate_motion__does_nothing_without_motion_or_views(scene):
     before, _, views, targets = scene
     lifted, rng = still(460), np.random.default_rng(0)
-    assert propagate_motion(before, lifted, views, targets, rng) is lifted
-    assert propagate_motion(before, lifted, {}, targets, rng) is lifted
+    assert propagate_motion(MotionProblem(before, views, targets, rng), lifted) is lifted
+    assert propagate_motion(MotionProblem(before, {}, targets, rng), lifted) is lifted
+
+
+def test_propagate_motion__leaves_a_single_gaussian_without_neighbours_as_it_is(scene):
+    before, _, views, targets = scene
+    alone = MotionProblem(before.select(np.array([0])), views, targets, np.random.default_rng(0))
+    lifted = MotionStart(SHIFT[None], np.float32([2]))
+    assert np.array_equal(propagate_motion(alone, lifted).displacement, lifted.displacement)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.method.config import MotionConfig
-from morgs_mi.method.lift import Lift
+from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.method.residual import apply_residual, residual_parameters
 from tests.assertions import assert_close
 from tests.scenes.gaussians import RAW, make_scene, to_gaussians
@@ -68,7 +68,7 @@ def test_residual_parameters__follow_the_modules():
 @pytest.mark.parametrize("lift_confidence", [False, True])
 def test_residual_parameters__lifted_motion_passes_the_gate_at_full_length(lift_confidence):
     previous, rng = to_gaussians(make_scene()), np.random.default_rng(1)
-    lifted = Lift(np.float32(rng.normal(size=(10, 3))), np.float32(rng.uniform(-2, 2, 10)))
+    lifted = MotionStart(np.float32(rng.normal(size=(10, 3))), np.float32(rng.uniform(-2, 2, 10)))
     config = MotionConfig(lift_confidence=lift_confidence)
     current = apply_residual(previous, residual_parameters(previous, config, lifted), config)
     assert (np.asarray(current.confidence) > 0.1).all()

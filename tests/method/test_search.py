@@ -11,8 +11,8 @@ from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation
-from morgs_mi.method.lift import Lift
 from morgs_mi.method.motion import initial_motion
+from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.search import SearchConfig, _MatchedView, search_motion
 from morgs_mi.render.active_view import ActiveView
 from tests.scenes.cameras import look_at_cameras
@@ -44,14 +44,18 @@ def moved(gaussians, shift=SHIFT):
 
 
 def still():
-    return Lift(np.zeros((ROD + WALL, 3), np.float32), np.full(ROD + WALL, -2, np.float32))
+    return MotionStart(np.zeros((ROD + WALL, 3), np.float32), np.full(ROD + WALL, -2, np.float32))
+
+
+def searched(gaussians, start, views, seen, config=None):
+    return search_motion(MotionProblem(gaussians, views, seen, np.random.default_rng(0)), start, config)
 
 
 @pytest.mark.parametrize("shift", [SHIFT, -SHIFT, SHIFT * [1, 1, -2]])
 def test_search_motion__finds_a_fast_thin_part(scene, shift):
     before, views = scene
     seen = targets(moved(before, shift), views)
-    found = search_motion(before, still(), views, seen)
+    found = searched(before, still(), views, seen)
     distance = np.linalg.norm(found.displacement[MOVES] - shift, axis=1)
     assert np.all(distance < 0.1 * np.linalg.norm(shift))
     assert not found.displacement[~MOVES].any()
@@ -61,23 +65,23 @@ def test_search_motion__finds_a_fast_thin_part(scene, shift):
 
 def test_search_motion__corrects_a_wrong_start(scene):
     before, views = scene
-    wrong = Lift((-SHIFT * MOVES[:, None]).astype(np.float32), np.where(MOVES, 1, -2).astype(np.float32))
-    found = search_motion(before, wrong, views, targets(moved(before), views))
+    wrong = MotionStart((-SHIFT * MOVES[:, None]).astype(np.float32), np.where(MOVES, 1, -2).astype(np.float32))
+    found = searched(before, wrong, views, targets(moved(before), views))
     assert np.all(np.linalg.norm(found.displacement[MOVES] - SHIFT, axis=1) < 0.1 * np.linalg.norm(SHIFT))
     assert np.all(found.logit_confidence[MOVES] == 1)
 
 
 def test_search_motion__keeps_a_start_that_explains_the_images(scene):
     before, views = scene
-    right = Lift((SHIFT * MOVES[:, None]).astype(np.float32), np.where(MOVES, 1, -2).astype(np.float32))
-    assert search_motion(before, right, views, targets(moved(before), views)) is right
-    assert search_motion(before, right, {}, {}) is right
+    right = MotionStart((SHIFT * MOVES[:, None]).astype(np.float32), np.where(MOVES, 1, -2).astype(np.float32))
+    assert searched(before, right, views, targets(moved(before), views)) is right
+    assert searched(before, right, {}, {}) is right
 
 
 def test_search_motion__keeps_a_part_that_vanished(scene):
     before, views = scene
     gone, start = before.select(np.flatnonzero(~MOVES)), still()
-    assert search_motion(before, start, views, targets(gone, views)) is start
+    assert searched(before, start, views, targets(gone, views)) is start
 
 
 @pytest.mark.parametrize(
@@ -96,12 +100,12 @@ def test_search_motion__keeps_a_part_that_vanished(scene):
 def test_search_config__each_setting_can_prevent_a_finding(scene, setting):
     before, views = scene
     start = still()
-    assert search_motion(before, start, views, targets(moved(before), views), SearchConfig(**setting)) is start
+    assert searched(before, start, views, targets(moved(before), views), SearchConfig(**setting)) is start
 
 
 def test_search_config__min_logit_is_the_confidence_of_what_is_found(scene):
     before, views = scene
-    found = search_motion(before, still(), views, targets(moved(before), views), SearchConfig(min_logit=1.5))
+    found = searched(before, still(), views, targets(moved(before), views), SearchConfig(min_logit=1.5))
     assert np.all(found.logit_confidence[MOVES] == 1.5)
 
 

@@ -1,0 +1,75 @@
+"""The start of the motion, and the images that it is found from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from morgs_mi.core.gaussians import Gaussians, displaced
+from morgs_mi.losses.ssim import Target
+from morgs_mi.method.boxes import boxes_around
+from morgs_mi.method.flow import FlowObservation
+from morgs_mi.method.neighbours import NeighbourIndex
+from morgs_mi.render.active_view import ActiveView
+
+__all__ = ["MotionProblem", "MotionStart"]
+
+
+@dataclass(frozen=True, eq=False)
+class MotionStart:
+    """Start of the motion, of the confidence, of the colour and of the rotation of N Gaussians.
+
+    Attributes:
+        displacement: d [N, 3] since the previous frame, world units; 0 for a Gaussian that does not move.
+        logit_confidence: logit of the confidence that it moves [N].
+        color_change: change of the constant SH coefficients [N, 3]; None: none.
+        rotation: change of the quaternions [N, 4]; None: none.
+    """
+
+    displacement: np.ndarray
+    logit_confidence: np.ndarray
+    color_change: np.ndarray | None = None
+    rotation: np.ndarray | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class MotionProblem:
+    """N Gaussians of the previous frame, and images of this one that show their motion.
+
+    Attributes:
+        gaussians: N Gaussians of the previous frame, detached; `motion` is their displacement into that frame.
+        views: active views, by view index.
+        targets: images of these views, by view index.
+        rng: draws the neighbours that proposals come from.
+        flows: optical flow of the views, by view index.
+    """
+
+    gaussians: Gaussians
+    views: Mapping[int, ActiveView]
+    targets: Mapping[int, Target]
+    rng: np.random.Generator
+    flows: Mapping[int, FlowObservation] = field(default_factory=dict)
+
+    @cached_property
+    def neighbours(self) -> NeighbourIndex:
+        """Neighbours of the Gaussians in the previous frame, one index for all stages."""
+        return NeighbourIndex(np.asarray(self.gaussians.means))
+
+    def views_around(self, chosen: np.ndarray, displacements: Sequence[np.ndarray]) -> dict[int, ActiveView]:
+        """Return the views with the blocks that some Gaussians reach, in place or displaced; without empty ones.
+
+        Args:
+            chosen: which Gaussians, bool [N].
+            displacements: of all Gaussians, [N, 3] each.
+        """
+        some = self.gaussians.select(np.flatnonzero(chosen))
+        places = [some, *(displaced(some, d[chosen]) for d in displacements if d.any())]
+        narrowed = {}
+        for index, view in self.views.items():
+            boxes = [boxes_around(place, view.camera, view.config, 1.0) for place in places]
+            shape, everyone = (view.camera.height, view.camera.width), np.ones(len(some), bool)
+            narrowed[index] = view.narrowed(np.any([box.union(everyone, shape) for box in boxes], axis=0))
+        return {index: view for index, view in narrowed.items() if view is not None}

@@ -1,0 +1,54 @@
+"""The start of the motion: its stages, one after the other."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+from scipy.spatial import KDTree
+
+from morgs_mi import RenderConfig
+from morgs_mi.losses.ssim import Target
+from morgs_mi.method import neighbours
+from morgs_mi.method.active_set import full_active_set
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.flow import FlowObservation
+from morgs_mi.method.motion import STAGES, initial_motion
+from tests.scenes.ball import opaque_ball, views
+
+SHIFT = np.float32([0.06, -0.03, 0.02])
+
+
+def start(config: MotionConfig):
+    """Return the start of a ball that goes on moving by `SHIFT`, without any flow."""
+    ball = opaque_ball()
+    before = replace(ball, motion=np.tile(SHIFT, (len(ball), 1)), logit_confidence=np.ones(len(ball)))
+    after = replace(ball, means=mi.TensorXf(np.asarray(ball.means) + SHIFT))
+    active = full_active_set(before, dict(enumerate(views())), RenderConfig())
+    targets = {v: Target(np.asarray(view.render(after).color)) for v, view in active.views.items()}
+    flow = np.zeros((*targets[0].image().shape[:2], 2), np.float32), np.ones(targets[0].image().shape[:2], bool)
+    flows = {v: FlowObservation(*flow, *flow) for v in active.views}
+    return initial_motion(before, active, flows, targets, config, np.random.default_rng(0))
+
+
+def test_initial_motion__runs_the_stages_that_are_on():
+    off = replace(MotionConfig(), propagate_motion=False, search_motion=False, refine_start=False)
+    assert [stage.acts(off) for stage in STAGES] == [True, False, False, False]
+    assert all(stage.acts(MotionConfig()) for stage in STAGES)
+    lifted, found = start(off), start(MotionConfig())
+    assert lifted is not None
+    assert found is not None
+    assert not lifted.displacement.any()  # the flow sees no motion
+    assert lifted.color_change is None
+    assert np.linalg.norm(found.displacement - SHIFT, axis=1).mean() < 0.5 * np.linalg.norm(SHIFT)
+    assert found.color_change is not None
+
+
+def test_initial_motion__builds_one_index_of_the_neighbours(monkeypatch: pytest.MonkeyPatch):
+    """The stages and the cohesion share it; the search has its own, of displaced Gaussians."""
+    built = []
+    monkeypatch.setattr(neighbours, "KDTree", lambda points: built.append(points) or KDTree(points))
+    start(replace(MotionConfig(), search_motion=False))
+    assert len(built) == 1

@@ -1,0 +1,24 @@
+"""Nearest neighbours: against all distances, for all points and for some."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from morgs_mi.method.neighbours import NeighbourIndex
+
+POINTS = np.random.default_rng(0).normal(size=(30, 3)).astype(np.float32)
+
+
+@pytest.mark.parametrize("count", [1, 8, 29, 100])
+def test_nearest__are_the_nearest_others_in_order(count):
+    distance = np.linalg.norm(POINTS[:, None].astype(float) - POINTS, axis=2)
+    expected = np.argsort(distance, axis=1)[:, 1 : count + 1]
+    index = NeighbourIndex(POINTS)
+    np.testing.assert_array_equal(index.nearest(count), expected)
+    np.testing.assert_array_equal(index.nearest_of(np.array([4, 2]), count), expected[[4, 2]])
+
+
+def test_nearest__has_none_for_a_single_point():
+    assert NeighbourIndex(POINTS[:1]).nearest(8).shape == (1, 0)
+    assert NeighbourIndex(POINTS[:1]).nearest_of(np.arange(0), 8).shape == (0, 0)
