@@ -6,8 +6,8 @@ Presets:
     baseline, ml, ml-mo, ml-mo-mc     rows of the ablation: residuals only; with motion; with offset; with confidence
     paper                             all three modules; motion starts from zero instead of the lifted flow, one gate,
                                       constant learning rates
-    hicom, rigidity, gates, cache,
-    grid, anchors                     what another publication adds to the baseline (docs/experiments/field.md)
+    rigidity                          the baseline with the rigid neighbours of Dynamic 3D Gaussians
+                                      (docs/experiments/field.md)
 
 The number of key views (2, 4, 8 or 12 in the paper) is `MotionConfig.key_views` and belongs to no preset.
 
@@ -51,9 +51,7 @@ __all__ = [
     "relocated",
 ]
 
-PresetName = Literal[
-    "l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper", "hicom", "rigidity", "gates", "cache", "grid", "anchors"
-]
+PresetName = Literal["l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper", "rigidity"]
 Config = TypeVar("Config")
 _NONE = "none"
 _MOST = 2**64  # of a whole number; the header of a stream has no longer ones
@@ -103,7 +101,6 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
             **_modules(True, True, True),
         },
     },
-    "hicom": {"motion": {"model": "hicom", **_modules(False, False, False)}},
     "rigidity": {
         "fit": {
             "objective": {"rigid_weight": 0.4, "rotation_weight": 0.4, "isometry_weight": 0.2},
@@ -113,13 +110,6 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
         },
         "motion": {"constant_velocity": True, **_modules(False, False, False)},
     },
-    "gates": {
-        "fit": {"rates": {"means": 2e-3}},
-        "motion": {"learn_gates": True, **_modules(False, False, False)},
-    },
-    "cache": {"motion": {"model": "cache", **_modules(False, False, False)}},
-    "grid": {"motion": {"model": "grid", **_modules(False, False, False)}},
-    "anchors": {"motion": {"model": "anchors", **_modules(False, False, False)}},
 }
 
 

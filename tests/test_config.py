@@ -108,12 +108,6 @@ def test_apply_preset__overrides_earlier_settings_and_later_ones_override_it() -
     assert apply_values(config, {"fit": {"epochs": 2}}).fit.epochs == 2
 
 
-@pytest.mark.parametrize("name", ["hicom", "cache", "grid", "anchors"])
-def test_apply_preset__adds_a_motion_model_to_the_baseline(name) -> None:
-    baseline, config = (apply_preset(StreamConfig(), preset) for preset in ("baseline", name))
-    assert config == replace(baseline, motion=replace(baseline.motion, model=name))
-
-
 def test_apply_preset__rejects_an_unknown_name() -> None:
     with pytest.raises(ValueError, match=f"must be one of {', '.join(PRESETS)}, got 'xl'"):
         apply_preset(StreamConfig(), "xl")  # type: ignore[arg-type]

@@ -35,7 +35,6 @@ BASE = StreamConfig(
 VALUES: dict[str, Any] = {
     "motion.flow_method": "farneback",
     "motion.mask_method": "superpixels",
-    "motion.model": "hicom",
     "fit.objective.rigid_weight": 1.0,
     "fit.objective.rotation_weight": 1.0,
     "fit.objective.isometry_weight": 1.0,
@@ -83,13 +82,7 @@ ELSEWHERE: dict[str, str] = {
     "motion.search_motion": "flow explains all parts here: tests/method/test_search.py",
     "fit.objective.rigidity": "no weight on rigidity here: tests/fit/test_later_frame.py",
     "motion.constant_velocity": "flow is lifted here: tests/fit/test_later_frame.py",
-    "fit.objective.gate_weight": "no gates here: tests/fit/test_later_frame.py",
-    "motion.gates": "no gates here: tests/fit/test_later_frame.py",
-    "motion.model_share": "no motion model here: tests/fit/test_motion_stage.py",
-    "motion.hicom": "a model that is not the default: tests/fit/test_motion_stage.py",
-    "motion.cache": "a model that is not the default: tests/fit/test_motion_stage.py",
-    "motion.grid": "a model that is not the default: tests/fit/test_motion_stage.py",
-    "motion.anchors": "a model that is not the default: tests/fit/test_motion_stage.py",
+    "motion.model": "the package has no motion model: tests/fit/test_motion_stage.py",
     "codec.keyframe_interval": "keyframes are written by the recorder: tests/test_recorder.py",
 }
 

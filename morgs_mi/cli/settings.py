@@ -50,7 +50,7 @@ SETTINGS = {
 
 _PRESET = (
     "Preset: l, s (the paper's variants, 8 and 5 epochs), paper (its scheme), baseline, ml, ml-mo, ml-mo-mc (its "
-    f"ablation), or of other publications hicom, rigidity, gates, cache, grid, anchors ({page('experiments/field')})."
+    f"ablation), or rigidity (rigid neighbours, {page('experiments/field')})."
 )
 _FLOW = f"Optical flow: a method, files:FOLDER or onnx:FILE ({page('flow')})."
 _MASKS = f"Refinement of the motion masks ({page('masks')})."
@@ -210,7 +210,7 @@ class Settings:
         return apply_values(config, _nested(self.given()))
 
     def check_methods(self, config: StreamConfig) -> None:
-        """Check the flow method and the mask refinement of a config and load their networks, before a fit begins.
+        """Check the methods that a config names, and load their networks, before a fit begins.
 
         Raises:
             FileNotFoundError: one of them names a missing file or folder.
@@ -218,11 +218,13 @@ class Settings:
         """
         from morgs_mi.method.flow_sources.registry import flow_source
         from morgs_mi.method.mask_refiners.registry import mask_refiner
+        from morgs_mi.method.motion_model import motion_model
 
         motion = config.motion
         checks: dict[str, Callable[[], Any]] = {
             "flow_method": lambda: flow_source(motion.flow_method, motion.flow),
             "mask_method": lambda: mask_refiner(motion.mask_method, motion.masks),
+            "model": lambda: motion_model(motion),
         }
         for name, check in checks.items():
             try:

@@ -15,14 +15,15 @@ from morgs_mi.core.progress import Progress
 from morgs_mi.core.types import Tensor
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.density import apply_plan, plan_additions, resize_optimizer
-from morgs_mi.fit.motion_stage import fit_motion, motion_model
+from morgs_mi.fit.motion_stage import fit_motion
 from morgs_mi.fit.optimise import Steps, adam, optimise, values_of, view_order
 from morgs_mi.losses.attribution import densification_scores
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet, with_zero_motion
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import choose_key_views
-from morgs_mi.method.motion_start import MotionStart
+from morgs_mi.method.motion_model import motion_model
+from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.objective import Observations, Prediction, channels_of, losses_of, weights_of
 from morgs_mi.method.residual import apply_residual, residual_parameters
 from morgs_mi.method.rigidity import find_neighbours
@@ -141,22 +142,19 @@ class _Fit:
     def start(self) -> int:
         """Fit the motion model, if there is one, start the residual, and return the number of epochs that this took."""
         problem, motion, start, epochs = self._problem, self._motion, self._problem.start, 0
-        model = motion_model(self._base, problem.extent, motion, self._rng)
-        if model is not None:
+        if (factory := motion_model(motion)) is not None:
             epochs = max(1, round(motion.model_share * self._config.epochs))
-            steps, weight = self._next_steps(epochs), self._config.objective.dssim_weight
-            given = self._base, model, start, problem.active.views, problem.targets
-            start, self.losses = fit_motion(*given, steps.views, weight, steps.on_step)
+            model = factory(self._base, problem.extent, self._rng)
+            shared = MotionProblem(self._base, problem.active.views, problem.targets, self._rng)
+            weight = self._config.objective.dssim_weight
+            start, self.losses = fit_motion(shared, model, start, self._next_steps(epochs), weight)
         self._optimizer = adam(residual_parameters(self._base, motion, start))
         return epochs
 
     def run_epoch(self, epoch: int) -> None:
         """Make one step in every active view."""
         self._last_recon = self.losses.get("recon", np.inf)
-        rates = {
-            **self._config.rates_at(epoch).by_parameter(self._problem.extent),
-            "logit_gate": self._motion.gates.rate,
-        }
+        rates = self._config.rates_at(epoch).by_parameter(self._problem.extent)
         weights = weights_of(self._config.objective)
         self.losses = optimise(self._optimizer, rates, self._losses_at, self._next_steps(1), weights)
 

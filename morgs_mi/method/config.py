@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 from morgs_mi.core.checks import check_number
 from morgs_mi.method.active_set import ActiveSetConfig
-from morgs_mi.method.anchors import AnchorConfig
 from morgs_mi.method.change import ChangeConfig
 from morgs_mi.method.cohesion import CohesionConfig
 from morgs_mi.method.flow_sources.config import FlowConfig
-from morgs_mi.method.gates import GateConfig
-from morgs_mi.method.hicom import HicomConfig
 from morgs_mi.method.lift import LiftConfig
 from morgs_mi.method.mask_refiners.config import MaskConfig
-from morgs_mi.method.motion_grid import GridConfig
 from morgs_mi.method.photometric import PhotometricConfig
 from morgs_mi.method.propagation import PropagationConfig
 from morgs_mi.method.search import SearchConfig
-from morgs_mi.method.transformation_cache import CacheConfig
 
 __all__ = ["MotionConfig"]
 
@@ -40,9 +34,6 @@ class MotionConfig:
     """MO: a learned offset corrects the flow-guided motion (eq. 8)."""
     learn_confidence: bool = True
     """MC: a learned confidence gates the residuals (eq. 12)."""
-    learn_gates: bool = False
-    """Learn a hard gate for the displacement of each Gaussian, and round the residuals of its other attributes (see
-    `gates`)."""
     two_gates: bool = True
     """Gate means and rotations only, so that appearance changes freely; False: one gate for all, as in the paper."""
     lift_flow: bool = True
@@ -71,9 +62,8 @@ class MotionConfig:
     """Gate below which a lifted motion is no longer scaled up to pass the gate at full length."""
     confidence_decay: float = 0.3
     """Logit that a confidence loses per frame without evidence of motion: where something moved, more is to correct."""
-    model: Literal["none", "hicom", "cache", "grid", "anchors"] = "none"
-    """Motion that Gaussians share, fitted before the residual: none, or that of another publication (see
-    docs/experiments/field.md)."""
+    model: str = "none"
+    """Motion that Gaussians share, fitted before the residual: none, or a registered model (see docs/extending.md)."""
     model_share: float = 0.5
     """Fraction of a later frame's epochs that fit this model, at least one epoch."""
     flow: FlowConfig = field(default_factory=FlowConfig)
@@ -94,16 +84,6 @@ class MotionConfig:
     """Selection of the Gaussians that a frame may change."""
     change: ChangeConfig = field(default_factory=ChangeConfig)
     """Detection of changed pixels."""
-    gates: GateConfig = field(default_factory=GateConfig)
-    """Hard gates and steps of residuals."""
-    hicom: HicomConfig = field(default_factory=HicomConfig)
-    """Hierarchical coherent motion, the model `hicom`."""
-    cache: CacheConfig = field(default_factory=CacheConfig)
-    """Neural transformation cache, the model `cache`."""
-    grid: GridConfig = field(default_factory=GridConfig)
-    """Motion grid whose rate is part of the loss, the model `grid`."""
-    anchors: AnchorConfig = field(default_factory=AnchorConfig)
-    """Motion of anchors, the model `anchors`."""
 
     def __post_init__(self) -> None:
         for name in ("key_views", "mask_interval"):

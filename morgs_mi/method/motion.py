@@ -86,7 +86,7 @@ def initial_motion(
         return _constant_velocity(gaussians) if config.constant_velocity else None
     views = {v: active.views[v] for v in sorted(flows.keys() & active.views.keys())}
     problem = MotionProblem(gaussians, views, targets, rng, flows)
-    start = _without_motion(gaussians)
+    start = MotionStart.without_motion(gaussians)
     for stage in STAGES:
         if stage.acts(config):
             start = stage.run(problem, start, config)
@@ -96,16 +96,9 @@ def initial_motion(
     return replace(start, logit_confidence=shared)
 
 
-def _without_motion(gaussians: Gaussians) -> MotionStart:
-    """Return a start without motion, with the confidence as it is."""
-    logit = gaussians.logit_confidence
-    confidence = np.zeros(len(gaussians), np.float32) if logit is None else np.asarray(logit)
-    return MotionStart(np.zeros((len(gaussians), 3), np.float32), confidence)
-
-
 def _constant_velocity(gaussians: Gaussians) -> MotionStart:
     """Return the motion into the previous frame as the start, with the confidence as it is."""
-    start = _without_motion(gaussians)
+    start = MotionStart.without_motion(gaussians)
     return start if gaussians.motion is None else replace(start, displacement=np.asarray(gaussians.motion))
 
 

@@ -8,8 +8,8 @@ quaternion,
 
 and the residual (eq. 12) starts from there. `fit.motion_stage` fits it. The spherical harmonics are not rotated.
 
-The models read positions through a constant sparse matrix W [N, C]: row i has the weights of the C entries of a grid at
-the mean of Gaussian i in the previous frame.
+The setting `motion.model` selects a model of `MOTION_MODELS`. The package has none; those of other publications are in
+benchmarks/field, and docs/extending.md describes how to register one.
 """
 
 from __future__ import annotations
@@ -25,8 +25,18 @@ from scipy.sparse import csr_array
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Jit, Tensor
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.registry import Registry
 
-__all__ = ["MotionModel", "corners", "moved", "quaternion_product", "sparse_product"]
+__all__ = [
+    "MOTION_MODELS",
+    "MotionModel",
+    "MotionModelFactory",
+    "motion_model",
+    "moved",
+    "quaternion_product",
+    "sparse_product",
+]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +54,26 @@ class MotionModel:
     rates: Mapping[str, float]
     motion: Callable[[Mapping[str, Tensor]], tuple[Tensor, Tensor]]
     losses: Callable[[Mapping[str, Tensor]], dict[str, Tensor]] = lambda parameters: {}
+
+
+# (N Gaussians of the previous frame, extent of the scene in world units, random generator) -> model.
+MotionModelFactory = Callable[[Gaussians, float, np.random.Generator], MotionModel]
+
+MOTION_MODELS: Registry[MotionModelFactory | None, MotionConfig] = Registry("motion_model()", "model")
+
+
+@MOTION_MODELS.register("none")
+def _none(argument: str, config: MotionConfig) -> None:
+    return None
+
+
+def motion_model(config: MotionConfig) -> MotionModelFactory | None:
+    """Return the factory of the motion model that the setting `model` selects; None for `none`.
+
+    Raises:
+        ValueError: no model of this name is registered.
+    """
+    return MOTION_MODELS.make(config.model, config)
 
 
 def moved(gaussians: Gaussians, displacement: Tensor, rotation: Tensor) -> Gaussians:
@@ -65,22 +95,6 @@ def quaternion_product(r: Jit, q: Jit) -> Jit:
         a * y - b * z + c * w + d * x,
         a * z + b * y - c * x + d * w,
     )
-
-
-def corners(points: np.ndarray, side: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of the cubic cells around points, and their weights in trilinear interpolation.
-
-    Args:
-        points: [N, 3], world units.
-        side: of the cells, world units.
-
-    Returns:
-        Integer coordinates [N, 8, 3], and weights float32 [N, 8], which sum to 1.
-    """
-    lowest = np.floor(points / side)
-    offsets, fraction = np.indices((2, 2, 2)).reshape(3, 8).T, points / side - lowest
-    weights = np.prod(np.where(offsets, fraction[:, None], 1 - fraction[:, None]), axis=-1)
-    return lowest.astype(np.int64)[:, None] + offsets, weights.astype(np.float32)
 
 
 def sparse_product(matrix: csr_array, x: Tensor) -> Tensor:

@@ -34,6 +34,13 @@ class MotionStart:
     color_change: np.ndarray | None = None
     rotation: np.ndarray | None = None
 
+    @classmethod
+    def without_motion(cls, gaussians: Gaussians) -> MotionStart:
+        """Return the start of N Gaussians that stay in place, with their confidence; its logit is 0 without one."""
+        logit = gaussians.logit_confidence
+        confidence = np.zeros(len(gaussians)) if logit is None else logit
+        return cls(np.zeros((len(gaussians), 3), np.float32), np.array(confidence, np.float32))
+
 
 @dataclass(frozen=True, eq=False)
 class MotionProblem:

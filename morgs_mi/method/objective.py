@@ -23,7 +23,6 @@ from morgs_mi.losses.losses import flow_loss, mask_loss, offset_loss, recon_loss
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.flow_sources.registry import FramePair
-from morgs_mi.method.gates import gate_loss
 from morgs_mi.method.rigidity import RigidityConfig, isometry_loss, rigid_loss, rotation_loss
 from morgs_mi.render.rasterize import Image
 from morgs_mi.render.region import Region
@@ -62,8 +61,6 @@ class ObjectiveConfig:
     """Weight of the similarity of rotations there."""
     isometry_weight: float = 0.0
     """Weight of the isometry there, per scene extent."""
-    gate_weight: float = 0.001
-    """Weight of the share of open gates (see `gates`)."""
     rigidity: RigidityConfig = field(default_factory=RigidityConfig)
     """Neighbours of the local rigidity."""
     detach_weights: bool = True
@@ -173,12 +170,6 @@ TERMS: tuple[Term, ...] = (
             observations=("neighbours",),
         )
         for name, loss in (("rigid", rigid_loss), ("rotation", rotation_loss), ("isometry", isometry_loss))
-    ),
-    Term(  # not in the paper, see `gates`
-        "gates",
-        lambda config: config.gate_weight,
-        lambda p, o, config: gate_loss(p.parameters["logit_gate"], p.num_gaussians),
-        parameters=("logit_gate",),
     ),
 )
 

@@ -4,8 +4,7 @@
 
 With two gates, m gates only the attributes of motion (means and rotations); colour, opacity and size are free, because
 shadows and light change where nothing moves and uncovered background has to be filled. The paper has one gate for all
-attributes. Which attribute belongs to which gate is a column of the attribute table (`core.attributes`). Further gates
-of the means, and rounded residuals of the others, are in `gates`; they are off by default.
+attributes. Which attribute belongs to which gate is a column of the attribute table (`core.attributes`).
 
 The parameters are a dict of raw tensors. All are zero at the start of a frame except the confidence, which carries
 over.
@@ -24,7 +23,6 @@ from morgs_mi.core.gaussians import Gaussians, repeat_each
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
 from morgs_mi.method.config import MotionConfig
-from morgs_mi.method.gates import hard_gate, quantised
 from morgs_mi.method.motion_start import MotionStart
 
 __all__ = ["apply_residual", "residual_parameters"]
@@ -48,8 +46,6 @@ def residual_parameters(
     shapes = {**previous.parameters(), "motion": previous.means, "offset": previous.means}
     names = [n for n in _RESIDUALS if n in shapes and (n != "offset" or config.learn_offset)]
     parameters: dict[str, Tensor] = {name: dr.zeros(mi.TensorXf, tuple(shapes[name].shape)) for name in names}
-    if config.learn_gates:
-        parameters["logit_gate"] = dr.full(mi.TensorXf, config.gates.start, (len(previous),))
     displacement, rotation = (None, None) if start is None else (start.displacement, start.rotation)
     if config.learn_confidence:
         logit = previous.logit_confidence
@@ -89,8 +85,6 @@ def apply_residual(previous: Gaussians, parameters: Mapping[str, Tensor], config
 
     def gated(name: str) -> Tensor:
         change = parameters[name]
-        if config.learn_gates:
-            change = quantised(change, config.gates.step(name))
         if gate is None or (config.two_gates and BY_NAME[name].gate == "appearance"):
             return change
         width = change.array.shape[0] // len(previous)
@@ -98,9 +92,6 @@ def apply_residual(previous: Gaussians, parameters: Mapping[str, Tensor], config
 
     motion = gated("motion")
     offset = gated("offset") if "offset" in parameters else dr.zeros(mi.TensorXf, tuple(motion.shape))
-    if "logit_gate" in parameters:
-        gates = repeat_each(hard_gate(parameters["logit_gate"].array), 3)
-        motion, offset = (mi.TensorXf(gates * part.array, tuple(part.shape)) for part in (motion, offset))
     known = previous.parameters()
     others = [name for name in parameters if name in known and name not in ("motion", "offset", "logit_confidence")]
     updated = {name: known[name] + gated(name) for name in others}

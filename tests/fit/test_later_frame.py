@@ -14,7 +14,6 @@ from morgs_mi.fit.later_frame import FrameProblem, LaterFrame, fit_later_frame
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.config import MotionConfig
-from morgs_mi.method.gates import GateConfig
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.objective import ObjectiveConfig
 from morgs_mi.method.rigidity import RigidityConfig
@@ -115,41 +114,6 @@ def test_fit_later_frame__every_setting_of_rigidity_acts(setting):
         for r in (RigidityConfig(), RigidityConfig(**setting))
     ]
     assert results[0].losses["rigid"] != pytest.approx(results[1].losses["rigid"], rel=0.05)
-
-
-GATED = replace(PLAIN, learn_gates=True)
-
-
-def test_fit_later_frame__closes_gates_that_the_images_do_not_need():
-    before, truth, _ = shifted((0.02, 0, 0))
-    config = FitConfig(sh_degree=0, epochs=8, density=DensityConfig(later_frames=False))
-    free, gated = (
-        fit(before, images_of(truth), replace(config, objective=ObjectiveConfig(gate_weight=weight)), motion)
-        for weight, motion in ((0.0, GATED), (10.0, replace(GATED, gates=GateConfig(start=0.0))))
-    )
-    free, gated = free.gaussians.numpy()["motion"], gated.gaussians.numpy()["motion"]
-    assert (free.any(axis=1)).mean() > 0.9
-    assert not gated.any()
-
-
-@pytest.mark.parametrize(
-    "setting",
-    [
-        {"start": 0.0},
-        {"rate": 0.3},
-        {"scale_step": 0.1},
-        {"rotation_step": 0.1},
-        {"opacity_step": 0.4},
-        {"color_step": 0.1},
-    ],
-    ids=lambda setting: next(iter(setting)),
-)
-def test_fit_later_frame__every_setting_of_the_gates_acts(setting):
-    before, truth, _ = shifted((0.02, 0, 0))
-    config = FitConfig(sh_degree=0, epochs=2)
-    motions = GATED, replace(GATED, gates=GateConfig(**setting))
-    one, other = (fit(before, images_of(truth), config, motion).gaussians.numpy() for motion in motions)
-    assert any(not np.array_equal(value, other[name]) for name, value in one.items())
 
 
 def test_initial_motion__continues_with_constant_velocity():

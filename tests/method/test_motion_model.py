@@ -5,11 +5,13 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pytest
 from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.geometry import unit_quats
-from morgs_mi.method.motion_model import moved, sparse_product
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.motion_model import motion_model, moved, sparse_product
 from tests.assertions import assert_close
 from tests.scenes.gaussians import make_scene, to_gaussians
 
@@ -19,6 +21,12 @@ MATRIX = csr_array(RNG.normal(size=(9, 5)) * (RNG.random((9, 5)) < 0.4), dtype=n
 
 def tensor(*shape: int) -> mi.TensorXf:
     return mi.TensorXf(RNG.normal(size=shape).astype(np.float32))
+
+
+def test_motion_model__is_the_one_that_the_setting_selects():
+    assert motion_model(MotionConfig()) is None
+    with pytest.raises(ValueError, match=r"motion_model\(\): `model` must be one of none.*, got 'mesh'\."):
+        motion_model(MotionConfig(model="mesh"))
 
 
 def test_sparse_product__is_that_of_dense_matrices():

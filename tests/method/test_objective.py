@@ -73,11 +73,9 @@ def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
         replace(to_gaussians(make_scene()), means=tensor(10, 3), quats=tensor(10, 4)),
     )
     inputs = {"recon": image.color, "flow": image["guided_motion"], "mask": image.confidence, "offset": tensor(5, 3)}
-    inputs |= {"rigid": moved.means, "rotation": moved.quats, "isometry": moved.means, "gates": tensor(10)}
+    inputs |= {"rigid": moved.means, "rotation": moved.quats, "isometry": moved.means}
     assert list(inputs) == NAMES, "a new term needs an input here"
-    prediction = Prediction(
-        image, {"offset": inputs["offset"], "logit_gate": inputs["gates"]}, None, H * W, 10, 2.0, moved
-    )
+    prediction = Prediction(image, {"offset": inputs["offset"]}, None, H * W, 10, 2.0, moved)
     observations = {
         "target": Target(np.zeros((H, W, 3), np.float32)),
         "motion": mi.TensorXf(np.zeros((H, W, 2), np.float32)),
@@ -85,12 +83,8 @@ def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
         "mask": mi.TensorXf(np.zeros((H, W), np.float32)),
         "neighbours": find_neighbours(before, 2.0, RigidityConfig()),
     }
-    assert losses_of(prediction, {"target": observations["target"]}, ObjectiveConfig()).keys() == {
-        "recon",
-        "offset",
-        "gates",
-    }
-    assert losses_of(prediction, observations, ObjectiveConfig()).keys() == {*NAMES[:4], "gates"}, "the others are off"
+    assert losses_of(prediction, {"target": observations["target"]}, ObjectiveConfig()).keys() == {"recon", "offset"}
+    assert losses_of(prediction, observations, ObjectiveConfig()).keys() == {*NAMES[:4]}, "the others are off"
     losses = losses_of(prediction, observations, ObjectiveConfig(rigid_weight=1, rotation_weight=1, isometry_weight=1))
     assert list(losses) == NAMES
     for name, loss in losses.items():
@@ -101,7 +95,7 @@ def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
 
 
 def test_weights_of__are_those_of_the_settings():
-    config = ObjectiveConfig(flow_weight=2.0, mask_weight=3.0, offset_weight=4.0, gate_weight=5.0)
+    config = ObjectiveConfig(flow_weight=2.0, mask_weight=3.0, offset_weight=4.0)
     assert weights_of(config) == {
         "recon": 1,
         "flow": 2,
@@ -110,7 +104,6 @@ def test_weights_of__are_those_of_the_settings():
         "rigid": 0,
         "rotation": 0,
         "isometry": 0,
-        "gates": 5,
     }
     with pytest.raises(ValueError, match=r"`flow_weight` must be a number in \[0, inf\), got -1"):
         ObjectiveConfig(flow_weight=-1)

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi.method.transformation_cache import CacheConfig, hash_matrix, transformation_cache
+from benchmarks.field.transformation_cache import CacheConfig, hash_matrix, transformation_cache
 from tests.assertions import assert_close
 from tests.scenes.gaussians import make_wide_scene, to_gaussians
 
@@ -70,12 +70,3 @@ def test_transformation_cache__gradients_agree_with_central_differences(name):
     ends = [reference({**values, name: values[name] + s * step * direction})[:, 3:] for s in (1, -1)]
     expected = np.vdot(weight, ends[0] - ends[1]) / (2 * step)
     assert np.vdot(np.asarray(dr.grad(p[name])), direction) == pytest.approx(expected, rel=1e-4)
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [({"levels": 0}, "`levels` must be at least 1, got 0"), ({"coarsest": 0.0}, "`coarsest` must be a number in")],
-)
-def test_CacheConfig__refuses_what_is_out_of_range(given, message):
-    with pytest.raises(ValueError, match=message):
-        CacheConfig(**given)

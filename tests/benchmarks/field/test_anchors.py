@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
-import pytest
 
-from morgs_mi.method.anchors import AnchorConfig, anchor_matrix, anchored_motion
+from benchmarks.field.anchors import AnchorConfig, anchor_matrix, anchored_motion
 from tests.assertions import assert_close
 from tests.scenes.gaussians import make_wide_scene, to_gaussians
 
@@ -37,16 +36,3 @@ def test_anchored_motion__sums_the_rounded_motions_of_the_levels():
     found, turned = model.motion({"translation": mi.TensorXf(translation), "rotation": mi.TensorXf(rotation)})
     assert_close(np.asarray(found), np.tile([1.0, 0, -0.4], (len(gaussians), 1)), atol=1e-6)
     assert_close(np.asarray(turned), np.tile([0, 0.25, 0, 0.5], (len(gaussians), 1)), atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"levels": 0}, "`levels` must be a number in \\[1, inf\\), got 0"),
-        ({"ratio": 1}, "`ratio` must be a number in \\[2, inf\\), got 1"),
-        ({"translation_step": -0.1}, "`translation_step` must be a number in \\[0, inf\\), got -0.1"),
-    ],
-)
-def test_AnchorConfig__refuses_what_is_out_of_range(given, message):
-    with pytest.raises(ValueError, match=message):
-        AnchorConfig(**given)

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi.method.motion_grid import GridConfig, bits, corner_matrix, motion_grid
+from benchmarks.field.motion_grid import GridConfig, bits, corner_matrix, motion_grid
 from tests.assertions import assert_close
 from tests.scenes.gaussians import make_wide_scene, to_gaussians
 
@@ -73,17 +73,3 @@ def test_motion_grid__moves_in_steps():
     displacement, rotation = model.motion({**model.parameters, "translation": corner_values})
     assert_close(displacement, np.full((30, 3), 3 * 0.01 * extent), atol=1e-6)
     assert not np.asarray(rotation).any()
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"cells": ()}, "`cells` must have one level or more, got none"),
-        ({"cells": (-1.0,)}, "`cells` must be a number in"),
-        ({"scale": 0.0}, "`scale` must be a number in"),
-        ({"rate_weight": -1.0}, "`rate_weight` must be a number in"),
-    ],
-)
-def test_GridConfig__refuses_what_is_out_of_range(given, message):
-    with pytest.raises(ValueError, match=message):
-        GridConfig(**given)

@@ -21,12 +21,12 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse import csr_array, hstack
 
+from benchmarks.field.shared import corners, quantised
 from morgs_mi.core.attributes import sigmoid
-from morgs_mi.core.checks import check_number
 from morgs_mi.core.gaussians import Gaussians, repeat_each
 from morgs_mi.core.types import Float, Tensor
-from morgs_mi.method.gates import quantised
-from morgs_mi.method.motion_model import MotionModel, corners, sparse_product
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
 
 __all__ = ["GridConfig", "bits", "corner_matrix", "motion_grid"]
 
@@ -55,15 +55,9 @@ class GridConfig:
     rate_weight: float = 1e-4
     """Weight of the bits per Gaussian."""
 
-    def __post_init__(self) -> None:
-        if not self.cells:
-            raise ValueError("GridConfig(): `cells` must have one level or more, got none; name a side in extents.")
-        for side in self.cells:
-            check_number("GridConfig()", "cells", side, "(0, inf)")
-        for name in ("translation_step", "rotation_step", "scale"):
-            check_number("GridConfig()", name, getattr(self, name), "(0, inf)")
-        for name in ("translation_rate", "rotation_rate", "scale_rate", "rate_weight"):
-            check_number("GridConfig()", name, getattr(self, name), "[0, inf)")
+
+# Beside the default, most motion is known when the grid begins.
+_SLOW = GridConfig(translation_rate=5e-4, rotation_rate=2e-3)
 
 
 def motion_grid(gaussians: Gaussians, extent: float, config: GridConfig) -> MotionModel:
@@ -96,6 +90,16 @@ def motion_grid(gaussians: Gaussians, extent: float, config: GridConfig) -> Moti
         motion,
         rate,
     )
+
+
+@MOTION_MODELS.register("grid")
+def _grid(argument: str, config: MotionConfig) -> MotionModelFactory:
+    return lambda gaussians, extent, rng: motion_grid(gaussians, extent, GridConfig())
+
+
+@MOTION_MODELS.register("grid-slow")
+def _slow_grid(argument: str, config: MotionConfig) -> MotionModelFactory:
+    return lambda gaussians, extent, rng: motion_grid(gaussians, extent, _SLOW)
 
 
 def bits(x: Float, scale: Float) -> Float:

@@ -19,10 +19,11 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse import csr_array
 
-from morgs_mi.core.checks import check_number
+from benchmarks.field.shared import corners
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.method.motion_model import MotionModel, corners, sparse_product
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
 
 __all__ = ["CacheConfig", "hash_matrix", "transformation_cache"]
 
@@ -52,15 +53,6 @@ class CacheConfig:
     """Learning rate of the network's weights at the start; it falls to a tenth."""
     table_rate: float = 0.1
     """Learning rate of the tables, likewise."""
-
-    def __post_init__(self) -> None:
-        for name in ("levels", "table", "features", "hidden"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"CacheConfig(): `{name}` must be at least 1, got {getattr(self, name)}.")
-        for name in ("coarsest", "spread", "displacement"):
-            check_number("CacheConfig()", name, getattr(self, name), "(0, inf)")
-        for name in ("rate", "table_rate"):
-            check_number("CacheConfig()", name, getattr(self, name), "[0, inf)")
 
 
 def transformation_cache(
@@ -95,6 +87,11 @@ def transformation_cache(
 
     rates = dict.fromkeys(start, config.rate) | {"table": config.table_rate}
     return MotionModel({name: from_numpy(mi.TensorXf, value) for name, value in start.items()}, rates, motion)
+
+
+@MOTION_MODELS.register("cache")
+def _cache(argument: str, config: MotionConfig) -> MotionModelFactory:
+    return lambda gaussians, extent, rng: transformation_cache(gaussians, extent, rng, CacheConfig())
 
 
 def hash_matrix(points: np.ndarray, sides: list[float], table: int) -> csr_array:

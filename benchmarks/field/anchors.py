@@ -21,11 +21,11 @@ import numpy as np
 from scipy.sparse import csr_array, hstack
 from scipy.spatial import KDTree
 
-from morgs_mi.core.checks import check_number
+from benchmarks.field.shared import quantised
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.z_order import equal_cells, z_order
-from morgs_mi.method.gates import quantised
-from morgs_mi.method.motion_model import MotionModel, sparse_product
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
 
 __all__ = ["AnchorConfig", "anchor_matrix", "anchored_motion"]
 
@@ -49,12 +49,6 @@ class AnchorConfig:
     rotation_rate: float = 8e-3
     """Learning rate of the rotations, likewise."""
 
-    def __post_init__(self) -> None:
-        for name, allowed in (("levels", "[1, inf)"), ("gaussians", "[1, inf)"), ("ratio", "[2, inf)")):
-            check_number("AnchorConfig()", name, getattr(self, name), allowed)
-        for name in ("translation_step", "rotation_step", "translation_rate", "rotation_rate"):
-            check_number("AnchorConfig()", name, getattr(self, name), "[0, inf)")
-
 
 def anchored_motion(gaussians: Gaussians, extent: float, config: AnchorConfig) -> MotionModel:
     """Return the model of N Gaussians of the previous frame; `extent` of the scene in world units."""
@@ -69,6 +63,11 @@ def anchored_motion(gaussians: Gaussians, extent: float, config: AnchorConfig) -
         {"translation": config.translation_rate * extent, "rotation": config.rotation_rate},
         lambda p: tuple(sparse_product(anchors, quantised(p[name], step)) for name, step in steps.items()),
     )
+
+
+@MOTION_MODELS.register("anchors")
+def _anchors(argument: str, config: MotionConfig) -> MotionModelFactory:
+    return lambda gaussians, extent, rng: anchored_motion(gaussians, extent, AnchorConfig())
 
 
 def anchor_matrix(points: np.ndarray, counts: Sequence[int]) -> tuple[csr_array, int]:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import mitsuba as mi
 import numpy as np
-import pytest
 
-from morgs_mi.method.hicom import HicomConfig, cell_matrix, coherent_motion
+from benchmarks.field.hicom import HicomConfig, cell_matrix, coherent_motion
 from tests.assertions import assert_close
 from tests.scenes.gaussians import make_wide_scene, to_gaussians
 
@@ -34,16 +33,3 @@ def test_coherent_motion__sums_the_levels():
     assert 0 < inside.sum() < len(gaussians)
     assert_close(fine[inside], np.tile(np.array([0.5, 0, 0]), (inside.sum(), 1)), atol=1e-6)
     assert not np.asarray(rotation).any()
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"cells": ()}, "`cells` must have one level or more, got none"),
-        ({"cells": (0.1, 0.0)}, "`cells` must be a number in \\(0, inf\\), got 0.0"),
-        ({"rotation_rate": -1.0}, "`rotation_rate` must be a number in"),
-    ],
-)
-def test_HicomConfig__refuses_what_is_out_of_range(given, message):
-    with pytest.raises(ValueError, match=message):
-        HicomConfig(**given)

@@ -18,9 +18,9 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse import csr_array, hstack
 
-from morgs_mi.core.checks import check_number
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.method.motion_model import MotionModel, sparse_product
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
 
 __all__ = ["HicomConfig", "cell_matrix", "coherent_motion"]
 
@@ -36,14 +36,6 @@ class HicomConfig:
     rotation_rate: float = 8e-3
     """Learning rate of the rotations at the start; it falls to a tenth."""
 
-    def __post_init__(self) -> None:
-        if not self.cells:
-            raise ValueError("HicomConfig(): `cells` must have one level or more, got none; name a side in extents.")
-        for side in self.cells:
-            check_number("HicomConfig()", "cells", side, "(0, inf)")
-        for name in ("translation_rate", "rotation_rate"):
-            check_number("HicomConfig()", name, getattr(self, name), "[0, inf)")
-
 
 def coherent_motion(gaussians: Gaussians, extent: float, config: HicomConfig) -> MotionModel:
     """Return the model of N Gaussians; `extent` of the scene in world units."""
@@ -57,6 +49,11 @@ def coherent_motion(gaussians: Gaussians, extent: float, config: HicomConfig) ->
         {"translation": config.translation_rate * extent, "rotation": config.rotation_rate},
         lambda p: (sparse_product(cells, p["translation"]), sparse_product(cells, p["rotation"])),
     )
+
+
+@MOTION_MODELS.register("hicom")
+def _hicom(argument: str, config: MotionConfig) -> MotionModelFactory:
+    return lambda gaussians, extent, rng: coherent_motion(gaussians, extent, HicomConfig())
 
 
 def cell_matrix(points: np.ndarray, sides: Sequence[float]) -> csr_array:

@@ -1,0 +1,46 @@
+"""A ball that moves as a whole into the next frame, for tests of shared motion."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from morgs_mi import Gaussians, RenderConfig
+from morgs_mi.fit.config import DensityConfig, FitConfig
+from morgs_mi.fit.later_frame import FrameProblem, LaterFrame, fit_later_frame
+from morgs_mi.losses.ssim import Target
+from morgs_mi.method.active_set import full_active_set
+from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.motion_start import MotionStart
+from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
+
+SHIFT = np.array([0.06, -0.03, 0.02], np.float32)
+EXTENT = 3.0
+PLAIN = MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False)
+FIT = FitConfig(sh_degree=0, epochs=8, density=DensityConfig(later_frames=False))
+
+
+def shifted_ball() -> Gaussians:
+    """Return the ball after its motion."""
+    ball = opaque_ball()
+    return replace(ball, means=np.asarray(ball.means) + SHIFT)
+
+
+def fit_shifted(motion: MotionConfig, start: MotionStart | None = None, config: FitConfig = FIT) -> LaterFrame:
+    """Fit the ball to images of its shifted self, with the same bytes on every run."""
+    before = opaque_ball()
+    active = full_active_set(before, dict(enumerate(views())), RenderConfig(reproducible=True))
+    targets = {view: Target(image) for view, image in enumerate(images_of(shifted_ball()))}
+    problem = FrameProblem(before, active, targets, {}, start, EXTENT)
+    return fit_later_frame(problem, config, motion, np.random.default_rng(0))
+
+
+def motion_error(found: LaterFrame) -> float:
+    """Return the mean error of the displacements, in world units."""
+    return float(np.linalg.norm(np.asarray(found.gaussians.motion) - SHIFT, axis=1).mean())
+
+
+def psnr_of(found: LaterFrame) -> float:
+    """Return the mean PSNR against the shifted ball, in dB."""
+    return mean_psnr(found.gaussians, images_of(shifted_ball()))
