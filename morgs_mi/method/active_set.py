@@ -22,9 +22,9 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.method.boxes import Boxes, boxes_around
+from morgs_mi.method.boxes import boxes_around
 from morgs_mi.method.flow import choose_key_views
-from morgs_mi.method.responsibility import responsibility
+from morgs_mi.method.responsibility import ChangedView, responsibility
 from morgs_mi.render.active_view import ActiveView, make_active_view
 from morgs_mi.render.config import RenderConfig
 
@@ -113,16 +113,19 @@ def find_active_set(
     config = config or ActiveSetConfig()
     if sum(c.mean() for c in changes.values()) > config.max_changed * len(cameras):
         return full_active_set(gaussians, cameras, render)
-    boxes = {view: boxes_around(gaussians, camera, render, config.core) for view, camera in cameras.items()}
-    shares = responsibility(gaussians, cameras, changes, boxes, render, config.min_weight)
+    changed = {
+        v: ChangedView(camera, changes[v], boxes_around(gaussians, camera, render, config.core))
+        for v, camera in cameras.items()
+    }
+    shares = responsibility(gaussians, changed.values(), render, config.min_weight)
     active = shares > config.min_responsibility
     if gaussians.logit_confidence is not None:
         active |= np.asarray(gaussians.logit_confidence) > 0
-    for view, box in boxes.items():
-        unexplained = _unexplained(changes[view], box.union(active, changes[view].shape), config)
+    for view in changed.values():
+        unexplained = _unexplained(view.change, view.boxes.union(active, view.change.shape), config)
         if unexplained.any():
-            active |= np.asarray(box.covered(unexplained) > 0.5 * box.area)
-    drawn = _drawn(active, shares > config.quiet_responsibility, cameras, boxes, changes, config)
+            active |= np.asarray(view.boxes.covered(unexplained) > 0.5 * view.boxes.area)
+    drawn = _drawn(active, shares > config.quiet_responsibility, changed, config)
     static = with_zero_motion(gaussians.select(~active))
     views = {
         view: make_active_view(cameras[view], mask, static, channels[view], render)
@@ -139,18 +142,13 @@ def with_zero_motion(gaussians: Gaussians) -> Gaussians:
 
 
 def _drawn(
-    active: np.ndarray,
-    changing: np.ndarray,
-    cameras: Mapping[int, Camera],
-    boxes: Mapping[int, Boxes],
-    changes: Mapping[int, np.ndarray],
-    config: ActiveSetConfig,
+    active: np.ndarray, changing: np.ndarray, views: Mapping[int, ChangedView], config: ActiveSetConfig
 ) -> dict[int, np.ndarray]:
     """Return the masks [H, W] of what is rendered, by view index: changes, and boxes of active Gaussians [N]."""
-    views = list(cameras)
-    some = {views[k] for k in choose_key_views([cameras[v] for v in views], config.quiet_views)}
-    chosen = {view: active if view in some else active & changing for view in views}
-    return {view: box.union(chosen[view], changes[view].shape) | changes[view] for view, box in boxes.items()}
+    indices = list(views)
+    some = {indices[k] for k in choose_key_views([view.camera for view in views.values()], config.quiet_views)}
+    chosen = {v: active if v in some else active & changing for v in views}
+    return {v: view.boxes.union(chosen[v], view.change.shape) | view.change for v, view in views.items()}
 
 
 def _unexplained(change: np.ndarray, covered: np.ndarray, config: ActiveSetConfig) -> np.ndarray:

@@ -15,7 +15,8 @@ Large views are rendered at a fraction of their resolution, where c_v is the cha
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
+from dataclasses import dataclass
 
 import cv2
 import drjit as dr
@@ -29,42 +30,49 @@ from morgs_mi.render.backproject import backproject
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.region import Region
 
-__all__ = ["responsibility"]
+__all__ = ["ChangedView", "responsibility"]
+
+
+@dataclass(frozen=True, eq=False)
+class ChangedView:
+    """A view, its changed pixels and the Gaussians in it.
+
+    Attributes:
+        camera: the camera.
+        change: mask of the changed pixels, bool [H, W].
+        boxes: boxes of the N Gaussians.
+    """
+
+    camera: Camera
+    change: np.ndarray
+    boxes: Boxes
 
 
 def responsibility(
-    gaussians: Gaussians,
-    cameras: Mapping[int, Camera],
-    changes: Mapping[int, np.ndarray],
-    boxes: Mapping[int, Boxes],
-    render: RenderConfig,
-    min_weight: float,
-    width: int = 640,
+    gaussians: Gaussians, views: Iterable[ChangedView], render: RenderConfig, min_weight: float, width: int = 640
 ) -> np.ndarray:
     """Return the responsibility r [N] of each Gaussian for the changes, from 0 to 1; 0 for hidden ones.
 
     Args:
         gaussians: N Gaussians of the previous frame, detached.
-        cameras: V cameras, by view index.
-        changes: masks of their changed pixels, bool [H, W], by view index.
-        boxes: boxes of the Gaussians in these views, by view index.
+        views: V views with the boxes of these Gaussians.
         render: cut-offs.
         min_weight: blend weight summed over all changed blocks, in px, below which a Gaussian counts as hidden.
         width: views are reduced by the largest whole factor that leaves this width, in px.
     """
     changed, weight = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), np.float32)
     near, area = dr.zeros(mi.Float, len(gaussians)), dr.zeros(mi.Float, len(gaussians))
-    for view, camera in cameras.items():
-        area += boxes[view].area
-        if not changes[view].any():
+    for view in views:
+        area += view.boxes.area
+        if not view.change.any():
             continue
-        factor = max(camera.width // width, 1)
-        c = _reduced(changes[view], factor)
+        factor = max(view.camera.width // width, 1)
+        c = _reduced(view.change, factor)
         region = Region(c > 0, render)
-        small = camera.resized(c.shape[1], c.shape[0])
+        small = view.camera.resized(c.shape[1], c.shape[0])
         sums = backproject(gaussians, small, region.crop(np.stack([c, np.ones_like(c)], axis=-1)), render, region)
         changed, weight = changed + factor**2 * sums[:, 0], weight + factor**2 * sums[:, 1]
-        near += boxes[view].covered(_enlarged(region.mask, changes[view].shape))
+        near += view.boxes.covered(_enlarged(region.mask, view.change.shape))
     seen = weight > min_weight
     # At least 1: the box of a Gaussian beside the view may be empty, although it reaches into the view.
     elsewhere = np.maximum(np.asarray(area / dr.maximum(near, 1)), 1)

@@ -7,7 +7,7 @@ import pytest
 
 from morgs_mi import RenderConfig
 from morgs_mi.method.boxes import boxes_around
-from morgs_mi.method.responsibility import responsibility
+from morgs_mi.method.responsibility import ChangedView, responsibility
 from morgs_mi.render.backproject import backproject
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
@@ -26,8 +26,8 @@ def gaussians():
 
 
 def responsibility_for(gaussians, changes, width=640):
-    boxes = {view: boxes_around(gaussians, camera, RENDER, CORE) for view, camera in CAMERAS.items()}
-    return responsibility(gaussians, CAMERAS, changes, boxes, RENDER, 0.2, width)
+    views = (ChangedView(c, changes[v], boxes_around(gaussians, c, RENDER, CORE)) for v, c in CAMERAS.items())
+    return responsibility(gaussians, views, RENDER, 0.2, width)
 
 
 def exact_ratio(gaussians, changes):
