@@ -33,8 +33,8 @@ BASE = StreamConfig(
 )
 # Values that act on a clip this small, where the default rule (not x, x + 1, 3 x) gives none.
 VALUES: dict[str, Any] = {
-    "motion.flow_method": "farneback",
-    "motion.mask_method": "superpixels",
+    "motion.flow_method": "dis-ultrafast",
+    "motion.mask_method": "superpixels+grabcut",
     "fit.objective.rigid_weight": 1.0,
     "fit.objective.rotation_weight": 1.0,
     "fit.objective.isometry_weight": 1.0,
@@ -72,7 +72,6 @@ ELSEWHERE: dict[str, str] = {
     "fit.refinement": "cameras are refined by the recorder: tests/calibration/test_refine.py",
     "fit.exposure": "the tests of the loop have cameras that differ: tests/test_stream_loop.py",
     "fit.exposures": "not estimated by default: tests/method/test_exposure.py, tests/fit/test_balance.py",
-    "motion.flow.farneback": "a method that is not the default: tests/method/flow_sources",
     "motion.active_set.min_explained": "no change here is unexplained: tests/method/test_active_set.py",
     "fit.noise_aware": "images without noise here: tests/fit/test_first_settings.py",
     "motion.active_set.min_cluster": "no change here is unexplained: tests/method/test_active_set.py",

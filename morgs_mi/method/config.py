@@ -52,7 +52,7 @@ class MotionConfig:
     """Source of optical flow: a method of OpenCV (see docs/flow.md), files:FOLDER, or onnx:FILE for a network
     (onnx-unit:FILE or onnx-signed:FILE if it takes values from 0 or -1 to 1 instead of bytes)."""
     mask_method: str = "grabcut"
-    """Refinement of flow masks to objects: none, grabcut, superpixels, superpixels+grabcut, or
+    """Refinement of flow masks to objects: none, grabcut, superpixels+grabcut, or
     sam2:ENCODER.onnx,DECODER.onnx (see docs/masks.md)."""
     key_views: int = 4
     """Number of cameras with optical flow and masks."""

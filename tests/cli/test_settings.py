@@ -62,7 +62,7 @@ def test_fit__overrides_defaults_by_preset_by_file_by_options(tmp_path: Path, ru
                 "--sh-degree",
                 2,
                 "--flow",
-                "farneback",
+                "rlof",
                 "--masks",
                 "none",
                 "--quality",

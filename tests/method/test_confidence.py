@@ -52,9 +52,9 @@ def test_motion_mask__passes_its_config_to_threshold_and_refiner():
     previous, image, _ = moving_disc(120, 160, (3, 2), CAMERA_NOISE)
     motion = observe_flow(image, previous).motion
     for config in (MaskConfig(floor=20), MaskConfig(superpixel_share=0.2)):
-        expected = mask_refiner("superpixels", config)(image, flow_mask(motion, config=config))
-        np.testing.assert_array_equal(motion_mask(image, motion, method="superpixels", config=config), expected)
-        assert not np.array_equal(expected, motion_mask(image, motion, method="superpixels"))
+        expected = mask_refiner("superpixels+grabcut", config)(image, flow_mask(motion, config=config))
+        np.testing.assert_array_equal(motion_mask(image, motion, method="superpixels+grabcut", config=config), expected)
+        assert not np.array_equal(expected, motion_mask(image, motion, method="superpixels+grabcut"))
 
 
 def test_observe_key_views__masks_are_those_of_the_configured_method():

@@ -22,17 +22,13 @@ class FlowConfig:
     """Side of an image in pixels below which OpenCV's methods have too little to match: the flow is zero."""
     fine_width: int = 480
     """Width in pixels up to which `dis` goes to full resolution; in wider images it stops at half resolution."""
-    farneback_levels: int = 5
-    """Pyramid levels of `farneback`."""
-    farneback_window: int = 15
-    """Averaging window of `farneback` in pixels."""
     consistency_relative: float = 0.01
     """Forward-backward check: tolerated squared mismatch as a share of the squared lengths of both flows."""
     consistency_absolute: float = 0.5
     """Forward-backward check: tolerated squared mismatch of the shortest flows, px^2."""
 
     def __post_init__(self) -> None:
-        least = {"min_side": _LEAST_SIDE, "fine_width": 0, "farneback_levels": 1, "farneback_window": 1}
+        least = {"min_side": _LEAST_SIDE, "fine_width": 0}
         for name, bound in (least | {"consistency_relative": 0, "consistency_absolute": 0}).items():
             if not getattr(self, name) >= bound:
                 raise ValueError(f"FlowConfig(): `{name}` must be at least {bound}, got {getattr(self, name)}.")

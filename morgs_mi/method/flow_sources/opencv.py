@@ -19,9 +19,6 @@ from morgs_mi.method.flow_sources.registry import FLOW_SOURCES, FlowSource, both
 
 __all__ = ["FLOW_METHODS", "optical_flow"]
 
-# PCAFlow writes its 18 x 14 coefficients into a quarter of the width and height: out of bounds below this size.
-_PCA_SIZE = (72, 56)
-
 # Given None, OpenCV allocates its result; OpenCV's type stubs do not allow for it.
 _ALLOCATE: Any = None
 
@@ -33,15 +30,6 @@ def _on_gray(method: _Method) -> _Method:
         return method(cv2.cvtColor(a, cv2.COLOR_RGB2GRAY), cv2.cvtColor(b, cv2.COLOR_RGB2GRAY), config)
 
     return on_gray
-
-
-def _padded(
-    width: int, height: int, method: Callable[[np.ndarray, np.ndarray], np.ndarray], a: np.ndarray, b: np.ndarray
-) -> np.ndarray:
-    """Return the flow of images that are padded below and on the right to at least `width` x `height`."""
-    down, right = max(0, height - a.shape[0]), max(0, width - a.shape[1])
-    padded = (cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_REPLICATE) for image in (a, b))
-    return method(*padded)[: a.shape[0], : a.shape[1]]
 
 
 def _dis(preset: int, finest: Callable[[int, FlowConfig], int] | None = None) -> _Method:
@@ -57,32 +45,11 @@ def _dis(preset: int, finest: Callable[[int, FlowConfig], int] | None = None) ->
         if finest is not None:
             method.setFinestScale(finest(a.shape[1], config))
         # DIS chooses its coarsest level by the width alone and crashes where the height is less than a patch.
-        return _padded(0, a.shape[1] // 2, lambda a, b: method.calc(a, b, _ALLOCATE), a, b)
+        rows, missing = a.shape[0], max(0, a.shape[1] // 2 - a.shape[0])
+        a, b = (cv2.copyMakeBorder(image, 0, missing, 0, 0, cv2.BORDER_REPLICATE) for image in (a, b))
+        return method.calc(a, b, _ALLOCATE)[:rows]
 
     return _on_gray(flow)
-
-
-def _farneback(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
-    return cv2.calcOpticalFlowFarneback(
-        a,
-        b,
-        _ALLOCATE,
-        pyr_scale=0.5,
-        levels=config.farneback_levels,
-        winsize=config.farneback_window,
-        iterations=3,
-        poly_n=5,
-        poly_sigma=1.2,
-        flags=0,
-    )
-
-
-def _pcaflow(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
-    method = cv2.optflow.createOptFlow_PCAFlow()
-    try:
-        return _padded(*_PCA_SIZE, lambda a, b: method.calc(a, b, _ALLOCATE), a, b)
-    except cv2.error:  # it found no corner or lost every one: there is no sign of motion
-        return np.zeros((*a.shape[:2], 2), np.float32)
 
 
 def _rlof(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
@@ -99,24 +66,16 @@ def _deepflow(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
     return cv2.optflow.createOptFlow_DeepFlow().calc(a, b, _ALLOCATE)
 
 
-def _tvl1(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
-    return cv2.optflow.createOptFlow_DualTVL1().calc(a, b, _ALLOCATE)
-
-
-# OpenCV's other methods (sparse-to-dense, SimpleFlow, RLOF with other interpolations) crash or return NaN on images
-# with too little to match: see docs/experiments/flow.md. All take RGB as bytes.
+# OpenCV's other methods are no better at any cost (Farneback, PCAFlow, dual TV-L1), or crash or return NaN on images
+# with too little to match (sparse-to-dense, SimpleFlow, RLOF with other interpolations): see docs/experiments/flow.md.
+# All take RGB as bytes.
 FLOW_METHODS: dict[str, _Method] = {
     # The presets stop at half or quarter resolution, where patches of 8 pixels miss small objects in small images.
     "dis": _dis(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM, lambda width, config: int(width > config.fine_width)),
     "dis-fine": _dis(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM, lambda width, config: 0),
     "dis-ultrafast": _dis(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST),
-    "dis-fast": _dis(cv2.DISOPTICAL_FLOW_PRESET_FAST),
-    "dis-medium": _dis(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM),
-    "farneback": _on_gray(_farneback),
-    "pcaflow": _on_gray(_pcaflow),
     "rlof": _rlof,
     "deepflow": _on_gray(_deepflow),
-    "tvl1": _on_gray(_tvl1),
 }
 
 

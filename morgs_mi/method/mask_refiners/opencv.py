@@ -92,11 +92,6 @@ def _grabcut(argument: str, config: MaskConfig) -> MaskRefiner:
     return lambda image, mask: mask | refine_mask(image, mask, config)
 
 
-@MASK_REFINERS.register("superpixels")
-def _superpixels(argument: str, config: MaskConfig) -> MaskRefiner:
-    return lambda image, mask: vote_superpixels(image, mask, config)
-
-
 @MASK_REFINERS.register("superpixels+grabcut")
 def _both(argument: str, config: MaskConfig) -> MaskRefiner:
     return lambda image, mask: vote_superpixels(image, mask, config) | refine_mask(image, mask, config)

@@ -74,7 +74,7 @@ def test_report_flow__errors_are_those_of_the_flow_observation(clip):
 def test_flow_command__writes_tables_json_and_plot(clip, tmp_path, capsys):
     pytest.importorskip("matplotlib")
     path, plot = tmp_path / "flow.json", tmp_path / "flow.png"
-    methods = ["--methods", "dis-ultrafast", "farneback"]
+    methods = ["--methods", "dis-ultrafast", "dis"]
     assert cli.main(["flow", str(clip), str(clip), *methods, "--json", str(path), "--plot", str(plot)]) == 0
     value = json.loads(path.read_text())
     result = FlowResult.from_dict(value)
@@ -112,4 +112,4 @@ def test_flow_page__quotes_the_committed_figures():
     text = page("flow.md")
     for clip in FlowResult.from_dict(result).clips:
         assert markdown_table(clip) in text
-        assert [row.method for row in clip.rows] == list(FLOW_METHODS)
+        assert {*FLOW_METHODS} <= {row.method for row in clip.rows}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -13,15 +14,13 @@ from tests.method.moving_disc import moving_disc, texture
 
 
 @pytest.mark.parametrize("method", FLOW_METHODS)
-@pytest.mark.parametrize("shift", [(5, 3), (-4, 0), (0, -2)])
-def test_optical_flow__recovers_a_translation_with_its_sign(method, shift):
-    dx, dy = shift
+def test_optical_flow__recovers_a_translation_with_its_sign(method):
     scene = texture(140, 180, seed=1)
-    previous, image = scene[10:130, 10:170], scene[10 - dy : 130 - dy, 10 - dx : 170 - dx]
-    motion = -optical_flow(image, previous, method)
-    error = np.linalg.norm(motion - shift, axis=-1)[10:-10, 10:-10]
-    # `dis-ultrafast` and `dis-fast` stop at a quarter of the resolution.
-    assert np.median(error) < 0.5
+    for dx, dy in ((5, 3), (-4, 0), (0, -2)):
+        previous, image = scene[10:130, 10:170], scene[10 - dy : 130 - dy, 10 - dx : 170 - dx]
+        motion = -optical_flow(image, previous, method)
+        error = np.linalg.norm(motion - (dx, dy), axis=-1)[10:-10, 10:-10]
+        assert np.median(error) < 0.5, (dx, dy)  # `dis-ultrafast` stops at a quarter of the resolution
 
 
 def test_observe_flow__motion_is_the_shift_on_frame_ts_grid():
@@ -48,7 +47,7 @@ def test_optical_flow__float_and_bytes_agree():
 
 
 @pytest.mark.parametrize("method", FLOW_METHODS)
-@pytest.mark.parametrize("size", [(1, 1), (1, 40), (15, 15), (16, 16), (16, 90), (90, 16), (24, 24), (31, 70)])
+@pytest.mark.parametrize("size", [(1, 40), (16, 90), (90, 16)])
 def test_optical_flow__is_finite_at_any_size(method, size):
     rng = np.random.default_rng(0)
     image, previous = rng.integers(0, 255, (2, *size, 3), dtype=np.uint8)
@@ -68,7 +67,7 @@ def test_optical_flow__is_finite_with_nothing_to_match(method):
     for previous, following in (*same, (flat, image), (image, flat), (image, scene[70:, 70:])):
         flow = optical_flow(following, previous, method)
         assert np.isfinite(flow).all()
-    # Every method finds no motion between equal images; RLOF and PCAFlow interpolate between sparse matches.
+    # Every method finds no motion between equal images; RLOF interpolates between sparse matches.
     assert np.abs(optical_flow(image, image, method)).max() < 0.1
 
 
@@ -78,7 +77,7 @@ RGB = np.zeros((20, 20, 3), np.uint8)
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ((RGB, RGB, "raft"), "dis-medium.*got 'raft'"),
+        ((RGB, RGB, "raft"), "dis-fine.*got 'raft'"),
         ((RGB, RGB[:18]), "one size"),
         ((RGB[..., 0], RGB[..., 0]), r"RGB .* \(20, 20\)"),
     ],
@@ -92,13 +91,10 @@ def test_optical_flow__rejects_bad_input(arguments, message):
     ("method", "settings"),
     [
         ("dis", {"fine_width": 64}),
-        ("farneback", {"farneback_levels": 1}),
-        ("farneback", {"farneback_window": 31}),
         ("dis-fine", {"min_side": 145}),
     ],
 )
 def test_flow_config__settings_of_a_method_act(method, settings):
-    # At 64 rows, OpenCV reduces Farneback's pyramid to one level.
     previous, image, _ = moving_disc(144, 200, shift=(6, 1))
     flow = optical_flow(image, previous, method)
     changed = optical_flow(image, previous, method, FlowConfig(**settings))
@@ -109,9 +105,11 @@ def test_flow_config__settings_of_a_method_act(method, settings):
 
 def test_flow_config__fine_width_selects_the_finest_level_of_dis():
     previous, image, _ = moving_disc(64, 96, shift=(6, 1))
-    for fine_width, reference in ((96, "dis-fine"), (95, "dis-medium")):
-        flow = optical_flow(image, previous, "dis", FlowConfig(fine_width=fine_width))
-        np.testing.assert_array_equal(flow, optical_flow(image, previous, reference))
+    fine, half = (optical_flow(image, previous, "dis", FlowConfig(fine_width=width)) for width in (96, 95))
+    np.testing.assert_array_equal(fine, optical_flow(image, previous, "dis-fine"))
+    gray = (cv2.cvtColor((255 * a + 0.5).astype(np.uint8), cv2.COLOR_RGB2GRAY) for a in (image, previous))
+    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)  # at half resolution
+    np.testing.assert_array_equal(half, method.calc(*gray, None))
 
 
 def test_flow_config__min_side_is_the_least_side_with_flow():
@@ -124,7 +122,6 @@ def test_flow_config__min_side_is_the_least_side_with_flow():
     ("settings", "message"),
     [
         ({"min_side": 15}, "`min_side` must be at least 16, got 15"),
-        ({"farneback_window": 0}, "`farneback_window` must be at least 1, got 0"),
         ({"consistency_absolute": float("nan")}, "`consistency_absolute` must be at least 0, got nan"),
     ],
 )
