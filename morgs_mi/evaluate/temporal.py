@@ -59,7 +59,7 @@ class StillVariation:
         return VariationScores(render, recorded, float(still.sum() / max(valid.sum(), 1)))
 
 
-# Not `morgs_mi.method.change.changed`, with which the fit selects its work. The score ignores a change of the whole
+# Not `morgs_mi.method.change.change_mask`, with which the fit selects its work. The score ignores a change of the whole
 # image's brightness (it subtracts the median), accepts any noise level, and marks changes above four standard
 # deviations; the fit must react to such a brightness change, assumes static noise of at most a grey level, and marks
 # changes above five. Sharing one definition would change the regions of all published scores.

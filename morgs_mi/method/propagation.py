@@ -62,6 +62,8 @@ def propagate_motion(
     near = problem.neighbours.nearest(config.neighbours)
     rounds = config.rounds if near.size else 0
     views = problem.views_around(_reached(near, np.any([d, before], axis=(0, 2)), rounds), (d, before))
+    if not views:
+        return start
 
     def error_of(d: np.ndarray) -> np.ndarray:
         moved = displaced(problem.gaussians, d)

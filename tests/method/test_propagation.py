@@ -94,6 +94,13 @@ def test_propagate_motion__does_nothing_without_motion_or_views(scene):
     assert propagate_motion(MotionProblem(before, {}, targets, rng), lifted) is lifted
 
 
+def test_propagate_motion__does_nothing_where_no_view_shows_what_may_move(scene):
+    before, moves, views, targets = scene
+    outside = replace(before, means=np.asarray(before.means) - np.float32([0, 0, 50]), motion=SHIFT * moves[:, None])
+    lifted = still(460)
+    assert propagate_motion(MotionProblem(outside, views, targets, np.random.default_rng(0)), lifted) is lifted
+
+
 def test_propagate_motion__leaves_a_single_gaussian_without_neighbours_as_it_is(scene):
     before, _, views, targets = scene
     alone = MotionProblem(before.select(np.array([0])), views, targets, np.random.default_rng(0))
