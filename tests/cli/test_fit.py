@@ -136,6 +136,7 @@ def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
         (["--config", "[render]\nblock_width = 17"], ("bad.toml: `render.block_width` must be 4, 8, 12 or 16",)),
         (["--config", "[motion]\nflow_method = 'no'"], ("bad.toml: `motion.flow_method` must be one of dis,",)),
         (["--config", "[motion]\nmask_method = 'no'"], ("bad.toml: `motion.mask_method` must be one of none,",)),
+        (["--config", "[motion]\nmodel = 'no'"], ("bad.toml: `motion.model` must be one of none",)),
         (["--variant", "cuda_ad_rgb"], ("--variant cuda_ad_rgb cannot be used here", "llvm_ad_rgb")),
         (["--variant", "metal_ad_rgb"], ("--variant metal_ad_rgb cannot be used here", "llvm_ad_rgb")),
     ],
