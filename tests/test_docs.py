@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import json
 import pkgutil
 import re
 from collections.abc import Callable
@@ -22,9 +21,7 @@ PAGES = {
 }
 ROWS = re.findall(r"^\| (\d+) \| [^|]+ \| (`[\w.]+`(?:, `[\w.]+`)*) \|$", PAGES["docs/architecture.md"], re.MULTILINE)
 EQUATIONS = [(number, name) for number, names in ROWS for name in re.findall(r"`([\w.]+)`", names)]
-EXPERIMENTS = {page: text for page, text in PAGES.items() if page.startswith("docs/experiments/")}
 GUIDES = {page: text for page, text in PAGES.items() if re.fullmatch(r"docs/[\w-]+\.md", page)}
-RESULTS = ROOT / "benchmarks/results"
 
 
 def resolve(path: str) -> Any:
@@ -65,10 +62,6 @@ def compiles(example: str) -> bool:
 def offenders(pages: dict[str, str], wrong: Callable[[str, str], list]) -> dict[str, list]:
     """Return what is wrong with each page; pages without mistakes are left out."""
     return {page: found for page, text in pages.items() if (found := wrong(page, text))}
-
-
-def committed(name: str) -> Any:
-    return json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
 
 
 def test_equation_table__has_every_equation():
@@ -117,81 +110,5 @@ def test_pages__examples_compile():
     assert offenders(PAGES, broken) == {}
 
 
-def test_experiments__begin_with_date_commit_and_command():
-    begin = re.compile(
-        r"\s*\d+ (and \d+ )?[A-Z][a-z]+ \d{4},\s+commits?\s+`[0-9a-f]{7}`.*?\bby\b.*?(python -m benchmarks|make demo)",
-        re.DOTALL,
-    )
-
-    def wrong(page: str, text: str) -> list[str]:
-        text = text.partition("## Summary\n" if page.endswith("index.md") else "\n")[2].strip()[:500]
-        return [] if begin.match(text) else [text]
-
-    assert offenders(EXPERIMENTS, wrong) == {}
-
-
-def test_experiments__index_lists_every_page():
-    listed = re.findall(r"^\| \[[^]]+\]\(([\w-]+\.md)\)", PAGES["docs/experiments/index.md"], re.MULTILINE)
-    pages = {path.name for path in (ROOT / "docs/experiments").glob("*.md")}
-    assert sorted(listed) == sorted(pages - {"index.md"})
-
-
 def test_user_pages__hold_no_measurements():
     assert offenders(GUIDES, lambda _, text: re.findall(r"[^.\n]*\d (?:dB|ms|kB)\b[^.\n]*", text)) == {}
-
-
-def test_experiments__quote_the_committed_demo():
-    text, report = PAGES["docs/experiments/index.md"], committed("demo")
-    for name, title in (("full", "ML + MO + MC"), ("plain", "residuals only")):
-        assert demo_row(title, report["comparison"][name]) in text
-    first, last = (report["full"]["frames"][k]["psnr"] for k in (0, -1))
-    assert re.search(rf"goes\s+from {first:.2f} dB\s+to {last:.2f} dB", text)
-    arm = committed("arm")["frames"]
-    text = " ".join(text.split())
-    assert f"from {arm[0]['psnr']:.2f} dB to {arm[-1]['psnr']:.2f} dB over {len(arm)}" in text
-
-
-def demo_row(title: str, scores: dict[str, float]) -> str:
-    moving, still = scores["motion_error_moving"], scores["motion_error_still"]
-    return f"| {title} | {scores['psnr']:.2f} dB | {moving:.2f} px | {still:.2f} px |"
-
-
-def test_experiments__quote_the_committed_gains():
-    clips = committed("method_report")["clips"]
-
-    def scores(preset: str, name: str) -> list[float]:
-        rows = [row for clip in clips for row in clip["rows"] if (row["preset"], row["epochs"]) == (preset, 2)]
-        return [row["mean"][name] for row in rows if row["best"]]
-
-    def gains(name: str) -> str:
-        added = [ours - theirs for ours, theirs in zip(scores("default", name), scores("baseline", name), strict=True)]
-        return f"{min(added):.1f} to {max(added):.1f} dB"
-
-    name = "motion_error_moving"
-    shares = [ours / theirs for ours, theirs in zip(scores("default", name), scores("baseline", name), strict=True)]
-    expected = (
-        f"{gains('psnr')} above residuals alone at their best rates ({gains('psnr_moving')} where things move), with "
-        f"{min(shares):.1f} to {max(shares):.1f} of their motion error, and PSNR falls by "
-        f"{-min(scores('default', 'psnr_slope')):.3f} dB a frame at most"
-    )
-    assert expected in " ".join(PAGES["docs/experiments/index.md"].split())
-
-
-def test_experiments__quote_the_committed_step_times():
-    def row(workload: str) -> str:
-        run = committed(f"render_speed_{workload}")
-        plain = f"{run['plain_step_ms']:.0f} ms" if run.get("plain_step_ms") else "not run"
-        steps = f"| {run['step_ms']:.0f} ms | {run['optimised_step_ms']:.0f} ms "
-        return f"{steps}| {run['ratio_to_yardstick']:.2f} x | {plain} |"
-
-    rows = [row(workload) for workload in ("W1", "W2", "W2b")]
-    assert [row for row in rows if row not in PAGES["docs/experiments/index.md"]] == []
-
-
-def test_experiments__quote_the_committed_frame_times():
-    found = committed("frame_speed")
-    big, small = ([found[size]["runs"][f"default, {n} epochs"] for n in (1, 2)] for size in ("n3dv", "small"))
-    text = " ".join(PAGES["docs/experiments/index.md"].split())
-    assert f"of whose pixels {100 * big[0]['pixels']:.0f} % have to be drawn, one epoch takes" in text
-    assert f"takes {big[0]['seconds']:.1f} s a frame and two epochs {big[1]['seconds']:.1f} s" in text
-    assert f"640x480 they take {small[0]['seconds']:.1f} s and {small[1]['seconds']:.1f} s" in text

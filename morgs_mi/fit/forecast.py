@@ -14,7 +14,7 @@ __all__ = ["Forecast", "angles_to", "forecast", "mean_views", "overlaps", "quali
 
 _WORDS = ("good", "fair", "poor")
 # Limits of good and of fair views between the cameras: loss against the training views in dB, PSNR in dB, and the angle
-# in degrees, of `Forecast.reach`, at which the loss is about as large (`docs/experiments/generalise.md`).
+# in degrees, of `Forecast.reach`, at which the loss is about as large (`docs/experiments/first-frame.md`).
 _LOSSES, _LEAST_PSNR, _ANGLES = (4.0, 8.0), (22.0, 16.0), (9.5, 18.0)
 # Angle that stands for a point that no other camera sees, degrees.
 _UNSEEN = 90.0

@@ -178,7 +178,7 @@ def fill_points(points: Points, views: Sequence[View], count: int, rng: np.rando
     """Return points [count, 3] and their colours: the given ones, resampled, and random ones where views show none.
 
     A view is divided into cells. Those that show no point get random pixels, at the mean depth of the nearest points
-    in the image, which is far better than a random depth (see `docs/experiments/generalise.md`).
+    in the image, which is far better than a random depth (see `docs/experiments/first-frame.md`).
 
     Args:
         points: P points and their colours.

@@ -10,14 +10,12 @@ import numpy as np
 import pytest
 
 from benchmarks.reports.codec import CodecReportConfig, CodecResult, markdown_table, plot_codec, report_codec
-from benchmarks.reports.plots import markdown
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import json_finite
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.render.config import RenderConfig
 from tests.benchmarks.reports.here import Here
-from tests.benchmarks.reports.pages import ROOT, page
 
 QUICK = CodecReportConfig(
     qualities=(4, 40),
@@ -98,35 +96,3 @@ def test_report_codec__refuses_bad_settings(fitted_clip: Path, tmp_path: Path) -
         report_codec([fitted_clip / "capture"], tmp_path, replace(QUICK, frames=1))
     with pytest.raises(ValueError, match="`qualities` must be positive and below the reference's 1000"):
         CodecReportConfig(qualities=(2000,))
-
-
-def groups_table(result: CodecResult) -> str:
-    rows = [(clip.name, next(row for row in clip.rows if row.quality == 1)) for clip in result.clips]
-    names = list(rows[0][1].bytes_by_group)
-    return markdown(
-        ["", *names], [[name, *(f"{row.bytes_by_group[key] / 1e3:.1f}" for key in names)] for name, row in rows]
-    )
-
-
-def speed_table(result: dict) -> str:
-    titles = ("Gaussians", "moving", "kB", "encode ms", "decode ms", "error, px RMS", "largest")
-    cells = [
-        [f"{row['gaussians']}", f"{row['moving']}", f"{row['bytes'] / 1e3:.0f}"]
-        + [f"{row[name]:.0f}" for name in ("encode_ms", "decode_ms")]
-        + [f"{row[name]:.3f}" for name in ("error_px_rms", "error_px_max")]
-        for row in result["rows"]
-    ]
-    return markdown(titles, cells, left=0)
-
-
-def test_codec_page__quotes_the_committed_figures() -> None:
-    text = page("codec.md")
-    report, speed = (
-        json.loads((ROOT / f"benchmarks/results/{name}.json").read_text(encoding="utf-8"))
-        for name in ("codec_report", "codec_speed")
-    )
-    report = CodecResult.from_dict(report)
-    assert groups_table(report) in text
-    assert speed_table(speed) in text
-    for clip in report.clips:
-        assert markdown_table(clip) in text

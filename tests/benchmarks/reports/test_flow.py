@@ -1,4 +1,4 @@
-"""Report on optical flow: errors compared with those of the flow, and the page with the committed figures."""
+"""Report on optical flow: errors compared with those of the flow."""
 
 from __future__ import annotations
 
@@ -15,11 +15,9 @@ from morgs_mi.capture.capture import load_capture
 from morgs_mi.evaluate.metrics import endpoint_error
 from morgs_mi.method.flow import observe_flow
 from morgs_mi.method.flow_sources.files import write_flow
-from morgs_mi.method.flow_sources.opencv import FLOW_METHODS
 from morgs_mi.synth.ground_truth import load_truth
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
-from tests.benchmarks.reports.pages import ROOT, page
 
 
 @pytest.fixture(scope="module")
@@ -105,11 +103,3 @@ def test_report_flow__refuses_a_clip_without_truth(clip, tmp_path, capsys):
 def test_flow_report_config__refuses_empty_settings(arguments, message):
     with pytest.raises(ValueError, match=message):
         FlowReportConfig(**arguments)
-
-
-def test_flow_page__quotes_the_committed_figures():
-    result = json.loads((ROOT / "benchmarks/results/flow_report.json").read_text(encoding="utf-8"))
-    text = page("flow.md")
-    for clip in FlowResult.from_dict(result).clips:
-        assert markdown_table(clip) in text
-        assert {*FLOW_METHODS} <= {row.method for row in clip.rows}

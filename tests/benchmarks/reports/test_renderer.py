@@ -1,4 +1,4 @@
-"""Report on the renderer: errors of the settings, and the page compared with the committed figures."""
+"""Report on the renderer: errors of the settings."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from benchmarks.reports import __main__ as cli
-from benchmarks.reports.renderer import RendererReportConfig, RendererResult, markdown_table
+from benchmarks.reports.renderer import RendererReportConfig, RendererResult
 from benchmarks.workloads import ball
 from tests import tolerances as tol
-from tests.benchmarks.reports.pages import ROOT, page
 
 SMALL = ["--gaussians", "400", "--width", "48", "--height", "32", "--median-scale", "0.1"]
 SMALL += ["--pixels", "200", "--repeats", "1"]
@@ -66,8 +65,3 @@ def test_report_renderer__errors_are_those_of_the_cut_offs(reported):
     no_stop = rows["stop_transmittance", "0"].rounding.gradients
     assert max(error.relative_l2 for error in no_stop.values()) < tol.GRADIENT_REL
     assert min(error.cosine for error in no_stop.values()) > 1 - 1e-6
-
-
-def test_renderer_page__quotes_the_committed_figures():
-    result = json.loads((ROOT / "benchmarks/results/renderer_report.json").read_text(encoding="utf-8"))
-    assert markdown_table(RendererResult.from_dict(result)) in page("renderer-accuracy.md")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -38,20 +37,3 @@ def test_mask_refiner__rejects_unknown_methods(method, message):
 def test_masks_page__lists_every_refiner():
     text = (ROOT / "docs/masks.md").read_text(encoding="utf-8")
     assert [usage for usage in MASK_REFINERS.usages if f"- `{usage}`: " not in text] == []
-
-
-def test_masks_experiment__quotes_the_committed_figures():
-    clips = json.loads((ROOT / "benchmarks/results/masks.json").read_text(encoding="utf-8"))["clips"]
-    text = (ROOT / "docs/experiments/masks.md").read_text(encoding="utf-8")
-
-    def cell(row: dict) -> str:
-        return f"{row['iou']:.2f} ({row['found']:.2f}, {row['true']:.2f})"
-
-    lines = [[f"`{clip['name']}`" for clip in clips]]
-    lines += [[cell(clip["masks"][method]) for clip in clips] for method in (*MASK_REFINERS.names, "lifted")]
-    for start in ("lifted", "as before"):
-        for method in clips[0]["loops"][start]:
-            rows = [clip["loops"][start][method]["held_out"] for clip in clips]
-            lines.append([f"{cell(row)}, {row['psnr_moving']:.2f} dB" for row in rows])
-    for line in lines:
-        assert f"| {' | '.join(line)} |" in text

@@ -1,0 +1,149 @@
+"""Tables of the pages on the method and on the methods of the field."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from benchmarks.pages.results import Scores, committed, fits_by_cell, means_over_cells, spreads
+from benchmarks.reports.plots import markdown, plus_minus
+
+__all__ = ["demo", "drift", "field", "frame_times", "gains", "parts", "search", "unseen"]
+
+
+def demo() -> str:
+    """Return the scores of the demo, with and without motion, offset and confidence."""
+    found = committed("demo")["comparison"]
+    rows = (
+        (title, f"{row['psnr']:.2f} dB", f"{row['motion_error_moving']:.2f} px", f"{row['motion_error_still']:.2f} px")
+        for title, row in (("default", found["full"]), ("residuals alone", found["plain"]))
+    )
+    return markdown(("", "PSNR", "motion error, moving", "still"), rows)
+
+
+def unseen() -> str:
+    """Return the scores of the random scenes that no setting was chosen on, and the spread of their means."""
+    fits = committed("random_scenes")["fits"]
+    digits = {"psnr": 2, "psnr_moving": 2, "confidence_iou": 2, "motion_error_moving": 2}
+    groups = fits_by_cell(fits) | {"mean": means_over_cells(fits, (*digits, "bytes"))}
+    rows = (
+        (name, *spreads(own, digits), f"{np.mean([fit['bytes'] for fit in own]) / 1000:.0f}")
+        for name, own in groups.items()
+    )
+    return markdown(("seed", "PSNR, dB", "moving, dB", "IoU of the confidence", "motion error, px", "kB"), rows)
+
+
+def _best_rates(clip: Scores) -> dict[tuple[str, int], Scores]:
+    """Return the mean scores of a clip by preset and epochs, at the best rates of the preset."""
+    return {(row["preset"], row["epochs"]): row["mean"] for row in clip["rows"] if row["best"]}
+
+
+def gains() -> str:
+    """Return the gains of the default over the tuned baseline, and over the paper's scheme."""
+    rows = []
+    for clip in committed("method_report")["clips"]:
+        for epochs in (2, 8):
+            best = _best_rates(clip)
+            ours, theirs, paper = (best[preset, epochs] for preset in ("default", "baseline", "paper"))
+            added = (f"{ours[name] - theirs[name]:.2f}" for name in ("psnr", "psnr_moving"))
+            share = ours["motion_error_moving"] / theirs["motion_error_moving"]
+            over_paper = ours["psnr_moving"] - paper["psnr_moving"]
+            rows.append((f"`{clip['name']}`", f"{epochs}", *added, f"{share:.2f}", f"{over_paper:.2f}"))
+    titles = "PSNR, dB", "moving, dB", "motion error, share", "moving, over `paper`, dB"
+    return markdown(("clip", "epochs", *titles), rows)
+
+
+def parts() -> str:
+    """Return the scores of the presets with one part more each, at 2 and 8 epochs."""
+    (clip,) = committed("method_parts")["clips"]
+    best, rows = _best_rates(clip), []
+    for preset in ("baseline", "paper", "ml", "ml-mo", "ml-mo-mc"):
+        short, long = best[preset, 2], best[preset, 8]
+        psnrs = (f"{scores[name]:.2f}" for scores in (short, long) for name in ("psnr", "psnr_moving"))
+        iou = "-" if long["confidence_iou"] is None else f"{long['confidence_iou']:.2f}"
+        rest = f"{long['motion_error_moving']:.2f}", iou, f"{long['num_bytes'] / 1000:.1f}"
+        rows.append((f"`{preset}`", *psnrs, *rest))
+    titles = "2 epochs: PSNR, dB", "moving", "8 epochs: PSNR, dB", "moving", "motion error, px", "IoU", "kB"
+    return markdown(("preset", *titles), rows)
+
+
+def search() -> str:
+    """Return the PSNR where things move without and with the coarse search, of every frame and of every second one."""
+    fits = committed("fast_parts")["fits"]
+    cases = [(stride, how) for stride in ("stride_1", "stride_2") for how in ("without", "search")]
+    flat = {name: {f"{s} {how}": fit[s][how]["psnr_moving"] for s, how in cases} for name, fit in fits.items()}
+    digits = {f"{stride} {how}": 2 for stride, how in cases}
+    groups = fits_by_cell(flat) | {"mean": means_over_cells(flat, tuple(digits))}
+    titles = "every frame: without", "with search", "every second frame: without", "with search"
+    return markdown(("seed", *titles), ((name, *spreads(own, digits)) for name, own in groups.items()))
+
+
+def drift() -> str:
+    """Return the quality over thirty frames, of one fit or three."""
+    clips = {name: [row] for name, row in committed("drift")["clips"].items()}
+    clips |= fits_by_cell(committed("drift_fresh")["clips"])
+    rows = []
+    for name, own in clips.items():
+        moving = [np.array(fit["psnr_moving"], float) for fit in own]
+        known = [values[np.isfinite(values)] for values in moving]
+        psnrs = (
+            [np.mean(fit["psnr"]) for fit in own],
+            *([values[at] for values in known] for at in (0, -1)),
+            [values.mean() for values in known],
+        )
+        slope = np.mean([fit["slope_moving_db_a_frame"] for fit in own])
+        iou = np.mean([np.nanmean(np.array(fit["confidence_iou"], float)) for fit in own])
+        means = (f"{np.mean(values):.2f}" for values in psnrs)
+        rows.append((f"`{name}`", f"{len(own)}", *means, f"{slope:+.3f}", f"{iou:.2f}"))
+    titles = "fits", "PSNR, dB", "moving: first", "last", "mean", "slope, dB a frame", "IoU"
+    return markdown(("clip", *titles), rows)
+
+
+def frame_times() -> str:
+    """Return time, quality and bytes of a later frame of a large and a small scene."""
+    found, rows = committed("frame_speed"), []
+    for size in ("n3dv", "small"):
+        about = found[size]["size"]
+        name = f"{about['gaussians']:,}, {about['views']} views of {about['width']}x{about['height']}"
+        for epochs in (1, 2):
+            run = found[size]["runs"][f"default, {epochs} epochs"]
+            shares = (f"{100 * run[key]:.0f} %" for key in ("gaussians", "pixels"))
+            rows.append(
+                (
+                    name,
+                    f"{epochs}",
+                    f"{run['seconds']:.1f}",
+                    f"{run['psnr']:.2f}",
+                    f"{run['bytes'] / 1000:.0f}",
+                    *shares,
+                )
+            )
+    return markdown(("Gaussians", "epochs", "s", "PSNR, dB", "kB", "active Gaussians", "drawn pixels"), rows)
+
+
+def field() -> str:
+    """Return the scores of the methods at 8 epochs: means over the scenes, and the spread of some means."""
+    cells = committed("field")["cells"]
+    jaccard = "Dynamic 3D Gaussians average_jaccard"
+    columns = {
+        "psnr": ("PSNR, dB", 1, 2),
+        "psnr_moving": ("moving, dB", 1, 2),
+        "motion_error_moving": ("motion error, px", 1, 2),
+        "motion_3d_relative_error": ("in 3D, %", 100, 0),
+        jaccard: ("AJ, %", 100, 1),
+        "num_bytes": ("kB", 1e-3, 1),
+        "cpu_s": ("CPU s", 1, 1),
+    }
+    rows = []
+    for name in next(iter(cells.values())):
+        method, epochs = name.split("/")
+        if epochs != "8":
+            continue
+        fits = means_over_cells({cell: found[name] for cell, found in cells.items()}, tuple(columns))
+        row = [f"`{method}`"]
+        for score, (_, factor, digits) in columns.items():
+            values = [factor * fit[score] for fit in fits]
+            mean = factor * np.mean([found[name][score] for found in cells.values()])
+            with_spread = score in ("psnr_moving", jaccard)
+            row.append(plus_minus(values, digits) if with_spread else f"{mean:.{digits}f}")
+        rows.append(row)
+    return markdown(("method", *(title for title, *_ in columns.values())), rows)

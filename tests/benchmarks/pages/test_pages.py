@@ -1,0 +1,176 @@
+"""Pages of experiments: their tables, claims and figures are those of the committed results."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.pages.__main__ import PAGES, with_tables
+from benchmarks.pages.plots import PLOTS
+from benchmarks.pages.results import CHOSEN_ON, committed
+from benchmarks.pages.tables import TABLES
+
+TEXTS = {path.name: path.read_text(encoding="utf-8") for path in PAGES.glob("*.md")}
+WORDS = {name: " ".join(text.split()) for name, text in TEXTS.items()}
+CLAIMS = re.split(r"^### ", TEXTS["index.md"].partition("## What is not shown")[0], flags=re.MULTILINE)[1:]
+# "22 November 2026, commit `c41387b`", also of several days or commits.
+SETUP = r"\d+ (?:and \d+ )?[A-Z][a-z]+ \d{4},\s+commits?\s+`[0-9a-f]{7}`"
+
+
+def missing(page: str, figures: Iterable[str]) -> list[str]:
+    """Return the sentences that a page does not have."""
+    return [text for text in figures if text not in WORDS[page]]
+
+
+def test_with_tables__leaves_every_page_as_it_is():
+    assert [name for name, text in TEXTS.items() if with_tables(text) != text] == []
+
+
+def test_tables__are_on_one_page_each():
+    assert sorted(re.findall(r"<!-- table: (\w+) -->", "".join(TEXTS.values()))) == sorted(TABLES)
+
+
+def test_plots__are_drawn_and_shown(tmp_path: Path):
+    for name, plot in PLOTS.items():
+        assert f"({name}.png)" in TEXTS["index.md"]
+        plot().savefig(tmp_path / f"{name}.png")
+
+
+def test_claims__have_a_table_or_figure_a_command_and_committed_results():
+    assert len(CLAIMS) == 11
+    result = r"\]\(\.\./\.\./benchmarks/results/\w+\.json\)"
+    parts = r"<!-- table: |!\[", r"`(?:make demo|python\s+-m\s+(?:benchmarks|tests)\.[^`]+)`", SETUP, result
+    assert [(claim.partition("\n")[0], part) for claim in CLAIMS for part in parts if not re.search(part, claim)] == []
+
+
+def test_commands__follow_date_and_commit():
+    for name, text in TEXTS.items():
+        commands = len(re.findall(r"^\n    python -m ", text, re.MULTILINE))
+        setups = re.findall(rf"^{SETUP}[^.\n]*(?:\n[^.\n]+)?\bby\n\n    python -m ", text, re.MULTILINE)
+        assert len(setups) == commands, name
+
+
+def test_index__lists_every_page():
+    listed = re.findall(r"^\| \[[^]]+\]\(([\w-]+\.md)\)", TEXTS["index.md"], re.MULTILINE)
+    assert sorted(listed) == sorted(TEXTS.keys() - {"index.md"})
+
+
+def test_index__quotes_the_demo():
+    frames, arm = committed("demo")["full"]["frames"], committed("arm")["frames"]
+    assert not missing(
+        "index.md",
+        [
+            f"PSNR goes from {frames[0]['psnr']:.2f} dB to {frames[-1]['psnr']:.2f} dB.",
+            f"from {arm[0]['psnr']:.2f} dB to {arm[-1]['psnr']:.2f} dB over {len(arm)} frames",
+        ],
+    )
+
+
+def test_index__quotes_the_gains():
+    clips = committed("method_report")["clips"]
+
+    def scores(preset: str, name: str) -> np.ndarray:
+        rows = [row for clip in clips for row in clip["rows"] if (row["preset"], row["epochs"]) == (preset, 2)]
+        return np.array([row["mean"][name] for row in rows if row["best"]])
+
+    def gains(name: str) -> str:
+        added = scores("default", name) - scores("baseline", name)
+        return f"{min(added):.1f} to {max(added):.1f} dB"
+
+    shares = scores("default", "motion_error_moving") / scores("baseline", "motion_error_moving")
+    assert not missing(
+        "index.md",
+        [
+            f"{gains('psnr')} above residuals alone at their best rates ({gains('psnr_moving')} where things move), "
+            f"with {min(shares):.1f} to {max(shares):.1f} of their motion error, and PSNR falls by "
+            f"{-min(scores('default', 'psnr_slope')):.3f} dB a frame at most"
+        ],
+    )
+
+
+def test_index__quotes_the_field_and_the_drift():
+    cells = committed("field")["cells"].values()
+    methods = [name for name in next(iter(cells)) if name.endswith("/8") and "default" not in name]
+
+    def mean(method: str, score: str) -> float:
+        return float(np.mean([cell[method][score] for cell in cells]))
+
+    jaccard = "Dynamic 3D Gaussians average_jaccard"
+    drift = committed("drift")["clips"]["random-15"]
+    assert not missing(
+        "index.md",
+        [
+            f"has {mean('default/8', 'psnr_moving'):.1f} dB where things move, the next method "
+            f"{max(mean(method, 'psnr_moving') for method in methods):.1f} dB",
+            f"AJ is {100 * mean('default/8', jaccard):.1f} % for the default and "
+            f"{100 * mean('default + rigidity/8', jaccard):.1f} % with their terms added",
+            f"Random scene 15 has {np.mean(drift['psnr']):.2f} dB, with a slope of "
+            f"{drift['slope_moving_db_a_frame']:+.2f} dB a frame",
+        ],
+    )
+
+
+def test_pages__quote_the_estimates():
+    fits = committed("estimates")["fits"]
+
+    def right(fresh: bool, *views: int) -> tuple[int, int]:
+        some = [fit for fit in fits if (fit["seed"] not in CHOSEN_ON) == fresh and fit["views"] in views]
+        return sum(abs(fit["estimate"] - fit["held_out"]) <= 1.5 for fit in some), len(some)
+
+    of_all, of_choice = right(True, 4, 6, 8, 10), right(False, 4, 6, 8, 10)
+    assert right(True, 8, 10) == (24, 24)
+    quoted = (
+        f"{of_all[0]} of {of_all[1]} are within 1.5 dB: all 24 with 8 and 10 views, {right(True, 6)[0]} of "
+        f"{right(True, 6)[1]} with 6 views, and {right(True, 4)[0]} of {right(True, 4)[1]} with 4 views"
+    )
+    assert not missing("index.md", [quoted])
+    assert not missing("first-frame.md", ["{} of {} estimates".format(*of_choice), "{} of {} are".format(*of_all)])
+
+
+def test_index__quotes_the_renderer_and_the_fuzzers():
+    ratios = [committed(f"render_speed_{name}")["ratio_to_yardstick"] for name in ("W1", "W2", "W2b")]
+    fuzzers = committed("fuzz")["fuzzers"]
+    assert not missing(
+        "index.md",
+        [
+            f"{min(ratios):.2f} to {max(ratios):.2f} of the time of tuned C++",
+            f"a step of the second row takes {100 * committed('render_speed_W2b')['tenth_share']:.0f} % of the time",
+            f"in {fuzzers['damage']['streams']:,} damaged streams and {fuzzers['bytes']['streams']:,} with changed",
+        ],
+    )
+
+
+def test_method_page__quotes_the_unseen_scenes_without_seed_4():
+    fits = [scores for name, scores in committed("random_scenes")["fits"].items() if not name.startswith("4/")]
+    psnr, moving = (np.mean([fit[name] for fit in fits]) for name in ("psnr", "psnr_moving"))
+    assert not missing("method.md", [f"the means are {psnr:.2f} dB and {moving:.2f} dB where things move"])
+
+
+def test_first_frame_page__quotes_the_gaussians_and_the_forecast():
+    by_seed = {fit["seed"]: fit["chosen"] for fit in committed("generalise")["fits"] if not fit["fit_seed"]}
+    counts = "{:,}, {:,} and {:,}".format(*(by_seed[seed]["gaussians"] for seed in (6, 7, 8)))
+    walk4 = committed("first_frame_walk4")["fits"]["walk4"]["chosen"]
+    assert not missing(
+        "first-frame.md",
+        [
+            f"get {counts}",
+            f"gets {walk4['gaussians']:,} Gaussians and {walk4['steps']} steps, and has {walk4['training']:.2f} dB",
+        ],
+    )
+
+
+def test_captures_page__quotes_the_recording_and_the_memory():
+    walk4, memory = committed("walk4"), committed("capture_memory")
+    assert not missing(
+        "captures.md",
+        [
+            f"{walk4['psnr']['first']:.2f} dB in the first frame and {walk4['psnr']['last']:.2f} dB in the last",
+            f"{walk4['psnr_moving']:.2f} dB where things move",
+            f"takes {walk4['seconds']['per_later_frame']:.1f} s and {walk4['bytes']['per_residual'] / 1000:.0f} kB",
+            f"from {memory['before_mib']:.0f} MiB to {memory['settled_mib']:.0f} MiB",
+            f"at most {memory['growth_mib']:.0f} MiB",
+        ],
+    )
