@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
-from morgs_mi.core.checks import check_number
+from morgs_mi.core.ranges import Above, AtLeast, check_ranges
 
 __all__ = ["LiveConfig"]
 
@@ -18,21 +19,21 @@ class LiveConfig:
     """Folder of a calibrated capture of the same cameras; by default they are calibrated by their first images."""
     without: tuple[str, ...] = ()
     """Calibrated cameras that are left out, by name."""
-    downscale: float = 1
+    downscale: Annotated[float, AtLeast(1)] = 1
     """Factor by which the images are reduced."""
     test_view: str | None = None
     """Held-out camera, by index or name; by default all are fitted."""
-    frames: int | None = None
+    frames: Annotated[int, AtLeast(1)] | None = None
     """Number of frames to fit; by default as many as come."""
-    seconds: float | None = None
+    seconds: Annotated[float, Above(0)] | None = None
     """Time in seconds for the frames after the first one; by default until the cameras end."""
     record: bool = True
     """Store the images of all fitted frames; otherwise those of the first one alone."""
-    fps: float = 30
+    fps: Annotated[float, Above(0)] = 30
     """Frames per second at which the stream is played."""
-    timeout: float = 10
+    timeout: Annotated[float, Above(0)] = 10
     """Seconds to wait for a camera before it is left out."""
-    warm_up: float = 1
+    warm_up: Annotated[float, AtLeast(0)] = 1
     """Seconds in which the cameras adjust their exposure before the first images are taken; not of files."""
     loop: bool = False
     """Repeat videos until the fit is ended; by default they are played once."""
@@ -40,7 +41,7 @@ class LiveConfig:
     """Width and height of the images that cameras of this machine are asked for; by default they choose."""
 
     def check(self, place: str) -> None:
-        """Check the numbers; an error's sentence begins with `place`.
+        """Check the settings; an error's sentence begins with `place`.
 
         Raises:
             ValueError: one is out of range.
@@ -50,9 +51,4 @@ class LiveConfig:
                 f"{place}: `without` must name cameras of a calibration, got {', '.join(self.without)} and no "
                 "calibration; name the sources that are used (--camera)."
             )
-        for name, least in (("downscale", 1), ("frames", 1), ("warm_up", 0)):
-            if (value := getattr(self, name)) is not None:
-                check_number(place, name, value, f"[{least}, inf)")
-        for name in ("seconds", "fps", "timeout"):
-            if (value := getattr(self, name)) is not None:
-                check_number(place, name, value, "(0, inf)")
+        check_ranges(self, place)

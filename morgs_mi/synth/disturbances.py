@@ -12,14 +12,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
 
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_number
 from morgs_mi.core.files import write_json
+from morgs_mi.core.ranges import AtLeast, AtMost, check_ranges
 from morgs_mi.io.bounded import read_json
 
 __all__ = [
@@ -32,17 +33,6 @@ __all__ = [
     "undistorted",
 ]
 
-# Bounds of the settings. A lens with a coefficient beyond 0.5 would fold the corners of a wide view.
-_INTERVALS = {
-    "time_offset": "[0, inf)",
-    "rolling_shutter": "[0, 1]",
-    "exposure_gain": "[0, 10]",
-    "exposure_drift": "[0, 10]",
-    "exposure_flicker": "[0, 1]",
-    "distortion": "[0, 0.5]",
-    "jpeg_quality": "[0, 100]",
-}
-
 
 @dataclass(frozen=True)
 class Disturbances:
@@ -51,19 +41,19 @@ class Disturbances:
     The held-out camera is the reference: it has no time offset, and exposure as it should be.
     """
 
-    time_offset: float = 0.0
+    time_offset: Annotated[float, AtLeast(0)] = 0.0
     """Largest time offset of a camera from cam00 in frames; drawn per camera."""
-    rolling_shutter: float = 0.0
+    rolling_shutter: Annotated[float, AtLeast(0), AtMost(1)] = 0.0
     """Time in which all cameras read their rows, as a share of a frame; a rolling shutter has about 0.5."""
-    exposure_gain: float = 0.0
+    exposure_gain: Annotated[float, AtLeast(0), AtMost(10)] = 0.0
     """Largest deviation of a camera's exposure, drawn per camera: 0.2 for factors from 1 / 1.2 to 1.2."""
-    exposure_drift: float = 0.0
+    exposure_drift: Annotated[float, AtLeast(0), AtMost(10)] = 0.0
     """Largest change of a camera's exposure from its first frame to its last, as for exposure-gain."""
-    exposure_flicker: float = 0.0
+    exposure_flicker: Annotated[float, AtLeast(0), AtMost(1)] = 0.0
     """Standard deviation of the exposure from frame to frame, drawn per camera and frame."""
-    distortion: float = 0.0
+    distortion: Annotated[float, AtLeast(0), AtMost(0.5)] = 0.0  # beyond, the corners of a wide view fold
     """Largest radial distortion of the lenses, COLMAP's SIMPLE_RADIAL k, drawn per camera; 0.1 is moderate."""
-    jpeg_quality: int = 0
+    jpeg_quality: Annotated[int, AtLeast(0), AtMost(100)] = 0
     """Quality from 1 to 100 of the JPEG compression of every image; 0: none."""
 
 
@@ -104,8 +94,7 @@ def draw_disturbances(
     Raises:
         ValueError: a setting is out of range.
     """
-    for name, interval in _INTERVALS.items():
-        check_number("draw_disturbances()", name, getattr(disturbances, name), interval)
+    check_ranges(disturbances, "draw_disturbances()")
     d, shape = disturbances, (num_cameras, num_frames)
     offsets, gains, drifts, flicker, lenses = (np.random.default_rng([seed, 3, kind]) for kind in range(5))
     offset = d.time_offset * offsets.uniform(-1, 1, num_cameras)

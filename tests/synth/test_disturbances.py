@@ -104,7 +104,7 @@ def test_load_disturbances__names_a_missing_or_broken_file(tmp_path: Path) -> No
 
 def test_draw_disturbances__refuses_values_out_of_range() -> None:
     for name, value in (("time_offset", -1), ("rolling_shutter", 1.5), ("distortion", 2), ("jpeg_quality", 101)):
-        with pytest.raises(ValueError, match=rf"draw_disturbances\(\): `{name}` must be a number in .*, got {value}"):
+        with pytest.raises(ValueError, match=rf"draw_disturbances\(\): `{name}` must be at least 0.*, got {value}"):
             draw_disturbances(Disturbances(**{name: value}), 2, 1, 0)
 
 
