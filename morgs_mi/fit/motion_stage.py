@@ -22,11 +22,7 @@ _FINAL_RATE = 0.1
 
 
 def fit_motion(
-    problem: MotionProblem,
-    model: MotionModel,
-    start: MotionStart | None,
-    steps: Steps,
-    dssim_weight: float,
+    problem: MotionProblem, model: MotionModel, start: MotionStart | None, steps: Steps, dssim_weight: float
 ) -> tuple[MotionStart, dict[str, float]]:
     """Fit a motion model to the images by L_recon and the model's own losses.
 
