@@ -15,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 
 from morgs_mi.capture.camera_source import CameraSource, at_clip_size
-from morgs_mi.capture.color_correction import COLOR_METHODS, ColorFit, fit_colors
+from morgs_mi.capture.color_correction import ColorFit, fit_colors
 from morgs_mi.capture.layouts.calibration import Calibration
 from morgs_mi.capture.layouts.clips import EXAMPLE
 from morgs_mi.capture.layouts.registry import find_layout
@@ -392,14 +392,14 @@ def _check_downscale(downscale: float, cameras: Sequence[Camera], recorded: Sequ
 def _color_corrected(capture: Capture, color: str) -> Capture:
     """Return the capture with colours that are corrected between cameras; `color` is that of `ReadConfig`."""
     method, _, name = color.partition(":")
-    if method not in COLOR_METHODS or (name and name not in capture.names):
+    if method != "linear" or (name and name not in capture.names):
         raise ValueError(
-            f"{capture.path}: `color` must be none, {', '.join(COLOR_METHODS)}, or one of these with a camera of "
-            f"{', '.join(capture.names)}, such as linear:{capture.names[0]}, got {color!r}."
+            f"{capture.path}: `color` must be none, linear, or linear with a camera of {', '.join(capture.names)}, "
+            f"such as linear:{capture.names[0]}, got {color!r}."
         )
     images = next(capture.partial_frames(0, 1)).images
     reference = capture.names.index(name) if name else None
-    fit = fit_colors(capture.cameras, images, capture.masks, method, reference)
+    fit = fit_colors(capture.cameras, images, capture.masks, reference)
     sources = tuple(replace(s, color_correction=fit.correction(view)) for view, s in enumerate(capture._sources))
     return replace(capture, _sources=sources, colors=fit)
 

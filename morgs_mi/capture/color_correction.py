@@ -1,9 +1,9 @@
 """Colour correction between cameras.
 
-Corrections are applied in linear light, where a different gain, white balance or sensor is a matrix on (R, G, B).
-They are fitted to the colours of points that views share: features that match and on which the poses agree. The
-reference camera is not changed. Then, one by one, the camera that shares most points with those already corrected is
-fitted to them.
+A correction is a matrix on (R, G, B) in linear light, as are differences of gain, white balance and cross-talk between
+sensors. Matrices are fitted to the colours of points that views share: features that match and on which the poses
+agree. The reference camera is not changed. Then, one by one, the camera that shares most points with those already
+corrected is fitted to them.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -20,16 +19,10 @@ from morgs_mi.capture.features import Features, Match, detect, match_views, repr
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
 
-__all__ = ["COLOR_METHODS", "ColorCorrection", "ColorFit", "fit_colors", "matched_colors"]
+__all__ = ["ColorCorrection", "ColorFit", "fit_colors", "matched_colors"]
 
 _LOG = logging.getLogger(__name__)
 
-# Per method the name and the settings of colour-science's method.
-COLOR_METHODS: dict[str, tuple[str, dict[str, Any]]] = {
-    "linear": ("Cheung 2004", {"terms": 3}),
-    "root-polynomial": ("Finlayson 2015", {"degree": 2, "root_polynomial_expansion": True}),
-    "vandermonde": ("Vandermonde", {"degree": 2}),
-}
 # A matrix has nine numbers; features are noisy.
 _MIN_SAMPLES, _MAX_ERROR = 30, 2.0
 # Well-exposed pixel values, of 0..255; those nearly black or white do not determine a gain.
@@ -46,15 +39,14 @@ class ColorFit:
     """Colour correction of all cameras towards a reference camera.
 
     Attributes:
-        method: one of `COLOR_METHODS`.
         reference: index of the reference camera, which is not changed.
-        matrices: per camera; None for the reference, and for a camera that shares too few points with the others.
+        matrices: per camera [3, 3]; None for the reference, and for a camera that shares too few points with the
+            others.
         samples: per camera, number of points shared with others.
         before: per camera, mean dE2000 of these against the other views' colours; NaN without any.
         after: the same after the correction.
     """
 
-    method: str
     reference: int
     matrices: tuple[np.ndarray | None, ...]
     samples: tuple[int, ...]
@@ -64,7 +56,7 @@ class ColorFit:
     def correction(self, view: int) -> ColorCorrection | None:
         """Return the correction of a view, None if it is not changed."""
         matrix = self.matrices[view]
-        return None if matrix is None else ColorCorrection(self.method, matrix)
+        return None if matrix is None else ColorCorrection(matrix)
 
 
 @dataclass(frozen=True)
@@ -72,23 +64,20 @@ class ColorCorrection:
     """Colour correction of one camera's images, towards the other cameras.
 
     Attributes:
-        method: one of `COLOR_METHODS`.
-        matrix: matrix of the correction.
+        matrix: matrix on linear (R, G, B) [3, 3].
     """
 
-    method: str
     matrix: np.ndarray
 
     def __call__(self, image: np.ndarray) -> np.ndarray:
         """Return the corrected image, uint8 [H, W, 3]."""
-        return _encode(_corrected(_LINEAR[image], self.matrix, self.method))
+        return _encode(_corrected(_LINEAR[image], self.matrix))
 
 
 def fit_colors(
     cameras: Sequence[Camera],
     images: Sequence[np.ndarray | None],
     masks: Sequence[np.ndarray | None],
-    method: str = "linear",
     reference: int | None = None,
 ) -> ColorFit:
     """Fit the correction that maps each view's colours of shared points to those in the reference view.
@@ -97,7 +86,6 @@ def fit_colors(
         cameras: C views.
         images: per view an image of one instant, uint8 [H, W, 3], or None: the view is not corrected.
         masks: per view the mask of valid pixels [H, W], or None.
-        method: one of `COLOR_METHODS`.
         reference: index of the reference view; by default the one that shares most points with the others.
     """
     features = [detect(image, mask) for image, mask in zip(images, masks, strict=True)]
@@ -113,15 +101,14 @@ def fit_colors(
         known[list(corrected)] = -1
         view = int(known.argmax())
         if known[view] >= _MIN_SAMPLES:
-            matrices[view] = matrix = _fit(*_shared_colors(view, pairs, colors, corrected), method)
-            corrected[view] = _corrected(colors[view], matrix, method)
+            matrices[view] = matrix = _fit(*_shared_colors(view, pairs, colors, corrected))
+            corrected[view] = _corrected(colors[view], matrix)
         else:
             _LOG.warning("%s keeps its colours: too few points in common with the others.", cameras[view].name)
             corrected[view] = colors[view]
             counts[view] = counts[:, view] = 0  # no other view is corrected towards it
     after = [corrected[view] for view in range(len(cameras))]
     return ColorFit(
-        method,
         start,
         tuple(matrices),
         tuple(sum(len(pair.features) for pair in pairs if view in pair.views) for view in range(len(cameras))),
@@ -183,25 +170,20 @@ def _shared_colors(
     return np.concatenate(mine), np.concatenate(theirs)
 
 
-def _fit(mine: np.ndarray, theirs: np.ndarray, method: str) -> np.ndarray:
-    """Return a correction that is fitted twice, the second time without outliers: highlights and wrong matches."""
-    from colour.characterisation import matrix_colour_correction
-
-    name, settings = COLOR_METHODS[method]
-    matrix = matrix_colour_correction(mine, theirs, name, **settings)
-    errors = delta_e(_corrected(mine, matrix, method), theirs)
+def _fit(mine: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """Return the matrix [3, 3], fitted a second time without outliers, which are highlights and wrong matches."""
+    errors = delta_e(_corrected(mine, _least_squares(mine, theirs)), theirs)
     good = errors <= 3 * np.median(errors)
-    return matrix_colour_correction(mine[good], theirs[good], name, **settings)
+    return _least_squares(mine[good], theirs[good])
 
 
-def _corrected(light: np.ndarray, matrix: np.ndarray, method: str) -> np.ndarray:
+def _least_squares(mine: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    return np.linalg.lstsq(mine, theirs, rcond=None)[0].T
+
+
+def _corrected(light: np.ndarray, matrix: np.ndarray) -> np.ndarray:
     """Return corrected linear colours [..., 3]."""
-    from colour.characterisation import apply_matrix_colour_correction
-
-    if method == "linear":  # its only terms are R, G and B
-        return light @ matrix.T.astype(light.dtype)
-    name, settings = COLOR_METHODS[method]
-    return apply_matrix_colour_correction(np.maximum(light, 0), matrix, name, **settings)
+    return light @ matrix.T.astype(light.dtype)
 
 
 def delta_e(a: np.ndarray, b: np.ndarray) -> np.ndarray:

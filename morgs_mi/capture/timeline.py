@@ -47,9 +47,9 @@ class ReadConfig:
     gaps: bool = False
     """Whether images may be missing; a camera is left out of the frames that it lacks."""
     color: str = "none"
-    """Method that matches each camera's colours to those of a reference camera, fitted to points that both see: linear,
-    root-polynomial, vandermonde, or none. linear:cam03 also names the reference camera; by default it is the one that
-    shares most points with the others."""
+    """Method that matches each camera's colours to a reference camera: linear, a matrix in linear light which is fitted
+    to points that both see, or none. linear:cam03 also names the reference camera; by default it is the one that shares
+    most points with the others."""
     without: tuple[str, ...] = ()
     """Names of the cameras that are left out."""
 

@@ -62,11 +62,9 @@ def corrected(fit: ColorFit, view: int, image: np.ndarray) -> np.ndarray:
     return image if correction is None else correction(image)
 
 
-# The noise alone causes 0.9; polynomials fit some of it as colour.
-@pytest.mark.parametrize(("method", "left"), [("linear", 1.3), ("root-polynomial", 1.6), ("vandermonde", 2.5)])
-def test_fit_colors__removes_differences_between_sensors(views, method: str, left: float) -> None:
+def test_fit_colors__removes_differences_between_sensors(views) -> None:
     cameras, true, recorded = views
-    fit = fit_colors(cameras, recorded, [None] * 4, method, 0)
+    fit = fit_colors(cameras, recorded, [None] * 4, 0)
     assert (fit.reference, fit.matrices[0]) == (0, None)
     assert min(fit.samples) > 100
     assert all(after < 0.5 * before for before, after in zip(fit.before, fit.after, strict=True))
@@ -76,10 +74,9 @@ def test_fit_colors__removes_differences_between_sensors(views, method: str, lef
             error(corrected(fit, view, recorded[view]), true[view]),
         )
         assert before > 4
-        assert after < left, (view, before, after)
-    if method == "linear":
-        found = np.array([matrix for matrix in fit.matrices[1:]])
-        assert_close(found @ SENSORS[1:], np.tile(np.eye(3), (3, 1, 1)), atol=0.03)
+        assert after < 1.3, (view, before, after)  # the noise alone causes 0.9
+    found = np.array([matrix for matrix in fit.matrices[1:]])
+    assert_close(found @ SENSORS[1:], np.tile(np.eye(3), (3, 1, 1)), atol=0.03)
 
 
 def test_fit_colors__leaves_matching_cameras_unchanged(views) -> None:
