@@ -65,7 +65,7 @@ def backproject(
             return sums
         splats = project(gaussians, camera, (), config, rows)
         if static_splats is not None:
-            splats = splats.concatenated_with(static_splats, None)
+            splats = splats.concatenated_with(static_splats)
         columns = [dr.zeros(mi.Float, len(splats)) for _ in range(C)]
         lists = build_lists(splats, columns, region, config)
         layout = Layout((Channel(C, False),), False, False, config)

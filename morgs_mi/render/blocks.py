@@ -73,10 +73,7 @@ def build_lists(
     """
     N = len(splats)
     depths = dr.select(splats.valid, splats.depths, dr.inf)
-    if splats.order is None:
-        by_rank = dr.argsort(depths)
-    else:
-        by_rank = dr.gather(mi.UInt32, splats.order, dr.argsort(dr.gather(mi.Float, depths, splats.order)))
+    by_rank = dr.argsort(depths)
     rank_of = dr.empty(mi.UInt32, N)
     dr.scatter(rank_of, dr.arange(mi.UInt32, N), by_rank, mode=dr.ReduceMode.Permute)
     rectangles = _tile_rectangles(splats, region)

@@ -54,7 +54,6 @@ class Splats:
         extent: (half width, half height) in px of the region where alpha >= alpha_min, detached; 0 if culled.
         valid: False where culled: behind the near plane, too faint, or not finite.
         finite: False where an attribute, or a value computed from it, is not finite.
-        order: splats in the order in which equal depths are blended; None: that of the input.
         profile: (z, gx, gy, 1 / sigma), the Gaussian in depth along the ray of a pixel (see module docstring), world
             units, differentiable; empty if no depth limit cuts the splats.
     """
@@ -65,7 +64,6 @@ class Splats:
     extent: tuple[Float, Float]
     valid: Bool
     finite: Bool
-    order: UInt32 | None = None
     profile: tuple[Float, ...] = ()
 
     def __len__(self) -> int:
@@ -76,8 +74,8 @@ class Splats:
         """The differentiable numbers that decide a splat's alpha at a pixel: `shape` and `profile`."""
         return self.shape + self.profile
 
-    def concatenated_with(self, other: Splats, order: UInt32 | None) -> Splats:
-        """Return these splats followed by the others, blended in `order` where depths are equal."""
+    def concatenated_with(self, other: Splats) -> Splats:
+        """Return these splats followed by the others."""
         return Splats(
             concatenated(self.shape, other.shape),
             {name: concatenated(value, other.channels[name]) for name, value in self.channels.items()},
@@ -85,7 +83,6 @@ class Splats:
             concatenated(self.extent, other.extent),
             concatenated(self.valid, other.valid),
             concatenated(self.finite, other.finite),
-            order,
             concatenated(self.profile, other.profile),
         )
 

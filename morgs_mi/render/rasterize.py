@@ -21,7 +21,7 @@ from morgs_mi.render.blocks import build_lists, touches
 from morgs_mi.render.channels import NORMALISED, attribute_channels, channel_sizes
 from morgs_mi.render.compositing import Channel, Layout, blend
 from morgs_mi.render.config import RenderConfig
-from morgs_mi.render.projection import FARTHEST, Splats, concatenated, project
+from morgs_mi.render.projection import FARTHEST, Splats, project
 from morgs_mi.render.recording import with_render_lock
 from morgs_mi.render.region import Region, full_view
 
@@ -92,7 +92,6 @@ def rasterize(
     background: Sequence[float] | None = None,
     detach_weights: Sequence[str] = (),
     region: Region | None = None,
-    active: Bool | np.ndarray | None = None,
     features: Tensor | np.ndarray | None = None,
     static_splats: Splats | None = None,
     config: RenderConfig | None = None,
@@ -113,7 +112,6 @@ def rasterize(
         detach_weights: channels whose gradient reaches only the blended values, not opacity and geometry.
         region: the blocks of pixels to draw; None: the whole view. Gaussians that touch none of its blocks are only
             projected.
-        active: bool [N], the Gaussians that receive gradients; None: all.
         features: [N, F], further values to blend like a colour, returned as `Image.features`; F is at most 12.
         static_splats: further splats of this view that are drawn and get no gradients; they must have the channels.
         config: cut-offs and block shape.
@@ -126,8 +124,8 @@ def rasterize(
         >>> dr.backward(dr.mean(dr.square(image.color - target), axis=None))
 
     Returns:
-        An `Image` with one tensor per requested channel. On a region, and with `active`, the pixels that are drawn and
-        the gradients that remain are those of the full computation.
+        An `Image` with one tensor per requested channel. On a region, the pixels that are drawn and their gradients
+        are those of the full computation.
 
     Raises:
         ValueError: an unknown channel, a channel whose attribute is missing, NaN or infinite attributes or poses, a
@@ -157,11 +155,11 @@ def rasterize(
         return _empty(channels, sizes, background, region)
     cut = limits is not None
     if static_splats is not None:
-        splats = project(gaussians, camera, blended, config, features=features).concatenated_with(static_splats, None)
-    elif region.whole and active is None:
+        splats = project(gaussians, camera, blended, config, features=features).concatenated_with(static_splats)
+    elif region.whole:
         splats = project(gaussians, camera, blended, config, features=features, profile=cut)
     else:
-        splats = _project_region(gaussians, camera, blended, region, active, features, config, cut)
+        splats = _project_region(gaussians, camera, blended, region, features, config, cut)
     if splats is None:
         return _empty(channels, sizes, background, region)
     dr.schedule(splats.geometry, splats.channels, splats.depths, splats.extent, splats.valid)
@@ -199,31 +197,18 @@ def _project_region(
     camera: Camera,
     channels: tuple[str, ...],
     region: Region,
-    active: Bool | np.ndarray | None,
     features: Tensor | None,
     config: RenderConfig,
     profile: bool,
 ) -> Splats | None:
-    """Project the Gaussians that touch the region; only those that are active are attached to the gradient graph."""
-    detached, detached_features = dr.detach(gaussians), None if features is None else dr.detach(features)
+    """Project the Gaussians that touch the region; None if there are none."""
     with dr.suspend_grad():
-        bare = project(detached, camera, (), config)
+        bare = project(dr.detach(gaussians), camera, (), config)
         visible = touches(bare, region)
         dr.schedule(visible)
         _check_finite(bare.finite, gaussians, camera, features)
-        if active is None:
-            rows = [dr.compress(visible)]
-        else:
-            chosen = _checked_active(active, int(gaussians.means.shape[0]))
-            rows = [dr.compress(visible & chosen), dr.compress(visible & ~chosen)]
-    parts = [
-        project(some, camera, channels, config, index, blended, profile)
-        for some, blended, index in zip((gaussians, detached), (features, detached_features), rows, strict=False)
-        if dr.width(index)
-    ]
-    if len(parts) < 2:
-        return parts[0] if parts else None
-    return parts[0].concatenated_with(parts[1], dr.argsort(concatenated(*rows)))
+        rows = dr.compress(visible)
+    return project(gaussians, camera, channels, config, rows, features, profile) if dr.width(rows) else None
 
 
 def _layout(
@@ -369,20 +354,6 @@ def _checked_limits(depth_limit: Tensor | np.ndarray, camera: Camera, static_spl
             "one with gradients enabled; pass dr.detach(depth_limit)."
         )
     return dr.clip(limits.array, -FARTHEST, FARTHEST)
-
-
-def _checked_active(active: Bool | np.ndarray, N: int) -> Bool:
-    """Return the mask of the active Gaussians [N]."""
-    if isinstance(active, mi.Bool):
-        found = dr.width(active)
-    else:
-        values = numbers("rasterize()", "active", active)
-        found = values.shape[0] if values.ndim == 1 and values.dtype == bool else f"{values.dtype} {list(values.shape)}"
-    if found != N:
-        raise ValueError(
-            f"rasterize(): `active` must be bool [N] with N={N}, got {found} values; pass one per Gaussian."
-        )
-    return active if isinstance(active, mi.Bool) else from_numpy(mi.Bool, active)
 
 
 def _check_finite(finite: Bool, gaussians: ActivatedGaussians, camera: Camera, features: Tensor | None) -> None:

@@ -182,8 +182,6 @@ def test_rasterize__refuses_bad_arguments(scene):
         ({"region": "all"}, "`region` must be a .*Region, got a str"),
         ({"static_splats": "all"}, "`static_splats` must be a .*Splats"),
         ({"config": {}}, "`config` must be a .*RenderConfig, got a dict"),
-        ({"active": np.arange(10)}, r"`active` must be bool \[N\] with N=10, got int64 \[10\]"),
-        ({"active": np.ones(9, bool)}, r"`active` must be bool \[N\] with N=10, got 9"),
         ({"background": "red"}, "`background` must be three finite numbers"),
         ({"features": "all"}, "`features` must be an array of real numbers"),
         ({"features": mi.Float(1)}, "`features` must be a NumPy array or a"),
@@ -217,16 +215,14 @@ def test_rasterize__refuses_to_be_frozen(scene):
     assert "rasterize(): expected a call outside dr.freeze" in str(error.value.__cause__)
 
 
-def test_rasterize__copies_masks_and_features_before_it_returns(scene):
+def test_rasterize__copies_features_and_background_before_it_returns(scene):
     raw, camera = scene
-    active, features, background = np.arange(10) < 5, np.ones((10, 2), np.float32), np.full(3, 0.5)
+    features, background = np.ones((10, 2), np.float32), np.full(3, 0.5)
     images = []
     for overwritten in (False, True):
         gaussians = to_gaussians(raw, grad=True)
-        arguments = [array.copy() for array in (active, features, background)]
-        image = rasterize(
-            gaussians, camera, ("color",), active=arguments[0], features=arguments[1], background=arguments[2]
-        )
+        arguments = [array.copy() for array in (features, background)]
+        image = rasterize(gaussians, camera, ("color",), features=arguments[0], background=arguments[1])
         for array in arguments if overwritten else ():
             array[:] = 0
         dr.backward(dr.sum(image.color) + dr.sum(image.features))

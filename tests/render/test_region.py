@@ -1,4 +1,4 @@
-"""Regions and active Gaussians against the full computation: the remaining pixels and gradients are the same."""
+"""Regions against the full computation: the pixels and gradients that remain are the same."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ def mask(camera: Camera) -> np.ndarray:
     return mask
 
 
-def run(raw, camera, region=None, active=None, weight=None, config=None):
+def run(raw, camera, region=None, weight=None, config=None):
     """Return images and gradients of <image, weight>, with the weight cropped to the region."""
     gaussians = Gaussians(**raw)
     dr.enable_grad(*gaussians.items().values())
-    image = rasterize(gaussians, camera, CHANNELS, BACKGROUND, region=region, active=active, config=config)
+    image = rasterize(gaussians, camera, CHANNELS, BACKGROUND, region=region, config=config)
     images = {name: image[name] for name in CHANNELS}
     if weight is not None:
         cropped = {name: region.crop(w) if region else w for name, w in weight.items()}
@@ -74,29 +74,17 @@ def test_rasterize__on_a_region_renders_and_differentiates_like_the_full_view(ra
     config = RenderConfig(reproducible=reproducible)
     region = Region(mask, config)
     assert region.num_blocks < 0.3 * (camera.width * camera.height) / 32
-    images, grads = run(raw, camera, region, None, weight, config)
-    full_images, full_grads = run(raw, camera, None, None, weight, config)
+    images, grads = run(raw, camera, region, weight, config)
+    full_images, full_grads = run(raw, camera, None, weight, config)
     for name in CHANNELS:
         assert np.array_equal(images[name], region.crop(full_images[name])), name
         assert (images[name][~region.inside()] == 0).all(), name
     assert_same_gradients(grads, full_grads)
 
 
-def test_rasterize__gives_gradients_to_active_gaussians_only(raw, camera, mask, weight):
-    rng = np.random.default_rng(0)
-    active = rng.uniform(size=len(raw["means"])) < 0.4
-    for region in (None, Region(mask)):
-        images, grads = run(raw, camera, region, active, weight)
-        expected_images, expected = run(raw, camera, region, None, weight)
-        for name in CHANNELS:
-            assert np.array_equal(images[name], expected_images[name]), name
-        assert_same_gradients(grads, expected, active)
-        assert all((grads[name][~active] == 0).all() for name in RAW)
-
-
-def test_rasterize__blends_features_of_active_gaussians_on_a_region(raw, camera, mask):
+def test_rasterize__blends_features_on_a_region(raw, camera, mask):
     rng, region = np.random.default_rng(0), Region(mask)
-    values, active = np.float32(rng.normal(size=(len(raw["means"]), 5))), rng.uniform(size=len(raw["means"])) < 0.4
+    values = np.float32(rng.normal(size=(len(raw["means"]), 5)))
 
     def run_features(**restriction):
         features = mi.TensorXf(values)
@@ -107,15 +95,14 @@ def test_rasterize__blends_features_of_active_gaussians_on_a_region(raw, camera,
         return np.asarray(dr.detach(image)), np.asarray(dr.grad(features))
 
     expected, full = run_features()
-    found, grad = run_features(region=region, active=active)
+    found, grad = run_features(region=region)
     assert np.array_equal(found, region.crop(expected))
-    assert np.abs(full[active]).max() > 0
-    assert_close(grad[active], full[active], atol=tol.SUM_ORDER_REL * np.abs(full).max())
-    assert (grad[~active] == 0).all()
+    assert np.abs(full).max() > 0
+    assert_close(grad, full, atol=tol.SUM_ORDER_REL * np.abs(full).max())
 
 
-def test_rasterize__equal_depths_keep_their_order_for_any_active_set(camera):
-    """Of two opaque Gaussians at one position, the first occludes the second, active or not."""
+def test_rasterize__equal_depths_keep_their_order(camera):
+    """Of two opaque Gaussians at one position, the first occludes the second."""
     raw = {
         "means": np.zeros((2, 3)),
         "log_scales": np.full((2, 3), -1.0),
@@ -123,12 +110,8 @@ def test_rasterize__equal_depths_keep_their_order_for_any_active_set(camera):
         "logit_opacities": np.full(2, 4.0),
         "sh_coeffs": np.array([[[1.5, -1.5, -1.5]], [[-1.5, -1.5, 1.5]]]),
     }
-    colors = [
-        np.asarray(rasterize(Gaussians(**raw), camera, ("color",), active=np.array(active)).color)
-        for active in ([True, True], [False, True], [True, False], [False, False])
-    ]
-    assert colors[0][37, 50, 0] > 0.9
-    assert all(np.array_equal(color, colors[0]) for color in colors)
+    color = np.asarray(rasterize(Gaussians(**raw), camera, ("color",)).color)
+    assert color[37, 50, 0] > 0.9
 
 
 def test_rasterize__forward_mode_on_a_region_agrees_with_the_full_view(raw, camera, mask):
@@ -168,12 +151,11 @@ def test_region__crop_and_paste_are_inverse(camera, mask):
 
 def test_rasterize__compiles_its_kernels_once_for_all_regions(raw, camera, mask):
     """Another region with another number of Gaussians compiles no kernel."""
-    active = np.arange(len(raw["means"])) % 3 == 0
 
     def step(where):
         gaussians = Gaussians(**raw)
         dr.enable_grad(*gaussians.items().values())
-        image = rasterize(gaussians, camera, ("color",), region=Region(where), active=active)
+        image = rasterize(gaussians, camera, ("color",), region=Region(where))
         dr.backward(dr.sum(image.color, axis=None))
         dr.eval(dr.grad(gaussians.means))
         dr.sync_thread()
@@ -195,8 +177,6 @@ def test_region__refuses_bad_masks_and_other_views(raw, camera, mask):
         rasterize(gaussians, camera, region=Region(mask[:, :-1]))
     with pytest.raises(ValueError, match="got 101x75 with 4x4"):
         rasterize(gaussians, camera, region=Region(mask, RenderConfig(block_width=4)))
-    with pytest.raises(ValueError, match=r"`active` must be bool \[N\] with N=120, got 7"):
-        rasterize(gaussians, camera, active=np.ones(7, bool))
     broken = raw | {"means": np.where(np.arange(360).reshape(120, 3) == 7, np.nan, raw["means"])}
     with pytest.raises(ValueError, match=r"`means` must be finite, got nan at \[2, 1\]"):
         rasterize(Gaussians(**broken), camera, region=Region(mask))
