@@ -42,7 +42,7 @@ from morgs_mi.render.channels import attribute_channels, exr_names
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.recording import render_lock
 from morgs_mi.surfaces.composite import composite, cropped
-from morgs_mi.surfaces.surface_view import SurfaceView
+from morgs_mi.surfaces.surface_view import SampledPixels, SurfaceView
 
 __all__ = ["ellipsoids"]
 
@@ -301,14 +301,13 @@ def _plugin() -> type:
 
             surfaces = None
             if self.surfaces is not None:
-                surfaces = SurfaceView.of(
-                    scene, self.surfaces, camera, crop, sensor, seed, spp, gaussians, self.srgb_primitives
-                )
+                pixels = SampledPixels(camera, crop, sensor, seed, spp)
+                surfaces = SurfaceView.of(scene, self.surfaces, pixels, gaussians, self.srgb_primitives)
             if surfaces is None:
                 self._warn_about_emitters(scene)
                 columns = self._splats(gaussians, camera, channels, crop)
             else:
-                columns = composite(gaussians, camera, channels, self.background, surfaces, crop, self.srgb_primitives)
+                columns = composite(gaussians, channels, self.background, surfaces)
             values = [*columns["color"], *(columns["alpha"] if has_alpha else [])]
             values += [mi.Float(1)]  # the sample's weight
             values += [value for name in self.aovs for value in columns[name]]

@@ -150,7 +150,7 @@ class Flight:
 
     def run(self) -> None:
         from morgs_mi.codec.packets import play
-        from morgs_mi.export.clips import frame_numbers, repeated_seconds, write_flight
+        from morgs_mi.export.clips import frame_numbers, repeated_frames, repeated_seconds, write_flight
         from morgs_mi.export.paths import focus, load_path, orbit, through_cameras
         from morgs_mi.playback.player import open_stream
 
@@ -174,15 +174,8 @@ class Flight:
             path = replace(path, keys=tuple(key.resized(self.width, height) for key in path.keys))
         output, _ = destination(stream.path, self.output, VIDEO, stem=Path(self.path).stem)
         with progress() as report:
-            write_flight(
-                stream,
-                path,
-                output,
-                self.channels,
-                self.freeze,
-                lambda done, of: report("Rendering", done, of),
-                self.back_and_forth,
-            )
+            clip = repeated_frames(stream, self.freeze, self.back_and_forth)
+            write_flight(stream, path, output, self.channels, clip, lambda done, of: report("Rendering", done, of))
         print_result(f"{output}: {path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}.")
 
 

@@ -58,7 +58,7 @@ class Render:
     def run(self) -> None:
         from morgs_mi.export.clips import frame_numbers
         from morgs_mi.export.frames import write_frames, write_images
-        from morgs_mi.export.insert import inserted_channels, load_insert, render_inserted, selected
+        from morgs_mi.export.insert import InsertConfig, inserted_channels, load_insert, render_inserted, selected
         from morgs_mi.playback.player import find_camera, open_stream
 
         stream = open_stream(self.out)
@@ -77,8 +77,7 @@ class Render:
             else:
                 layers = inserted_channels(stream) if chosen.name == "exr" else ("color",)
                 channels, build = self.channels or layers, load_insert(self.insert)
-                images = render_inserted(
-                    stream, camera, build, frames, channels, self.samples, self.shadows, self.light
-                )
+                config = InsertConfig(self.samples, self.shadows, self.light)
+                images = render_inserted(stream, camera, build, frames, channels, config)
                 write_images(images, stream.fps, output, done, chosen.name)
         print_result(f"{output}: {len(frames)} frames of camera {camera.name}, {camera.width}x{camera.height}.")

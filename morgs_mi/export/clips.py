@@ -19,7 +19,7 @@ from morgs_mi.io.video_writer import playable_format, write_video
 from morgs_mi.playback.player import channel_image, render, render_config
 from morgs_mi.playback.visualise import side_by_side
 
-__all__ = ["frame_numbers", "repeated_seconds", "select_frames", "write_each", "write_flight"]
+__all__ = ["frame_numbers", "repeated_frames", "repeated_seconds", "select_frames", "write_each", "write_flight"]
 
 Progress = Callable[[int, int], None] | None
 
@@ -106,26 +106,21 @@ def write_flight(
     path: CameraPath,
     output: str | Path,
     channels: Sequence[str] = ("color",),
-    freeze: int | None = None,
+    clip: Iterator[Gaussians] | None = None,
     progress: Progress = None,
-    back_and_forth: bool = False,
 ) -> None:
     """Render a stream along a camera path into a video at the stream's frame rate; the file is written atomically.
-
-    The clip plays while the camera moves, and restarts after its last frame or plays backwards from there.
 
     Args:
         stream: the file.
         path: the moving camera; it determines the duration of the video.
         output: ``FILE.mp4``.
         channels: out of `CHANNELS`, drawn side by side.
-        freeze: index of a single frame to show; None plays the clip.
+        clip: Gaussians of each image of the video; None: `repeated_frames`.
         progress: called with (images done, total number of images).
-        back_and_forth: play the clip backwards after its last frame. Motion is then that of the clip, so it points
-            opposite to the motion in the video.
 
     Raises:
-        ValueError: another type of file, an unknown channel or frame, or a broken packet.
+        ValueError: another type of file, an unknown channel, or a broken packet.
         OSError: the file cannot be written.
     """
     choose_format(VIDEO, output)
@@ -133,7 +128,7 @@ def write_flight(
     count, config = max(1, round(path.seconds * stream.fps)), render_config(stream)
 
     def images() -> Iterator[np.ndarray]:
-        for i, gaussians in zip(range(count), _repeated_frames(stream, freeze, back_and_forth), strict=False):
+        for i, gaussians in zip(range(count), clip or repeated_frames(stream), strict=False):
             rendered = render(gaussians, path.at(i / stream.fps), channels, config)
             yield pad_to_even(side_by_side([channel_image(name, values) for name, values in rendered.items()]))
             if progress is not None:
@@ -153,8 +148,20 @@ def repeated_seconds(clip: float, least: float) -> float:
     return clip * max(1, math.ceil(least / clip - 1e-9))
 
 
-def _repeated_frames(stream: StreamReader, freeze: int | None, back_and_forth: bool) -> Iterator[Gaussians]:
-    """Yield the frames of a stream, or the one frame `freeze`, without end."""
+def repeated_frames(
+    stream: StreamReader, freeze: int | None = None, back_and_forth: bool = False
+) -> Iterator[Gaussians]:
+    """Yield the frames of a stream without end.
+
+    Args:
+        stream: the file.
+        freeze: index of a single frame to yield; None: all.
+        back_and_forth: go backwards after the last frame. Motion is then the one of the clip, opposite to the motion
+            that is shown.
+
+    Raises:
+        ValueError: the stream has no such frame, or a packet is broken.
+    """
     frozen = None if freeze is None else seek(stream, freeze).gaussians
     while True:
         yield from (frozen,) if frozen is not None else (gaussians for _, gaussians in play(stream))

@@ -13,6 +13,7 @@ from __future__ import annotations
 import importlib.util
 import re
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
@@ -39,7 +40,16 @@ from morgs_mi.surfaces.splat_path import rays_for, traced
 from morgs_mi.surfaces.surface_view import lights
 from morgs_mi.synth.scene import failures_in
 
-__all__ = ["LAYERS", "Light", "captured_light", "inserted_channels", "load_insert", "render_inserted", "selected"]
+__all__ = [
+    "LAYERS",
+    "InsertConfig",
+    "Light",
+    "captured_light",
+    "inserted_channels",
+    "load_insert",
+    "render_inserted",
+    "selected",
+]
 
 LAYERS = ("splats", "surfaces", "shadow", "mattes")
 """Further channels, for compositing: the splats alone and the surfaces alone, in linear light with alpha, the shadow of
@@ -48,6 +58,22 @@ the surfaces on the splats, a factor of their linear light, and ``matte:NAME`` f
 Light = Literal["probe", "traced"]
 
 Build = Callable[[int, float], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class InsertConfig:
+    """Rendering of an inserted scene."""
+
+    samples: int = 16
+    """Samples per pixel of its surfaces."""
+    shadows: bool = True
+    """Whether its surfaces throw shadows on the Gaussians, see `shadow_ratio`."""
+    light: Light = "probe"
+    """``probe`` lights the surfaces by an environment map, see `captured_light`; ``traced`` traces rays through the
+    Gaussians (`splat_path`), which also throw shadows on them."""
+
+    def __post_init__(self) -> None:
+        check_number("render_inserted()", "samples", self.samples, "[1, inf)")
 
 
 def load_insert(path: str | Path) -> Build:
@@ -119,9 +145,7 @@ def render_inserted(
     build: Build,
     frames: Sequence[int] | None = None,
     channels: Sequence[str] = ("color",),
-    samples: int = 16,
-    shadows: bool = True,
-    light: Light = "probe",
+    config: InsertConfig | None = None,
 ) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
     """Render frames of a stream for one camera with a Mitsuba scene inserted.
 
@@ -133,10 +157,7 @@ def render_inserted(
         build: see `load_insert`.
         frames: indices of the frames to render; None: all.
         channels: out of ``color``, ``alpha``, the AOVs of `gaussian_splat`, and `LAYERS`.
-        samples: samples per pixel of the inserted surfaces.
-        shadows: whether they throw shadows on the Gaussians, see `shadow_ratio`.
-        light: ``probe`` lights them by an environment map, see `captured_light`; ``traced`` traces rays through the
-            Gaussians (`splat_path`), which also throw shadows on them.
+        config: settings.
 
     Yields:
         (frame, images) as `render_stream` does; the layer ``mattes`` is one image per name.
@@ -144,11 +165,11 @@ def render_inserted(
     Raises:
         ValueError: a broken packet, or a scene that Mitsuba or `gaussian_splat` refuses.
     """
-    check_number("render_inserted()", "samples", samples, "[1, inf)")
+    config = config or InsertConfig()
     for frame, gaussians in play(stream):
         if frames is None or frame in frames:
             entries = build(frame, frame / stream.fps)
-            yield frame, _render(gaussians, camera, entries, channels, samples, shadows, light)
+            yield frame, _render(gaussians, camera, entries, channels, config)
 
 
 def captured_light(gaussians: Gaussians, camera: Camera, position: np.ndarray) -> dict[str, Any]:
@@ -188,16 +209,10 @@ def _integrator(chosen: Any, light: Light) -> Any:
 
 
 def _render(
-    gaussians: Gaussians,
-    camera: Camera,
-    entries: dict[str, Any],
-    channels: Sequence[str],
-    samples: int,
-    shadows: bool,
-    light: Light,
+    gaussians: Gaussians, camera: Camera, entries: dict[str, Any], channels: Sequence[str], config: InsertConfig
 ) -> dict[str, np.ndarray]:
     entries = {name: value for name, value in entries.items() if name not in ("type", "sensor")}
-    nested = _integrator(entries.pop("integrator", None), light)
+    nested = _integrator(entries.pop("integrator", None), config.light)
     ratio, found = np.ones(len(gaussians), np.float32), {}
     try:
         inserted: Any = mi.load_dict({"type": "scene", **entries})
@@ -212,17 +227,17 @@ def _render(
         if not inserted.emitters():
             lamp = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel())
             lit = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
-            inserted = lit if light == "probe" else _in_background_light(entries, gaussians, camera)
+            inserted = lit if config.light == "probe" else _in_background_light(entries, gaussians, camera)
         if "mattes" in channels:
             # Before other scenes rename the shapes.
             found = mattes(gaussians, camera, inserted)
-        if shadows:
+        if config.shadows:
             ratio = shadow_ratio(gaussians, lit, camera.position)
         dark = shadowed(gaussians, ratio)
-        images = _plugin_images(dark, camera, inserted, nested, channels, samples)
+        images = _plugin_images(dark, camera, inserted, nested, channels, config.samples)
         if "surfaces" in channels:
             with traced(nested, rays_for(nested, dark), srgb=True):
-                images["surfaces"] = np.asarray(nested.render(inserted, _sensor(camera), spp=samples))
+                images["surfaces"] = np.asarray(nested.render(inserted, _sensor(camera), spp=config.samples))
     except RuntimeError as error:
         raise ValueError(f"The inserted scene: {_reason(error)}; correct it.") from error
     if {"splats", "shadow"} & set(channels):

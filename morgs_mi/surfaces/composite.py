@@ -17,7 +17,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, Tensor
@@ -33,13 +32,7 @@ Columns = dict[str, list[Float]]
 
 
 def composite(
-    gaussians: ActivatedGaussians,
-    camera: Camera,
-    channels: Sequence[str],
-    background: Sequence[float] | None,
-    view: SurfaceView,
-    crop: Crop,
-    srgb: bool,
+    gaussians: ActivatedGaussians, channels: Sequence[str], background: Sequence[float] | None, view: SurfaceView
 ) -> Columns:
     """Return the channels of splats and surfaces, differentiable in both, each a list of floats [P].
 
@@ -48,17 +41,15 @@ def composite(
 
     Args:
         gaussians: N Gaussians.
-        camera: the view.
         channels: those of `rasterize`.
         background: colour [3] behind all splats where no surface and no environment is seen, encoded like the splats.
-        view: the surfaces on the pixels of `crop`.
-        crop: pixels of the camera's image, (x, y, width, height), P in all.
-        srgb: whether the colours of the splats are sRGB-encoded.
+        view: the surfaces on P pixels of a camera's image.
     """
-    encode, decode = (mi.math.linear_to_srgb, mi.math.srgb_to_linear) if srgb else (_unchanged, _unchanged)
+    encode, decode = (mi.math.linear_to_srgb, mi.math.srgb_to_linear) if view.srgb else (_unchanged, _unchanged)
     channels = tuple(dict.fromkeys(("color", "alpha", *channels)))
-    whole = _blended(rasterize(gaussians, camera, channels), channels, lambda image: cropped(image, crop))
-    front = _in_front(gaussians, camera, channels, view, crop) or whole
+    image, crop = rasterize(gaussians, view.pixels.camera, channels), view.pixels.crop
+    whole = _blended(image, channels, lambda image: cropped(image, crop))
+    front = _in_front(gaussians, channels, view) or whole
     f, covered = view.coverage, view.coverage > 0
     t_front, t_whole = (1 - part["alpha"][0] for part in (front, whole))
 
@@ -87,14 +78,12 @@ def composite(
     return {**splats, "color": color, "alpha": [opaque]}
 
 
-def _in_front(
-    gaussians: ActivatedGaussians, camera: Camera, channels: tuple[str, ...], view: SurfaceView, crop: Crop
-) -> Columns | None:
+def _in_front(gaussians: ActivatedGaussians, channels: tuple[str, ...], view: SurfaceView) -> Columns | None:
     """Return the blended sums of the splats in front of the surfaces [P], 0 where there are none; None: nowhere.
 
     Only the blocks of pixels in which a surface is seen are drawn.
     """
-    x, y, width, height = crop
+    camera, (x, y, width, height) = view.pixels.camera, view.pixels.crop
     mask = np.zeros((camera.height, camera.width), bool)
     mask[y : y + height, x : x + width] = view.mask
     if not mask.any():

@@ -22,7 +22,7 @@ from morgs_mi.core.types import Bool, Float, Tensor, UInt32
 from morgs_mi.surfaces.splat_path import rays_for, traced
 from morgs_mi.surfaces.splat_rays import SplatRays
 
-__all__ = ["SurfaceView", "coverage_and_depth", "lights", "shared_scene", "surface_scene"]
+__all__ = ["SampledPixels", "SurfaceView", "coverage_and_depth", "lights", "shared_scene", "surface_scene"]
 
 _log = logging.getLogger(__name__)
 
@@ -108,6 +108,40 @@ def _detached(shapes: list[Any]) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
+class SampledPixels:
+    """Pixels of a view, and the samples of an integrator in them.
+
+    Attributes:
+        camera: the view.
+        crop: its pixels, (x, y, width, height), P in all.
+        template: sensor with the sampler and the far plane.
+        seed: of the samples.
+        spp: samples per pixel; 0: those of the sampler.
+    """
+
+    camera: Camera
+    crop: tuple[int, int, int, int]
+    template: Any
+    seed: int = 0
+    spp: int = 0
+
+    def sensor(self) -> Any:
+        """Return a sensor with a film of the pixels."""
+        names = ("crop_offset_x", "crop_offset_y", "crop_width", "crop_height")
+        params: Any = mi.traverse(self.template)
+        more = {"far_clip": float(params["far_clip"]), "sampler": self.template.sampler()}
+        return mi.load_dict(
+            {**self.camera.sensor(pixel_format="rgba", **dict(zip(names, self.crop, strict=True))), **more}
+        )
+
+    def samples(self) -> int:
+        """Return the samples per pixel, which some samplers round up."""
+        sampler = self.template.sampler().clone()
+        sampler.set_sample_count(self.spp or sampler.sample_count())
+        return sampler.sample_count()
+
+
+@dataclass(frozen=True)
 class SurfaceView:
     """Surfaces as seen by one camera, P pixels row by row.
 
@@ -115,9 +149,8 @@ class SurfaceView:
         scene: the surfaces, see `surface_scene`.
         gaussians: the other shapes.
         integrator: renders them.
+        pixels: the pixels and their samples.
         sensor: the camera, with a film of those pixels.
-        seed: of the integrator's samples.
-        spp: samples per pixel.
         image: radiance and alpha of the nested integrator [h, w, 4], in linear light, a leaf of the gradient graph.
         coverage: fraction of each pixel in which a surface is seen [P], in [0, 1].
         depth: mean camera-space z of what is seen there [P], world units; inf where there is no surface.
@@ -130,9 +163,8 @@ class SurfaceView:
     scene: Any
     gaussians: list[Any]
     integrator: Any
+    pixels: SampledPixels
     sensor: Any
-    seed: int
-    spp: int
     image: Tensor
     coverage: Float
     depth: Float
@@ -142,26 +174,14 @@ class SurfaceView:
 
     @staticmethod
     def of(
-        whole: Any,
-        integrator: Any,
-        camera: Camera,
-        crop: tuple[int, int, int, int],
-        template: Any,
-        seed: int,
-        spp: int,
-        splats: ActivatedGaussians,
-        srgb: bool,
+        whole: Any, integrator: Any, pixels: SampledPixels, splats: ActivatedGaussians, srgb: bool
     ) -> SurfaceView | None:
         """Render the surfaces of a scene, or return None if it has neither surfaces nor an environment.
 
         Args:
             whole: scene of Gaussians and surfaces.
             integrator: renders them.
-            camera: the view.
-            crop: its pixels that are rendered, (x, y, width, height).
-            template: sensor with the sampler and the far plane.
-            seed: of the integrator's samples.
-            spp: its samples per pixel; 0: those of the sampler.
+            pixels: pixels that are rendered, and their samples.
             splats: the Gaussians of the scene.
             srgb: whether their colours are sRGB-encoded.
 
@@ -172,29 +192,22 @@ class SurfaceView:
         if scene is None:
             return None
         gaussians = [shape for shape in whole.shapes() if shape.is_ellipsoids()]
-        x, y, width, height = crop
-        area = {"crop_offset_x": x, "crop_offset_y": y, "crop_width": width, "crop_height": height}
-        params: Any = mi.traverse(template)
-        more = {"far_clip": float(params["far_clip"]), "sampler": template.sampler()}
-        sensor = mi.load_dict({**camera.sensor(pixel_format="rgba", **area), **more})
-        sampler = template.sampler().clone()
-        sampler.set_sample_count(spp or sampler.sample_count())
-        spp = sampler.sample_count()  # some samplers round it up
+        sensor = pixels.sensor()
         rays = rays_for(integrator, splats)
         with dr.suspend_grad(), traced(integrator, rays, srgb):
-            image = mi.TensorXf(integrator.render(scene, sensor, seed=seed, spp=spp))
-            coverage, depth = coverage_and_depth(scene, sensor, camera, crop)
+            image = mi.TensorXf(integrator.render(scene, sensor, seed=pixels.seed, spp=pixels.samples()))
+            coverage, depth = coverage_and_depth(scene, sensor, pixels.camera, pixels.crop)
             shown = scene.environment() is not None and not getattr(integrator, "hide_emitters", False)
             behind = _environment(scene, sensor) if shown else None
         dr.enable_grad(image, behind)
-        return SurfaceView(scene, gaussians, integrator, sensor, seed, spp, image, coverage, depth, behind, rays, srgb)
+        return SurfaceView(scene, gaussians, integrator, pixels, sensor, image, coverage, depth, behind, rays, srgb)
 
     def forward(self, params: Any) -> None:
         """Set the tangents of `image` and `behind` from those of the surfaces' parameters."""
         if not self._differentiates():
             return
         with _detached(self.gaussians), traced(self.integrator, self.splats, self.srgb):
-            tangent = self.integrator.render_forward(self.scene, params, self.sensor, seed=self.seed, spp=self.spp)
+            tangent = self.integrator.render_forward(self.scene, params, self.sensor, **self._samples(self.pixels.seed))
         dr.set_grad(self.image, tangent)
         if self.behind is not None and dr.grad_enabled(values := _environment(self.scene, self.sensor)):
             dr.set_grad(self.behind, dr.forward_to(values))
@@ -207,10 +220,10 @@ class SurfaceView:
         """
         if not self._differentiates():
             return
-        seed, _ = mi.sample_tea_32(self.seed, 1)
+        seed, _ = mi.sample_tea_32(self.pixels.seed, 1)
         grad = dr.grad(self.image)
         with traced(self.integrator, self.splats, self.srgb):
-            self.integrator.render_backward(self.scene, params, grad, self.sensor, seed=seed, spp=self.spp)
+            self.integrator.render_backward(self.scene, params, grad, self.sensor, **self._samples(seed))
         if self.behind is not None and dr.grad_enabled(values := _environment(self.scene, self.sensor)):
             # `values` may be a parameter itself, whose gradient is added to.
             dr.backward(dr.sum(dr.dot(values, dr.grad(self.behind))))
@@ -231,6 +244,9 @@ class SurfaceView:
                 "the Gaussians send to the surfaces and take from their light."
             )
         return bool(attached)
+
+    def _samples(self, seed: Any) -> dict[str, Any]:
+        return {"seed": seed, "spp": self.pixels.samples()}
 
     @property
     def mask(self) -> np.ndarray:

@@ -14,7 +14,7 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.core.color_space import srgb_to_linear
 from morgs_mi.export.frames import exr_layers, write_images
-from morgs_mi.export.insert import inserted_channels, load_insert, render_inserted, selected
+from morgs_mi.export.insert import InsertConfig, inserted_channels, load_insert, render_inserted, selected
 from morgs_mi.playback.player import render_stream
 from tests.scenes.surfaces import camera, cloud
 
@@ -55,7 +55,7 @@ def test_render_inserted__shows_the_scene_of_each_frame(stream, tmp_path):
 def test_render_inserted__takes_shapes_lights_and_integrator_of_an_xml_file(stream, tmp_path):
     (tmp_path / "ball.xml").write_text(XML)
     build = load_insert(tmp_path / "ball.xml")
-    images = dict(render_inserted(stream, camera(), build, [1], ("color",), samples=64))
+    images = dict(render_inserted(stream, camera(), build, [1], ("color",), InsertConfig(samples=64)))
     np.testing.assert_allclose(images[1]["color"][12, 16], (0.735, 0.537, 0), atol=0.05)
 
 
@@ -73,7 +73,7 @@ def test_render_inserted__traces_rays_through_the_stream(stream, tmp_path):
     )
     build = load_insert(tmp_path / "mirror.py")
     found = [
-        dict(render_inserted(stream, camera(), build, [0], ("color", "surfaces"), light=light))[0]
+        dict(render_inserted(stream, camera(), build, [0], ("color", "surfaces"), InsertConfig(light=light)))[0]
         for light in ("probe", "traced")
     ]
     assert np.abs(found[0]["color"] - found[1]["color"]).max() > 0.05
@@ -86,7 +86,7 @@ def test_render_inserted__refuses_an_integrator_that_does_not_trace_the_light(st
         return {"ball": {"type": "sphere"}, "integrator": {"type": "direct"}}
 
     with pytest.raises(ValueError, match="with light 'traced', expected an integrator `splat_path`, got"):
-        next(render_inserted(stream, camera(), build, light="traced"))
+        next(render_inserted(stream, camera(), build, config=InsertConfig(light="traced")))
 
 
 def test_render_inserted__layers_compose_to_the_image_where_surfaces_cover_nothing(stream, tmp_path):

@@ -13,7 +13,7 @@ import pytest
 from morgs_mi import FitConfig, StreamConfig, SynthConfig, open_stream, stream_capture, synthesize
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.evaluate.metrics import psnr
-from morgs_mi.export.insert import render_inserted
+from morgs_mi.export.insert import InsertConfig, render_inserted
 from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import Object, load_scene
 
@@ -44,7 +44,7 @@ def test_render_inserted__agrees_with_the_path_traced_clip(tmp_path: Path):
 
     before, truth = traced({}), traced({"ball": Object({"ball": BALL})})
     found, unshadowed = (
-        next(render_inserted(stream, camera, build, [0], ("color", "surfaces"), 64, shadows))[1]
+        next(render_inserted(stream, camera, build, [0], ("color", "surfaces"), InsertConfig(64, shadows)))[1]
         for shadows in (True, False)
     )
     coverage = found["surfaces"][..., 3]
