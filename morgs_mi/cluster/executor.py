@@ -1,7 +1,7 @@
 """The one place where work leaves this process: an executor of processes on this machine, or of a Dask cluster.
 
 Everything else awaits `Workers.run`. A task is a function of the package with plain arguments, and returns bytes. If
-its worker dies, it is run again; tasks have no side effects, so that the result is the same.
+its worker dies, it is run again; tasks have no side effects, and the result is the same.
 """
 
 from __future__ import annotations
@@ -44,7 +44,11 @@ class Workers(ABC):
     @property
     @abstractmethod
     def count(self) -> int:
-        """Number of workers, which may grow."""
+        """Number of workers, which may grow.
+
+        Raises:
+            ConnectionError: the scheduler was lost.
+        """
 
     @abstractmethod
     async def run(self, function: Callable[..., Result], *args: Any) -> Result:
@@ -76,7 +80,7 @@ class Workers(ABC):
 
 
 class _Processes(Workers):
-    """Processes of this machine, each in a pool of its own, so that only the task of a process dies with it."""
+    """Processes of this machine, each in a pool of its own: only its task dies with it."""
 
     place = "this machine"
 
@@ -124,7 +128,10 @@ class _DaskWorkers(Workers):
 
     @property
     def count(self) -> int:
-        return len(self._client.scheduler_info(n_workers=-1)["workers"])
+        about = self._client.scheduler_info(n_workers=-1)
+        if "workers" not in about:
+            raise ConnectionError(_lost(self.place))
+        return len(about["workers"])
 
     async def run(self, function: Callable[..., Result], *args: Any) -> Result:
         try:
@@ -174,7 +181,7 @@ def _lost(place: str) -> str:
 
 @contextmanager
 def open_workers(scheduler: str | None = None, count: int | None = None) -> Iterator[Workers]:
-    """Start workers, or connect to those of a scheduler.
+    """Start workers, or connect to the workers of a scheduler.
 
     Args:
         scheduler: None: processes on this machine; ``local``: a Dask cluster on this machine; otherwise the address of
