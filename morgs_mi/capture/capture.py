@@ -390,7 +390,7 @@ def _check_downscale(downscale: float, cameras: Sequence[Camera], recorded: Sequ
 
 
 def _color_corrected(capture: Capture, color: str) -> Capture:
-    """Return the capture with colours that are corrected between cameras; `color` is that of `ReadConfig`."""
+    """Return the capture with colours that are corrected between cameras; `color` as in `ReadConfig`."""
     method, _, name = color.partition(":")
     if method != "linear" or (name and name not in capture.names):
         raise ValueError(

@@ -160,7 +160,7 @@ def _reliable(
 def _shared_colors(
     view: int, pairs: Sequence[Match], colors: Sequence[np.ndarray], corrected: dict[int, np.ndarray]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a view's colours [M, 3] and those of the same points in the views already corrected."""
+    """Return the colours [M, 3] of the same points in a view and in the views already corrected."""
     mine, theirs = [], []
     for pair in pairs:
         if view in pair.views and (other := sum(pair.views) - view) in corrected:

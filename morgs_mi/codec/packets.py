@@ -112,7 +112,7 @@ def keyframe_packet(
     Args:
         gaussians: N Gaussians; their `motion` and `offset` are not stored.
         frame: index of the video frame.
-        cameras: cameras on whose screens the error is measured.
+        cameras: cameras in which the error is measured.
         config: tolerated errors.
 
     Raises:
@@ -142,14 +142,14 @@ def residual_packet(
 ) -> Packet:
     """Return the packet that leads from `previous` to `gaussians` (eq. 3); it contains changed Gaussians only.
 
-    A change counts from one step on, that of a base colour from half a step on. With a `target_size`, the steps of the
+    A change counts from one step on, of a base colour from half a step on. With a `target_size`, the steps of the
     changes are widened until the packet fits.
 
     Args:
         previous: state of the decoder, N Gaussians.
         gaussians: N' Gaussians of the next frame; with `config.offset`, `offset` is stored where the means change.
         source: int [N'], see above; None if there are no births and no deaths.
-        cameras: cameras on whose screens the error of births is measured.
+        cameras: cameras in which the error of births is measured.
         config: tolerated errors.
 
     Raises:
@@ -183,8 +183,8 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
         packet: a packet of the stream.
 
     Raises:
-        ValueError: a residual without the state that it continues, a packet that contradicts itself, or one whose frame
-            is not after that of `previous`.
+        ValueError: a residual without the state that it continues, a packet that contradicts itself, or a packet
+            of a frame that is not after the frame of `previous`.
     """
     where = packet.place or f"packet of frame {packet.frame}"
     names = {"head", "code"} | ({"parent"} if packet.kind == PacketKind.RESIDUAL else set())
@@ -220,7 +220,7 @@ def coded_frames(packets: Iterable[Packet]) -> Iterator[CodedFrame]:
 def frames_with_first_id(packets: Iterable[Packet]) -> Iterator[tuple[int, CodedFrame]]:
     """Decode packets in order and yield (first_id, state) after each frame; `first_id` is added to the state's ids.
 
-    It changes where a keyframe starts a new set of Gaussians with ids from 0, so that no two Gaussians have one id.
+    It changes where a keyframe starts a new set of Gaussians with ids from 0; no two Gaussians have one id.
     """
     first_id, coded = 0, None
     for packet in packets:

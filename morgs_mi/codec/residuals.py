@@ -82,7 +82,7 @@ def take_change(reader: ColumnReader, grid: Grid, coarseness: int) -> tuple[np.n
     """Return the integers int32 [N, C] after changes in steps of a coarseness, and the mask of deaths, bool [N].
 
     Raises:
-        ValueError: the columns are not those of changes, or a value leaves its range.
+        ValueError: the columns do not describe changes, or a value leaves its range.
     """
     values, dead, step = grid.values.copy(), np.zeros(len(grid), bool), float(_step(coarseness))
     for rows in _classes(grid):
@@ -104,7 +104,7 @@ def take_change(reader: ColumnReader, grid: Grid, coarseness: int) -> tuple[np.n
 
 
 def _flags(changed: dict[str, np.ndarray], names: tuple[str, ...], N: int) -> np.ndarray:
-    """Return the sum of 2^k [N] over those of the groups `names` that change, k being their place."""
+    """Return the sum of 2^k [N] over the groups `names` that change; k is the place of a group."""
     flags = np.zeros(N, np.int32)
     for bit, name in enumerate(names):
         if name in changed:

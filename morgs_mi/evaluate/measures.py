@@ -4,9 +4,9 @@ A measure is given the frames in order, each view by view. It returns the scores
 and at the end the scores of the clip, as fields of `Evaluation`.
 
 Every score is one number per view and frame. Frames average over views and the clip over frames; NaN stands for an
-unknown score. A name with ``_moving`` or ``_still`` is the score of a region: the pixels whose surface moved since the
-last frame (in the first frame: until the next) according to ``truth/``, or the pixels in which the recording changed by
-more than its noise if there is no truth.
+unknown score. A name with ``_moving`` or ``_still`` is the score of a region. With ``truth/``, it is the pixels with a
+surface that moved since the last frame, in the first frame until the next. Otherwise it is the pixels in which the
+recording changed by more than its noise.
 """
 
 from __future__ import annotations

@@ -118,7 +118,7 @@ class TrackScores:
     delta_avg: float = _NAN
     """Share of the visible points that are within a threshold, mean over the thresholds, in [0, 1]."""
     occlusion_accuracy: float = _NAN
-    """OA: share of the points whose visibility is right, in [0, 1]."""
+    """OA: share of the points with the right visibility, in [0, 1]."""
     median_error: float = _NAN
     """MTE: median over the visible points of a track of the distance, mean over the tracks, world units."""
     median_error_percent: float = _NAN
@@ -140,7 +140,7 @@ class TrackingScores:
     all: TrackScores
     """Scores of all tracks."""
     moving: TrackScores
-    """Scores of the tracks whose true paths are longer than 10 cm."""
+    """Scores of the tracks with true paths longer than 10 cm."""
 
 
 @dataclass(frozen=True)
@@ -234,7 +234,7 @@ class Evaluation:
     capture: str
     """Path of the capture."""
     held_out: bool
-    """Whether the scores are those of the held-out view; otherwise of all training views."""
+    """Whether the held-out view is scored; otherwise all training views."""
     complete: bool
     """Whether the stream holds all frames that were to be fitted."""
     regions: str
@@ -252,8 +252,8 @@ class Evaluation:
     """PSNR of the held-out view in the first frame, seen from the camera that fits its image best, dB; NaN without a
     held-out view. The scores of the frames are those as calibrated."""
     expected: str = ""
-    """What the fit expects of views between the cameras, a sentence; without its report, a forecast from the rig; empty
-    with a single training view."""
+    """Expected quality of views between the cameras, a sentence from the report of the fit; without one, a forecast
+    from the rig; empty with a single training view."""
     expected_psnr: float = float("nan")
     """Their PSNR as the fit estimates it, dB; NaN without an estimate."""
 

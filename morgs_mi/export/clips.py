@@ -74,7 +74,7 @@ def write_each(
 
     Args:
         clip: (frame, Gaussians) of all frames, as `play` and `by_place` yield them.
-        output: a folder that does not exist, or for one frame a file whose name ends in `suffix`.
+        output: a folder that does not exist, or for one frame a file with a name that ends in `suffix`.
         suffix: of the files, e.g. ``.ply``.
         write: function that writes the Gaussians of one frame.
         frames: indices of the frames, ascending.

@@ -5,7 +5,7 @@ A scene is an XML file, which is the same in all frames, or a Python file with a
     build(frame: int, time: float) -> dict
 
 that returns the entries of a Mitsuba scene: shapes, emitters, and optionally an `integrator` for them. The time is in
-seconds. World space and its units are those of the stream.
+seconds. World space and its units are the stream's.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ def _in_background_light(entries: dict[str, Any], gaussians: Gaussians, camera: 
 
 
 def _integrator(chosen: Any, light: Light) -> Any:
-    """Return the integrator of the surfaces, that of the inserted scene if it has one.
+    """Return the integrator of the surfaces: the inserted scene's own, if it has one.
 
     Raises:
         ValueError: it does not light them as the option demands.

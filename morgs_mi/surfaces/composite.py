@@ -1,7 +1,7 @@
 """Splats and surfaces in one image.
 
 Per pixel, a fraction f is covered by surfaces at depth z, with radiance L there and E elsewhere. C(z) and T(z) are the
-blended colour of the splats in front of z and the transmittance that remains; at z = inf, those of all splats:
+blended colour of the splats in front of z and the transmittance that remains; at z = inf, of all splats:
 
     f dec(C(z) + T(z) enc(L)) + (1 - f) dec(C(inf) + T(inf) enc(E))
 
@@ -37,11 +37,12 @@ def composite(
     """Return the channels of splats and surfaces, differentiable in both, each a list of floats [P].
 
     Colour is linear light. Alpha is 1 where a surface or the environment is seen, depth is the expected depth of splats
-    and surfaces together. Motion and the channels of attributes are those of the splats in front of the surfaces.
+    and surfaces together. Motion and the channels of attributes
+    belong to the splats in front of the surfaces.
 
     Args:
         gaussians: N Gaussians.
-        channels: those of `rasterize`.
+        channels: as for `rasterize`.
         background: colour [3] behind all splats where no surface and no environment is seen, encoded like the splats.
         view: the surfaces on P pixels of a camera's image.
     """

@@ -116,7 +116,7 @@ class SampledPixels:
         crop: its pixels, (x, y, width, height), P in all.
         template: sensor with the sampler and the far plane.
         seed: of the samples.
-        spp: samples per pixel; 0: those of the sampler.
+        spp: samples per pixel; 0: as the sampler has.
     """
 
     camera: Camera
@@ -203,7 +203,7 @@ class SurfaceView:
         return SurfaceView(scene, gaussians, integrator, pixels, sensor, image, coverage, depth, behind, rays, srgb)
 
     def forward(self, params: Any) -> None:
-        """Set the tangents of `image` and `behind` from those of the surfaces' parameters."""
+        """Set the tangents of `image` and `behind` from the tangents of the surfaces' parameters."""
         if not self._differentiates():
             return
         with _detached(self.gaussians), traced(self.integrator, self.splats, self.srgb):
@@ -213,10 +213,10 @@ class SurfaceView:
             dr.set_grad(self.behind, dr.forward_to(values))
 
     def backward(self, params: Any) -> None:
-        """Add to the gradients of the surfaces' parameters those that follow from those of `image` and `behind`.
+        """Add to the gradients of the surfaces' parameters what follows from the gradients of `image` and `behind`.
 
-        Its samples are others than those of `image`: where an image is no linear function of the radiance, the product
-        of two noisy factors would be biased.
+        Its samples differ from the samples of `image`: where an image is no linear function of the radiance, the
+        product of two noisy factors would be biased.
         """
         if not self._differentiates():
             return

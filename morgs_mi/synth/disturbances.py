@@ -1,7 +1,7 @@
-"""What makes a recording hard: clocks that are apart, rolling shutters, changes of exposure, lenses, and compression.
+"""Disturbances of a recording: clocks that are apart, rolling shutters, changes of exposure, lenses, and compression.
 
 Frame k of a camera with the time offset o is exposed at (k + o) / fps, and its row r of H at
-(k + o + s ((r + 0.5) / H - 0.5)) / fps, with s the rolling shutter: the time of a frame is that of its middle row.
+(k + o + s ((r + 0.5) / H - 0.5)) / fps, with s the rolling shutter: the time of a frame is the time of its middle row.
 Ground truth refers to this time and to the view without distortion, which `load_capture` returns.
 
 On disk: ``truth/disturbances.json``.

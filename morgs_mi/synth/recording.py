@@ -1,4 +1,4 @@
-"""What a camera with a clock, a rolling shutter and a lens of its own sees of a moving scene."""
+"""Light that a camera with its own clock, rolling shutter and lens receives from a moving scene."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def record_light(
     """Return the light of a frame as a camera with its clock, shutter and lens receives it, linear [H, W, 3].
 
     Args:
-        tracer: the scene, whose time is changed.
+        tracer: the scene; its time is changed.
         camera: the view without distortion.
         own: its disturbance, of which exposure and compression are not applied.
         frame: index of the frame.

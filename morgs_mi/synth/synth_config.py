@@ -64,7 +64,7 @@ class SynthConfig:
             raise ValueError(f"synthesize(): `width` and `height` must be even, got {self.width}x{self.height}.")
 
     def completed(self, recording: Recording) -> SynthConfig:
-        """Return the settings with those of a scene where none are given."""
+        """Return the settings with the scene's own ones where none are given."""
         own = {"cameras": recording.num_cameras, "spp": recording.spp, "noise": recording.noise}
         return replace(self, **{name: value for name, value in own.items() if getattr(self, name) is None})
 

@@ -60,7 +60,7 @@ def synthesize(
     `ground_truth` and `disturbances`). ``cam00`` is the central camera of the rig and the held-out test view, as in
     N3DV. With lens distortion there is no ``poses_bounds.npy``, which cannot hold it. The folder is written atomically.
 
-    Tracks are at the times of the frames of ``cam00``, the other ground truth at those of each camera.
+    Tracks are at the times of the frames of ``cam00``, the other ground truth at the times of each camera.
 
     Args:
         scene: a scene, its name, or the path of its Python file or of an animated glTF file (see `gltf_scene`).
@@ -251,7 +251,7 @@ def _sample_tracks(
 def _write_calibration(tracer: PathTracer, rig: _Rig, clips: Sequence[Path], folder: Path) -> None:
     """Write the cameras as `poses_bounds.npy` and as a COLMAP model with points from the training views.
 
-    The colours of the points are those of the `clips`, one per camera.
+    The points have the colours of the `clips`, one per camera.
     """
     cameras, disturbed, rng = rig.cameras, rig.disturbed, np.random.default_rng([rig.config.seed, 2])
     points, colors, bounds = [], [], []

@@ -52,8 +52,8 @@ def refusal(host: str | None, origin: str | None, names: Collection[str] = ()) -
 def checked_connections(names: Collection[str] = (), ready: Event | None = None) -> Iterator[None]:
     """Refuse connections according to `refusal` in the viser server that is started in this context.
 
-    Until `ready` is set, pages load but do not connect. viser passes no options to the `serve` of websockets, so that
-    function is replaced while viser starts.
+    Until `ready` is set, pages load but do not connect. viser passes no options to the `serve` of websockets.
+    Therefore that function is replaced while viser starts.
 
     Raises:
         RuntimeError: no server was started through `serve`, so its connections would not be checked.

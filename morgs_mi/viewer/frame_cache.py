@@ -15,7 +15,7 @@ from morgs_mi.playback.player import open_stream
 
 __all__ = ["NO_TRAILS", "FrameCache", "Trails"]
 
-# Frames whose centres are cached: 3 MB each for 200,000 Gaussians.
+# Number of frames with cached centres: 3 MB each for 200,000 Gaussians.
 _CACHED_FRAMES = 64
 # Frames that are decoded in search of motion.
 _SEARCHED_FRAMES = 32
@@ -151,7 +151,7 @@ class FrameCache:
             current = self._current
             self.at(frame)
             centres = self._centres[frame]
-            if current is not None:  # so that the frame on display is not decoded again later
+            if current is not None:  # otherwise the frame on display would be decoded again later
                 self.at(current.frame)
             return centres
         return self._centres[frame]

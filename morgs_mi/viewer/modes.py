@@ -81,5 +81,5 @@ def scale_text(mode: str, values: np.ndarray, motion_scale: float) -> str:
 
 
 def value_colors(mode: str, values: np.ndarray, motion_scale: float) -> np.ndarray:
-    """Return the colours of values [N, C] of a mode, uint8 [N, 3]; `motion_scale` is that of `channel_image`."""
+    """Return the colours of values [N, C] of a mode, uint8 [N, 3]; `motion_scale` as for `channel_image`."""
     return channel_image(mode, values[:, None], motion_scale)[:, 0]

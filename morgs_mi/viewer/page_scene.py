@@ -1,4 +1,4 @@
-"""What the page draws: Gaussians or an image behind them, trajectories, the cameras of the rig."""
+"""The scene of a page: Gaussians or an image behind them, trajectories, the cameras of the rig."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class PageScene:
     def show_splats(
         self, ids: np.ndarray, gaussians: Gaussians, values: np.ndarray, mode: str, motion_scale: float
     ) -> None:
-        """Show Gaussians with numbers `ids` [N] in the colours of a mode; arguments are those of `value_colors`."""
+        """Show Gaussians with numbers `ids` [N] in the colours of a mode; arguments as for `value_colors`."""
         if self._background != BACKGROUNDS[mode]:
             self._background = BACKGROUNDS[mode]
             self._scene.set_background_image(np.full((2, 2, 3), self._background, np.uint8), format="png")

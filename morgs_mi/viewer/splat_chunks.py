@@ -1,4 +1,4 @@
-"""Gaussians on the page in chunks, so that only those that change are sent again.
+"""Gaussians on the page in chunks: only chunks with changes are sent again.
 
 viser sends the whole buffer of a splat object, but it sorts and blends the Gaussians of all objects together. So the
 Gaussians are distributed over the rows of several objects, the chunks, and a frame sends the chunks that differ. A
@@ -22,11 +22,11 @@ _CHUNKS, _LEAST_ROWS, _MOST_ROWS = 64, 64, 4096
 # Share of the rows that are free for Gaussians that are born.
 _SPARE = 1 / 16
 _FREE = -1
-# Share of the rows above which a change is that of a mode or a view and says nothing about motion.
+# Share of the rows above which a change is due to a mode or a view, not to motion.
 _NEARLY_ALL = 0.75
 # Upper triangle of a covariance.
 _UPPER = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
-# Variance of the transparent Gaussians in free rows: small, so that they cover few pixels.
+# Variance of the transparent Gaussians in free rows: small, to cover few pixels.
 _TINY = 1e-4
 
 
@@ -136,7 +136,7 @@ class SplatChunks:
         count = int(np.ceil(needed / size))
         self._ids = np.full(count * size, _FREE, np.int64)
         self._ids[rows] = ids
-        self._shown = np.zeros((count * size, 8), np.uint32)  # differs from every row, so that all are sent
+        self._shown = np.zeros((count * size, 8), np.uint32)  # differs from every row: all are sent
         self._changes, self._sent_in_vain = np.zeros(count * size, np.int64), 0
         self._changes[rows] = changes
         # Beside the others, as the page sorts by depths between the least and the largest.

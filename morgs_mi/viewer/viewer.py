@@ -1,7 +1,7 @@
 """A stream in the browser: play, scrub, orbit, show motion, compare with the recording, follow a running fit.
 
 The page is viser's. It draws the Gaussians itself from their centres, covariances in half precision, and one colour and
-opacity each, so that orbiting is smooth. "Exact image" shows the image of this package's renderer instead, which is
+opacity each, which makes orbiting smooth. "Exact image" shows the image of this package's renderer instead, which is
 rendered whenever the camera comes to rest. All decoding and rendering happens in the thread that calls `run`.
 """
 
