@@ -55,6 +55,7 @@ def test_fit__reports_what_to_expect_of_views_between_the_cameras(capture: Path,
     assert first["validation"]["sentence"] in " ".join(output.split())
 
 
+@pytest.mark.slow
 def test_fit__names_cameras_of_other_exposure(tmp_path: Path, run) -> None:
     path = textured.write_capture(tmp_path / "rig").path
     sentence = r"cam2 is 2[3-6] % brighter than the other cameras: .*, or use --exposure auto or --color linear\."

@@ -76,7 +76,6 @@ def test_render_stream__renders_the_available_channels(fitted_clip: Path, tmp_pa
         ({"reading": {"offset": {"cam0": "0.5"}}}, capture_of, r"`reading` of the header's metadata: `offset` must be"),
         ({"reading": {"offset": {"cam0": 2}, "trim": 1}}, capture_of, r"metadata: `trim` must be true or false, got 1"),
     ],
-    ids=str,
 )
 def test_open_stream__metadata_of_other_types_are_refused_where_they_are_read(
     tmp_path: Path, metadata: dict[str, Any], read: Callable[[StreamReader], Any], message: str
