@@ -1,0 +1,123 @@
+"""Draw the stages of one frame of the demo's clip, for the page docs/how-it-works.md.
+
+    python -m benchmarks.pictures
+
+The clip is that of `morgs-mi demo`: made in `out/demo/capture` unless it is there. All pictures show one key view.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import mitsuba as mi
+import numpy as np
+import tyro
+
+import morgs_mi
+from morgs_mi.codec.packets import CodedFrame
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians, displaced
+from morgs_mi.demo import DemoConfig
+from morgs_mi.method.active_set import full_active_set
+from morgs_mi.method.lift import lift_flow
+from morgs_mi.observation import FrameObservation, observe_frame
+from morgs_mi.playback.visualise import confidence_image, grey_image, motion_image, to_uint8
+from morgs_mi.stream_loop import StreamLoop
+from morgs_mi.synth.synthesize import synthesize
+
+_ERROR_GAIN = 10
+_JPEG_QUALITY = 90
+
+
+@dataclass(frozen=True)
+class Options:
+    """Draw the stages of one frame of the demo's clip."""
+
+    capture: Path = Path("out/demo/capture")
+    """Capture of the demo; made if missing."""
+    out: Path = Path("docs/how-it-works")
+    """Folder of the pictures."""
+    frame: int = 5
+    """The frame; a multiple of `mask_interval`, at which motion masks are computed."""
+    variant: str = "llvm_ad_rgb"
+    """Variant of Mitsuba."""
+
+
+def main(options: Options) -> None:
+    """Fit the clip up to the frame and write a JPEG file per stage."""
+    mi.set_variant(options.variant)
+    config = DemoConfig()
+    if not options.capture.exists():
+        synthesize(config.scene, options.capture, replace(config.clip, seed=config.stream.seed))
+    capture = morgs_mi.load_capture(options.capture)
+    loop = StreamLoop.of(capture, config.stream)
+    frames = [[frame.images[v] for v in capture.train_views] for frame in capture.frames(0, options.frame + 1)]
+    for images in frames[:-1]:
+        loop.push(images)
+    options.out.mkdir(parents=True, exist_ok=True)
+    for name, picture in draw(loop, frames[-1]).items():
+        bgr = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
+        cv2.imwrite(str(options.out / f"{name}.jpg"), bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+
+
+def draw(loop: StreamLoop, images: Sequence[np.ndarray | None]) -> dict[str, np.ndarray]:
+    """Push the next frame and return the picture [H, W, 3] of each stage in the key view that changes most, by name."""
+    setup, state = loop.setup, loop.state
+    observed = observe_frame(setup, state.frame, state.seen, images)
+    changes = observed.changes or {}
+    view = max(observed.flows, key=lambda v: changes[v].sum())
+    camera, flow, before = setup.cameras[view], observed.flows[view], loop.gaussians
+    image = observed.seen.images[view]
+    assert before is not None
+    assert state.coded is not None
+    assert flow.mask is not None, "motion masks are computed at multiples of `mask_interval`"
+    lifted = _lifted(before, loop, observed)
+    loop.push(images)
+    after, coded = loop.gaussians, loop.state.coded
+    assert after is not None
+    assert coded is not None
+    rendered = _channel(after, camera, "color")
+    # Fully saturated at a speed that the fastest pixels reach.
+    scale = float(np.percentile(np.linalg.norm(flow.motion[flow.mask], axis=-1), 95))
+    return {
+        "image": image,
+        "changes": grey_image(changes[view].astype(float)),
+        "flow": motion_image(np.where(flow.reliable[..., None], flow.motion, np.nan), scale),
+        "mask": grey_image(flow.mask.astype(float)),
+        "lifted": motion_image(_channel(lifted, camera, "motion"), scale),
+        "motion": motion_image(_channel(after, camera, "motion"), scale),
+        "confidence": confidence_image(_channel(after, camera, "confidence")),
+        "residual": confidence_image(_changed_share(state.coded, coded, camera)),
+        "render": to_uint8(np.clip(rendered, 0, 1)),
+        "error": to_uint8(np.clip(_ERROR_GAIN * np.abs(rendered - image / 255), 0, 1)),
+    }
+
+
+def _lifted(gaussians: Gaussians, loop: StreamLoop, observed: FrameObservation) -> Gaussians:
+    """Return the Gaussians after the displacement that explains the flow of the key views best (`lift_flow`)."""
+    cameras = {v: loop.setup.cameras[v] for v in observed.flows}
+    views = full_active_set(gaussians, cameras, loop.setup.config.render).views
+    return displaced(gaussians, lift_flow(gaussians, views, observed.flows).displacement)
+
+
+def _channel(gaussians: Gaussians, camera: Camera, name: str) -> np.ndarray:
+    return np.asarray(morgs_mi.rasterize(gaussians, camera, (name,))[name])
+
+
+def _changed_share(before: CodedFrame, after: CodedFrame, camera: Camera) -> np.ndarray:
+    """Return the share [H, W, 1] of each pixel that Gaussians have which the residual packet changed."""
+    rows = {number: row for row, number in enumerate(before.ids)}
+    same = [
+        number in rows and np.array_equal(before.grid.values[rows[number]], values)
+        for number, values in zip(after.ids, after.grid.values, strict=True)
+    ]
+    changed = np.logical_not(same)[:, None].astype(np.float32)
+    gaussians = replace(after.gaussians, motion=None, offset=None)
+    return np.asarray(morgs_mi.rasterize(gaussians, camera, ("alpha",), features=changed).features)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Options))
