@@ -22,6 +22,7 @@ SMALLER = {
     "live": "--calibration CAPTURE --frames 2 --loop --first-frame-steps 30 --epochs 1",
     "demo": "--frames 3 --cameras 7",
 }
+PAGES = ("README.md", *(f"docs/{name}.md" for name in ("quickstart", "captures", "cameras", "colours", "checks")))
 # Commands that never end, or write outside of the folder.
 LEFT_OUT = ("morgs-mi view", "morgs-mi --completion")
 
@@ -47,7 +48,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", ["README.md", "docs/quickstart.md", "docs/captures.md"])
+@pytest.mark.parametrize("page", PAGES)
 def test_commands__of_a_page_run_to_the_end(page: str, recordings: Path, tmp_path: Path, run, monkeypatch) -> None:
     shutil.copytree(recordings, tmp_path / "there")
     monkeypatch.chdir(tmp_path / "there")

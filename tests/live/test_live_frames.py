@@ -90,10 +90,10 @@ def test_live_frames__refuse_bad_sources(rig: Capture, sources, error, message: 
         list(live_frames(rig, sources))
 
 
-def test_captures_page__live_example_runs(rig: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The loop over live frames in docs/captures.md, with raw pipes in place of FFmpeg's."""
-    text = (Path(__file__).parents[2] / "docs" / "captures.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+def test_live_page__loop_runs(rig: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop over live frames in docs/live.md, with raw pipes in place of FFmpeg's."""
+    text = (Path(__file__).parents[2] / "docs" / "live.md").read_text(encoding="utf-8")
+    *_, example = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     reads, pushed = iter(NAMES), []
 
     def popen(command, stdout):
@@ -115,6 +115,6 @@ def test_captures_page__live_example_runs(rig: Capture, monkeypatch: pytest.Monk
     monkeypatch.setattr("morgs_mi.StreamLoop", Loop)
     monkeypatch.setattr("morgs_mi.load_capture", lambda path, downscale: rig)
     monkeypatch.setattr("mitsuba.set_variant", lambda name: None)
-    exec(compile(example, "captures.md", "exec"), {})
+    exec(compile(example, "live.md", "exec"), {})
     assert len(pushed) == 3
     assert all(image.shape == (23, 31, 3) for image in pushed[0])
