@@ -55,35 +55,31 @@ def timed(work: Callable[[], Any], repeats: int, patience: float = float("inf"))
     return median(times[2:] or times[1:])
 
 
-def stages(
-    gaussians: Gaussians, camera: Camera, channels: tuple[str, ...] = ("color",), num_features: int = 0, seed: int = 1
-) -> dict[str, Callable[[], Any]]:
+def stages(gaussians: Gaussians, camera: Camera, seed: int = 1) -> dict[str, Callable[[], Any]]:
     """Return the timed stages by name.
 
-    Lists (with projection), forward (with lists), adjoint (from the image's gradient to the attributes'), and the whole
-    step; for colour alone also the step with Adam's, the step on a tenth of the tiles, drawn at random, and the L1 +
-    D-SSIM loss with its derivative.
+    Lists (with projection), forward (with lists), adjoint (from the image's gradient to the attributes'), the whole
+    step, the step with Adam's, the step on a tenth of the tiles, drawn at random, and the L1 + D-SSIM loss with its
+    derivative.
     """
     config = RenderConfig()
     target = np.broadcast_to(np.array(TARGET, np.float32), (camera.height, camera.width, 3)).copy()
-    attributes, full, features = list(gaussians.items().values()), mi.TensorXf(target), None
-    if num_features:
-        features = mi.TensorXf(np.full((len(gaussians), num_features), 0.3, np.float32))
-        attributes.append(features)
-    named = (*channels, "features") if num_features else channels
+    attributes, full = list(gaussians.items().values()), mi.TensorXf(target)
     dr.enable_grad(attributes)
 
     def lists() -> Any:
         with dr.suspend_grad():
             region = full_view(camera.width, camera.height, config)
-            splats = project(gaussians, camera, named, config, features=features)
-            built = build_lists(splats, [v for name in named for v in splats.channels.get(name, ())], region, config)
+            splats = project(gaussians, camera, ("color",), config)
+            built = build_lists(splats, list(splats.channels["color"]), region, config)
         return built.words, built.order
 
     def forward() -> Any:
         with dr.suspend_grad():
-            image = rasterize(gaussians, camera, channels, features=features)
-            return [getattr(image, name) for name in named]
+            return rasterize(gaussians, camera, ("color",)).color
+
+    def distance(color: Any, wanted: Any = full) -> Any:
+        return dr.sum(dr.abs(color - wanted), axis=None) / target.size
 
     def gradients(loss: Any) -> Any:
         dr.backward(loss)
@@ -92,19 +88,15 @@ def stages(
         dr.clear_grad(attributes)
         return grads
 
-    def step(region: Region | None = None, wanted: Any = None) -> Any:
-        image = rasterize(gaussians, camera, channels, features=features, region=region)
-        return gradients(_distance(image, named, full if wanted is None else wanted, target.size))
+    def step(region: Region | None = None, wanted: Any = full) -> Any:
+        return gradients(distance(rasterize(gaussians, camera, ("color",), region=region).color, wanted))
 
     def adjoint() -> Callable[[], Any]:
-        image = rasterize(gaussians, camera, channels, features=features)
-        loss = _distance(image, named, full, target.size)
-        dr.eval(image, loss)
+        color = rasterize(gaussians, camera, ("color",)).color
+        loss = distance(color)
+        dr.eval(color, loss)
         return lambda: gradients(loss)
 
-    works = {"lists": lists, "forward": forward, "adjoint": adjoint, "step": step}
-    if named != ("color",):
-        return works
     tiles = np.random.default_rng(seed).uniform(size=(-(-camera.height // 32), -(-camera.width // 32)))
     mask = np.kron(tiles <= np.quantile(tiles, 0.1), np.ones((32, 32), bool))[: camera.height, : camera.width]
 
@@ -120,14 +112,14 @@ def stages(
         return made
 
     def optimised_step() -> Any:
-        image = rasterize(gaussians.with_parameters(dict(optimizer().items())), camera, channels)
-        dr.backward(_distance(image, named, full, target.size))
+        image = rasterize(gaussians.with_parameters(dict(optimizer().items())), camera, ("color",))
+        dr.backward(distance(image.color))
         optimizer().step()
         return list(optimizer().values())
 
     @cache
     def compared() -> tuple[Any, Target]:
-        image = dr.detach(forward()[0])
+        image = dr.detach(forward())
         dr.enable_grad(image)
         return image, Target(target)
 
@@ -138,13 +130,8 @@ def stages(
         dr.clear_grad(image)
         return grad
 
+    works = {"lists": lists, "forward": forward, "adjoint": adjoint, "step": step}
     return works | {"optimised_step": optimised_step, "tenth_step": lambda: step(*tenth()), "loss": loss}
-
-
-def _distance(image: Any, channels: tuple[str, ...], target: Any, size: int) -> Any:
-    """Return the sum of L1 distances of the colour to its target and of the other channels to 0.5, over `size`."""
-    errors = (dr.abs(getattr(image, name) - (target if name == "color" else 0.5)) for name in channels)
-    return sum(dr.sum(error, axis=None) for error in errors) / size
 
 
 def measure(works: dict[str, Callable[[], Any]], repeats: int, patience: float = float("inf")) -> dict[str, float]:
@@ -227,10 +214,8 @@ def volprim_stages(gaussians: Gaussians, camera: Camera) -> dict[str, Callable[[
     return {"volprim_forward": forward, "volprim_step": step}
 
 
-def baselines(gaussians: Gaussians, camera: Camera, channels: tuple[str, ...]) -> tuple[dict[str, Any], dict[str, str]]:
+def baselines(gaussians: Gaussians, camera: Camera) -> tuple[dict[str, Any], dict[str, str]]:
     """Return the stages of the baselines, and the reasons for which others are omitted."""
-    if channels != ("color",):
-        return {}, {"baselines": "they render colour only"}
     works = plain_stages(gaussians, camera)
     if len(gaussians) > VOLPRIM_GAUSSIANS or camera.width * camera.height > VOLPRIM_PIXELS:
         reason = f"a step beyond {VOLPRIM_GAUSSIANS} Gaussians or {VOLPRIM_PIXELS} pixels takes many seconds"

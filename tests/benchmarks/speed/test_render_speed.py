@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import stat
 import subprocess
@@ -44,17 +43,9 @@ def run(*args: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
 
 
-@pytest.fixture(scope="module")
-def figures(tmp_path_factory: pytest.TempPathFactory):
-    """The figures of a small ball, without baselines."""
-    rung = workloads.Rung("tiny", "size", 60, (40, 24), 0.1)
-    gaussians, camera = workloads.build(rung, 1)
-    options = render_speed.Options(repeats=1, rounds=2)
-    return rung, render_speed.figures(gaussians, camera, rung.channels, options)
-
-
-def test_figures__are_times_memory_and_error(figures):
-    _, result = figures
+def test_figures__are_times_memory_and_error(workload: Path):
+    options = render_speed.Options(workload, repeats=1, rounds=2)
+    result = render_speed.figures(*workloads.load(workload), options)
     for stage in ("lists_ms", "forward_ms", "adjoint_ms", "step_ms", "loss_ms", "peak_megabytes", "pairs"):
         assert result[stage] > 0, stage
     assert result["tenth_share"] > 0
@@ -62,25 +53,14 @@ def test_figures__are_times_memory_and_error(figures):
     assert not any("yardstick" in name or "plain" in name for name in result)
 
 
-def test_write_csv__joins_lists_and_leaves_missing_figures_empty(figures, tmp_path: Path):
-    rung, result = figures
-    rows = [{"name": rung.name, "size": [40, 24], **result}, {"name": "other", "size": [1, 2], "extra": 3}]
-    render_speed.write_csv(rows, tmp_path / "out.csv")
-    with (tmp_path / "out.csv").open(newline="") as file:
-        first, second = csv.DictReader(file)
-    assert float(first["step_ms"]) == result["step_ms"]
-    assert (first["size"], first["extra"], second["size"], second["step_ms"]) == ("40 24", "", "1 2", "")
-
-
 def test_yardstick__passes_the_workload_and_reads_the_median(workload: Path, yardstick: Path):
     gaussians, camera = workloads.load(workload)
     assert timing.Yardstick(yardstick).step(gaussians, camera, 2) == 0.5
 
 
-def test_baselines__are_omitted_for_other_channels_and_large_workloads(workload: Path):
+def test_baselines__are_omitted_for_large_workloads(workload: Path):
     gaussians, camera = workloads.load(workload)
-    assert timing.baselines(gaussians, camera, ("depth",)) == ({}, {"baselines": "they render colour only"})
-    works, omitted = timing.baselines(gaussians, camera.resized(1024, 768), ("color",))
+    works, omitted = timing.baselines(gaussians, camera.resized(1024, 768))
     assert set(works) == {"plain_forward", "plain_step"}
     assert set(omitted) == {"volprim"}
 
@@ -103,25 +83,18 @@ def test_render_speed__compares_a_workload_with_a_yardstick(workload: Path, yard
 
 
 @pytest.mark.slow
-def test_render_speed__times_baselines_and_writes_the_table(workload: Path, tmp_path: Path):
-    out, table = tmp_path / "out.json", tmp_path / "out.csv"
-    done = run("--workload", workload, "--json", out, "--csv", table, "--baselines", "--repeats", 1, "--rounds", 1)
+def test_render_speed__times_baselines(workload: Path):
+    done = run("--workload", workload, "--baselines", "--repeats", 1, "--rounds", 1)
     assert done.returncode == 0, done.stderr
-    result = json.loads(out.read_text())
+    result = json.loads(done.stdout)
     for name in ("plain_forward_ms", "plain_step_ms", "volprim_forward_ms", "volprim_step_ms", "ratio_to_plain"):
         assert result[name] > 0, name
-    with table.open(newline="") as file:
-        (row,) = csv.DictReader(file)
-    assert float(row["step_ms"]) == result["step_ms"]
-    assert row["size"] == "40 24"
 
 
 def test_plain__renders_the_same_image_and_gradients():
     gaussians, camera = ball(2, 300, 50, 38, 0.1)
-    config, target = (
-        RenderConfig(stop_transmittance=0),
-        (3.0, 4.0, 5.0),
-    )  # above any colour: signs are certain
+    config = RenderConfig(stop_transmittance=0)
+    target = (3.0, 4.0, 5.0)  # above any colour: signs are certain
     dr.enable_grad(*gaussians.items().values())
     image = rasterize(gaussians, camera, ("color",), config=config).color
     assert_close(plain.render(gaussians, camera, config), image, atol=2e-5)
