@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
-from benchmarks.pages.results import CHOSEN_ON, Scores, committed, fits_by_cell, span, spreads
-from benchmarks.reports.plots import grouped, markdown, plus_minus
+from benchmarks.pages.results import CHOSEN_ON, Scores, committed, span
+from benchmarks.reports.plots import Column, grouped, markdown, plus_minus, scores_table
 
 __all__ = [
     "cameras",
@@ -70,20 +72,23 @@ def estimates() -> str:
 
 def disturbances() -> str:
     """Return what each kind of disturbance costs."""
-    digits = {"psnr": 2, "psnr_moving": 2, "motion_error_moving": 2, "confidence_iou": 2}
-    rows = ((name, *spreads(own, digits)) for name, own in fits_by_cell(committed("disturbances")["cells"]).items())
-    return markdown(("disturbance", "PSNR, dB", "moving, dB", "motion error, px", "IoU of the confidence"), rows)
+    columns = (
+        Column("PSNR, dB", "psnr"),
+        Column("moving, dB", "psnr_moving"),
+        Column("motion error, px", "motion_error_moving"),
+        Column("IoU of the confidence", "confidence_iou"),
+    )
+    return scores_table(committed("disturbances")["fits"], {"disturbance": "disturbance"}, columns)
 
 
 def cameras() -> str:
     """Return what refinement brings back, by the error of the poses, and of denied lenses."""
-    found = committed("cameras")
+    fits, rows = committed("cameras")["fits"], []
     groups = {
         f"poses off by {degrees:g} degrees": own
-        for (degrees,), own in sorted(grouped(found["fits"], "degrees").items())
+        for (degrees,), own in sorted(grouped((fit for fit in fits if not fit["lens"]), "degrees").items())
     }
-    rows = []
-    for name, own in (groups | {"lenses ignored": found["lenses"]}).items():
+    for name, own in (groups | {"lenses ignored": [fit for fit in fits if fit["lens"]]}).items():
         psnrs = (f"{np.mean([fit[how]['registered'] for fit in own]):.1f}" for how in ("true", "disturbed", "refined"))
         rotations = span((fit["refined"]["rotation"] for fit in own), 2)
         rows.append((name, *psnrs, f"{span((100 * fit['recovered'] for fit in own), 0)} %", rotations))
@@ -94,41 +99,45 @@ def cameras() -> str:
 def clocks() -> str:
     """Return the errors of the time offsets of each scene, and the PSNR where things move with and without them."""
     names = "synchronised", "recorded", "aligned"
-    scenes, rows = committed("timing")["scenes"], []
-    for scene, row in scenes.items():
-        errors = (f"{row[error]:.3f}" for error in ("mean_error", "largest_error"))
-        rows.append((scene, f"{row['views']:.0f}", *errors, *(plus_minus(row[name]["moving"]) for name in names)))
-    means = (f"{np.mean([np.mean(row[name]['moving']) for row in scenes.values()]):.2f}" for name in names)
+    scenes, rows = grouped(committed("timing")["fits"], "scene"), []
+    for (scene,), own in scenes.items():
+        errors = (f"{own[0][error]:.3f}" for error in ("mean_error", "largest_error"))
+        psnrs = (plus_minus([fit[f"{name}_moving"] for fit in own]) for name in names)
+        rows.append((scene, f"{own[0]['views']:.0f}", *errors, *psnrs))
+    means = (f"{_mean_over(scenes, f'{name}_moving'):.2f}" for name in names)
     rows.append(("mean", "", "", "", *means))
     return markdown(("scene", "views", "mean error", "largest", "synchronised, dB", "apart", "aligned"), rows)
 
 
 def clocks_mean() -> str:
     """Return the errors of the time offsets over all scenes, and the PSNR where things move, means over the scenes."""
-    scenes = committed("timing")["scenes"].values()
+    scenes = grouped(committed("timing")["fits"], "scene")
     row = [
-        span((scene["mean_error"] for scene in scenes), 2),
-        f"{max(scene['largest_error'] for scene in scenes):.2f}",
-        *(
-            f"{np.mean([np.mean(scene[name]['moving']) for scene in scenes]):.1f} dB"
-            for name in ("synchronised", "recorded", "aligned")
-        ),
+        span((own[0]["mean_error"] for own in scenes.values()), 2),
+        f"{max(own[0]['largest_error'] for own in scenes.values()):.2f}",
+        *(f"{_mean_over(scenes, f'{name}_moving'):.1f} dB" for name in ("synchronised", "recorded", "aligned")),
     ]
     titles = "mean error, frames", "largest error", "synchronised", "clocks apart", "aligned"
     return markdown(titles, [row], left=0)
 
 
+def _mean_over(scenes: Mapping[tuple[str, ...], Sequence[Scores]], score: str) -> float:
+    """Return the mean over the scenes of a score's mean over the fits."""
+    return float(np.mean([np.mean([fit[score] for fit in own]) for own in scenes.values()]))
+
+
 def exposure() -> str:
     """Return the PSNR with matched colours of equal and disturbed cameras, and the share that comes back."""
-    found = fits_by_cell(committed("exposure")["fits"], " ")
+    found = grouped(committed("exposure")["fits"], "seed", "cameras", "exposure")
     rows = []
-    for seed in dict.fromkeys(name.split()[0] for name in found):
+    for seed in dict.fromkeys(seed for seed, *_ in found):
         cases = [
-            [fit["psnr_matched"] for fit in found[f"{seed} {case}"]]
-            for case in ("equal off", "equal auto", "disturbed off", "disturbed auto")
+            [fit["psnr_matched"] for fit in found[seed, cameras, mode]]
+            for cameras in ("equal", "disturbed")
+            for mode in ("off", "auto")
         ]
         equal, _, off, auto = (np.mean(values) for values in cases)
-        rows.append((seed, *map(plus_minus, cases), f"{100 * (auto - off) / (equal - off):.0f} %"))
+        rows.append((f"{seed}", *map(plus_minus, cases), f"{100 * (auto - off) / (equal - off):.0f} %"))
     return markdown(("seed", "equal: off, dB", "auto", "disturbed: off, dB", "auto", "recovered"), rows)
 
 

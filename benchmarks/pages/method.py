@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.pages.results import Scores, committed, fits_by_cell, means_over_cells, spreads
-from benchmarks.reports.plots import markdown, plus_minus
+from benchmarks.pages.results import Scores, committed
+from benchmarks.reports.plots import Column, grouped, markdown, means_over, scores_table
 
 __all__ = ["demo", "drift", "field", "frame_times", "gains", "parts", "search", "unseen"]
 
@@ -23,13 +23,14 @@ def demo() -> str:
 def unseen() -> str:
     """Return the scores of the random scenes that no setting was chosen on, and the spread of their means."""
     fits = committed("random_scenes")["fits"]
-    digits = {"psnr": 2, "psnr_moving": 2, "confidence_iou": 2, "motion_error_moving": 2}
-    groups = fits_by_cell(fits) | {"mean": means_over_cells(fits, (*digits, "bytes"))}
-    rows = (
-        (name, *spreads(own, digits), f"{np.mean([fit['bytes'] for fit in own]) / 1000:.0f}")
-        for name, own in groups.items()
+    columns = (
+        Column("PSNR, dB", "psnr"),
+        Column("moving, dB", "psnr_moving"),
+        Column("IoU of the confidence", "confidence_iou"),
+        Column("motion error, px", "motion_error_moving"),
+        Column("kB", "bytes", 0, 1e-3, spread=False),
     )
-    return markdown(("seed", "PSNR, dB", "moving, dB", "IoU of the confidence", "motion error, px", "kB"), rows)
+    return scores_table([*fits, *means_over(fits, "fit_seed", seed="mean")], {"seed": "seed"}, columns)
 
 
 def _best_rates(clip: Scores) -> dict[tuple[str, int], Scores]:
@@ -68,21 +69,28 @@ def parts() -> str:
 
 def search() -> str:
     """Return the PSNR where things move without and with the coarse search, of every frame and of every second one."""
-    fits = committed("fast_parts")["fits"]
-    cases = [(stride, how) for stride in ("stride_1", "stride_2") for how in ("without", "search")]
-    flat = {name: {f"{s} {how}": fit[s][how]["psnr_moving"] for s, how in cases} for name, fit in fits.items()}
-    digits = {f"{stride} {how}": 2 for stride, how in cases}
-    groups = fits_by_cell(flat) | {"mean": means_over_cells(flat, tuple(digits))}
-    titles = "every frame: without", "with search", "every second frame: without", "with search"
-    return markdown(("seed", *titles), ((name, *spreads(own, digits)) for name, own in groups.items()))
+    titles = {
+        ("stride_1", "without"): "every frame: without",
+        ("stride_1", "search"): "with search",
+        ("stride_2", "without"): "every second frame: without",
+        ("stride_2", "search"): "with search",
+    }
+    fits = [
+        {
+            "seed": fit["seed"],
+            "fit_seed": fit["fit_seed"],
+            **{f"{stride} {how}": fit[stride][how]["psnr_moving"] for stride, how in titles},
+        }
+        for fit in committed("fast_parts")["fits"]
+    ]
+    columns = [Column(title, " ".join(case)) for case, title in titles.items()]
+    return scores_table([*fits, *means_over(fits, "fit_seed", seed="mean")], {"seed": "seed"}, columns)
 
 
 def drift() -> str:
     """Return the quality over thirty frames, of one fit or three."""
-    clips = {name: [row] for name, row in committed("drift")["clips"].items()}
-    clips |= fits_by_cell(committed("drift_fresh")["clips"])
-    rows = []
-    for name, own in clips.items():
+    fits, rows = [fit for name in ("drift", "drift_fresh") for fit in committed(name)["fits"]], []
+    for (name,), own in grouped(fits, "clip").items():
         moving = [np.array(fit["psnr_moving"], float) for fit in own]
         known = [values[np.isfinite(values)] for values in moving]
         psnrs = (
@@ -124,26 +132,20 @@ def field() -> str:
     """Return the scores of the methods at 8 epochs: means over the scenes, and the spread of some means."""
     cells = committed("field")["cells"]
     jaccard = "Dynamic 3D Gaussians average_jaccard"
-    columns = {
-        "psnr": ("PSNR, dB", 1, 2),
-        "psnr_moving": ("moving, dB", 1, 2),
-        "motion_error_moving": ("motion error, px", 1, 2),
-        "motion_3d_relative_error": ("in 3D, %", 100, 0),
-        jaccard: ("AJ, %", 100, 1),
-        "num_bytes": ("kB", 1e-3, 1),
-        "cpu_s": ("CPU s", 1, 1),
-    }
+    columns = (
+        Column("PSNR, dB", "psnr", spread=False),
+        Column("moving, dB", "psnr_moving"),
+        Column("motion error, px", "motion_error_moving", spread=False),
+        Column("in 3D, %", "motion_3d_relative_error", 0, 100, spread=False),
+        Column("AJ, %", jaccard, 1, 100),
+        Column("kB", "num_bytes", 1, 1e-3, spread=False),
+        Column("CPU s", "cpu_s", 1, spread=False),
+    )
     rows = []
     for name in next(iter(cells.values())):
         method, epochs = name.split("/")
         if epochs != "8":
             continue
-        fits = means_over_cells({cell: found[name] for cell, found in cells.items()}, tuple(columns))
-        row = [f"`{method}`"]
-        for score, (_, factor, digits) in columns.items():
-            values = [factor * fit[score] for fit in fits]
-            mean = factor * np.mean([found[name][score] for found in cells.values()])
-            with_spread = score in ("psnr_moving", jaccard)
-            row.append(plus_minus(values, digits) if with_spread else f"{mean:.{digits}f}")
-        rows.append(row)
-    return markdown(("method", *(title for title, *_ in columns.values())), rows)
+        fits = [{"fit": cell.split("/")[1], **found[name]} for cell, found in cells.items()]
+        rows += means_over(fits, "fit", method=f"`{method}`")
+    return scores_table(rows, {"method": "method"}, columns)

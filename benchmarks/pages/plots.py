@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from benchmarks.pages.results import CHOSEN_ON, committed, fits_by_cell
-from benchmarks.reports.plots import blank_figure
+from benchmarks.pages.results import CHOSEN_ON, committed
+from benchmarks.reports.plots import blank_figure, grouped
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -20,8 +20,8 @@ def drift() -> Figure:
     """Return the PSNR where things move over the frames of five clips, means of their fits."""
     figure = blank_figure(7, 3.2)
     axis = figure.subplots()
-    clips = {name: [row] for name, row in committed("drift")["clips"].items()}
-    for name, fits in (clips | fits_by_cell(committed("drift_fresh")["clips"])).items():
+    clips = grouped([fit for name in ("drift", "drift_fresh") for fit in committed(name)["fits"]], "clip")
+    for (name,), fits in clips.items():
         psnr = np.mean([np.array(fit["psnr_moving"], float) for fit in fits], axis=0)
         axis.plot(np.arange(1, len(psnr) + 1), psnr, label=name)
     axis.set(xlabel="frame", ylabel="PSNR where things move, dB")

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from benchmarks.pages.results import Scores, committed, span
-from benchmarks.reports.plots import grouped, markdown, plus_minus
+from benchmarks.reports.plots import Column, grouped, markdown, plus_minus, scores_table
 
 __all__ = [
     "accuracy",
@@ -39,7 +39,7 @@ def flow() -> str:
 
 def masks() -> str:
     """Return the IoU of each kind of mask with the true mask."""
-    clips = committed("masks")["clips"]
+    clips = committed("masks")["fits"]
     rows = (
         (
             "lifted confidence" if method == "lifted" else f"`{method}`",
@@ -53,7 +53,7 @@ def masks() -> str:
 
 def mask_fits() -> str:
     """Return the IoU of the fitted confidence and the PSNR where things move, by the kind of mask."""
-    clips, rows = grouped(committed("masks_fresh")["clips"], "name"), []
+    clips, rows = grouped(committed("masks_fresh")["fits"], "name"), []
     for start, label in (("lifted", "lifted"), ("as before", "as in the paper")):
         for method in next(iter(clips.values()))[0]["loops"][start]:
             cells = []
@@ -128,22 +128,15 @@ def modelled() -> str:
 
 def seams() -> str:
     """Return quality and size of segmented fits: at a seam, around it, and in one piece."""
-    found: dict[tuple[str, ...], list[tuple[Scores, float]]] = {}
-    for fit in committed("seams")["clips"]:
-        for seam in fit["seams"]:
-            key = f"`{fit['scene']}` {fit['seed']}", f"{seam['frame']}"
-            found.setdefault(key, []).append((seam, fit["num_bytes"] / fit["num_bytes_whole"]))
-    rows = []
-    for key, own in found.items():
-        around = np.mean([seam["psnr_around"] for seam, _ in own])
-        whole = np.mean([seam["whole"]["psnr"] for seam, _ in own])
-        at_seam = plus_minus([seam["psnr"] - seam["psnr_around"] for seam, _ in own])
-        flicker = plus_minus([seam["mtv"] / seam["mtv_around"] for seam, _ in own])
-        rows.append(
-            (*key, f"{around:.2f}", f"{whole:.2f}", at_seam, flicker, f"{np.mean([growth for _, growth in own]):.2f}")
-        )
-    titles = "around, dB", "in one piece, dB", "seam - around, dB", "mTV, ratio", "size, ratio"
-    return markdown(("clip", "frame", *titles), rows)
+    columns = (
+        Column("around, dB", "psnr_around", spread=False),
+        Column("in one piece, dB", lambda seam: seam["whole"]["psnr"], spread=False),
+        Column("seam - around, dB", lambda seam: seam["psnr"] - seam["psnr_around"]),
+        Column("mTV, ratio", lambda seam: seam["mtv"] / seam["mtv_around"]),
+        Column("size, ratio", lambda seam: seam["num_bytes"] / seam["num_bytes_whole"], spread=False),
+    )
+    keys = {"clip": lambda seam: f"`{seam['scene']}` {seam['seed']}", "frame": "frame"}
+    return scores_table(committed("seams")["fits"], keys, columns)
 
 
 def steps() -> str:

@@ -5,7 +5,7 @@
 Each clip is `morgs-mi synth random --seed SEED`, as in `random_scenes`. Every camera is rotated by an angle about a
 random axis, displaced by as many per cent of the scene extent in a random direction, and given focal lengths that are
 1 % too long or too short; at 0 degrees, all cameras are true. The first frame is fitted with the true cameras, the
-disturbed and the refined ones. The held-out view is scored as calibrated, and registered: seen from the camera that
+wrong and the refined ones. The held-out view is scored as calibrated, and registered: seen from the camera that
 fits its image best.
 
 With `--lens`, cameras are also refined that are true but for their lenses: the training views have a radial distortion
@@ -22,12 +22,12 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import mitsuba as mi
 import numpy as np
 import tyro
 
-from benchmarks.reports.cells import CellOptions
-from benchmarks.reports.fits import new_loop, random_capture
+from benchmarks.reports.fits import RandomOptions, new_loop, random_capture, synthetic
+from benchmarks.reports.plots import Column, scores_table
+from benchmarks.reports.study import Row, Scene, Study, Variant
 from morgs_mi.calibration.bundle import changed_camera, distorted
 from morgs_mi.calibration.refine import refine_cameras, register_camera
 from morgs_mi.capture.capture import Capture, load_capture
@@ -40,19 +40,23 @@ from morgs_mi.fit.initialise import scene_extent
 from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.synth.synth_config import SynthConfig
-from morgs_mi.synth.synthesize import synthesize
 
 _FOCAL_ERROR = 0.01
+COLUMNS = (
+    *(Column(f"{name} cameras", lambda fit, name=name: fit[name]["registered"]) for name in ("true", "disturbed")),
+    Column("refined", lambda fit: fit["refined"]["registered"]),
+    Column("recovered", "recovered", 0, 100, " %"),
+    Column("rotation, degrees", lambda fit: fit["disturbed"]["rotation"], 3),
+    Column("refined", lambda fit: fit["refined"]["rotation"], 3),
+)
 
 
 @dataclass(frozen=True)
-class Options(CellOptions):
+class Options(RandomOptions):
     """Clips, disturbances and output."""
 
     seeds: tuple[int, ...] = (3, 6, 7)
     """Seeds of the scenes."""
-    clips: Path = Path("out/random")
-    """Folder of the clips."""
     degrees: tuple[float, ...] = (0.5, 1.0, 0.2)
     """Rotations of the cameras; their displacements in per cent of the scene extent."""
     disturbances: tuple[int, ...] = (0, 1, 2)
@@ -61,10 +65,26 @@ class Options(CellOptions):
     """Largest distortion of lenses that the calibration denies; 0: none."""
     downscale: float = 1
     """Factor by which the clips are reduced."""
-    steps: int = 600
-    """Steps of the first frame."""
-    gaussians: int = 4000
+    gaussians: int | None = 4000
     """Number of Gaussians."""
+
+    def study(self) -> Study:
+        """Return the study of the disturbances."""
+        scenes = []
+        for seed in self.seeds:
+            source = Source.of(random_capture(self.clips, seed, self.downscale))
+            for disturbance, degrees in product(self.disturbances, self.degrees):
+                keys = {"seed": seed, "degrees": degrees, "disturbance": disturbance, "lens": 0.0}
+                scenes.append(Scene(keys, (source, source, degrees, disturbance)))
+            if self.lens:
+                true, denied = (Source.of(load_capture(c, self.downscale)) for c in lens_clips(self, seed))
+                keys = {"seed": seed, "degrees": 0.0, "disturbance": 0, "lens": self.lens}
+                scenes.append(Scene(keys, (true, denied, 0.0, 0)))
+        return Study(measure, scenes, [Variant({}, self.config(dropping=0.0, refine_cameras="auto"))], self.fit_seeds)
+
+    def table(self, rows: Sequence[Row]) -> str:
+        """Return the registered PSNR, dB, and the errors of the rotations by clip and disturbance."""
+        return scores_table(rows, {"seed": "seed", "degrees": "degrees", "lens": "lens"}, COLUMNS)
 
 
 def disturbed(cameras: Sequence[Camera], degrees: float, seed: int) -> tuple[Camera, ...]:
@@ -90,10 +110,10 @@ def pose_errors(cameras: Sequence[Camera], true: Sequence[Camera]) -> dict[str, 
     turns = [cv2.Rodrigues(a.viewmat[:3, :3] @ U @ Vt @ b.viewmat[:3, :3].T)[0] for a, b in pairs]
     degrees = np.rad2deg([np.linalg.norm(turn) for turn in turns])
     return {
-        "rotation": round(float(degrees.mean()), 4),
-        "worst_rotation": round(float(degrees.max()), 4),
-        "position": round(float(np.linalg.norm(centres - goals, axis=1).mean() / scene_extent(true)), 5),
-        "focal": round(float(np.mean([abs(a.K[0, 0] / b.K[0, 0] - 1) for a, b in pairs])), 5),
+        "rotation": float(degrees.mean()),
+        "worst_rotation": float(degrees.max()),
+        "position": float(np.linalg.norm(centres - goals, axis=1).mean() / scene_extent(true)),
+        "focal": float(np.mean([abs(a.K[0, 0] / b.K[0, 0] - 1) for a, b in pairs])),
     }
 
 
@@ -111,61 +131,58 @@ def scores(capture: Capture, config: StreamConfig) -> dict[str, float]:
         "calibrated": [view],
         "registered": [view._replace(camera=registered)],
     }
-    return {name: round(mean_psnr(gaussians, given, config.render), 2) for name, given in views.items()}
+    return {name: mean_psnr(gaussians, given, config.render) for name, given in views.items()}
 
 
-def measure_true(source: Source, config: StreamConfig) -> dict[str, Any]:
-    """Return the scores with the true cameras."""
-    return {"true": scores(source.open(), config)}
+def measure(
+    source: Source, calibrated: Source, degrees: float, disturbance: int, config: StreamConfig
+) -> dict[str, Any]:
+    """Return the scores with true, wrong and refined cameras, and the errors of the cameras.
 
-
-def measure(source: Source, degrees: float, seed: int, config: StreamConfig) -> dict[str, Any]:
-    """Return the scores with disturbed and with refined cameras, and their errors."""
-    capture = source.open()
-    wrong = replace(capture, cameras=disturbed(capture.cameras, degrees, seed))
+    Args:
+        source: the recording with its true cameras.
+        calibrated: the same with the lenses of a calibration.
+        degrees: rotation of the cameras.
+        disturbance: seed of the disturbance.
+        config: settings.
+    """
+    capture, wrong = source.open(), calibrated.open()
+    if degrees:
+        wrong = replace(wrong, cameras=disturbed(wrong.cameras, degrees, disturbance))
     better, found = refine_cameras(wrong, config.fit, config.render, config.seed)
-    true, before, after = ([c.cameras[v] for v in capture.train_views] for c in (capture, wrong, better))
-    return {
-        "disturbed": scores(wrong, config) | pose_errors(before, true),
-        "refined": scores(better, config) | pose_errors(after, true),
+    row = {
+        "true": scores(capture, config),
+        "disturbed": scores(wrong, config) | camera_errors(wrong, capture),
+        "refined": scores(better, config) | camera_errors(better, capture),
         "refinement": asdict(found),
     }
+    is_wrong = degrees or calibrated != source
+    return {"recovered": recovered(row) if is_wrong else None, **row}
 
 
-def lens_clips(clips: Path, seed: int, distortion: float) -> tuple[Path, Path]:
+def camera_errors(given: Capture, capture: Capture) -> dict[str, float]:
+    """Return the errors of the training cameras, and by how much their lenses shift a corner of the image, px."""
+    truth, none = load_disturbances(capture.path / "truth"), [(0.0, 0.0)] * len(capture.cameras)
+    terms, train = given.distortions or none, capture.train_views
+    corners = [
+        _at_corner(given.cameras[v], terms[v]) - _at_corner(capture.cameras[v], (truth[capture.names[v]].distortion, 0))
+        for v in train
+    ]
+    errors = pose_errors([given.cameras[v] for v in train], [capture.cameras[v] for v in train])
+    return {**errors, "corner": float(np.mean(np.linalg.norm(corners, axis=1)))}
+
+
+def lens_clips(options: Options, seed: int) -> tuple[Path, Path]:
     """Return a clip through lenses with distortion, and a copy whose calibration denies it for the training views."""
-    true = clips / f"random-{seed}-lens-{distortion:g}"
-    denied = true.with_name(f"{true.name}-denied")
+    true = options.clips / f"random-{seed}-lens-{options.lens:g}"
+    denied, own = true.with_name(f"{true.name}-denied"), Disturbances(distortion=options.lens)
+    capture = synthetic("random", true, SynthConfig(frames=1, seed=seed, disturbances=own))
     if not denied.exists():
-        own = Disturbances(distortion=distortion)
-        synthesize("random", true, SynthConfig(frames=1, seed=seed, disturbances=own), overwrite=True)
-        capture, truth = load_capture(true), load_disturbances(true / "truth")
+        truth = load_disturbances(true / "truth")
         lenses = [truth[n].lens if v == capture.test_view else Lens() for v, n in enumerate(capture.names)]
         shutil.copytree(true, denied)
         write_colmap(denied / "sparse" / "0", capture.cameras, capture.points, capture.point_colors, lenses)
     return true, denied
-
-
-def measure_lens(source: Source, denied: Source, config: StreamConfig) -> dict[str, Any]:
-    """Return the scores with true, denied and refined lenses, and the errors of the cameras."""
-    capture, wrong = source.open(), denied.open()
-    better, found = refine_cameras(wrong, config.fit, config.render, config.seed)
-    truth, none = load_disturbances(capture.path / "truth"), [(0.0, 0.0)] * len(capture.cameras)
-    train = [(v, capture.cameras[v], truth[capture.names[v]].distortion) for v in capture.train_views]
-
-    def about(given: Capture) -> dict[str, float]:
-        terms = given.distortions or none
-        corners = [_at_corner(given.cameras[v], terms[v]) - _at_corner(camera, (k, 0.0)) for v, camera, k in train]
-        shift = float(np.mean(np.linalg.norm(corners, axis=1)))
-        errors = pose_errors([given.cameras[v] for v in given.train_views], [camera for _, camera, _ in train])
-        return scores(given, config) | errors | {"corner": round(shift, 3)}
-
-    return {
-        "true": scores(capture, config),
-        "disturbed": about(wrong),
-        "refined": about(better),
-        "refinement": asdict(found),
-    }
 
 
 def _at_corner(camera: Camera, terms: Sequence[float]) -> np.ndarray:
@@ -175,36 +192,10 @@ def _at_corner(camera: Camera, terms: Sequence[float]) -> np.ndarray:
 
 
 def recovered(row: Mapping[str, Any]) -> float:
-    """Return the share of the lost PSNR of the registered view that refinement brings back."""
+    """Return the share of the lost PSNR of the registered view that refinement brings back; NaN if none is lost."""
     true, before, after = (row[name]["registered"] for name in ("true", "disturbed", "refined"))
-    return round((after - before) / (true - before), 3)
-
-
-def main(options: Options) -> None:
-    """Run the report; the file is written after each disturbance."""
-    mi.set_variant("llvm_ad_rgb")
-    config = StreamConfig()
-    fit = replace(config.fit, first_frame_steps=options.steps, num_gaussians=options.gaussians, dropping=0.0)
-    config = replace(config, fit=replace(fit, refine_cameras="auto"))
-    sources = {seed: Source.of(random_capture(options.clips, seed, options.downscale)) for seed in options.seeds}
-    true = options.run(measure_true, {str(seed): (source, config) for seed, source in sources.items()})
-    given = {"downscale": options.downscale, "steps": options.steps, "gaussians": options.gaussians}
-    rows: list[dict[str, Any]] = []
-    lenses: list[dict[str, Any]] = []
-    if options.lens:
-        clips = {str(seed): lens_clips(options.clips, seed, options.lens) for seed in options.seeds}
-        pairs = {s: [Source.of(load_capture(path, options.downscale)) for path in pair] for s, pair in clips.items()}
-        found = options.run(measure_lens, {seed: (*pair, config) for seed, pair in pairs.items()})
-        lenses = [
-            {"seed": int(s), "lens": options.lens, "recovered": recovered(row), **row} for s, row in found.items()
-        ]
-    for disturbance, degrees in product(options.disturbances, options.degrees):
-        cells = {str(seed): (source, degrees, disturbance, config) for seed, source in sources.items()}
-        for seed, row in options.run(measure, cells).items():
-            about, row = {"seed": int(seed), "degrees": degrees, "disturbance": disturbance}, {**true[seed], **row}
-            rows.append({**about, "recovered": recovered(row) if degrees else None, **row})
-        options.write({**given, "fits": rows, "lenses": lenses}, unprinted=["fits", "lenses"])
+    return (after - before) / (true - before) if true != before else float("nan")
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    tyro.cli(Options).run()

@@ -11,11 +11,10 @@ from typing import Any, TypeVar
 
 import mitsuba as mi
 
-from benchmarks.speed.output import Output
 from morgs_mi.cluster.executor import Workers, open_workers, wait_for
 from morgs_mi.cluster.tasks import installed, prepared
 
-__all__ = ["CellOptions", "OnWorkers", "run_cells"]
+__all__ = ["OnWorkers", "run_cells"]
 
 Name = TypeVar("Name")
 Result = TypeVar("Result")
@@ -39,19 +38,6 @@ class OnWorkers:
             return
         with open_workers(self.scheduler, self.workers) as workers:
             yield workers
-
-
-@dataclass(frozen=True)
-class CellOptions(Output, OnWorkers):
-    """Base of the options of reports that print the result of each cell."""
-
-    def run(self, function: Callable[..., Result], cells: Mapping[str, tuple[Any, ...]]) -> dict[str, Result]:
-        """Return the results of `function` for the arguments of each cell, which are printed as soon as they are there.
-
-        See `run_cells`.
-        """
-        with self.opened() as workers:
-            return run_cells(function, cells, workers, lambda name, result: print(name, result, flush=True))
 
 
 def run_cells(

@@ -1,7 +1,16 @@
 """Bytes, quality and time of the codec at several quality settings, compared with lzma over raw residuals.
 
+    python -m benchmarks.reports codec CAPTURE... --out out/codec --json out.json --plot out.png
+
 Each setting fits the clip again, because the next frame starts from what the codec has quantised. Fits of one setting
 differ by some hundredths of a dB; smaller differences are not significant.
+
+A clip of the JSON has one row per `quality`, the reference last: the PSNR of the `first` and of the `later` frames in
+dB; the bytes of the `file`, of the `first` and of a `later` frame, and of the float32 residual of a later frame, `raw`
+and with `lzma`; the Gaussians that a later frame writes (`moved`); the median times to encode and decode a later frame,
+and of lzma, in ms; the entropy of a later frame by group of attributes in bytes (`bytes_by_group`); and the `loss` of
+PSNR against the reference in dB. Figures of later frames are means. `raw` and `lzma` lead to the same frames, so lzma
+benefits from values that were rounded to zero; in the reference stream there are none.
 """
 
 from __future__ import annotations
@@ -9,15 +18,18 @@ from __future__ import annotations
 import asyncio
 import lzma
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tyro.conf import Positional
 
-from benchmarks.reports.plots import blank_figure, label_points, markdown, save_figure
-from benchmarks.reports.records import Record
+from benchmarks.reports.cells import OnWorkers
+from benchmarks.reports.plots import Column, blank_figure, label_points, save_figure, scores_table
+from benchmarks.reports.study import Row
+from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.cluster.executor import Workers, wait_for
 from morgs_mi.cluster.segments import fit_in_segments
@@ -25,30 +37,33 @@ from morgs_mi.codec.entropy import column_bits
 from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, residual_packet
 from morgs_mi.codec.quantisation import step_sizes
 from morgs_mi.config import StreamConfig
-from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.playback.player import open_stream
 from morgs_mi.recorder import stream_capture
 
-__all__ = [
-    "CodecClip",
-    "CodecQuality",
-    "CodecReportConfig",
-    "CodecResult",
-    "CodecRow",
-    "markdown_table",
-    "plot_codec",
-    "report_codec",
-]
-
 # The best preset of lzma takes several times as long and saves a few percent.
 _LZMA_PRESET = 6
+COLUMNS = (
+    Column("dB later", lambda row: row["psnr"]["later"], spread=False),
+    Column("loss", "loss", spread=False),
+    Column("kB first", "first", 1, 1e-3, spread=False),
+    Column("kB later", "later", 1, 1e-3, spread=False),
+    Column("lzma", "lzma", 1, 1e-3, spread=False),
+    Column("moved", "moved", 0, spread=False),
+    *(Column(f"{name} ms", f"{name}_ms", 0, spread=False) for name in ("encode", "decode", "lzma")),
+)
 
 
-@dataclass(frozen=True)
-class CodecReportConfig:
-    """Settings of the report on the codec."""
+@dataclass(frozen=True, kw_only=True)
+class Options(Output, OnWorkers):
+    """Measure bytes, quality and time of the codec, compared with lzma over raw residuals."""
 
+    captures: Positional[tuple[Path, ...]]
+    """Folders of captures; each is fitted once per quality."""
+    out: Path = Path("out/codec")
+    """Output folder for the streams, which stay in OUT/CLIP/QUALITY."""
+    plot: Path | None = None
+    """Plot of quality and time over bytes, .png or .svg; needs matplotlib."""
     qualities: tuple[float, ...] = (0.5, 1, 2, 4)
     """Values of `codec.quality`."""
     reference: float = 1000
@@ -60,141 +75,64 @@ class CodecReportConfig:
     resume: bool = False
     """Reuse streams of an earlier report with the same settings, and continue incomplete ones."""
 
-    def __post_init__(self) -> None:
-        if not self.qualities or not all(0 < quality < self.reference for quality in self.qualities):
-            raise ValueError(
-                f"CodecReportConfig(): `qualities` must be positive and below the reference's {self.reference:g}, got "
-                f"{list(self.qualities)}."
-            )
+    def run(self) -> None:
+        """Fit every capture with every quality, measure the streams, print the tables, and write the figures."""
+        if not self.captures:
+            raise ValueError("codec: `captures` must name at least one folder, got none.")
+        recordings = [load_capture(path, max_frames=self.frames) for path in self.captures]
+        with self.opened() as workers:
+            clips = [measure(recording, self, workers) for recording in recordings]
+        for clip in clips:
+            print(f"{clip['name']}\n\n{quality_table(clip['rows'])}")
+        if self.plot is not None:
+            plot_codec(clips, self.plot)
+        names = "qualities", "reference", "frames", "resume"
+        settings = {**{name: getattr(self, name) for name in names}, "stream": asdict(self.stream)}
+        self.write({"clips": clips, "settings": settings}, unprinted=["clips", "settings"])
 
 
-@dataclass(frozen=True)
-class CodecQuality:
-    """PSNR of a stream, dB."""
-
-    first: float
-    """PSNR of the first frame."""
-    later: float
-    """Mean PSNR of the later frames."""
-
-
-@dataclass(frozen=True)
-class CodecRow:
-    """Quality, bytes and times of one stream; times are medians over the later frames.
-
-    `raw` and `lzma` measure float32 residuals between the decoded frames, without and with lzma. They lead to the same
-    frames, so lzma benefits from values that were rounded to zero; in the reference stream there are none.
-    """
-
-    quality: float
-    """Value of `codec.quality`."""
-    psnr: CodecQuality
-    file: int
-    """Size of the file, bytes."""
-    first: int
-    """Size of the first frame, bytes."""
-    later: float
-    """Mean size of a later frame, bytes."""
-    raw: float
-    """Mean size of a later frame's float32 residual, bytes."""
-    lzma: float
-    """Mean size of a later frame's float32 residual with lzma, bytes."""
-    moved: float
-    """Mean number of Gaussians that a later frame writes."""
-    encode_ms: float
-    decode_ms: float
-    lzma_ms: float
-    bytes_by_group: Mapping[str, float]
-    """Mean entropy of a later frame by group of attributes, bytes."""
-    loss: float
-    """PSNR of the reference's later frames minus that of this stream, dB."""
-
-
-@dataclass(frozen=True)
-class CodecClip:
-    """Results of one clip."""
-
-    name: str
-    rows: tuple[CodecRow, ...]
-    """One row per quality; the reference is last."""
-
-
-@dataclass(frozen=True)
-class CodecResult(Record):
-    """Results of the report on the codec."""
-
-    clips: tuple[CodecClip, ...]
-    settings: Mapping[str, Any]
-    machine: Mapping[str, Any]
-    versions: Mapping[str, str]
-
-
-def report_codec(
-    captures: Sequence[str | Path],
-    out: str | Path,
-    config: CodecReportConfig,
-    progress: Callable[[str, float, float], None] = lambda stage, done, total: None,
-    workers: Workers | None = None,
-) -> CodecResult:
-    """Fit every capture with every quality and measure the streams, which stay in OUT/CLIP/QUALITY.
-
-    Args:
-        captures: folders of captures; those without a held-out view are evaluated in the training views.
-        out: folder for the streams.
-        config: settings.
-        progress: called with (stage, done, total).
-        workers: from `open_workers`, which fit the qualities of a clip side by side; None: this process fits them, one
-            by one. It measures the streams in any case.
-
-    Returns:
-        One clip per capture, the settings, the machine and the versions.
+def measure(capture: Capture, options: Options, workers: Workers | None) -> dict[str, Any]:
+    """Fit a capture with every quality, side by side on workers, and return the figures of the streams.
 
     Raises:
-        ValueError: there is no capture, a capture has a single frame, or as `stream_capture` and `evaluate_stream`.
+        ValueError: the capture has a single frame, or as `stream_capture` and `evaluate_stream`.
     """
-    if not captures:
-        raise ValueError("report_codec(): `captures` must name at least one folder, got none.")
-    recordings = (load_capture(path, max_frames=config.frames) for path in captures)
-    clips = tuple(_clip(recording, Path(out), config, progress, workers) for recording in recordings)
-    return CodecResult(clips, asdict(config), machine(), versions())
-
-
-def markdown_table(clip: CodecClip) -> str:
-    """Return one clip's rows as a table."""
-    titles = (
-        "quality",
-        "dB later",
-        "loss",
-        "kB first",
-        "kB later",
-        "lzma",
-        "moved",
-        "encode ms",
-        "decode ms",
-        "lzma ms",
-    )
+    name = capture.path.resolve().name
+    if capture.num_frames < 2:
+        raise ValueError(f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}.")
+    qualities, codec = (*options.qualities, options.reference), options.stream.codec
+    settings = {quality: replace(options.stream, codec=replace(codec, quality=quality)) for quality in qualities}
+    folders = {quality: options.out / name / f"{quality:g}" for quality in qualities}
+    if workers is not None:
+        wait_for(_fit_all(capture, {folders[q]: settings[q] for q in qualities}, workers, options.resume))
     rows = []
-    for row in clip.rows:
-        cells = [f"{row.quality:g}", f"{row.psnr.later:.2f}", f"{row.loss:.2f}", _kilo(row.first)]
-        cells += [_kilo(row.later), _kilo(row.lzma), f"{row.moved:.0f}"]
-        cells += [f"{ms:.0f}" for ms in (row.encode_ms, row.decode_ms, row.lzma_ms)]
-        rows.append(cells)
-    return markdown(titles, rows, left=0)
+    for quality, folder in folders.items():
+        print(f"{name} at quality {quality:g}", flush=True)
+        stream_capture(capture, folder, settings[quality], resume=options.resume or workers is not None)
+        rows.append({"quality": quality, **_evaluated(folder, capture), **_measured(folder, settings[quality])})
+    best = rows[-1]["psnr"]["later"]
+    return {"name": name, "rows": [{**row, "loss": best - row["psnr"]["later"]} for row in rows]}
 
 
-def plot_codec(result: CodecResult, path: str | Path) -> None:
+def quality_table(rows: Sequence[Row]) -> str:
+    """Return one clip's rows as a table."""
+    return scores_table(rows, {"quality": lambda row: f"{row['quality']:g}"}, COLUMNS, left=0)
+
+
+def plot_codec(clips: Sequence[Row], path: Path) -> None:
     """Plot quality and encoding time over the bytes of a later frame.
 
     Raises:
         ValueError: matplotlib is not installed.
     """
-    clips = result.clips
     figure = blank_figure(10, 3.8 * len(clips))
     for (left, right), clip in zip(figure.subplots(len(clips), 2, squeeze=False), clips, strict=True):
-        rows = clip.rows
-        later, packed = (1e-3 * np.array(column) for column in zip(*((r.later, r.lzma) for r in rows), strict=True))
-        psnr = [row.psnr.later for row in rows]
-        times = [row.encode_ms for row in rows], [row.lzma_ms for row in rows]
+        rows = clip["rows"]
+        later, packed = (
+            1e-3 * np.array(column) for column in zip(*((r["later"], r["lzma"]) for r in rows), strict=True)
+        )
+        psnr = [row["psnr"]["later"] for row in rows]
+        times = [row["encode_ms"] for row in rows], [row["lzma_ms"] for row in rows]
         for axis, (own, other) in ((left, (psnr, psnr)), (right, times)):
             axis.plot(later, own, "o-", label="stream")
             axis.plot(packed, other, "s--", label="lzma over float32 residuals")
@@ -202,39 +140,12 @@ def plot_codec(result: CodecResult, path: str | Path) -> None:
             axis.grid(alpha=0.3, which="both")
             axis.tick_params(axis="x", which="minor", labelsize=6, rotation=45)
             points = zip(later, own, strict=True)
-            label_points(axis, points, [f"{row.quality:g}" for row in rows], (4, -12), 8)
-        left.set(ylabel="PSNR of later frames, dB", title=f"{clip.name}: quality")
-        right.set(ylabel="ms to encode a frame", yscale="log", title=f"{clip.name}: encoding time")
+            label_points(axis, points, [f"{row['quality']:g}" for row in rows], (4, -12), 8)
+        left.set(ylabel="PSNR of later frames, dB", title=f"{clip['name']}: quality")
+        right.set(ylabel="ms to encode a frame", yscale="log", title=f"{clip['name']}: encoding time")
         left.ticklabel_format(axis="y", useOffset=False)
         left.legend(fontsize=8)
     save_figure(figure, path)
-
-
-def _clip(
-    capture: Capture,
-    out: Path,
-    config: CodecReportConfig,
-    progress: Callable[[str, float, float], None],
-    workers: Workers | None,
-) -> CodecClip:
-    name = capture.path.resolve().name
-    if capture.num_frames < 2:
-        raise ValueError(f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}.")
-    qualities, rows = (*config.qualities, config.reference), []
-    fits = {
-        out / name / f"{quality:g}": replace(config.stream, codec=replace(config.stream.codec, quality=quality))
-        for quality in qualities
-    }
-    if workers is not None:
-        progress(f"Fitting {name}", 0, len(qualities))
-        wait_for(_fit_all(capture, fits, workers, config.resume))
-    for done, (quality, (folder, settings)) in enumerate(zip(qualities, fits.items(), strict=True)):
-        progress(f"Fitting {name}", done, len(qualities))
-        stream_capture(capture, folder, settings, resume=config.resume or workers is not None)
-        rows.append({"quality": quality, **_evaluated(folder, capture), **_measured(folder, settings)})
-    progress(f"Fitting {name}", len(qualities), len(qualities))
-    best = rows[-1]["psnr"].later
-    return CodecClip(name, tuple(CodecRow(**row, loss=best - row["psnr"].later) for row in rows))
 
 
 async def _fit_all(capture: Capture, fits: Mapping[Path, StreamConfig], workers: Workers, resume: bool) -> None:
@@ -248,7 +159,7 @@ def _evaluated(folder: Path, capture: Capture) -> dict[str, Any]:
     found = evaluate_stream(folder, capture.path)
     first, *later = found.frames
     return {
-        "psnr": CodecQuality(first.scores.psnr, float(np.mean([row.scores.psnr for row in later]))),
+        "psnr": {"first": first.scores.psnr, "later": float(np.mean([row.scores.psnr for row in later]))},
         "file": found.sizes.file,
         "first": first.num_bytes,
         "later": float(np.mean([row.num_bytes for row in later])),
@@ -315,7 +226,3 @@ def _birth_bytes(state: CodedFrame, born: np.ndarray) -> float:
 
 def _bytes(*columns: np.ndarray) -> float:
     return sum(map(column_bits, columns)) / 8
-
-
-def _kilo(count: float) -> str:
-    return f"{count / 1e3:.1f}"

@@ -22,8 +22,7 @@ import tyro
 
 from benchmarks.field import anchors, hicom, motion_grid, transformation_cache  # noqa: F401, they register models
 from benchmarks.reports.cells import OnWorkers, run_cells
-from benchmarks.reports.fits import random_capture
-from benchmarks.reports.method_cells import DEFAULT, Clip
+from benchmarks.reports.fits import DEFAULT, Clip, random_capture
 from benchmarks.reports.plots import blank_figure, markdown, save_figure
 from benchmarks.speed.output import Output
 from morgs_mi.cluster.tasks import Source

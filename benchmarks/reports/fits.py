@@ -1,30 +1,105 @@
-"""What the reports on fits share: clips of random scenes, loops over a capture's views, and first frames."""
+"""What the reports on fits share: clips of synthetic scenes, loops over a capture's views, and their fits."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from benchmarks.reports.study import StudyOptions
 from morgs_mi import StreamLoop, rasterize
 from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.codec.container import StreamWriter
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.fit.config import FitConfig
 from morgs_mi.stream_loop import FrameReport
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
-__all__ = ["first_frame", "new_loop", "random_capture"]
+__all__ = [
+    "DEFAULT",
+    "Clip",
+    "ClipOptions",
+    "RandomOptions",
+    "first_frame",
+    "new_loop",
+    "random_capture",
+    "synthetic",
+]
+
+
+DEFAULT = "default"  # name of the settings without a preset
+
+
+@dataclass(frozen=True)
+class RandomOptions(StudyOptions):
+    """Base of the options of studies of the first frame on random scenes."""
+
+    seeds: tuple[int, ...] = (3, 4, 5, 6, 7, 8)
+    """Seeds of the scenes."""
+    clips: Path = Path("out/random")
+    """Folder of the clips, which are made where they are missing."""
+    downscale: float = 2
+    """Factor by which the clips are reduced."""
+    gaussians: int | None = None
+    """Number of Gaussians; default: by the detail of the images."""
+    steps: int = 600
+    """Steps of the first frame."""
+
+    def config(self, **fit: Any) -> StreamConfig:
+        """Return the settings of a fit, with further ones of `FitConfig`."""
+        return StreamConfig(FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps, **fit))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClipOptions(StudyOptions):
+    """Base of the options of studies on small clips that are made for them."""
+
+    clips: Path = Path("out/clips")
+    """Folder of the clips, which are made where they are missing."""
+    frames: int = 6
+    """Number of frames."""
+    width: int = 160
+    """Width of the images in pixels; the height is three quarters of it."""
+    gaussians: int | None = 4000
+    """Gaussians of the first frame."""
+    steps: int | None = 600
+    """Steps of the first frame."""
+    epochs: int = 4
+    """Epochs of a later frame."""
+
+    def config(self, **fit: Any) -> StreamConfig:
+        """Return the settings of a fit, with further ones of `FitConfig`."""
+        work = {"num_gaussians": self.gaussians, "first_frame_steps": self.steps, "epochs": self.epochs}
+        return StreamConfig(FitConfig(**{**work, **fit}))
+
+    def clip(self, scene: str | Path, name: str, **settings: Any) -> Capture:
+        """Return the clip of a scene, with further settings of `SynthConfig`."""
+        config = SynthConfig(frames=self.frames, width=self.width, height=self.width * 3 // 4)
+        config = replace(config, **settings)
+        return synthetic(scene, self.clips / f"{name}-{config.frames}x{self.width}", config)
+
+    def named_clip(self, name: str) -> Capture:
+        """Return the clip of a scene; random-N is the random one of the seed N."""
+        scene, _, seed = name.partition("-")
+        return self.clip(scene, name, seed=int(seed or 0))
+
+
+def synthetic(scene: str | Path, clip: Path, config: SynthConfig, downscale: float = 1) -> Capture:
+    """Return the clip of a scene, which is made by `synthesize` if it is not there."""
+    if not clip.exists():
+        synthesize(scene, clip, config)
+    return load_capture(clip, downscale)
 
 
 def random_capture(clips: Path, seed: int, downscale: float = 1) -> Capture:
     """Return the random scene of a seed, which is made in the folder `clips` if it is not there."""
-    clip = clips / f"random-{seed}"
-    if not clip.exists():
-        synthesize("random", clip, SynthConfig(frames=8, seed=seed))
-    return load_capture(clip, downscale)
+    return synthetic("random", clips / f"random-{seed}", SynthConfig(frames=8, seed=seed), downscale)
 
 
 def new_loop(capture: Capture, config: StreamConfig, train: Sequence[int] | None = None) -> StreamLoop:
@@ -46,3 +121,31 @@ def first_frame(capture: Capture, train: Sequence[int], config: StreamConfig) ->
         return psnr(np.clip(found, 0, 1)[valid], image[valid] / 255.0)
 
     return np.array([score(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]), report
+
+
+@dataclass(frozen=True, eq=False)
+class Clip:
+    """A capture with its images in memory.
+
+    Attributes:
+        capture: the recording.
+        images: images by frame and training view, uint8 [H, W, 3].
+    """
+
+    capture: Capture
+    images: tuple[tuple[np.ndarray, ...], ...]
+
+    @classmethod
+    def read(cls, capture: Capture) -> Clip:
+        """Return a capture with its images decoded."""
+        return cls(capture, tuple(tuple(f.images[v] for v in capture.train_views) for f in capture.frames()))
+
+    def loop(self, config: StreamConfig) -> StreamLoop:
+        """Return a loop on the training views, before its first frame."""
+        return new_loop(self.capture, config)
+
+    def writer(self, path: Path, config: StreamConfig) -> StreamWriter:
+        """Return a writer of a new stream of this clip."""
+        about = {"capture": str(self.capture.path.resolve()), "downscale": self.capture.downscale}
+        about |= {"test_view": self.capture.test_view, "config": asdict(config)}
+        return StreamWriter(path, self.capture.cameras, self.capture.fps, about)

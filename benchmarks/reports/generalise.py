@@ -8,35 +8,47 @@ cross-validation or the noise of few views chooses the probability of dropping, 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import product
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
-import mitsuba as mi
 import tyro
 
-from benchmarks.reports.cells import CellOptions
-from benchmarks.reports.fits import first_frame, random_capture
-from benchmarks.reports.plots import grouped, markdown, plus_minus
+from benchmarks.reports.fits import RandomOptions, first_frame, random_capture
+from benchmarks.reports.plots import Column, scores_table
+from benchmarks.reports.study import Row, Scene, Study, Variant
 from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 from morgs_mi.fit.dropping import dropping_by_noise
 
+_WITHOUT, _CHOSEN = {"variant": "without"}, {"variant": "chosen"}
+COLUMNS = (
+    Column("Gaussians", lambda _: "", unit=lambda fit: f"{fit['gaussians']:,}", only=_CHOSEN),  # of the first fit
+    Column("p = 0", "held_out", unit=" dB", only=_WITHOUT),
+    Column("chosen p", lambda fit: f"{fit['dropping']:g}", only=_CHOSEN),
+    Column("with it", "held_out", unit=" dB", only=_CHOSEN),
+)
+
 
 @dataclass(frozen=True)
-class Options(CellOptions):
+class Options(RandomOptions):
     """Clips and output."""
 
-    seeds: tuple[int, ...] = (3, 4, 5, 6, 7, 8)
-    """Seeds of the scenes."""
-    clips: Path = Path("out/random")
-    """Folder of the clips."""
+    downscale: float = 1
+    """Factor by which the clips are reduced."""
     steps: int = 1500
     """Steps of the first frame."""
-    fit_seeds: tuple[int, ...] = (0,)
-    """Seeds of the fits of each clip."""
+
+    def study(self) -> Study:
+        """Return the study of the clips without dropping and with the chosen probability."""
+        captures = {seed: random_capture(self.clips, seed, self.downscale) for seed in self.seeds}
+        scenes = [Scene({"seed": s, "views": len(c.train_views)}, (Source.of(c),)) for s, c in captures.items()]
+        variants = [Variant(_WITHOUT, self.config(dropping=0.0)), Variant(_CHOSEN, self.config())]
+        return Study(measure, scenes, variants, self.fit_seeds)
+
+    def table(self, rows: Sequence[Row]) -> str:
+        """Return the held-out PSNR of each clip without dropping and with the chosen probability."""
+        return scores_table(rows, {"seed": "seed", "training views": "views"}, COLUMNS)
 
 
 def measure(source: Source, config: StreamConfig) -> dict[str, Any]:
@@ -55,44 +67,14 @@ def measure(source: Source, config: StreamConfig) -> dict[str, Any]:
         images = next(capture.frames(0, 1)).images
         dropping = dropping_by_noise([images[v] for v in train])
     return {
-        "held_out": round(float(scores[test]), 2),
-        "training": round(float(scores[train].mean()), 2),
+        "held_out": scores[test],
+        "training": scores[train].mean(),
         "dropping": dropping,
         "estimate": report.validation.get("expected_psnr"),
         "gaussians": report.num_gaussians,
-        "seconds": round(report.seconds, 1),
+        "seconds": report.seconds,
     }
 
 
-def choice_table(fits: Sequence[Mapping[str, Any]]) -> str:
-    """Return the held-out PSNR of each clip without dropping and with the chosen strength, in Markdown."""
-    rows = []
-    for (seed,), own in grouped(fits, "seed").items():
-        chosen = [fit["chosen"] for fit in own]
-        without = plus_minus([fit["without"]["held_out"] for fit in own])
-        strengths = ", ".join(f"{strength:g}" for strength in sorted({each["dropping"] for each in chosen}))
-        with_it = plus_minus([each["held_out"] for each in chosen])
-        row = f"{without} dB", strengths, f"{with_it} dB"
-        rows.append((f"{seed}", f"{own[0]['views']}", f"{chosen[0]['gaussians']:,}", *row))
-    return markdown(("seed", "training views", "Gaussians", "p = 0", "chosen p", "with it"), rows)
-
-
-def main(options: Options) -> None:
-    """Run the report."""
-    mi.set_variant("llvm_ad_rgb")
-    config = StreamConfig()
-    config = replace(config, fit=replace(config.fit, first_frame_steps=options.steps))
-    settings = {"without": replace(config, fit=replace(config.fit, dropping=0.0)), "chosen": config}
-    about, cells = {}, {}
-    for seed, fit_seed in product(options.seeds, options.fit_seeds):
-        capture, name = random_capture(options.clips, seed), f"seed {seed}, fit {fit_seed}"
-        about[name] = {"seed": seed, "fit_seed": fit_seed, "views": len(capture.train_views)}
-        for how, each in settings.items():
-            cells[f"{name}, {how}"] = Source.of(capture), replace(each, seed=fit_seed)
-    found = options.run(measure, cells)
-    rows = [{**row, **{how: found[f"{name}, {how}"] for how in settings}} for name, row in about.items()]
-    options.write({"steps": options.steps, "fits": rows}, unprinted=["fits"])
-
-
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    tyro.cli(Options).run()

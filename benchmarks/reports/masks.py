@@ -18,19 +18,19 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 import tyro
 
-from benchmarks.reports.cells import CellOptions
 from benchmarks.reports.fits import new_loop
-from benchmarks.reports.plots import markdown, plus_minus
+from benchmarks.reports.plots import Column, grouped, markdown
+from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
 from morgs_mi import Camera, Gaussians, rasterize
-from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.cluster.tasks import Source
 from morgs_mi.codec.packets import CodedFrame
 from morgs_mi.config import StreamConfig
 from morgs_mi.evaluate.metrics import iou, psnr
@@ -45,23 +45,35 @@ from morgs_mi.render.config import RenderConfig
 from morgs_mi.stream_loop import StreamLoop
 from morgs_mi.synth.ground_truth import load_truth
 
+_COLUMNS = Column("IoU", "iou"), Column("PSNR", "psnr_moving", unit=" dB")
+
 
 @dataclass(frozen=True, kw_only=True)
-class Options(CellOptions):
-    """Measure the overlap of motion masks with the truth."""
+class Options(StudyOptions):
+    """Captures and work."""
 
     captures: tyro.conf.Positional[tuple[Path, ...]]
     """Folders of captures with ground truth."""
     frames: int = 4
     """Number of later frames of each clip."""
-    first_frame_steps: int = 600
-    """Number of steps of the first frame."""
-    num_gaussians: int = 10_000
-    """Number of Gaussians of the first frame."""
+    steps: int = 600
+    """Steps of the first frame."""
+    gaussians: int = 10_000
+    """Gaussians of the first frame."""
     loops: tuple[str, ...] = ("grabcut", "superpixels+grabcut")
     """Methods with whose masks later frames are fitted; a minute each."""
-    fit_seeds: tuple[int, ...] = (0,)
-    """Seeds of the fits of each clip."""
+
+    def study(self) -> Study:
+        """Return the study of the captures."""
+        sources = {path.resolve().name: Source.of(load_capture(path)) for path in self.captures}
+        frames = {name: replace(s, num_frames=min(s.num_frames, self.frames + 1)) for name, s in sources.items()}
+        scenes = [Scene({"name": name}, (source, self.loops)) for name, source in frames.items()]
+        fit = FitConfig(first_frame_steps=self.steps, num_gaussians=self.gaussians)
+        return Study(measure, scenes, [Variant({}, StreamConfig(fit))], self.fit_seeds, seed_key="seed")
+
+    def table(self, rows: Sequence[Row]) -> str:
+        """Return the held-out IoU and PSNR of the later frames by start and masks."""
+        return loops_table(rows)
 
 
 def overlap(mask: np.ndarray, truth: np.ndarray) -> dict[str, float]:
@@ -85,7 +97,7 @@ def lifted(gaussians: Gaussians, cameras: Sequence[Camera], flow: Mapping[int, F
 def means(rows: Iterable[Mapping[str, float]]) -> dict[str, float]:
     """Return the mean of every figure."""
     rows = list(rows)
-    return {name: round(float(np.mean([row[name] for row in rows])), 3) for name in rows[0]}
+    return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
 
 
 def processor_ms(image: np.ndarray, previous: np.ndarray) -> dict[str, float]:
@@ -98,24 +110,24 @@ def processor_ms(image: np.ndarray, previous: np.ndarray) -> dict[str, float]:
             start = time.process_time()
             refine(image, moving)
             times.append(1e3 * (time.process_time() - start))
-        costs[method] = round(float(np.median(times)), 1)
+        costs[method] = float(np.median(times))
     return costs
 
 
 class Clip:
     """A capture with its first frame fitted."""
 
-    def __init__(self, path: Path, options: Options, seed: int = 0) -> None:
-        self.seed = seed
-        self.capture: Capture = load_capture(path, max_frames=options.frames + 1)
+    def __init__(self, source: Source, config: StreamConfig) -> None:
+        self.capture, self.config = source.open(), config
         self.views = self.capture.train_views
         self.cameras = [self.capture.cameras[v] for v in self.views]
         if self.capture.test_view is None or self.capture.truth is None:
-            raise ValueError(f"{path}: expected a capture with a held-out view and ground truth; make one with synth.")
+            raise ValueError(
+                f"{source.path}: expected a capture with a held-out view and ground truth; make one with synth."
+            )
         self.test_view, self.truth = self.capture.test_view, self.capture.truth
         self.held_out = self.capture.cameras[self.test_view]
         self.frames = list(self.capture.frames())
-        self.fit = FitConfig(first_frame_steps=options.first_frame_steps, num_gaussians=options.num_gaussians)
         loop = self._loop(MotionConfig())
         loop.push(self._images(0))
         assert loop.state.coded is not None
@@ -125,7 +137,7 @@ class Clip:
         return [self.frames[t].images[v] for v in self.views]
 
     def _loop(self, motion: MotionConfig) -> StreamLoop:
-        return new_loop(self.capture, StreamConfig(seed=self.seed, fit=self.fit, motion=motion))
+        return new_loop(self.capture, replace(self.config, motion=motion))
 
     def _truth(self, camera: Camera, t: int) -> np.ndarray:
         return load_truth(self.truth, camera.name, t).mask
@@ -166,47 +178,36 @@ class Clip:
         return {"key_views": means(key_views), "held_out": means(held_out)}
 
 
-def measure(path: Path, options: Options, seed: int = 0) -> dict[str, Any]:
-    """Return the figures of one clip, fitted with one seed."""
-    clip = Clip(path, options, seed)
-    camera = clip.cameras[0]
-    masks, last = clip.masks(), clip.capture.num_frames - 1
-    costs = processor_ms(*(clip.frames[t].images[clip.views[0]] for t in (last, last - 1)))
-    loops = {
-        start: {method: clip.fitted(method, start == "lifted") for method in options.loops}
-        for start in ("lifted", "as before")
+def measure(source: Source, loops: Sequence[str], config: StreamConfig) -> dict[str, Any]:
+    """Return the figures of one clip."""
+    clip = Clip(source, config)
+    camera, last = clip.cameras[0], len(clip.frames) - 1
+    return {
+        "width": camera.width,
+        "height": camera.height,
+        "masks": clip.masks(),
+        "processor_ms": processor_ms(*(clip.frames[t].images[clip.views[0]] for t in (last, last - 1))),
+        "loops": {
+            start: {method: clip.fitted(method, start == "lifted") for method in loops}
+            for start in ("lifted", "as before")
+        },
     }
-    size = {"width": camera.width, "height": camera.height}
-    name = path.resolve().name
-    return {"name": name, "seed": seed, **size, "masks": masks, "processor_ms": costs, "loops": loops}
 
 
-def loops_table(clips: Sequence[Mapping[str, Any]]) -> str:
+def loops_table(clips: Sequence[Row]) -> str:
     """Return the held-out IoU and PSNR of the later frames in Markdown: mean and spread of each clip's fits."""
-    names, rows = list(dict.fromkeys(clip["name"] for clip in clips)), []
-    for start, label in (("lifted", "lifted"), ("as before", "as in the paper")):
-        for method in clips[0]["loops"][start]:
-            cells = []
-            for name in names:
-                fits = [clip["loops"][start][method]["held_out"] for clip in clips if clip["name"] == name]
-                overlaps, qualities = ([fit[key] for fit in fits] for key in ("iou", "psnr_moving"))
-                cells.append(f"{plus_minus(overlaps)}, {plus_minus(qualities)} dB")
-            rows.append((f"{label}, `{method}`", *cells))
-    return markdown(("start, masks", *(f"`{name}`" for name in names)), rows)
-
-
-def main(options: Options) -> None:
-    """Print the figures and write them."""
-    mi.set_variant("llvm_ad_rgb")
-    cells = {
-        f"{path} {seed}": (path.resolve(), options, seed) for path in options.captures for seed in options.fit_seeds
-    }
-    clips = list(options.run(measure, cells).values())
-    print(loops_table(clips))
-    unused = ("captures", "json", "workers", "scheduler")
-    settings = {name: value for name, value in asdict(options).items() if name not in unused}
-    options.write({"clips": clips, "settings": settings}, unprinted=["clips"])
+    rows = [
+        {**fit["held_out"], "clip": clip["name"], "how": f"{label}, `{method}`"}
+        for start, label in (("lifted", "lifted"), ("as before", "as in the paper"))
+        for clip in clips
+        for method, fit in clip["loops"][start].items()
+    ]
+    names, table = list(dict.fromkeys(row["clip"] for row in rows)), []
+    for (how,), own in grouped(rows, "how").items():
+        cells = ([column.of([row for row in own if row["clip"] == name]) for column in _COLUMNS] for name in names)
+        table.append((how, *map(", ".join, cells)))
+    return markdown(("start, masks", *(f"`{name}`" for name in names)), table)
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    tyro.cli(Options).run()

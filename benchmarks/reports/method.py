@@ -1,49 +1,73 @@
 """Contribution of the method's parts: presets by epochs, and key views with and without offset, over several seeds.
 
+    python -m benchmarks.reports method CAPTURE... --out out/method --workers 2
+
 A *setting* is a preset, a number of epochs, a number of key views and a factor on the learning rates. It is measured
-with several seeds; each seed has its own first frame, which all settings share. Tuned presets are run at several rates
-with the first seed. The rate with the best mean PSNR of the held-out view over the later frames is selected, and the
-other seeds are run at that rate only.
+with several seeds. Each seed has its own first frame, which depends on none of these: it is fitted once, stored as a
+keyframe, and all settings continue from it. Tuned presets are run at several rates with the first seed.
+The rate with the best mean PSNR of the held-out view over the later frames is selected, and the other seeds are run at
+that rate only.
+
+docs/experiments/method.md explains the JSON.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from base64 import b64decode, b64encode
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
+from tyro.conf import Positional
 
-from benchmarks.reports.flow import FlowReportConfig, report_flow
-from benchmarks.reports.method_cells import (
-    DEFAULT,
-    Cell,
-    Clip,
-    Scores,
-    fit_cells,
-    method_version,
-    scores_of,
-    scratch_scores,
-)
-from benchmarks.reports.method_results import FlowError, MethodClip, MethodResult, ScratchRow, SettingRow
-from morgs_mi.capture.capture import load_capture
+from benchmarks.reports import flow
+from benchmarks.reports.cells import OnWorkers
+from benchmarks.reports.fits import DEFAULT, Clip
+from benchmarks.reports.method_tables import method_page, plot_method
+from benchmarks.reports.plots import grouped
+from benchmarks.reports.study import Row, Scene, Study, Variant, method_version
+from benchmarks.speed.output import Output
+from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.cluster.executor import Workers
-from morgs_mi.config import PRESETS, StreamConfig
-from morgs_mi.evaluate.environment import machine, versions
+from morgs_mi.cluster.tasks import Source
+from morgs_mi.codec.container import Packet, decode_packet, encode_packet
+from morgs_mi.codec.packets import coded_frames
+from morgs_mi.config import PRESETS, StreamConfig, apply_preset
+from morgs_mi.core.files import json_finite
+from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.evaluate.results import Evaluation, known_mean
 from morgs_mi.fit.config import FitConfig
-
-__all__ = ["MethodReportConfig", "report_method"]
+from morgs_mi.stream_loop import FrameReport, StreamState
 
 # Rows of the paper's table of key views.
 _WITHOUT_OFFSET, _WITH_OFFSET = "ml", "ml-mo"
 _PAPER_EPOCHS = 8
 _SCRATCH = 20
+_WORK = "captures", "out", "workers", "scheduler"  # options on which no figure depends
+_SETTING = "preset", "epochs", "key_views", "rates"
+# Scores that are averaged over the later frames; `by_frame` has those that are plotted over time.
+_MEANS = ("psnr", "psnr_moving", "psnr_still", "ssim", "motion_error_moving", "motion_error_still")
+_MEANS += ("true_motion_moving", "confidence_iou")
+_BY_FRAME = ("psnr", "psnr_moving", "motion_error_moving")
+_MOTION_3D = ("error", "relative_error", "length_ratio", "angle")
+_IMAGES = ("psnr", "psnr_moving", "psnr_still", "ssim")
 
 
-@dataclass(frozen=True)
-class MethodReportConfig:
-    """Settings of the report on the method."""
+@dataclass(frozen=True, kw_only=True)
+class Options(OnWorkers):
+    """Measure the method's parts, key views, and quality over run time, with several seeds.
 
+    Results stored in OUT are reused, so that an interrupted report continues.
+    """
+
+    captures: Positional[tuple[Path, ...]]
+    """Folders of captures."""
+    out: Path = Path("out/method")
+    """Output folder for method.md, method.json, finished fits and, with matplotlib, method.png."""
     presets: tuple[str, ...] = ("baseline", "ml", "ml-mo", "ml-mo-mc", "paper", DEFAULT)
     """Presets of morgs-mi fit; default means none."""
     epochs: tuple[int, ...] = (1, 2, 3, 5, 8, 12)
@@ -69,17 +93,11 @@ class MethodReportConfig:
 
     def __post_init__(self) -> None:
         unknown = [name for name in (*self.presets, *self.tuned) if name not in (DEFAULT, *PRESETS)]
-        if unknown or not self.presets:
+        if unknown or not self.presets or not self.epochs or self.seeds < 1:
             raise ValueError(
-                f"MethodReportConfig(): `presets` and `tuned` must be among {', '.join((DEFAULT, *PRESETS))}, got "
-                f"{', '.join(unknown) or 'none'}."
+                f"method: `presets` and `tuned` must be among {', '.join((DEFAULT, *PRESETS))}, with one preset, one "
+                f"number of epochs and one seed or more, got {', '.join(unknown) or 'none'}."
             )
-        for name in ("epochs", "rates", "seeds", "num_gaussians"):
-            values = np.atleast_1d(getattr(self, name))
-            if not len(values) or not (values > 0).all():
-                raise ValueError(f"MethodReportConfig(): `{name}` must be positive, got {getattr(self, name)}.")
-        if self.scratch < 0 or any(count < 1 for count in self.key_views):
-            raise ValueError("MethodReportConfig(): `scratch` must be at least 0 and `key_views` at least 1.")
 
     @property
     def base(self) -> StreamConfig:
@@ -92,180 +110,221 @@ class MethodReportConfig:
         """Number of epochs of the tables: the nearest to the paper's 8."""
         return min(self.epochs, key=lambda epochs: abs(epochs - _PAPER_EPOCHS))
 
+    def run(self) -> None:
+        """Fit every clip with every setting and seed, and write the results so far after each clip.
 
-def report_method(
-    captures: Sequence[str | Path],
-    out: str | Path,
-    config: MethodReportConfig,
-    progress: Callable[[str, float, float], None] = lambda *_: None,
-    finished: Callable[[MethodResult], None] = lambda _: None,
-    workers: Workers | None = None,
-) -> MethodResult:
-    """Fit every clip with every setting and seed, reusing stored results.
-
-    Args:
-        captures: folders of captures, two frames or more.
-        out: folder that stores first frames and cells, so that an interrupted report continues.
-        config: settings.
-        progress: called with (stage, done, total).
-        finished: called with the result so far after each clip.
-        workers: from `open_workers`, which fit the cells side by side; None: this process fits them, one by one.
-
-    Returns:
-        One clip per capture, the settings, the machine and the versions.
-
-    Raises:
-        OSError: a capture cannot be read, or a result cannot be written.
-        ValueError: there is no capture, two captures have the same name, a capture has a single frame, or a setting is
-            incompatible with a preset.
-    """
-    names = [Path(path).resolve().name for path in captures]
-    if not names or len(set(names)) < len(names):
-        raise ValueError(
-            f"report_method(): `captures` must be one folder or more with distinct names, got {', '.join(names)}."
-        )
-    version = config.version or method_version()
-    result = MethodResult((), config.table_epochs, version, asdict(config), machine(), versions())
-    for path in captures:
-        result = replace(result, clips=(*result.clips, _clip(path, Path(out), config, version, progress, workers)))
-        finished(result)
-    return result
-
-
-def cells_of(config: MethodReportConfig, num_views: int) -> tuple[list[Cell], list[Cell]]:
-    """Return the first seed's cells of the presets, and those that compare numbers of key views; both may overlap."""
-    usual = min(config.stream.motion.key_views, num_views)
-    presets = [
-        Cell(preset, epochs, usual, rate, seed=0)
-        for epochs in config.epochs
-        for preset in config.presets
-        for rate in (config.rates if preset in config.tuned else (1.0,))
-    ]
-    key_views = [
-        Cell(preset, config.table_epochs, views, 1.0, seed=0)
-        for views in sorted({min(count, num_views) for count in config.key_views})
-        for preset in (_WITHOUT_OFFSET, _WITH_OFFSET)
-    ]
-    return list(dict.fromkeys(presets)), key_views
-
-
-def best_cells(found: Mapping[Cell, Scores]) -> set[Cell]:
-    """Return the first seed's cells with the best rate for their preset, epochs and key views."""
-    best: dict[Cell, Cell] = {}
-    for cell in (cell for cell in found if cell.seed == 0):
-        setting = replace(cell, rates=1.0)
-        best[setting] = max(best.get(setting, cell), cell, key=lambda cell: found[cell]["psnr"])
-    return set(best.values())
-
-
-def aggregate(found: Mapping[Cell, Scores]) -> tuple[SettingRow, ...]:
-    """Return one row per setting: mean and standard deviation of every score over the seeds."""
-    best, groups = best_cells(found), dict[Cell, list[Scores]]()
-    for cell, scores in found.items():
-        groups.setdefault(replace(cell, seed=0), []).append(scores)
-    rows = []
-    for setting, runs in groups.items():
-        names = [name for name in runs[0] if name != "by_frame"]
-        table = {name: np.array([run[name] for run in runs], float) for name in names}
-        by_frame = {
-            name: np.mean([np.array(run["by_frame"][name], float) for run in runs], axis=0).tolist()
-            for name in runs[0]["by_frame"]
-        }
-        rows.append(
-            SettingRow(
-                preset=setting.preset,
-                epochs=setting.epochs,
-                key_views=setting.key_views,
-                rates=setting.rates,
-                runs=len(runs),
-                mean={name: float(values.mean()) for name, values in table.items()},
-                std={name: _spread(values) for name, values in table.items()},
-                by_frame={name: tuple(values) for name, values in by_frame.items()},
-                best=setting in best,
+        Raises:
+            OSError: a capture cannot be read, or a result cannot be written.
+            ValueError: there is no capture, two captures have the same name, a capture has a single frame, or a setting
+                is incompatible with a preset.
+        """
+        names = [Path(path).resolve().name for path in self.captures]
+        if not names or len(set(names)) < len(names):
+            raise ValueError(
+                f"method: `captures` must be one folder or more with distinct names, got {', '.join(names)}."
             )
-        )
-    return tuple(rows)
+        clips, settings = [], {n: v for n, v in asdict(self).items() if n not in _WORK}
+        about = {"table_epochs": self.table_epochs, "version": self.version or method_version()}
+        with self.opened() as workers:
+            for path in self.captures:
+                clips.append(measure(path, self, workers))
+                page = method_page(clips, self.table_epochs)
+                (self.out / "method.md").write_text(page, encoding="utf-8")
+                result = {"clips": clips, **about, "settings": settings}
+                Output(self.out / "method.json").write(result, unprinted=["clips", "settings"])
+                if find_spec("matplotlib"):
+                    plot_method(clips, self.out / "method.png")
+        print(f"{page}\nAll figures: {self.out / 'method.json'}")
 
 
-def _clip(
-    path: str | Path,
-    out: Path,
-    config: MethodReportConfig,
-    version: str,
-    progress: Callable[[str, float, float], None],
-    workers: Workers | None,
-) -> MethodClip:
-    capture = load_capture(path, max_frames=config.frames)
+def measure(path: Path, options: Options, workers: Workers | None) -> dict[str, Any]:
+    """Return the results of one clip."""
+    capture = load_capture(path, max_frames=options.frames)
     if capture.num_frames < 2:
         raise ValueError(f"{capture.path}: expected a capture of two frames or more, got {capture.num_frames}.")
-    clip, base = Clip.read(capture), config.base
-    presets, key_views = cells_of(config, len(capture.train_views))
-    found = _measured(clip, presets, key_views, config, version, out, progress, workers)
-
-    def rows_of(cells: Sequence[Cell]) -> tuple[SettingRow, ...]:
-        return aggregate({cell: scores for cell, scores in found.items() if replace(cell, seed=0) in cells})
-
-    steps = _SCRATCH * _PAPER_EPOCHS * len(capture.train_views)
-    chosen = np.linspace(capture.num_frames - 1, 1, config.scratch + 1)[: config.scratch].round().astype(int)
-    scratch: list[ScratchRow] = []
-    for done, frame in enumerate(dict.fromkeys(chosen.tolist())):
-        progress(f"Fitting {clip.name} from scratch", done, config.scratch)
-        scratch.append(scratch_scores(clip, frame, base, steps, version, out))
+    presets, key_views = variants_of(options, len(capture.train_views))
+    rows = fitted(capture, [*presets, *(v for v in key_views if v not in presets)], presets, options, workers)
     camera = capture.cameras[0]
-    return MethodClip(
-        name=clip.name,
-        views=len(capture.cameras),
-        frames=capture.num_frames,
-        width=camera.width,
-        height=camera.height,
-        held_out=capture.test_view is not None,
-        flow=_flow_error(path, config) if capture.truth is not None else None,
-        scratch=tuple(scratch),
-        rows=rows_of(presets),
-        key_view_rows=rows_of(key_views),
-    )
+    return {
+        "name": capture.path.resolve().name,
+        "views": len(capture.cameras),
+        "frames": capture.num_frames,
+        "width": camera.width,
+        "height": camera.height,
+        "held_out": capture.test_view is not None,
+        "cue": flow_error(capture, options.stream) if capture.truth is not None else None,
+        "scratch": from_scratch(capture, options, workers),
+        "rows": aggregate(rows, presets),
+        "key_view_rows": aggregate(rows, key_views),
+    }
 
 
-def _measured(
-    clip: Clip,
-    presets: Sequence[Cell],
-    key_views: Sequence[Cell],
-    config: MethodReportConfig,
-    version: str,
-    out: Path,
-    progress: Callable[[str, float, float], None],
+def variants_of(options: Options, num_views: int) -> tuple[list[Variant], list[Variant]]:
+    """Return the settings of the presets, and those that compare numbers of key views; both may overlap."""
+
+    def variant(preset: str, epochs: int, key_views: int, rates: float) -> Variant:
+        keys = {"preset": preset, "epochs": epochs, "key_views": key_views, "rates": rates}
+        return Variant(keys, settings_of(options.base, **keys))
+
+    usual = min(options.stream.motion.key_views, num_views)
+    presets = [
+        variant(preset, epochs, usual, rates)
+        for epochs in options.epochs
+        for preset in options.presets
+        for rates in (options.rates if preset in options.tuned else (1.0,))
+    ]
+    key_views = [
+        variant(preset, options.table_epochs, views, 1.0)
+        for views in sorted({min(count, num_views) for count in options.key_views})
+        for preset in (_WITHOUT_OFFSET, _WITH_OFFSET)
+    ]
+    return presets, key_views
+
+
+def settings_of(base: StreamConfig, preset: str, epochs: int, key_views: int, rates: float) -> StreamConfig:
+    """Return `base` with a setting; `rates` is a factor on all learning rates of later frames."""
+    if preset != DEFAULT:
+        base = apply_preset(base, preset)  # pyright: ignore[reportArgumentType]
+    scaled = {name: rates * rate for name, rate in asdict(base.fit.rates).items()}
+    fit = replace(base.fit, epochs=epochs, rates=replace(base.fit.rates, **scaled))
+    return replace(base, fit=fit, motion=replace(base.motion, key_views=key_views))
+
+
+def fitted(
+    capture: Capture,
+    variants: Sequence[Variant],
+    presets: Sequence[Variant],
+    options: Options,
     workers: Workers | None,
-) -> dict[Cell, Scores]:
-    """Return the scores of the first seed's cells, and of the others' at the best rates and all key views."""
-    found: dict[Cell, Scores] = {}
-
-    def measure(cells: Sequence[Cell], seed: int) -> None:
-        stage = f"Fitting {clip.name}" + (f", seed {seed + 1} of {config.seeds}" if seed else "")
-        cells = [replace(cell, seed=seed) for cell in cells]
-        if workers is not None:
-            fit_cells(clip, cells, config.base, version, out, workers, lambda done: progress(stage, done, len(cells)))
-        for done, cell in enumerate(cells):
-            progress(stage, done, len(cells))
-            found[cell] = scores_of(clip, cell, config.base, version, out)
-        progress(stage, len(cells), len(cells))
-
-    first = list(dict.fromkeys([*presets, *key_views]))
-    measure(first, seed=0)
-    later = best_cells({cell: found[cell] for cell in presets}) | set(key_views)
+) -> list[Row]:
+    """Return the rows of all variants with the first seed, and of the others at the best rates and all key views."""
+    source, rows = Source.of(capture), list[Row]()
+    start = Study(first_frame, [Scene({"frame": 0}, (replace(source, num_frames=1),))], [Variant({}, options.base)])
+    start = replace(start, seeds=range(options.seeds), version=options.version)
+    firsts = {row["fit_seed"]: row["packet"] for row in start.run(workers, options.out)}
     # Seed by seed: after an interruption, a report with fewer seeds is complete.
-    for seed in range(1, config.seeds):
-        measure([cell for cell in first if cell in later], seed)
+    for seed in range(options.seeds):
+        if seed:
+            best = [row for row in aggregate(rows, presets) if row["best"]]
+            chosen = [v for v in variants if v not in presets or v.keys in [_setting(row) for row in best]]
+        else:
+            chosen = variants
+        scenes = [Scene({}, (source, firsts[seed]))]
+        rows += Study(later_frames, scenes, chosen, (seed,), version=options.version).run(workers, options.out)
+    return rows
+
+
+def aggregate(rows: Sequence[Row], variants: Sequence[Variant]) -> list[dict[str, Any]]:
+    """Return one row per variant: mean and standard deviation of every score over the seeds.
+
+    `best` are the rates whose first run has the best mean PSNR for their preset, epochs and key views.
+    """
+    keys = [variant.keys for variant in variants]
+    groups = [own for own in grouped(rows, *_SETTING).values() if _setting(own[0]) in keys]
+    best: dict[tuple[Any, ...], Row] = {}
+    for first in (own[0] for own in groups):
+        setting = first["preset"], first["epochs"], first["key_views"]
+        best[setting] = max(best.get(setting, first), first, key=lambda row: row["psnr"])
+    found = []
+    for own in groups:
+        names = [name for name in own[0] if name not in (*_SETTING, "fit_seed", "by_frame")]
+        table = {name: np.array([row[name] for row in own], float) for name in names}
+        series = {n: np.mean([np.array(row["by_frame"][n], float) for row in own], axis=0) for n in own[0]["by_frame"]}
+        row = {
+            **_setting(own[0]),
+            "runs": len(own),
+            "mean": {name: float(values.mean()) for name, values in table.items()},
+            "std": {name: float(v.std(ddof=1)) if len(v) > 1 else None for name, v in table.items()},
+            "by_frame": {name: values.tolist() for name, values in series.items()},
+            "best": any(own[0] is row for row in best.values()),
+        }
+        found.append(json_finite(row))
     return found
 
 
-def _flow_error(path: str | Path, config: MethodReportConfig) -> FlowError:
-    """Return the error of the flow that guides the motion."""
-    motion = config.stream.motion
-    flow = FlowReportConfig((motion.flow_method,), motion.key_views, config.frames)
-    moving = report_flow([path], flow).clips[0].rows[0].moving
-    return FlowError(moving.error, moving.reliable_error)
+def _setting(row: Row) -> dict[str, Any]:
+    return {name: row[name] for name in _SETTING}
 
 
-def _spread(values: np.ndarray) -> float:
-    """Return the standard deviation of several runs; NaN for a single run."""
-    return float(values.std(ddof=1)) if len(values) > 1 else float("nan")
+def first_frame(source: Source, config: StreamConfig) -> dict[str, str]:
+    """Fit the first frame and return its `packet`, base64."""
+    clip = Clip.read(source.open())
+    packet, _ = clip.loop(config).push(clip.images[0])
+    return {"packet": b64encode(encode_packet(packet)).decode()}
+
+
+def later_frames(source: Source, first: str, config: StreamConfig) -> dict[str, Any]:
+    """Fit all later frames after the packet `first`, base64, and return their scores.
+
+    Returns:
+        Means over the later frames in the held-out view (or all training views): ``psnr``, ``psnr_moving``,
+        ``psnr_still`` in dB, ``ssim``, ``motion_error_moving`` and ``_still`` and ``true_motion_moving`` in px,
+        ``confidence_iou``, ``motion_3d_error`` in world units, ``_relative_error`` and ``_length_ratio`` of the true
+        length, ``_angle`` in degrees, ``num_bytes``; ``mtv`` and ``mtv_input`` (x100), ``psnr_slope`` in dB per frame,
+        ``seconds``, the median of a later frame; ``by_frame``, lists of some of them. None if unknown.
+    """
+    clip = Clip.read(source.open())
+    return summary(*continued(clip, decode_packet(b64decode(first)), config))
+
+
+def continued(clip: Clip, packet: Packet, config: StreamConfig) -> tuple[Evaluation, list[FrameReport]]:
+    """Fit all later frames of a clip after its first packet; return the evaluation of the stream, and the reports."""
+    loop, reports = clip.loop(config), list[FrameReport]()
+    (coded,) = coded_frames([packet])
+    loop.resume(coded, clip.images[:1])
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "stream.morgs"
+        with clip.writer(path, config) as writer:
+            writer.write(packet)
+            for images in clip.images[1:]:
+                packet, report = loop.push(images)
+                writer.write(packet)
+                reports.append(report)
+        return evaluate_stream(path, clip.capture.path), reports
+
+
+def summary(found: Evaluation, reports: Sequence[FrameReport]) -> dict[str, Any]:
+    """Return the scores of a stream, see `later_frames`."""
+    later = found.frames[1:]
+    motion = [row.motion_3d for row in later if row.motion_3d is not None]
+    return {
+        **{name: known_mean([getattr(row.scores, name) for row in later]) for name in _MEANS},
+        "num_bytes": known_mean([row.num_bytes for row in later]),
+        **{f"motion_3d_{name}": known_mean([getattr(scores, name) for scores in motion]) for name in _MOTION_3D},
+        "mtv": found.variation.render,
+        "mtv_input": found.variation.input,
+        "psnr_slope": found.psnr_slope,
+        "seconds": float(np.median([report.seconds for report in reports])),
+        "by_frame": {name: [getattr(row.scores, name) for row in later] for name in _BY_FRAME},
+    }
+
+
+def from_scratch(capture: Capture, options: Options, workers: Workers | None) -> list[dict[str, Any]]:
+    """Return the image scores of some frames that are fitted from scratch like a first frame."""
+    steps = _SCRATCH * _PAPER_EPOCHS * len(capture.train_views)
+    chosen = np.linspace(capture.num_frames - 1, 1, options.scratch + 1)[: options.scratch].round().astype(int)
+    config = replace(options.base, fit=replace(options.base.fit, first_frame_steps=steps))
+    frames = dict.fromkeys(chosen.tolist())
+    scenes = [Scene({"frame": frame, "steps": steps}, (Source.of(capture), frame)) for frame in frames]
+    rows = Study(scratch_frame, scenes, [Variant({}, config)], (config.seed,), version=options.version)
+    return [{n: v for n, v in row.items() if n != "fit_seed"} for row in rows.run(workers, options.out)]
+
+
+def scratch_frame(source: Source, frame: int, config: StreamConfig) -> dict[str, float]:
+    """Return the image scores of one frame that is fitted from scratch."""
+    clip = Clip.read(source.open())
+    loop = clip.loop(config)
+    loop.state = StreamState(frame)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "stream.morgs"
+        with clip.writer(path, config) as writer:
+            packet, report = loop.push(clip.images[frame])
+            writer.write(packet)
+        found = evaluate_stream(path, clip.capture.path).frames[0].scores
+    return {**{name: getattr(found, name) for name in _IMAGES}, "seconds": report.seconds}
+
+
+def flow_error(capture: Capture, config: StreamConfig) -> Mapping[str, float]:
+    """Return the error of the flow that guides the motion on the key views where the surface moves, px."""
+    moving = flow.measure(capture, (config.motion.flow_method,), config.motion.key_views)["rows"][0]["moving"]
+    return {name: moving[name] for name in ("error", "reliable_error")}

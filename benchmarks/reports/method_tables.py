@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.reports.method_cells import DEFAULT
-from benchmarks.reports.method_results import MethodClip, MethodResult, SettingRow
+from benchmarks.reports.fits import DEFAULT
 from benchmarks.reports.plots import blank_figure, label_points, markdown, save_figure
+from benchmarks.reports.study import Row
 from morgs_mi.evaluate.tables import figure
 
 __all__ = [
@@ -59,92 +59,95 @@ _WHOLE = "ml-mo-mc"
 _GAINED = ("psnr", "psnr_moving", "motion_error_moving")
 
 
-def best_rows(clip: MethodClip) -> list[SettingRow]:
+def best_rows(clip: Row) -> list[Row]:
     """Return each preset's rows at its best rate, by preset and epochs."""
-    rows = [row for row in clip.rows if row.best]
-    order = list(dict.fromkeys(row.preset for row in rows))
-    return sorted(rows, key=lambda row: (order.index(row.preset), row.epochs))
+    rows = [row for row in clip["rows"] if row["best"]]
+    order = list(dict.fromkeys(row["preset"] for row in rows))
+    return sorted(rows, key=lambda row: (order.index(row["preset"]), row["epochs"]))
 
 
-def ablation_table(clip: MethodClip, epochs: int) -> str:
+def ablation_table(clip: Row, epochs: int) -> str:
     """Return the paper's Table 4 on a clip: one row per preset at a number of epochs."""
-    rows = [row for row in best_rows(clip) if row.epochs == epochs]
-    return _table(("preset", "rates"), rows, lambda row: (f"`{row.preset}`", f"{row.rates:g}x"))
+    rows = [row for row in best_rows(clip) if row["epochs"] == epochs]
+    return _table(("preset", "rates"), rows, lambda row: (f"`{row['preset']}`", f"{row['rates']:g}x"))
 
 
-def epochs_table(clip: MethodClip) -> str:
+def epochs_table(clip: Row) -> str:
     """Return quality and run time: one row per preset and number of epochs."""
     titles = ("preset", "epochs", "rates")
-    return _table(titles, best_rows(clip), lambda row: (f"`{row.preset}`", str(row.epochs), f"{row.rates:g}x"))
+    return _table(titles, best_rows(clip), lambda row: (f"`{row['preset']}`", str(row["epochs"]), f"{row['rates']:g}x"))
 
 
-def key_views_rows(clip: MethodClip) -> list[SettingRow]:
+def key_views_rows(clip: Row) -> list[Row]:
     """Return the rows that compare numbers of key views, by preset and number."""
-    return sorted(clip.key_view_rows, key=lambda row: (row.preset, row.key_views))
+    return sorted(clip["key_view_rows"], key=lambda row: (row["preset"], row["key_views"]))
 
 
-def key_views_table(clip: MethodClip) -> str:
+def key_views_table(clip: Row) -> str:
     """Return the paper's Table 5 on a clip: motion without and with offset by key views."""
     titles = {"ml": "without offset", "ml-mo": "with offset"}
-    return _table(("", "key views"), key_views_rows(clip), lambda row: (titles[row.preset], str(row.key_views)))
+    return _table(("", "key views"), key_views_rows(clip), lambda row: (titles[row["preset"]], str(row["key_views"])))
 
 
-def gains_table(clips: Sequence[MethodClip]) -> str:
+def gains_table(clips: Sequence[Row]) -> str:
     """Return the gains of the parts at the best rates: PSNR of whole and moving region, dB, and motion error, px."""
     table = []
     for clip in clips:
-        rows = {(row.preset, row.epochs): row.mean for row in best_rows(clip)}
+        rows = {(row["preset"], row["epochs"]): row["mean"] for row in best_rows(clip)}
         for epochs in sorted({epochs for _, epochs in rows}):
             cells = []
             for _, preset, without in _GAINS:
                 gains = [_score(rows, (preset, epochs), n) - _score(rows, (without, epochs), n) for n in _GAINED]
                 cells.append(" / ".join(f"{gain:+.2f}" if _known(gain) else "-" for gain in gains))
-            table.append((clip.name, str(epochs), *cells))
+            table.append((clip["name"], str(epochs), *cells))
     return markdown(("clip", "epochs", *(title for title, *_ in _GAINS)), table, 2)
 
 
-def comparison_table(clips: Sequence[MethodClip]) -> str:
+def comparison_table(clips: Sequence[Row]) -> str:
     """Return the default, or the preset with all parts, compared with `baseline`, `paper` and the recording."""
     columns = [list(_comparisons(clip)) for clip in clips]
     rows = [(row[0][0], *(figure(found, 2) for _, found in row)) for row in zip(*columns, strict=True)]
-    return markdown(("", *(clip.name for clip in clips)), rows, 1)
+    return markdown(("", *(clip["name"] for clip in clips)), rows, 1)
 
 
-def method_page(result: MethodResult) -> str:
-    """Return all tables of all clips in Markdown; the page on the method explains them."""
-    clips, epochs = result.clips, result.table_epochs
+def method_page(clips: Sequence[Row], epochs: int) -> str:
+    """Return all tables of all clips in Markdown; the page on the method explains them.
+
+    Args:
+        clips: results of the clips.
+        epochs: number of epochs of the tables on parts and on key views.
+    """
     parts = [f"## What the parts add\n\n{gains_table(clips)}", f"## Comparison\n\n{comparison_table(clips)}"]
     for clip in clips:
-        size = f"{clip.views} views of {clip.width}x{clip.height}, {clip.frames} frames"
-        seeds = best_rows(clip)[0].runs
+        size = "{views} views of {width}x{height}, {frames} frames".format(**clip)
+        seeds = best_rows(clip)[0]["runs"]
         spread = "one run" if seeds == 1 else f"mean ± standard deviation of {seeds} runs"
-        parts.append(f"## {clip.name}\n\n{size}; {spread}. {_references(clip)}{_edges(clip)}")
+        parts.append(f"## {clip['name']}\n\n{size}; {spread}. {_references(clip)}{_edges(clip)}")
         parts.append(f"### Parts of the method, {epochs} epochs\n\n{ablation_table(clip, epochs)}")
-        if clip.key_view_rows:
+        if clip["key_view_rows"]:
             parts.append(f"### Key views, {epochs} epochs\n\n{key_views_table(clip)}")
         parts.append(f"### Quality against run time\n\n{epochs_table(clip)}")
-        if clip.scratch:
+        if clip["scratch"]:
             parts.append(f"### Frames fitted from scratch\n\n{_scratch_table(clip, epochs)}")
     return "\n".join(parts)
 
 
-def plot_method(result: MethodResult, path: str | Path) -> None:
+def plot_method(clips: Sequence[Row], path: Path) -> None:
     """Plot quality over run time: a row of panels per clip, a line per preset, points labelled by epochs.
 
     Raises:
         ValueError: matplotlib is not installed.
     """
-    clips = result.clips
     drawing = blank_figure(4.6 * len(_PANELS), 4.0 * len(clips) + 0.6)
     grid = drawing.subplots(len(clips), len(_PANELS), squeeze=False)
     for axes, clip in zip(grid, clips, strict=True):
         rows = best_rows(clip)
         for axis, (title, name, with_flow) in zip(axes, _PANELS, strict=True):
-            for preset in dict.fromkeys(row.preset for row in rows):
-                _draw_line(axis, preset, name, [row for row in rows if row.preset == preset])
-            if with_flow and clip.flow is not None:
-                axis.axhline(clip.flow.error, color="k", linestyle=":", label="error of the flow")
-            axis.set(title=f"{clip.name}: {title}", xlabel="seconds per later frame", xscale="log")
+            for preset in dict.fromkeys(row["preset"] for row in rows):
+                _draw_line(axis, preset, name, [row for row in rows if row["preset"] == preset])
+            if with_flow and clip["cue"] is not None:
+                axis.axhline(clip["cue"]["error"], color="k", linestyle=":", label="error of the flow")
+            axis.set(title=f"{clip['name']}: {title}", xlabel="seconds per later frame", xscale="log")
             axis.title.set_fontsize(10)
             axis.grid(alpha=0.3, which="both")
             axis.tick_params(axis="x", which="both", labelsize=7)
@@ -155,9 +158,9 @@ def plot_method(result: MethodResult, path: str | Path) -> None:
     save_figure(drawing, path)
 
 
-def _comparisons(clip: MethodClip) -> Iterator[tuple[str, float]]:
+def _comparisons(clip: Row) -> Iterator[tuple[str, float]]:
     """Yield title and figure of each comparison, NaN if unknown; without a number of epochs it is at 8."""
-    rows = {(row.preset, row.epochs): row.mean for row in best_rows(clip)}
+    rows = {(row["preset"], row["epochs"]): row["mean"] for row in best_rows(clip)}
     whole = DEFAULT if any(preset == DEFAULT for preset, _ in rows) else _WHOLE
 
     def score(name: str, epochs: int = 8, preset: str = whole) -> float:
@@ -175,7 +178,7 @@ def _comparisons(clip: MethodClip) -> Iterator[tuple[str, float]]:
             )
     for title, name in metrics:
         yield f"{title} at 2 epochs over `paper` at 8, dB", score(name, 2) - score(name, 8, "paper")
-    flow = nan if clip.flow is None else clip.flow.error
+    flow = nan if clip["cue"] is None else clip["cue"]["error"]
     yield "motion error as a share of the flow's own", _ratio(score("motion_error_moving"), flow)
     yield "motion error as a share of `baseline`'s", share("motion_error_moving")
     yield "motion error in 3D as a share of `baseline`'s", share("motion_3d_error")
@@ -187,67 +190,72 @@ def _comparisons(clip: MethodClip) -> Iterator[tuple[str, float]]:
 
 def _score(rows: Mapping[tuple[str, int], Mapping[str, float]], setting: tuple[str, int], name: str) -> float:
     """Return a setting's mean, NaN if it is unknown."""
-    return rows.get(setting, {}).get(name, nan)
+    value = rows.get(setting, {}).get(name)
+    return nan if value is None else value
 
 
 def _ratio(value: float, other: float) -> float:
     return value / other if other else nan
 
 
-def _draw_line(axis: Any, preset: str, name: str, rows: Sequence[SettingRow]) -> None:
-    seconds, values = (np.array([row.mean[key] for row in rows]) for key in ("seconds", name))
-    spread = np.nan_to_num(np.array([row.std[name] for row in rows]))
+def _draw_line(axis: Any, preset: str, name: str, rows: Sequence[Row]) -> None:
+    seconds, values = (np.array([row["mean"][key] for row in rows], float) for key in ("seconds", name))
+    spread = np.nan_to_num(np.array([row["std"][name] for row in rows], float))
     axis.errorbar(seconds, values, spread, fmt="o-", markersize=4, capsize=2, label=preset, alpha=0.85)
-    label_points(axis, zip(seconds, values, strict=True), [str(row.epochs) for row in rows], (4, 3))
+    label_points(axis, zip(seconds, values, strict=True), [str(row["epochs"]) for row in rows], (4, 3))
 
 
-def _table(titles: Sequence[str], rows: Sequence[SettingRow], name: Any) -> str:
+def _table(titles: Sequence[str], rows: Sequence[Row], name: Any) -> str:
     """Return a table of all scores that are known in any of the rows."""
-    columns = [column for column in _COLUMNS if any(_known(row.mean[column[1]]) for row in rows)]
+    columns = [column for column in _COLUMNS if any(_known(row["mean"][column[1]]) for row in rows)]
     cells = [(*name(row), *(_spread(row, key, digits, unit) for _, key, digits, unit in columns)) for row in rows]
     return markdown((*titles, *(column[0] for column in columns)), cells, len(titles))
 
 
-def _scratch_table(clip: MethodClip, epochs: int) -> str:
+def _scratch_table(clip: Row, epochs: int) -> str:
     titles = ("frame", "preset", "steps", "PSNR, dB", "moving")
     rows = []
-    for found in clip.scratch:
-        frame = str(found.frame)
-        rows.append((frame, "from scratch", str(found.steps), figure(found.psnr, 2), figure(found.psnr_moving, 2)))
+    for found in clip["scratch"]:
+        frame = str(found["frame"])
+        rows.append(
+            (frame, "from scratch", str(found["steps"]), figure(found["psnr"], 2), figure(found["psnr_moving"], 2))
+        )
         for row in best_rows(clip):
-            if row.epochs == epochs:
-                values = (row.by_frame[name][found.frame - 1] for name in ("psnr", "psnr_moving"))
-                steps = epochs * (clip.views - clip.held_out)
-                rows.append((frame, f"`{row.preset}`", str(steps), *(figure(value, 2) for value in values)))
+            if row["epochs"] == epochs:
+                values = (row["by_frame"][name][found["frame"] - 1] for name in ("psnr", "psnr_moving"))
+                steps = epochs * (clip["views"] - clip["held_out"])
+                rows.append((frame, f"`{row['preset']}`", str(steps), *(figure(value, 2) for value in values)))
     return markdown(titles, rows, 2)
 
 
-def _references(clip: MethodClip) -> str:
+def _references(clip: Row) -> str:
     """Return a sentence on the figures of the recording and of the flow."""
-    mean = clip.rows[0].mean
+    mean = clip["rows"][0]["mean"]
     clauses = [f"The recording's own mTV is {figure(mean['mtv_input'], 3)}"]
-    if clip.flow is not None:
+    if clip["cue"] is not None:
         clauses.append(f"motion is {figure(mean['true_motion_moving'], 1)} px where things move")
-        clauses.append(f"the flow that guides it is off by {figure(clip.flow.error, 2)} px there")
+        clauses.append(f"the flow that guides it is off by {figure(clip['cue']['error'], 2)} px there")
     return ", ".join(clauses) + ".\n"
 
 
-def _edges(clip: MethodClip) -> str:
+def _edges(clip: Row) -> str:
     """Return a warning about presets whose best rate is the largest one measured, empty if there are none."""
-    tried: dict[str, set[float]] = {row.preset: set() for row in clip.rows}
-    for row in clip.rows:
-        tried[row.preset].add(row.rates)
-    edges = [row for row in best_rows(clip) if len(tried[row.preset]) > 1 and row.rates == max(tried[row.preset])]
-    found = ", ".join(f"`{row.preset}` at {row.epochs} epochs" for row in edges)
+    tried: dict[str, set[float]] = {row["preset"]: set() for row in clip["rows"]}
+    for row in clip["rows"]:
+        tried[row["preset"]].add(row["rates"])
+    edges = [
+        row for row in best_rows(clip) if len(tried[row["preset"]]) > 1 and row["rates"] == max(tried[row["preset"]])
+    ]
+    found = ", ".join(f"`{row['preset']}` at {row['epochs']} epochs" for row in edges)
     return f"Larger rates than were tried may be better for {found}.\n" if found else ""
 
 
-def _spread(row: SettingRow, name: str, digits: int, unit: float) -> str:
-    mean, std = row.mean[name], row.std[name]
+def _spread(row: Row, name: str, digits: int, unit: float) -> str:
+    mean, std = row["mean"][name], row["std"][name]
     if not _known(mean):
         return "-"
     return figure(unit * mean, digits) + (f" ± {figure(unit * std, digits)}" if _known(std) else "")
 
 
-def _known(value: float) -> bool:
-    return value == value
+def _known(value: float | None) -> bool:
+    return value is not None and value == value

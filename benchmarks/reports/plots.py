@@ -2,16 +2,94 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+
+from morgs_mi.evaluate.tables import figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["blank_figure", "grouped", "label_points", "markdown", "plus_minus", "save_figure"]
+__all__ = [
+    "Column",
+    "blank_figure",
+    "grouped",
+    "label_points",
+    "markdown",
+    "means_over",
+    "plus_minus",
+    "save_figure",
+    "scores_table",
+]
+
+
+class Column(NamedTuple):
+    """Column of a table of scores.
+
+    Attributes:
+        title: head of the column.
+        score: name of the score, or a function of a row. Texts are listed instead of averaged.
+        decimals: number of decimals.
+        factor: factor on the score.
+        unit: text after the figure, or a function of a row.
+        spread: whether the standard deviation follows the mean.
+        only: keys and values of the rows that count; None: all.
+    """
+
+    title: str
+    score: str | Callable[[Mapping[str, Any]], Any]
+    decimals: int = 2
+    factor: float = 1
+    unit: str | Callable[[Mapping[str, Any]], str] = ""
+    spread: bool = True
+    only: Mapping[str, Any] | None = None
+
+    def of(self, rows: Sequence[Mapping[str, Any]]) -> str:
+        """Return the figure of some rows."""
+        rows = [row for row in rows if self.only is None or self.only.items() <= row.items()]
+        values = [self.score(row) if callable(self.score) else row[self.score] for row in rows]
+        unit = self.unit(rows[0]) if callable(self.unit) else self.unit
+        if isinstance(values[0], str):
+            return ", ".join(dict.fromkeys(values)) + unit
+        values = [self.factor * float("nan" if value is None else value) for value in values]
+        found = plus_minus(values, self.decimals) if self.spread else figure(float(np.mean(values)), self.decimals)
+        return found + unit
+
+
+def scores_table(
+    rows: Iterable[Mapping[str, Any]],
+    keys: Mapping[str, str | Callable[..., Any]],
+    columns: Sequence[Column],
+    left: int = 1,
+) -> str:
+    """Return the scores of a study in Markdown: one line for all rows that have the keys in common.
+
+    Args:
+        rows: rows of a study.
+        keys: names of the keys by the titles of the first columns, or functions of a row.
+        columns: of the scores.
+        left: number of columns that are aligned left.
+    """
+    groups: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
+    for row in rows:
+        values = (key(row) if callable(key) else row[key] for key in keys.values())
+        groups.setdefault(tuple(map(str, values)), []).append(row)
+    lines = [(*names, *(column.of(own) for column in columns)) for names, own in groups.items()]
+    return markdown((*keys, *(column.title for column in columns)), lines, left)
+
+
+def means_over(rows: Sequence[Mapping[str, Any]], key: str, **about: Any) -> list[dict[str, Any]]:
+    """Return the means of the numbers of the rows that have `key` in common, as rows with the entries `about`."""
+    found = []
+    for (value,), own in grouped(rows, key).items():
+        names = [name for name, entry in own[0].items() if isinstance(entry, Real) and name not in (key, *about)]
+        table = {name: np.array([row[name] for row in own], float) for name in names}
+        found.append({key: value, **about, **{name: float(np.nanmean(column)) for name, column in table.items()}})
+    return found
 
 
 def markdown(titles: Sequence[str], rows: Iterable[Sequence[str]], left: int = 1) -> str:

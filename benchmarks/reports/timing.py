@@ -11,42 +11,51 @@ first. Scores are means over the later frames of the held-out view, whose clock 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
-import mitsuba as mi
 import numpy as np
 import tyro
 
-from benchmarks.reports.cells import CellOptions
-from benchmarks.reports.fits import new_loop
-from benchmarks.reports.plots import markdown, plus_minus
+from benchmarks.reports.fits import ClipOptions, new_loop
+from benchmarks.reports.plots import Column, scores_table
+from benchmarks.reports.study import Row, Scene, Study, Variant
 from morgs_mi import rasterize
 from morgs_mi.calibration.timing import estimate_time_offsets
 from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.cluster.tasks import Source
 from morgs_mi.config import StreamConfig
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.recorder import push_frame
 from morgs_mi.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.synth.ground_truth import load_truth
-from morgs_mi.synth.synth_config import SynthConfig
-from morgs_mi.synth.synthesize import synthesize
 
-__all__ = ["Options", "main", "timing_table"]
+# Ways in which a scene is recorded and read, with the titles of the table.
+FITS = {
+    "synchronised": "synchronised",
+    "recorded": "apart",
+    "aligned": "aligned",
+    "shutter": "rolling shutter",
+    "readout": "with its readout",
+}
+COLUMNS = (
+    Column("views", "views", 0, spread=False),
+    Column("largest offset", "largest_offset", spread=False),
+    *(Column(name.replace("_", " "), name, 3, spread=False) for name in ("mean_error", "largest_error")),
+    Column("standard error", "standard_error", 3, spread=False),
+    *(Column(title, f"{name}_moving") for name, title in FITS.items()),
+)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Options(CellOptions):
+class Options(ClipOptions):
     """Clips, work and output."""
 
     seeds: tuple[int, ...] = (3, 6)
     """Seeds of the scenes."""
-    clips: Path = Path("out/timing")
-    """Folder of the clips, which are made if they are not there."""
-    width: int = 160
-    """Width of the images in pixels; the height is three quarters of it."""
+    fit_seeds: tuple[int, ...] = (0, 1, 2)
+    """Seeds of the fits of each scene."""
     frames: int = 12
     """Number of frames of a clip."""
     fitted: int = 4
@@ -55,48 +64,37 @@ class Options(CellOptions):
     """Largest time offset in frames."""
     readout: float = 0.6
     """Readout of the rolling shutters in frames."""
-    fit_seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds of the fits of each clip."""
-    num_gaussians: int = 4000
-    """Gaussians of the first frame."""
-    first_frame_steps: int = 500
-    """Optimisation steps of the first frame."""
-    epochs: int = 4
-    """Epochs of a later frame."""
+    steps: int | None = 500
+    """Steps of the first frame."""
 
-    def cells(self) -> dict[str, tuple[Options, int]]:
-        """Return the options and the seed of each scene."""
-        return {f"random {seed}": (self, seed) for seed in self.seeds}
+    def study(self) -> Study:
+        """Return the study of the scenes, each of which is recorded by three rigs."""
+        rigs = {
+            "one-clock": Disturbances(),
+            "apart": Disturbances(time_offset=self.time_offset),
+            "rolling": Disturbances(rolling_shutter=self.readout),
+        }
+        scenes = []
+        for seed in self.seeds:
+            clips = (self.clip("random", f"random-{seed}-{n}", disturbances=d, seed=seed) for n, d in rigs.items())
+            sources = tuple(map(Source.of, clips))
+            scenes.append(Scene({"scene": f"random {seed}"}, (*sources, self.readout, self.fitted)))
+        return Study(measure, scenes, [Variant({}, self.config(dropping=0.0))], self.fit_seeds)
 
-    def config(self, seed: int) -> StreamConfig:
-        """Return the settings of a fit."""
-        config = StreamConfig(seed=seed)
-        work = {name: getattr(self, name) for name in ("num_gaussians", "first_frame_steps", "epochs")}
-        return replace(config, fit=replace(config.fit, dropping=0.0, **work))
-
-    def clip(self, seed: int, own: Disturbances) -> Path:
-        """Return the folder of a clip, which is made if it is not there."""
-        folder = self.clips / f"random-{seed}-{own.time_offset:g}-{own.rolling_shutter:g}"
-        if not folder.exists():
-            width, height = self.width, self.width * 3 // 4
-            config = SynthConfig(frames=self.frames, width=width, height=height, disturbances=own, seed=seed)
-            synthesize("random", folder, config)
-        return folder
+    def table(self, rows: Sequence[Row]) -> str:
+        """Return the errors of each scene's offsets, and PSNR where things move."""
+        return scores_table(rows, {"scene": "scene"}, COLUMNS)
 
 
-def measure(options: Options, seed: int) -> dict[str, Any]:
-    """Return the errors of the offsets of one scene, and the scores of its fits by the way in which it is read."""
-    apart, rolling = Disturbances(time_offset=options.time_offset), Disturbances(rolling_shutter=options.readout)
-    recorded, start = load_capture(options.clip(seed, apart)), time.perf_counter()
-    found = estimate_time_offsets(recorded)
-    seconds = time.perf_counter() - start
-    truth = load_disturbances(recorded.path / "truth")
-    others = [name for name in found.offsets if name != found.reference]
-    errors = [found.offsets[name] + truth[name].time_offset for name in others]
-    aligned = load_capture(recorded.path, reading=replace(recorded.reading, offset=found.offsets))
-    first = int(aligned.metadata()["cameras"][recorded.names.index(found.reference)]["first_frame"])
-    synchronised, shutter = load_capture(options.clip(seed, Disturbances())), load_capture(options.clip(seed, rolling))
-    cameras = tuple(replace(camera, readout=options.readout) for camera in shutter.cameras)
+def measure(
+    clock: Source, apart: Source, rolling: Source, readout: float, num_frames: int, config: StreamConfig
+) -> dict[str, float]:
+    """Return the errors of a scene's offsets, and the scores of its fits by the way in which it is read."""
+    synchronised, recorded, shutter = clock.open(), apart.open(), rolling.open()
+    errors, offsets, reference = offset_errors(recorded)
+    aligned = load_capture(recorded.path, reading=replace(recorded.reading, offset=offsets))
+    first = int(aligned.metadata()["cameras"][recorded.names.index(reference)]["first_frame"])
+    cameras = tuple(replace(camera, readout=readout) for camera in shutter.cameras)
     fits = {
         "synchronised": (synchronised, first),
         "recorded": (recorded, first),
@@ -104,27 +102,37 @@ def measure(options: Options, seed: int) -> dict[str, Any]:
         "shutter": (shutter, first),
         "readout": (replace(shutter, cameras=cameras), first),
     }
-    numbers = {
+    found = dict(errors)
+    for name, (capture, begin) in fits.items():
+        for score, value in scores(capture, range(begin, begin + num_frames), first, config).items():
+            found[f"{name}_{score}"] = value
+    return found
+
+
+def offset_errors(recorded: Capture) -> tuple[dict[str, float], dict[str, float], str]:
+    """Return the errors of a clip's offsets, the offsets by camera, and the reference."""
+    start = time.perf_counter()
+    found = estimate_time_offsets(recorded)
+    seconds, truth = time.perf_counter() - start, load_disturbances(recorded.path / "truth")
+    others = [name for name in found.offsets if name != found.reference]
+    errors = np.abs([found.offsets[name] + truth[name].time_offset for name in others])
+    figures = {
         "views": len(recorded.cameras),
         "largest_offset": max(abs(camera.time_offset) for camera in truth.values()),
-        "mean_error": float(np.abs(errors).mean()),
-        "largest_error": float(np.abs(errors).max()),
-        "standard_error": float(np.mean([found.errors[name] for name in others])),
+        "mean_error": errors.mean(),
+        "largest_error": errors.max(),
+        "standard_error": np.mean([found.errors[name] for name in others]),
         "seconds": seconds,
     }
-    row: dict[str, Any] = {name: float(f"{value:.4g}") for name, value in numbers.items()}
-    for name, (capture, begin) in fits.items():
-        rows = [scores(capture, begin, first, options.config(own), options.fitted) for own in options.fit_seeds]
-        row[name] = {score: [float(f"{each[score]:.4g}") for each in rows] for score in rows[0]}
-    return row
+    return figures, dict(found.offsets), found.reference
 
 
-def scores(capture: Capture, begin: int, first: int, config: StreamConfig, num_frames: int) -> dict[str, float]:
-    """Return the scores of a fit from the instant `begin` of a capture, which is frame `first` of the held-out clip."""
+def scores(capture: Capture, frames: range, first: int, config: StreamConfig) -> dict[str, Any]:
+    """Return the scores of a fit of some instants, of which the first is frame `first` of the held-out clip."""
     test, loop, rows = capture.test_view, new_loop(capture, config), []
     assert test is not None
     camera = capture.cameras[test]
-    for k, frame in enumerate(capture.partial_frames(begin, begin + num_frames)):
+    for k, frame in enumerate(capture.partial_frames(frames.start, frames.stop)):
         push_frame(loop, frame, capture.train_views)
         image = frame.images[test]
         assert loop.gaussians is not None
@@ -134,31 +142,8 @@ def scores(capture: Capture, begin: int, first: int, config: StreamConfig, num_f
         if k and moving.any():
             color = np.clip(color, 0, 1)
             rows.append((psnr(color, target), psnr(color[moving], target[moving])))
-    return dict(zip(("psnr", "moving"), np.mean(rows, axis=0).tolist(), strict=True))
-
-
-def timing_table(scenes: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return the results for the scenes as a table in Markdown: PSNR where things move as mean and spread over fits."""
-    names = ("synchronised", "recorded", "aligned", "shutter", "readout")
-    rows = [
-        (
-            *(name, f"{row['views']:.0f}", f"{row['largest_offset']:.2f}"),
-            *(f"{row[error]:.3f}" for error in ("mean_error", "largest_error", "standard_error")),
-            *(plus_minus(row[fit]["moving"]) for fit in names),
-        )
-        for name, row in scenes.items()
-    ]
-    head = ("scene", "views", "largest offset", "mean error", "largest error", "standard error")
-    return markdown((*head, "synchronised", "apart", "aligned", "rolling shutter", "with its readout"), rows)
-
-
-def main(options: Options) -> None:
-    """Run the report."""
-    mi.set_variant("llvm_ad_rgb")
-    found = options.run(measure, options.cells())
-    print(timing_table(found))
-    options.write({"scenes": found}, unprinted=["scenes"])
+    return dict(zip(("psnr", "moving"), np.mean(rows, axis=0), strict=True))
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Options))
+    tyro.cli(Options).run()

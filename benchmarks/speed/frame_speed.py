@@ -14,7 +14,7 @@ from __future__ import annotations
 import cProfile
 import json
 import pstats
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -25,14 +25,11 @@ import mitsuba as mi
 import numpy as np
 import tyro
 
+from benchmarks.speed.output import Output
 from morgs_mi import Camera, Gaussians, rasterize
-from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.packets import decode, keyframe_packet
 from morgs_mi.config import StreamConfig, apply_preset
-from morgs_mi.core.files import write_json
-from morgs_mi.evaluate.environment import machine, versions
 from morgs_mi.fit.config import DensityConfig, FitConfig
-from morgs_mi.method.config import MotionConfig
 from morgs_mi.stream_loop import StreamLoop
 
 # Stages of a frame: file and function that are timed.
@@ -77,11 +74,9 @@ SIZES = {"small": Size(640, 480, 12, 50_000, 3), "n3dv": Size(1352, 1014, 20, 20
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(Output):
     """Sizes, settings and output."""
 
-    json: Path | None = None
-    """JSON file for the figures, which are also printed."""
     sizes: tuple[str, ...] = ("small", "n3dv")
     """Sizes to run, among small and n3dv."""
     frames: int = 3
@@ -142,6 +137,11 @@ class Scene:
         size = (self.size.width, self.size.height)
         return [Camera.look_at(p, (0, -0.2, 0.3), (0, -1, 0), 38, *size) for p in [(0.1, -0.4, -4.5), *places]]
 
+    def recorded(self, num_frames: int, seed: int) -> list[list[np.ndarray]]:
+        """Return the images of the first frames, with camera noise, by camera."""
+        rng = np.random.default_rng(seed)
+        return [film(self.at(frame), self.cameras(), rng) for frame in range(num_frames)]
+
 
 def film(gaussians: Gaussians, cameras: list[Camera], rng: np.random.Generator) -> list[np.ndarray]:
     """Return the recorded image of each camera."""
@@ -153,9 +153,12 @@ def film(gaussians: Gaussians, cameras: list[Camera], rng: np.random.Generator) 
     return images
 
 
-def measure(
-    size: Size, config: StreamConfig, recorded: list[list[np.ndarray]], scene: Scene, live: bool = True
-) -> dict[str, Any]:
+def config_of(size: Size, **fit: Any) -> StreamConfig:
+    """Return the settings of a fit at a size, with further ones of `FitConfig`."""
+    return StreamConfig(FitConfig(sh_degree=0, density=DensityConfig(max_gaussians=round(1.1 * size.gaussians)), **fit))
+
+
+def measure(scene: Scene, config: StreamConfig, recorded: list[list[np.ndarray]], live: bool = True) -> dict[str, Any]:
     """Fit the later frames but the last; return seconds by stage, shares of what is processed, bytes, held-out PSNR.
 
     Unless they arrive `live`, the next frame is observed while one is fitted, in another thread, whose stages are not
@@ -196,40 +199,29 @@ def stages(profile: cProfile.Profile) -> dict[str, float]:
     return seconds
 
 
-def settings(options: Options, name: str, base: StreamConfig) -> dict[str, StreamConfig]:
+def settings(options: Options, name: str) -> dict[str, StreamConfig]:
     """Return the settings that are run at a size, by name."""
-    runs = {f"default, {e} epochs": replace(base, fit=replace(base.fit, epochs=e)) for e in options.epochs}
+    runs = {f"default, {epochs} epochs": config_of(SIZES[name], epochs=epochs) for epochs in options.epochs}
     if name in options.full:
-        runs["8 epochs, nothing left out"] = replace(base, fit=replace(base.fit, skip_static=False))
-        paper = apply_preset(base, "paper")
-        runs["paper, 8 epochs"] = replace(paper, fit=replace(paper.fit, skip_static=False))
+        runs["8 epochs, nothing left out"] = config_of(SIZES[name], skip_static=False)
+        runs["paper, 8 epochs"] = apply_preset(config_of(SIZES[name], skip_static=False), "paper")
     return runs
 
 
 def main(options: Options) -> None:
     """Run the benchmark."""
     mi.set_variant("llvm_ad_rgb")
-    result: dict[str, Any] = {
-        "seed": options.seed,
-        "noise": NOISE,
-        "machine": machine(),
-        "versions": versions(),
-    }
+    result: dict[str, Any] = {"seed": options.seed, "noise": NOISE}
     for name in options.sizes:
-        size = SIZES[name]
-        scene, rng = Scene(size, options.seed), np.random.default_rng(options.seed)
-        recorded = [film(scene.at(t), scene.cameras(), rng) for t in range(options.frames + 2)]
-        density = DensityConfig(max_gaussians=round(1.1 * size.gaussians))
-        base = StreamConfig(FitConfig(sh_degree=0, density=density), MotionConfig(), codec=CodecConfig())
-        rows = {}
-        for label, config in settings(options, name, base).items():
+        scene, rows = Scene(SIZES[name], options.seed), {}
+        recorded = scene.recorded(options.frames + 2, options.seed)
+        for label, config in settings(options, name).items():
             for live in (False, True) if label.startswith("default") else (True,):
                 row = f"{label}, live" if live and label.startswith("default") else label
-                rows[row] = measure(size, config, recorded, scene, live)
+                rows[row] = measure(scene, config, recorded, live)
                 print(f"{name:6s} {row:28s}", json.dumps(rows[row]), flush=True)
-        result[name] = {"size": vars(size), "runs": rows}
-    if options.json is not None:
-        write_json(options.json, result)
+        result[name] = {"size": vars(SIZES[name]), "runs": rows}
+    options.write(result, unprinted=options.sizes)
 
 
 if __name__ == "__main__":

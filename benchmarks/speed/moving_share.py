@@ -17,11 +17,9 @@ import numpy as np
 import tyro
 
 from benchmarks.reports.plots import blank_figure, save_figure
-from benchmarks.speed.frame_speed import SIZES, Scene, Size, film, measure
+from benchmarks.speed.frame_speed import SIZES, Scene, config_of, measure
 from benchmarks.speed.output import Output
 from morgs_mi import SH_C0, Gaussians, rasterize
-from morgs_mi.config import StreamConfig
-from morgs_mi.fit.config import DensityConfig, FitConfig
 
 RUNS = ("default", "nothing left out")
 VISIBLE = 4 / 255
@@ -65,14 +63,11 @@ def changed_share(scene: Scene) -> float:
     return float(np.mean([(np.abs(b - a) > VISIBLE).any(axis=-1).mean() for b, a in zip(before, after, strict=True)]))
 
 
-def fits(scene: Scene, size: Size, options: Options) -> dict[str, Any]:
+def fits(scene: Scene, options: Options) -> dict[str, Any]:
     """Return the figures of a scene, with and without leaving out what is static."""
-    rng = np.random.default_rng(options.seed)
-    recorded = [film(scene.at(frame), scene.cameras(), rng) for frame in range(options.frames + 2)]
-    density = DensityConfig(max_gaussians=round(1.1 * size.gaussians))
-    fit = FitConfig(sh_degree=0, density=density, epochs=options.epochs)
+    recorded = scene.recorded(options.frames + 2, options.seed)
     runs = {
-        name: measure(size, StreamConfig(replace(fit, skip_static=skip)), recorded, scene)
+        name: measure(scene, config_of(scene.size, epochs=options.epochs, skip_static=skip), recorded)
         for name, skip in zip(RUNS, (True, False), strict=True)
     }
     return {"changed": changed_share(scene), **runs}
@@ -97,7 +92,7 @@ def main(options: Options) -> None:
     scenes = [Scene(replace(size, movers=count), options.seed) for count in options.movers]
     rows = []
     for scene in [*scenes, FlickeringScene(replace(size, movers=0), options.seed)]:
-        rows.append(fits(scene, size, options))
+        rows.append(fits(scene, options))
         print(
             f"{rows[-1]['changed']:6.1%}", *(f"{rows[-1][n]['seconds']:.2f} s" for n in ("default", "nothing left out"))
         )

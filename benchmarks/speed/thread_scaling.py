@@ -17,10 +17,8 @@ import mitsuba as mi
 import numpy as np
 import tyro
 
-from benchmarks.speed.frame_speed import SIZES, Scene, film, measure
+from benchmarks.speed.frame_speed import SIZES, Scene, config_of, measure
 from benchmarks.speed.output import Output
-from morgs_mi.config import StreamConfig
-from morgs_mi.fit.config import DensityConfig, FitConfig
 
 
 @dataclass(frozen=True)
@@ -44,12 +42,9 @@ def fit_on(count: int, options: Options) -> dict[str, float]:
     # Before Dr.Jit and OpenCV start their threads, one per usable core.
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:count])
     mi.set_variant("llvm_ad_rgb")
-    size = SIZES[options.size]
-    scene, rng = Scene(size, options.seed), np.random.default_rng(options.seed)
-    recorded = [film(scene.at(frame), scene.cameras(), rng) for frame in range(options.frames + 2)]
-    density = DensityConfig(max_gaussians=round(1.1 * size.gaussians))
-    config = StreamConfig(FitConfig(sh_degree=0, density=density, epochs=options.epochs))
-    row = measure(size, config, recorded, scene)
+    scene = Scene(SIZES[options.size], options.seed)
+    config = config_of(scene.size, epochs=options.epochs)
+    row = measure(scene, config, scene.recorded(options.frames + 2, options.seed))
     return {name: value for name, value in row.items() if name == "seconds" or name.endswith("_s")}
 
 

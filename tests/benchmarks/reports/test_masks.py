@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.reports.masks import Options, means, measure, overlap
+from benchmarks.reports.masks import means, measure, overlap
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.cluster.tasks import Source
+from morgs_mi.config import StreamConfig
+from morgs_mi.fit.config import FitConfig
 from morgs_mi.method.mask_refiners.registry import MASK_REFINERS
-from morgs_mi.synth.synth_config import SynthConfig
-from morgs_mi.synth.synthesize import synthesize
 
 
 def test_overlap__of_known_masks():
@@ -28,15 +30,15 @@ def test_measure__refuses_a_capture_without_truth(fitted_clip: Path, tmp_path: P
     for path in (fitted_clip / "capture").iterdir():
         if path.name != "truth":
             (tmp_path / "capture" / path.name).symlink_to(path)
+    source = Source.of(load_capture(tmp_path / "capture"))
     with pytest.raises(ValueError, match="expected a capture with a held-out view and ground truth"):
-        measure(tmp_path / "capture", Options(captures=()))
+        measure(source, (), StreamConfig())
 
 
 @pytest.mark.slow
-def test_measure__compares_masks_and_confidence_with_the_truth(tmp_path: Path):
-    clip = synthesize("spheres", tmp_path / "clip", SynthConfig(cameras=6, frames=3, width=64, height=48, spp=4))
-    options = Options(captures=(clip,), frames=2, first_frame_steps=20, num_gaussians=300, loops=("none",))
-    result = measure(clip, options)
+def test_measure__compares_masks_and_confidence_with_the_truth(clip: Path):
+    config = StreamConfig(FitConfig(first_frame_steps=20, num_gaussians=300))
+    result = measure(Source.of(load_capture(clip)), ("none",), config)
     assert result["masks"].keys() == {*MASK_REFINERS.names, "lifted"}
     assert set(result["processor_ms"]) == set(MASK_REFINERS.names)
     for start in ("lifted", "as before"):

@@ -12,8 +12,6 @@ import pytest
 import morgs_mi
 from benchmarks.speed import frame_speed
 from benchmarks.speed.frame_speed import STAGES, Scene, Size
-from morgs_mi.config import StreamConfig
-from morgs_mi.fit.config import FitConfig
 from morgs_mi.losses.ssim import Target
 
 SIZE = Size(64, 48, 3, 600, 2)
@@ -46,10 +44,9 @@ def test_scene__moves_the_given_number_of_balls():
 
 @pytest.mark.slow
 def test_measure__reports_stages_bytes_and_quality():
-    scene, rng = Scene(SIZE, seed=0), np.random.default_rng(0)
-    recorded = [frame_speed.film(scene.at(t), scene.cameras(), rng) for t in range(3)]
-    config = StreamConfig(FitConfig(sh_degree=0, epochs=1, skip_static=False))
-    result = frame_speed.measure(SIZE, config, recorded, scene)
+    scene = Scene(SIZE, seed=0)
+    config = frame_speed.config_of(SIZE, epochs=1, skip_static=False)
+    result = frame_speed.measure(scene, config, scene.recorded(4, seed=0))
     stages = {f"{name}_s" for name in STAGES}
     assert stages | {"seconds", "bytes", "psnr", "gaussians", "views", "pixels", "epochs"} <= result.keys()
     assert min(result[name] for name in ("seconds", "flow_s", "lift_s", "steps_s", "packet_s", "bytes")) > 0

@@ -1,0 +1,165 @@
+"""Studies: their rows, resumption, and a tiny run of every one."""
+
+from __future__ import annotations
+
+import json
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from benchmarks.reports import (
+    cameras,
+    cells,
+    disturbances,
+    drift,
+    estimates,
+    exposure,
+    fits,
+    generalise,
+    live,
+    masks,
+    random_scenes,
+    seams,
+    study,
+    timing,
+)
+from benchmarks.reports.cells import run_cells
+from benchmarks.reports.generalise import measure
+from benchmarks.reports.study import Scene, Study, Variant, method_version, rounded
+from morgs_mi import StreamLoop
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.cluster.executor import open_workers
+from morgs_mi.cluster.tasks import Source
+from morgs_mi.config import StreamConfig
+from morgs_mi.fit.config import FitConfig
+from morgs_mi.render.config import RenderConfig
+from tests.benchmarks.reports.here import Here
+from tests.scenes.animated_gltf import write_glb
+
+TINY = StreamConfig(
+    fit=FitConfig(num_gaussians=60, first_frame_steps=3, epochs=1, dropping=0.0),
+    render=RenderConfig(reproducible=True),
+)
+# Figures that are times, which no two fits share.
+TIMES = {"seconds", "cpu_s", "processor_ms"}
+FIRST = {"seeds": (1,), "downscale": 1, "steps": 3, "gaussians": 60}
+SMALL = {"frames": 3, "width": 64, "gaussians": 60, "steps": 3, "epochs": 1, "fit_seeds": (0, 1)}
+# Options of a tiny run, and the number of its rows.
+STUDIES = {
+    random_scenes: ({"seeds": (1,), "frames": 2}, 1),
+    estimates: ({**FIRST, "views": (3,)}, 1),
+    generalise: ({**FIRST, "seeds": (1, 2)}, 4),
+    cameras: ({**FIRST, "degrees": (0.0, 0.5), "disturbances": (0,), "lens": 0.1}, 3),
+    masks: ({"frames": 1, "loops": ("none",)}, 1),
+    drift: ({**SMALL, "scenes": ("spheres",)}, 2),
+    live: ({**SMALL, "scenes": ("spheres",), "strides": (1,), "gap": 1, "gap_epochs": (2,)}, 6),
+    exposure: ({**SMALL, "seeds": (3,)}, 8),
+    disturbances: ({**SMALL, "animation": "bend", "cameras": 3}, 10),
+    timing: ({**SMALL, "seeds": (3,), "frames": 6, "fitted": 2, "time_offset": 0.4}, 2),
+    seams: ({**SMALL, "scenes": (("spheres", 0, 4),), "cameras": 3, "segment_frames": 2, "fit_seeds": (0,)}, 1),
+}
+FAST = (random_scenes, estimates)
+
+
+def tiny_loop(cameras, points, colors, config, image_masks):
+    """Return a loop that fits a few Gaussians in a few steps."""
+    fit = replace(TINY.fit, cross_validation=config.fit.cross_validation, dropping=config.fit.dropping)
+    return StreamLoop(cameras, points, colors, replace(config, fit=fit, render=TINY.render), image_masks)
+
+
+def without_times(value):
+    """Return figures without those that are times."""
+    if isinstance(value, list):
+        return [without_times(entry) for entry in value]
+    if not isinstance(value, dict):
+        return value
+    return {name: without_times(entry) for name, entry in value.items() if name not in TIMES}
+
+
+@pytest.mark.parametrize(
+    "report",
+    [pytest.param(report, marks=[pytest.mark.slow] * (report not in FAST)) for report in STUDIES],
+    ids=lambda report: report.__name__.rpartition(".")[2],
+)
+def test_study_options__of_workers_write_the_rows_of_one_process(report, clip: Path, tmp_path: Path, monkeypatch):
+    for name in ("random-1", "random-2", "random-1-lens-0.1", "spheres-3x64"):
+        (tmp_path / name).symlink_to(clip)
+    given, num_rows = STUDIES[report]
+    place = {"captures": (clip,)} if report is masks else {"clips": tmp_path}
+    if report is disturbances:
+        place["model"] = write_glb(tmp_path / "model.glb")
+    workers, found = Here(), {}
+    monkeypatch.setattr(fits, "StreamLoop", tiny_loop)
+    monkeypatch.setattr(cameras, "refine_cameras", lambda capture, *_: (capture, Scene({}, ())))  # needs larger images
+    monkeypatch.setattr(cells, "open_workers", contextmanager(lambda scheduler, count: iter([workers])))
+    for count in (None, 2):
+        options = report.Options(json=tmp_path / "out.json", workers=count, **place, **given)
+        options.run()
+        result = json.loads((tmp_path / "out.json").read_text())
+        found[count] = result["fits"]
+    assert workers.left < 99, "a worker was at work"
+    assert len(found[None]) == num_rows
+    assert {"settings", "commit", "date", "machine", "versions"} <= result.keys()
+    assert "clips" not in result["settings"]
+    assert "|" in options.table(found[None])
+    if report is not seams:  # segments are fitted by processes of their own, with the usual renderer
+        assert without_times(found[2]) == without_times(found[None])
+
+
+def score(source: Source, config: StreamConfig) -> dict[str, float]:
+    """Return a score in place of that of a fit."""
+    CALLS.append(config.seed)
+    return {"psnr": 30 + config.fit.epochs + config.seed / 3}
+
+
+CALLS: list[int] = []
+
+
+def test_study__continues_with_the_stored_cells(clip: Path, tmp_path: Path, monkeypatch):
+    source = Source.of(load_capture(clip))
+    variants = [Variant({"epochs": n}, StreamConfig(FitConfig(epochs=n))) for n in (1, 2)]
+    given = Study(score, [Scene({"clip": "a"}, (source,))], variants, (0, 1))
+    CALLS.clear()
+    rows = given.run(None, tmp_path)
+    assert rows[1] == {"clip": "a", "epochs": 1, "fit_seed": 1, "psnr": 31.333}
+    assert given.run(None, tmp_path) == rows
+    assert CALLS == [0, 1, 0, 1], "the second run fits nothing"
+    assert len(replace(given, seeds=(0, 1, 2)).run(None, tmp_path)) == 6
+    assert CALLS[4:] == [2, 2], "only another seed is fitted"
+    shorter = Scene({"clip": "a"}, (replace(source, num_frames=2),))
+    replace(given, scenes=[shorter], seeds=(0,)).run(None, tmp_path)
+    assert CALLS[6:] == [0, 0], "another part of the recording is fitted"
+    monkeypatch.setattr(study, "method_version", lambda: "another")
+    given.run(None, tmp_path)
+    assert CALLS[8:] == [0, 1, 0, 1], "another version of the method fits again"
+    assert len(given.run(None)) == 4
+    assert len(CALLS) == 16, "nothing is stored without a folder"
+
+
+def test_method_version__ignores_comments_and_depends_on_the_code(tmp_path: Path):
+    versions = []
+    for k, text in enumerate(("a = 1\n", "# Why.\na  =  1\n", "a = 2\n")):
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        (folder / "module.py").write_text(text)
+        versions.append(method_version((folder,)))
+    assert versions[0] == versions[1] != versions[2]
+
+
+def test_rounded__has_five_digits_of_what_is_no_integer():
+    assert rounded({"a": [1 / 3, 7, None], "b": "x", "c": float("inf")}) == {
+        "a": [0.33333, 7, None],
+        "b": "x",
+        "c": float("inf"),
+    }
+
+
+@pytest.mark.slow
+def test_run_cells__of_processes_gives_the_scores_of_one_process(clip: Path):
+    source = Source.of(load_capture(clip))
+    args = {seed: (source, replace(TINY, seed=seed)) for seed in (0, 1)}
+    with open_workers(count=2) as workers:
+        ours, theirs = (run_cells(measure, args, each, lambda *_: None) for each in (workers, None))
+    assert without_times(list(ours.values())) == without_times(list(theirs.values()))
