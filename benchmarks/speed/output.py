@@ -7,7 +7,6 @@ import subprocess
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from datetime import date
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -22,14 +21,11 @@ class Output:
     json: Path | None = None
     """JSON file for the figures, which are also printed."""
 
-    def write(
-        self, figures: Mapping[str, Any], packages: Collection[str] = (), unprinted: Collection[str] = ()
-    ) -> None:
+    def write(self, figures: Mapping[str, Any], unprinted: Collection[str] = ()) -> None:
         """Print the figures and write them to the file.
 
         Args:
             figures: by name.
-            packages: whose versions are recorded beside those of the package's own dependencies.
             unprinted: names of figures that only the file has.
         """
         found = {
@@ -37,7 +33,7 @@ class Output:
             "commit": commit(),
             "date": date.today().isoformat(),
             "machine": machine(),
-            "versions": versions() | {name: version(name) for name in packages},
+            "versions": versions(),
         }
         print(json.dumps({name: value for name, value in found.items() if name not in unprinted}, indent=2))
         if self.json is not None:
