@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.synth.scene import Light, Object, Recording, Rig, Scene, rotate, translate
+from morgs_mi.synth.scene import Light, Object, RecordingDefaults, Rig, Scene, rotate, translate
 from morgs_mi.synth.solids import Solid, draw_solid
 from morgs_mi.synth.textures import lights, pattern, room, textured
 
@@ -71,7 +71,7 @@ class RandomScene:
 
     bodies: dict[str, Body]
     rig: Rig
-    recording: Recording
+    recording: RecordingDefaults
     half_width: float
     swing: float
 
@@ -92,7 +92,7 @@ def draw_scene(seed: int) -> RandomScene:
     """Return the objects, rig and noise of a seed's scene."""
     rng = np.random.default_rng([seed, 0])
     noise = rng.uniform(0.003, 0.02) if rng.random() < 0.6 else 0.0
-    recording = Recording(int(rng.integers(4, 17)), int(rng.choice([4, 16, 49])), noise)
+    recording = RecordingDefaults(int(rng.integers(4, 17)), int(rng.choice([4, 16, 49])), noise)
     swing = rng.uniform(0.15, 0.5) if rng.random() < 0.5 else 0.0
     half_width = rng.uniform(2.4, 3.0)
     rig = _rig(rng, half_width)

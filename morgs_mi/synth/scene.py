@@ -29,7 +29,7 @@ __all__ = [
     "Light",
     "Mesh",
     "Object",
-    "Recording",
+    "RecordingDefaults",
     "Rig",
     "Scene",
     "check_scene",
@@ -146,7 +146,7 @@ class Rig:
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordingDefaults:
     """How a scene is recorded unless `synthesize` is given other values.
 
     Attributes:
@@ -178,7 +178,7 @@ class Scene:
     lights: Mapping[str, Light]
     rig: Rig = field(default_factory=Rig)
     exposure: Callable[[float], float] | None = None
-    recording: Recording = field(default_factory=Recording)
+    recording: RecordingDefaults = field(default_factory=RecordingDefaults)
 
 
 def load_scene(scene: str | Path, seed: int = 0) -> Scene:

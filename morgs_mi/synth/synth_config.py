@@ -9,7 +9,7 @@ from morgs_mi.core.checks import check_number
 from morgs_mi.synth.disturbances import Disturbances
 
 if TYPE_CHECKING:
-    from morgs_mi.synth.scene import Recording
+    from morgs_mi.synth.scene import RecordingDefaults
 
 __all__ = ["SynthConfig"]
 
@@ -63,7 +63,7 @@ class SynthConfig:
         if min(self.width, self.height) < 2 or self.width % 2 or self.height % 2:
             raise ValueError(f"synthesize(): `width` and `height` must be even, got {self.width}x{self.height}.")
 
-    def completed(self, recording: Recording) -> SynthConfig:
+    def completed(self, recording: RecordingDefaults) -> SynthConfig:
         """Return the settings with the scene's own ones where none are given."""
         own = {"cameras": recording.num_cameras, "spp": recording.spp, "noise": recording.noise}
         return replace(self, **{name: value for name, value in own.items() if getattr(self, name) is None})

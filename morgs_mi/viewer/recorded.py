@@ -14,7 +14,7 @@ from morgs_mi.playback.player import fitted_capture, num_frames, open_stream_cap
 from morgs_mi.playback.visualise import label
 from morgs_mi.viewer.frame_cache import FrameCache
 
-__all__ = ["RecordedImages", "Recording", "seen_from", "wipe"]
+__all__ = ["RecordedClip", "RecordedImages", "seen_from", "wipe"]
 
 _OUTSIDE = (40, 40, 40)
 # Frames that are decoded and dropped rather than seeking, which decodes from a keyframe of the video.
@@ -55,7 +55,7 @@ class RecordedImages:
         return self._last
 
 
-class Recording:
+class RecordedClip:
     """Recorded images of a stream; its capture is opened when the first one is shown.
 
     Args:

@@ -29,7 +29,7 @@ from morgs_mi.viewer.frame_cache import NO_TRAILS, FrameCache
 from morgs_mi.viewer.modes import available_modes, scale_text, sees_same, splat_values
 from morgs_mi.viewer.page_scene import PageScene
 from morgs_mi.viewer.page_view import PageCamera, page_view
-from morgs_mi.viewer.recorded import Recording, seen_from, wipe
+from morgs_mi.viewer.recorded import RecordedClip, seen_from, wipe
 
 __all__ = ["Viewer", "ViewerConfig"]
 
@@ -112,7 +112,7 @@ class Viewer:
             )
         self._cameras = self._cache.stream.cameras
         self._config = render_config(self._cache.stream)
-        self._recording = Recording(self._cache, config.capture)
+        self._recording = RecordedClip(self._cache, config.capture)
         self._shown: tuple[Any, ...] | None = None
         self._rendered: tuple[Any, np.ndarray] | None = None
         self._colored_for = self._cameras[0]  # camera that sees the colours of the Gaussians on the page
