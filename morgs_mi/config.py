@@ -23,17 +23,19 @@ import json
 import re
 import textwrap
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, is_dataclass, replace
 from difflib import get_close_matches
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from reprlib import repr as shortened
-from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from types import NoneType
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.core.documentation import with_pages
+from morgs_mi.core.ranges import arms_of, check_ranges, check_value, types_of
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.io.bounded import read_toml
 from morgs_mi.method.config import MotionConfig
@@ -54,7 +56,6 @@ __all__ = [
 PresetName = Literal["l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper", "rigidity"]
 Config = TypeVar("Config")
 _NONE = "none"
-_MOST = 2**64  # of a whole number; the header of a stream has no longer ones
 _COMMENT_WIDTH = 110
 
 
@@ -76,6 +77,9 @@ class StreamConfig:
     """Precision and size of the stream."""
     seed: int = 0
     """Seed of every random choice: order of the views, added points."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
 
 
 def _modules(motion: bool, offset: bool, confidence: bool) -> dict[str, Any]:
@@ -196,98 +200,54 @@ def relocated(error: ValueError, source: str, prefix: str, names: list[str]) -> 
 
 def _replaced(config: Any, values: Mapping[str, Any], source: str, prefix: str) -> Any:
     """Return `config` with `values`; `prefix` is its own key with a dot behind it, or empty."""
-    hints, names = get_type_hints(type(config)), [f.name for f in fields(config)]
+    kinds = types_of(type(config))
     changes: dict[str, Any] = {}
     for name, value in values.items():
         key = f"{prefix}{name}"
-        if name not in names:
-            near = get_close_matches(name, names, 1) or names
-            raise ValueError(f"{source}: `{key}` is unknown, expected {' or '.join(f'`{prefix}{n}`' for n in near)}.")
-        nested = _nested_type(hints[name])
+        if name not in kinds:
+            near = " or ".join(f"`{prefix}{n}`" for n in get_close_matches(name, kinds, 1) or kinds)
+            raise ValueError(f"{source}: `{key}` is unknown, expected {near}.")
+        nested = next((arm for arm in arms_of(kinds[name]) if is_dataclass(arm) and isinstance(arm, type)), None)
         if nested and isinstance(value, Mapping):
             before = getattr(config, name)
             changes[name] = _replaced(nested() if before is None else before, value, source, f"{key}.")
-            continue
-        try:
-            changes[name] = _converted(value, hints[name])
-        except (TypeError, OverflowError):
-            expected = _described(hints[name])
-            raise ValueError(f"{source}: `{key}` must be {expected}, got {shortened(value)}.") from None
+        else:
+            changes[name] = _converted(value, kinds[name])
+            check_value(source, key, changes[name], kinds[name])
     try:
         return replace(config, **changes)
     except ValueError as error:
-        raise relocated(error, source, prefix, names) from None
-
-
-def _arms(kind: Any) -> tuple[Any, ...]:
-    """Return the members of a union, or the type itself."""
-    return get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)
-
-
-def _nested_type(kind: Any) -> type | None:
-    """Return the dataclass that a field's type admits, or None."""
-    return next((arm for arm in _arms(kind) if is_dataclass(arm) and isinstance(arm, type)), None)
+        raise relocated(error, source, prefix, list(kinds)) from None
 
 
 def _converted(value: Any, kind: Any) -> Any:
-    """Return a value of a TOML file as a field's type has it; TypeError where it is of another type."""
-    arms = _arms(kind)
+    """Return a TOML value as a field's type has it: tuples for lists, floats for integers, None for "none"."""
+    arms = [get_args(arm)[0] if get_origin(arm) is Annotated else arm for arm in arms_of(kind)]
     if NoneType in arms and value in (None, _NONE):
         return None
-    for arm in arms:
-        if arm is float and isinstance(value, (int, float)) and not isinstance(value, bool):
+    if type(value) is int and float in arms:
+        with suppress(OverflowError):
             return float(value)
-        if arm is int and type(value) is int and -_MOST // 2 <= value < _MOST:
-            return value
-        if arm in (bool, str) and type(value) is arm:
-            return value
-        if is_dataclass(arm) and isinstance(arm, type) and isinstance(value, arm):
-            return value
-        origin = get_origin(arm) or arm
-        if origin is Literal and any(type(value) is type(choice) and value == choice for choice in get_args(arm)):
-            return value
-        if origin is tuple and isinstance(value, (list, tuple)):
-            kinds = get_args(arm)
-            kinds = kinds[:1] * len(value) if kinds[1:] == (...,) else kinds
-            if len(kinds) == len(value):
-                return tuple(_converted(*pair) for pair in zip(value, kinds, strict=True))
-        if origin is dict and isinstance(value, dict):
-            names, values = get_args(arm)
-            return {_converted(k, names): _converted(v, values) for k, v in value.items()}
-    raise TypeError
-
-
-def _described(kind: Any) -> str:
-    """Return a field's type in words."""
-    words = {
-        int: "a whole number below 2^64",
-        float: "a number",
-        bool: "true or false",
-        str: "a string",
-        NoneType: f"'{_NONE}'",
-    }
-    described = []
-    for arm in _arms(kind):
-        origin, kinds = get_origin(arm) or arm, get_args(arm)
-        if origin is Literal:
-            described.append(f"one of {', '.join(map(repr, kinds))}")
-        elif origin is tuple:
-            items = f"each {_described(kinds[0])}" if kinds[1:] == (...,) else ", ".join(map(_described, kinds))
-            described.append(f"a list ({items})")
-        else:
-            described.append(words.get(arm, "a table"))
-    return " or ".join(described)
+    if isinstance(value, (list, tuple)):
+        kinds = next((get_args(arm) for arm in arms if get_origin(arm) is tuple), ())
+        kinds = kinds[:1] * len(value) if kinds[1:] == (...,) else kinds
+        if len(kinds) == len(value):
+            return tuple(map(_converted, value, kinds))
+    if isinstance(value, dict):
+        types = next((get_args(arm) for arm in arms if get_origin(arm) is dict), None)
+        return {k: _converted(v, types[1]) for k, v in value.items()} if types else value
+    return value
 
 
 def _table(config: Any, key: str) -> Iterator[str]:
     """Yield the lines of a table: its own settings, then the tables inside it."""
-    docs, hints = field_docs(type(config)), get_type_hints(type(config))
-    values = {f.name: getattr(config, f.name) for f in fields(config)}
+    docs, kinds = field_docs(type(config)), types_of(type(config))
+    values = {name: getattr(config, name) for name in kinds}
     nested = {name: value for name, value in values.items() if is_dataclass(value)}
     for name, value in values.items():
         if name in nested:
             continue
-        if value == _NONE and NoneType in _arms(hints[name]):
+        if value == _NONE and NoneType in arms_of(kinds[name]):
             raise ValueError(f"config_toml(): `{name}` must not be the string 'none', which stands for None.")
         yield from _comment(docs.get(name, ""))
         yield f"{name} = {_toml(value)}"

@@ -17,7 +17,7 @@ from morgs_mi.core.checks import check_mask, check_points, check_type
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.initialise import Points, scene_extent
 from morgs_mi.method.change import box_around, change_mask, moving_region, update_reference
-from morgs_mi.method.exposure import Exposure, common_change, follow_exposure
+from morgs_mi.method.exposure import LEAST_CHANGE, Exposure, common_change, follow_exposure
 from morgs_mi.method.flow import FlowObservation, choose_key_views, observe_key_views
 from morgs_mi.method.flow_sources.registry import FramePair
 from morgs_mi.method.objective import KeyView
@@ -191,17 +191,14 @@ def _seen(setup: Setup, before: Seen, recorded: Images) -> tuple[Seen, dict[int,
 
 def _exposures(setup: Setup, before: Seen, recorded: Images) -> dict[int, Exposure]:
     """Return the exposures relative to the views' first images, without the change of light that all views show."""
-    config, known = setup.config.fit.exposures, sorted(recorded.keys() & before.references.keys())
+    known = sorted(recorded.keys() & before.references.keys())
     found = map_in_threads(
-        lambda v: follow_exposure(
-            before.references[v], recorded[v], setup.masks[v], before.exposures.get(v), config.priors
-        ),
+        lambda v: follow_exposure(before.references[v], recorded[v], setup.masks[v], before.exposures.get(v)),
         known,
     )
     light = common_change(found)
     own = {v: exposure.without(light) for v, exposure in zip(known, found, strict=True)}
-    # Less is an error of the measurement.
-    kept = {v: exposure if exposure.change > config.least_change else Exposure() for v, exposure in own.items()}
+    kept = {v: exposure if exposure.change > LEAST_CHANGE else Exposure() for v, exposure in own.items()}
     return {**before.exposures, **kept}
 
 
@@ -215,9 +212,9 @@ def _flows(
         return {}, {}
     pairs = {}
     for v in _frame_key_views(setup, before, images):
-        box = None if changes is None else box_around(changes[v], motion.change)
+        box = None if changes is None else box_around(changes[v])
         if changes is None or box is not None:
-            region = None if changes is None else moving_region(changes[v], motion.change)
+            region = None if changes is None else moving_region(changes[v])
             name, valid = setup.cameras[v].name, setup.masks[v]
             pairs[v] = FramePair(images[v], before[v], name, frame, valid, box, region)
     if not pairs:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import asdict, dataclass, field, replace
-from math import inf
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -131,13 +130,13 @@ def test_rates_at__decays_the_rate_of_the_means_and_raises_the_others_for_fewer_
         *(apply_preset(StreamConfig(), name) for name in PRESETS),
         StreamConfig(
             fit=FitConfig(density=DensityConfig(rounds=0, births=1 / 3), rates=LearningRates(means=1e-300)),
-            motion=MotionConfig(mask_method="none", confidence_decay=1e22),
+            motion=MotionConfig(mask_method="none", cohesion_weight=1e22),
             render=RenderConfig(block_width=4, block_height=None, reproducible=True),
             codec=CodecConfig(quality=0.1 + 0.2),
             seed=-1,
         ),
         Leaf(),
-        Leaf(number=inf, name='"quoted" \\ \n\t\x00\x1b\x7f é 漢 🙂', sizes=(), limit=None, mode="exact"),
+        Leaf(number=1e308, name='"quoted" \\ \n\t\x00\x1b\x7f é 漢 🙂', sizes=(), limit=None, mode="exact"),
         Leaf(pair=("", -0.0), pairs=((1.0, 2.5), (-1e-9, 3.0)), labels=(), count=2**63),
         Root(),
         Root(Branch(Leaf(count=7), extra=Leaf(name="none"), weight=-1.0), seed=4),
@@ -208,36 +207,63 @@ def test_apply_values__builds_and_removes_an_optional_config() -> None:
         ),
         (StreamConfig(), "[fit]\nepoch = 2", "`fit.epoch` is unknown, expected `fit.epochs`."),
         (StreamConfig(), "[fit.density]\nround = 2", "`fit.density.round` is unknown, expected `fit.density.rounds`."),
-        (StreamConfig(), "[fit]\nepochs = 'many'", "`fit.epochs` must be a whole number below 2^64, got 'many'."),
-        (StreamConfig(), "[fit]\nepochs = 2.0", "`fit.epochs` must be a whole number below 2^64, got 2.0."),
+        (
+            StreamConfig(),
+            "[fit]\nepochs = 'many'",
+            "`fit.epochs` must be a whole number below 2^64, at least 1, got 'many'.",
+        ),
+        (StreamConfig(), "[fit]\nepochs = 2.0", "`fit.epochs` must be a whole number below 2^64, at least 1, got 2.0."),
         (
             StreamConfig(),
             "[fit]\nepochs = 99999999999999999999",
-            "`fit.epochs` must be a whole number below 2^64, got 99999999999999999999.",
+            "`fit.epochs` must be a whole number below 2^64, at least 1, got 99999999999999999999.",
         ),
-        (StreamConfig(), "[fit]\nepochs = true", "`fit.epochs` must be a whole number below 2^64, got True."),
+        (
+            StreamConfig(),
+            "[fit]\nepochs = true",
+            "`fit.epochs` must be a whole number below 2^64, at least 1, got True.",
+        ),
         (StreamConfig(), "[fit]\nskip_static = 1", "`fit.skip_static` must be true or false, got 1."),
-        (StreamConfig(), "[codec]\nquality = '1'", "`codec.quality` must be a number, got '1'."),
-        (StreamConfig(), "[codec]\nquality = true", "`codec.quality` must be a number, got True."),
+        (StreamConfig(), "[codec]\nquality = '1'", "`codec.quality` must be a finite number, above 0, got '1'."),
+        (StreamConfig(), "[codec]\nquality = true", "`codec.quality` must be a finite number, above 0, got True."),
         (StreamConfig(), "[motion]\nflow_method = 1", "`motion.flow_method` must be a string, got 1."),
         (StreamConfig(), "[motion]\nflow_method = 1979-05-27", "`motion.flow_method` must be a string, got "),
-        (StreamConfig(), "fit = 1", "`fit` must be a table, got 1."),
-        (StreamConfig(), "[[fit]]\nepochs = 1", "`fit` must be a table, got [{'epochs': 1}]."),
+        (StreamConfig(), "fit = 1", "`fit` must be a table (FitConfig), got 1."),
+        (StreamConfig(), "[[fit]]\nepochs = 1", "`fit` must be a table (FitConfig), got [{'epochs': 1}]."),
         (StreamConfig(), "[seed]\na = 1", "`seed` must be a whole number below 2^64, got {'a': 1}."),
         (
             StreamConfig(),
             "[render]\nblock_width = 'wide'",
-            "`render.block_width` must be a whole number below 2^64 or 'none', got 'wide'.",
+            "`render.block_width` must be a whole number below 2^64, at least 4, at most 16 and a ",
         ),
-        (StreamConfig(), "[render]\nblock_width = 17", "`render.block_width` must be 4, 8, 12 or 16 px, got 17; "),
+        (
+            StreamConfig(),
+            "[render]\nblock_width = 17",
+            "`render.block_width` must be at least 4, at most 16 and a multiple of 4 or none, got 17.",
+        ),
         (StreamConfig(), "[fit]\nepochs = 0", "`fit.epochs` must be at least 1, got 0."),
-        (StreamConfig(), "[fit.rates]\nmeans = nan", "`fit.rates.means` must be finite and not negative, got nan."),
-        (StreamConfig(), "[codec]\nquality = 1" + 400 * "0", "`codec.quality` must be a number, got 1000000"),
+        (StreamConfig(), "[fit.rates]\nmeans = nan", "`fit.rates.means` must be a finite number, at least 0, got nan."),
+        (
+            StreamConfig(),
+            "[codec]\nquality = 1" + 400 * "0",
+            "`codec.quality` must be a finite number, above 0, got 1000000",
+        ),
         (Leaf(), "sizes = 1", "`sizes` must be a list (each a whole number below 2^64), got 1."),
-        (Leaf(), "sizes = [1, 'a']", "`sizes` must be a list (each a whole number below 2^64), got [1, 'a']."),
-        (Leaf(), "pair = ['a']", "`pair` must be a list (a string, a number), got ['a']."),
-        (Leaf(), "mode = 'slow'", "`mode` must be one of 'fast', 'exact' or 'none', got 'slow'."),
+        (Leaf(), "sizes = [1, 'a']", "`sizes` must be a list (each a whole number below 2^64), got (1, 'a')."),
+        (Leaf(), "pair = ['a']", "`pair` must be a list (a string, a finite number), got ['a']."),
+        (Leaf(), "mode = 'slow'", "`mode` must be fast or exact or none, got 'slow'."),
         (Root(), "[branch.leaf]\ncount = -1", "`branch.leaf.count` must not be negative, got -1; take 0."),
+        (
+            StreamConfig(),
+            "[fit.convergence]\nsteps = 9000",
+            "`fit.convergence.steps` must be 1 to `fit.convergence.most_",
+        ),
+        (
+            StreamConfig(),
+            "[fit.detail]\nmost_gaussians = 10",
+            "`fit.detail.least_gaussians` must be 1 to `fit.detail.most_gaussians` = 10, got 4000.",
+        ),
+        (StreamConfig(), "[fit]\nexposure = 'yes'", "`fit.exposure` must be off, auto or on, got 'yes'."),
         (Root(), "[branch.extra]\ncount = -1", "`branch.extra.count` must not be negative, got -1; take 0."),
     ],
 )

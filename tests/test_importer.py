@@ -269,7 +269,7 @@ def test_import__reads_what_export_writes(clip, tmp_path, capsys):
         ([], "expected FRAMES and OUT, got fewer"),
         ([clip], "expected FRAMES and OUT, got fewer"),
         ([clip, tmp_path / "c", "--fps", 0], "--fps must be a number in [1e-6, 1e6], got 0.0"),
-        ([clip, tmp_path / "c", "--quality", -1], "--quality must be positive"),
+        ([clip, tmp_path / "c", "--quality", -1], "--quality must be above 0, got -1"),
         ([tmp_path / "none", tmp_path / "c"], "none: expected frames"),
     ):
         status, _, error = run("import", *args)

@@ -23,8 +23,7 @@ from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import PAYLOAD, TRAILER, StreamWriter
 from morgs_mi.codec.packets import CodedFrame, coded_frames, play, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.fit.config import RefinementConfig
-from morgs_mi.method.exposure import ExposureConfig
+from morgs_mi.fit.config import ShortFitConfig
 from morgs_mi.playback.player import open_stream_capture
 from morgs_mi.recorder import stream_capture, with_next
 from morgs_mi.recording import _without_folder, as_fitted, stream_metadata
@@ -379,8 +378,8 @@ def test_with_next__yields_the_frames_before_one_that_cannot_be_read() -> None:
 
 def refined_config():
     """Return the config with refined cameras, by as little work as possible."""
-    how = RefinementConfig(gaussians=40, steps=4, rounds=1)
-    return replace(CONFIG, fit=replace(CONFIG.fit, refine_cameras="on", refinement=how))
+    how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
+    return replace(CONFIG, fit=replace(CONFIG.fit, refine_cameras="on", short_fits=how))
 
 
 def test_stream_capture__stores_refined_cameras_and_resumes_with_them(tmp_path_factory):
@@ -428,8 +427,8 @@ def test_as_fitted__refuses_broken_distortions(tmp_path, found):
 
 
 def test_stream_capture__resumes_with_the_exposures_of_the_report(tmp_path):
-    how = ExposureConfig(gaussians=40, steps=4, rounds=1)
-    capture, config = recording(num_frames=3), replace(CONFIG, fit=replace(CONFIG.fit, exposure="on", exposures=how))
+    how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
+    capture, config = recording(num_frames=3), replace(CONFIG, fit=replace(CONFIG.fit, exposure="on", short_fits=how))
     stream_capture(capture, tmp_path, config)
     stream, whole, report = StreamReader(tmp_path / "stream.morgs"), stream_of(tmp_path), report_of(tmp_path)
     assert all(len(row["exposures"]) == len(capture.train_views) for row in report["frames"])

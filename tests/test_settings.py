@@ -1,4 +1,4 @@
-"""Every setting acts: another value of any field changes the stream of a small clip."""
+"""Every setting acts: another value of any field changes the stream of a small clip. And every range is checked."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from morgs_mi import Camera, RenderConfig
 from morgs_mi.codec.config import CodecConfig
 from morgs_mi.codec.container import encode_packet
 from morgs_mi.config import StreamConfig
+from morgs_mi.core.ranges import Above, AtLeast, AtMost, Below, MultipleOf, arms_of, types_of
 from morgs_mi.fit.config import DensityConfig, FitConfig
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.stream_loop import StreamLoop
@@ -41,23 +42,12 @@ VALUES: dict[str, Any] = {
     "fit.early_stopping_tolerance": 0.5,
     "fit.dropping": 0.3,
     "fit.first_frame_seconds": 0.01,
-    "fit.density.later_views": 1,
-    "fit.density.last_round": 0.3,
-    "fit.density.later_round": 0.3,
     "fit.density.max_gaussians": 1000,
     "fit.density.split_scale": 1.0,
     "fit.density.min_opacity": 0.4,
-    "motion.min_gate": 0.9,
-    "motion.flow.min_side": 100,
     "motion.flow.fine_width": 32,
-    "motion.propagation.floor_px": 10.0,
-    "motion.propagation.min_logit": 6.0,
-    "motion.active_set.max_changed": 0.0,
     "motion.active_set.quiet_views": 1,
-    "motion.photometric.floor_px": 100.0,
-    "motion.photometric.max_step_px": 0.01,
     "render.stop_transmittance": 0.5,
-    "motion.change.min_margin": 2,
     "render.alpha_max": 0.5,
     "render.block_width": 4,
     "render.block_height": 8,
@@ -67,19 +57,15 @@ ELSEWHERE: dict[str, str] = {
     "render.reproducible": "changes the order of sums only: tests/render",
     "fit.detail": "the number of Gaussians is given here: tests/fit/test_detail.py",
     "fit.convergence": "the number of steps is given here: tests/fit/test_first_frame.py",
-    "fit.cross_validation": "chooses among few values: tests/fit/test_cross_validation.py",
+    "fit.cross_validation_views": "fewer views here: tests/fit/test_cross_validation.py",
+    "fit.camera_priors": "cameras are refined by the recorder: tests/calibration/test_bundle.py",
+    "fit.short_fits": "no cameras are refined here: tests/calibration/test_refine.py, tests/fit/test_balance.py",
     "fit.refine_cameras": "cameras are refined by the recorder: tests/calibration/test_refine.py",
-    "fit.refinement": "cameras are refined by the recorder: tests/calibration/test_refine.py",
     "fit.exposure": "the tests of the loop have cameras that differ: tests/test_stream_loop.py",
-    "fit.exposures": "not estimated by default: tests/method/test_exposure.py, tests/fit/test_balance.py",
-    "motion.active_set.min_explained": "no change here is unexplained: tests/method/test_active_set.py",
     "fit.noise_aware": "images without noise here: tests/fit/test_first_settings.py",
-    "motion.active_set.min_cluster": "no change here is unexplained: tests/method/test_active_set.py",
-    "motion.active_set.quiet_responsibility": "fewer views here than `quiet_views`: tests/method/test_active_set.py",
     "motion.masks": "tests/method/test_confidence.py and tests/method/mask_refiners",
     "motion.search": "flow explains all parts here: tests/method/test_search.py",
     "motion.search_motion": "flow explains all parts here: tests/method/test_search.py",
-    "fit.objective.rigidity": "no weight on rigidity here: tests/fit/test_later_frame.py",
     "motion.constant_velocity": "flow is lifted here: tests/fit/test_later_frame.py",
     "motion.model": "the package has no motion model: tests/fit/test_motion_stage.py",
     "codec.keyframe_interval": "keyframes are written by the recorder: tests/test_recorder.py",
@@ -160,3 +146,31 @@ def base(clip) -> bytes:
 @pytest.mark.parametrize("name", [name for name in leaves(BASE) if not name.startswith(tuple(ELSEWHERE))])
 def test_settings__every_field_acts(clip, base, name):
     assert stream(clip, with_value(BASE, name, other(name))) != base
+
+
+def bounds() -> list[tuple[Any, str, Any]]:
+    """Return a config, the name of a field, and a value beyond each of its bounds, for all settings of a fit."""
+    found, configs = [], [StreamConfig()]
+    for config in configs:
+        configs += [value for value in vars(config).values() if is_dataclass(value)]
+        for name, kind in types_of(type(config)).items():
+            given = [bound for arm in arms_of(kind) for bound in getattr(arm, "__metadata__", ())]
+            found += [(config, name, BEYOND[type(bound)](bound.limit)) for bound in given]
+    return found
+
+
+BEYOND = {
+    AtLeast: lambda limit: limit - 1,
+    Above: lambda limit: limit,
+    AtMost: lambda limit: limit + 1 if limit < 1e9 else 2 * limit,
+    Below: lambda limit: limit,
+    MultipleOf: lambda limit: limit + 1,
+}
+
+
+def test_settings__every_range_is_checked():
+    for config, name, value in bounds():
+        with pytest.raises(ValueError, match=rf"^{type(config).__name__}\(\): `{name}` must be ") as caught:
+            replace(config, **{name: value})
+        assert str(caught.value).endswith(f", got {value}.")
+    assert len(bounds()) > 60

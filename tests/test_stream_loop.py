@@ -19,9 +19,8 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
-from morgs_mi.fit.config import CrossValidationConfig, DensityConfig, FitConfig, LearningRates
+from morgs_mi.fit.config import DensityConfig, FitConfig, LearningRates, ShortFitConfig
 from morgs_mi.method.config import MotionConfig
-from morgs_mi.method.exposure import ExposureConfig
 from morgs_mi.recorder import stream_capture
 from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.cameras import QUAD, look_at_cameras
@@ -221,7 +220,7 @@ def test_push__replaces_too_few_points_and_reports_it(clip):
 
 
 def test_push__reports_what_cross_validation_of_the_first_frame_found(clip):
-    ticks, fit = [], dataclasses.replace(TRIALS, cross_validation=CrossValidationConfig(min_views=4))
+    ticks, fit = [], dataclasses.replace(TRIALS, cross_validation_views=4)
     given = dataclasses.replace(QUICK, fit=dataclasses.replace(fit, dropping=0.0))
     _, report = new_loop(dataclasses.replace(QUICK, fit=fit)).push(clip[0][:4], lambda *tick: ticks.append(tick))
     found = report.validation
@@ -382,8 +381,8 @@ def masked(masks):
         (lambda clip: new_loop().push(None), "one image or None for each of 4 views, got a NoneType"),
         (lambda clip: new_loop().push(["a", None, None, None]), "got str; convert it"),
         (lambda clip: FitConfig(epochs=0), "`epochs` must be at least 1, got 0"),
-        (lambda clip: LearningRates(means=np.nan), "`means` must be finite and not negative, got nan"),
-        (lambda clip: FitConfig(sh_degree=4), "`sh_degree` must be 0 to 3, got 4"),
+        (lambda clip: LearningRates(means=np.nan), "`means` must be a finite number, at least 0, got nan"),
+        (lambda clip: FitConfig(sh_degree=4), "`sh_degree` must be at least 0 and at most 3, got 4"),
         (lambda clip: MotionConfig(key_views=0), "`key_views` must be at least 1, got 0"),
     ],
 )
@@ -520,7 +519,7 @@ def test_push__refuses_upcoming_images_of_another_size_in_their_turn(clip, first
 
 EXPOSED = dataclasses.replace(
     QUICK,
-    fit=dataclasses.replace(QUICK.fit, exposure="on", exposures=ExposureConfig(gaussians=600, steps=60, rounds=2)),
+    fit=dataclasses.replace(QUICK.fit, exposure="on", short_fits=ShortFitConfig(gaussians=600, steps=60, rounds=2)),
     render=RenderConfig(reproducible=True),
 )
 
@@ -575,8 +574,8 @@ def test_push__leaves_a_change_of_light_in_the_scene(clip):
     assert reports[1].num_bytes > 1000
 
 
-def test_push__has_the_same_bytes_with_exposures_where_cameras_are_equal(clip, plain):
+def test_push__has_the_same_bytes_with_exposures_where_cameras_are_equal(clip, plain, monkeypatch):
     # Their few short fits would find differences of 1 %.
-    how = dataclasses.replace(EXPOSED.fit.exposures, least_difference=0.1)
-    loop = new_loop(dataclasses.replace(EXPOSED, fit=dataclasses.replace(EXPOSED.fit, exposure="auto", exposures=how)))
+    monkeypatch.setattr("morgs_mi.fit.balance._LEAST_DIFFERENCE", 0.1)
+    loop = new_loop(dataclasses.replace(EXPOSED, fit=dataclasses.replace(EXPOSED.fit, exposure="auto")))
     assert [loop.push(images[:4])[0].encoded for images in clip[:3]] == plain

@@ -49,7 +49,7 @@ from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.initialise import scene_extent, seen_points
 from morgs_mi.fit.problem import FirstFrameProblem
-from morgs_mi.fit.view import View, mean_psnr, withheld_blocks
+from morgs_mi.fit.view import LEAST_GAIN, View, mean_psnr, withheld_blocks
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.image_gradient import blurred, gradient_products, image_gradient
 from morgs_mi.render.active_view import ActiveView
@@ -134,7 +134,7 @@ def refine_cameras(
     Raises:
         ValueError: fewer than two training views have an image of the first frame.
     """
-    rounds, report = config.refinement.rounds, progress or (lambda done, count: None)
+    rounds, report = config.short_fits.rounds, progress or (lambda done, count: None)
     problem = _Problem.of(capture, config, render or RenderConfig(), seed)
     matched, tracks, deviations = _matched(capture, problem.indices, problem.deviations)
     # The calibrated cameras, those of the bundle adjustment, and those of the images; one alone is not compared.
@@ -150,7 +150,7 @@ def refine_cameras(
             scores.append(problem.score(changes))
     best = compared + int(np.argmax(scores[compared:]))
     calibrated = scores[0] if compared else float("nan")
-    taken = not scores[best] < calibrated + config.refinement.least_gain
+    taken = not scores[best] < calibrated + LEAST_GAIN
     found = Refinement(taken, calibrated, scores[best], tracks, *problem.sizes(estimates[best]))
     return problem.changed_capture(estimates[best]) if taken else capture, found
 
@@ -194,7 +194,7 @@ class _Problem:
                 "set `refine_cameras` to off."
             )
         rng = rng_of(seed, Stream.WITHHELD_BLOCKS)
-        views, unseen = withheld_blocks(list(given.values()), config.refinement.width, rng)
+        views, unseen = withheld_blocks(list(given.values()), config.short_fits.width, rng)
         extent = scene_extent([view.camera for view in given.values()])
         return cls(capture, tuple(given), tuple(views), tuple(unseen), extent, config, render, seed)
 
@@ -206,7 +206,7 @@ class _Problem:
     @property
     def deviations(self) -> np.ndarray:
         """Standard deviations [11] of the priors."""
-        return prior_deviations(self.extent, self.config.refinement.priors)
+        return prior_deviations(self.extent, self.config.camera_priors)
 
     def refined(self, changes: np.ndarray, deviations: np.ndarray, report: Callable[[int], None]) -> np.ndarray:
         """Return the changes [V, 11] after rounds of fitting Gaussians to the images and of joint steps.
@@ -217,7 +217,7 @@ class _Problem:
             report: called with the number of fits that are done.
         """
         problem = self._begun(changes)
-        for done in range(self.config.refinement.rounds):
+        for done in range(self.config.short_fits.rounds):
             report(done)
             posed = replace(problem, views=tuple(_changed(self.views, changes)))
             gaussians = self._fitted(posed, later=done > 0)
@@ -272,7 +272,7 @@ def register_camera(
         render: cut-offs.
     """
     render, camera, target = render or RenderConfig(), view.camera, view.target
-    priors = replace(config.refinement.priors, distortion=_NO_DISTORTION)  # the image stays as it is
+    priors = replace(config.camera_priors, distortion=_NO_DISTORTION)  # the image stays as it is
     deviations, best = prior_deviations(extent, priors), np.zeros((1, CHANGES))
     means = np.asarray(gaussians.means, np.float64)
     for blur in (*_BLURS, 0.0):
@@ -349,7 +349,7 @@ def _short(config: FitConfig, later: bool = False) -> FitConfig:
 
     It has no view-dependent colours, which would hide wrong poses.
     """
-    how, rates = config.refinement, config.first_frame_rates
+    how, rates = config.short_fits, config.first_frame_rates
     if later:
         rates = replace(rates, **{name: factor * getattr(rates, name) for name, factor in _LATER_RATES.items()})
     return replace(

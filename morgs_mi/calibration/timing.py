@@ -31,7 +31,6 @@ from morgs_mi.calibration.offset_equations import UNKNOWN, OffsetEquations, offs
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.interpolation import image_between
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.checks import check_number
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.config import DensityConfig, FitConfig
@@ -46,54 +45,28 @@ from morgs_mi.method.lift import lift_flow
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.config import RenderConfig
 
-__all__ = ["TimeOffsets", "TimingConfig", "estimate_time_offsets"]
+__all__ = ["TimeOffsets", "estimate_time_offsets"]
+
+# px, least width of the images: a small image is fitted fast, and an offset displaces by few pixels.
+_WIDTH = 160
+# Frames from the start of the recording that are used, and instants, spread over them, that Gaussians are fitted at.
+_FRAMES, _INSTANTS = 12, 2
+# Gaussians and steps of the fit at an instant; half as many of both for blurred images.
+_GAUSSIANS, _STEPS = 8000, 600
+# Standard deviations in pixels of the filters of the first rounds, one round each.
+_BLURS = (6.0, 3.0, 1.5)
+# Rounds at most after these, with images that are not blurred.
+_ROUNDS = 6
+# Largest step in frames of the last round: an offset is found to about half of it.
+_TOLERANCE = 0.02
+# Largest offset from the mean of the training views, frames.
+_LARGEST = 3
+_BLUR_OF_ROUND = (*_BLURS, *[0.0] * _ROUNDS)
 
 # Bounds of kappa, and of a step in frames.
 _SHARES, _LONGEST_STEP = (0.2, 1.2), 1.0
 # Frames by which the last round moves the clocks, and the least part of it that counts as found.
 _MOVED, _LEAST_FOUND = 0.5, 0.05
-
-
-@dataclass(frozen=True)
-class TimingConfig:
-    """Settings of the estimate."""
-
-    width: int = 160
-    """Width of the images in pixels, at least: a small image is fitted fast, and an offset displaces by few pixels."""
-    frames: int = 12
-    """Frames from the start of the recording that are used."""
-    instants: int = 2
-    """Instants that Gaussians are fitted at, spread over these frames."""
-    num_gaussians: int = 8000
-    """Gaussians of an instant; half as many for blurred images."""
-    steps: int = 600
-    """Optimisation steps of an instant; half as many for blurred images."""
-    blurs: tuple[float, ...] = (6, 3, 1.5)
-    """Standard deviations in pixels of the filters of the first rounds, one round each."""
-    rounds: int = 6
-    """Rounds at most after these, with images that are not blurred."""
-    tolerance: float = 0.02
-    """Largest step in frames of the last round: an offset is found to about half of it."""
-    largest: int = 3
-    """Largest offset from the mean of the training views, frames."""
-
-    def __post_init__(self) -> None:
-        for name, low in (
-            ("width", 32),
-            ("frames", 4),
-            ("instants", 1),
-            ("num_gaussians", 1),
-            ("steps", 1),
-            ("rounds", 1),
-            ("largest", 1),
-        ):
-            check_number("TimingConfig()", name, getattr(self, name), f"[{low}, inf)")
-        for blur in self.blurs:
-            check_number("TimingConfig()", "blurs", blur, "(0, inf)")
-
-    def halved(self) -> TimingConfig:
-        """Return the settings with half the work of an instant."""
-        return replace(self, num_gaussians=-(-self.num_gaussians // 2), steps=-(-self.steps // 2))
 
 
 @dataclass(frozen=True)
@@ -118,7 +91,6 @@ class TimeOffsets:
 
 def estimate_time_offsets(
     capture: Capture,
-    config: TimingConfig | None = None,
     progress: Callable[[int, int], None] | None = None,
     seed: int = 0,
 ) -> TimeOffsets:
@@ -131,7 +103,6 @@ def estimate_time_offsets(
 
     Args:
         capture: a capture, whose clips have one frame rate.
-        config: settings.
         progress: called with (fits done, fits at most).
         seed: of the fits.
 
@@ -140,33 +111,32 @@ def estimate_time_offsets(
     """
     if len(capture.cameras) < 2:
         raise ValueError(f"{capture.path}: expected at least 2 cameras to compare clocks, got 1.")
-    config = config or TimingConfig()
-    clips = _Clips.of(capture, config.frames, config.width)
-    largest = min(config.largest, (clips.num_frames - 2) // 2)
+    clips = _Clips.of(capture)
+    largest = min(_LARGEST, (clips.num_frames - 2) // 2)
     if largest < 1:
         raise ValueError(
             f"{capture.path}: expected at least 4 frames to compare clocks, got {clips.num_frames}; record longer."
         )
-    instants = np.linspace(largest, clips.num_frames - 2 - largest, config.instants).round().astype(int)
-    rounds = _Rounds(clips, config, instants, seed, progress)
+    instants = np.linspace(largest, clips.num_frames - 2 - largest, _INSTANTS).round().astype(int)
+    rounds = _Rounds(clips, instants, seed, progress)
     offsets, step, equations = _aligned(rounds, largest)
     reference = capture.test_view or 0
     part = _found_back(rounds, offsets - step, equations, reference)
     errors = np.minimum(equations.errors(reference) / part, UNKNOWN)
-    return _relative(capture, offsets, errors, float(np.abs(step).max()), config.tolerance)
+    return _relative(capture, offsets, errors, float(np.abs(step).max()))
 
 
 def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, OffsetEquations]:
     """Return offsets [V] of at most `largest`, and the last step [V] with the equations that it was taken from."""
-    clips, blurs = rounds.clips, rounds.blurs
+    clips = rounds.clips
     offsets, step, left = np.zeros(len(clips.cameras)), np.zeros(len(clips.cameras)), None
-    for index, blur in enumerate(blurs):
+    for index, blur in enumerate(_BLUR_OF_ROUND):
         equations = rounds.equations(offsets, blur)
-        before, left = left if blur in blurs[:index] else None, equations.solution()
+        before, left = left if blur in _BLUR_OF_ROUND[:index] else None, equations.solution()
         share = 1.0 if before is None else _share(step[clips.train], (left - before)[clips.train])
         moved = np.clip(offsets + np.clip(equations.solution(share), -_LONGEST_STEP, _LONGEST_STEP), -largest, largest)
         offsets, step = moved, moved - offsets
-        if not blur and np.abs(step).max() < rounds.config.tolerance:
+        if not blur and np.abs(step).max() < _TOLERANCE:
             break
     return offsets, step, equations
 
@@ -191,7 +161,6 @@ class _Rounds:
 
     Attributes:
         clips: what Gaussians are fitted to.
-        config: settings.
         instants: frames that they are fitted at.
         seed: of all fits.
         progress: called with (fits done, fits at most), or None.
@@ -199,26 +168,19 @@ class _Rounds:
     """
 
     clips: _Clips
-    config: TimingConfig
     instants: np.ndarray
     seed: int
     progress: Callable[[int, int], None] | None
     done: int = 0
 
-    @property
-    def blurs(self) -> tuple[float, ...]:
-        """The blur of each round, in pixels."""
-        return *self.config.blurs, *[0.0] * self.config.rounds
-
     def equations(self, offsets: np.ndarray, blur: float) -> OffsetEquations:
         """Return the sum of the equations of all instants, with images interpolated by offsets [V] and blurred."""
-        config = self.config.halved() if blur else self.config
         found = []
         for instant in self.instants:
-            found.append(_equations_at(self.clips, instant - offsets, blur, config, self.seed))
+            found.append(_equations_at(self.clips, instant - offsets, blur, self.seed))
             self.done += 1
             if self.progress is not None:
-                self.progress(self.done, (len(self.blurs) + 1) * len(self.instants))
+                self.progress(self.done, (len(_BLUR_OF_ROUND) + 1) * len(self.instants))
         equations = reduce(add, found)
         if not equations.own.any():
             raise ValueError(
@@ -251,10 +213,10 @@ class _Clips:
     point_colors: np.ndarray
 
     @classmethod
-    def of(cls, capture: Capture, count: int, width: int) -> _Clips:
-        clips = [[_checked(image) for image in capture.images(v, 0, count)] for v in range(len(capture.cameras))]
+    def of(cls, capture: Capture) -> _Clips:
+        clips = [[_checked(image) for image in capture.images(v, 0, _FRAMES)] for v in range(len(capture.cameras))]
         views = zip(capture.cameras, (clip[0] for clip in clips), capture.masks, strict=True)
-        small, _, masks = zip(*(View(*view).reduced(width) for view in views), strict=True)
+        small, _, masks = zip(*(View(*view).reduced(_WIDTH) for view in views), strict=True)
         # The images are whole frames: rendered at the time that the capture gives them, they would be displaced twice.
         cameras = tuple(camera.without_delays() for camera in small)
         images = tuple(tuple(_resized(i, c) for i in clip) for clip, c in zip(clips, cameras, strict=True))
@@ -285,11 +247,11 @@ def _resized(image: np.ndarray, camera: Camera) -> np.ndarray:
     return np.asarray(cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_AREA))
 
 
-def _equations_at(clips: _Clips, times: np.ndarray, blur: float, config: TimingConfig, seed: int) -> OffsetEquations:
+def _equations_at(clips: _Clips, times: np.ndarray, blur: float, seed: int) -> OffsetEquations:
     """Return the equations of an instant, which each view shows at a time of its own [V]."""
     images, after = clips.at(times), clips.at(times + 1)
     targets = [Target(image, mask) for image, mask in zip(images, clips.masks, strict=True)]
-    gaussians = _fitted(clips, images, config, seed)
+    gaussians = _fitted(clips, images, 2 if blur else 1, seed)
     pairs = {v: FramePair(after[v], images[v], valid=clips.masks[v]) for v in clips.train}
     views = [ActiveView(camera) for camera in clips.cameras]
     lifted = lift_flow(gaussians, {v: views[v] for v in clips.train}, observe_key_views(pairs))
@@ -297,12 +259,19 @@ def _equations_at(clips: _Clips, times: np.ndarray, blur: float, config: TimingC
     return offset_equations(replace(gaussians, motion=lifted.displacement), views, targets, train, blur)
 
 
-def _fitted(clips: _Clips, images: Sequence[np.ndarray], config: TimingConfig, seed: int) -> Gaussians:
-    """Return Gaussians that are fitted to the images of the training views at one instant."""
+def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int) -> Gaussians:
+    """Return Gaussians that are fitted to the images of the training views at one instant.
+
+    Args:
+        clips: what they are fitted to.
+        images: of all views.
+        divisor: of the number of Gaussians and of the number of steps.
+        seed: of the fit.
+    """
     fit = FitConfig(
         sh_degree=0,
-        num_gaussians=config.num_gaussians,
-        first_frame_steps=config.steps,
+        num_gaussians=_GAUSSIANS // divisor,
+        first_frame_steps=_STEPS // divisor,
         dropping=0.0,
         density=DensityConfig(rounds=0),
     )
@@ -312,9 +281,7 @@ def _fitted(clips: _Clips, images: Sequence[np.ndarray], config: TimingConfig, s
     return fit_first_frame(problem, fit, rng).gaussians
 
 
-def _relative(
-    capture: Capture, offsets: np.ndarray, errors: np.ndarray, change: float, tolerance: float
-) -> TimeOffsets:
+def _relative(capture: Capture, offsets: np.ndarray, errors: np.ndarray, change: float) -> TimeOffsets:
     """Return the result with the offsets from the reference's, in addition to those of the capture."""
     reference = capture.test_view or 0
     known = capture.reading.offset
@@ -322,4 +289,4 @@ def _relative(
     own = {n: known.get(n, 0.0) - (o - apart[reference]) for n, o in zip(capture.names, apart, strict=True)}
     rounded = {name: round(float(offset), 3) + 0.0 for name, offset in own.items()}
     uncertain = dict(zip(capture.names, np.round(errors, 3).tolist(), strict=True))
-    return TimeOffsets(rounded, uncertain, capture.names[reference], change, change < tolerance)
+    return TimeOffsets(rounded, uncertain, capture.names[reference], change, change < _TOLERANCE)

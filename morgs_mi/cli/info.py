@@ -94,9 +94,7 @@ class Info:
             print_result(line)
         if self.time:
             with progress() as report:
-                offsets = estimate_time_offsets(
-                    capture, None, lambda done, total: report("Comparing clocks", done, total)
-                )
+                offsets = estimate_time_offsets(capture, lambda done, total: report("Comparing clocks", done, total))
             for line in _time_lines(offsets):
                 print_result(line)
         for line in (*(finding.sentence for finding in exposures), *_deep_lines(deep)):

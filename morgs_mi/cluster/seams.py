@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import reduce
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.progress import Report
+from morgs_mi.core.ranges import AtLeast, check_ranges
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.evaluate.results import VariationScores
 from morgs_mi.evaluate.temporal import StillVariation, recorded_change
@@ -56,6 +57,14 @@ __all__ = [
 COMMON_FRAMES = 2
 """Frames of the common model: the second one determines the confidence."""
 
+# Factor on the learning rates of the fits of the first frame: there is further to go than between two frames.
+_RATES = 2.0
+# Largest number of births in each of them, as a fraction of the Gaussians.
+_BIRTHS = 0.1
+# Factor on the epochs of the other frames: the fit is not yet as good as one that followed from the beginning.
+_OVERLAP_EPOCHS = 2
+# Distance, in largest scales of the Gaussian, up to which it is interpolated in the cross-fade.
+_NEAR = 1.0
 _AROUND = 8  # frames before and after a seam, with which it is compared
 _MIN_ODDS = 1e-4  # of a faded opacity, o / (1 - o); less is invisible, and nothing has no logarithm
 _ATTRIBUTES = ("means", "quats", "log_scales", "logit_opacities", "sh_coeffs")
@@ -65,29 +74,24 @@ _ATTRIBUTES = ("means", "quats", "log_scales", "logit_opacities", "sh_coeffs")
 class SeamConfig:
     """Settings of the seams between segments."""
 
-    passes: int = 24
+    passes: Annotated[int, AtLeast(1)] = 24
     """Fits of the first frame of the overlap, one after the other, each with a round of density control."""
-    epochs: int = 4
+    epochs: Annotated[int, AtLeast(1)] = 4
     """Passes over all training views in each of them."""
-    rates: float = 2.0
-    """Factor on the learning rates: there is further to go than between two frames."""
-    births: float = 0.1
-    """Largest number of births in each of them, as a fraction of the Gaussians."""
-    overlap: int = 10
+    overlap: Annotated[int, AtLeast(1)] = 10
     """Last frames of a segment that the next one fits too, and in which the stream fades to it."""
-    overlap_epochs: int = 2
-    """Factor on the epochs of its other frames: the fit is not yet as good as one that followed from the beginning."""
-    nearness: float = 1.0
-    """Distance, in largest scales of the Gaussian, up to which it is interpolated in the cross-fade."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
 
     def overlap_config(self, config: StreamConfig) -> StreamConfig:
         """Return the settings of the other frames of the overlap."""
-        return replace(config, fit=replace(config.fit, epochs=self.overlap_epochs * config.fit.epochs))
+        return replace(config, fit=replace(config.fit, epochs=_OVERLAP_EPOCHS * config.fit.epochs))
 
     def fit_config(self, config: StreamConfig, number: int) -> StreamConfig:
         """Return the settings of one of these fits."""
-        rates = replace(config.fit.rates, **{n: self.rates * rate for n, rate in asdict(config.fit.rates).items()})
-        density = replace(config.fit.density, births=self.births)
+        rates = replace(config.fit.rates, **{n: _RATES * rate for n, rate in asdict(config.fit.rates).items()})
+        density = replace(config.fit.density, births=_BIRTHS)
         fit = replace(config.fit, epochs=self.epochs, rates=rates, density=density, early_stopping_tolerance=0.0)
         return replace(config, fit=fit, seed=config.seed + number)
 
@@ -166,13 +170,11 @@ class Overlap:
         ending: states of the segment that ends, of each frame.
         beginning: states of the next segment, of the same frames.
         shared_ids: number of ids of the common model; below it, both segments have the same Gaussians.
-        nearness: see `SeamConfig`.
     """
 
     ending: Sequence[CodedFrame]
     beginning: Sequence[CodedFrame]
     shared_ids: int
-    nearness: float
 
     @property
     def states(self) -> list[tuple[CodedFrame, CodedFrame]]:
@@ -189,7 +191,7 @@ class Overlap:
         ids, here, there = np.intersect1d(a.ids, b.ids, return_indices=True)
         means = np.asarray(a.gaussians.means)[here], np.asarray(b.gaussians.means)[there]
         largest = np.asarray(a.gaussians.scales).max(axis=1)[here]
-        near = np.linalg.norm(means[0] - means[1], axis=1) <= self.nearness * largest
+        near = np.linalg.norm(means[0] - means[1], axis=1) <= _NEAR * largest
         return ids[near & (ids < self.shared_ids)]
 
 

@@ -343,6 +343,6 @@ def _faded(
     """Return packets and states of the last frames of a segment in the cross-fade to the next one."""
     frames = {state.frame for state in states}
     beginning = [coded for coded in coded_frames(map(decode_packet, following.packets)) if coded.frame in frames]
-    overlap = Overlap(states, beginning, following.shared_ids, fit.seams.nearness)
+    overlap = Overlap(states, beginning, following.shared_ids)
     packets, faded = zip(*cross_fade(before, overlap, cameras, fit.config.codec), strict=True)
     return list(packets), list(faded)

@@ -275,7 +275,7 @@ def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
 def _exponents(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> np.ndarray:
     """Return quarter octaves int8 [N, E]: steps whose half is the error that `config` tolerates."""
     precision = config.quality * config.birth_precision
-    error, color = 2 * config.error_px / precision, 2 * config.error_color / precision
+    error, color = (2 * _tolerated(name) / precision for name in ("means", "sh_dc"))
     pixel, N = _world_per_pixel(raw["means"], cameras), len(raw["means"])
     sizes = np.maximum(np.exp(np.minimum(raw["log_scales"], 80.0)) / pixel[:, None], _MIN_SIZE_PX)  # px
     elongation = np.maximum(np.sqrt(sizes.max(1) ** 2 - sizes.min(1) ** 2), _MIN_SIZE_PX)  # a ball tolerates any turn
@@ -312,10 +312,15 @@ def _generic_step(name: str, config: CodecConfig) -> float:
 
     Where the slope of the activation has no bound, the error is that of the optimised value.
     """
-    row = _STORED[name]
-    error = getattr(config, row.error) if isinstance(row.error, str) else row.error
+    precision = config.quality * config.birth_precision
+    return 2 * _tolerated(name) / precision / (_STORED[name].activation.largest_slope or 1.0)
+
+
+def _tolerated(name: str) -> float:
+    """Return the tolerated error of a stored attribute."""
+    error = _STORED[name].error
     assert error is not None
-    return 2 * error / (config.quality * config.birth_precision) / (row.activation.largest_slope or 1.0)
+    return error
 
 
 def _world_per_pixel(means: np.ndarray, cameras: Sequence[Camera]) -> np.ndarray:

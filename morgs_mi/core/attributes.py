@@ -66,8 +66,8 @@ class Attribute:
         gate: which gate its residual passes with two gates: the confidence for ``motion``, none for ``appearance``;
             None where it has no residual (eq. 12).
         first_frame: whether the first frame fits it.
-        error: field of `CodecConfig`, or number: error of the activated value that the stream tolerates; None where the
-            stream does not store it.
+        error: of the activated value that the stream tolerates with `quality` 1; on screen in px for means, scales and
+            rotations. None where the stream does not store it.
         channel: of the renderer that blends it like a colour; None where there is none, or where the channel is not
             plain blending (`color`, `motion`).
         initial: value of the optimised tensor before the first frame; None where `fit.initialise` computes it, or where
@@ -83,7 +83,7 @@ class Attribute:
     rate_in_extents: bool = False
     gate: Literal["motion", "appearance"] | None = None
     first_frame: bool = False
-    error: str | float | None = None
+    error: float | None = None
     channel: str | None = None
     initial: float | None = None
 
@@ -96,11 +96,16 @@ class Attribute:
         return width
 
 
+# px, in the camera that magnifies a Gaussian most: a step of the stream, twice the error, is about a tenth of a pixel.
+_ERROR_PX = 0.04
+# Of 1: the error of an image of 8 bits.
+_ERROR_COLOR = 1 / 255
+
 # The order is that of the stream's columns.
 ATTRIBUTES: tuple[Attribute, ...] = (
     # The residual of the means is motion + offset, below.
     Attribute(
-        "means", (3,), "means", required=True, rate="means", rate_in_extents=True, first_frame=True, error="error_px"
+        "means", (3,), "means", required=True, rate="means", rate_in_extents=True, first_frame=True, error=_ERROR_PX
     ),
     Attribute(
         "log_scales",
@@ -111,9 +116,9 @@ ATTRIBUTES: tuple[Attribute, ...] = (
         rate="scales",
         gate="appearance",
         first_frame=True,
-        error="error_px",
+        error=_ERROR_PX,
     ),
-    Attribute("quats", (4,), "quats", required=True, rate="quats", gate="motion", first_frame=True, error="error_px"),
+    Attribute("quats", (4,), "quats", required=True, rate="quats", gate="motion", first_frame=True, error=_ERROR_PX),
     Attribute(
         "logit_opacities",
         (),
@@ -123,7 +128,7 @@ ATTRIBUTES: tuple[Attribute, ...] = (
         rate="opacities",
         gate="appearance",
         first_frame=True,
-        error="error_opacity",
+        error=0.005,
     ),
     Attribute(
         "sh_dc",
@@ -133,7 +138,7 @@ ATTRIBUTES: tuple[Attribute, ...] = (
         rate="sh_dc",
         gate="appearance",
         first_frame=True,
-        error="error_color",
+        error=_ERROR_COLOR,
     ),
     Attribute(
         "sh_rest",
@@ -143,7 +148,7 @@ ATTRIBUTES: tuple[Attribute, ...] = (
         rate="sh_rest",
         gate="appearance",
         first_frame=True,
-        error="error_color",
+        error=_ERROR_COLOR,
     ),
     Attribute(
         "logit_confidence",
@@ -151,7 +156,7 @@ ATTRIBUTES: tuple[Attribute, ...] = (
         "confidence",
         SIGMOID,
         rate="confidence",
-        error="error_confidence",
+        error=0.05,  # it gates the fit, where its error affects all other attributes
         channel="confidence",
         initial=0.0,
     ),

@@ -144,7 +144,8 @@ def _in_words(kind: Any) -> str:
     if origin is tuple:
         items = f"each {_in_words(args[0])}" if args[1:] == (...,) else ", ".join(map(_in_words, args))
         return f"a list ({items})"
-    return "a table" if is_dataclass(kind) else _WORDS.get(origin or kind, getattr(kind, "__name__", str(kind)))
+    name = getattr(kind, "__name__", str(kind))
+    return f"a table ({name})" if is_dataclass(kind) else _WORDS.get(origin or kind, name)
 
 
 def _expected(value: Any, kind: Any) -> str:

@@ -18,13 +18,15 @@ from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.problem import FirstFrameProblem
-from morgs_mi.fit.view import View, mean_psnr, rendered, withheld_blocks
+from morgs_mi.fit.view import LEAST_GAIN, View, mean_psnr, rendered, withheld_blocks
 from morgs_mi.method.exposure import Exposure, centred, fit_exposure
 
 __all__ = ["Balance", "balance_cameras", "balance_config"]
 
 # Fits that are compared: to the images as recorded and to the balanced ones.
 _COMPARED = 2
+# Difference of tones, of 1, from which `auto` considers to take the exposures: about a grey level.
+_LEAST_DIFFERENCE = 0.005
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class Balance:
 
 def balance_config(config: FitConfig) -> FitConfig:
     """Return the settings of the short fits, without view-dependent colours and density control."""
-    how = config.exposures
+    how = config.short_fits
     return replace(
         config,
         sh_degree=0,
@@ -79,7 +81,7 @@ def balance_cameras(
         seed: of all random choices.
         progress: of the fits, in one stage.
     """
-    how, short = config.exposures, balance_config(config)
+    how, short = config.short_fits, balance_config(config)
     progress, render, done = (progress or Progress()).of("Balancing cameras"), problem.render, 0
     kept, unseen = withheld_blocks(problem.views, how.width, rng_of(seed, Stream.WITHHELD_BLOCKS))
     as_recorded = {v: Exposure() for v in range(len(kept))}
@@ -98,11 +100,11 @@ def balance_cameras(
         gaussians = fit(gaussians, exposures, how.steps // 2 if k else how.steps)
         exposures = centred(
             {
-                v: fit_exposure(rendered(gaussians, camera, render), image / 255, mask, weights=how.priors)
+                v: fit_exposure(rendered(gaussians, camera, render), image / 255, mask)
                 for v, (camera, image, mask) in enumerate(kept)
             }
         )
-    differ = max(exposure.change for exposure in exposures.values()) >= how.least_difference
+    differ = max(exposure.change for exposure in exposures.values()) >= _LEAST_DIFFERENCE
     if config.exposure == "on" or not differ:
         return Balance(tuple(exposures.values()), config.exposure == "on")
     scores = []
@@ -114,5 +116,5 @@ def balance_cameras(
             if mask is not None and mask.any()
         ]
         scores.append(mean_psnr(fitted, compared, render))
-    taken = scores[1] >= scores[0] + how.least_gain
+    taken = scores[1] >= scores[0] + LEAST_GAIN
     return Balance(tuple(exposures.values()), taken, scores[0], scores[1])

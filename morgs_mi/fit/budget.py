@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.cross_validation import TRIAL_STEPS
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.problem import FirstFrameProblem
 
@@ -32,13 +33,11 @@ def steps_within(seconds: float, problem: FirstFrameProblem, config: FitConfig, 
         seed: of the steps that are timed.
     """
     begin = time.perf_counter()
-    timed = replace(
-        config, first_frame_steps=_TIMED, dropping=0.0, density=replace(config.density, rounds=0), sh_band_fraction=0.0
-    )
+    timed = replace(config, first_frame_steps=_TIMED, dropping=0.0, density=replace(config.density, rounds=0))
     took = 0.0
     for _ in range(2):  # the first time, kernels are compiled
         start = time.perf_counter()
         fit_first_frame(problem, timed, rng_of(seed, Stream.BUDGET))
         took = time.perf_counter() - start
-    per_step = _GROWTH * took / _TIMED * (1 + trials * config.cross_validation.steps)
+    per_step = _GROWTH * took / _TIMED * (1 + trials * TRIAL_STEPS)
     return max(_LEAST, int((seconds - (time.perf_counter() - begin)) / per_step))

@@ -28,6 +28,7 @@ from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import decibels
 
 __all__ = [
+    "TRIAL_STEPS",
     "CrossValidation",
     "Trial",
     "candidates_of",
@@ -37,6 +38,15 @@ __all__ = [
     "withheld_views",
 ]
 
+TRIAL_STEPS = 0.4
+"""Steps of a trial, as a fraction of those of the first frame."""
+
+# Probabilities of dropping that are tried, in rising order.
+_CANDIDATES = (0.0, 0.2, 0.4)
+# One view of that many is withheld, at least one.
+_WITHHELD = 6
+# px, of the images of a trial, which are reduced by the largest whole factor that leaves this width.
+_WIDTH = 640
 # Angle in degrees at which the excess of error ends, and power of the angle, times the number of views, with which it
 # grows in trials with few views.
 _FAR, _POWER = 20.0, 6.0
@@ -139,10 +149,10 @@ def cross_validate(
         progress: of the trials, a stage each.
     """
     progress = progress or Progress()
-    how, cameras = config.cross_validation, problem.cameras
-    withheld = withheld_views(cameras, how.share)
+    cameras = problem.cameras
+    withheld = withheld_views(cameras, _WITHHELD)
     kept = [view for view in range(len(cameras)) if view not in withheld]
-    small = problem.reduced(how.width)
+    small = problem.reduced(_WIDTH)
     trained, unseen = small.only(kept), small.only(withheld)
     candidates, trials = candidates_of(problem, config), []
     for number, dropping in enumerate(candidates, 1):
@@ -161,13 +171,13 @@ def cross_validate(
 
 def candidates_of(problem: FirstFrameProblem, config: FitConfig) -> tuple[float, ...]:
     """Return the probabilities of dropping that are tried."""
-    how = config.cross_validation
-    return how.candidates if len(problem.views) >= how.min_views else (dropping_by_noise(problem.images),)
+    chosen = len(problem.views) >= config.cross_validation_views
+    return _CANDIDATES if chosen else (dropping_by_noise(problem.images),)
 
 
 def trial_steps(config: FitConfig) -> int:
     """Return the number of steps of one fit."""
-    return max(1, round(config.cross_validation.steps * config.planned_steps))
+    return max(1, round(TRIAL_STEPS * config.planned_steps))
 
 
 def withheld_views(cameras: Sequence[Camera], share: int) -> tuple[int, ...]:

@@ -31,6 +31,10 @@ __all__ = ["DensityPlan", "Room", "apply_plan", "plan_additions", "plan_growth",
 
 # float32 has no opacity closer to 1.
 _MAX_OPACITY = 1 - 1e-6
+# Opacity of a birth in a later frame: what is not needed there is pruned soon.
+_BIRTH_OPACITY = 0.1
+# Logarithm of the factor by which a split Gaussian, and a birth in a later frame, is smaller than its parent (3DGS).
+_LOG_SHRINK = -float(np.log(1.6))
 
 
 @dataclass(frozen=True)
@@ -89,7 +93,7 @@ def plan_growth(
     split = touched & (scales > config.split_scale * extent)
     half = 1 - np.sqrt(1 - np.minimum(opacity[parent], _MAX_OPACITY))
     logits = np.where(touched & ~split, _logit(half) - np.asarray(gaussians.logit_opacities)[parent], 0)
-    return _plan(gaussians, survivors, parents, np.where(split, _log_shrink(config), 0), logits, rng)
+    return _plan(gaussians, survivors, parents, np.where(split, _LOG_SHRINK, 0), logits, rng)
 
 
 def plan_additions(
@@ -113,12 +117,8 @@ def plan_additions(
     survivors, parents = _select(gaussians, scores, room, config.min_error, config)
     born = np.arange(len(survivors) + len(parents)) >= len(survivors)
     logits = np.asarray(gaussians.logit_opacities)[np.concatenate([survivors, parents])]
-    fainter = np.where(born, _logit(config.birth_opacity) - logits, 0)
-    return _plan(gaussians, survivors, parents, np.where(born, _log_shrink(config), 0), fainter, rng)
-
-
-def _log_shrink(config: DensityConfig) -> float:
-    return -float(np.log(config.shrink))
+    fainter = np.where(born, _logit(_BIRTH_OPACITY) - logits, 0)
+    return _plan(gaussians, survivors, parents, np.where(born, _LOG_SHRINK, 0), fainter, rng)
 
 
 def _select(

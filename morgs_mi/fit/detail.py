@@ -13,7 +13,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from morgs_mi.fit.config import DetailConfig, FitConfig
+from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.forecast import mean_views
 from morgs_mi.fit.noise import noise_of
 from morgs_mi.fit.view import View
@@ -22,6 +22,9 @@ __all__ = ["count_details", "with_num_gaussians"]
 
 # A value of a block follows from its mean and the other three.
 _INDEPENDENT = 3 / 4
+# Difference from the mean of a block, relative to white, from which a value is a detail, and the same in standard
+# deviations of the noise.
+_THRESHOLD, _NOISE = 0.02, 3.5
 
 
 def with_num_gaussians(config: FitConfig, views: Sequence[View], points: np.ndarray) -> FitConfig:
@@ -35,28 +38,27 @@ def with_num_gaussians(config: FitConfig, views: Sequence[View], points: np.ndar
     if config.num_gaussians is not None:
         return config
     how = config.detail
-    details = sum(count_details(view.image, view.mask, how) for view in views)
+    details = sum(count_details(view.image, view.mask) for view in views)
     wanted = how.per_detail * details / mean_views([view.camera for view in views], points)
     return replace(config, num_gaussians=int(np.clip(round(wanted), how.least_gaussians, how.most_gaussians)))
 
 
-def count_details(image: np.ndarray, mask: np.ndarray | None, config: DetailConfig) -> float:
+def count_details(image: np.ndarray, mask: np.ndarray | None) -> float:
     """Return the number of details of an image.
 
     Args:
         image: [H, W, 3], uint8.
         mask: valid pixels [H, W], or None; a block with others has no detail.
-        config: threshold.
     """
     values = image.astype(np.float32) / 255
     valid = np.ones(image.shape[:2], np.float32) if mask is None else mask.astype(np.float32)
-    noise, count = config.noise_tolerance * noise_of(image), 0
+    noise, count = _NOISE * noise_of(image), 0
     while min(values.shape[:2]) > 1:
         height, width = (size // 2 for size in values.shape[:2])
         values, valid = values[: 2 * height, : 2 * width], valid[: 2 * height, : 2 * width]
         means, fractions = (cv2.resize(v, (width, height), interpolation=cv2.INTER_AREA) for v in (values, valid))
         differences = np.abs(values - means.repeat(2, axis=0).repeat(2, axis=1)).max(axis=-1)
         whole = (fractions == 1).repeat(2, axis=0).repeat(2, axis=1)
-        count += np.count_nonzero((differences > max(config.threshold, noise)) & whole)
+        count += np.count_nonzero((differences > max(_THRESHOLD, noise)) & whole)
         values, valid, noise = means, fractions, noise / 2
     return _INDEPENDENT * count

@@ -31,6 +31,15 @@ from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["FrameProblem", "LaterFrame", "fit_later_frame"]
 
+# The round of density control, as a fraction of the epochs: the residual has shown by then what is missing, and enough
+# steps are left to fit what is added.
+_DENSITY_ROUND = 0.625
+# Views, spread over the rig, in which that round looks for what is missing.
+_DENSITY_VIEWS = 8
+# Error that counts as noise there, in medians of the image's error: normal noise, independent in three colours, exceeds
+# 3 at 3 of 10,000 pixels.
+_NOISE = 3.0
+
 
 @dataclass(frozen=True, eq=False)
 class FrameProblem:
@@ -90,7 +99,7 @@ def fit_later_frame(
     if not active.views or not len(active.indices):
         return LaterFrame(with_zero_motion(previous), np.arange(len(previous)), {}, 0)
     fit = _Fit(problem, config, motion, rng, progress)
-    density_epoch = round(config.density.later_round * config.epochs)
+    density_epoch = round(_DENSITY_ROUND * config.epochs)
     for epoch in range(fit.start(), config.epochs):
         if epoch == density_epoch and config.density.later_frames:
             fit.densify()
@@ -161,8 +170,8 @@ class _Fit:
     def densify(self) -> None:
         """Add and prune active Gaussians by density control."""
         problem, density = self._problem, self._config.density
-        now, views = self.gaussians, _spread(problem, density.later_views)
-        scores = densification_scores(now, *views, density.noise_tolerance)
+        now, views = self.gaussians, _spread(problem, _DENSITY_VIEWS)
+        scores = densification_scores(now, *views, _NOISE)
         num_static = len(problem.previous) - len(problem.active.indices)
         plan = plan_additions(now, scores, density, self._rng, num_static)
         # A birth starts from its parent's past and shares its residual, so that its motion is the parent's.
@@ -182,7 +191,8 @@ class _Fit:
         problem, objective = self._problem, self._config.objective
         view, observed = problem.active.views[index], {**self._observations[index], **self._neighbours}
         channels = channels_of(observed, objective)
-        detached = [name for name in channels if name != "color"] if objective.detach_weights else ()
+        # The other terms are about motion and confidence, and must not move opacity and geometry.
+        detached = [name for name in channels if name != "color"]
         now = apply_residual(self._base, parameters, self._motion)
         image = view.render(now, channels, detached)
         num_pixels, num_gaussians = view.camera.width * view.camera.height, problem.active.num_gaussians
@@ -194,7 +204,7 @@ class _Fit:
         objective = self._config.objective
         if not objective.is_rigid:
             return {}
-        found = find_neighbours(self._base, self._problem.extent, objective.rigidity)
+        found = find_neighbours(self._base, self._problem.extent)
         return {} if found is None else {"neighbours": found}
 
 

@@ -16,6 +16,9 @@ from morgs_mi.render.config import RenderConfig
 
 __all__ = ["FirstFrameProblem"]
 
+# Opacity of the Gaussians at the start: most can become opaque or vanish within the steps of a first frame.
+_OPACITY = 0.3
+
 
 @dataclass(frozen=True, eq=False)
 class FirstFrameProblem:
@@ -49,12 +52,12 @@ class FirstFrameProblem:
         Args:
             views: V views, at least one.
             points: P points and their colours; P may be 0.
-            config: number, opacity and SH degree of the Gaussians.
+            config: number and SH degree of the Gaussians.
             render: cut-offs.
             rng: draws points.
         """
         chosen = initial_points(views, points, config.first_count, rng)
-        start = from_points(*chosen, config.sh_degree, config.initial_opacity)
+        start = from_points(*chosen, config.sh_degree, _OPACITY)
         return cls(start, tuple(views), points[0], scene_extent([view.camera for view in views]), render)
 
     @property

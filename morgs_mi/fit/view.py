@@ -14,7 +14,10 @@ from morgs_mi.losses.ssim import Target
 from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
 
-__all__ = ["View", "decibels", "mean_psnr", "rendered", "squared_errors", "withheld_blocks"]
+__all__ = ["LEAST_GAIN", "View", "decibels", "mean_psnr", "rendered", "squared_errors", "withheld_blocks"]
+
+LEAST_GAIN = 0.1
+"""Increase of the PSNR of withheld pixels from which a change of the cameras is taken, dB: less is chance."""
 
 _MIN_SIDE = 32  # px, of a reduced image
 # Withheld blocks: side in px, and one of how many.

@@ -16,12 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.ranges import AtLeast, check_ranges
 from morgs_mi.method.boxes import boxes_around
 from morgs_mi.method.flow import choose_key_views
 from morgs_mi.method.responsibility import ChangedView, responsibility
@@ -30,29 +32,33 @@ from morgs_mi.render.config import RenderConfig
 
 __all__ = ["ActiveSet", "ActiveSetConfig", "find_active_set", "full_active_set", "with_zero_motion"]
 
+# Fraction of a connected change that active Gaussians must cover to explain it.
+_EXPLAINED = 0.5
+# Side of the smallest square of unexplained pixels that counts, in px.
+_CLUSTER = 5
+# Fraction of all pixels above which all Gaussians are active: leaving out the others would cost more than it saves.
+_MOST_CHANGED = 0.5
+# Half side of the box, as a fraction of the Gaussian's extent: two standard deviations of an opaque one, whose extent
+# reaches the alpha cut-off at three and a third.
+_CORE = 0.6
+# Responsibility below which an active Gaussian is rendered in `quiet_views` only.
+_QUIET = 0.2
+
 
 @dataclass(frozen=True)
 class ActiveSetConfig:
     """Settings of the selection, see the module."""
 
-    min_responsibility: float = 0.05
+    min_responsibility: Annotated[float, AtLeast(0)] = 0.05
     """Responsibility above which a Gaussian is active."""
-    min_weight: float = 0.2
+    min_weight: Annotated[float, AtLeast(0)] = 0.2
     """Blend weight in changed blocks, summed over all views in px, below which a Gaussian counts as hidden. One inside
     an object that moves is nearly hidden: it would stay behind, and be uncovered later."""
-    min_explained: float = 0.5
-    """Fraction of a connected change that active Gaussians must cover to explain it."""
-    min_cluster: int = 5
-    """Side of the smallest square of unexplained pixels that counts, in px."""
-    max_changed: float = 0.5
-    """Fraction of all pixels above which all Gaussians are active."""
-    core: float = 0.6
-    """Half side of the box, as a fraction of the Gaussian's extent: two standard deviations of an opaque one, whose
-    extent reaches the alpha cut-off at three and a third."""
-    quiet_responsibility: float = 0.2
-    """Responsibility below which an active Gaussian is rendered in some views only."""
-    quiet_views: int = 12
-    """Number of these views."""
+    quiet_views: Annotated[int, AtLeast(1)] = 12
+    """Number of views in which active Gaussians that hardly change are rendered."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,10 +117,10 @@ def find_active_set(
         config: settings.
     """
     config = config or ActiveSetConfig()
-    if sum(c.mean() for c in changes.values()) > config.max_changed * len(cameras):
+    if sum(c.mean() for c in changes.values()) > _MOST_CHANGED * len(cameras):
         return full_active_set(gaussians, cameras, render)
     changed = {
-        v: ChangedView(camera, changes[v], boxes_around(gaussians, camera, render, config.core))
+        v: ChangedView(camera, changes[v], boxes_around(gaussians, camera, render, _CORE))
         for v, camera in cameras.items()
     }
     shares = responsibility(gaussians, changed.values(), render, config.min_weight)
@@ -122,10 +128,10 @@ def find_active_set(
     if gaussians.logit_confidence is not None:
         active |= np.asarray(gaussians.logit_confidence) > 0
     for view in changed.values():
-        unexplained = _unexplained(view.change, view.boxes.union(active, view.change.shape), config)
+        unexplained = _unexplained(view.change, view.boxes.union(active, view.change.shape))
         if unexplained.any():
             active |= np.asarray(view.boxes.covered(unexplained) > 0.5 * view.boxes.area)
-    drawn = _drawn(active, shares > config.quiet_responsibility, changed, config)
+    drawn = _drawn(active, shares > _QUIET, changed, config)
     static = with_zero_motion(gaussians.select(~active))
     views = {
         view: make_active_view(cameras[view], mask, static, channels[view], render)
@@ -151,15 +157,15 @@ def _drawn(
     return {v: view.boxes.union(chosen[v], view.change.shape) | view.change for v, view in views.items()}
 
 
-def _unexplained(change: np.ndarray, covered: np.ndarray, config: ActiveSetConfig) -> np.ndarray:
+def _unexplained(change: np.ndarray, covered: np.ndarray) -> np.ndarray:
     """Return the pixels [H, W] of the connected changes that a mask covers by less than half."""
-    square = np.ones((config.min_cluster, config.min_cluster), np.uint8)
+    square = np.ones((_CLUSTER, _CLUSTER), np.uint8)
     if not cv2.morphologyEx((change & ~covered).astype(np.uint8), cv2.MORPH_OPEN, square).any():
         return np.zeros_like(change)
     clusters = cv2.morphologyEx(change.astype(np.uint8), cv2.MORPH_OPEN, square)
     count, components, stats, _ = cv2.connectedComponentsWithStats(clusters)
     labels = np.asarray(components, np.int32)
     inside = np.bincount(labels[covered], minlength=count)
-    missing = inside < config.min_explained * stats[:, cv2.CC_STAT_AREA]
+    missing = inside < _EXPLAINED * stats[:, cv2.CC_STAT_AREA]
     missing[0] = False
     return missing[labels]

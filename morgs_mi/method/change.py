@@ -11,9 +11,12 @@ motion and shadows hardly contribute.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
+
+from morgs_mi.core.ranges import AtLeast, check_ranges
 
 __all__ = ["ChangeConfig", "box_around", "change_mask", "moving_region", "update_reference"]
 
@@ -22,6 +25,12 @@ _GREY_LEVEL = 1 / 255
 _NORMAL = 1.4826
 # px: 5 x 5 groups of pixels, that far apart, are a sample of the noise that thin moving parts do not dominate.
 _NOISE_STEP = 4
+# Side of the window over which changes of brightness are averaged, in px.
+_WINDOW = 5
+# Side of the window that closes gaps in the outline of a moving object, in px.
+_CLOSING = 5
+# Least margin of the box around a change, in px: flow needs something to match.
+_MARGIN = 24
 _SUM = np.ones((1, 3), np.float32)
 # Red minus green, and yellow minus blue; the absolute weights of each sum to 1.
 _COLORS = np.array([[0.5, -0.5, 0], [0.25, 0.25, -0.5]])
@@ -31,16 +40,13 @@ _COLORS = np.array([[0.5, -0.5, 0], [0.25, 0.25, -0.5]])
 class ChangeConfig:
     """Settings of the change detection."""
 
-    window: int = 5
-    """Side of the window over which changes of brightness are averaged, in px."""
-    sigmas: float = 5.0
+    sigmas: Annotated[float, AtLeast(0)] = 5.0
     """Threshold in standard deviations of the noise: normal noise exceeds 5 at less than one of 1.4 million pixels."""
-    min_change: float = _GREY_LEVEL
+    min_change: Annotated[float, AtLeast(0)] = _GREY_LEVEL
     """Least threshold and bound of the noise of the whole image, of 1: a grey level."""
-    min_margin: int = 24
-    """Least margin of the box around a change, in px: flow needs something to match."""
-    closing: int = 5
-    """Side of the window that closes gaps in the outline of a moving object, in px."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
 
 
 def change_mask(
@@ -71,7 +77,7 @@ def change_mask(
 
 def _exceeds_noise(change: np.ndarray, scale: int, config: ChangeConfig) -> np.ndarray:
     """Return where a change [H, W], of 1, at 1 / scale of the resolution exceeds its noise on average, bool [H, W]."""
-    window = max(config.window // scale, 1) | 1
+    window = max(_WINDOW // scale, 1) | 1
     # Zero padding: reflection would double the noise at the border.
     average = cv2.blur(change, (window, window), borderType=cv2.BORDER_CONSTANT)
     sample = average.ravel()[:: max(1, average.size // 20_000)]
@@ -92,20 +98,19 @@ def _noise_of_surroundings(change: np.ndarray, step: int) -> np.ndarray:
     return _NORMAL * cv2.blur(median, (3, 3))
 
 
-def moving_region(change: np.ndarray, config: ChangeConfig | None = None) -> np.ndarray:
+def moving_region(change: np.ndarray) -> np.ndarray:
     """Return the pixels [H, W] that may have moved: the changed ones and what they enclose.
 
     The inside of a plain object does not change where it moves, but its outline does.
 
     Args:
         change: the `change_mask` [H, W].
-        config: settings.
     """
-    size = (config or ChangeConfig()).closing
-    closed = np.pad(change.astype(np.uint8), 2 * size)
-    closed = cv2.morphologyEx(closed, cv2.MORPH_CLOSE, np.ones((size, size), np.uint8))
+    margin = 2 * _CLOSING
+    closed = np.pad(change.astype(np.uint8), margin)
+    closed = cv2.morphologyEx(closed, cv2.MORPH_CLOSE, np.ones((_CLOSING, _CLOSING), np.uint8))
     cv2.floodFill(closed, None, (0, 0), 2)  # pyright: ignore[reportCallIssue, reportArgumentType]
-    return (closed != 2)[2 * size : -2 * size, 2 * size : -2 * size]
+    return (closed != 2)[margin:-margin, margin:-margin]
 
 
 def update_reference(reference: np.ndarray, image: np.ndarray, change: np.ndarray) -> np.ndarray:
@@ -121,7 +126,7 @@ def update_reference(reference: np.ndarray, image: np.ndarray, change: np.ndarra
     return np.asarray(cv2.copyTo(image, change.astype(np.uint8), reference.copy()))
 
 
-def box_around(mask: np.ndarray, config: ChangeConfig | None = None) -> tuple[slice, slice] | None:
+def box_around(mask: np.ndarray) -> tuple[slice, slice] | None:
     """Return rows and columns of the smallest box around a mask [H, W], enlarged by half its size on all sides.
 
     The static surroundings of a motion are needed to separate it from noise. None where the mask is empty.
@@ -132,6 +137,6 @@ def box_around(mask: np.ndarray, config: ChangeConfig | None = None) -> tuple[sl
     for axis in (0, 1):
         (places,) = np.nonzero(mask.any(axis=1 - axis))
         low, high = int(places[0]), int(places[-1]) + 1
-        margin = max((config or ChangeConfig()).min_margin, (high - low) // 2)
+        margin = max(_MARGIN, (high - low) // 2)
         spans.append(slice(max(low - margin, 0), min(high + margin, mask.shape[axis])))
     return spans[0], spans[1]

@@ -16,8 +16,6 @@ others along: such Gaussians gather over many frames, and all of them seem to st
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.sparse import csr_array
 
@@ -25,25 +23,16 @@ from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.neighbours import NeighbourIndex
 
-__all__ = ["CohesionConfig", "share_confidence"]
+__all__ = ["share_confidence"]
 
 # Of 1: chromaticity of what is darker is noise.
 _LEAST_COLOR = 0.02
-
-
-@dataclass(frozen=True)
-class CohesionConfig:
-    """Settings of the cohesion of neighbours."""
-
-    neighbours: int = 12
-    """Number of nearest Gaussians."""
-    weight: float = 50.0
-    """Weight lambda of an opaque neighbour of the same colour against the evidence of the Gaussian alone; 0: no
-    cohesion."""
-    chroma_scale: float = 0.03
-    """Difference of chromaticity s at which the affinity has fallen to 0.61."""
-    rounds: int = 150
-    """Rounds of averaging (Jacobi's method). With more of them, and a larger weight, evidence spreads farther."""
+# Number of nearest Gaussians: more of them would pull along thin objects of few Gaussians.
+_NEIGHBOURS = 12
+# Difference of chromaticity s at which the affinity has fallen to 0.61.
+_CHROMA_SCALE = 0.03
+# Rounds of averaging (Jacobi's method). With more of them, and a larger weight, evidence spreads farther.
+_ROUNDS = 150
 
 
 def share_confidence(
@@ -51,7 +40,7 @@ def share_confidence(
     chosen: np.ndarray,
     logit: np.ndarray,
     still: float,
-    config: CohesionConfig | None = None,
+    weight: float,
     neighbours: NeighbourIndex | None = None,
 ) -> np.ndarray:
     """Return the logits z [M] of the chosen Gaussians (see the module).
@@ -61,23 +50,22 @@ def share_confidence(
         chosen: int [M], indices of the active ones.
         logit: u [M], their own logits.
         still: logit of all others.
-        config: settings.
+        weight: lambda, of an opaque neighbour of the same colour; 0: no cohesion.
         neighbours: index of all means; None: it is built.
     """
-    config = config or CohesionConfig()
     neighbours = neighbours or NeighbourIndex(np.asarray(gaussians.means))
-    near = neighbours.nearest_of(chosen, config.neighbours)
+    near = neighbours.nearest_of(chosen, _NEIGHBOURS)
     if not near.size:
         return logit
     chroma, opacity = _chromaticity(gaussians), np.asarray(gaussians.opacities)
-    affinity = np.exp(-np.sum((chroma[chosen][:, None] - chroma[near]) ** 2, axis=2) / (2 * config.chroma_scale**2))
-    affinity = config.weight * (opacity[near] * affinity).astype(np.float32)
+    affinity = np.exp(-np.sum((chroma[chosen][:, None] - chroma[near]) ** 2, axis=2) / (2 * _CHROMA_SCALE**2))
+    affinity = weight * (opacity[near] * affinity).astype(np.float32)
     starts = np.arange(0, near.size + 1, near.shape[1])
     weights = csr_array((affinity.ravel(), near.ravel(), starts), (len(chosen), len(gaussians)))
     total = 1 + affinity.sum(axis=1)
     everywhere = np.full(len(gaussians), still, np.float32)
     everywhere[chosen] = logit
-    for _ in range(config.rounds):
+    for _ in range(_ROUNDS):
         everywhere[chosen] = (logit + weights @ everywhere) / total
     return everywhere[chosen]
 

@@ -12,11 +12,16 @@ from morgs_mi.method.mask_refiners.registry import mask_refiner
 
 __all__ = ["flow_mask", "flow_threshold", "motion_floor", "motion_mask"]
 
+# px, the width of an image that `MaskConfig.floor` refers to.
+_FLOOR_WIDTH = 1352
+# Least threshold in px at any width: the noise of the flow itself.
+_NOISE = 0.2
+
 
 def motion_floor(width: int, config: MaskConfig | None = None) -> float:
     """Return the speed in pixels, in an image of `width` pixels, below which nothing counts as moving."""
     config = config or MaskConfig()
-    return max(config.floor * width / config.floor_width, config.noise_floor)
+    return max(config.floor * width / _FLOOR_WIDTH, _NOISE)
 
 
 def flow_threshold(motion: np.ndarray, reliable: np.ndarray | None = None, config: MaskConfig | None = None) -> float:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
-from morgs_mi.core.checks import check_number
+from morgs_mi.core.ranges import AtLeast, AtMost, check_ranges
 from morgs_mi.method.active_set import ActiveSetConfig
 from morgs_mi.method.change import ChangeConfig
-from morgs_mi.method.cohesion import CohesionConfig
 from morgs_mi.method.flow_sources.config import FlowConfig
 from morgs_mi.method.lift import LiftConfig
 from morgs_mi.method.mask_refiners.config import MaskConfig
-from morgs_mi.method.photometric import PhotometricConfig
-from morgs_mi.method.propagation import PropagationConfig
 from morgs_mi.method.search import SearchConfig
 
 __all__ = ["MotionConfig"]
@@ -54,17 +52,16 @@ class MotionConfig:
     mask_method: str = "grabcut"
     """Refinement of flow masks to objects: none, grabcut, superpixels+grabcut, or
     sam2:ENCODER.onnx,DECODER.onnx (see docs/masks.md)."""
-    key_views: int = 4
+    key_views: Annotated[int, AtLeast(1)] = 4
     """Number of cameras with optical flow and masks."""
-    mask_interval: int = 5
+    mask_interval: Annotated[int, AtLeast(1)] = 5
     """Frames from one supervision of the confidence by masks to the next."""
-    min_gate: float = 0.1
-    """Gate below which a lifted motion is no longer scaled up to pass the gate at full length."""
-    confidence_decay: float = 0.3
-    """Logit that a confidence loses per frame without evidence of motion: where something moved, more is to correct."""
+    cohesion_weight: Annotated[float, AtLeast(0)] = 50.0
+    """Weight of an opaque neighbour of the same colour against the evidence of motion of a Gaussian alone (see
+    `cohesion`); 0: no cohesion."""
     model: str = "none"
     """Motion that Gaussians share, fitted before the residual: none, or a registered model (see docs/extending.md)."""
-    model_share: float = 0.5
+    model_share: Annotated[float, AtLeast(0), AtMost(1)] = 0.5
     """Fraction of a later frame's epochs that fit this model, at least one epoch."""
     flow: FlowConfig = field(default_factory=FlowConfig)
     """Optical flow and its forward-backward check."""
@@ -72,21 +69,12 @@ class MotionConfig:
     """Motion masks."""
     lift: LiftConfig = field(default_factory=LiftConfig)
     """Lifted flow."""
-    cohesion: CohesionConfig = field(default_factory=CohesionConfig)
-    """Confidence that neighbours share."""
-    propagation: PropagationConfig = field(default_factory=PropagationConfig)
-    """Motion proposals."""
     search: SearchConfig = field(default_factory=SearchConfig)
     """Coarse search."""
-    photometric: PhotometricConfig = field(default_factory=PhotometricConfig)
-    """Refinement by the images."""
     active_set: ActiveSetConfig = field(default_factory=ActiveSetConfig)
     """Selection of the Gaussians that a frame may change."""
     change: ChangeConfig = field(default_factory=ChangeConfig)
     """Detection of changed pixels."""
 
     def __post_init__(self) -> None:
-        for name in ("key_views", "mask_interval"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"MotionConfig(): `{name}` must be at least 1, got {getattr(self, name)}.")
-        check_number("MotionConfig()", "model_share", self.model_share, "[0, 1]")
+        check_ranges(self)

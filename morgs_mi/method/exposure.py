@@ -16,10 +16,15 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from morgs_mi.core.checks import check_number
+__all__ = ["LEAST_CHANGE", "Exposure", "centred", "common_change", "fit_exposure", "follow_exposure"]
 
-__all__ = ["Exposure", "ExposureConfig", "centred", "common_change", "fit_exposure", "follow_exposure"]
+LEAST_CHANGE = 3e-3
+"""Change of tones over time, of 1, below which an image is not corrected: it is an error of the measurement."""
 
+# Weights of the priors of gain and bias, relative to all pixels. The first acts where nearly all pixels are dark. The
+# second, for the bias beyond that of a factor on the light, acts where images have little contrast, so that a gain
+# explains a change there.
+_WEIGHTS = (1e-4, 0.02)
 # Values, of 1, that are neither nearly black nor nearly white.
 _DARK, _BRIGHT = 0.03, 0.97
 # Steps of the reweighted least squares, and the least scale of its errors, of 1.
@@ -33,42 +38,6 @@ _WIDTH = 160  # px, of the thumbnails on which changes over time are measured: m
 # sRGB is 1.055 l^(1/2.4) - 0.055: a gain g of the light's root comes with the bias 0.055 (g - 1).
 _TOE = 0.055
 _TONES = np.array([0.1, 0.5, 0.9])[:, None]
-
-
-@dataclass(frozen=True)
-class ExposureConfig:
-    """Settings of the exposures."""
-
-    prior: float = 1e-4
-    """Weight of the prior of a gain, relative to all pixels: it acts where nearly all pixels are dark."""
-    bias_prior: float = 0.02
-    """Weight of the prior of a bias beyond that of a factor on the light, likewise: it acts where images have little
-    contrast, so that a gain explains a change there."""
-    least_change: float = 3e-3
-    """Change of tones over time, of 1, below which an image is not corrected: it is an error of the measurement."""
-    gaussians: int = 4000
-    """Gaussians of the fits by which the cameras of the first frame are balanced."""
-    steps: int = 300
-    """Steps of such a fit; each further round takes half as many."""
-    rounds: int = 5
-    """Rounds of fitting Gaussians and solving for the exposures."""
-    width: int = 320
-    """Least width to which images are reduced for that, px."""
-    least_difference: float = 0.005
-    """Difference of tones, of 1, from which `auto` considers to take the exposures: about a grey level."""
-    least_gain: float = 0.1
-    """Increase of the PSNR of withheld pixels from which it takes them, dB: less is chance."""
-
-    @property
-    def priors(self) -> tuple[float, float]:
-        """Weights of both priors."""
-        return self.prior, self.bias_prior
-
-    def __post_init__(self) -> None:
-        for name, low in (("gaussians", 4), ("steps", 2), ("rounds", 1), ("width", 1)):
-            check_number("ExposureConfig()", name, getattr(self, name), f"[{low}, inf)")
-        for name in ("prior", "bias_prior", "least_change", "least_difference", "least_gain"):
-            check_number("ExposureConfig()", name, getattr(self, name), "[0, inf)")
 
 
 @dataclass(frozen=True)
@@ -119,7 +88,7 @@ def fit_exposure(
     recorded: np.ndarray,
     mask: np.ndarray | None = None,
     prior: Exposure | None = None,
-    weights: tuple[float, float] = (ExposureConfig.prior, ExposureConfig.bias_prior),
+    weights: tuple[float, float] = _WEIGHTS,
 ) -> Exposure:
     """Return the exposure that shows the colours of a scene as a recorded image.
 
@@ -128,7 +97,7 @@ def fit_exposure(
         recorded: image of the same pixels, likewise.
         mask: pixels that count [H, W]; None: all.
         prior: expected exposure; None: no change.
-        weights: of the priors of gain and bias, see `ExposureConfig`.
+        weights: of the priors of gain and bias, relative to all pixels.
 
     Returns:
         The exposure, or the prior where it is not determined: with few well-exposed pixels, and for images that do not
@@ -188,7 +157,6 @@ def follow_exposure(
     image: np.ndarray,
     mask: np.ndarray | None = None,
     last: Exposure | None = None,
-    weights: tuple[float, float] = (ExposureConfig.prior, ExposureConfig.bias_prior),
 ) -> Exposure:
     """Return the exposure of an image relative to an earlier one of the same fixed camera.
 
@@ -197,7 +165,6 @@ def follow_exposure(
         image: the later one, likewise.
         mask: pixels that count [H, W]; None: all.
         last: exposure of the last frame, the prior; None: that of the reference.
-        weights: of the priors, as for `fit_exposure`.
     """
     height, width = image.shape[:2]
     size = (min(width, _WIDTH), max(1, round(height * min(1, _WIDTH / width))))
@@ -205,7 +172,7 @@ def follow_exposure(
         cv2.resize(x.astype(np.float32) / 255, size, interpolation=cv2.INTER_AREA) for x in (reference, image)
     )
     small = None if mask is None else cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
-    return fit_exposure(before, now, small, last, weights)
+    return fit_exposure(before, now, small, last)
 
 
 def _exposure(gain: np.ndarray, bias: np.ndarray) -> Exposure:

@@ -29,10 +29,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.ranges import Above, AtLeast, check_ranges
 from morgs_mi.method.confidence import motion_floor
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.mask_refiners.config import MaskConfig
@@ -41,28 +43,32 @@ from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["LiftConfig", "lift_flow"]
 
+# Weight of the prior that nothing moves, in fully covered pixels without motion: a Gaussian that is hardly visible
+# stays in place.
+_PRIOR_PIXELS = 0.3
+# Growth of s with the motion, as a fraction of it: flow errors grow with the motion.
+_NOISE_FRACTION = 0.2
+# Rounds of reweighting; more change little.
+_ROUNDS = 4
+# Covered pixels at which a view's evidence counts half.
+_HALF_WEIGHT_PIXELS = 1.0
+# Logit of the confidence per unit of evidence above `min_evidence`.
+_CONFIDENCE_SLOPE = 4.0
+
 
 @dataclass(frozen=True)
 class LiftConfig:
     """Settings of the lifted flow."""
 
-    prior_pixels: float = 0.3
-    """Weight of the prior that nothing moves, in fully covered pixels without motion: a Gaussian that is hardly visible
-    stays in place."""
-    noise_px: float = 0.2
+    noise_px: Annotated[float, Above(0)] = 0.2
     """Scale s of the robust cost for a Gaussian that does not move, in px: the noise of the flow."""
-    noise_fraction: float = 0.2
-    """Growth of s with the motion, as a fraction of it: flow errors grow with the motion."""
-    rounds: int = 4
-    """Rounds of reweighting; more change little."""
-    half_weight_pixels: float = 1.0
-    """Covered pixels at which a view's evidence counts half."""
     min_evidence: float = 0.5
     """Evidence e_i above which a Gaussian moves."""
-    confidence_slope: float = 4.0
-    """Logit of the confidence per unit of evidence above `min_evidence`."""
-    max_logit: float = 2.0
-    """Bound of that logit: confidences from 0.12 to 0.88, soft enough for the images to correct them."""
+    max_logit: Annotated[float, AtLeast(0)] = 2.0
+    """Bound of the logit of the confidence: from 0.12 to 0.88, soft enough for the images to correct it."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +81,7 @@ class _LiftView:
         variance: of the flow over the pixels of the Gaussian [N], px^2.
         jacobian: J [N, 2, 3], px per world unit.
         floor: of the motion, px.
-        config: settings.
+        noise_px: scale s of the cost without motion, px.
     """
 
     weight: np.ndarray
@@ -83,7 +89,7 @@ class _LiftView:
     variance: np.ndarray
     jacobian: np.ndarray
     floor: float
-    config: LiftConfig
+    noise_px: float
 
     def project(self, d: np.ndarray) -> np.ndarray:
         """Return J d [N, 2] in px."""
@@ -91,7 +97,7 @@ class _LiftView:
 
     def cost(self, d: np.ndarray, motion: np.ndarray) -> np.ndarray:
         """Return r(u - J d) [N] (see the module), with the scale s that belongs to a motion [N, 2] in px."""
-        scale = self.config.noise_px + self.config.noise_fraction * np.linalg.norm(motion, axis=1)
+        scale = self.noise_px + _NOISE_FRACTION * np.linalg.norm(motion, axis=1)
         return np.log1p((np.sum((self.flow - self.project(d)) ** 2, axis=1) + self.variance) / scale**2)
 
 
@@ -114,23 +120,25 @@ def lift_flow(
     config = config or LiftConfig()
     means = gaussians.numpy()["means"].astype(np.float64)
     seen = [
-        _lift_view(gaussians, means, views[v], observations[v], motion_floor(views[v].camera.width, masks), config)
+        _lift_view(
+            gaussians, means, views[v], observations[v], motion_floor(views[v].camera.width, masks), config.noise_px
+        )
         for v in sorted(observations.keys() & views.keys())
     ]
     top = config.max_logit
     if not seen:
         return MotionStart(np.zeros((len(means), 3), np.float32), np.full(len(means), -top, np.float32))
-    d = _solve(seen, [np.ones(len(means))] * len(seen), config)
-    for _ in range(config.rounds):
-        d = _solve(seen, [np.exp(-view.cost(d, view.project(d))) for view in seen], config)
+    d = _solve(seen, [np.ones(len(means))] * len(seen))
+    for _ in range(_ROUNDS):
+        d = _solve(seen, [np.exp(-view.cost(d, view.project(d))) for view in seen])
     gain, total, moves = np.zeros(len(means)), np.full(len(means), 1e-6), np.zeros(len(means), bool)
     for view in seen:
-        motion, a = view.project(d), view.weight / (view.weight + config.half_weight_pixels)
+        motion, a = view.project(d), view.weight / (view.weight + _HALF_WEIGHT_PIXELS)
         gain += a * (view.cost(np.zeros_like(d), motion) - view.cost(d, motion))
         total += a
         moves |= np.linalg.norm(motion, axis=1) > view.floor
     evidence = gain / total
-    logit = np.where(moves, np.clip(config.confidence_slope * (evidence - config.min_evidence), -top, top), -top)
+    logit = np.where(moves, np.clip(_CONFIDENCE_SLOPE * (evidence - config.min_evidence), -top, top), -top)
     return MotionStart(np.where(logit[:, None] > 0, d, 0).astype(np.float32), logit.astype(np.float32))
 
 
@@ -140,7 +148,7 @@ def _lift_view(
     view: ActiveView,
     observation: FlowObservation,
     floor: float,
-    config: LiftConfig,
+    noise_px: float,
 ) -> _LiftView:
     reliable = observation.forward_reliable[..., None].astype(np.float32)
     flow = observation.forward_flow
@@ -149,10 +157,10 @@ def _lift_view(
     average = sums[:, :3] / np.maximum(sums[:, 3:], 1e-6)
     variance = np.maximum(average[:, 2] - np.sum(average[:, :2] ** 2, axis=1), 0)
     jacobian = view.camera.projection_jacobian(means)
-    return _LiftView(sums[:, 3], average[:, :2], variance, jacobian, floor, config)
+    return _LiftView(sums[:, 3], average[:, :2], variance, jacobian, floor, noise_px)
 
 
-def _solve(views: list[_LiftView], trust: list[np.ndarray], config: LiftConfig) -> np.ndarray:
+def _solve(views: list[_LiftView], trust: list[np.ndarray]) -> np.ndarray:
     """Return d [N, 3] of the system with the weights k = `trust`."""
     system: np.ndarray | float = 0.0
     right: np.ndarray | float = 0.0
@@ -162,5 +170,5 @@ def _solve(views: list[_LiftView], trust: list[np.ndarray], config: LiftConfig) 
         system = system + weight[:, None, None] * np.einsum("nij,nik->njk", J, J)
         right = right + np.einsum("nij,ni->nj", J, weight[:, None] * view.flow)
         scale.append(np.median(np.sum(J[:, 0] ** 2, axis=1)))
-    prior = max(config.prior_pixels * float(np.mean(scale)), 1e-30)
+    prior = max(_PRIOR_PIXELS * float(np.mean(scale)), 1e-30)
     return np.linalg.solve(system + prior * np.eye(3), np.asarray(right)[..., None])[..., 0]

@@ -46,7 +46,7 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         lambda config: config.propagate_motion,
-        lambda p, start, config: propagate_motion(p, start, config.propagation),
+        lambda p, start, config: propagate_motion(p, start),
     ),
     Stage(
         lambda config: config.search_motion,
@@ -54,9 +54,12 @@ STAGES: tuple[Stage, ...] = (
     ),
     Stage(
         lambda config: config.refine_start and config.two_gates,
-        lambda p, start, config: refine_start(p, start, config.photometric),
+        lambda p, start, config: refine_start(p, start),
     ),
 )
+
+# Logit that a confidence loses per frame without evidence of motion: where something moved, more is to correct.
+_CONFIDENCE_DECAY = 0.3
 
 
 def initial_motion(
@@ -91,8 +94,8 @@ def initial_motion(
         if stage.acts(config):
             start = stage.run(problem, start, config)
     everyone = problem.neighbours if gaussians is previous else NeighbourIndex(np.asarray(previous.means))
-    logit = _carried_confidence(start, gaussians, config)
-    shared = share_confidence(previous, active.indices, logit, -config.lift.max_logit, config.cohesion, everyone)
+    logit = _carried_confidence(start, gaussians)
+    shared = share_confidence(previous, active.indices, logit, -config.lift.max_logit, config.cohesion_weight, everyone)
     return replace(start, logit_confidence=shared)
 
 
@@ -102,9 +105,9 @@ def _constant_velocity(gaussians: Gaussians) -> MotionStart:
     return start if gaussians.motion is None else replace(start, displacement=np.asarray(gaussians.motion))
 
 
-def _carried_confidence(start: MotionStart, gaussians: Gaussians, config: MotionConfig) -> np.ndarray:
+def _carried_confidence(start: MotionStart, gaussians: Gaussians) -> np.ndarray:
     """Return the logits [M] of the previous frame, a little lower, or those of the start where they are higher."""
     if gaussians.logit_confidence is None:
         return start.logit_confidence
     before = np.asarray(gaussians.logit_confidence)
-    return np.maximum(start.logit_confidence, before - np.float32(config.confidence_decay))
+    return np.maximum(start.logit_confidence, before - np.float32(_CONFIDENCE_DECAY))

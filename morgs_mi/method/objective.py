@@ -11,19 +11,19 @@ returns them. A term acts in the views that have all its observations.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 import numpy as np
 
-from morgs_mi.core.checks import check_number
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.ranges import AtLeast, AtMost, check_ranges
 from morgs_mi.core.types import Tensor
 from morgs_mi.losses.losses import flow_loss, mask_loss, offset_loss, recon_loss
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.flow_sources.registry import FramePair
-from morgs_mi.method.rigidity import RigidityConfig, isometry_loss, rigid_loss, rotation_loss
+from morgs_mi.method.rigidity import isometry_loss, rigid_loss, rotation_loss
 from morgs_mi.render.rasterize import Image
 from morgs_mi.render.region import Region
 
@@ -47,29 +47,23 @@ Observations = Mapping[str, Any]
 class ObjectiveConfig:
     """Weights of the terms; 0 switches one off."""
 
-    dssim_weight: float = 0.2
+    dssim_weight: Annotated[float, AtLeast(0), AtMost(1)] = 0.2
     """lambda of eq. 2."""
-    flow_weight: float = 0.01
+    flow_weight: Annotated[float, AtLeast(0)] = 0.01
     """lambda_flow of eq. 13, per px of endpoint error."""
-    mask_weight: float = 0.5
+    mask_weight: Annotated[float, AtLeast(0)] = 0.5
     """lambda_mask of eq. 13."""
-    offset_weight: float = 0.01
+    offset_weight: Annotated[float, AtLeast(0)] = 0.01
     """lambda_off of eq. 13, per scene extent."""
-    rigid_weight: float = 0.0
+    rigid_weight: Annotated[float, AtLeast(0)] = 0.0
     """Weight of the local rigidity (see `rigidity`), per scene extent."""
-    rotation_weight: float = 0.0
+    rotation_weight: Annotated[float, AtLeast(0)] = 0.0
     """Weight of the similarity of rotations there."""
-    isometry_weight: float = 0.0
+    isometry_weight: Annotated[float, AtLeast(0)] = 0.0
     """Weight of the isometry there, per scene extent."""
-    rigidity: RigidityConfig = field(default_factory=RigidityConfig)
-    """Neighbours of the local rigidity."""
-    detach_weights: bool = True
-    """Keep all terms but L_recon from moving opacity and geometry: they are about motion and confidence."""
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if name.endswith("_weight"):
-                check_number("ObjectiveConfig()", name, value, "[0, 1]" if name == "dssim_weight" else "[0, inf)")
+        check_ranges(self)
 
     @property
     def is_rigid(self) -> bool:

@@ -19,7 +19,7 @@ A Gaussian accepts the step if its error falls. Then its colour changes by the m
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -30,56 +30,43 @@ from morgs_mi.method.image_gradient import image_gradient
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.render.active_view import ActiveView
 
-__all__ = ["PhotometricConfig", "mean_color_error", "refine_displacement", "refine_start"]
+__all__ = ["mean_color_error", "refine_displacement", "refine_start"]
+
+# Steps of the displacement; more gain nothing before the fit.
+_ROUNDS = 1
+# Nearest Gaussians whose pixels count, too, if they move: a small one alone may see one straight edge.
+_NEIGHBOURS = 8
+# Weight of the prior that a step is 0, in pixels on which the contrast is 1 per px.
+_PRIOR_PIXELS = 1e-3
+# Longest step, in px of the view where it is longest: farther away, the image is not linear.
+_LONGEST_PX = 2.0
+# Error, in pixels of full contrast, that is added to that of every Gaussian, see `propagation`.
+_FLOOR_PX = 0.01
+# Covered pixels at which the colour changes by half of the mean error: that of few pixels is noise.
+_HALF_COLOR_PIXELS = 10.0
 
 
-@dataclass(frozen=True)
-class PhotometricConfig:
-    """Settings of the refinement."""
-
-    rounds: int = 1
-    """Steps of the displacement; more gain nothing before the fit."""
-    neighbours: int = 8
-    """Nearest Gaussians whose pixels count, too, if they move: a small one alone may see one straight edge."""
-    prior_pixels: float = 1e-3
-    """Weight of the prior that a step is 0, in pixels on which the contrast is 1 per px."""
-    max_step_px: float = 2.0
-    """Longest step, in px of the view where it is longest: farther away, the image is not linear."""
-    floor_px: float = 0.01
-    """Error, in pixels of full contrast, that is added to that of every Gaussian, see `propagation`."""
-    half_color_pixels: float = 10.0
-    """Covered pixels at which the colour changes by half of the mean error: that of few pixels is noise."""
-
-    def __post_init__(self) -> None:
-        for name, low in (("rounds", 0), ("neighbours", 1)):
-            if not getattr(self, name) >= low:
-                raise ValueError(f"PhotometricConfig(): `{name}` must be at least {low}, got {getattr(self, name)}.")
-
-
-def refine_start(problem: MotionProblem, start: MotionStart, config: PhotometricConfig) -> MotionStart:
+def refine_start(problem: MotionProblem, start: MotionStart) -> MotionStart:
     """Return a start with refined displacements, and with the change of colour at these displacements.
 
     Args:
         problem: N Gaussians, the key views and their images.
         start: of the motion.
-        config: settings.
     """
-    start = refine_displacement(problem, start, config)
+    start = refine_displacement(problem, start)
     moved = displaced(problem.gaussians, start.displacement)
-    return replace(start, color_change=mean_color_error(moved, problem.views, problem.targets, config))
+    return replace(start, color_change=mean_color_error(moved, problem.views, problem.targets))
 
 
-def refine_displacement(
-    problem: MotionProblem, start: MotionStart, config: PhotometricConfig | None = None
-) -> MotionStart:
+def refine_displacement(problem: MotionProblem, start: MotionStart) -> MotionStart:
     """Return a start whose moving Gaussians explain the images better; see `refine_start`."""
-    config, d = config or PhotometricConfig(), start.displacement
-    previous, targets, moves = problem.gaussians, problem.targets, np.any(d, axis=1)
+    previous, targets, d = problem.gaussians, problem.targets, start.displacement
+    moves = np.any(d, axis=1)
     views = problem.views_around(moves, [d]) if moves.any() else {}
     if not views:
         return start
     means = np.asarray(previous.means)
-    near = problem.neighbours.nearest(config.neighbours)
+    near = problem.neighbours.nearest(_NEIGHBOURS)
     gradients = {v: _gradient(view, targets[v]) for v, view in views.items()}
 
     def sums_of(d: np.ndarray) -> np.ndarray:
@@ -87,12 +74,12 @@ def refine_displacement(
         return np.stack([_sums(moved, view, targets[v], gradients[v]) for v, view in views.items()])
 
     def error_of(sums: np.ndarray) -> np.ndarray:
-        return (sums[..., 0].sum(0) + config.floor_px) / (sums[..., 1].sum(0) + 1)
+        return (sums[..., 0].sum(0) + _FLOOR_PX) / (sums[..., 1].sum(0) + 1)
 
     sums = sums_of(d)
-    for _ in range(config.rounds):
+    for _ in range(_ROUNDS):
         jacobians = np.stack([view.camera.projection_jacobian(means + d) for view in views.values()])
-        step = np.where(moves[:, None], _step(jacobians, sums, near, moves, config), 0)
+        step = np.where(moves[:, None], _step(jacobians, sums, near, moves), 0)
         new_sums = sums_of(d + step)
         better = error_of(new_sums) < error_of(sums)
         d, sums = d + np.where(better[:, None], step, 0), np.where(better[:, None], new_sums, sums)
@@ -100,10 +87,7 @@ def refine_displacement(
 
 
 def mean_color_error(
-    gaussians: Gaussians,
-    views: Mapping[int, ActiveView],
-    targets: Mapping[int, Target],
-    config: PhotometricConfig | None = None,
+    gaussians: Gaussians, views: Mapping[int, ActiveView], targets: Mapping[int, Target]
 ) -> np.ndarray:
     """Return the change c [N, 3] of the constant SH coefficients that removes the mean error of each Gaussian's pixels.
 
@@ -111,13 +95,12 @@ def mean_color_error(
         gaussians: N Gaussians at their start in this frame, detached.
         views: active views of the key views, by view index.
         targets: their images, by view index.
-        config: settings.
     """
-    config, sums = config or PhotometricConfig(), np.zeros((len(gaussians), 4), np.float32)
+    sums = np.zeros((len(gaussians), 4), np.float32)
     for v, view in views.items():
         error = targets[v].difference(view.render(gaussians).color, view.region)
         sums += view.backproject(gaussians, np.concatenate([error, np.ones_like(error[..., :1])], axis=-1))
-    return sums[:, :3] / (sums[:, 3:] + config.half_color_pixels) / np.float32(SH_C0)
+    return sums[:, :3] / (sums[:, 3:] + _HALF_COLOR_PIXELS) / np.float32(SH_C0)
 
 
 def _gradient(view: ActiveView, target: Target) -> tuple[np.ndarray, np.ndarray]:
@@ -136,9 +119,7 @@ def _sums(
     return view.backproject(gaussians, np.stack([size, np.ones_like(size), *products], axis=-1))
 
 
-def _step(
-    jacobians: np.ndarray, sums: np.ndarray, near: np.ndarray, moves: np.ndarray, config: PhotometricConfig
-) -> np.ndarray:
+def _step(jacobians: np.ndarray, sums: np.ndarray, near: np.ndarray, moves: np.ndarray) -> np.ndarray:
     """Return the step delta [N, 3] from J [V, N, 2, 3] and the sums [V, N, 7]."""
     G = sums[..., [2, 3, 3, 4]].reshape(*sums.shape[:2], 2, 2)
     system = np.einsum("vnia,vnij,vnjb->nab", jacobians, G, jacobians, optimize=True)
@@ -146,7 +127,7 @@ def _step(
     counts = moves[near].astype(float)
     system = system + np.einsum("nk,nkab->nab", counts, system[near])
     right = right + np.einsum("nk,nka->na", counts, right[near])
-    prior = config.prior_pixels * np.median(np.sum(jacobians[:, :, 0] ** 2, axis=-1))
+    prior = _PRIOR_PIXELS * np.median(np.sum(jacobians[:, :, 0] ** 2, axis=-1))
     step = np.linalg.solve(system + max(prior, 1e-30) * np.eye(3), right[..., None])[..., 0]
     length = np.linalg.norm(np.einsum("vnij,nj->vni", jacobians, step), axis=-1).max(axis=0)
-    return step * np.minimum(1, config.max_step_px / np.maximum(length, 1e-30))[:, None]
+    return step * np.minimum(1, _LONGEST_PX / np.maximum(length, 1e-30))[:, None]

@@ -13,54 +13,41 @@ A Gaussian whose error falls clearly accepts its proposal. Only the surroundings
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.losses.attribution import attribute_error
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 
-__all__ = ["PropagationConfig", "propagate_motion"]
+__all__ = ["propagate_motion"]
+
+# Rounds of proposals from neighbours, after the one from the previous frame.
+_ROUNDS = 2
+# Nearest Gaussians that a proposal is drawn from.
+_NEIGHBOURS = 8
+# Ratio of the new error to the old one up to which a moving Gaussian accepts a proposal, and one that does not move
+# without it. Others move at the same time: a smaller gain is chance.
+_ERROR_RATIO, _ERROR_RATIO_STATIC = 0.9, 0.8
+# Error, in pixels of full contrast, that is added to that of every Gaussian: one that is hardly visible does not change
+# its motion.
+_FLOOR_PX = 0.01
+# Logit of the confidence of a Gaussian that accepted a motion: 0.57, as some accept a wrong one by chance.
+_LOGIT = 0.3
 
 
-@dataclass(frozen=True)
-class PropagationConfig:
-    """Settings of the motion proposals."""
-
-    rounds: int = 2
-    """Rounds of proposals from neighbours, after the one from the previous frame."""
-    neighbours: int = 8
-    """Nearest Gaussians that a proposal is drawn from."""
-    max_error_ratio: float = 0.9
-    """Ratio of the new error to the old one up to which a moving Gaussian accepts a proposal. Others move at the same
-    time, so that a smaller gain is chance."""
-    max_error_ratio_static: float = 0.8
-    """The same for a Gaussian that does not move without the proposal."""
-    floor_px: float = 0.01
-    """Error, in pixels of full contrast, that is added to that of every Gaussian: one that is hardly visible does not
-    change its motion."""
-    min_logit: float = 0.3
-    """Logit of the confidence of a Gaussian that accepted a motion: 0.57, as some accept a wrong one by chance."""
-
-
-def propagate_motion(
-    problem: MotionProblem, start: MotionStart, config: PropagationConfig | None = None
-) -> MotionStart:
+def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
     """Return a start of the motion that explains the images at least as well as `start` does.
 
     Args:
         problem: N Gaussians, the key views and their images.
         start: by lifted flow.
-        config: settings.
     """
-    config = config or PropagationConfig()
     d, logit = start.displacement, start.logit_confidence  # [N, 3], [N]
     before = _previous_motion(problem.gaussians)
     if not problem.views or not (d.any() or before.any()):
         return start
-    near = problem.neighbours.nearest(config.neighbours)
-    rounds = config.rounds if near.size else 0
+    near = problem.neighbours.nearest(_NEIGHBOURS)
+    rounds = _ROUNDS if near.size else 0
     views = problem.views_around(_reached(near, np.any([d, before], axis=(0, 2)), rounds), (d, before))
     if not views:
         return start
@@ -68,7 +55,7 @@ def propagate_motion(
     def error_of(d: np.ndarray) -> np.ndarray:
         moved = displaced(problem.gaussians, d)
         sums = np.sum([attribute_error(moved, view, problem.targets[v]) for v, view in views.items()], axis=0)
-        return (sums[:, 0] + config.floor_px) / (sums[:, 1] + 1)
+        return (sums[:, 0] + _FLOOR_PX) / (sums[:, 1] + 1)
 
     error, continues = error_of(d), np.any(before, axis=1, keepdims=True)
     for k in range(1 + rounds):
@@ -77,10 +64,10 @@ def propagate_motion(
         if not differs.any():
             continue
         new_error = error_of(proposal)
-        ratio = np.where(d.any(axis=1), config.max_error_ratio, config.max_error_ratio_static)
+        ratio = np.where(d.any(axis=1), _ERROR_RATIO, _ERROR_RATIO_STATIC)
         accepted = differs & (new_error < ratio * error)
         d, error = np.where(accepted[:, None], proposal, d), np.where(accepted, new_error, error)
-        moves = np.where(d.any(axis=1), np.maximum(logit, config.min_logit), np.minimum(logit, -config.min_logit))
+        moves = np.where(d.any(axis=1), np.maximum(logit, _LOGIT), np.minimum(logit, -_LOGIT))
         logit = np.where(accepted, moves, logit)
     return MotionStart(d, logit.astype(np.float32))
 

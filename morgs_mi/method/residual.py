@@ -27,6 +27,8 @@ from morgs_mi.method.motion_start import MotionStart
 
 __all__ = ["apply_residual", "residual_parameters"]
 
+# Gate below which a lifted motion is no longer scaled up to pass the gate at full length.
+_MIN_GATE = 0.1
 _RESIDUALS = tuple(a.name for a in ATTRIBUTES if a.gate is not None)
 
 
@@ -57,7 +59,7 @@ def residual_parameters(
         if start is not None and config.lift_confidence:
             logit = from_numpy(mi.TensorXf, start.logit_confidence)
         # The gate would shrink the displacement; a Gaussian that hardly moves may stay shrunk.
-        gate = np.maximum(np.asarray(sigmoid(logit.array)), config.min_gate)[:, None]
+        gate = np.maximum(np.asarray(sigmoid(logit.array)), _MIN_GATE)[:, None]
         displacement = None if displacement is None else displacement / gate
         rotation = None if rotation is None else rotation / gate
         parameters["logit_confidence"] = logit

@@ -19,32 +19,20 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse import csr_array
 
-from morgs_mi.core.checks import check_number
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, Jit, Tensor
 from morgs_mi.method.motion_model import quaternion_product, sparse_product
 from morgs_mi.method.neighbours import NeighbourIndex
 
-__all__ = ["Neighbours", "RigidityConfig", "find_neighbours", "isometry_loss", "rigid_loss", "rotation_loss"]
+__all__ = ["Neighbours", "find_neighbours", "isometry_loss", "rigid_loss", "rotation_loss"]
 
 # Scene extents below which a length counts as 0: the derivative of a norm is infinite there.
 _SHORT = 1e-6
-
-
-@dataclass(frozen=True)
-class RigidityConfig:
-    """Settings of the local rigidity."""
-
-    neighbours: int = 20
-    """Nearest neighbours k of each Gaussian, as in the publication."""
-    reach: float = 0.1
-    """Distance s at which the weight of a neighbour has fallen to 0.37, in scene extents."""
-
-    def __post_init__(self) -> None:
-        if self.neighbours < 1:
-            raise ValueError(f"RigidityConfig(): `neighbours` must be at least 1, got {self.neighbours}.")
-        check_number("RigidityConfig()", "reach", self.reach, "(0, inf)")
+# Neighbours k of each Gaussian, as in the publication.
+_NEIGHBOURS = 20
+# Distance s in scene extents at which the weight of a neighbour has fallen to 0.37.
+_REACH = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,19 +56,28 @@ class Neighbours:
     extent: float
 
 
-def find_neighbours(gaussians: Gaussians, extent: float, config: RigidityConfig) -> Neighbours | None:
-    """Return the pairs of neighbours among N Gaussians of the previous frame, None if there is only one Gaussian."""
+def find_neighbours(
+    gaussians: Gaussians, extent: float, count: int = _NEIGHBOURS, reach: float = _REACH
+) -> Neighbours | None:
+    """Return the pairs of neighbours among N Gaussians of the previous frame, None if there is only one Gaussian.
+
+    Args:
+        gaussians: the N Gaussians.
+        extent: of the scene, world units.
+        count: number k of neighbours of each Gaussian.
+        reach: distance s at which the weight of a neighbour has fallen to 0.37, in scene extents.
+    """
     means = np.asarray(gaussians.means)
     if len(means) < 2:
         return None
-    near = NeighbourIndex(means).nearest(config.neighbours)
+    near = NeighbourIndex(means).nearest(count)
     (N, k), pairs = near.shape, np.arange(near.size)
     ones = np.ones(near.size, np.float32)
     first, second = (
         csr_array((ones, (pairs, of)), (near.size, N)) for of in (np.repeat(np.arange(N), k), near.ravel())
     )
     edges = (means[near] - means[:, None]).reshape(-1, 3) / extent
-    weights = np.exp(-np.sum(edges**2, axis=1) / config.reach**2) / len(edges)
+    weights = np.exp(-np.sum(edges**2, axis=1) / reach**2) / len(edges)
     quats = np.asarray(gaussians.quats)
     inverse = quats * (1, -1, -1, -1) / np.maximum(np.sum(quats**2, axis=1, keepdims=True), 1e-30)
     return Neighbours(

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import cv2
 import numpy as np
@@ -25,6 +26,7 @@ from scipy.sparse.csgraph import connected_components
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians, displaced
+from morgs_mi.core.ranges import Above, AtLeast, AtMost, check_ranges
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.neighbours import NeighbourIndex
@@ -33,36 +35,30 @@ from morgs_mi.render.active_view import ActiveView
 __all__ = ["SearchConfig", "search_motion"]
 
 _GRID = 16  # steps of the grid from 0 to its end, in each direction of each axis
+# Error of a Gaussian, in medians of all active ones, or in grey levels if the median is less, above which it is not
+# explained.
+_UNEXPLAINED = 3.0
+# Nearest Gaussians that it forms a part with if they are not explained either, and the fewest Gaussians of a part.
+_NEIGHBOURS, _MIN_SIZE = 8, 4
+# Cost of a displacement, as a fraction of that of no displacement, up to which it is tested.
+_COST_RATIO = 0.3
+# Error of the images around a part, as a fraction of that without the displacement, up to which it is accepted.
+_ERROR_RATIO = 0.8
+# Logit of the confidence of a Gaussian that was found, see `propagation`.
+_LOGIT = 0.3
 
 
 @dataclass(frozen=True)
 class SearchConfig:
     """Settings of the coarse search."""
 
-    reach: float = 0.1
+    reach: Annotated[float, Above(0), AtMost(1)] = 0.1
     """Longest displacement along each axis, as a fraction of the image width."""
-    error_ratio: float = 3.0
-    """Error of a Gaussian, in medians of all active ones, or in grey levels if the median is less, above which it is
-    not explained."""
-    neighbours: int = 8
-    """Nearest Gaussians that it forms a part with if they are not explained either."""
-    min_size: int = 4
-    """Fewest Gaussians of a part."""
-    max_parts: int = 3
+    max_parts: Annotated[int, AtLeast(0)] = 3
     """Most parts of a frame, those with the largest errors first."""
-    max_cost_ratio: float = 0.3
-    """Cost of a displacement, as a fraction of that of no displacement, up to which it is tested."""
-    max_error_ratio: float = 0.8
-    """Error of the images around a part, as a fraction of that without the displacement, up to which it is accepted."""
-    min_logit: float = 0.3
-    """Logit of the confidence of a Gaussian that was found, see `propagation`."""
 
     def __post_init__(self) -> None:
-        for name, low in (("neighbours", 1), ("min_size", 1), ("max_parts", 0)):
-            if not getattr(self, name) >= low:
-                raise ValueError(f"SearchConfig(): `{name}` must be at least {low}, got {getattr(self, name)}.")
-        if not 0 < self.reach <= 1:
-            raise ValueError(f"SearchConfig(): `reach` must be in (0, 1], got {self.reach}.")
+        check_ranges(self)
 
 
 def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConfig | None = None) -> MotionStart:
@@ -79,7 +75,7 @@ def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConf
     gaussians, views, targets = problem.gaussians, problem.views, problem.targets
     started = displaced(gaussians, start.displacement)
     errors = _errors(started, views, targets)
-    parts = _unexplained_parts(started, errors, views, config)
+    parts = _unexplained_parts(started, errors, views, config.max_parts)
     displacement, logit = start.displacement, start.logit_confidence
     for part, d in _find(problem, parts, config):
         proposal = np.where(part[:, None], d, displacement).astype(np.float32)
@@ -87,8 +83,8 @@ def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConf
         moved = displaced(gaussians, proposal)
         before = sum(float(errors[v][views[v].crop(_drawn(view))].sum()) for v, view in around.items())
         after = sum(float(error.sum()) for error in _errors(moved, around, targets).values())
-        if after < config.max_error_ratio * before:
-            displacement, logit = proposal, np.where(part, np.maximum(logit, config.min_logit), logit)
+        if after < _ERROR_RATIO * before:
+            displacement, logit = proposal, np.where(part, np.maximum(logit, _LOGIT), logit)
             errors = _errors(moved, views, targets)
     if displacement is start.displacement:
         return start
@@ -107,26 +103,26 @@ def _errors(
 
 
 def _unexplained_parts(
-    gaussians: Gaussians, errors: Mapping[int, np.ndarray], views: Mapping[int, ActiveView], config: SearchConfig
+    gaussians: Gaussians, errors: Mapping[int, np.ndarray], views: Mapping[int, ActiveView], count: int
 ) -> list[np.ndarray]:
-    """Return the parts that are not explained, each as a mask [N]."""
+    """Return the `count` parts with the largest errors that are not explained, or fewer, each as a mask [N]."""
     sums = np.zeros((len(gaussians), 2), np.float32)
     for v, view in views.items():
         sums += view.backproject(gaussians, np.stack([errors[v], np.ones_like(errors[v])], axis=-1))
     error, seen = sums[:, 0] / (sums[:, 1] + 1), sums[:, 1] > 1
     if not seen.any():
         return []
-    unexplained = seen & (error > config.error_ratio * max(float(np.median(error[seen])), 1 / 255))
-    if np.count_nonzero(unexplained) < config.min_size:
+    unexplained = seen & (error > _UNEXPLAINED * max(float(np.median(error[seen])), 1 / 255))
+    if np.count_nonzero(unexplained) < _MIN_SIZE:
         return []
-    near = NeighbourIndex(np.asarray(gaussians.means)).nearest(config.neighbours)
+    near = NeighbourIndex(np.asarray(gaussians.means)).nearest(_NEIGHBOURS)
     ends = unexplained[:, None] & unexplained[near]
     rows = np.broadcast_to(np.arange(len(near))[:, None], near.shape)[ends]
     graph = coo_array((np.ones(len(rows), bool), (rows, near[ends])), (len(near), len(near)))
     label = connected_components(graph, directed=False)[1]
     size, total = np.bincount(label, unexplained), np.bincount(label, np.where(unexplained, sums[:, 0], 0))
-    largest = np.argsort(-total, kind="stable")[: config.max_parts]
-    return [label == part for part in largest if size[part] >= config.min_size]
+    largest = np.argsort(-total, kind="stable")[:count]
+    return [label == part for part in largest if size[part] >= _MIN_SIZE]
 
 
 def _find(
@@ -143,13 +139,13 @@ def _find(
         weights = {v: view.blend_weights(previous, few) for v, view in matched.items()}
         for k, part in enumerate(few):
             surfaces = [matched[v].cost_surface(weights[v][..., k]) for v in views if weights[v][..., k].any()]
-            d = _best_displacement(np.asarray(previous.means)[part].mean(axis=0), surfaces, config)
+            d = _best_displacement(np.asarray(previous.means)[part].mean(axis=0), surfaces, config.reach)
             if d.any():
                 found.append((part, d))
     return found
 
 
-def _best_displacement(center: np.ndarray, surfaces: Sequence[_CostSurface], config: SearchConfig) -> np.ndarray:
+def _best_displacement(center: np.ndarray, surfaces: Sequence[_CostSurface], reach: float) -> np.ndarray:
     """Return the displacement d [3] that costs a part around `center` least; 0 if it hardly saves anything."""
     if not surfaces:
         return np.zeros(3)
@@ -158,7 +154,7 @@ def _best_displacement(center: np.ndarray, surfaces: Sequence[_CostSurface], con
         return np.sum([surface.at(center, d) for surface in surfaces], axis=0)
 
     camera = surfaces[0].camera
-    unit = config.reach * camera.width / _GRID / np.linalg.norm(camera.projection_jacobian(center[None])[0, 0])
+    unit = reach * camera.width / _GRID / np.linalg.norm(camera.projection_jacobian(center[None])[0, 0])
     coarse = np.stack(np.meshgrid(*[np.arange(-_GRID, _GRID + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     fine = coarse[np.abs(coarse).max(axis=1) <= 4] / 4
     d = np.zeros(3)
@@ -166,7 +162,7 @@ def _best_displacement(center: np.ndarray, surfaces: Sequence[_CostSurface], con
         steps = d + unit * grid
         d = steps[np.argmin(cost_of(steps))]
     at_d, at_rest = cost_of(np.stack([d, np.zeros(3)]))
-    return d if at_d < config.max_cost_ratio * at_rest else np.zeros(3)
+    return d if at_d < _COST_RATIO * at_rest else np.zeros(3)
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from morgs_mi.calibration.timing import TimingConfig, estimate_time_offsets
+from morgs_mi.calibration.timing import estimate_time_offsets
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.synth.disturbances import Disturbances, load_disturbances
@@ -24,13 +24,6 @@ def test_estimate_time_offsets__refuses_a_single_camera(textured_capture: Captur
     alone = replace(textured_capture, cameras=textured_capture.cameras[:1])
     with pytest.raises(ValueError, match="expected at least 2 cameras to compare clocks, got 1"):
         estimate_time_offsets(alone)
-
-
-def test_timing_config__refuses_numbers_out_of_range() -> None:
-    with pytest.raises(ValueError, match=r"TimingConfig\(\): `frames` must be a number in \[4, inf\), got 3"):
-        TimingConfig(frames=3)
-    with pytest.raises(ValueError, match=r"`blurs` must be a number in \(0, inf\), got -1"):
-        TimingConfig(blurs=(3, -1))
 
 
 @pytest.mark.long

@@ -100,7 +100,7 @@ def test_main__leaves_out_a_camera_without_a_clip(capture: Path, tmp_path: Path,
     [
         (("synth", "spheres", "OUT", "--cameras", 1), ("--cameras must be at least 2, got 1",)),
         (("synth", "spheres", "OUT", "--frames", 0), ("--frames must be at least 1, got 0",)),
-        (("synth", "spheres", "OUT", "--width", 3), ("--width and --height must be even, got 3x240",)),
+        (("synth", "spheres", "OUT", "--width", 3), ("--width must be at least 2 and a multiple of 2, got 3",)),
         (("synth", "spheres", "OUT", "--noise", 2), ("--noise must be at least 0 and below 1, got 2",)),
         (("demo", "OUT", "--cameras", 1), ("--cameras must be at least 2, got 1",)),
         (("demo", "OUT", "--seed", -1), ("--seed must be at least 0, got -1",)),

@@ -32,7 +32,7 @@ def test_synth__renders_an_animated_model_with_disturbances(tmp_path: Path, run)
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (("spheres", "--rolling-shutter", 2), "--rolling-shutter must be a number in [0, 1], got 2.0"),
+        (("spheres", "--rolling-shutter", 2), "--rolling-shutter must be at least 0 and at most 1, got 2.0"),
         (("spheres", "--animation", "run"), "--animation is for glTF files, got another scene"),
         (("MODEL", "--animation", "run"), "--animation must be one of 'bend', 'rest' of"),
         (("nowhere.glb",), "nowhere.glb: expected a glTF file, got none; check the path"),

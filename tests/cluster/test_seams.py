@@ -34,7 +34,7 @@ def segment(seed: int, first_id: int = 0) -> list[CodedFrame]:
 
 def faded(ending: list[CodedFrame], beginning: list[CodedFrame], shared_ids: int = COUNT) -> list[CodedFrame]:
     before = reemitted(replace(ending[0], frame=3))
-    found = cross_fade(before, Overlap(ending, beginning, shared_ids, 1.0), CAMERAS, CodecConfig())
+    found = cross_fade(before, Overlap(ending, beginning, shared_ids), CAMERAS, CodecConfig())
     return [coded for _, coded in found]
 
 
@@ -60,7 +60,7 @@ def test_cross_fade__approaches_also_what_is_less_than_a_step_away() -> None:
     means = ending.gaussians.numpy()["means"] + (0.7 * step).astype(np.float32)
     beginning = replace(ending, gaussians=replace(ending.gaussians, means=means))
     before, count = replace(ending, frame=-1), 20
-    found = cross_fade(before, Overlap(count * [ending], count * [beginning], COUNT, 1.0), CAMERAS, config)
+    found = cross_fade(before, Overlap(count * [ending], count * [beginning], COUNT), CAMERAS, config)
     *_, (_, last) = found
     assert np.all(np.abs(last.gaussians.numpy()["means"] - means) < 0.3 * step)
 
@@ -108,13 +108,13 @@ def test_fit_seam_frame__leaves_what_is_static_as_it_is() -> None:
 
 
 def test_fit_config__has_other_seeds_and_rates_for_each_pass() -> None:
-    first, second = (SeamConfig(rates=3).fit_config(CONFIG, number) for number in (0, 1))
+    first, second = (SeamConfig().fit_config(CONFIG, number) for number in (0, 1))
     assert first.seed != second.seed
-    assert first.fit.rates.scales == pytest.approx(3 * CONFIG.fit.rates.scales)
+    assert first.fit.rates.scales == pytest.approx(2 * CONFIG.fit.rates.scales)
 
 
 def test_overlap_config__has_more_epochs_and_the_same_other_settings() -> None:
     given = StreamConfig(fit=FitConfig(epochs=3))
-    found = SeamConfig(overlap_epochs=2).overlap_config(given)
+    found = SeamConfig().overlap_config(given)
     assert found.fit.epochs == 6
     assert replace(found, fit=given.fit) == given

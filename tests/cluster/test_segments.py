@@ -25,7 +25,7 @@ from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.packets import coded_frames, frames_with_lasting_ids, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.config import StreamConfig
-from morgs_mi.fit.config import RefinementConfig
+from morgs_mi.fit.config import ShortFitConfig
 from morgs_mi.recorder import stream_capture
 from morgs_mi.recording import FILES
 from tests.scenes.coded_clip import history
@@ -260,8 +260,8 @@ def test_stream_segments__triangulates_points_where_there_are_few(
 
 def test_stream_segments__refines_cameras_once(capture: Capture, workers: Workers, tmp_path: Path) -> None:
     held_out = load_capture(capture.path, test_view=0)
-    how = RefinementConfig(gaussians=40, steps=4, rounds=1)
-    config = replace(SETTINGS, fit=replace(SETTINGS.fit, refine_cameras="on", refinement=how))
+    how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
+    config = replace(SETTINGS, fit=replace(SETTINGS.fit, refine_cameras="on", short_fits=how))
     fit(held_out, tmp_path / "three", workers, config=config)
     stream, row = StreamReader(tmp_path / "three" / "stream.morgs"), rows_of(tmp_path / "three")[0]
     assert not np.array_equal(stream.cameras[1].viewmat, capture.cameras[1].viewmat)

@@ -181,8 +181,8 @@ def test_decode__refuses_scrambled_code_or_the_packet_after_it() -> None:
             lambda s: residual_packet(s, cloud(3, confidence=False)),
             r"\['logit_confidence'\] .* got .* \[\];",
         ),
-        (lambda s: CodecConfig(quality=0), "`quality` must be positive"),
-        (lambda s: CodecConfig(target_size=-1), "`target_size` must not be negative"),
+        (lambda s: CodecConfig(quality=0), "`quality` must be above 0, got 0"),
+        (lambda s: CodecConfig(target_size=-1), "`target_size` must be at least 0, got -1"),
     ],
 )
 def test_packets__refuse_bad_input(call, message: str) -> None:

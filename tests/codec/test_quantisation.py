@@ -17,6 +17,7 @@ from morgs_mi.codec.packets import (
     reemitted_keyframe,
     residual_packet,
 )
+from morgs_mi.core.attributes import BY_NAME
 from morgs_mi.core.gaussians import Gaussians
 from tests.scenes.coded_clip import CAMERAS, cloud, encoded_clip, history, jittered
 
@@ -34,17 +35,17 @@ def test_residual_packet__errors_stay_within_the_tolerance() -> None:
             a, b = (g.numpy()["means"].astype(float) @ view[:3, :3].T + view[:3, 3] for g in (true, found.gaussians))
             # At most, the errors of three coordinates add up.
             pixels = camera.K[0, 0] * np.abs(a - b)[:, :2] / a[:, 2:]
-            assert pixels.max() < error * config.error_px * np.sqrt(3)
+            assert pixels.max() < error * BY_NAME["means"].error * np.sqrt(3)
         sh = np.abs(true.numpy()["sh_coeffs"] - found.gaussians.numpy()["sh_coeffs"])
-        assert 0.2821 * sh[:, 0].max() < 1.001 * color_error * config.error_color
-        assert sh[:, 1:].max() < 1.001 * error * config.error_color
+        assert 0.2821 * sh[:, 0].max() < 1.001 * color_error * BY_NAME["sh_dc"].error
+        assert sh[:, 1:].max() < 1.001 * error * BY_NAME["sh_dc"].error
         opacity = np.abs(np.asarray(true.opacities) - np.asarray(found.gaussians.opacities))
-        assert opacity.max() < 1.001 * error * config.error_opacity
+        assert opacity.max() < 1.001 * error * BY_NAME["logit_opacities"].error
         q, p = true.numpy()["quats"], found.gaussians.numpy()["quats"]
         cosine = np.abs((q * p).sum(1)) / np.linalg.norm(q, axis=1)
         # The steps are chosen for about 5 px: far below a tenth of a pixel at the ends of an axis.
         assert np.rad2deg(2 * np.arccos(np.minimum(cosine, 1))).max() < 8 * error
-        assert opacity.max() > 0.7 * error * config.error_opacity, "the bound is near"
+        assert opacity.max() > 0.7 * error * BY_NAME["logit_opacities"].error, "the bound is near"
 
 
 def test_codec_config__more_quality_takes_more_bytes_and_has_smaller_errors() -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from morgs_mi.fit import budget
 from morgs_mi.fit.budget import steps_within
-from morgs_mi.fit.config import CrossValidationConfig, FitConfig
+from morgs_mi.fit.config import FitConfig
 from tests.scenes.ball import problem
 
 
@@ -20,7 +20,7 @@ def steps(monkeypatch):
 
     monkeypatch.setattr(budget.time, "perf_counter", lambda: now[0])
     monkeypatch.setattr(budget, "fit_first_frame", fit)
-    return lambda seconds, trials=0, **settings: steps_within(seconds, problem([]), FitConfig(**settings), trials, 0)
+    return lambda seconds, trials=0: steps_within(seconds, problem([]), FitConfig(), trials, 0)
 
 
 def test_steps_within__fill_the_time_that_the_measurement_leaves(steps):
@@ -29,9 +29,8 @@ def test_steps_within__fill_the_time_that_the_measurement_leaves(steps):
 
 
 def test_steps_within__leave_time_for_the_trials(steps):
-    half = CrossValidationConfig(steps=0.5)
-    assert steps(45.4, trials=4, cross_validation=half) == pytest.approx(1000, abs=1)
-    assert steps(30.4, trials=2, cross_validation=half) == pytest.approx(1000, abs=1)
+    assert steps(45.4, trials=5) == pytest.approx(1000, abs=1)  # each has 0.4 times the steps
+    assert steps(27.4, trials=2) == pytest.approx(1000, abs=1)
 
 
 def test_steps_within__are_a_hundred_at_least(steps):

@@ -9,7 +9,7 @@ import pytest
 
 from morgs_mi import RenderConfig
 from morgs_mi.core.progress import Progress
-from morgs_mi.fit.config import CrossValidationConfig, FitConfig
+from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import (
     CrossValidation,
     Trial,
@@ -24,7 +24,7 @@ from tests.scenes.cameras import arc, look_at_cameras
 
 CONFIG = FitConfig(sh_degree=0, first_frame_steps=100, num_gaussians=150)
 # Among four views.
-CHOOSING = dataclasses.replace(CONFIG, cross_validation=CrossValidationConfig(min_views=4))
+CHOOSING = dataclasses.replace(CONFIG, cross_validation_views=4)
 
 
 def validate(images, masks=None, config=CONFIG, report=None, render=None):
@@ -84,15 +84,14 @@ def test_cross_validate__is_the_same_every_time():
     assert first == second
 
 
-def test_cross_validate__judges_reduced_images_with_their_masks():
+def test_cross_validate__judges_reduced_images_with_their_masks(monkeypatch):
     images = bytes_of(images_of(opaque_ball()))
     masks = [np.ones(image.shape[:2], bool) for image in images]
-    how = CrossValidationConfig(candidates=(0.0,), width=images[0].shape[1] // 2)
-    config = dataclasses.replace(CONFIG, cross_validation=how)
-    clean = validate(images, config=config).best
+    monkeypatch.setattr("morgs_mi.fit.cross_validation._WIDTH", images[0].shape[1] // 2)
+    clean = validate(images).best
     for image, mask in zip(images, masks, strict=True):
         image[:10], mask[:10] = 255, False
-    masked, spoiled = validate(images, masks, config).best, validate(images, config=config).best
+    masked, spoiled = validate(images, masks).best, validate(images).best
     assert masked.withheld_psnr == pytest.approx(clean.withheld_psnr, abs=2)
     assert spoiled.withheld_psnr < masked.withheld_psnr - 2
 
@@ -144,19 +143,3 @@ def test_excess_share__grows_by_a_power_of_the_angle_with_few_views(trained: int
 def test_excess_share__ends_where_neighbours_show_something_else():
     assert excess_share(40.0, 80.0, 2) > 0.99
     assert excess_share(40.0, 80.0, 7) > 0.85
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"min_views": 1}, "`min_views` must be at least 2"),
-        ({"candidates": ()}, "rising numbers"),
-        ({"candidates": (0.2, 0.0)}, "rising numbers"),
-        ({"candidates": (0.0, 1.0)}, "rising numbers"),
-        ({"share": 1}, "`share` must be at least 2"),
-        ({"steps": 0.0}, "`steps` must be above 0"),
-    ],
-)
-def test_cross_validation_config__names_bad_values(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        CrossValidationConfig(**arguments)

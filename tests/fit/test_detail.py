@@ -26,22 +26,22 @@ def texture(width: int = 64, height: int = 48, cell: int = 4, amplitude: float =
 
 
 def test_count_details__has_none_in_flat_or_noisy_images():
-    assert count_details(texture(amplitude=0), None, CONFIG) == 0
-    assert count_details(texture(amplitude=0, noise=6), None, CONFIG) < 30
+    assert count_details(texture(amplitude=0), None) == 0
+    assert count_details(texture(amplitude=0, noise=6), None) < 30
 
 
 def test_count_details__counts_the_cells_of_a_texture():
     cells = (64 // 4) * (48 // 4)
     for image in (texture(), texture(noise=6)):
-        assert 0.7 * cells < count_details(image, None, CONFIG) < 1.1 * cells
-    assert count_details(texture(cell=2), None, CONFIG) > 2 * count_details(texture(), None, CONFIG)
+        assert 0.7 * cells < count_details(image, None) < 1.1 * cells
+    assert count_details(texture(cell=2), None) > 2 * count_details(texture(), None)
 
 
 def test_count_details__counts_valid_pixels_only():
     image, mask = texture(), np.zeros((48, 64), bool)
-    assert count_details(image, mask, CONFIG) == 0
+    assert count_details(image, mask) == 0
     mask[:, :32] = True
-    assert count_details(image, mask, CONFIG) == pytest.approx(count_details(image, None, CONFIG) / 2, rel=0.1)
+    assert count_details(image, mask) == pytest.approx(count_details(image, None) / 2, rel=0.1)
 
 
 def count(cameras, image: np.ndarray, points: np.ndarray, config: DetailConfig = CONFIG) -> int | None:
@@ -70,17 +70,3 @@ def test_with_num_gaussians__stays_within_its_limits():
 def test_with_num_gaussians__keeps_a_given_number():
     config = FitConfig(num_gaussians=123)
     assert with_num_gaussians(config, [], POINTS) is config
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"per_detail": 0.0}, "`per_detail` must be positive"),
-        ({"threshold": -1.0}, "`threshold` must be positive"),
-        ({"least_gaussians": 0}, "`least_gaussians` must be 1 to `most_gaussians` = 40000, got 0"),
-        ({"most_gaussians": 10}, "`least_gaussians` must be 1 to `most_gaussians` = 10, got 4000"),
-    ],
-)
-def test_detail_config__names_bad_values(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        DetailConfig(**arguments)

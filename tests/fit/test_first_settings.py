@@ -8,7 +8,7 @@ import pytest
 
 from morgs_mi.core.progress import Progress
 from morgs_mi.fit import first_settings as module
-from morgs_mi.fit.config import CrossValidationConfig, FitConfig
+from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import CrossValidation
 from morgs_mi.fit.first_settings import first_settings
 from morgs_mi.fit.forecast import Forecast
@@ -53,7 +53,7 @@ def test_first_settings__withhold_a_view_of_three_and_more(views: int, expected,
 
 
 def test_first_settings__choose_the_dropping_with_the_best_withheld_views():
-    config = replace(CHOOSING, first_frame_steps=60, cross_validation=CrossValidationConfig(min_views=4))
+    config = replace(CHOOSING, first_frame_steps=60, cross_validation_views=4)
     stages = []
     found = settings(config, report=lambda stage, *_: stages.append(stage))
     assert isinstance(found.expected, CrossValidation)

@@ -16,7 +16,6 @@ from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.objective import ObjectiveConfig
-from morgs_mi.method.rigidity import RigidityConfig
 from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
 
 RENDER, EXTENT = RenderConfig(), 3.0
@@ -100,20 +99,6 @@ def test_fit_later_frame__compares_the_neighbours_of_births_with_their_parents()
     found = fit(before, images_of(truth), config)
     assert len(found.gaussians) > len(before)
     assert np.isfinite(found.losses["rigid"])
-
-
-@pytest.mark.parametrize("setting", [{"neighbours": 3}, {"reach": 0.02}])
-def test_fit_later_frame__every_setting_of_rigidity_acts(setting):
-    before, truth, _ = shifted((0.06, -0.03, 0.02))
-    results = [
-        fit(
-            before,
-            images_of(truth),
-            FitConfig(sh_degree=0, epochs=2, objective=ObjectiveConfig(rigid_weight=4.0, rigidity=r)),
-        )
-        for r in (RigidityConfig(), RigidityConfig(**setting))
-    ]
-    assert results[0].losses["rigid"] != pytest.approx(results[1].losses["rigid"], rel=0.05)
 
 
 def test_initial_motion__continues_with_constant_velocity():

@@ -26,11 +26,11 @@ def large_view(mask: np.ndarray | None = None) -> View:
 
 def test_first_frame_problem__starts_from_the_points_with_the_settings_of_the_fit():
     points = np.random.default_rng(0).uniform(-0.5, 0.5, (300, 3)), np.full((300, 3), 0.25)
-    config = FitConfig(sh_degree=2, num_gaussians=100, initial_opacity=0.4, density=DensityConfig(rounds=1))
+    config = FitConfig(sh_degree=2, num_gaussians=100, density=DensityConfig(rounds=1))
     given = [View(*view) for view in zip(views(), bytes_of(images_of(opaque_ball())), strict=True)]
     found = FirstFrameProblem.of(given, points, config, RenderConfig(), np.random.default_rng(0))
     assert (len(found.start), found.start.sh_degree) == (50, 2)  # half, as it grows to all
-    np.testing.assert_allclose(found.start.opacities, 0.4, rtol=1e-6)
+    np.testing.assert_allclose(found.start.opacities, 0.3, rtol=1e-6)
     assert found.points is points[0]
     assert found.extent == scene_extent(views())
     assert [camera.name for camera in found.cameras] == [camera.name for camera in views()]

@@ -84,7 +84,7 @@ def test_find_active_set__is_empty_without_changes(before):
     assert not np.asarray(fitted.gaussians.motion).any()
 
 
-def test_find_active_set__covers_what_appears_in_front_of_a_static_wall(before):
+def test_find_active_set__covers_what_appears_in_front_of_a_static_wall(before, monkeypatch):
     """The ball is new: no Gaussian is there, and every view sees it before another part of the wall."""
     wall = before.select(np.arange(HIDDEN))
     active = find_active_set(wall, cameras(), changes(wall, before), CHANNELS, RENDER)
@@ -97,26 +97,29 @@ def test_find_active_set__covers_what_appears_in_front_of_a_static_wall(before):
     # With so few views, most of the wall behind is responsible all the same.
     counts = []
     for min_explained in (0.0, 1.0):
-        config = ActiveSetConfig(min_responsibility=0.5, min_explained=min_explained)
+        monkeypatch.setattr("morgs_mi.method.active_set._EXPLAINED", min_explained)
+        config = ActiveSetConfig(min_responsibility=0.5)
         found = find_active_set(wall, cameras(), changes(wall, before), CHANNELS, RENDER, config)
         counts.append(len(found.indices))
     assert counts[0] < counts[1]
 
 
-def test_find_active_set__draws_what_hardly_changed_in_some_views_only(before, after):
+def test_find_active_set__draws_what_hardly_changed_in_some_views_only(before, after, monkeypatch):
     changed = changes(before, after)
 
-    def drawn(**settings):
-        found = find_active_set(before, cameras(), changed, CHANNELS, RENDER, ActiveSetConfig(**settings))
+    def drawn(quiet_views, quiet=0.9):
+        monkeypatch.setattr("morgs_mi.method.active_set._QUIET", quiet)
+        config = ActiveSetConfig(quiet_views=quiet_views)
+        found = find_active_set(before, cameras(), changed, CHANNELS, RENDER, config)
         return found, {view: found.views[view].region.mask for view in range(V)}
 
-    every, everywhere = drawn(quiet_views=V)
-    some, masks = drawn(quiet_views=2, quiet_responsibility=0.9)
+    every, everywhere = drawn(V)
+    some, masks = drawn(2)
     assert np.array_equal(some.indices, every.indices)
     fewer = [view for view in range(V) if masks[view].sum() < everywhere[view].sum()]
     assert len(fewer) == V - 2
     assert all(masks[view][changed[view]].all() for view in range(V))
-    assert drawn(quiet_views=2, quiet_responsibility=0.0)[0].fractions == every.fractions
+    assert drawn(2, 0.0)[0].fractions == every.fractions
 
 
 def test_find_active_set__keeps_what_moved_for_one_more_frame(before):

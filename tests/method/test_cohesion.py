@@ -6,10 +6,11 @@ import numpy as np
 
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.method.cohesion import CohesionConfig, share_confidence
+from morgs_mi.method.cohesion import share_confidence
+from morgs_mi.method.config import MotionConfig
 from tests.scenes.gaussians import isotropic, random_sheet
 
-STILL = -2.0
+STILL, WEIGHT = -2.0, MotionConfig().cohesion_weight
 GREY, RED = (0.5, 0.5, 0.5), (0.7, 0.2, 0.2)
 # The wall has 600 Gaussians, the object 100.
 WALL = np.arange(700) < 600
@@ -29,8 +30,8 @@ def moving(share, seed=1):
     return np.where(~WALL & (rng.random(700) < share), 2.0, STILL).astype(np.float32)
 
 
-def shared(gaussians, logit, config=None):
-    return share_confidence(gaussians, np.arange(700), logit, STILL, config)
+def shared(gaussians, logit, weight=WEIGHT):
+    return share_confidence(gaussians, np.arange(700), logit, STILL, weight)
 
 
 def test_share_confidence__fills_gaps_in_an_object_that_is_separate_in_space():
@@ -57,7 +58,7 @@ def test_share_confidence__is_not_stopped_by_transparent_neighbours():
     ghosts = isotropic(random_sheet(rng, 100, 0.3, 1.0), 0.05, 0.01)
     everything = Gaussians.concatenate([gaussians, ghosts])
     logit = np.concatenate([moving(0.7), np.full(100, STILL, np.float32)])
-    found = share_confidence(everything, np.arange(800), logit, STILL)
+    found = share_confidence(everything, np.arange(800), logit, STILL, WEIGHT)
     assert (found[:700][~WALL] > 0).all()
 
 
@@ -66,13 +67,15 @@ def test_share_confidence__leaves_a_gaussian_unlike_its_neighbours_alone():
     red = isotropic([[0, 0, 0]], 0.05, 0.9, ((np.array([RED]) - 0.5) / SH_C0)[:, None])
     logit = np.full(701, STILL, np.float32)
     logit[-1] = 2.0
-    found = share_confidence(Gaussians.concatenate([wall, red]), np.arange(701), logit, STILL)
+    found = share_confidence(Gaussians.concatenate([wall, red]), np.arange(701), logit, STILL, WEIGHT)
     assert found[-1] > 1.9
 
 
-def test_share_confidence__solves_its_equation():
+def test_share_confidence__solves_its_equation(monkeypatch):
     gaussians = wall_and_object(0.3, RED)
-    few, many = (shared(gaussians, moving(0.5), CohesionConfig(weight=0.2, rounds=rounds)) for rounds in (60, 61))
+    few = shared(gaussians, moving(0.5), 0.2)
+    monkeypatch.setattr("morgs_mi.method.cohesion._ROUNDS", 151)
+    many = shared(gaussians, moving(0.5), 0.2)
     np.testing.assert_allclose(few, many, atol=1e-5)
     means = np.asarray(gaussians.means)
     i = 650
@@ -86,14 +89,14 @@ def test_share_confidence__solves_its_equation():
 
 def test_share_confidence__counts_all_but_the_chosen_as_still():
     gaussians, chosen = wall_and_object(0.0, GREY), np.flatnonzero(~WALL)
-    found = share_confidence(gaussians, chosen, np.full(100, 2.0, np.float32), STILL)
+    found = share_confidence(gaussians, chosen, np.full(100, 2.0, np.float32), STILL, WEIGHT)
     assert found.shape == (100,)
     assert (found < 0).all()
 
 
 def test_share_confidence__returns_the_logits_without_neighbours_or_weight():
     one, logit = isotropic(np.zeros((1, 3)), 0.1, 0.9), np.array([1.5], np.float32)
-    np.testing.assert_array_equal(share_confidence(one, np.arange(1), logit, STILL), logit)
-    alone = shared(wall_and_object(0.0, GREY), moving(0.5), CohesionConfig(weight=0))
+    np.testing.assert_array_equal(share_confidence(one, np.arange(1), logit, STILL, WEIGHT), logit)
+    alone = shared(wall_and_object(0.0, GREY), moving(0.5), 0)
     np.testing.assert_array_equal(alone, moving(0.5))
-    assert not len(share_confidence(one, np.arange(0), logit[:0], STILL))
+    assert not len(share_confidence(one, np.arange(0), logit[:0], STILL, WEIGHT))

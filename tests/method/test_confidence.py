@@ -82,9 +82,8 @@ def test_flow_threshold__follows_width_and_noise():
     [
         (1352, MaskConfig(), 0.5),
         (1352, MaskConfig(floor=0.8), 0.8),
-        (1352, MaskConfig(floor_width=676), 1.0),
+        (676, MaskConfig(floor=0.8), 0.4),
         (160, MaskConfig(), 0.2),
-        (160, MaskConfig(noise_floor=0.3), 0.3),
     ],
 )
 def test_motion_floor__is_that_of_the_config(width, config, floor):

@@ -23,7 +23,7 @@ from morgs_mi.method.objective import (
     observe,
     weights_of,
 )
-from morgs_mi.method.rigidity import RigidityConfig, find_neighbours
+from morgs_mi.method.rigidity import find_neighbours
 from morgs_mi.render.rasterize import Image
 from tests.scenes.gaussians import make_scene, to_gaussians
 
@@ -81,7 +81,7 @@ def test_losses_of__every_term_acts_where_its_inputs_exist_and_has_a_gradient():
         "motion": mi.TensorXf(np.zeros((H, W, 2), np.float32)),
         "reliable": mi.TensorXf(np.ones((H, W), np.float32)),
         "mask": mi.TensorXf(np.zeros((H, W), np.float32)),
-        "neighbours": find_neighbours(before, 2.0, RigidityConfig()),
+        "neighbours": find_neighbours(before, 2.0),
     }
     assert losses_of(prediction, {"target": observations["target"]}, ObjectiveConfig()).keys() == {"recon", "offset"}
     assert losses_of(prediction, observations, ObjectiveConfig()).keys() == {*NAMES[:4]}, "the others are off"
@@ -105,5 +105,5 @@ def test_weights_of__are_those_of_the_settings():
         "rotation": 0,
         "isometry": 0,
     }
-    with pytest.raises(ValueError, match=r"`flow_weight` must be a number in \[0, inf\), got -1"):
+    with pytest.raises(ValueError, match="`flow_weight` must be at least 0, got -1"):
         ObjectiveConfig(flow_weight=-1)

@@ -10,7 +10,7 @@ import pytest
 from morgs_mi import SH_C0
 from morgs_mi.losses.ssim import Target
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
-from morgs_mi.method.photometric import PhotometricConfig, mean_color_error, refine_displacement
+from morgs_mi.method.photometric import mean_color_error, refine_displacement
 from morgs_mi.render.active_view import ActiveView
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
@@ -49,8 +49,8 @@ def start(factor):
     return MotionStart(displacement, np.full(len(displacement), 1.0, np.float32))
 
 
-def refined_from(scene, start, config=None):
-    return refine_displacement(MotionProblem(*scene, np.random.default_rng(0)), start, config)
+def refined_from(scene, start):
+    return refine_displacement(MotionProblem(*scene, np.random.default_rng(0)), start)
 
 
 def errors(lift):
@@ -70,10 +70,10 @@ def test_refine_displacement__keeps_true_motion(scene):
     assert np.median(errors(refined_from(scene, start(1.0)))) < 0.01
 
 
-def test_refine_displacement__takes_no_step_longer_than_the_limit(scene):
+def test_refine_displacement__takes_no_step_longer_than_the_limit(scene, monkeypatch):
     before, views, _ = scene
-    config = PhotometricConfig(rounds=1, max_step_px=0.1)
-    step = refined_from(scene, start(0.6), config).displacement - start(0.6).displacement
+    monkeypatch.setattr("morgs_mi.method.photometric._LONGEST_PX", 0.1)
+    step = refined_from(scene, start(0.6)).displacement - start(0.6).displacement
     px = [view.camera.projection_jacobian(np.asarray(before.means)) @ step[..., None] for view in views.values()]
     assert 0.05 < np.linalg.norm(px, axis=2).max() < 0.11
 
@@ -105,9 +105,3 @@ def test_mean_color_error__trusts_few_pixels_less(scene):
 
 def test_mean_color_error__is_zero_without_views(scene):
     assert not mean_color_error(scene[0], {}, {}).any()
-
-
-@pytest.mark.parametrize("settings", [{"rounds": -1}, {"neighbours": 0}])
-def test_PhotometricConfig__refuses_numbers_out_of_range(settings):
-    with pytest.raises(ValueError, match=f"`{next(iter(settings))}` must be at least"):
-        PhotometricConfig(**settings)

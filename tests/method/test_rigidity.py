@@ -11,16 +11,16 @@ from scipy.spatial.transform import Rotation
 
 from morgs_mi import Gaussians
 from morgs_mi.core.geometry import rotated, unit_quats
-from morgs_mi.method.rigidity import RigidityConfig, find_neighbours, isometry_loss, rigid_loss, rotation_loss
+from morgs_mi.method.rigidity import find_neighbours, isometry_loss, rigid_loss, rotation_loss
 from tests.scenes.gaussians import make_wide_scene, to_gaussians
 
 LOSSES = {"rigid": rigid_loss, "rotation": rotation_loss, "isometry": isometry_loss}
-CONFIG, EXTENT = RigidityConfig(neighbours=5, reach=0.3), 2.0
+COUNT, REACH, EXTENT = 5, 0.3, 2.0
 BEFORE = make_wide_scene(40)
 
 
 def neighbours():
-    found = find_neighbours(to_gaussians(BEFORE), EXTENT, CONFIG)
+    found = find_neighbours(to_gaussians(BEFORE), EXTENT, COUNT, REACH)
     assert found is not None
     return found
 
@@ -40,9 +40,9 @@ def reference(gaussians: Gaussians) -> dict[str, float]:
     sums, count = dict.fromkeys(LOSSES, 0.0), 0
     turns = (q_new * q_old.inv()).as_quat(scalar_first=True)
     for i in range(len(old)):
-        for j in np.argsort(np.linalg.norm(old - old[i], axis=1))[1 : 1 + CONFIG.neighbours]:
+        for j in np.argsort(np.linalg.norm(old - old[i], axis=1))[1 : 1 + COUNT]:
             e, e_now = old[j] - old[i], new[j] - new[i]
-            w, turn = np.exp(-(e @ e) / CONFIG.reach**2), Rotation.from_quat(turns[i], scalar_first=True)
+            w, turn = np.exp(-(e @ e) / REACH**2), Rotation.from_quat(turns[i], scalar_first=True)
             sums["rigid"] += w * np.linalg.norm(e_now - turn.apply(e))
             # A quaternion and its negative are one rotation; small changes keep the sign of both factors.
             sums["rotation"] += w * min(np.linalg.norm(turns[j] - s * turns[i]) for s in (1, -1))
@@ -97,18 +97,9 @@ def test_find_neighbours__weighs_near_ones_more():
     found = neighbours()
     lengths = np.asarray(dr.norm(found.edges))
     weights = np.asarray(found.weights) * len(lengths)
-    assert weights == pytest.approx(np.exp(-((lengths / CONFIG.reach) ** 2)), rel=1e-4)
+    assert weights == pytest.approx(np.exp(-((lengths / REACH) ** 2)), rel=1e-4)
     assert np.asarray(found.difference @ np.ones(40)) == pytest.approx(np.zeros(200), abs=0)
 
 
 def test_find_neighbours__has_none_for_a_single_gaussian():
-    assert find_neighbours(to_gaussians(BEFORE).select(np.array([3])), EXTENT, CONFIG) is None
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [({"neighbours": 0}, "`neighbours` must be at least 1, got 0"), ({"reach": 0.0}, "`reach` must be a number in")],
-)
-def test_RigidityConfig__refuses_what_is_out_of_range(given, message):
-    with pytest.raises(ValueError, match=message):
-        RigidityConfig(**given)
+    assert find_neighbours(to_gaussians(BEFORE).select(np.array([3])), EXTENT) is None

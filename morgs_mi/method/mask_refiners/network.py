@@ -22,7 +22,7 @@ import numpy as np
 
 from morgs_mi.core.documentation import page
 from morgs_mi.io.onnx_file import OnnxNetwork, imagenet_blob, written_shapes
-from morgs_mi.method.mask_refiners.config import MaskConfig, PromptConfig
+from morgs_mi.method.mask_refiners.config import MaskConfig
 from morgs_mi.method.mask_refiners.opencv import clean_mask
 from morgs_mi.method.mask_refiners.registry import MASK_REFINERS, MaskRefiner
 
@@ -43,7 +43,7 @@ class SegmentNetwork:
     Args:
         encoder: the image encoder's ONNX file.
         decoder: the mask decoder's ONNX file.
-        config: settings of the prompts; None: the defaults.
+        count: largest connected components that become prompts.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -51,8 +51,8 @@ class SegmentNetwork:
             those of the module's docstring.
     """
 
-    def __init__(self, encoder: str | Path, decoder: str | Path, config: PromptConfig | None = None) -> None:
-        self._config = config or PromptConfig()
+    def __init__(self, encoder: str | Path, decoder: str | Path, count: int = MaskConfig.prompts) -> None:
+        self._count = count
         self._encoder, self._decoder = OnnxNetwork(encoder), OnnxNetwork(decoder)
         shapes = list(self._encoder.inputs.values())
         if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][1] != 3:
@@ -82,7 +82,7 @@ class SegmentNetwork:
             ValueError: the decoder cannot run on the encoder's outputs, or its results are not those of SAM2.
         """
         objects = np.zeros(mask.shape, bool)
-        components = _components(mask, self._config.objects)
+        components = _components(mask, self._count)
         if not components:
             return objects
         features = self._encoder.run({next(iter(self._encoder.inputs)): imagenet_blob(image, *self._size)})
@@ -93,7 +93,7 @@ class SegmentNetwork:
     def _segment(self, features: Mapping[str, np.ndarray], component: np.ndarray) -> np.ndarray:
         """Return the object [H, W] under one component: the decoder's mask with the highest predicted IoU."""
         (height, width), (across, down) = component.shape, self._size
-        points, labels = prompts(component, self._config)
+        points, labels = prompts(component)
         # The decoder adds half a pixel: its pixel centres have whole coordinates.
         scaled = points * np.array((across / width, down / height), np.float32) - np.float32(0.5)
         quarter = down // _MASK_SHRINK, across // _MASK_SHRINK
@@ -117,27 +117,27 @@ class SegmentNetwork:
         return cv2.resize(logits, (width, height), interpolation=cv2.INTER_LINEAR) > 0
 
 
-def prompts(component: np.ndarray, config: PromptConfig | None = None) -> tuple[np.ndarray, np.ndarray]:
+def prompts(component: np.ndarray, count: int = 3, spacing: float = 0.25) -> tuple[np.ndarray, np.ndarray]:
     """Return SAM2's prompt for the object under a connected component: its box and a few points deep inside it.
 
-    Each point is the deepest one at least `PromptConfig.spacing` times the box's longer side from the others.
+    Each point is the deepest one that is not too near to the others.
 
     Args:
         component: [H, W] bool, not empty.
-        config: number and spacing of the points; None: the defaults.
+        count: most points.
+        spacing: least distance between them, in longer sides of the box.
 
     Returns:
         Coordinates [P, 2] in pixels of the image, float32, pixel centres at +0.5, and labels [P], float32; first the
         box's corners, then the points.
     """
-    config = config or PromptConfig()
     rows, columns = np.flatnonzero(component.any(1)), np.flatnonzero(component.any(0))
     upper_left, lower_right = (columns[0], rows[0]), (columns[-1] + 1, rows[-1] + 1)
     depth = cv2.distanceTransform(np.pad(component, 1).astype(np.uint8), cv2.DIST_L2, 5)[1:-1, 1:-1]
-    apart = max(np.subtract(lower_right, upper_left)) * config.spacing
+    apart = max(np.subtract(lower_right, upper_left)) * spacing
     y, x = np.mgrid[: component.shape[0], : component.shape[1]]
     points = []
-    while len(points) < config.points and depth.any():
+    while len(points) < count and depth.any():
         row, column = np.unravel_index(np.argmax(depth), depth.shape)
         points.append((column + 0.5, row + 0.5))
         depth = np.where(np.hypot(x - column, y - row) < apart, 0, depth)
@@ -160,4 +160,4 @@ def _make(files: str, config: MaskConfig) -> MaskRefiner:
             f"mask_refiner(): `mask_method` must be sam2:ENCODER.onnx,DECODER.onnx, got {'sam2:' + files!r}."
         )
     network = SegmentNetwork(encoder, decoder, config.prompts)
-    return lambda image, mask: mask | network(image, clean_mask(mask, config))
+    return lambda image, mask: mask | network(image, clean_mask(mask))

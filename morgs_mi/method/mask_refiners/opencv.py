@@ -10,6 +10,19 @@ from morgs_mi.method.mask_refiners.registry import MASK_REFINERS, MaskRefiner
 
 __all__ = ["clean_mask", "refine_mask", "vote_superpixels"]
 
+# Radius in pixels of the opening that removes specks.
+_OPENING = 1
+# Radius of the closing that fills holes, in widths of the mask; at least a pixel.
+_CLOSING = 0.005
+# Iterations of GrabCut.
+_ITERATIONS = 2
+# Distance from the flow mask within which GrabCut may add pixels, in longer sides of the image.
+_REACH = 0.05
+# Share of the image above which GrabCut is skipped: what is left has too few colours to learn from.
+_COVERAGE = 0.9
+# Side of a superpixel in pixels of the reduced image, iterations of SLIC, and its weight of distance against colour.
+_SIDE, _SLIC_ITERATIONS, _COMPACTNESS = 8, 5, 10.0
+
 
 def refine_mask(image: np.ndarray, mask: np.ndarray, config: MaskConfig | None = None) -> np.ndarray:
     """Return the mask of the objects [H, W] bool that a motion mask lies on, by GrabCut on colours.
@@ -29,17 +42,17 @@ def refine_mask(image: np.ndarray, mask: np.ndarray, config: MaskConfig | None =
     if image.shape != (*mask.shape, 3):
         raise ValueError(f"refine_mask(): `image` must be [H, W, 3] with H, W = {mask.shape}, got {image.shape}.")
     config = config or MaskConfig()
-    clean = clean_mask(mask, config)
+    clean = clean_mask(mask)
     small = _reduced(image, config.working_width)
     seed = cv2.resize(clean.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST)
-    near = cv2.dilate(seed, _disc(int(max(seed.shape) * config.grabcut_reach)))
-    if not seed.any() or near.all() or seed.mean() > config.grabcut_coverage:
+    near = cv2.dilate(seed, _disc(int(max(seed.shape) * _REACH)))
+    if not seed.any() or near.all() or seed.mean() > _COVERAGE:
         return clean
     labels = np.where(near > 0, np.where(seed > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD).astype(np.uint8)
     cv2.setRNGSeed(0)  # GrabCut's k-means starts at random
     models = np.zeros((1, 65)), np.zeros((1, 65))
-    labels, _, _ = cv2.grabCut(small, labels, (0, 0, 0, 0), *models, config.grabcut_iterations, cv2.GC_INIT_WITH_MASK)
-    return clean_mask(_enlarged(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)), mask.shape), config)
+    labels, _, _ = cv2.grabCut(small, labels, (0, 0, 0, 0), *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    return clean_mask(_enlarged(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)), mask.shape))
 
 
 def vote_superpixels(image: np.ndarray, mask: np.ndarray, config: MaskConfig | None = None) -> np.ndarray:
@@ -61,13 +74,11 @@ def vote_superpixels(image: np.ndarray, mask: np.ndarray, config: MaskConfig | N
         raise ValueError(f"vote_superpixels(): `image` must be [H, W, 3] with H, W = {mask.shape}, got {image.shape}.")
     config = config or MaskConfig()
     small = _reduced(image, config.working_width)
-    if min(small.shape[:2]) < 2 * config.superpixel_side:
+    if min(small.shape[:2]) < 2 * _SIDE:
         return mask
     lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
-    slic = cv2.ximgproc.createSuperpixelSLIC(
-        lab, cv2.ximgproc.SLIC, config.superpixel_side, config.superpixel_compactness
-    )
-    slic.iterate(config.superpixel_iterations)
+    slic = cv2.ximgproc.createSuperpixelSLIC(lab, cv2.ximgproc.SLIC, _SIDE, _COMPACTNESS)
+    slic.iterate(_SLIC_ITERATIONS)
     slic.enforceLabelConnectivity()
     labels = np.asarray(slic.getLabels(), np.int32)
     votes = cv2.resize(mask.astype(np.float32), labels.shape[::-1], interpolation=cv2.INTER_AREA)
@@ -75,16 +86,14 @@ def vote_superpixels(image: np.ndarray, mask: np.ndarray, config: MaskConfig | N
     return _enlarged(shares[labels] >= config.superpixel_share, mask.shape)
 
 
-def clean_mask(mask: np.ndarray, config: MaskConfig | None = None) -> np.ndarray:
+def clean_mask(mask: np.ndarray) -> np.ndarray:
     """Return a mask [H, W] bool with its specks removed and its holes closed.
 
     Args:
         mask: [H, W] bool.
-        config: radii of the opening and the closing; None: the defaults.
     """
-    config = config or MaskConfig()
-    opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, _disc(config.opening))
-    return cv2.morphologyEx(opened, cv2.MORPH_CLOSE, _disc(max(1, int(mask.shape[1] * config.closing)))) > 0
+    opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, _disc(_OPENING))
+    return cv2.morphologyEx(opened, cv2.MORPH_CLOSE, _disc(max(1, int(mask.shape[1] * _CLOSING)))) > 0
 
 
 @MASK_REFINERS.register("grabcut")

@@ -87,19 +87,11 @@ def test_optical_flow__rejects_bad_input(arguments, message):
         optical_flow(*arguments)
 
 
-@pytest.mark.parametrize(
-    ("method", "settings"),
-    [
-        ("dis", {"fine_width": 64}),
-        ("dis-fine", {"min_side": 145}),
-    ],
-)
-def test_flow_config__settings_of_a_method_act(method, settings):
+def test_flow_source__passes_its_config_to_the_method():
     previous, image, _ = moving_disc(144, 200, shift=(6, 1))
-    flow = optical_flow(image, previous, method)
-    changed = optical_flow(image, previous, method, FlowConfig(**settings))
+    flow, changed = (optical_flow(image, previous, config=FlowConfig(fine_width=width)) for width in (480, 64))
     assert not np.array_equal(flow, changed)
-    source_flow, _ = flow_source(method, FlowConfig(**settings))(FramePair(image, previous))
+    source_flow, _ = flow_source("dis", FlowConfig(fine_width=64))(FramePair(image, previous))
     np.testing.assert_array_equal(source_flow, changed)
 
 
@@ -112,22 +104,11 @@ def test_flow_config__fine_width_selects_the_finest_level_of_dis():
     np.testing.assert_array_equal(half, method.calc(*gray, None))
 
 
-def test_flow_config__min_side_is_the_least_side_with_flow():
+@pytest.mark.parametrize(("least", "is_any"), [(64, True), (65, False)])
+def test_optical_flow__is_zero_in_images_below_a_least_side(monkeypatch, least, is_any):
     previous, image, _ = moving_disc(64, 96, shift=(6, 1))
-    assert optical_flow(image, previous, config=FlowConfig(min_side=64)).any()
-    assert not optical_flow(image, previous, config=FlowConfig(min_side=65)).any()
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"min_side": 15}, "`min_side` must be at least 16, got 15"),
-        ({"consistency_absolute": float("nan")}, "`consistency_absolute` must be at least 0, got nan"),
-    ],
-)
-def test_flow_config__rejects_numbers_out_of_range(settings, message):
-    with pytest.raises(ValueError, match=message):
-        FlowConfig(**settings)
+    monkeypatch.setattr("morgs_mi.method.flow_sources.opencv._MIN_SIDE", least)
+    assert optical_flow(image, previous).any() == is_any
 
 
 def test_both_directions__computes_flow_inside_the_box_alone():

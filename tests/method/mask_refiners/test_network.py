@@ -7,7 +7,7 @@ import pytest
 
 from morgs_mi.evaluate.metrics import iou
 from morgs_mi.method.confidence import motion_mask
-from morgs_mi.method.mask_refiners.config import MaskConfig, PromptConfig
+from morgs_mi.method.mask_refiners.config import MaskConfig
 from morgs_mi.method.mask_refiners.network import SegmentNetwork, prompts
 from morgs_mi.method.mask_refiners.registry import mask_refiner
 from tests.method.mask_refiners.tiny_segmenter import export_decoder, export_encoder
@@ -162,27 +162,21 @@ def test_segment_network__rejects_masks_that_are_not_finite(tmp_path, files):
         SegmentNetwork(files[0], export_decoder(tmp_path / "decoder.onnx", scale=float("inf")))(image, disc)
 
 
-def test_prompt_config__limits_points_and_their_spacing():
+def test_prompts__limits_points_and_their_spacing():
     component = np.ones((10, 100), bool)
-    assert len(prompts(component, PromptConfig(points=2))[0]) == 2 + 2
-    points = prompts(component, PromptConfig(points=9, spacing=0.4))[0][2:]
+    assert len(prompts(component, count=2)[0]) == 2 + 2
+    points = prompts(component, count=9, spacing=0.4)[0][2:]
     distances = np.linalg.norm(points[:, None] - points, axis=-1)[np.triu_indices(len(points), 1)]
     assert len(points) == 3
     assert distances.min() >= 0.4 * 100
 
 
-def test_prompt_config__limits_objects_to_the_largest(files):
+def test_mask_config__limits_prompts_to_the_largest(files):
     image, (small, large) = discs(240, 320, (60, 60), (220, 120))
     hole = np.zeros((240, 320), bool)
     hole[55:65, 55:65] = hole[115:122, 215:222] = True
     mask = (small | large) & ~hole
-    config = MaskConfig(prompts=PromptConfig(objects=1))
+    config = MaskConfig(prompts=1)
     for found, filled in ((mask_refiner(f"sam2:{files[0]},{files[1]}", config), large), (SegmentNetwork(*files), hole)):
         assert found(image, mask)[hole & filled].mean() > 0.9
     assert not mask_refiner(f"sam2:{files[0]},{files[1]}", config)(image, mask)[hole & small].any()
-
-
-@pytest.mark.parametrize("name", ["objects", "points"])
-def test_prompt_config__rejects_numbers_out_of_range(name):
-    with pytest.raises(ValueError, match=rf"PromptConfig\(\): `{name}` must be at least 1, got 0"):
-        PromptConfig(**{name: 0})
