@@ -2,8 +2,8 @@
 
     python -m benchmarks.reports.drift --json out.json
 
-The clips are `morgs-mi synth arm` and random scenes that no setting was chosen on. Scores are those of the held-out
-view against the exact ground truth.
+The clips are `morgs-mi synth arm` and random scenes that no setting was chosen on. Scores are of the held-out
+view, against the exact ground truth.
 """
 
 from __future__ import annotations

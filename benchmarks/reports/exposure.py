@@ -1,11 +1,11 @@
-"""Cameras whose exposures differ and change: what they cost, and what estimating them in the fit brings back.
+"""Exposures that differ and change: their cost, and the gain by estimating them in the fit.
 
     python -m benchmarks.reports.exposure --seeds 3 4 --json out.json
 
-Each scene is `morgs-mi synth random --seed SEED`, recorded twice: by equal cameras, and by cameras whose exposures
-differ, drift and vary from frame to frame. Both are fitted with `fit.exposure` off and auto. Scores are means over all
-frames of the held-out view, whose exposure is as it should be: as recorded, and after the gain and bias per channel
-that fit best, because only differences between cameras are known.
+Each scene is `morgs-mi synth random --seed SEED`, recorded twice: by equal cameras, and by cameras with exposures that
+differ, drift and vary from frame to frame. Both are fitted with `fit.exposure` off and auto. The exposure of the
+held-out view is right. Scores are means over all its frames: as recorded, and after the gain and bias per channel that
+fit best, because only differences between cameras are known.
 """
 
 from __future__ import annotations

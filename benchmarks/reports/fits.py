@@ -1,4 +1,4 @@
-"""What the reports on fits share: clips of synthetic scenes, loops over a capture's views, and their fits."""
+"""Shared by the reports on fits: clips of synthetic scenes, loops over a capture's views, and their fits."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@
 
 The motion of a flow is compared as the loop uses it: both directions of two successive images, with the sign that
 points from t - 1 to t on frame t's grid, and with the forward-backward check. All methods run in turn on each pair of
-images, so that background load affects them equally. The first pair of the clip is run once before, as warm-up.
+images: background load affects them equally. The first pair of the clip is run once before, as warm-up.
 
 A clip of the JSON has one row per method: the median time of both directions of a pair in `ms`, and, for `all` and for
 the `moving` pixels, the mean endpoint `error` in px, the share `within_1px`, and the share and the error of the
@@ -158,7 +158,7 @@ def _pairs(capture: Capture, views: Sequence[int]) -> Iterator[tuple[FramePair, 
 
 
 def _errors(motion: np.ndarray, reliable: np.ndarray, truth: GroundTruth) -> dict[str, dict[str, float]]:
-    """Return sums over the pixels of one image, by subset, so that images can be added up."""
+    """Return sums over the pixels of one image, by subset."""
     error = np.linalg.norm(motion.astype(np.float64) - truth.motion, axis=-1)
     figures = {}
     for name, subset in (("all", np.ones_like(truth.mask)), ("moving", truth.mask)):
@@ -173,7 +173,7 @@ def _errors(motion: np.ndarray, reliable: np.ndarray, truth: GroundTruth) -> dic
 
 
 def _row(method: str, pairs: Sequence[Row]) -> dict[str, Any]:
-    """Return the errors and the time of a method from those of its pairs."""
+    """Return the errors and the time of a method, given the sums of its pairs."""
     row: dict[str, Any] = {"method": method, "ms": round(float(np.median([pair["ms"] for pair in pairs])), 2)}
     for subset in ("all", "moving"):
         total = {name: sum(pair[subset][name] for pair in pairs) for name in pairs[0][subset]}

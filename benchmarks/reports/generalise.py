@@ -23,9 +23,9 @@ from morgs_mi.fit.dropping import dropping_by_noise
 
 _WITHOUT, _CHOSEN = {"variant": "without"}, {"variant": "chosen"}
 COLUMNS = (
-    Column("Gaussians", lambda _: "", unit=lambda fit: f"{fit['gaussians']:,}", only=_CHOSEN),  # of the first fit
+    Column("Gaussians", "gaussians", 0, spread=False, only=_CHOSEN),
     Column("p = 0", "held_out", unit=" dB", only=_WITHOUT),
-    Column("chosen p", lambda fit: f"{fit['dropping']:g}", only=_CHOSEN),
+    Column("chosen p", "dropping", only=_CHOSEN),
     Column("with it", "held_out", unit=" dB", only=_CHOSEN),
 )
 

@@ -2,10 +2,9 @@
 
     python -m benchmarks.reports.live --fit-seeds 0 1 2 --json out.json
 
-A live fit is that of a recording of the frames that it takes, so that frames of a clip are left out here in place of a
-race with a clock. After the first frame, during whose fit many frames are dropped, the fit continues with the next
-frame or after a gap. Scores are those of the held-out view, against the exact ground truth, at the instants that all
-fits have.
+A live fit equals the fit of a recording of the frames that it takes. Frames of a clip are left out here, in place of a
+race with a clock. Many frames are dropped during the fit of the first one: the fit continues with the next frame or
+after a gap. Scores are of the held-out view, against the exact ground truth, at the instants that all fits have.
 """
 
 from __future__ import annotations

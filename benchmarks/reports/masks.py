@@ -26,7 +26,7 @@ import numpy as np
 import tyro
 
 from benchmarks.reports.fits import new_loop
-from benchmarks.reports.plots import Column, grouped, markdown
+from benchmarks.reports.plots import Column, scores_table
 from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
 from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.capture.capture import load_capture
@@ -45,7 +45,7 @@ from morgs_mi.render.config import RenderConfig
 from morgs_mi.stream_loop import StreamLoop
 from morgs_mi.synth.ground_truth import load_truth
 
-_COLUMNS = Column("IoU", "iou"), Column("PSNR", "psnr_moving", unit=" dB")
+_COLUMNS = Column("IoU", "iou"), Column("PSNR where things move, dB", "psnr_moving")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +61,7 @@ class Options(StudyOptions):
     gaussians: int = 10_000
     """Gaussians of the first frame."""
     loops: tuple[str, ...] = ("grabcut", "superpixels+grabcut")
-    """Methods with whose masks later frames are fitted; a minute each."""
+    """Methods of the masks that later frames are fitted with; a minute each."""
 
     def study(self) -> Study:
         """Return the study of the captures."""
@@ -195,18 +195,14 @@ def measure(source: Source, loops: Sequence[str], config: StreamConfig) -> dict[
 
 
 def loops_table(clips: Sequence[Row]) -> str:
-    """Return the held-out IoU and PSNR of the later frames in Markdown: mean and spread of each clip's fits."""
+    """Return the held-out IoU and PSNR of the later frames of each clip in Markdown."""
     rows = [
         {**fit["held_out"], "clip": clip["name"], "how": f"{label}, `{method}`"}
         for start, label in (("lifted", "lifted"), ("as before", "as in the paper"))
         for clip in clips
         for method, fit in clip["loops"][start].items()
     ]
-    names, table = list(dict.fromkeys(row["clip"] for row in rows)), []
-    for (how,), own in grouped(rows, "how").items():
-        cells = ([column.of([row for row in own if row["clip"] == name]) for column in _COLUMNS] for name in names)
-        table.append((how, *map(", ".join, cells)))
-    return markdown(("start, masks", *(f"`{name}`" for name in names)), table)
+    return scores_table(rows, {"start, masks": "how", "clip": "clip"}, _COLUMNS, left=2)
 
 
 if __name__ == "__main__":

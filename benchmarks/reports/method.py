@@ -61,7 +61,7 @@ _IMAGES = ("psnr", "psnr_moving", "psnr_still", "ssim")
 class Options(OnWorkers):
     """Measure the method's parts, key views, and quality over run time, with several seeds.
 
-    Results stored in OUT are reused, so that an interrupted report continues.
+    Results stored in OUT are reused: an interrupted report continues.
     """
 
     captures: Positional[tuple[Path, ...]]
@@ -217,7 +217,7 @@ def fitted(
 def aggregate(rows: Sequence[Row], variants: Sequence[Variant]) -> list[dict[str, Any]]:
     """Return one row per variant: mean and standard deviation of every score over the seeds.
 
-    `best` are the rates whose first run has the best mean PSNR for their preset, epochs and key views.
+    `best` marks the rates of the first run with the best mean PSNR for their preset, epochs and key views.
     """
     keys = [variant.keys for variant in variants]
     groups = [own for own in grouped(rows, *_SETTING).values() if _setting(own[0]) in keys]

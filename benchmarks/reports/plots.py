@@ -32,10 +32,10 @@ class Column(NamedTuple):
 
     Attributes:
         title: head of the column.
-        score: name of the score, or a function of a row. Texts are listed instead of averaged.
+        score: name of the score, or a function of a row.
         decimals: number of decimals.
         factor: factor on the score.
-        unit: text after the figure, or a function of a row.
+        unit: text after the figure.
         spread: whether the standard deviation follows the mean.
         only: keys and values of the rows that count; None: all.
     """
@@ -44,7 +44,7 @@ class Column(NamedTuple):
     score: str | Callable[[Mapping[str, Any]], Any]
     decimals: int = 2
     factor: float = 1
-    unit: str | Callable[[Mapping[str, Any]], str] = ""
+    unit: str = ""
     spread: bool = True
     only: Mapping[str, Any] | None = None
 
@@ -52,12 +52,9 @@ class Column(NamedTuple):
         """Return the figure of some rows."""
         rows = [row for row in rows if self.only is None or self.only.items() <= row.items()]
         values = [self.score(row) if callable(self.score) else row[self.score] for row in rows]
-        unit = self.unit(rows[0]) if callable(self.unit) else self.unit
-        if isinstance(values[0], str):
-            return ", ".join(dict.fromkeys(values)) + unit
         values = [self.factor * float("nan" if value is None else value) for value in values]
         found = plus_minus(values, self.decimals) if self.spread else figure(float(np.mean(values)), self.decimals)
-        return found + unit
+        return found + self.unit
 
 
 def scores_table(

@@ -3,7 +3,7 @@
     python -m benchmarks.reports renderer --json out.json --plot out.png
 
 One scene, one setting changed at a time. The *exact* image has no cut-offs and no early stop. The *rounding* error
-compares with a reference that has the same `alpha_min`, so that only float32 and the early stop remain. Errors are
+compares with a reference that has the same `alpha_min`: only float32 and the early stop remain. Errors are
 measured on a sample of pixels: the loss whose gradients are compared has random weights at these pixels and zero
 weights elsewhere. So the renderer runs unchanged while the reference stays affordable.
 

@@ -116,7 +116,7 @@ class Study:
         return [{**keys[name], **row} for name, rows in results.items() for row in rows]
 
     def stored_file(self, store: Path, args: tuple[Any, ...]) -> Path:
-        """Return the file of a cell's scores; its name follows from everything that the scores depend on."""
+        """Return the file of a cell's scores. Its name has a digest of all that the scores depend on."""
         files = [state for value in args if (path := getattr(value, "path", None)) for state in _files(Path(path))]
         name = f"{self.measure.__module__}.{self.measure.__qualname__}"
         parts = self.version or method_version(), name, args, files

@@ -5,7 +5,7 @@
 Each scene is `morgs-mi synth random --seed SEED`, recorded three times: by cameras of one clock, by cameras that are up
 to `--time-offset` frames apart, and by cameras with a rolling shutter. The second clip is fitted as it is and with the
 offsets that are found, the third as if its shutter were global and with its readout, all over the same instants as the
-first. Scores are means over the later frames of the held-out view, whose clock is the reference.
+first. Scores are means over the later frames of the held-out view. Its clock is the reference.
 """
 
 from __future__ import annotations

@@ -36,6 +36,7 @@ from morgs_mi.config import StreamConfig
 from morgs_mi.fit.config import FitConfig
 from morgs_mi.render.config import RenderConfig
 from tests.benchmarks.reports.here import Here
+from tests.benchmarks.reports.pages import ROOT
 from tests.scenes.animated_gltf import write_glb
 
 TINY = StreamConfig(
@@ -154,6 +155,17 @@ def test_rounded__has_five_digits_of_what_is_no_integer():
         "b": "x",
         "c": float("inf"),
     }
+
+
+def test_study_options__have_tables_of_the_committed_results():
+    names = {masks: ("masks", "masks_fresh"), drift: ("drift", "drift_fresh"), cameras: ("cameras", "cameras_true")}
+    for report in STUDIES:
+        needed = {masks: {"captures": ()}, disturbances: {"model": Path()}}.get(report, {})
+        for name in names.get(report, (report.__name__.rpartition(".")[2],)):
+            text = (ROOT / "benchmarks" / "results" / f"{name}.json").read_text(encoding="utf-8")
+            table = report.Options(**needed).table(json.loads(text)["fits"])
+            assert table.count("\n") > 2, name
+            assert "nan" not in table or name == "cameras_true", name  # nothing is lost there
 
 
 @pytest.mark.slow
