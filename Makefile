@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-WEB_PLAYER ?= morgs_mi/export/web_player
+WEB_PLAYER ?= morgs_mi/playback/export/web_player
 STAMP := $(VENV)/.installed
 
 .PHONY: demo test test-slow test-long lint docs web setup clean

@@ -20,11 +20,11 @@ import morgs_mi
 from morgs_mi.codec.packets import CodedFrame
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians, displaced
-from morgs_mi.demo import DemoConfig
+from morgs_mi.loop.observation import FrameObservation, observe_frame
 from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.lift import lift_flow
-from morgs_mi.observation import FrameObservation, observe_frame
 from morgs_mi.playback.visualise import confidence_image, grey_image, motion_image, to_uint8
+from morgs_mi.runs.demo import DemoConfig
 from morgs_mi.stream_loop import StreamLoop
 from morgs_mi.synth.synthesize import synthesize
 

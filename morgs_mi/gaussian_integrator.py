@@ -38,11 +38,11 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians, tensor_rows
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, Tensor, UInt32
+from morgs_mi.plugins.composite import composite, cropped
+from morgs_mi.plugins.surface_view import SampledPixels, SurfaceView
 from morgs_mi.render.channels import attribute_channels, exr_names
+from morgs_mi.render.kernel_recording import render_lock
 from morgs_mi.render.rasterize import rasterize
-from morgs_mi.render.recording import render_lock
-from morgs_mi.surfaces.composite import composite, cropped
-from morgs_mi.surfaces.surface_view import SampledPixels, SurfaceView
 
 __all__ = ["ellipsoids"]
 

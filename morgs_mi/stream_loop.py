@@ -19,29 +19,29 @@ import numpy as np
 
 from morgs_mi.codec.container import Packet
 from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, residual_packet
-from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.threads import in_background
 from morgs_mi.fit.balance import Balance, balance_cameras, balance_config
-from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.detail import with_num_gaussians
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.first_settings import Expected, first_settings
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.initialise import MIN_POINTS
 from morgs_mi.fit.later_frame import FrameProblem, fit_later_frame
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import View
-from morgs_mi.losses.ssim import Target
+from morgs_mi.loop.observation import FrameObservation, Images, Recorded, Seen, Setup, observe_frame, prepare, see_frame
+from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.active_set import ActiveSet, find_active_set, full_active_set
 from morgs_mi.method.confidence import motion_mask
 from morgs_mi.method.exposure import Exposure
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.objective import Observations, channels_of, observe
-from morgs_mi.observation import FrameObservation, Images, Recorded, Seen, Setup, observe_frame, prepare, see_frame
+from morgs_mi.method.ssim import Target
 
 __all__ = ["FrameReport", "StreamLoop", "StreamState", "step"]
 

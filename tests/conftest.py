@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 import morgs_mi  # noqa: F401  (finds a usable LLVM before the variant is set)
-from morgs_mi.calibration.rig_check import SharedFeatures, match_capture
+from morgs_mi.calibration.checks.rig_check import SharedFeatures, match_capture
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.capture.truth import GroundTruth, save_truth
 from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.visualise import to_uint8
 from morgs_mi.render.rasterize import rasterize
-from morgs_mi.synth.ground_truth import GroundTruth, save_truth
 from tests.scenes import textured
 from tests.scenes.gaussians import NEW_ATTRIBUTES
 from tests.scenes.moving_splats import CAMERAS, DISTANCE, FRAMES, PIXELS, STEP, moved, write_stream

@@ -9,10 +9,10 @@ import pytest
 
 from morgs_mi import Gaussians, RenderConfig, StreamConfig, StreamLoop, rasterize
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.fit.config import DensityConfig, FitConfig
-from morgs_mi.losses.losses import flow_loss, mask_loss, recon_loss
-from morgs_mi.losses.ssim import Target
-from morgs_mi.method.config import MotionConfig
+from morgs_mi.fit.fit_config import DensityConfig, FitConfig
+from morgs_mi.method.losses import flow_loss, mask_loss, recon_loss
+from morgs_mi.method.motion_config import MotionConfig
+from morgs_mi.method.ssim import Target
 from morgs_mi.render.region import Region
 from tests import tolerances as tol
 from tests.assertions import assert_close

@@ -34,9 +34,9 @@ mi.set_variant("llvm_ad_rgb")
 import morgs_mi
 from morgs_mi import ProgressBar as Bar
 from morgs_mi.codec.packets import play
-from morgs_mi.export.clips import write_each
-from morgs_mi.export.web import write_web_page
-from morgs_mi.importer import import_frames
+from morgs_mi.playback.export.clips import write_each
+from morgs_mi.playback.export.web import write_web_page
+from morgs_mi.runs.import_frames import import_frames
 from morgs_mi.io.ply import write_ply
 from tests.scenes.changing_splats import rig, splats
 from tests.scenes.recording import CONFIG, write_recording

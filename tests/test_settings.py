@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, RenderConfig
-from morgs_mi.codec.config import CodecConfig
+from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import encode_packet
-from morgs_mi.config import StreamConfig
 from morgs_mi.core.ranges import Above, AtLeast, AtMost, Below, MultipleOf, arms_of, types_of
-from morgs_mi.fit.config import DensityConfig, FitConfig
-from morgs_mi.method.config import MotionConfig
+from morgs_mi.fit.fit_config import DensityConfig, FitConfig
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import random_sheet
@@ -68,7 +68,7 @@ ELSEWHERE: dict[str, str] = {
     "motion.search_motion": "flow explains all parts here: tests/method/test_search.py",
     "motion.constant_velocity": "flow is lifted here: tests/fit/test_later_frame.py",
     "motion.model": "the package has no motion model: tests/fit/test_motion_stage.py",
-    "codec.keyframe_interval": "keyframes are written by the recorder: tests/test_recorder.py",
+    "codec.keyframe_interval": "keyframes are written by the recorder: tests/runs/test_recorder.py",
 }
 
 

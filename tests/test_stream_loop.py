@@ -16,12 +16,12 @@ from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.codec.container import PacketKind, encode_packet
 from morgs_mi.codec.packets import coded_frames, decode, play
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.config import StreamConfig
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
-from morgs_mi.fit.config import DensityConfig, FitConfig, LearningRates, ShortFitConfig
-from morgs_mi.method.config import MotionConfig
-from morgs_mi.recorder import stream_capture
+from morgs_mi.fit.fit_config import DensityConfig, FitConfig, LearningRates, ShortFitConfig
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.method.motion_config import MotionConfig
+from morgs_mi.runs.recorder import stream_capture
 from morgs_mi.stream_loop import StreamLoop
 from tests.scenes.cameras import QUAD, look_at_cameras
 from tests.scenes.gaussians import isotropic

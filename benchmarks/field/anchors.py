@@ -24,7 +24,7 @@ from scipy.spatial import KDTree
 from benchmarks.field.shared import quantised
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.z_order import equal_cells, z_order
-from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
 
 __all__ = ["AnchorConfig", "anchor_matrix", "anchored_motion"]

@@ -25,7 +25,7 @@ from benchmarks.field.shared import corners, quantised
 from morgs_mi.core.attributes import sigmoid
 from morgs_mi.core.gaussians import Gaussians, repeat_each
 from morgs_mi.core.types import Float, Tensor
-from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
 
 __all__ = ["GridConfig", "bits", "corner_matrix", "motion_grid"]

@@ -22,7 +22,7 @@ from scipy.sparse import csr_array
 from benchmarks.field.shared import corners
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
-from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
 
 __all__ = ["CacheConfig", "hash_matrix", "transformation_cache"]

@@ -33,11 +33,11 @@ from morgs_mi.calibration.refine import refine_cameras, register_camera
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.lens import Lens
-from morgs_mi.cluster.tasks import Source
-from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
-from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.core.rig import scene_extent
 from morgs_mi.fit.view import View, mean_psnr
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.synth.disturbances import Disturbances, load_disturbances
 from morgs_mi.synth.synth_config import SynthConfig
 

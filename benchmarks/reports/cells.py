@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 
 import mitsuba as mi
 
-from morgs_mi.cluster.executor import Workers, open_workers, wait_for
-from morgs_mi.cluster.tasks import installed, prepared
+from morgs_mi.runs.cluster.executor import Workers, open_workers, wait_for
+from morgs_mi.runs.cluster.tasks import installed, prepared
 
 __all__ = ["OnWorkers", "run_cells"]
 

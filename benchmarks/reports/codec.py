@@ -31,15 +31,15 @@ from benchmarks.reports.plots import Column, blank_figure, label_points, save_fi
 from benchmarks.reports.study import Row
 from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.cluster.executor import Workers, wait_for
-from morgs_mi.cluster.segments import fit_in_segments
 from morgs_mi.codec.entropy import column_bits
 from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, residual_packet
 from morgs_mi.codec.quantisation import step_sizes
-from morgs_mi.config import StreamConfig
 from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.player import open_stream
-from morgs_mi.recorder import stream_capture
+from morgs_mi.runs.cluster.executor import Workers, wait_for
+from morgs_mi.runs.cluster.segments import fit_in_segments
+from morgs_mi.runs.recorder import stream_capture
 
 # The best preset of lzma takes several times as long and saves a few percent.
 _LZMA_PRESET = 6

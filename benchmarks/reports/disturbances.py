@@ -19,7 +19,7 @@ from benchmarks.reports.fits import ClipOptions
 from benchmarks.reports.plots import Column, scores_table
 from benchmarks.reports.random_scenes import measure
 from benchmarks.reports.study import Row, Scene, Study, Variant
-from morgs_mi.cluster.tasks import Source
+from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.synth.disturbances import Disturbances
 
 DISTURBANCES = {

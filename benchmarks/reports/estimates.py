@@ -18,9 +18,9 @@ import tyro
 from benchmarks.reports.fits import RandomOptions, first_frame, random_capture
 from benchmarks.reports.plots import Column, scores_table
 from benchmarks.reports.study import Row, Scene, Study, Variant
-from morgs_mi.cluster.tasks import Source
-from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.runs.cluster.tasks import Source
 
 COLUMNS = (
     Column("training views", "training", 1, unit=" dB", spread=False),

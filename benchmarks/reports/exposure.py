@@ -22,14 +22,14 @@ from benchmarks.reports.fits import ClipOptions, new_loop
 from benchmarks.reports.plots import Column, scores_table
 from benchmarks.reports.study import Row, Scene, Study, Variant
 from morgs_mi import rasterize
-from morgs_mi.cluster.tasks import Source
-from morgs_mi.config import StreamConfig
+from morgs_mi.capture.truth import load_truth
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.evaluate.temporal import StillVariation
+from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.exposure import follow_exposure
 from morgs_mi.playback.visualise import to_uint8
+from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.synth.disturbances import Disturbances
-from morgs_mi.synth.ground_truth import load_truth
 
 CAMERAS = {
     "equal": Disturbances(),

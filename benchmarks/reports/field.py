@@ -25,12 +25,12 @@ from benchmarks.reports.cells import OnWorkers, run_cells
 from benchmarks.reports.fits import DEFAULT, Clip, random_capture
 from benchmarks.reports.plots import blank_figure, markdown, save_figure
 from benchmarks.speed.output import Output
-from morgs_mi.cluster.tasks import Source
 from morgs_mi.codec.packets import coded_frames
-from morgs_mi.config import StreamConfig, apply_preset, apply_values
 from morgs_mi.core.files import json_finite
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.results import Evaluation, known_mean
+from morgs_mi.loop.stream_config import StreamConfig, apply_preset, apply_values
+from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.stream_loop import FrameReport
 
 __all__ = ["METHODS", "Options", "field_table", "main", "plot_field"]

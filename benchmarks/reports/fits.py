@@ -13,10 +13,10 @@ from benchmarks.reports.study import StudyOptions
 from morgs_mi import StreamLoop, rasterize
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.codec.container import StreamWriter
-from morgs_mi.config import StreamConfig
 from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.metrics import psnr
-from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.stream_loop import FrameReport
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize

@@ -27,11 +27,11 @@ from benchmarks.reports.plots import Column, blank_figure, save_figure, scores_t
 from benchmarks.reports.study import Row
 from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.method.flow import choose_key_views
+from morgs_mi.capture.truth import GroundTruth, load_truth
+from morgs_mi.core.rig import choose_key_views
 from morgs_mi.method.flow_sources.consistency import consistency_mask
-from morgs_mi.method.flow_sources.opencv import FLOW_METHODS
-from morgs_mi.method.flow_sources.registry import FramePair, flow_source
-from morgs_mi.synth.ground_truth import GroundTruth, load_truth
+from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
+from morgs_mi.method.flow_sources.opencv_flow import FLOW_METHODS
 
 _NEAR = 1.0  # px
 

@@ -17,9 +17,9 @@ import tyro
 from benchmarks.reports.fits import RandomOptions, first_frame, random_capture
 from benchmarks.reports.plots import Column, scores_table
 from benchmarks.reports.study import Row, Scene, Study, Variant
-from morgs_mi.cluster.tasks import Source
-from morgs_mi.config import StreamConfig
 from morgs_mi.fit.dropping import dropping_by_noise
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.runs.cluster.tasks import Source
 
 _WITHOUT, _CHOSEN = {"variant": "without"}, {"variant": "chosen"}
 COLUMNS = (

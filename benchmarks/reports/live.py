@@ -20,8 +20,8 @@ from benchmarks.reports.fits import ClipOptions, new_loop
 from benchmarks.reports.plots import Column, grouped, scores_table
 from benchmarks.reports.random_scenes import fitted_frames
 from benchmarks.reports.study import Row, Scene, Study, Variant
-from morgs_mi.cluster.tasks import Source
-from morgs_mi.config import StreamConfig
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.runs.cluster.tasks import Source
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -30,20 +30,20 @@ from benchmarks.reports.plots import Column, scores_table
 from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
 from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.cluster.tasks import Source
+from morgs_mi.capture.truth import load_truth
 from morgs_mi.codec.packets import CodedFrame
-from morgs_mi.config import StreamConfig
 from morgs_mi.evaluate.metrics import iou, psnr
-from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.active_set import full_active_set
 from morgs_mi.method.confidence import flow_mask
-from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation, observe_flow
 from morgs_mi.method.lift import lift_flow
-from morgs_mi.method.mask_refiners.registry import MASK_REFINERS, mask_refiner
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, mask_refiner
+from morgs_mi.method.motion_config import MotionConfig
+from morgs_mi.render.render_config import RenderConfig
+from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.stream_loop import StreamLoop
-from morgs_mi.synth.ground_truth import load_truth
 
 _COLUMNS = Column("IoU", "iou"), Column("PSNR where things move, dB", "psnr_moving")
 

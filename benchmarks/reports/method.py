@@ -32,15 +32,15 @@ from benchmarks.reports.plots import grouped
 from benchmarks.reports.study import Row, Scene, Study, Variant, method_version
 from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.cluster.executor import Workers
-from morgs_mi.cluster.tasks import Source
 from morgs_mi.codec.container import Packet, decode_packet, encode_packet
 from morgs_mi.codec.packets import coded_frames
-from morgs_mi.config import PRESETS, StreamConfig, apply_preset
 from morgs_mi.core.files import json_finite
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.results import Evaluation, known_mean
-from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.loop.stream_config import PRESETS, StreamConfig, apply_preset
+from morgs_mi.runs.cluster.executor import Workers
+from morgs_mi.runs.cluster.tasks import Source
 from morgs_mi.stream_loop import FrameReport, StreamState
 
 # Rows of the paper's table of key views.

@@ -21,11 +21,11 @@ from benchmarks.reports.plots import Column, means_over, scores_table
 from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
 from morgs_mi import Gaussians, StreamLoop, rasterize
 from morgs_mi.capture.capture import Capture, PartialFrame
-from morgs_mi.cluster.tasks import Source
-from morgs_mi.config import StreamConfig
+from morgs_mi.capture.truth import load_truth
 from morgs_mi.evaluate.metrics import iou, psnr
-from morgs_mi.fit.config import FitConfig
-from morgs_mi.synth.ground_truth import load_truth
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.runs.cluster.tasks import Source
 
 COLUMNS = (
     Column("PSNR, dB", "psnr"),

@@ -22,7 +22,7 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["ATTRIBUTES", "Reference64"]
 

@@ -33,8 +33,8 @@ from benchmarks.workloads import ball
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.render.backend import block_shape
-from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
+from morgs_mi.render.render_config import RenderConfig
 
 _MARKS = {"block": "s", "reproducible": "D"}
 _EXACT_ALPHA_MIN = 1e-12  # smaller values do not change a float32 image

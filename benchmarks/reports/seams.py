@@ -19,12 +19,12 @@ import tyro
 from benchmarks.reports.fits import ClipOptions
 from benchmarks.reports.plots import Column, scores_table
 from benchmarks.reports.study import Row, Scene, Study, Variant
-from morgs_mi.cluster.executor import open_workers
-from morgs_mi.cluster.seams import score_seam
-from morgs_mi.cluster.segments import stream_segments
-from morgs_mi.cluster.tasks import Source
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.config import StreamConfig
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.runs.cluster.executor import open_workers
+from morgs_mi.runs.cluster.seams import score_seam
+from morgs_mi.runs.cluster.segments import stream_segments
+from morgs_mi.runs.cluster.tasks import Source
 
 COLUMNS = (
     Column("PSNR around, dB", "psnr_around"),

@@ -27,9 +27,9 @@ import mitsuba as mi
 import morgs_mi
 from benchmarks.reports.cells import OnWorkers, run_cells
 from benchmarks.speed.output import Output
-from morgs_mi.cluster.executor import Workers
-from morgs_mi.config import StreamConfig
 from morgs_mi.core.files import json_finite, write_json
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.runs.cluster.executor import Workers
 
 __all__ = ["Row", "Scene", "Study", "StudyOptions", "Variant", "method_version", "rounded"]
 

@@ -28,8 +28,8 @@ import tyro
 from benchmarks.speed.output import Output
 from morgs_mi import Camera, Gaussians, rasterize
 from morgs_mi.codec.packets import decode, keyframe_packet
-from morgs_mi.config import StreamConfig, apply_preset
-from morgs_mi.fit.config import DensityConfig, FitConfig
+from morgs_mi.fit.fit_config import DensityConfig, FitConfig
+from morgs_mi.loop.stream_config import StreamConfig, apply_preset
 from morgs_mi.stream_loop import StreamLoop
 
 # Stages of a frame: file and function that are timed.

@@ -10,8 +10,8 @@ from datetime import date
 from pathlib import Path
 from typing import Any
 
+from morgs_mi.core.environment import machine, versions
 from morgs_mi.core.files import write_json
-from morgs_mi.evaluate.environment import machine, versions
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ import morgs_mi
 from benchmarks import workloads
 from benchmarks.speed import timing
 from morgs_mi import Camera, Gaussians
-from morgs_mi.evaluate.environment import machine, versions
+from morgs_mi.core.environment import machine, versions
 
 
 @dataclass(frozen=True)

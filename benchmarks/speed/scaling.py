@@ -41,13 +41,13 @@ import tyro
 from benchmarks.reports.plots import blank_figure, save_figure
 from benchmarks.speed.output import Output
 from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.cluster.executor import Workers, open_workers
-from morgs_mi.cluster.seams import COMMON_FRAMES, score_seam
-from morgs_mi.cluster.segments import TASK_FRAMES, SegmentedFit, stream_segments
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.config import StreamConfig
-from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.runs.cluster.executor import Workers, open_workers
+from morgs_mi.runs.cluster.seams import COMMON_FRAMES, score_seam
+from morgs_mi.runs.cluster.segments import TASK_FRAMES, SegmentedFit, stream_segments
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 

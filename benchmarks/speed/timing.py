@@ -22,8 +22,8 @@ from benchmarks.speed import plain
 from benchmarks.workloads import TARGET, write_bin
 from morgs_mi import Camera, Gaussians, RenderConfig, ellipsoids, rasterize
 from morgs_mi.fit.optimise import adam
-from morgs_mi.losses.losses import recon_loss
-from morgs_mi.losses.ssim import Target
+from morgs_mi.method.losses import recon_loss
+from morgs_mi.method.ssim import Target
 from morgs_mi.render.blocks import build_lists
 from morgs_mi.render.projection import project
 from morgs_mi.render.region import Region, full_view

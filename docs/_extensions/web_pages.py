@@ -14,7 +14,7 @@ def write_pages(app: Sphinx, error: Exception | None) -> None:
     import mitsuba as mi
 
     mi.set_variant("llvm_ad_rgb")
-    from morgs_mi.export.web import write_web_page
+    from morgs_mi.playback.export.web import write_web_page
     from morgs_mi.playback.player import open_stream
 
     for stream in Path(app.srcdir, "gallery").glob("*.morgs"):

@@ -28,7 +28,7 @@ import numpy as np
 
 from morgs_mi.capture.features import Tracks, intersect
 from morgs_mi.core.camera import Camera
-from morgs_mi.fit.config import CameraPriors
+from morgs_mi.fit.fit_config import CameraPriors
 
 __all__ = [
     "CHANGES",

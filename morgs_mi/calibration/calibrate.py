@@ -15,8 +15,8 @@ from typing import Any, Literal
 import cv2
 import numpy as np
 
-from morgs_mi.calibration.mistakes import same_poses
-from morgs_mi.calibration.rig_check import MAX_ERROR, CameraCheck
+from morgs_mi.calibration.checks.mistakes import same_poses
+from morgs_mi.calibration.checks.rig_check import MAX_ERROR, CameraCheck
 from morgs_mi.capture.capture import opaque_pixels
 from morgs_mi.capture.layouts.clips import EXAMPLE, clips_by_camera, names_without, photos
 from morgs_mi.capture.layouts.colmap import write_reconstruction

@@ -33,8 +33,8 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.losses.ssim import Target
 from morgs_mi.method.image_gradient import blurred, gradient_products, image_gradient
+from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["UNKNOWN", "OffsetEquations", "offset_equations"]

@@ -45,15 +45,15 @@ from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.random_streams import Stream, rng_of
-from morgs_mi.fit.config import FitConfig
+from morgs_mi.core.rig import scene_extent, seen_points
 from morgs_mi.fit.first_frame import fit_first_frame
-from morgs_mi.fit.initialise import scene_extent, seen_points
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import LEAST_GAIN, View, mean_psnr, withheld_blocks
-from morgs_mi.losses.ssim import Target
 from morgs_mi.method.image_gradient import blurred, gradient_products, image_gradient
+from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["Refinement", "refine_cameras", "register_camera"]
 

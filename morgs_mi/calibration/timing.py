@@ -33,17 +33,17 @@ from morgs_mi.capture.interpolation import image_between
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.random_streams import Stream, rng_of
-from morgs_mi.fit.config import DensityConfig, FitConfig
 from morgs_mi.fit.first_frame import fit_first_frame
+from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import View
 from morgs_mi.io.video import ImageOrError
-from morgs_mi.losses.ssim import Target
 from morgs_mi.method.flow import observe_key_views
-from morgs_mi.method.flow_sources.registry import FramePair
+from morgs_mi.method.flow_sources.flow_registry import FramePair
 from morgs_mi.method.lift import lift_flow
+from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["TimeOffsets", "estimate_time_offsets"]
 

@@ -18,7 +18,7 @@ from morgs_mi.capture.camera_source import CameraSource, at_clip_size
 from morgs_mi.capture.color_correction import ColorFit, fit_colors
 from morgs_mi.capture.layouts.calibration import Calibration
 from morgs_mi.capture.layouts.clips import EXAMPLE
-from morgs_mi.capture.layouts.registry import find_layout
+from morgs_mi.capture.layouts.layout_registry import find_layout
 from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.capture.timeline import ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera

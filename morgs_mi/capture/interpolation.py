@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from morgs_mi.method.flow_sources.consistency import consistency_mask
-from morgs_mi.method.flow_sources.registry import FramePair, flow_source
+from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
 
 __all__ = ["image_between"]
 

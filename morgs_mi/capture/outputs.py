@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TypeVar
 
-from morgs_mi.capture.layouts.registry import LAYOUTS
+from morgs_mi.capture.layouts.layout_registry import LAYOUTS
 
 __all__ = ["check_output"]
 

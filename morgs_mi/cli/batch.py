@@ -19,7 +19,7 @@ from morgs_mi.cli.settings import optional
 from morgs_mi.core.documentation import page
 
 if TYPE_CHECKING:
-    from morgs_mi.cluster.batch import JobState
+    from morgs_mi.runs.cluster.jobs import JobState
 
 __all__ = ["Batch"]
 
@@ -38,9 +38,9 @@ class Batch:
     """Dask scheduler whose workers fit the jobs, such as tcp://host:8786, or local."""
 
     def run(self) -> None:
-        from morgs_mi.cluster.batch import read_jobs, run_batch
-        from morgs_mi.cluster.executor import open_workers
         from morgs_mi.core.files import write_json
+        from morgs_mi.runs.cluster.executor import open_workers
+        from morgs_mi.runs.cluster.jobs import read_jobs, run_batch
 
         jobs = read_jobs(self.jobs)
         with _noting_command(), open_workers(self.scheduler, self.workers) as workers, _shown() as show:

@@ -12,8 +12,8 @@ from tyro.conf import DisallowNone, Positional
 
 from morgs_mi.cli.console import print_result, print_table, progress
 from morgs_mi.cli.settings import Settings, optional, setting
-from morgs_mi.demo import DemoConfig
 from morgs_mi.evaluate.tables import figure
+from morgs_mi.runs.demo import DemoConfig
 
 __all__ = ["Demo"]
 
@@ -47,7 +47,7 @@ class Demo:
     """File with settings of the fit, as `morgs-mi fit --print-config` writes it."""
 
     def run(self) -> None:
-        from morgs_mi.demo import run_demo
+        from morgs_mi.runs.demo import run_demo
 
         settings = Settings(config=self.config, seed=self.seed)
         stream = settings.stream_config(_DEFAULT.stream)

@@ -15,7 +15,7 @@ from morgs_mi.cli.console import print_result, print_table, print_warning, progr
 from morgs_mi.cli.settings import optional
 from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.evaluate.tables import evaluation_summary, evaluation_tables
-from morgs_mi.recording import FILES
+from morgs_mi.runs.recording import FILES
 
 __all__ = ["Eval"]
 
@@ -36,8 +36,8 @@ class Eval:
     """LPIPS network as ONNX with inputs in0 and in1, RGB [1, 3, H, W] from -1 to 1; the package includes none."""
 
     def run(self) -> None:
+        from morgs_mi.core.environment import machine, versions
         from morgs_mi.core.files import json_finite, write_json
-        from morgs_mi.evaluate.environment import machine, versions
         from morgs_mi.evaluate.evaluate import evaluate_stream
         from morgs_mi.evaluate.figures import draw_stream
         from morgs_mi.evaluate.lpips import Lpips

@@ -14,7 +14,7 @@ from tyro.conf import DisallowNone, Positional, arg
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.settings import ChannelName, Flag, one_of, optional, place
 from morgs_mi.core.documentation import page
-from morgs_mi.export.formats import GLTF, PLY, TRACKS, USD, VIDEO, WEB, Format, destination
+from morgs_mi.playback.export.formats import GLTF, PLY, TRACKS, USD, VIDEO, WEB, Format, destination
 
 __all__ = ["Export"]
 
@@ -44,10 +44,10 @@ class Ply:
 
     def run(self) -> None:
         from morgs_mi.codec.packets import play
-        from morgs_mi.export.clips import select_frames, write_each
-        from morgs_mi.export.order import by_place
         from morgs_mi.io.compressed_ply import write_compressed_ply
         from morgs_mi.io.ply import write_ply
+        from morgs_mi.playback.export.clips import select_frames, write_each
+        from morgs_mi.playback.export.order import by_place
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
@@ -77,9 +77,9 @@ class Gltf:
 
     def run(self) -> None:
         from morgs_mi.codec.packets import play
-        from morgs_mi.export.axes import gltf_axes
-        from morgs_mi.export.clips import select_frames, write_each
-        from morgs_mi.export.gltf import write_gltf
+        from morgs_mi.playback.export.axes import gltf_axes
+        from morgs_mi.playback.export.clips import select_frames, write_each
+        from morgs_mi.playback.export.gltf_export import write_gltf
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
@@ -110,8 +110,8 @@ class Usd:
     arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
 
     def run(self) -> None:
-        from morgs_mi.export.clips import select_frames
-        from morgs_mi.export.usd import write_usd
+        from morgs_mi.playback.export.clips import select_frames
+        from morgs_mi.playback.export.usd import write_usd
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
@@ -150,8 +150,8 @@ class Flight:
 
     def run(self) -> None:
         from morgs_mi.codec.packets import play
-        from morgs_mi.export.clips import frame_numbers, repeated_frames, repeated_seconds, write_flight
-        from morgs_mi.export.paths import focus, load_path, orbit, through_cameras
+        from morgs_mi.playback.export.clips import frame_numbers, repeated_frames, repeated_seconds, write_flight
+        from morgs_mi.playback.export.paths import focus, load_path, orbit, through_cameras
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
@@ -189,8 +189,8 @@ class Tracks:
     """File for the tracks; by default OUT/tracks.npz."""
 
     def run(self) -> None:
-        from morgs_mi.export.clips import frame_numbers
-        from morgs_mi.export.tracks import extract_tracks, write_tracks
+        from morgs_mi.playback.export.clips import frame_numbers
+        from morgs_mi.playback.export.tracks import extract_tracks, write_tracks
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)
@@ -217,8 +217,8 @@ class Web:
     """Title of the page; by default the name of the stream's folder or file."""
 
     def run(self) -> None:
-        from morgs_mi.export.clips import frame_numbers
-        from morgs_mi.export.web import write_web_folder, write_web_page
+        from morgs_mi.playback.export.clips import frame_numbers
+        from morgs_mi.playback.export.web import write_web_folder, write_web_page
         from morgs_mi.playback.player import open_stream
 
         stream = open_stream(self.out)

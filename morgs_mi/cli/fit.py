@@ -13,8 +13,8 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, print_warning, progress
 from morgs_mi.cli.settings import Flag, GivenReading, GivenSettings, Reading, Settings, optional
-from morgs_mi.config import StreamConfig, config_toml
 from morgs_mi.core.documentation import page
+from morgs_mi.loop.stream_config import StreamConfig, config_toml
 
 if TYPE_CHECKING:
     from morgs_mi.capture.capture import Capture
@@ -58,9 +58,9 @@ class Fit:
     arguments: ClassVar[Mapping[str, str]] = {"max_frames": "--frames"}
 
     def run(self) -> None:
-        from morgs_mi.calibration.deep import check_exposures
+        from morgs_mi.calibration.checks.deep import check_exposures
         from morgs_mi.capture.capture import load_capture
-        from morgs_mi.recorder import stream_capture
+        from morgs_mi.runs.recorder import stream_capture
 
         config = self.settings.stream_config()
         if self.print_config:
@@ -84,8 +84,8 @@ class Fit:
 
     def _fit_in_segments(self, capture: Capture, config: StreamConfig) -> None:
         """Fit a capture in segments, and print the scores of the seams."""
-        from morgs_mi.cluster.executor import cores, open_workers
-        from morgs_mi.cluster.segments import noting_segments, stream_segments
+        from morgs_mi.runs.cluster.executor import cores, open_workers
+        from morgs_mi.runs.cluster.segments import noting_segments, stream_segments
 
         assert self.out is not None
         count = self.segments or 1

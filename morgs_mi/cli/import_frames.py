@@ -11,8 +11,8 @@ from tyro.conf import DisallowNone, Positional, arg
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.settings import SETTINGS, setting
-from morgs_mi.codec.config import CodecConfig
-from morgs_mi.importer import Axes
+from morgs_mi.codec.codec_config import CodecConfig
+from morgs_mi.runs.import_frames import Axes
 
 __all__ = ["Import"]
 
@@ -42,7 +42,7 @@ class Import:
     """Frames between two keyframes; 0: only where they are needed."""
 
     def run(self) -> None:
-        from morgs_mi.importer import import_frames
+        from morgs_mi.runs.import_frames import import_frames
 
         if len(self.paths) < 2:
             raise ValueError("morgs-mi import: expected FRAMES and OUT, got fewer; see morgs-mi import --help.")

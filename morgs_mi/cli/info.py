@@ -12,8 +12,8 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from tyro.conf import DisallowNone, Positional, arg
 
-from morgs_mi.calibration.deep import MAX_FRAMES, DeepCheck, Finding, check_deep, check_exposures
-from morgs_mi.calibration.rig_check import (
+from morgs_mi.calibration.checks.deep import MAX_FRAMES, DeepCheck, Finding, check_deep, check_exposures
+from morgs_mi.calibration.checks.rig_check import (
     CameraCheck,
     RigCheck,
     SharedFeatures,
@@ -21,7 +21,7 @@ from morgs_mi.calibration.rig_check import (
     match_capture,
     triangulate_points,
 )
-from morgs_mi.calibration.signals import read_signals
+from morgs_mi.calibration.checks.signals import read_signals
 from morgs_mi.calibration.timing import TimeOffsets, estimate_time_offsets
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.outputs import check_output
@@ -61,7 +61,7 @@ class Info:
     arguments: ClassVar[Mapping[str, str]] = {"max_frames": "morgs-mi fit --frames"}
 
     def run(self) -> None:
-        from morgs_mi.calibration.rig_plot import check_plot, write_rig
+        from morgs_mi.calibration.checks.rig_plot import check_plot, write_rig
 
         if self.deep and not self.check:
             raise ValueError("--deep: expected the check of the poses, on which it builds; leave out --no-check.")

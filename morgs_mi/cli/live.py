@@ -17,11 +17,11 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, print_warning, progress
 from morgs_mi.cli.settings import Flag, GivenSettings, Settings
-from morgs_mi.config import StreamConfig
-from morgs_mi.live.config import LiveConfig
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.runs.live.live_config import LiveConfig
 
 if TYPE_CHECKING:
-    from morgs_mi.live.fit import LiveFrame
+    from morgs_mi.runs.live.fit_live import LiveFrame
 
 __all__ = ["Live"]
 
@@ -48,7 +48,7 @@ class Live:
     settings: GivenSettings = field(default_factory=Settings)
 
     def run(self) -> None:
-        from morgs_mi.live.fit import fit_live
+        from morgs_mi.runs.live.fit_live import fit_live
 
         out = self.out or Path(time.strftime("live-%Y%m%d-%H%M%S"))
         config = _with_first_seconds(self.settings.stream_config())

@@ -10,7 +10,7 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.settings import ChannelName, one_of, optional
-from morgs_mi.export.formats import IMAGES, destination
+from morgs_mi.playback.export.formats import IMAGES, destination
 
 __all__ = ["Render"]
 
@@ -56,9 +56,15 @@ class Render:
     shadows and reflections."""
 
     def run(self) -> None:
-        from morgs_mi.export.clips import frame_numbers
-        from morgs_mi.export.frames import write_frames, write_images
-        from morgs_mi.export.insert import InsertConfig, inserted_channels, load_insert, render_inserted, selected
+        from morgs_mi.playback.export.clips import frame_numbers
+        from morgs_mi.playback.export.frames import write_frames, write_images
+        from morgs_mi.playback.export.insert import (
+            InsertConfig,
+            inserted_channels,
+            load_insert,
+            render_inserted,
+            selected,
+        )
         from morgs_mi.playback.player import find_camera, open_stream
 
         stream = open_stream(self.out)

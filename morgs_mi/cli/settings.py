@@ -12,8 +12,8 @@ from tyro.conf import DisallowNone, FlagCreatePairsOff, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
 from morgs_mi.capture.timeline import ReadConfig
-from morgs_mi.config import PresetName, StreamConfig, apply_preset, apply_values, read_config, relocated
 from morgs_mi.core.documentation import page
+from morgs_mi.loop.stream_config import PresetName, StreamConfig, apply_preset, apply_values, read_config, relocated
 
 __all__ = [
     "SETTINGS",
@@ -216,8 +216,8 @@ class Settings:
             FileNotFoundError: one of them names a missing file or folder.
             ValueError: one of them is unknown, or its network does not fit.
         """
-        from morgs_mi.method.flow_sources.registry import flow_source
-        from morgs_mi.method.mask_refiners.registry import mask_refiner
+        from morgs_mi.method.flow_sources.flow_registry import flow_source
+        from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
         from morgs_mi.method.motion_model import motion_model
 
         motion = config.motion

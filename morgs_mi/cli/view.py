@@ -13,7 +13,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from morgs_mi.cli.console import print_result
-from morgs_mi.viewer.viewer import Viewer, ViewerConfig
+from morgs_mi.playback.viewer.viewer import Viewer, ViewerConfig
 
 __all__ = ["View"]
 

@@ -20,7 +20,7 @@ from math import prod
 
 import numpy as np
 
-from morgs_mi.codec.config import CodecConfig
+from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import Packet, PacketKind
 from morgs_mi.codec.entropy import LIMIT, ColumnReader, ColumnWriter, column_bits
 from morgs_mi.codec.quantisation import (

@@ -27,7 +27,7 @@ from math import prod
 
 import numpy as np
 
-from morgs_mi.codec.config import CodecConfig
+from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.entropy import LIMIT
 from morgs_mi.core.attributes import ATTRIBUTES, BY_NAME, SIGMOID, Attribute
 from morgs_mi.core.camera import Camera

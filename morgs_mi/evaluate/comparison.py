@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.truth import GroundTruth
 from morgs_mi.codec.container import PacketKind, encode_packet
 from morgs_mi.codec.packets import CodedFrame, coded_frames
 from morgs_mi.codec.reader import StreamReader
@@ -17,8 +18,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.temporal import recorded_change
 from morgs_mi.playback.player import has_confidence, open_stream_capture, render, render_config, truth_for_camera
 from morgs_mi.playback.visualise import to_uint8
-from morgs_mi.render.config import RenderConfig
-from morgs_mi.synth.ground_truth import GroundTruth
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["ComparedClip", "ComparedFrame", "ComparedView"]
 

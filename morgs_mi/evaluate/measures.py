@@ -17,8 +17,10 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.calibration.refine import register_camera
+from morgs_mi.capture.truth import GroundTruth, load_tracks, load_truth
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.packets import CodedFrame
+from morgs_mi.core.rig import scene_extent
 from morgs_mi.evaluate.comparison import ComparedClip, ComparedFrame, ComparedView
 from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.metrics import WINDOW, endpoint_error, iou, mean_over, psnr_of, ssim_map, unit_pair
@@ -27,11 +29,9 @@ from morgs_mi.evaluate.perception import delta_e_map, flip_map
 from morgs_mi.evaluate.results import Motion3DScores, VariationScores, ViewScores
 from morgs_mi.evaluate.temporal import StillVariation, slope
 from morgs_mi.evaluate.tracking import evaluate_tracks
-from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.method.exposure import follow_exposure
-from morgs_mi.synth.ground_truth import GroundTruth, load_tracks, load_truth
 
 __all__ = [
     "IMAGE_SCORES",

@@ -20,9 +20,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.spatial import KDTree
 
+from morgs_mi.capture.truth import GroundTruth
 from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.results import Motion3DScores
-from morgs_mi.synth.ground_truth import GroundTruth
 
 __all__ = ["compare_motion", "evaluate_motion", "local_motion", "rigid_motions", "surface_ids"]
 

@@ -16,9 +16,9 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.dynamic3dgs import read_meta
+from morgs_mi.capture.truth import load_tracks
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.bounded import read_array
-from morgs_mi.synth.ground_truth import load_tracks
 
 __all__ = ["TrackTruth", "read_annotation", "synthetic_tracks", "tapvid3d_tracks"]
 

@@ -10,11 +10,11 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.timeline import read_settings
 from morgs_mi.codec.packets import play
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.rig import scene_extent
 from morgs_mi.evaluate.point_tracks import seen_in_depth, track_points
 from morgs_mi.evaluate.results import TrackingScores
 from morgs_mi.evaluate.track_scores import DYNAMIC_3D_GAUSSIANS, MVTRACKER, TAPVID3D, Comparison, score_tracks
 from morgs_mi.evaluate.track_truth import TrackTruth, synthetic_tracks, tapvid3d_tracks
-from morgs_mi.fit.initialise import scene_extent
 from morgs_mi.playback.player import render, render_config
 
 __all__ = ["evaluate_tracks"]

@@ -6,9 +6,9 @@ import time
 from dataclasses import replace
 
 from morgs_mi.core.random_streams import Stream, rng_of
-from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import TRIAL_STEPS
 from morgs_mi.fit.first_frame import fit_first_frame
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.problem import FirstFrameProblem
 
 __all__ = ["steps_within"]

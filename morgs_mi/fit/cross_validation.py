@@ -20,10 +20,11 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.random_streams import Stream, rng_of
-from morgs_mi.fit.config import FitConfig
+from morgs_mi.core.rig import angles_to, scene_depths
 from morgs_mi.fit.dropping import dropping_by_noise
 from morgs_mi.fit.first_frame import fit_first_frame
-from morgs_mi.fit.forecast import angles_to, forecast, scene_depths, verdict
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.fit.forecast import forecast, verdict
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import decibels
 

@@ -9,7 +9,7 @@ cloned, and both get the opacity 1 - sqrt(1 - o), so that together they cover wh
 later frame, `plan_additions` (Sun et al. 2024): parents stay unchanged, because the few remaining steps could not
 repair them; births are small and faint, and gain opacity or are pruned.
 
-Parents are the Gaussians with the largest densification scores (see `losses.attribution`).
+Parents are the Gaussians with the largest densification scores (see `method.attribution`).
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ import numpy as np
 from drjit.opt import Adam
 
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.fit.config import DensityConfig
+from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.fit.optimise import replace_parameter
-from morgs_mi.losses.attribution import DensificationScores
+from morgs_mi.method.attribution import DensificationScores
 
 __all__ = ["DensityPlan", "Room", "apply_plan", "plan_additions", "plan_growth", "resize_optimizer"]
 

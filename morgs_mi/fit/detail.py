@@ -13,8 +13,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.forecast import mean_views
+from morgs_mi.core.rig import mean_views
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.noise import noise_of
 from morgs_mi.fit.view import View
 

@@ -23,16 +23,16 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.types import Tensor
-from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.density import Room, plan_growth, resize_optimizer
 from morgs_mi.fit.dropping import dropped
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.optimise import Steps, adam, optimise, replace_parameter, values_of, view_order
 from morgs_mi.fit.problem import FirstFrameProblem
-from morgs_mi.losses.attribution import densification_scores
-from morgs_mi.losses.losses import mask_loss, recon_loss
+from morgs_mi.method.attribution import densification_scores
+from morgs_mi.method.losses import mask_loss, recon_loss
 from morgs_mi.render.active_view import ActiveView
-from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["FirstFrame", "fit_confidence", "fit_first_frame"]
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 
 from morgs_mi.core.progress import Progress
 from morgs_mi.fit.budget import steps_within
-from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import CrossValidation, candidates_of, cross_validate
 from morgs_mi.fit.dropping import dropping_by_noise
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.forecast import Forecast, forecast
 from morgs_mi.fit.noise import is_noisy
 from morgs_mi.fit.problem import FirstFrameProblem

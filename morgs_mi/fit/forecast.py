@@ -8,9 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.fit.initialise import focus_depths, scene_extent, seen_points
+from morgs_mi.core.rig import (
+    angles_between,
+    angles_to,
+    scene_depths,
+    seen_points,
+    surface_of,
+)
 
-__all__ = ["Forecast", "angles_to", "forecast", "mean_views", "overlaps", "quality_of", "scene_depths", "verdict"]
+__all__ = ["Forecast", "forecast", "quality_of", "verdict"]
 
 _WORDS = ("good", "fair", "poor")
 # Limits of good and of fair views between the cameras: loss against the training views in dB, PSNR in dB, and the angle
@@ -18,8 +24,6 @@ _WORDS = ("good", "fair", "poor")
 _LOSSES, _LEAST_PSNR, _ANGLES = (4.0, 8.0), (22.0, 16.0), (9.5, 18.0)
 # Angle that stands for a point that no other camera sees, degrees.
 _UNSEEN = 90.0
-# Rows and columns of the points of each view.
-_GRID = 16
 
 
 @dataclass(frozen=True)
@@ -98,64 +102,10 @@ def forecast(cameras: Sequence[Camera], points: np.ndarray) -> Forecast:
     measures = []
     for view, (camera, depth) in enumerate(zip(cameras, scene_depths(cameras, points), strict=True)):
         others = [*cameras[:view], *cameras[view + 1 :]]
-        angles, surface = angles_to(camera, depth, others), _surface(camera, depth)
+        angles, surface = angles_to(camera, depth, others), surface_of(camera, depth)
         seen = np.array([seen_points(other, surface)[0] for other in others])
-        to_each = np.array([_angles(surface, camera, other) for other in others])
+        to_each = np.array([angles_between(surface, camera, other) for other in others])
         nearest = np.where(seen, to_each, _UNSEEN).min(axis=0)
         measures.append((angles.min(), seen[angles.argmin()].mean(), nearest.mean()))
     spacing, overlap, reach = np.mean(measures, axis=0)
     return Forecast(len(cameras), float(spacing), float(overlap), float(reach))
-
-
-def mean_views(cameras: Sequence[Camera], points: np.ndarray) -> float:
-    """Return the mean number of views that see a surface of the scene, at least 1, as far as their frustums tell.
-
-    Args:
-        cameras: at least one.
-        points: [P, 3] of the scene, world units, or none.
-    """
-    return max(1.0, float(overlaps(cameras, points).sum(axis=1).mean()))
-
-
-def overlaps(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
-    """Return the share of each camera's image that each camera sees, as far as their frustums tell [C, C].
-
-    Args:
-        cameras: C views.
-        points: [P, 3] of the scene, world units, or none.
-    """
-    surfaces = [_surface(*view) for view in zip(cameras, scene_depths(cameras, points), strict=True)]
-    return np.array([[np.mean(seen_points(other, surface)[0]) for other in cameras] for surface in surfaces])
-
-
-def scene_depths(cameras: Sequence[Camera], points: np.ndarray) -> list[float]:
-    """Return the median depth of the points in each view, world units.
-
-    For a view without points it is that of the `focus_point`, or far away if that is not in front of the camera.
-    """
-    far, depths = 1e6 * scene_extent(cameras), []
-    for camera, focus in zip(cameras, focus_depths(cameras), strict=True):
-        _, _, seen = seen_points(camera, points)
-        middle = float(np.median(seen)) if len(seen) else min(float(focus), far)
-        depths.append(middle if middle > camera.near else far)
-    return depths
-
-
-def angles_to(camera: Camera, depth: float, others: Sequence[Camera]) -> np.ndarray:
-    """Return the angles to other cameras, as seen from the point at a depth in the middle of the image, degrees."""
-    middle = camera.unproject(np.array([[camera.width / 2, camera.height / 2]]), np.array([depth]))
-    return np.array([_angles(middle, camera, other)[0] for other in others])
-
-
-def _angles(points: np.ndarray, a: Camera, b: Camera) -> np.ndarray:
-    """Return the angle between two cameras as seen from each point, degrees."""
-    rays = [camera.position - points for camera in (a, b)]
-    x, y = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
-    return np.rad2deg(np.arccos(np.clip((x * y).sum(axis=1), -1, 1)))
-
-
-def _surface(camera: Camera, depth: float) -> np.ndarray:
-    """Return points that are evenly spread over the image, at one depth."""
-    steps = (np.arange(_GRID) + 0.5) / _GRID
-    pixels = np.stack(np.meshgrid(steps * camera.width, steps * camera.height), axis=-1).reshape(-1, 2)
-    return camera.unproject(pixels, np.full(len(pixels), depth))

@@ -12,20 +12,17 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.rig import focus_depths, scene_extent, seen_points
 from morgs_mi.fit.view import View
 
 __all__ = [
     "MIN_POINTS",
     "Points",
     "fill_points",
-    "focus_depths",
-    "focus_point",
     "from_points",
     "initial_points",
     "resample_points",
-    "scene_extent",
     "seed_points",
-    "seen_points",
 ]
 
 Points = tuple[np.ndarray, np.ndarray]
@@ -40,16 +37,6 @@ _CELLS = 8
 _PARALLEL = 10.0
 # Points in a view that a random one gets its depth from, and how far it may be off, as a fraction.
 _NEIGHBOURS, _SPREAD = 3, 0.1
-
-
-def scene_extent(cameras: Sequence[Camera]) -> float:
-    """Return the scene extent in world units: 1.1 times the radius of the cameras around their mean, as in 3DGS.
-
-    It is 1 for a single camera.
-    """
-    positions = np.array([camera.position for camera in cameras])
-    radius = np.linalg.norm(positions - positions.mean(0), axis=1).max()
-    return float(1.1 * radius) if radius > 0 else 1.0
 
 
 def from_points(points: np.ndarray, colors: np.ndarray, sh_degree: int, opacity: float = 0.3) -> Gaussians:
@@ -124,27 +111,6 @@ def resample_points(points: Points, count: int, rng: np.random.Generator) -> Poi
     return np.concatenate([positions, added[0]]), np.concatenate([colors, added[1]])
 
 
-def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the point [3] that is nearest to all optical axes in the least-squares sense.
-
-    Along a direction that all axes share it is that of the mean camera position.
-    """
-    middle = np.mean([camera.position for camera in cameras], axis=0)
-    system, right = 1e-9 * np.eye(3), np.zeros(3)
-    for camera in cameras:
-        axis = np.asarray(camera.viewmat, float)[2, :3]
-        across = np.eye(3) - np.outer(axis, axis)
-        system, right = system + across, right + across @ (camera.position - middle)
-    return middle + np.linalg.solve(system, right)
-
-
-def focus_depths(cameras: Sequence[Camera]) -> np.ndarray:
-    """Return the depth of the `focus_point` in each view [V], world units; infinite where it is not in front."""
-    focus, least = np.append(focus_point(cameras), 1), 1e-3 * scene_extent(cameras)
-    depths = np.array([np.asarray(camera.viewmat, float)[2] @ focus for camera in cameras])
-    return np.where(depths > least, depths, np.inf)
-
-
 def seed_points(views: Sequence[View], count: int, rng: np.random.Generator) -> Points:
     """Return random points [count, 3] inside the views, and their colours [count, 3] in [0, 1].
 
@@ -207,14 +173,6 @@ def fill_points(points: Points, views: Sequence[View], count: int, rng: np.rando
 def _share(count: int, index: int, views: int) -> int:
     """Return the number of points of one of the views, of `count` in all."""
     return count // views + (index < count % views)
-
-
-def seen_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return which points [P, 3] lie in a view [P], the n pixel positions [n, 2] of those, and their depths [n]."""
-    with np.errstate(divide="ignore", invalid="ignore"):  # points beside the camera
-        pixels, depths = camera.project(np.asarray(points, np.float64).reshape(-1, 3))
-    inside = (depths > camera.near) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
-    return inside, pixels[inside], depths[inside]
 
 
 def _cells_of(camera: Camera, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,21 +12,21 @@ import numpy as np
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.progress import Progress
+from morgs_mi.core.rig import choose_key_views
 from morgs_mi.core.types import Tensor
-from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.density import apply_plan, plan_additions, resize_optimizer
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.motion_stage import fit_motion
 from morgs_mi.fit.optimise import Steps, adam, optimise, values_of, view_order
-from morgs_mi.losses.attribution import densification_scores
-from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet, with_zero_motion
-from morgs_mi.method.config import MotionConfig
-from morgs_mi.method.flow import choose_key_views
+from morgs_mi.method.attribution import densification_scores
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import motion_model
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.objective import Observations, Prediction, channels_of, losses_of, weights_of
 from morgs_mi.method.residual import apply_residual, residual_parameters
 from morgs_mi.method.rigidity import find_neighbours
+from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["FrameProblem", "LaterFrame", "fit_later_frame"]

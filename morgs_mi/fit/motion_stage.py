@@ -11,7 +11,7 @@ import numpy as np
 from morgs_mi.core.gaussians import displaced
 from morgs_mi.core.types import Tensor
 from morgs_mi.fit.optimise import Steps, adam, optimise, values_of
-from morgs_mi.losses.losses import recon_loss
+from morgs_mi.method.losses import recon_loss
 from morgs_mi.method.motion_model import MotionModel, moved
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 

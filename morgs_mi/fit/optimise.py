@@ -13,7 +13,7 @@ from drjit.opt import Adam
 
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
-from morgs_mi.render.recording import render_lock
+from morgs_mi.render.kernel_recording import render_lock
 
 __all__ = ["Losses", "Steps", "adam", "optimise", "replace_parameter", "values_of", "view_order"]
 

@@ -9,10 +9,11 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.fit.config import FitConfig
-from morgs_mi.fit.initialise import Points, from_points, initial_points, scene_extent
+from morgs_mi.core.rig import scene_extent
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.fit.initialise import Points, from_points, initial_points
 from morgs_mi.fit.view import View, mean_psnr
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["FirstFrameProblem"]
 

@@ -10,9 +10,9 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.losses.ssim import Target
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.method.ssim import Target
 from morgs_mi.render.rasterize import rasterize
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["LEAST_GAIN", "View", "decibels", "mean_psnr", "rendered", "squared_errors", "withheld_blocks"]
 

@@ -24,11 +24,11 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.ranges import AtLeast, check_ranges
+from morgs_mi.core.rig import choose_key_views
 from morgs_mi.method.boxes import boxes_around
-from morgs_mi.method.flow import choose_key_views
 from morgs_mi.method.responsibility import ChangedView, responsibility
 from morgs_mi.render.active_view import ActiveView, make_active_view
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["ActiveSet", "ActiveSetConfig", "find_active_set", "full_active_set", "with_zero_motion"]
 

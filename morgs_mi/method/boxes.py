@@ -13,8 +13,8 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, UInt32
-from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.projection import project
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["Boxes", "boxes_around"]
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from morgs_mi.method.mask_refiners.config import MaskConfig
-from morgs_mi.method.mask_refiners.registry import mask_refiner
+from morgs_mi.method.mask_refiners.mask_config import MaskConfig
+from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
 
 __all__ = ["flow_mask", "flow_threshold", "motion_floor", "motion_mask"]
 

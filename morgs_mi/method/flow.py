@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.method.confidence import motion_mask
-from morgs_mi.method.flow_sources.config import FlowConfig
 from morgs_mi.method.flow_sources.consistency import consistency_mask
-from morgs_mi.method.flow_sources.registry import FlowSource, FramePair, flow_source
-from morgs_mi.method.mask_refiners.config import MaskConfig
+from morgs_mi.method.flow_sources.flow_config import FlowConfig
+from morgs_mi.method.flow_sources.flow_registry import FlowSource, FramePair, flow_source
+from morgs_mi.method.mask_refiners.mask_config import MaskConfig
 
-__all__ = ["FlowObservation", "choose_key_views", "observe_flow", "observe_key_views"]
+__all__ = ["FlowObservation", "observe_flow", "observe_key_views"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,21 +34,6 @@ class FlowObservation:
     forward_flow: np.ndarray
     forward_reliable: np.ndarray
     mask: np.ndarray | None = None
-
-
-def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
-    """Return the indices of `count` views spread over the rig, or of all if there are fewer.
-
-    The first is the most central one; each further one is the farthest from those chosen.
-    """
-    if not cameras:
-        return ()
-    positions = np.array([camera.position for camera in cameras])
-    chosen = [int(np.argmin(np.linalg.norm(positions - positions.mean(0), axis=1)))]
-    while len(chosen) < min(count, len(cameras)):
-        distance = np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(1)
-        chosen.append(int(np.argmax(distance)))
-    return tuple(sorted(chosen))
 
 
 def observe_flow(

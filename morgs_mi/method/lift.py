@@ -37,7 +37,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.ranges import Above, AtLeast, check_ranges
 from morgs_mi.method.confidence import motion_floor
 from morgs_mi.method.flow import FlowObservation
-from morgs_mi.method.mask_refiners.config import MaskConfig
+from morgs_mi.method.mask_refiners.mask_config import MaskConfig
 from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.render.active_view import ActiveView
 

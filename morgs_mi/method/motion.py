@@ -11,17 +11,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet
 from morgs_mi.method.cohesion import share_confidence
-from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.lift import lift_flow
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.neighbours import NeighbourIndex
 from morgs_mi.method.photometric import refine_start
 from morgs_mi.method.propagation import propagate_motion
 from morgs_mi.method.search import search_motion
+from morgs_mi.method.ssim import Target
 
 __all__ = ["STAGES", "Stage", "initial_motion"]
 

@@ -25,8 +25,8 @@ from scipy.sparse import csr_array
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Jit, Tensor
-from morgs_mi.method.config import MotionConfig
-from morgs_mi.method.registry import Registry
+from morgs_mi.method.method_registry import Registry
+from morgs_mi.method.motion_config import MotionConfig
 
 __all__ = [
     "MOTION_MODELS",

@@ -9,10 +9,10 @@ from functools import cached_property
 import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians, displaced
-from morgs_mi.losses.ssim import Target
 from morgs_mi.method.boxes import boxes_around
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.neighbours import NeighbourIndex
+from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["MotionProblem", "MotionStart"]

@@ -19,10 +19,10 @@ import numpy as np
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.ranges import AtLeast, AtMost, check_ranges
 from morgs_mi.core.types import Tensor
-from morgs_mi.losses.losses import flow_loss, mask_loss, offset_loss, recon_loss
-from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation
-from morgs_mi.method.flow_sources.registry import FramePair
+from morgs_mi.method.flow_sources.flow_registry import FramePair
+from morgs_mi.method.losses import flow_loss, mask_loss, offset_loss, recon_loss
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.rigidity import isometry_loss, rigid_loss, rotation_loss
 from morgs_mi.render.rasterize import Image
 from morgs_mi.render.region import Region

@@ -25,9 +25,9 @@ import numpy as np
 
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians, displaced
-from morgs_mi.losses.ssim import Target
 from morgs_mi.method.image_gradient import image_gradient
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
+from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["mean_color_error", "refine_displacement", "refine_start"]

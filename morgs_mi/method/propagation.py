@@ -4,7 +4,7 @@ Flow fails where parts are thin and fast, or look alike; but motion mostly conti
 surroundings. So each Gaussian gets further proposals, as PatchMatch gives them to pixels (Barnes et al. 2009): first
 its own motion of the previous frame, then, in each of some rounds, that of a random one of its nearest moving
 neighbours. All Gaussians try their proposals at once and are rendered in the key views. With the attributed error E_iv
-and the coverage W_iv there (see `losses.attribution`), the error of a Gaussian is
+and the coverage W_iv there (see `method.attribution`), the error of a Gaussian is
 
     (0.01 px + sum_v E_iv) / (1 px + sum_v W_iv) .
 
@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians, displaced
-from morgs_mi.losses.attribution import attribute_error
+from morgs_mi.method.attribution import attribute_error
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 
 __all__ = ["propagate_motion"]

@@ -22,7 +22,7 @@ from morgs_mi.core.attributes import ATTRIBUTES, BY_NAME, sigmoid
 from morgs_mi.core.gaussians import Gaussians, repeat_each
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Tensor
-from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import MotionStart
 
 __all__ = ["apply_residual", "residual_parameters"]

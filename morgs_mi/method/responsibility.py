@@ -27,8 +27,8 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.boxes import Boxes
 from morgs_mi.render.backproject import backproject
-from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.region import Region
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["ChangedView", "responsibility"]
 

@@ -27,9 +27,9 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.core.ranges import Above, AtLeast, AtMost, check_ranges
-from morgs_mi.losses.ssim import Target
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.neighbours import NeighbourIndex
+from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["SearchConfig", "search_motion"]

@@ -21,25 +21,26 @@ import numpy as np
 
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.capture.truth import GroundTruth, load_truth
 from morgs_mi.codec.container import PacketKind
 from morgs_mi.codec.packets import play
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.config import apply_values
 from morgs_mi.core.attributes import ATTRIBUTES
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.types import Tensor
 from morgs_mi.io.bounded import read_json
+from morgs_mi.loop.stream_config import apply_values
+from morgs_mi.playback.source import as_fitted
 from morgs_mi.playback.visualise import confidence_image, depth_image, grey_image, motion_image, to_uint8
-from morgs_mi.recording import as_fitted
-from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.rasterize import rasterize
-from morgs_mi.synth.ground_truth import GroundTruth, load_truth
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = [
     "CHANNELS",
     "MOTION_SCALE",
     "OFFSET_SCALE",
+    "PlayableStream",
     "available_channels",
     "channel_image",
     "find_camera",
@@ -78,7 +79,17 @@ _JSON_TYPES = {
 }
 
 
-def open_stream(out: str | Path) -> StreamReader:
+class PlayableStream(StreamReader):
+    """A stream file that plays in the output of a notebook's cell."""
+
+    def _repr_html_(self) -> str:
+        # The page draws what this module renders, so it is imported when it is shown.
+        from morgs_mi.playback.export.notebook import stream_html
+
+        return stream_html(self)
+
+
+def open_stream(out: str | Path) -> PlayableStream:
     """Open a stream file, or the ``stream.morgs`` in the folder of a fit.
 
     Example:
@@ -94,7 +105,7 @@ def open_stream(out: str | Path) -> StreamReader:
     path = path / _STREAM if path.is_dir() else path
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a stream, found none; check the path or fit a capture first.")
-    return StreamReader(path)
+    return PlayableStream(path)
 
 
 def stream_name(stream: StreamReader) -> str:

@@ -12,10 +12,10 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.render.backproject import backproject
 from morgs_mi.render.blocks import touches
-from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.projection import Splats, project
 from morgs_mi.render.rasterize import Image, rasterize
 from morgs_mi.render.region import Region
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["ActiveView", "make_active_view"]
 

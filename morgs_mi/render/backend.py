@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from morgs_mi.core.types import Int32, UInt32
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["add_mode", "block_shape", "on_aligned_stack", "stable_order"]
 

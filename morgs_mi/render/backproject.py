@@ -11,10 +11,10 @@ from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.render.blocks import build_lists, touches
 from morgs_mi.render.compositing import Channel, Layout, padded, weighted_sums
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.kernel_recording import with_render_lock
 from morgs_mi.render.projection import Splats, project
-from morgs_mi.render.recording import with_render_lock
 from morgs_mi.render.region import Region, full_view
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["backproject"]
 

@@ -19,10 +19,10 @@ import mitsuba as mi
 
 from morgs_mi.core.types import Bool, Float, UInt32
 from morgs_mi.render.backend import stable_order
-from morgs_mi.render.config import RenderConfig
 from morgs_mi.render.cut import FARTHEST_CUT
 from morgs_mi.render.projection import Splats
 from morgs_mi.render.region import ACROSS, DOWN, NO_SLOT, Region, quotient
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["BlockLists", "build_lists", "fetch_record", "next_entry", "pack_records", "sorted_buckets", "touches"]
 

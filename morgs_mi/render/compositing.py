@@ -10,6 +10,7 @@ import mitsuba as mi
 
 from morgs_mi.core.types import Float
 from morgs_mi.render.blocks import BlockLists, pack_records, sorted_buckets
+from morgs_mi.render.kernel_recording import recorded
 from morgs_mi.render.loops import (
     Blocks,
     Channel,
@@ -21,7 +22,6 @@ from morgs_mi.render.loops import (
     record_packets,
     tangent,
 )
-from morgs_mi.render.recording import recorded
 from morgs_mi.render.region import Region, on_region, quotient
 
 __all__ = ["Channel", "Layout", "blend", "padded", "weighted_sums"]

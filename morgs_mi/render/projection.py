@@ -31,7 +31,7 @@ from morgs_mi.core.gaussians import ActivatedGaussians, tensor_rows
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Bool, Float, Jit, Tensor, UInt32
 from morgs_mi.render.channels import attribute_channels
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["FARTHEST", "Splats", "concatenated", "project"]
 

@@ -20,10 +20,10 @@ from morgs_mi.render.backend import block_shape
 from morgs_mi.render.blocks import build_lists, touches
 from morgs_mi.render.channels import NORMALISED, attribute_channels, channel_sizes
 from morgs_mi.render.compositing import Channel, Layout, blend
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.kernel_recording import with_render_lock
 from morgs_mi.render.projection import FARTHEST, Splats, project
-from morgs_mi.render.recording import with_render_lock
 from morgs_mi.render.region import Region, full_view
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["Image", "rasterize"]
 

@@ -16,7 +16,7 @@ from morgs_mi.core.checks import check_type
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, UInt32
 from morgs_mi.render.backend import block_shape
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["ACROSS", "DOWN", "NO_SLOT", "Region", "full_view", "on_region", "quotient"]
 

@@ -20,6 +20,7 @@ from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import undistortion
 from morgs_mi.capture.outputs import check_output
+from morgs_mi.capture.truth import Tracks, save_tracks, save_truth
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path, write_json
 from morgs_mi.io.bounded import read_json
@@ -32,10 +33,10 @@ from morgs_mi.synth.disturbances import (
     save_disturbances,
 )
 from morgs_mi.synth.gltf_scene import gltf_scene
-from morgs_mi.synth.ground_truth import Tracks, compute_ground_truth, move_with_objects, save_tracks, save_truth
+from morgs_mi.synth.ground_truth import compute_ground_truth, move_with_objects
 from morgs_mi.synth.path_tracer import PathTracer, developed
-from morgs_mi.synth.recording import check_lenses, record_light
 from morgs_mi.synth.scene import DeformingObject, Scene, check_scene, load_scene
+from morgs_mi.synth.sensor import check_lenses, record_light
 from morgs_mi.synth.synth_config import SynthConfig
 
 __all__ = ["synthesize"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from morgs_mi.calibration.rig_check import SharedFeatures
+from morgs_mi.calibration.checks.rig_check import SharedFeatures
 from morgs_mi.capture.capture import Capture
 from tests.scenes.filmed import Clips, film
 

@@ -15,8 +15,8 @@ from morgs_mi.calibration.bundle import (
     undistorted,
 )
 from morgs_mi.capture.features import Tracks, intersect
-from morgs_mi.fit.config import CameraPriors
-from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.core.rig import scene_extent
+from morgs_mi.fit.fit_config import CameraPriors
 from tests.assertions import assert_close
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.textured import rig

@@ -14,7 +14,7 @@ import pytest
 
 from morgs_mi import cli
 from morgs_mi.calibration.calibrate import CalibrateConfig, _frames, calibrate
-from morgs_mi.calibration.rig_check import check_rig, match_capture
+from morgs_mi.calibration.checks.rig_check import check_rig, match_capture
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.core.camera import Camera

@@ -9,7 +9,7 @@ import numpy as np
 
 from morgs_mi import Gaussians, rasterize
 from morgs_mi.calibration.offset_equations import OffsetEquations, offset_equations
-from morgs_mi.losses.ssim import Target
+from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from tests.scenes.ball import opaque_ball
 from tests.scenes.cameras import look_at_cameras

@@ -18,12 +18,12 @@ from morgs_mi.calibration.refine import (
 )
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.fit.config import CameraPriors, FitConfig, ShortFitConfig
-from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.core.rig import scene_extent
+from morgs_mi.fit.fit_config import CameraPriors, FitConfig, ShortFitConfig
 from morgs_mi.fit.view import View, rendered
 from morgs_mi.playback.visualise import to_uint8, write_png
-from morgs_mi.recorder import with_points
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.render.render_config import RenderConfig
+from morgs_mi.runs.recorder import with_points
 from tests.assertions import assert_close
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from morgs_mi.calibration.rig_check import SharedFeatures
+from morgs_mi.calibration.checks.rig_check import SharedFeatures
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.features import Features, detect, match_views, reprojection_errors, triangulate
 from morgs_mi.core.camera import Camera

@@ -60,7 +60,7 @@ def test_batch__says_how_to_continue_after_an_interruption(jobs: Path, run: Call
     def stop(*_: object) -> Iterator[None]:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("morgs_mi.cluster.batch.run_batch", stop)
+    monkeypatch.setattr("morgs_mi.runs.cluster.jobs.run_batch", stop)
     status, _, error = run("batch", jobs)
     assert (status, error.strip()) == (130, "Interrupted. The jobs continue with the same command.")
 

@@ -12,7 +12,7 @@ import pytest
 
 from morgs_mi import cli
 from morgs_mi.cli.completion import near_command
-from morgs_mi.config import PresetName
+from morgs_mi.loop.stream_config import PresetName
 
 # Prints what bash would replace the last word by.
 TRY = """

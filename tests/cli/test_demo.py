@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from morgs_mi.demo import DemoConfig
+from morgs_mi.runs.demo import DemoConfig
 
 
 def test_demo__passes_its_options_on(tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -17,7 +17,7 @@ def test_demo__passes_its_options_on(tmp_path: Path, run, monkeypatch: pytest.Mo
         calls.append(config)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("morgs_mi.demo.run_demo", stop)
+    monkeypatch.setattr("morgs_mi.runs.demo.run_demo", stop)
     (tmp_path / "a.toml").write_text("seed = 7\n[fit]\nepochs = 2\n")
     assert run("demo", tmp_path)[0] == 130
     options = ("--scene", "arm", "--cameras", 4, "--frames", 5, "--width", 64, "--height", 48, "--spp", 2)

@@ -17,13 +17,13 @@ import pytest
 from morgs_mi import cli
 from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.cluster.seams import SeamConfig
-from morgs_mi.cluster.segments import _Segment
-from morgs_mi.cluster.tasks import Part
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.io.video_writer import write_video
+from morgs_mi.runs.cluster.seams import SeamConfig
+from morgs_mi.runs.cluster.segments import _Segment
+from morgs_mi.runs.cluster.tasks import Part
 from morgs_mi.stream_loop import StreamLoop
-from tests.calibration.test_signals import brighter
+from tests.calibration.checks.test_signals import brighter
 from tests.cli.commands import QUICK, assert_one_sentence, assert_refused, interrupt
 from tests.scenes import textured
 from tests.scenes.captures import colmap
@@ -196,7 +196,7 @@ def fitted_capture(monkeypatch: pytest.MonkeyPatch, run, capture: Path, out: Pat
         passed.append(capture)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("morgs_mi.recorder.stream_capture", stop)
+    monkeypatch.setattr("morgs_mi.runs.recorder.stream_capture", stop)
     assert run("fit", capture, out, *args)[0] == 130
     return passed[0]
 
@@ -236,7 +236,7 @@ def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
 ) -> None:
     (tmp_path / "out").mkdir()
     stream.rename(tmp_path / "out" / "stream.morgs")
-    monkeypatch.setattr("morgs_mi.recorder.StreamLoop.of", interrupt)
+    monkeypatch.setattr("morgs_mi.runs.recorder.StreamLoop.of", interrupt)
     status, _, error = run("fit", capture, tmp_path / "out", *QUICK)
     assert status == 130
     assert error.splitlines()[-1] == "Interrupted."
@@ -247,7 +247,7 @@ def test_fit__reports_progress_before_the_first_frame(capture: Path, tmp_path: P
     write_colmap(capture / "sparse" / "0", rig(), np.zeros((0, 3)), np.zeros((0, 3)))
     now = iter(range(0, 10**9, 40))
     monkeypatch.setattr("morgs_mi.cli.console.time.monotonic", lambda: float(next(now)))
-    monkeypatch.setattr("morgs_mi.recorder.StreamLoop.of", interrupt)
+    monkeypatch.setattr("morgs_mi.runs.recorder.StreamLoop.of", interrupt)
     status, _, error = run("fit", capture, tmp_path / "out", *QUICK)
     assert status == 130
     assert error.startswith("Matching views: 0/3, 0:00:00 elapsed.\nMatching views: 1/3, ")
@@ -290,7 +290,7 @@ def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, 
 
 
 def test_fit__fits_segments_side_by_side(tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("morgs_mi.cluster.segments.SeamConfig", lambda: SeamConfig(passes=1, epochs=1))
+    monkeypatch.setattr("morgs_mi.runs.cluster.segments.SeamConfig", lambda: SeamConfig(passes=1, epochs=1))
     clip, out = write_recording(tmp_path / "clip", 4), tmp_path / "out"
     status, output, _ = run("fit", clip, out, *QUICK, "--segments", 2)
     assert status == 0

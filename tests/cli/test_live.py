@@ -12,8 +12,8 @@ from morgs_mi.cli import live as module
 from morgs_mi.cli.live import Live, _Lines, _summary
 from morgs_mi.cli.settings import Settings
 from morgs_mi.io.video_writer import write_video
-from morgs_mi.live.fit import LiveFrame
 from morgs_mi.playback.player import open_stream
+from morgs_mi.runs.live.fit_live import LiveFrame
 from tests.cli.commands import QUICK, assert_refused
 from tests.scenes import noise_capture
 
@@ -103,7 +103,7 @@ def test_Live__names_the_output_after_the_time(monkeypatch: pytest.MonkeyPatch) 
         given.update(out=out, sources=sources, fit=config.fit)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("morgs_mi.live.fit.fit_live", fit)
+    monkeypatch.setattr("morgs_mi.runs.live.fit_live.fit_live", fit)
     for settings, seconds in ((Settings(), 30), (Settings(first_frame_steps=7), None), (Settings(preset="s"), 30)):
         with pytest.raises(KeyboardInterrupt):
             Live(camera=("0", "rtsp://10.0.0.10/live"), settings=settings).run()

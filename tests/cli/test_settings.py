@@ -14,7 +14,7 @@ import pytest
 from morgs_mi import cli
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cli.settings import SETTINGS, Reading
-from morgs_mi.config import StreamConfig, apply_values, config_toml
+from morgs_mi.loop.stream_config import StreamConfig, apply_values, config_toml
 
 
 def printed_config(run, *args: object) -> StreamConfig:

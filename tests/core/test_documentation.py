@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from morgs_mi.config import StreamConfig, config_toml
 from morgs_mi.core import documentation
 from morgs_mi.core.documentation import page, with_pages
+from morgs_mi.loop.stream_config import StreamConfig, config_toml
 
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted((ROOT / "morgs_mi").rglob("*.py"))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from morgs_mi.capture.truth import GroundTruth
 from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.motion3d import compare_motion, evaluate_motion, local_motion, rigid_motions, surface_ids
-from morgs_mi.synth.ground_truth import GroundTruth
 from tests.assertions import assert_close
 
 rng = np.random.default_rng(0)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from morgs_mi.codec.config import CodecConfig
+from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.codec.reader import StreamReader

@@ -9,8 +9,8 @@ import pytest
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.capture.truth import Tracks, save_tracks
 from morgs_mi.evaluate.track_truth import TrackTruth, read_annotation, synthetic_tracks, tapvid3d_tracks
-from morgs_mi.synth.ground_truth import Tracks, save_tracks
 from tests.assertions import assert_close
 from tests.scenes import captures as layouts
 from tests.scenes.annotations import PATHS, QUERIES, VISIBLE, annotated

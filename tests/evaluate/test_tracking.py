@@ -11,12 +11,12 @@ import pytest
 from rich.console import Console
 
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.truth import Tracks, load_tracks, save_tracks
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.evaluate.tables import evaluation_tables
-from morgs_mi.synth.ground_truth import Tracks, load_tracks, save_tracks
 from tests.scenes.annotations import STARTS, STEP, annotated
 from tests.scenes.captures import COUNT
 from tests.scenes.gaussians import isotropic

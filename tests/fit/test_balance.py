@@ -11,9 +11,9 @@ from morgs_mi import Gaussians, RenderConfig, rasterize
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
 from morgs_mi.core.progress import Progress, Report
+from morgs_mi.core.rig import scene_extent
 from morgs_mi.fit.balance import Balance, balance_cameras
-from morgs_mi.fit.config import FitConfig, ShortFitConfig
-from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.fit.fit_config import FitConfig, ShortFitConfig
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import View
 from morgs_mi.method.exposure import Exposure

@@ -6,7 +6,7 @@ import pytest
 
 from morgs_mi.fit import budget
 from morgs_mi.fit.budget import steps_within
-from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.fit_config import FitConfig
 from tests.scenes.ball import problem
 
 

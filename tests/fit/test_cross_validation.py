@@ -9,7 +9,6 @@ import pytest
 
 from morgs_mi import RenderConfig
 from morgs_mi.core.progress import Progress
-from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import (
     CrossValidation,
     Trial,
@@ -18,6 +17,7 @@ from morgs_mi.fit.cross_validation import (
     trial_steps,
     withheld_views,
 )
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import View, rendered
 from tests.scenes.ball import ball, bytes_of, images_of, opaque_ball, problem, views
 from tests.scenes.cameras import arc, look_at_cameras

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, rasterize
-from morgs_mi.fit.config import DensityConfig
 from morgs_mi.fit.density import DensityPlan, Room, apply_plan, plan_additions, plan_growth, resize_optimizer
+from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.fit.later_frame import _NOISE
 from morgs_mi.fit.optimise import adam, values_of
-from morgs_mi.losses.attribution import DensificationScores, densification_scores
-from morgs_mi.losses.ssim import Target
+from morgs_mi.method.attribution import DensificationScores, densification_scores
+from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from tests.assertions import assert_close
 from tests.scenes.gaussians import isotropic

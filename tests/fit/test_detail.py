@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morgs_mi.fit.config import DetailConfig, FitConfig
+from morgs_mi.core.rig import mean_views
 from morgs_mi.fit.detail import count_details, with_num_gaussians
-from morgs_mi.fit.forecast import mean_views
+from morgs_mi.fit.fit_config import DetailConfig, FitConfig
 from morgs_mi.fit.view import View
 from tests.scenes.cameras import arc, look_at_cameras
 

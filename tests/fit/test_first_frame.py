@@ -11,8 +11,8 @@ import pytest
 
 from morgs_mi import Gaussians, RenderConfig
 from morgs_mi.core.progress import Progress
-from morgs_mi.fit.config import ConvergenceConfig, DensityConfig, FitConfig, LearningRates
 from morgs_mi.fit.first_frame import FirstFrame, density_rounds, fit_confidence, fit_first_frame
+from morgs_mi.fit.fit_config import ConvergenceConfig, DensityConfig, FitConfig, LearningRates
 from morgs_mi.fit.view import View, rendered
 from morgs_mi.method.objective import ObjectiveConfig
 from morgs_mi.render.active_view import ActiveView

@@ -8,9 +8,9 @@ import pytest
 
 from morgs_mi.core.progress import Progress
 from morgs_mi.fit import first_settings as module
-from morgs_mi.fit.config import FitConfig
 from morgs_mi.fit.cross_validation import CrossValidation
 from morgs_mi.fit.first_settings import first_settings
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.forecast import Forecast
 from tests.scenes.ball import bytes_of, images_of, opaque_ball, problem
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from morgs_mi.fit.forecast import forecast, overlaps, quality_of
+from morgs_mi.core.rig import overlaps
+from morgs_mi.fit.forecast import forecast, quality_of
 from tests.scenes.cameras import arc, look_at_cameras
 
 NO_POINTS = np.zeros((0, 3))

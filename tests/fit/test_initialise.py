@@ -8,15 +8,8 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera
-from morgs_mi.fit.initialise import (
-    MIN_POINTS,
-    fill_points,
-    focus_point,
-    initial_points,
-    scene_extent,
-    seed_points,
-    seen_points,
-)
+from morgs_mi.core.rig import focus_point, scene_extent, seen_points
+from morgs_mi.fit.initialise import MIN_POINTS, fill_points, initial_points, seed_points
 from morgs_mi.fit.view import View
 from tests.scenes.cameras import arc, look_at_cameras
 

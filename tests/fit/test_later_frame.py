@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from morgs_mi import Gaussians, RenderConfig
-from morgs_mi.config import StreamConfig, apply_preset
-from morgs_mi.fit.config import DensityConfig, FitConfig
+from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.later_frame import FrameProblem, LaterFrame, fit_later_frame
-from morgs_mi.losses.ssim import Target
+from morgs_mi.loop.stream_config import StreamConfig, apply_preset
 from morgs_mi.method.active_set import full_active_set
-from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.motion import initial_motion
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.objective import ObjectiveConfig
+from morgs_mi.method.ssim import Target
 from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
 
 RENDER, EXTENT = RenderConfig(), 3.0

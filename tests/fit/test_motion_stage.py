@@ -9,8 +9,8 @@ import mitsuba as mi
 import numpy as np
 from scipy.sparse import csr_array
 
-from morgs_mi.fit.config import FitConfig
-from morgs_mi.method.config import MotionConfig
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModelFactory, sparse_product
 from morgs_mi.method.motion_start import MotionStart
 from tests.scenes.ball import opaque_ball

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from morgs_mi import RenderConfig
+from morgs_mi.core.rig import scene_extent
 from morgs_mi.evaluate.metrics import psnr
-from morgs_mi.fit.config import DensityConfig, FitConfig
-from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import View, rendered, withheld_blocks
 from tests.scenes.ball import ball, bytes_of, images_of, opaque_ball, problem, views

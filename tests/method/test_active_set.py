@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
-from morgs_mi.fit.config import DensityConfig, FitConfig
+from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.later_frame import FrameProblem, LaterFrame, fit_later_frame
-from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet, ActiveSetConfig, find_active_set, full_active_set
-from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.motion_config import MotionConfig
+from morgs_mi.method.ssim import Target
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 

@@ -8,7 +8,7 @@ import pytest
 
 from morgs_mi.method.change import box_around, change_mask, moving_region, update_reference
 from morgs_mi.method.flow import observe_key_views
-from morgs_mi.method.flow_sources.registry import FramePair
+from morgs_mi.method.flow_sources.flow_registry import FramePair
 
 H, W, NOISE = 120, 160, 3.0
 

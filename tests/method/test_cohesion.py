@@ -7,7 +7,7 @@ import numpy as np
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.cohesion import share_confidence
-from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.motion_config import MotionConfig
 from tests.scenes.gaussians import isotropic, random_sheet
 
 STILL, WEIGHT = -2.0, MotionConfig().cohesion_weight

@@ -7,9 +7,9 @@ import pytest
 
 from morgs_mi.method.confidence import flow_mask, flow_threshold, motion_floor, motion_mask
 from morgs_mi.method.flow import observe_flow, observe_key_views
-from morgs_mi.method.flow_sources.registry import FramePair
-from morgs_mi.method.mask_refiners.config import MaskConfig
-from morgs_mi.method.mask_refiners.registry import MASK_REFINERS, mask_refiner
+from morgs_mi.method.flow_sources.flow_registry import FramePair
+from morgs_mi.method.mask_refiners.mask_config import MaskConfig
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, mask_refiner
 from tests.method.moving_disc import moving_disc
 
 CAMERA_NOISE = 2 / 255  # standard deviation of a video camera in room light

@@ -7,7 +7,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from morgs_mi.method.flow import FlowObservation, choose_key_views
+from morgs_mi.core.rig import choose_key_views
+from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.lift import lift_flow
 from morgs_mi.render.active_view import ActiveView
 from tests.scenes.cameras import arc, look_at_cameras

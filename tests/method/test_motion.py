@@ -10,12 +10,12 @@ import pytest
 from scipy.spatial import KDTree
 
 from morgs_mi import RenderConfig
-from morgs_mi.losses.ssim import Target
 from morgs_mi.method import neighbours
 from morgs_mi.method.active_set import full_active_set
-from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.motion import STAGES, initial_motion
+from morgs_mi.method.motion_config import MotionConfig
+from morgs_mi.method.ssim import Target
 from tests.scenes.ball import opaque_ball, views
 
 SHIFT = np.float32([0.06, -0.03, 0.02])

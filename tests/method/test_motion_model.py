@@ -10,7 +10,7 @@ from scipy.sparse import csr_array
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.geometry import unit_quats
-from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import motion_model, moved, sparse_product
 from tests.assertions import assert_close
 from tests.scenes.gaussians import make_scene, to_gaussians

@@ -9,10 +9,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi.losses.ssim import Target
-from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation
-from morgs_mi.method.flow_sources.registry import FramePair
+from morgs_mi.method.flow_sources.flow_registry import FramePair
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.objective import (
     TERMS,
     KeyView,
@@ -24,6 +23,7 @@ from morgs_mi.method.objective import (
     weights_of,
 )
 from morgs_mi.method.rigidity import find_neighbours
+from morgs_mi.method.ssim import Target
 from morgs_mi.render.rasterize import Image
 from tests.scenes.gaussians import make_scene, to_gaussians
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.method.residual import apply_residual, residual_parameters
 from tests.assertions import assert_close

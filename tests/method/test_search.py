@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import ActiveSet
-from morgs_mi.method.config import MotionConfig
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.motion import initial_motion
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.search import SearchConfig, _MatchedView, search_motion
+from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, rasterize
-from morgs_mi.codec.config import CodecConfig
+from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from tests import tolerances as tol
 from tests.assertions import assert_close

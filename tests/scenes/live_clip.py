@@ -13,12 +13,12 @@ from threading import Event, Thread
 import numpy as np
 
 from morgs_mi.capture.layouts.colmap import write_colmap
-from morgs_mi.config import StreamConfig
-from morgs_mi.fit.config import DensityConfig, FitConfig
+from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.io.png import png_bytes
 from morgs_mi.io.video_writer import write_video
-from morgs_mi.method.config import MotionConfig
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.method.motion_config import MotionConfig
+from morgs_mi.render.render_config import RenderConfig
 from tests.scenes import filmed, textured
 
 FPS = 20.0

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.codec.config import CodecConfig
+from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import Packet, StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.core.camera import Camera

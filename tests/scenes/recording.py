@@ -17,12 +17,12 @@ from morgs_mi import RenderConfig
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec import container
-from morgs_mi.codec.config import CodecConfig
-from morgs_mi.config import StreamConfig
-from morgs_mi.fit.config import DensityConfig, FitConfig
-from morgs_mi.method.config import MotionConfig
+from morgs_mi.codec.codec_config import CodecConfig
+from morgs_mi.fit.fit_config import DensityConfig, FitConfig
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.playback.visualise import write_png
-from morgs_mi.recorder import stream_capture
+from morgs_mi.runs.recorder import stream_capture
 from tests.scenes.cameras import look_at_cameras
 
 FRAMES = 6

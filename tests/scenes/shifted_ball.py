@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from morgs_mi import Gaussians, RenderConfig
-from morgs_mi.fit.config import DensityConfig, FitConfig
+from morgs_mi.fit.fit_config import DensityConfig, FitConfig
 from morgs_mi.fit.later_frame import FrameProblem, LaterFrame, fit_later_frame
-from morgs_mi.losses.ssim import Target
 from morgs_mi.method.active_set import full_active_set
-from morgs_mi.method.config import MotionConfig
+from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import MotionStart
+from morgs_mi.method.ssim import Target
 from tests.scenes.ball import images_of, mean_psnr, opaque_ball, views
 
 SHIFT = np.array([0.06, -0.03, 0.02], np.float32)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from morgs_mi.codec.config import CodecConfig
+from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import PAYLOAD, StreamWriter
 from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, reemitted_keyframe, residual_packet
 from morgs_mi.core.gaussians import Gaussians

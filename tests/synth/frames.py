@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from morgs_mi.capture.truth import GroundTruth
 from morgs_mi.core.camera import Camera
-from morgs_mi.synth.ground_truth import GroundTruth, compute_ground_truth
+from morgs_mi.synth.ground_truth import compute_ground_truth
 from morgs_mi.synth.path_tracer import PathTracer
 
 FPS = 30.0

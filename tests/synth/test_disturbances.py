@@ -11,6 +11,7 @@ import pytest
 
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.lens import Lens
+from morgs_mi.capture.truth import load_tracks, load_truth
 from morgs_mi.core.color_space import srgb_to_linear
 from morgs_mi.io.video import open_frames
 from morgs_mi.synth.disturbances import (
@@ -22,7 +23,6 @@ from morgs_mi.synth.disturbances import (
     save_disturbances,
     undistorted,
 )
-from morgs_mi.synth.ground_truth import load_tracks, load_truth
 from morgs_mi.synth.path_tracer import PathTracer, srgb_bytes
 from morgs_mi.synth.scene import Light, Object, Rig, Scene, load_scene, translate
 from morgs_mi.synth.shapes import box

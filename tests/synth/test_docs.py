@@ -11,8 +11,8 @@ import pytest
 
 from morgs_mi import cli
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.truth import load_truth
 from morgs_mi.synth.disturbances import Disturbances, load_disturbances
-from morgs_mi.synth.ground_truth import load_truth
 from tests.scenes.animated_gltf import model, write_glb
 
 TEXT = (Path(__file__).parents[2] / "docs" / "scenes.md").read_text(encoding="utf-8")

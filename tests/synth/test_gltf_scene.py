@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.truth import load_tracks, load_truth
 from morgs_mi.io.gltf import read_gltf
 from morgs_mi.synth.gltf_scene import gltf_scene
-from morgs_mi.synth.ground_truth import load_tracks, load_truth
 from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import Deformed, DeformingObject, Mesh, Scene, check_scene
 from morgs_mi.synth.synth_config import SynthConfig

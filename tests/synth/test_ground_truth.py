@@ -6,7 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from morgs_mi.synth.ground_truth import compute_ground_truth, load_tracks, load_truth
+from morgs_mi.capture.truth import load_tracks, load_truth
+from morgs_mi.synth.ground_truth import compute_ground_truth
 from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import Object, Scene, load_scene, translate
 from tests.assertions import assert_close

@@ -8,7 +8,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from morgs_mi.synth.ground_truth import load_truth
+from morgs_mi.capture.truth import load_truth
 from morgs_mi.synth.random_scene import MOTIONS, Body, RandomScene, draw_scene
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize

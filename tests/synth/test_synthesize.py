@@ -13,8 +13,8 @@ import pytest
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import read_colmap
 from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds
+from morgs_mi.capture.truth import load_truth
 from morgs_mi.io.video import open_frames
-from morgs_mi.synth.ground_truth import load_truth
 from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import Light, Object, Scene, load_scene
 from morgs_mi.synth.synth_config import SynthConfig

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.codec.config import CodecConfig
+from morgs_mi.capture.truth import Tracks, load_tracks, load_truth, save_tracks
+from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import decode, keyframe_packet, residual_packet
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.evaluate.tracking import evaluate_tracks
-from morgs_mi.synth.ground_truth import Tracks, load_tracks, load_truth, save_tracks
 from morgs_mi.synth.path_tracer import PathTracer
 from morgs_mi.synth.scene import Object, Scene, translate
 from morgs_mi.synth.shapes import ball

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from morgs_mi.method.flow_sources.config import FlowConfig
+from morgs_mi.method.flow_sources.flow_config import FlowConfig
 
 __all__ = ["consistency_mask"]
 

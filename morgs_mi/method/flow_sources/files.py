@@ -25,8 +25,8 @@ import numpy as np
 
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.exr import read_exr, write_exr
-from morgs_mi.method.flow_sources.config import FlowConfig
-from morgs_mi.method.flow_sources.registry import FLOW_SOURCES, FlowSource, FramePair
+from morgs_mi.method.flow_sources.flow_config import FlowConfig
+from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowSource, FramePair
 
 __all__ = ["SUFFIXES", "FlowFolder", "read_flow", "write_flow"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 
-from morgs_mi.cluster.executor import Workers
+from morgs_mi.runs.cluster.executor import Workers
 
 
 class Here(Workers):

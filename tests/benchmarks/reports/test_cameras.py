@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.reports.cameras import disturbed, pose_errors
 from morgs_mi.core.camera import Camera
-from morgs_mi.fit.initialise import scene_extent
+from morgs_mi.core.rig import scene_extent
 from tests.scenes.textured import rig
 
 

@@ -11,10 +11,10 @@ import pytest
 
 from benchmarks.reports.codec import Options, measure, quality_table
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.config import StreamConfig
-from morgs_mi.fit.config import FitConfig
-from morgs_mi.method.config import MotionConfig
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.method.motion_config import MotionConfig
+from morgs_mi.render.render_config import RenderConfig
 from tests.benchmarks.reports.here import Here
 
 QUICK = Options(

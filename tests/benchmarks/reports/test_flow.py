@@ -11,10 +11,10 @@ import pytest
 from benchmarks.reports import __main__ as cli
 from benchmarks.reports.flow import errors_table, measure
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.truth import load_truth
 from morgs_mi.evaluate.metrics import endpoint_error
 from morgs_mi.method.flow import observe_flow
 from morgs_mi.method.flow_sources.files import write_flow
-from morgs_mi.synth.ground_truth import load_truth
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 

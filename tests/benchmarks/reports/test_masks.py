@@ -9,10 +9,10 @@ import pytest
 
 from benchmarks.reports.masks import means, measure, overlap
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.cluster.tasks import Source
-from morgs_mi.config import StreamConfig
-from morgs_mi.fit.config import FitConfig
-from morgs_mi.method.mask_refiners.registry import MASK_REFINERS
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
+from morgs_mi.runs.cluster.tasks import Source
 
 
 def test_overlap__of_known_masks():

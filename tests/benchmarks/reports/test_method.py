@@ -23,8 +23,8 @@ from benchmarks.reports.method_tables import (
     method_page,
 )
 from benchmarks.reports.study import Variant
-from morgs_mi.config import StreamConfig
-from morgs_mi.fit.config import FitConfig
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.loop.stream_config import StreamConfig
 from tests.benchmarks.reports.here import Here
 from tests.benchmarks.reports.pages import ROOT, page
 

@@ -30,11 +30,11 @@ from benchmarks.reports.generalise import measure
 from benchmarks.reports.study import Scene, Study, Variant, method_version, rounded
 from morgs_mi import StreamLoop
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.cluster.executor import open_workers
-from morgs_mi.cluster.tasks import Source
-from morgs_mi.config import StreamConfig
-from morgs_mi.fit.config import FitConfig
-from morgs_mi.render.config import RenderConfig
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.render.render_config import RenderConfig
+from morgs_mi.runs.cluster.executor import open_workers
+from morgs_mi.runs.cluster.tasks import Source
 from tests.benchmarks.reports.here import Here
 from tests.benchmarks.reports.pages import ROOT
 from tests.scenes.animated_gltf import write_glb

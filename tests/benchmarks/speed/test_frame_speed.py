@@ -12,7 +12,7 @@ import pytest
 import morgs_mi
 from benchmarks.speed import frame_speed
 from benchmarks.speed.frame_speed import STAGES, Scene, Size
-from morgs_mi.losses.ssim import Target
+from morgs_mi.method.ssim import Target
 
 SIZE = Size(64, 48, 3, 600, 2)
 

@@ -11,7 +11,7 @@ import pytest
 from morgs_mi.io.exr import write_exr
 from morgs_mi.method.flow import observe_key_views
 from morgs_mi.method.flow_sources.files import FlowFolder, read_flow, write_flow
-from morgs_mi.method.flow_sources.registry import FramePair, flow_source
+from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
 
 
 def random_flow(height=6, width=9, seed=0):

@@ -1,0 +1,1 @@
+"""Checks of recordings: poses, signals, synchrony and typical mistakes."""

@@ -1,0 +1,159 @@
+"""Common mistakes of a calibration, and the poses that would correct them.
+
+A candidate is a pair of corrected cameras and the description of the mistake. The rig check accepts a candidate that
+explains the matches between the images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations, permutations
+from typing import Any
+
+import numpy as np
+
+from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.layouts import poses_bounds
+from morgs_mi.capture.layouts.calibration import PoseConvention
+from morgs_mi.capture.layouts.layout_registry import layout_called
+from morgs_mi.core.camera import Camera
+
+__all__ = [
+    "best_focal_factor",
+    "camera_candidates",
+    "rig_candidates",
+    "same_poses",
+    "with_focal_factor",
+]
+
+_FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
+_HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+_ABOUT_FACE = np.diag([-1.0, 1.0, -1.0, 1.0])
+# Corrects a camera whose columns right, up were read as down, right.
+_UPRIGHT = np.array([[0, 1.0, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+_AXES = {"OpenCV": "OpenCV's axes (x right, y down, z forward)", "OpenGL": "OpenGL's axes (x right, y up, z backward)"}
+# Share of the rig's radius, and entries of a rotation: neighbours of a dense rig differ by far more than this.
+_SAME = 1e-3
+# Every exchange of poses is compared with all matches, so their number is limited.
+_MAX_EXCHANGED, _MAX_PERMUTED = 12, 4
+# Factors of the focal length that are tried, and their step: at a wrong focal length the error has several minima.
+_FACTOR_OCTAVES, _FACTOR_STEP = 2.0, 0.25
+
+
+def same_poses(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
+    """Return the pairs of cameras with one pose."""
+    positions = np.array([camera.position for camera in cameras])
+    rotations = np.array([np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in cameras])
+    near = _SAME * np.linalg.norm(positions - positions.mean(0), axis=1).max()
+    return [
+        (i, j)
+        for i, j in combinations(range(len(cameras)), 2)
+        if np.linalg.norm(positions[i] - positions[j]) <= near and np.abs(rotations[i] - rotations[j]).max() < _SAME
+    ]
+
+
+def rig_candidates(capture: Capture, wrong: Sequence[int]) -> Iterator[tuple[Sequence[Camera], str]]:
+    """Yield the corrected cameras for each mistake that concerns several poses.
+
+    Args:
+        capture: the capture.
+        wrong: the views whose poses do not fit, among which the order may be wrong.
+    """
+    if capture.layout == poses_bounds.LAYOUT.name:
+        yield from _other_rows(capture)
+    else:
+        layout = layout_called(capture.layout)
+        poses = layout.poses if layout else PoseConvention()
+        yield from _other_conventions(capture.cameras, poses) if poses else ()
+    cameras, every = capture.cameras, range(len(capture.cameras))
+    if len(cameras) <= _MAX_EXCHANGED:
+        for i, j in combinations(every, 2):
+            order = [{i: j, j: i}.get(view, view) for view in every]
+            names = f"{cameras[i].name} and {cameras[j].name}"
+            yield (
+                [cameras[k] for k in order],
+                f"the clips of {names}, or their poses, seem to be swapped; exchange them",
+            )
+    if 3 <= len(wrong) <= _MAX_PERMUTED:
+        for order in permutations(wrong):
+            exchanged = dict(zip(wrong, order, strict=True))
+            names = ", ".join(f"{cameras[view].name} has that of {cameras[k].name}" for view, k in exchanged.items())
+            yield (
+                [cameras[exchanged.get(v, v)] for v in every],
+                f"the poses seem to be in another order ({names}); reorder them",
+            )
+
+
+def camera_candidates(camera: Camera) -> Iterator[tuple[Camera, str]]:
+    """Yield the corrected camera for each mistake that concerns a single pose."""
+
+    def moved(matrix: np.ndarray) -> Camera:
+        return replace(camera, viewmat=matrix @ np.asarray(camera.viewmat, np.float64))
+
+    mirrored = np.array([[0, 0, camera.width], [0, 0, camera.height], [0, 0, 2]])
+    upside_down = "its images are upside down relative to its pose: turn the clip or the pose by 180 degrees"
+    # A turned pose has the principal point of the image, a turned image the opposite one.
+    yield moved(_HALF_TURN), upside_down
+    turned_image = np.concatenate([camera.K[:, :2], (mirrored - camera.K)[:, 2:]], axis=1)
+    yield replace(moved(_HALF_TURN), K=turned_image), upside_down
+    sideways = "its pose is turned by 90 degrees about the optical axis: check the order and signs of its axes"
+    yield moved(_UPRIGHT), sideways
+    yield moved(_UPRIGHT.T), sideways
+    yield moved(_ABOUT_FACE), "its pose looks backward: turn it by 180 degrees about its vertical axis"
+    yield moved(_FLIP), "its pose is in other axes than those of the rest: negate its y and z axes"
+    inverse = np.linalg.inv(np.asarray(camera.viewmat, np.float64))
+    yield replace(camera, viewmat=inverse), "its pose is inverted, unlike those of the rest: invert it"
+
+
+def best_focal_factor(error: Callable[[float], float]) -> float:
+    """Return the factor on a focal length, from 1/4 to 4, with the least `error` of the factor."""
+
+    def of_octaves(octaves: float) -> float:
+        # A bound, because the search cannot compare infinite errors.
+        return min(error(float(2.0**octaves)), 1e9)
+
+    steps = np.arange(-_FACTOR_OCTAVES, _FACTOR_OCTAVES + _FACTOR_STEP, _FACTOR_STEP)
+    start = min(steps, key=of_octaves)
+    bounds = (start - _FACTOR_STEP, start + _FACTOR_STEP)
+    from scipy.optimize import minimize_scalar  # not at the start of every command, which it slows down
+
+    found: Any = minimize_scalar(of_octaves, bounds=bounds, method="bounded", options={"xatol": 3e-3})
+    return float(2.0**found.x)
+
+
+def with_focal_factor(camera: Camera, factor: float) -> Camera:
+    """Return the camera with its focal lengths multiplied by `factor`."""
+    return replace(camera, K=camera.K @ np.diag([factor, factor, 1.0]))
+
+
+def _other_rows(capture: Capture) -> list[tuple[Sequence[Camera], str]]:
+    """Return the alternatives for poses in the rows of `poses_bounds.npy`."""
+    cameras, alphabetical = capture.cameras, sorted(capture.names)
+    rows = [cameras[alphabetical.index(name)] for name in capture.names]
+    turned = [replace(c, viewmat=_UPRIGHT @ c.viewmat) for c in cameras]
+    order = ", ".join(alphabetical[:4])
+    return [
+        (rows, f"the rows seem to be in alphabetical order ({order}, ...); put them in numerical order"),
+        (turned, "the columns seem to be the camera's right, up and backward axes; expected down, right, backward"),
+    ]
+
+
+def _other_conventions(cameras: Sequence[Camera], expected: PoseConvention) -> list[tuple[Sequence[Camera], str]]:
+    """Return the alternatives for poses in 4x4 matrices.
+
+    Images do not determine a rotation of the world, so there are only four distinguishable conventions: camera to
+    world or the inverse, in OpenCV's axes or OpenGL's.
+    """
+    inverses = [replace(c, viewmat=np.linalg.inv(c.viewmat)) for c in cameras]
+    other_axes = "OpenCV" if expected.axes == "OpenGL" else "OpenGL"
+    inverse = "world to camera" if expected.direction == "camera to world" else "camera to world"
+    found = [
+        ([replace(c, viewmat=_FLIP @ c.viewmat) for c in cameras], expected.direction, other_axes),
+        (inverses, inverse, "OpenCV"),
+        ([replace(c, viewmat=_FLIP @ c.viewmat) for c in inverses], inverse, "OpenGL"),
+    ]
+    remedy = f"expected {expected.direction} in {_AXES[expected.axes]}; convert them"
+    return [
+        (cameras, f"the poses seem to be {direction} in {_AXES[axes]}; {remedy}") for cameras, direction, axes in found
+    ]

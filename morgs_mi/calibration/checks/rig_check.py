@@ -1,0 +1,389 @@
+"""Check of the camera poses against feature matches, which are found without the poses.
+
+A camera fits if most of its matches with the other cameras that fit have a small reprojection error. If a pose does not
+fit, the common mistakes of `mistakes` are tried, and the one that explains the matches is reported.
+
+Features are found at the recorded size, and pixels are those of that size, however far the capture is downscaled: the
+smaller the images, the fewer features are found, and the less exactly.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from morgs_mi.calibration.checks.mistakes import (
+    best_focal_factor,
+    camera_candidates,
+    rig_candidates,
+    same_poses,
+    with_focal_factor,
+)
+from morgs_mi.calibration.guided_matching import match_guided
+from morgs_mi.calibration.stereo import stereo_points
+from morgs_mi.capture.capture import Capture
+from morgs_mi.capture.features import Features, Match, detect, match_views, reprojection_errors, triangulate
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.random_streams import Stream, rng_of
+
+__all__ = [
+    "MAX_ERROR",
+    "CameraCheck",
+    "RigCheck",
+    "SharedFeatures",
+    "check_rig",
+    "dense_points",
+    "match_capture",
+    "triangulate_points",
+]
+
+# px. Distortion that a layout cannot represent causes errors of about a pixel, a wrong pose tens of pixels.
+MAX_ERROR = 2.0
+# With a wrong pose a handful of matches may fit by chance, but not this many.
+_MIN_MATCHES = 50
+# px. Features of two cameras at different places are farther apart.
+_SAME_IMAGE = 0.5
+# A correction must lower the error by this factor, and to less than twice the error of the poses that fit or to this
+# many pixels: with enough candidates, one that is wrong too may be a little better than the given poses.
+_GAIN, _GOOD_ERROR = 3.0, 0.5
+# Factors nearer to 1 than this are no mistake in the calibration's image size or field of view.
+_LEAST_FACTOR = 0.1
+# Matches of a pair, and pairs, with which candidates are compared: more are slow, and not more accurate.
+_SAMPLE, _FACTOR_PAIRS = 40, 8
+# A view that matches fewer others without its pose is also matched with it, which takes longer.
+_MIN_PARTNERS = 3
+_NO_OVERLAP = (
+    "check that the clip is of this scene and not mirrored, compare the camera's place in the plot of the rig (--plot) "
+    "with the real one, or add cameras in between and textured objects"
+)
+
+
+@dataclass(frozen=True)
+class CameraCheck:
+    """Result of checking the pose of one camera.
+
+    Attributes:
+        name: of the camera.
+        matches: number of its matches with other cameras.
+        error: median reprojection error of its matches with the cameras that fit, or with all if it has none with
+            these, px. NaN without matches, infinite if most of the points lie behind a camera.
+        fits: whether the pose fits the images; None if that could not be checked.
+        advice: the reason and a remedy; empty if the pose fits.
+    """
+
+    name: str
+    matches: int
+    error: float
+    fits: bool | None
+    advice: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """The result in words."""
+        return "not checked" if self.fits is None else "fits" if self.fits else "does not fit"
+
+
+@dataclass(frozen=True)
+class RigCheck:
+    """Result of checking the poses on the first frame.
+
+    Attributes:
+        matches: number of matches, over all pairs of views.
+        pairs: number of pairs of views with matches.
+        error: median reprojection error, px; NaN without matches.
+        cameras: result of each camera.
+        fits: whether all poses fit the images; None if no pose is known to be wrong but some could not be checked.
+        advice: one sentence with the result, and the remedy if it is the same for all cameras.
+    """
+
+    matches: int
+    pairs: int
+    error: float
+    cameras: tuple[CameraCheck, ...]
+    fits: bool | None
+    advice: str
+
+
+@dataclass(frozen=True)
+class SharedFeatures:
+    """Features of a capture's first frame and their matches between views.
+
+    Attributes:
+        features: per camera, in pixels of the recorded size.
+        matches: per pair of cameras with matches.
+    """
+
+    features: tuple[Features, ...]
+    matches: tuple[Match, ...]
+
+
+def match_capture(capture: Capture, progress: Callable[[int, int], None] | None = None) -> SharedFeatures:
+    """Return the features and matches of the first frame; takes about 0.6 s per view and 0.03 s per pair.
+
+    A view without an image has no features.
+
+    Args:
+        capture: a capture, downscaled or not.
+        progress: called with (views done, views).
+    """
+    capture = capture.at_recorded_size()
+    images, count = next(capture.partial_frames(0, 1)).images, len(capture.cameras)
+    features = []
+    for done, (image, mask) in enumerate(zip(images, capture.masks, strict=True)):
+        if progress is not None:
+            progress(done, count)
+        features.append(detect(image, mask))
+    matches = match_views(features, capture.cameras)
+    if progress is not None:
+        progress(count, count)
+    return SharedFeatures(tuple(features), tuple(matches))
+
+
+def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
+    """Return how well the capture's cameras fit the matches between its views."""
+    capture = capture.at_recorded_size()
+    pairs, views = _Pairs.of(shared, capture.cameras), range(len(capture.cameras))
+    group = pairs.agreeing()
+    checks = [_check(view, pairs, group) for view in views]
+    errors = np.concatenate([np.zeros(0), *pairs.errors])
+    correction = _correct_rig(capture, pairs.sampled(), checks) if len(errors) else None
+    if correction:
+        cameras, explanation = correction
+        changed = {view for view in views if cameras[view] is not capture.cameras[view]}
+        checks = [_check(view, pairs, set(views) - changed) for view in views]
+        checks = [
+            replace(c, fits=False, advice="") if view in changed and c.matches else c for view, c in enumerate(checks)
+        ]
+        advice = f"the poses do not fit the images: {explanation}."
+    else:
+        reasons = _copies(shared, checks, capture.cameras)
+        checks = [_with_reason(view, check, pairs.sampled(), group, reasons) for view, check in enumerate(checks)]
+        advice = _summary(checks)
+    fits = False if any(c.fits is False for c in checks) else None if any(c.fits is None for c in checks) else True
+    return RigCheck(len(errors), len(shared.matches), _median(errors), tuple(checks), fits, advice)
+
+
+def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
+    """Return the capture with its points replaced by ones triangulated from its training views.
+
+    Views that match few others without their poses are matched with them. Views that share few features give few points
+    or none, which the fit reports. The held-out view is not used.
+    """
+    cameras = capture.at_recorded_size().cameras
+    matches = [match for match in shared.matches if capture.test_view not in match.views]
+    matches += match_guided(shared.features, cameras, _unmatched(capture.train_views, matches))
+    points, colors = triangulate(matches, shared.features, cameras, MAX_ERROR)
+    return replace(capture, points=points, point_colors=colors)
+
+
+def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Capture:
+    """Return the capture with its points replaced by triangulated ones and, where cameras are close, those of stereo.
+
+    Args:
+        capture: a capture; its held-out view is not used.
+        shared: features of its first frame.
+        seed: of the choice among the points of stereo.
+    """
+    sparse, recorded = triangulate_points(capture, shared), capture.at_recorded_size()
+    images = next(recorded.partial_frames(0, 1)).images
+    views = [(v, image) for v in capture.train_views if (image := images[v]) is not None]
+    points, colors = stereo_points(
+        [recorded.cameras[v] for v, _ in views],
+        [image for _, image in views],
+        [recorded.masks[v] for v, _ in views],
+        sparse.points,
+        rng_of(seed, Stream.POINTS),
+    )
+    points, colors = np.concatenate([sparse.points, points]), np.concatenate([sparse.point_colors, colors])
+    return replace(capture, points=points, point_colors=colors)
+
+
+def _unmatched(views: Sequence[int], matches: Sequence[Match]) -> list[tuple[int, int]]:
+    """Return the pairs without matches of those views that match few others."""
+    matched = {match.views for match in matches}
+    partners = Counter(view for pair in matched for view in pair)
+    few = {view for view in views if partners[view] < _MIN_PARTNERS}
+    return [pair for pair in combinations(views, 2) if pair not in matched and few & set(pair)]
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """Reprojection errors of all pairs of views with matches.
+
+    Attributes:
+        shared: the matches.
+        cameras: the poses.
+        errors: per match of a pair [M], px.
+    """
+
+    shared: SharedFeatures
+    cameras: tuple[Camera, ...]
+    errors: tuple[np.ndarray, ...]
+
+    @classmethod
+    def of(cls, shared: SharedFeatures, cameras: Sequence[Camera]) -> _Pairs:
+        errors = (reprojection_errors(match, shared.features, cameras) for match in shared.matches)
+        return cls(shared, tuple(cameras), tuple(errors))
+
+    def of_view(self, view: int, partners: Collection[int] | None = None) -> np.ndarray:
+        """Return the errors of a view's matches with `partners`, by default with all views, px."""
+        pairs = zip(self.shared.matches, self.errors, strict=True)
+        found = [errors for match, errors in pairs if _is_shared(match, view, partners)]
+        return np.concatenate([np.zeros(0), *found])
+
+    def of_replaced(self, view: int, camera: Camera, partners: Collection[int]) -> float:
+        """Return the median error of a view's matches with `partners` if it had another camera, px."""
+        matches = [match for match in self.shared.matches if _is_shared(match, view, partners)]
+        cameras = [camera if i == view else c for i, c in enumerate(self.cameras)]
+        return _median(_Pairs.of(replace(self.shared, matches=tuple(matches)), cameras).of_view(view))
+
+    def sampled(self, max_pairs: int | None = None) -> _Pairs:
+        """Return the same for a part of each pair's matches, and for the `max_pairs` pairs with the most matches."""
+        largest = sorted(self.shared.matches, key=lambda match: -len(match.features))[:max_pairs]
+        few = (replace(m, features=m.features[:: -(-len(m.features) // _SAMPLE)]) for m in largest)
+        return self.of(replace(self.shared, matches=tuple(few)), self.cameras)
+
+    def with_cameras(self, cameras: Sequence[Camera]) -> _Pairs:
+        """Return the same for other poses."""
+        return self.of(self.shared, cameras)
+
+    def worst(self) -> float:
+        """Return the largest median error of a view, px; NaN without matches."""
+        medians = [_median(errors) for view in range(len(self.cameras)) if len(errors := self.of_view(view))]
+        return max(medians, default=float("nan"))
+
+    def agreeing(self) -> set[int]:
+        """Return the views most of whose matches with each other have a small error.
+
+        The view with the largest share of large errors is removed until no share exceeds a half, because a wrong pose
+        spoils the matches of the other views too.
+        """
+        group = {view for match in self.shared.matches for view in match.views}
+        while group:
+            bad = {view: _share_of_large(self.of_view(view, group)) for view in sorted(group)}
+            worst = max(bad, key=lambda view: bad[view])
+            if bad[worst] <= 0.5:
+                break
+            group = group - {worst}
+        return group
+
+
+def _is_shared(match: Match, view: int, partners: Collection[int] | None) -> bool:
+    """Return whether a match is between a view and one of its `partners`, which are all views if None."""
+    return view in match.views and (partners is None or (set(match.views) - {view}) <= set(partners))
+
+
+def _share_of_large(errors: np.ndarray) -> float:
+    return float((errors > MAX_ERROR).mean()) if len(errors) else 1.0
+
+
+def _median(errors: np.ndarray) -> float:
+    return float(np.median(errors)) if len(errors) else float("nan")
+
+
+def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
+    """Return the result of a view; its advice is empty if the pose does not fit."""
+    name, every, agreed = pairs.cameras[view].name, pairs.of_view(view), pairs.of_view(view, group)
+    used = agreed if len(agreed) else every
+    fits, advice = bool(_median(used) <= MAX_ERROR), ""
+    if not len(every):
+        fits, advice = None, f"no matches with any other camera: {_NO_OVERLAP}"
+    elif group and not len(agreed):
+        fits, advice = None, "matches only with cameras that do not fit: correct those first"
+    elif len(used) < _MIN_MATCHES:
+        fits, advice = None, f"only {len(used)} matches, {_MIN_MATCHES} are needed: {_NO_OVERLAP}"
+    return CameraCheck(name, len(every), _median(used), fits, advice)
+
+
+def _correct_rig(capture: Capture, pairs: _Pairs, checks: Sequence[CameraCheck]) -> tuple[Sequence[Camera], str] | None:
+    """Return the corrected cameras for a mistake in several poses, and its description; None if none explains all."""
+    wrong = [view for view, check in enumerate(checks) if check.fits is False]
+    largest, given = pairs.sampled(_FACTOR_PAIRS), pairs.worst()
+
+    def cameras_of(factor: float) -> list[Camera]:
+        return [with_focal_factor(camera, factor) for camera in capture.cameras]
+
+    factor = best_focal_factor(lambda f: _median(np.concatenate(largest.with_cameras(cameras_of(f)).errors)))
+    candidates = [*rig_candidates(capture, wrong)] if given > _GOOD_ERROR else []
+    if abs(factor - 1) > _LEAST_FACTOR:
+        candidates.append((cameras_of(factor), _focal_mistake("the focal lengths of all cameras seem", factor)))
+    scored = [(pairs.with_cameras(cameras).worst(), index) for index, (cameras, _) in enumerate(candidates)]
+    error, index = min(scored, default=(np.inf, 0))
+    return candidates[index] if error <= min(given / _GAIN, MAX_ERROR) else None
+
+
+def _copies(shared: SharedFeatures, checks: Sequence[CameraCheck], cameras: Sequence[Camera]) -> dict[int, str]:
+    """Return the reason for each camera that has the pose or the clip of another one."""
+    found: dict[int, str] = {}
+    for pair in same_poses(cameras):
+        # If one of the two fits, the pose is its own.
+        wrong = [view for view in pair if not checks[view].fits] or pair
+        for view in wrong:
+            other = checks[pair[0] + pair[1] - view].name
+            found.setdefault(
+                view, f"it has the same pose as {other}: give each camera its own, or leave the copy out (--without)"
+            )
+    for match in shared.matches:
+        a, b = (shared.features[view].points[match.features[:, k]] for k, view in enumerate(match.views))
+        if np.median(np.linalg.norm(a - b, axis=1)) < _SAME_IMAGE:
+            for view in match.views:
+                if view in found or not checks[view].fits:
+                    other = checks[sum(match.views) - view].name
+                    found[view] = f"its images are those of {other}: one clip is a copy of the other; replace it"
+    return found
+
+
+def _with_reason(view: int, check: CameraCheck, pairs: _Pairs, group: set[int], reasons: dict[int, str]) -> CameraCheck:
+    """Return the result with the reason why a pose does not fit, from `reasons` or by trying the common mistakes."""
+    if view in reasons:
+        return replace(check, fits=False, advice=reasons[view])
+    if check.fits is not False:
+        return check
+    return replace(check, advice=_explain_camera(view, check, pairs, group))
+
+
+def _explain_camera(view: int, check: CameraCheck, pairs: _Pairs, group: set[int]) -> str:
+    """Return the common mistake that explains the matches of a view, and a remedy."""
+    # Without views that agree, a correction can only be compared with all others.
+    partners = group or set(range(len(pairs.cameras)))
+    given = pairs.cameras[view]
+    factor = best_focal_factor(lambda f: pairs.of_replaced(view, with_focal_factor(given, f), partners))
+    candidates = [*camera_candidates(given)]
+    if abs(factor - 1) > _LEAST_FACTOR:
+        candidates.append((with_focal_factor(given, factor), _focal_mistake("its focal length seems", factor)))
+    scored = [(pairs.of_replaced(view, camera, partners), index) for index, (camera, _) in enumerate(candidates)]
+    error, index = min(scored)
+    of_group = [_median(pairs.of_view(other, group)) for other in group]
+    if error <= min(check.error / _GAIN, MAX_ERROR, max(_GOOD_ERROR, 2 * max(of_group, default=MAX_ERROR))):
+        return candidates[index][1]
+    cause = "no common mistake explains it"
+    if np.isinf(check.error):
+        cause = "the points in its images lie behind it, so it looks away from them"
+    return (
+        f"{cause}: check its place in the order of the cameras, its axes and the image size of the calibration, or "
+        "calibrate again (morgs-mi calibrate)"
+    )
+
+
+def _focal_mistake(what: str, factor: float) -> str:
+    """Return the sentence on a focal length that has to be multiplied by `factor`."""
+    return (
+        f"{what} to be wrong by a factor, {factor:.2g} times the given value fits: check the image size of the "
+        "calibration, and whether its field of view is horizontal or vertical"
+    )
+
+
+def _summary(checks: Sequence[CameraCheck]) -> str:
+    """Return which poses fit, which do not, and which were not checked."""
+    wrong, open_ = (", ".join(c.name for c in checks if c.fits is fits) for fits in (False, None))
+    count = sum(c.fits is True for c in checks)
+    if not wrong and not count:
+        return "too few matches to check the poses: the views have little overlap, or the scene has little texture."
+    text = f"the poses of {wrong} do not fit the images" if wrong else "the poses fit the images"
+    if open_ and not wrong:
+        text = f"the poses of {count} of {len(checks)} cameras fit the images"
+    return f"{text}; not checked: {open_}." if open_ else f"{text}."

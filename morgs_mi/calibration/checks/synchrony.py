@@ -1,0 +1,175 @@
+"""Time offsets between calibrated cameras, from where their images change.
+
+An object lies between the same two epipolar planes of a pair of cameras in both views. So the change per epipolar plane
+and frame, the *epipolar profile* of a view, is similar in both at the same time, and shifted in time by the difference
+of the cameras' time offsets (after Pundik and Moses, Video Synchronization Using Temporal Signals from Epipolar Lines,
+ECCV 2010).
+
+Notation: frame k of camera i shows the time k + o_i, with o_i its time offset in frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from morgs_mi.calibration.checks.signals import known_median
+from morgs_mi.core.camera import Camera
+
+__all__ = ["consensus", "time_offsets"]
+
+_PLANES = 48
+# Grey levels, and multiples of a frame's median change, below which a change is noise or compression.
+_NOISE, _MEDIANS = 6.0, 5.0
+# Frames of the largest shift, and as a share of the clip: fewer overlapping frames correlate by chance.
+_MAX_SHIFT, _MAX_SHARE = 15, 0.25
+# A pair's peak counts if it is this high, and higher by this much than three frames beside it.
+_MIN_CORRELATION, _MIN_PROMINENCE = 0.3, 0.05
+_BESIDE = 3
+# Difference in frames up to which a pair agrees with the offsets of its cameras, and the share of a camera's pairs that
+# must agree.
+_AGREEING, _MIN_AGREEMENT = 0.5, 0.75
+_ITERATIONS = 30
+
+
+@dataclass(frozen=True)
+class _PairShift:
+    """Difference of the time offsets of two cameras.
+
+    Attributes:
+        views: the two cameras i and j.
+        frames: o_j - o_i.
+        correlation: of the epipolar profiles at this shift.
+        weight: by how much it exceeds that of other shifts.
+    """
+
+    views: tuple[int, int]
+    frames: float
+    correlation: float
+    weight: float
+
+
+def time_offsets(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the time offset of each camera from the others' median [C], frames; NaN where it is not determined.
+
+    An offset is determined if three quarters of the camera's pairs with others agree about it. It is accurate to 0.4
+    frames where things hardly move across the epipolar planes (see `timing` for fractions of frames).
+
+    Args:
+        cameras: C views.
+        thumbs: per camera thumbnails [T, h, w] of the same instants, values in [0, 255], NaN where there is none.
+    """
+    shifts = _pair_shifts(cameras, thumbs)
+    views = np.array([shift.views for shift in shifts]).reshape(-1, 2).astype(int)
+    frames, weights = (np.array([getattr(shift, key) for shift in shifts]) for key in ("frames", "weight"))
+    offsets = consensus(len(cameras), views, frames, weights)
+    agreeing = np.abs(offsets[views[:, 1]] - offsets[views[:, 0]] - frames) <= _AGREEING
+    for view in range(len(cameras)):
+        own = (views == view).any(axis=1)
+        if (own & agreeing).sum() < _MIN_AGREEMENT * own.sum():
+            offsets[view] = np.nan
+    return offsets
+
+
+def consensus(count: int, views: np.ndarray, differences: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Return values x [count] that best explain differences x_j - x_i [P] of pairs (i, j) [P, 2], by weighted L1.
+
+    The median of x, or the lower one of two, is zero; x is NaN for what is in no pair.
+    """
+    values = np.full(count, np.nan)
+    if not len(views):
+        return values
+    system = np.zeros((len(views), count))
+    rows = np.arange(len(views))
+    system[rows, views[:, 0]], system[rows, views[:, 1]] = -1, 1
+    scale = np.sqrt(weights)
+    for _ in range(_ITERATIONS):
+        solution = np.linalg.lstsq(system * scale[:, None], differences * scale, rcond=None)[0]
+        scale = np.sqrt(weights / np.maximum(np.abs(system @ solution - differences), 1e-2))
+    seen = np.unique(views)
+    values[seen] = solution[seen] - np.quantile(solution[seen], 0.5, method="lower")
+    return values
+
+
+def _pair_shifts(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> list[_PairShift]:
+    """Return the shifts of all pairs of cameras that see common motion distinctly."""
+    changes = [_changes(own) for own in thumbs]
+    rays = [_rays(camera, own.shape[1:]) for camera, own in zip(cameras, thumbs, strict=True)]
+    found = []
+    for i, j in combinations(range(len(cameras)), 2):
+        angles = _plane_angles(cameras[i], cameras[j], rays[i], rays[j])
+        low, high = max(np.percentile(a, 2) for a in angles), min(np.percentile(a, 98) for a in angles)
+        if high > low:
+            a, b = (_profile(changes[v], x, low, high) for v, x in zip((i, j), angles, strict=True))
+            shift = _best_shift((i, j), a, b)
+            found += [] if shift is None else [shift]
+    return found
+
+
+def _changes(thumbs: np.ndarray) -> np.ndarray:
+    """Return the change of each pixel from frame to frame beyond noise [T - 1, h * w]."""
+    frames = thumbs.reshape(len(thumbs), -1)
+    level = known_median(frames, axis=1)[:, None]
+    # A change of the exposure is no motion.
+    frames = frames * (known_median(level, axis=0) / np.maximum(level, 1))
+    steps = np.nan_to_num(np.abs(np.diff(frames, axis=0)))
+    return np.maximum(steps - np.maximum(_NOISE, _MEDIANS * np.median(steps, axis=1, keepdims=True)), 0)
+
+
+def _rays(camera: Camera, shape: tuple[int, ...]) -> np.ndarray:
+    """Return the directions of a thumbnail's pixels [h * w, 3]."""
+    height, width = shape
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    return camera.resized(width, height).rays(np.stack([x, y], axis=-1).reshape(-1, 2))[1]
+
+
+def _plane_angles(a: Camera, b: Camera, *rays: np.ndarray) -> list[np.ndarray]:
+    """Return the angle of the epipolar half plane of each ray about the baseline of two cameras, radians."""
+    baseline = b.position - a.position
+    baseline = baseline / max(float(np.linalg.norm(baseline)), 1e-12)
+    forward = sum(np.asarray(camera.viewmat, np.float64)[2, :3] for camera in (a, b))
+    across = forward - baseline * (baseline @ forward)
+    across = across / max(float(np.linalg.norm(across)), 1e-12)
+    return [np.arctan2(r @ np.cross(baseline, across), r @ across) for r in rays]
+
+
+def _profile(changes: np.ndarray, angles: np.ndarray, low: float, high: float) -> np.ndarray:
+    """Return the epipolar profile [T - 1, planes], relative to the mean over time and over the planes."""
+    planes = np.floor((angles - low) / (high - low) * _PLANES).astype(int)
+    used = (planes >= 0) & (planes < _PLANES)
+    pixels = np.maximum(np.bincount(planes[used], minlength=_PLANES), 1)
+    sums = [np.bincount(planes[used], change[used], _PLANES) for change in changes]
+    return np.sqrt(np.array(sums).reshape(len(changes), _PLANES) / pixels)
+
+
+def _best_shift(views: tuple[int, int], a: np.ndarray, b: np.ndarray) -> _PairShift | None:
+    """Return the shift of the largest correlation, between frames by a parabola; None if it is not distinct."""
+    largest = min(_MAX_SHIFT, int(_MAX_SHARE * len(a)))
+    if largest < 2:
+        return None
+    shifts = np.arange(-largest, largest + 1)
+    curve = np.array(
+        [_correlation(a[max(0, s) : len(a) + min(0, s)], b[max(0, -s) : len(b) - max(0, s)]) for s in shifts]
+    )
+    k = int(curve.argmax())
+    if k in (0, len(curve) - 1) or curve[k] < _MIN_CORRELATION:
+        return None
+    left, top, right = curve[k - 1 : k + 2]
+    beside = max(curve[x] for x in (max(0, k - _BESIDE), min(len(curve) - 1, k + _BESIDE)))
+    if top - beside < _MIN_PROMINENCE:
+        return None
+    peak = shifts[k] + 0.5 * (left - right) / (left - 2 * top + right)
+    return _PairShift(views, float(peak), float(top), float(top - beside))
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    a, b = _centred(a), _centred(b)
+    return float((a * b).sum() / max(np.sqrt((a * a).sum() * (b * b).sum()), 1e-9))
+
+
+def _centred(profile: np.ndarray) -> np.ndarray:
+    centred = profile - profile.mean(axis=0)
+    return centred - centred.mean(axis=1, keepdims=True)

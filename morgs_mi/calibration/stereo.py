@@ -1,0 +1,222 @@
+"""Dense points from pairs of neighbouring cameras, where these are close enough for stereo matching.
+
+A pair is rectified, so that a point lies in the same row of both images, and matched by OpenCV's semi-global block
+matching. A point is kept if both directions of matching agree, and if some third camera that sees it shows its colour.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.rig import angles_to, scene_depths, seen_points
+
+__all__ = ["stereo_points"]
+
+# Images are reduced to this number of pixels: points are a start for the fit, which is more exact.
+_PIXELS = 2e5
+# Each camera is matched with its nearest ones, if they are at least and at most this far, degrees.
+_NEIGHBOURS, _MIN_ANGLE, _MAX_ANGLE = 2, 0.5, 25.0
+# Points per pair.
+_POINTS = 4000
+# A pair is searched for depths around those of the known points: fractions of their near and far end. Without at least
+# so many points, around the depth that the cameras look at.
+_NEAR, _FAR, _KNOWN = 0.6, 1.6, 10
+_BLIND = 3.0
+# px, largest difference between the disparities of both directions; largest difference of a colour.
+_MAX_DIFFERENCE, _MAX_COLOR = 1.0, 0.08
+_BLOCK = 5
+# Depth of a view's corners before the rectified plane, for depth 1 before the camera, below which they are too oblique.
+_LEAST_DEPTH = 0.2
+
+
+def stereo_points(
+    cameras: Sequence[Camera],
+    images: Sequence[np.ndarray],
+    masks: Sequence[np.ndarray | None],
+    known: np.ndarray,
+    rng: np.random.Generator,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return points [P, 3], world units, and their colours [P, 3] in [0, 1]; none where no cameras are close.
+
+    Args:
+        cameras: C views.
+        images: per view uint8 [H, W, 3], RGB.
+        masks: per view [H, W] bool of valid pixels, or None.
+        known: points [K, 3] of the scene, which limit the depths.
+        rng: draws a part of the points.
+    """
+    views = [_View.of(*view) for view in zip(cameras, images, masks, strict=True)]
+    found = [np.zeros((0, 6))]
+    for i, j in _neighbours(cameras, known):
+        pair = views[i], views[j]
+        points = _matched(*pair, _depth_range(cameras, i, known))
+        others = [view for k, view in enumerate(views) if k not in (i, j)]
+        points = points[_confirmed(points, others)] if others else points
+        found.append(rng.permutation(points)[:_POINTS])
+    points, colors = np.split(np.concatenate(found), 2, axis=1)
+    return points.astype(np.float32), colors.astype(np.float32)
+
+
+@dataclass(frozen=True)
+class _View:
+    """A view, reduced.
+
+    Attributes:
+        camera: with the size of the image.
+        image: uint8 [H, W, 3].
+        valid: uint8 [H, W], 255 where the pixel is valid.
+    """
+
+    camera: Camera
+    image: np.ndarray
+    valid: np.ndarray
+
+    @classmethod
+    def of(cls, camera: Camera, image: np.ndarray, mask: np.ndarray | None) -> _View:
+        scale = min(1.0, np.sqrt(_PIXELS / (camera.width * camera.height)))
+        size = round(camera.width * scale), round(camera.height * scale)
+        valid = np.full(image.shape[:2], 255, np.uint8) if mask is None else np.uint8(255) * mask.astype(np.uint8)
+        valid = cv2.resize(valid, size, interpolation=cv2.INTER_NEAREST)
+        return cls(camera.resized(*size), cv2.resize(image, size, interpolation=cv2.INTER_AREA), valid)
+
+
+def _neighbours(cameras: Sequence[Camera], known: np.ndarray) -> list[tuple[int, int]]:
+    """Return the pairs of cameras that are close enough."""
+    pairs = set()
+    for i, (camera, depth) in enumerate(zip(cameras, scene_depths(cameras, known), strict=True)):
+        angles = angles_to(camera, depth, cameras)
+        angles[i] = np.inf
+        for j in np.argsort(angles)[:_NEIGHBOURS]:
+            if _MIN_ANGLE <= angles[j] <= _MAX_ANGLE:
+                pairs.add((min(i, int(j)), max(i, int(j))))
+    return sorted(pairs)
+
+
+def _depth_range(cameras: Sequence[Camera], view: int, known: np.ndarray) -> tuple[float, float]:
+    """Return the smallest and the largest depth in a view."""
+    _, _, depths = seen_points(cameras[view], known)
+    if len(depths) >= _KNOWN:
+        near, far = np.quantile(depths, (0.02, 0.98))
+        return _NEAR * float(near), _FAR * float(far)
+    middle = scene_depths(cameras, known)[view]
+    return middle / _BLIND, middle * _BLIND
+
+
+@dataclass(frozen=True)
+class _Rectified:
+    """Two views on one plane along the line between their cameras.
+
+    Attributes:
+        axes: of the plane, rows right, down and forward in the world [3, 3].
+        focal: px.
+        baseline: distance of the cameras, world units.
+        homographies: from the pixels of each view to those of its rectified image.
+        corners: position of each image's first column relative to the optical axis, px, and of their first row.
+        size: of both images, width and height.
+    """
+
+    axes: np.ndarray
+    focal: float
+    baseline: float
+    homographies: tuple[np.ndarray, np.ndarray]
+    corners: tuple[float, float, float]
+    size: tuple[int, int]
+
+    @classmethod
+    def of(cls, a: Camera, b: Camera) -> _Rectified | None:
+        """Return the rectification of two views, None if no plane shows both, as if one camera is before the other."""
+        right = b.position - a.position
+        baseline = float(np.linalg.norm(right))
+        right, forward = right / baseline, a.viewmat[2, :3] + b.viewmat[2, :3]
+        forward = forward - forward @ right * right
+        forward /= max(float(np.linalg.norm(forward)), 1e-12)
+        axes, focal = np.stack([right, np.cross(forward, right), forward]), float(a.K[0, 0] + b.K[0, 0]) / 2
+        homographies, boxes = [], []
+        for camera in (a, b):
+            H = np.diag([focal, focal, 1]) @ axes @ camera.viewmat[:3, :3].T @ np.linalg.inv(camera.K)
+            sides = np.array([[x, y, 1] for x in (0, camera.width) for y in (0, camera.height)]) @ H.T
+            if sides[:, 2].min() < _LEAST_DEPTH:
+                return None
+            homographies.append(H)
+            boxes.append([(sides[:, :2] / sides[:, 2:]).min(axis=0), (sides[:, :2] / sides[:, 2:]).max(axis=0)])
+        (a0, a1), (b0, b1) = boxes
+        top, bottom = max(a0[1], b0[1]), min(a1[1], b1[1])
+        size = int(np.ceil(max(a1[0] - a0[0], b1[0] - b0[0]))), int(np.ceil(bottom - top))
+        shifted = [_shift(-box[0][0], -top) @ H for box, H in zip(boxes, homographies, strict=True)]
+        return cls(axes, focal, baseline, (shifted[0], shifted[1]), (a0[0], b0[0], top), size)
+
+    def warped(self, index: int, image: np.ndarray, interpolation: int = cv2.INTER_LINEAR) -> np.ndarray:
+        """Return an image of one of the views, rectified; OpenCV's pixel centres lie at whole numbers."""
+        H = _shift(-0.5, -0.5) @ self.homographies[index] @ _shift(0.5, 0.5)
+        return cv2.warpPerspective(image, H, self.size, flags=interpolation)
+
+
+def _matched(a: _View, b: _View, depths: tuple[float, float]) -> np.ndarray:
+    """Return the points of a pair of views and their colours [P, 6], at depths in a range."""
+    rig = _Rectified.of(a.camera, b.camera)
+    if rig is None:
+        return np.zeros((0, 6))
+    width, height = rig.size
+    product, shift = rig.focal * rig.baseline, rig.corners[1] - rig.corners[0]
+    lowest = int(np.floor(product / depths[1] + shift))
+    count = 16 * max(1, int(np.ceil((product / depths[0] + shift - lowest + 1) / 16)))
+    # Strongly converging cameras have no useful plane in common.
+    if min(rig.size) < 2 * _BLOCK or count > width or width * height > 4 * a.image[..., 0].size:
+        return np.zeros((0, 6))
+    images, valid = (
+        [rig.warped(k, image, flag) for k, image in enumerate(pair)]
+        for pair, flag in (((a.image, b.image), cv2.INTER_LINEAR), ((a.valid, b.valid), cv2.INTER_NEAREST))
+    )
+    left, right = images
+    forth, back = _disparity(left, right, lowest, count), _disparity(right, left, 1 - lowest - count, count)
+    rows, columns = np.mgrid[:height, :width]
+    partner = np.round(columns - forth).astype(int)
+    inside = (partner >= 0) & (partner < width)
+    partner = np.clip(partner, 0, width - 1)
+    agree = np.abs(forth + back[rows, partner]) <= _MAX_DIFFERENCE
+    kept = agree & inside & (forth >= lowest) & (forth - shift > 0) & (valid[0] > 0) & (valid[1][rows, partner] > 0)
+    depth = product / (forth[kept] - shift)
+    x, y = columns[kept] + 0.5 + rig.corners[0], rows[kept] + 0.5 + rig.corners[2]
+    points = np.stack([x * depth / rig.focal, y * depth / rig.focal, depth], axis=1) @ rig.axes + a.camera.position
+    return np.concatenate([points, left[kept] / 255.0], axis=1)
+
+
+def _disparity(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> np.ndarray:
+    """Return the disparity of each pixel of the left image [H, W], px, below `lowest` where there is none."""
+    # OpenCV leaves out the columns whose partners may lie outside the image.
+    pad = count + abs(lowest) + _BLOCK
+    wide = [cv2.copyMakeBorder(image, 0, 0, pad, pad, cv2.BORDER_CONSTANT) for image in (left, right)]
+    area = 3 * _BLOCK**2
+    matcher = cv2.StereoSGBM.create(
+        minDisparity=lowest,
+        numDisparities=count,
+        blockSize=_BLOCK,
+        P1=8 * area,
+        P2=32 * area,
+        uniquenessRatio=10,
+        speckleWindowSize=50,
+        speckleRange=2,
+        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+    )
+    return matcher.compute(*wide)[:, pad:-pad] / 16.0
+
+
+def _confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
+    """Return which points with colours [P, 6] have their colour in a valid pixel of another view that sees them."""
+    confirmed = np.zeros(len(points), bool)
+    for view in others:
+        seen, pixels, _ = seen_points(view.camera, points[:, :3])
+        columns, rows = pixels.astype(int).T
+        shown = cv2.blur(view.image, (3, 3))[rows, columns] / 255.0
+        same = np.abs(shown - points[seen, 3:]).max(axis=1) < _MAX_COLOR
+        confirmed[seen] |= same & (view.valid[rows, columns] > 0)
+    return confirmed
+
+
+def _shift(x: float, y: float) -> np.ndarray:
+    return np.array([[1, 0, x], [0, 1, y], [0, 0, 1.0]])

@@ -1,0 +1,134 @@
+"""Geometry of a rig: its extent, what its cameras look at, and the angles and overlaps between them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+
+__all__ = [
+    "angles_between",
+    "angles_to",
+    "choose_key_views",
+    "focus_depths",
+    "focus_point",
+    "mean_views",
+    "overlaps",
+    "scene_depths",
+    "scene_extent",
+    "seen_points",
+    "surface_of",
+]
+
+# Rows and columns of the points of each view.
+_GRID = 16
+
+
+def scene_extent(cameras: Sequence[Camera]) -> float:
+    """Return the scene extent in world units: 1.1 times the radius of the cameras around their mean, as in 3DGS.
+
+    It is 1 for a single camera.
+    """
+    positions = np.array([camera.position for camera in cameras])
+    radius = np.linalg.norm(positions - positions.mean(0), axis=1).max()
+    return float(1.1 * radius) if radius > 0 else 1.0
+
+
+def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the point [3] that is nearest to all optical axes in the least-squares sense.
+
+    Along a direction that all axes share it is that of the mean camera position.
+    """
+    middle = np.mean([camera.position for camera in cameras], axis=0)
+    system, right = 1e-9 * np.eye(3), np.zeros(3)
+    for camera in cameras:
+        axis = np.asarray(camera.viewmat, float)[2, :3]
+        across = np.eye(3) - np.outer(axis, axis)
+        system, right = system + across, right + across @ (camera.position - middle)
+    return middle + np.linalg.solve(system, right)
+
+
+def focus_depths(cameras: Sequence[Camera]) -> np.ndarray:
+    """Return the depth of the `focus_point` in each view [V], world units; infinite where it is not in front."""
+    focus, least = np.append(focus_point(cameras), 1), 1e-3 * scene_extent(cameras)
+    depths = np.array([np.asarray(camera.viewmat, float)[2] @ focus for camera in cameras])
+    return np.where(depths > least, depths, np.inf)
+
+
+def seen_points(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which points [P, 3] lie in a view [P], the n pixel positions [n, 2] of those, and their depths [n]."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # points beside the camera
+        pixels, depths = camera.project(np.asarray(points, np.float64).reshape(-1, 3))
+    inside = (depths > camera.near) & ((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+    return inside, pixels[inside], depths[inside]
+
+
+def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
+    """Return the indices of `count` views spread over the rig, or of all if there are fewer.
+
+    The first is the most central one; each further one is the farthest from those chosen.
+    """
+    if not cameras:
+        return ()
+    positions = np.array([camera.position for camera in cameras])
+    chosen = [int(np.argmin(np.linalg.norm(positions - positions.mean(0), axis=1)))]
+    while len(chosen) < min(count, len(cameras)):
+        distance = np.linalg.norm(positions[:, None] - positions[chosen], axis=-1).min(1)
+        chosen.append(int(np.argmax(distance)))
+    return tuple(sorted(chosen))
+
+
+def mean_views(cameras: Sequence[Camera], points: np.ndarray) -> float:
+    """Return the mean number of views that see a surface of the scene, at least 1, as far as their frustums tell.
+
+    Args:
+        cameras: at least one.
+        points: [P, 3] of the scene, world units, or none.
+    """
+    return max(1.0, float(overlaps(cameras, points).sum(axis=1).mean()))
+
+
+def overlaps(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
+    """Return the share of each camera's image that each camera sees, as far as their frustums tell [C, C].
+
+    Args:
+        cameras: C views.
+        points: [P, 3] of the scene, world units, or none.
+    """
+    surfaces = [surface_of(*view) for view in zip(cameras, scene_depths(cameras, points), strict=True)]
+    return np.array([[np.mean(seen_points(other, surface)[0]) for other in cameras] for surface in surfaces])
+
+
+def scene_depths(cameras: Sequence[Camera], points: np.ndarray) -> list[float]:
+    """Return the median depth of the points in each view, world units.
+
+    For a view without points it is that of the `focus_point`, or far away if that is not in front of the camera.
+    """
+    far, depths = 1e6 * scene_extent(cameras), []
+    for camera, focus in zip(cameras, focus_depths(cameras), strict=True):
+        _, _, seen = seen_points(camera, points)
+        middle = float(np.median(seen)) if len(seen) else min(float(focus), far)
+        depths.append(middle if middle > camera.near else far)
+    return depths
+
+
+def angles_to(camera: Camera, depth: float, others: Sequence[Camera]) -> np.ndarray:
+    """Return the angles to other cameras, as seen from the point at a depth in the middle of the image, degrees."""
+    middle = camera.unproject(np.array([[camera.width / 2, camera.height / 2]]), np.array([depth]))
+    return np.array([angles_between(middle, camera, other)[0] for other in others])
+
+
+def angles_between(points: np.ndarray, a: Camera, b: Camera) -> np.ndarray:
+    """Return the angle between two cameras as seen from each point, degrees."""
+    rays = [camera.position - points for camera in (a, b)]
+    x, y = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
+    return np.rad2deg(np.arccos(np.clip((x * y).sum(axis=1), -1, 1)))
+
+
+def surface_of(camera: Camera, depth: float) -> np.ndarray:
+    """Return points that are evenly spread over the image, at one depth."""
+    steps = (np.arange(_GRID) + 0.5) / _GRID
+    pixels = np.stack(np.meshgrid(steps * camera.width, steps * camera.height), axis=-1).reshape(-1, 2)
+    return camera.unproject(pixels, np.full(len(pixels), depth))

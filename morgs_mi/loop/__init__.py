@@ -1,0 +1,1 @@
+"""The loop around the method: its settings, and the observations of a frame."""

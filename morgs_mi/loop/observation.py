@@ -1,0 +1,258 @@
+"""What the loop sees: the rig, and what the images of a frame say without the Gaussians.
+
+Changes and optical flow follow from the images alone, so those of the next frame may be found while this one is fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import check_mask, check_points, check_type
+from morgs_mi.core.rig import choose_key_views, scene_extent
+from morgs_mi.core.threads import map_in_threads
+from morgs_mi.fit.initialise import Points
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.method.change import box_around, change_mask, moving_region, update_reference
+from morgs_mi.method.exposure import LEAST_CHANGE, Exposure, common_change, follow_exposure
+from morgs_mi.method.flow import FlowObservation, observe_key_views
+from morgs_mi.method.flow_sources.flow_registry import FramePair
+from morgs_mi.method.objective import KeyView
+
+__all__ = ["FrameObservation", "Images", "Recorded", "Seen", "Setup", "observe_frame", "prepare", "see_frame"]
+
+# By view index: the images of those views that have one.
+Images = Mapping[int, np.ndarray]
+
+
+class Recorded(Protocol):
+    """Cameras and points of a recording, as a `Capture` has them."""
+
+    @property
+    def cameras(self) -> Sequence[Camera]:
+        """All cameras."""
+        ...
+
+    @property
+    def masks(self) -> Sequence[np.ndarray | None]:
+        """Per camera [H, W] bool of valid pixels, or None."""
+        ...
+
+    @property
+    def train_views(self) -> Sequence[int]:
+        """Indices of the cameras that are trained on."""
+        ...
+
+    @property
+    def points(self) -> np.ndarray:
+        """Points [P, 3], world units."""
+        ...
+
+    @property
+    def point_colors(self) -> np.ndarray:
+        """Their colours [P, 3] in [0, 1]."""
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Images up to a frame, with the exposure of each view's first image if exposures are estimated.
+
+    Attributes:
+        images: of that frame, by view index, of the views that have one.
+        references: images that the next frame is compared with to detect changes, by view index.
+        exposures: of that frame relative to the view's first image, by view index; empty if they are not estimated.
+    """
+
+    images: Images = field(default_factory=dict)
+    references: Images = field(default_factory=dict)
+    exposures: Mapping[int, Exposure] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class FrameObservation:
+    """What the images of a frame say without the Gaussians.
+
+    Attributes:
+        seen: the images.
+        changes: masks of changed pixels [H, W], by view index; None: all pixels may have changed.
+        flows: optical flow of the key views that changed, by view index.
+        key_views: these views for the terms of the objective, by view index.
+        recorded: the images as they were given, by view index.
+    """
+
+    seen: Seen
+    changes: Mapping[int, np.ndarray] | None
+    flows: Mapping[int, FlowObservation]
+    key_views: Mapping[int, KeyView]
+    recorded: Images
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """What all frames share; made by `prepare`.
+
+    Attributes:
+        cameras: the V training views.
+        masks: per view [H, W] bool of valid pixels, or None.
+        points: SfM points [P, 3], world units.
+        point_colors: [P, 3] in [0, 1].
+        key_views: indices of the views with optical flow and masks.
+        extent: of the scene, world units.
+        config: settings.
+    """
+
+    cameras: tuple[Camera, ...]
+    masks: tuple[np.ndarray | None, ...]
+    points: np.ndarray
+    point_colors: np.ndarray
+    key_views: tuple[int, ...]
+    extent: float
+    config: StreamConfig
+
+    @property
+    def cloud(self) -> Points:
+        """The points and their colours."""
+        return self.points, self.point_colors
+
+
+def prepare(
+    cameras: Sequence[Camera],
+    points: np.ndarray,
+    point_colors: np.ndarray,
+    config: StreamConfig | None = None,
+    masks: Sequence[np.ndarray | None] | None = None,
+) -> Setup:
+    """Return what all frames share; arguments and errors are those of `StreamLoop`."""
+    config = StreamConfig() if config is None else config
+    check_type("StreamLoop()", "config", config, StreamConfig)
+    if not isinstance(cameras, Sequence) or not cameras:
+        found = f"a {type(cameras).__name__}" if cameras else "none"
+        raise ValueError(f"StreamLoop(): `cameras` must be a sequence of at least one view, got {found}; pass a list.")
+    for camera in cameras:
+        check_type("StreamLoop()", "cameras", camera, Camera)
+    points, point_colors = check_points("StreamLoop()", points, point_colors)
+    masks = (None,) * len(cameras) if masks is None else masks
+    if len(masks) != len(cameras):
+        raise ValueError(
+            f"StreamLoop(): `masks` must have one mask or None for each of {len(cameras)} views, got {len(masks)}; "
+            "pass None where all pixels are valid."
+        )
+    for view, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
+        if mask is not None:
+            check_mask(f"StreamLoop(): view {camera.name or view!r}", mask, camera.height, camera.width)
+    copies = tuple(None if mask is None else mask.copy() for mask in masks)
+    key_views = choose_key_views(cameras, config.motion.key_views)
+    extent = scene_extent(cameras)
+    return Setup(tuple(cameras), copies, points.copy(), point_colors.copy(), key_views, extent, config)
+
+
+def observe_frame(setup: Setup, frame: int, before: Seen, images: Sequence[np.ndarray | None]) -> FrameObservation:
+    """Return what the images of a frame say: changes, flow (eq. 4) and masks (eqs. 9, 10).
+
+    Args:
+        setup: what all frames share.
+        frame: its index.
+        before: images up to the frame before; `Seen()` for the first.
+        images: per training view uint8 [H, W, 3], RGB, or None where the view has no image. They are copied.
+
+    Raises:
+        ValueError: an image has another size or type than its camera, or the first frame has no image at all.
+    """
+    recorded = _copies(setup.cameras, images, frame)
+    seen, changes = _seen(setup, before, recorded)
+    return FrameObservation(seen, changes, *_flows(setup, frame, before.images, seen.images, changes), recorded)
+
+
+def see_frame(
+    setup: Setup, frame: int, before: Seen, images: Sequence[np.ndarray | None]
+) -> tuple[Seen, dict[int, np.ndarray] | None]:
+    """Return the images up to a frame and the masks of its changes, without flow; see `observe_frame`."""
+    return _seen(setup, before, _copies(setup.cameras, images, frame))
+
+
+def _seen(setup: Setup, before: Seen, recorded: Images) -> tuple[Seen, dict[int, np.ndarray] | None]:
+    """Return the images up to a frame with these, and the masks of its changes; None: all may have changed."""
+    skip, follow = setup.config.fit.skip_static, setup.config.fit.exposure != "off"
+    if not (skip or follow):
+        return Seen(recorded), None
+    exposures = _exposures(setup, before, recorded) if follow else {}
+    now = {v: exposures[v].corrected(image) if v in exposures else image for v, image in recorded.items()}
+    changes = {v: np.zeros(image.shape[:2], bool) for v, image in now.items()}  # where it is the view's first image
+    known, config = sorted(now.keys() & before.references.keys()), setup.config.motion.change
+    masks = map_in_threads(lambda v: change_mask(before.references[v], now[v], setup.masks[v], config), known)
+    changes |= dict(zip(known, masks, strict=True))
+    references = {v: update_reference(before.references[v], now[v], changes[v]) for v in known}
+    return Seen(now, {**before.references, **now, **references}, exposures), changes if skip else None
+
+
+def _exposures(setup: Setup, before: Seen, recorded: Images) -> dict[int, Exposure]:
+    """Return the exposures relative to the views' first images, without the change of light that all views show."""
+    known = sorted(recorded.keys() & before.references.keys())
+    found = map_in_threads(
+        lambda v: follow_exposure(before.references[v], recorded[v], setup.masks[v], before.exposures.get(v)),
+        known,
+    )
+    light = common_change(found)
+    own = {v: exposure.without(light) for v, exposure in zip(known, found, strict=True)}
+    kept = {v: exposure if exposure.change > LEAST_CHANGE else Exposure() for v, exposure in own.items()}
+    return {**before.exposures, **kept}
+
+
+def _flows(
+    setup: Setup, frame: int, before: Images, images: Images, changes: Mapping[int, np.ndarray] | None
+) -> tuple[dict[int, FlowObservation], dict[int, KeyView]]:
+    """Return the optical flow of the key views that changed, with masks in every n-th frame, where a term uses it."""
+    motion = setup.config.motion
+    with_masks = motion.learn_confidence and frame % motion.mask_interval == 0
+    if not (motion.learn_motion or with_masks or (motion.learn_confidence and frame == 1)):
+        return {}, {}
+    pairs = {}
+    for v in _frame_key_views(setup, before, images):
+        box = None if changes is None else box_around(changes[v])
+        if changes is None or box is not None:
+            region = None if changes is None else moving_region(changes[v])
+            name, valid = setup.cameras[v].name, setup.masks[v]
+            pairs[v] = FramePair(images[v], before[v], name, frame, valid, box, region)
+    if not pairs:
+        return {}, {}
+    masks = motion.mask_method if with_masks else None
+    flows = observe_key_views(pairs, motion.flow_method, masks, motion.flow, motion.masks)
+    return flows, {v: KeyView(pairs[v], flow) for v, flow in flows.items()}
+
+
+def _frame_key_views(setup: Setup, before: Images, images: Images) -> tuple[int, ...]:
+    """Return the key views of a frame: those of the setup, with others in place of those that lack an image."""
+    both = sorted(before.keys() & images.keys())
+    key_views = tuple(v for v in setup.key_views if v in both)
+    if len(key_views) == len(setup.key_views) or not both:
+        return key_views
+    return tuple(both[k] for k in choose_key_views([setup.cameras[v] for v in both], len(setup.key_views)))
+
+
+def _copies(cameras: Sequence[Camera], images: Sequence[np.ndarray | None], frame: int) -> dict[int, np.ndarray]:
+    """Return copies of the images of those views that have one, by view index, if all have their camera's size."""
+    _check_images(cameras, images, frame)
+    return {view: image.copy() for view, image in enumerate(images) if image is not None}
+
+
+def _check_images(cameras: Sequence[Camera], images: Sequence[np.ndarray | None], frame: int) -> None:
+    count = len(images) if isinstance(images, (Sequence, np.ndarray)) else f"a {type(images).__name__}"
+    if count != len(cameras):
+        raise ValueError(
+            f"step(): frame {frame} must have one image or None for each of {len(cameras)} views, got {count}."
+        )
+    if not frame and all(image is None for image in images):
+        raise ValueError("step(): frame 0 must have an image of at least one view, got none; begin with one that has.")
+    for view, (camera, image) in enumerate(zip(cameras, images, strict=True)):
+        shape = camera.height, camera.width, 3
+        if image is not None and (not isinstance(image, np.ndarray) or (image.shape, image.dtype) != (shape, np.uint8)):
+            found = f"{image.dtype} {list(image.shape)}" if isinstance(image, np.ndarray) else type(image).__name__
+            raise ValueError(
+                f"step(): frame {frame} of view {camera.name or view!r} must be uint8 {list(shape)}, got {found}; "
+                "convert it."
+            )

@@ -1,0 +1,283 @@
+"""Settings of a fit: all configs in one value, presets, and TOML files.
+
+Presets:
+
+    l, s                              8 and 5 passes over the views for every later frame
+    baseline, ml, ml-mo, ml-mo-mc     rows of the ablation: residuals only; with motion; with offset; with confidence
+    paper                             all three modules; motion starts from zero instead of the lifted flow, one gate,
+                                      constant learning rates
+    rigidity                          the baseline with the rigid neighbours of Dynamic 3D Gaussians
+                                      (docs/experiments/field.md)
+
+The number of key views (2, 4, 8 or 12 in the paper) is `MotionConfig.key_views` and belongs to no preset.
+
+A key such as ``fit.density.rounds`` names a setting. In a TOML file it is ``rounds`` in the table ``[fit.density]``.
+TOML has no null: the string ``"none"`` stands for None.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import json
+import re
+import textwrap
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, is_dataclass, replace
+from difflib import get_close_matches
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from reprlib import repr as shortened
+from types import NoneType
+from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
+
+from morgs_mi.codec.codec_config import CodecConfig
+from morgs_mi.core.documentation import with_pages
+from morgs_mi.core.ranges import arms_of, check_ranges, check_value, types_of
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.io.bounded import read_toml
+from morgs_mi.method.motion_config import MotionConfig
+from morgs_mi.render.render_config import RenderConfig
+
+__all__ = [
+    "PRESETS",
+    "PresetName",
+    "StreamConfig",
+    "apply_preset",
+    "apply_values",
+    "config_toml",
+    "field_docs",
+    "read_config",
+    "relocated",
+]
+
+PresetName = Literal["l", "s", "baseline", "ml", "ml-mo", "ml-mo-mc", "paper", "rigidity"]
+Config = TypeVar("Config")
+_NONE = "none"
+_COMMENT_WIDTH = 110
+
+
+@dataclass(frozen=True)
+class StreamConfig:
+    """Settings of the streaming loop.
+
+    Example:
+        >>> config = morgs_mi.StreamConfig(fit=morgs_mi.FitConfig(epochs=4), seed=1)
+    """
+
+    fit: FitConfig = field(default_factory=FitConfig)
+    """Optimisation of the Gaussians."""
+    motion: MotionConfig = field(default_factory=MotionConfig)
+    """Motion, offset and confidence."""
+    render: RenderConfig = field(default_factory=RenderConfig)
+    """Rasteriser."""
+    codec: CodecConfig = field(default_factory=CodecConfig)
+    """Precision and size of the stream."""
+    seed: int = 0
+    """Seed of every random choice: order of the views, added points."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)
+
+
+def _modules(motion: bool, offset: bool, confidence: bool) -> dict[str, Any]:
+    return {"learn_motion": motion, "learn_offset": offset, "learn_confidence": confidence}
+
+
+PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
+    "l": {"fit": {"epochs": 8}},
+    "s": {"fit": {"epochs": 5}},
+    "baseline": {"motion": _modules(False, False, False)},
+    "ml": {"motion": _modules(True, False, False)},
+    "ml-mo": {"motion": _modules(True, True, False)},
+    "ml-mo-mc": {"motion": _modules(True, True, True)},
+    "paper": {
+        "fit": {"epochs": 8, "decay_means_rate": False},
+        "motion": {
+            "lift_flow": False,
+            "propagate_motion": False,
+            "search_motion": False,
+            "refine_start": False,
+            "lift_confidence": False,
+            "two_gates": False,
+            **_modules(True, True, True),
+        },
+    },
+    "rigidity": {
+        "fit": {
+            "objective": {"rigid_weight": 0.4, "rotation_weight": 0.4, "isometry_weight": 0.2},
+            "density": {"later_frames": False},
+            "decay_means_rate": False,
+            "rates": {"means": 4e-3, "quats": 0.02, "scales": 0.0, "opacities": 0.0, "sh_dc": 0.0, "sh_rest": 0.0},
+        },
+        "motion": {"constant_velocity": True, **_modules(False, False, False)},
+    },
+}
+
+
+def apply_preset(config: StreamConfig, name: PresetName) -> StreamConfig:
+    """Return `config` with the settings of a preset; all others are unchanged.
+
+    Raises:
+        ValueError: `name` is not a preset.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"apply_preset(): `name` must be one of {', '.join(PRESETS)}, got {name!r}.")
+    return apply_values(config, PRESETS[name], "apply_preset()")
+
+
+def apply_values(config: Config, values: Mapping[str, Any], source: str = "apply_values()") -> Config:
+    """Return a config with some of its settings replaced.
+
+    Args:
+        config: a frozen dataclass of numbers, strings, booleans, tuples, None and further such dataclasses.
+        values: new values by field name; a mapping for a nested dataclass, which replaces only the fields it names.
+        source: where the values come from, for messages: a file or a function.
+
+    Raises:
+        ValueError: an unknown key, a value of the wrong type, or one that is out of range.
+    """
+    return _replaced(config, values, source, "")
+
+
+def read_config(path: str | Path) -> dict[str, Any]:
+    """Return the settings that a TOML file gives, as `apply_values` takes them; they are not checked yet.
+
+    Raises:
+        FileNotFoundError: the file is missing.
+        ValueError: as for `read_toml`.
+    """
+    try:
+        return read_toml(path)
+    except FileNotFoundError:
+        raise FileNotFoundError(
+            f"{path}: expected a TOML file with settings, found none; write one with `morgs-mi fit --print-config`."
+        ) from None
+
+
+def config_toml(config: Any) -> str:
+    """Return a config as TOML: every setting with its docstring as a comment.
+
+    `apply_values` on any config of the same type with what `read_config` returns for this text gives an equal config.
+
+    Raises:
+        TypeError: a value has no TOML form here, see `apply_values`.
+        ValueError: an optional string is "none", which would be read as None.
+    """
+    return "\n".join((f'# The string "{_NONE}" stands for no value.', "", *_table(config, ""))) + "\n"
+
+
+@cache
+def field_docs(config_type: type) -> dict[str, str]:
+    """Return the docstrings of a dataclass's fields by name; those without source code have none."""
+    docs: dict[str, str] = {}
+    for base in reversed(config_type.__mro__):
+        try:
+            (definition,) = ast.parse(textwrap.dedent(inspect.getsource(base))).body
+        except (OSError, TypeError, SyntaxError):
+            continue
+        body = definition.body if isinstance(definition, ast.ClassDef) else []
+        for node, after in pairwise(body):
+            if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name) and isinstance(after, ast.Expr):
+                text = after.value.value if isinstance(after.value, ast.Constant) else None
+                if isinstance(text, str):
+                    docs[node.target.id] = inspect.cleandoc(text)
+    return docs
+
+
+def relocated(error: ValueError, source: str, prefix: str, names: list[str]) -> ValueError:
+    """Return an error of a config's check with `source` as the place and full keys in place of field names.
+
+    ``FitConfig(): `epochs` must be ...`` becomes ``FILE.toml: `fit.epochs` must be ...``. An error that names none of
+    the fields is returned as it is.
+    """
+    text = re.sub(r"^[\w.]+\(\): ", "", str(error))
+    keyed = re.sub(r"`(\w+)`", lambda m: f"`{prefix}{m[1]}`" if m[1] in names else m[0], text)
+    return ValueError(f"{source}: {keyed}") if any(f"`{name}`" in text for name in names) else error
+
+
+def _replaced(config: Any, values: Mapping[str, Any], source: str, prefix: str) -> Any:
+    """Return `config` with `values`; `prefix` is its own key with a dot behind it, or empty."""
+    kinds = types_of(type(config))
+    changes: dict[str, Any] = {}
+    for name, value in values.items():
+        key = f"{prefix}{name}"
+        if name not in kinds:
+            near = " or ".join(f"`{prefix}{n}`" for n in get_close_matches(name, kinds, 1) or kinds)
+            raise ValueError(f"{source}: `{key}` is unknown, expected {near}.")
+        nested = next((arm for arm in arms_of(kinds[name]) if is_dataclass(arm) and isinstance(arm, type)), None)
+        if nested and isinstance(value, Mapping):
+            before = getattr(config, name)
+            changes[name] = _replaced(nested() if before is None else before, value, source, f"{key}.")
+        else:
+            changes[name] = _converted(value, kinds[name])
+            check_value(source, key, changes[name], kinds[name])
+    try:
+        return replace(config, **changes)
+    except ValueError as error:
+        raise relocated(error, source, prefix, list(kinds)) from None
+
+
+def _converted(value: Any, kind: Any) -> Any:
+    """Return a TOML value as a field's type has it: tuples for lists, floats for integers, None for "none"."""
+    arms = [get_args(arm)[0] if get_origin(arm) is Annotated else arm for arm in arms_of(kind)]
+    if NoneType in arms and value in (None, _NONE):
+        return None
+    if type(value) is int and float in arms:
+        with suppress(OverflowError):
+            return float(value)
+    if isinstance(value, (list, tuple)):
+        kinds = next((get_args(arm) for arm in arms if get_origin(arm) is tuple), ())
+        kinds = kinds[:1] * len(value) if kinds[1:] == (...,) else kinds
+        if len(kinds) == len(value):
+            return tuple(map(_converted, value, kinds))
+    if isinstance(value, dict):
+        types = next((get_args(arm) for arm in arms if get_origin(arm) is dict), None)
+        return {k: _converted(v, types[1]) for k, v in value.items()} if types else value
+    return value
+
+
+def _table(config: Any, key: str) -> Iterator[str]:
+    """Yield the lines of a table: its own settings, then the tables inside it."""
+    docs, kinds = field_docs(type(config)), types_of(type(config))
+    values = {name: getattr(config, name) for name in kinds}
+    nested = {name: value for name, value in values.items() if is_dataclass(value)}
+    for name, value in values.items():
+        if name in nested:
+            continue
+        if value == _NONE and NoneType in arms_of(kinds[name]):
+            raise ValueError(f"config_toml(): `{name}` must not be the string 'none', which stands for None.")
+        yield from _comment(docs.get(name, ""))
+        yield f"{name} = {_toml(value)}"
+    for name, value in nested.items():
+        path = f"{key}.{name}" if key else name
+        yield ""
+        yield from _comment(docs.get(name, ""))
+        yield f"[{path}]"
+        yield from _table(value, path)
+
+
+def _comment(text: str) -> list[str]:
+    """Return a docstring as lines of comment."""
+    lines = textwrap.wrap(
+        with_pages(" ".join(text.split())), _COMMENT_WIDTH, break_long_words=False, break_on_hyphens=False
+    )
+    return [f"# {line}" for line in lines]
+
+
+def _toml(value: Any) -> str:
+    """Return a number, string, boolean, tuple or None as TOML has it."""
+    if value is None:
+        return f'"{_NONE}"'
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, (int, float)):
+        return repr(float(value) if isinstance(value, float) else int(value))
+    if isinstance(value, str):
+        # JSON's strings are TOML's, except that TOML has DEL escaped.
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    raise TypeError(f"config_toml(): expected numbers, strings, booleans, tuples or None, got {shortened(value)}.")

@@ -1,0 +1,106 @@
+"""Selection of an optical-flow source by one string.
+
+A source takes two successive images of a camera and returns two flows in pixels: from I_t to I_{t-1} on frame t's
+grid (eq. 4), and from I_{t-1} to I_t on frame t - 1's grid.
+
+A new source is one module in this package that decorates a factory with `FLOW_SOURCES.register`; docs/flow.md has an
+example. A source outside this package registers itself in the same way where it is imported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from morgs_mi.method.flow_sources.flow_config import FlowConfig
+from morgs_mi.method.method_registry import Registry
+
+__all__ = ["FLOW_SOURCES", "FlowSource", "FramePair", "both_directions", "check_images", "flow_source"]
+
+
+@dataclass(frozen=True, eq=False)
+class FramePair:
+    """Two successive images of one camera.
+
+    Attributes:
+        image: I_t [H, W, 3], RGB, uint8 or float in [0, 1].
+        previous: I_{t-1}, likewise.
+        camera: the camera's name; flow from files needs it.
+        frame: t; flow from files needs it.
+        valid: [H, W] bool, False where undistortion left nothing; None: valid everywhere.
+        box: rows and columns outside which nothing has changed; None: any pixel may have changed.
+        region: [H, W] bool, pixels outside which nothing has moved, all of them in the box; None: any may have.
+    """
+
+    image: np.ndarray
+    previous: np.ndarray
+    camera: str = ""
+    frame: int = 1
+    valid: np.ndarray | None = None
+    box: tuple[slice, slice] | None = None
+    region: np.ndarray | None = None
+
+
+FlowSource = Callable[[FramePair], tuple[np.ndarray, np.ndarray]]
+
+FLOW_SOURCES: Registry[FlowSource, FlowConfig] = Registry("flow_source()", "flow_method")
+
+
+def flow_source(flow_method: str, config: FlowConfig | None = None) -> FlowSource:
+    """Return the flow source that a string selects.
+
+    The last few sources are cached, so a network is loaded once.
+
+    Args:
+        flow_method: one of `FLOW_SOURCES.usages`: a key of `FLOW_METHODS`; ``files:FOLDER`` (see `files`);
+            ``onnx:FILE`` (see `network`) for a network that takes values from 0 to 255, ``onnx-unit:FILE`` for one that
+            takes 0 to 1, ``onnx-signed:FILE`` for one that takes -1 to 1.
+        config: settings of the methods; None: the defaults.
+
+    Raises:
+        FileNotFoundError: the folder or file is missing.
+        ValueError: the string selects no source, or as `FlowNetwork`.
+    """
+    return _flow_source(flow_method, config or FlowConfig())
+
+
+@lru_cache(maxsize=8)
+def _flow_source(flow_method: str, config: FlowConfig) -> FlowSource:
+    return FLOW_SOURCES.make(flow_method, config)
+
+
+def both_directions(method: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> FlowSource:
+    """Return the source that computes both flows by a function of two images, inside the pair's box.
+
+    Args:
+        method: takes two images and returns the flow [H, W, 2] from the first to the second.
+    """
+
+    def source(pair: FramePair) -> tuple[np.ndarray, np.ndarray]:
+        check_images("flow_source()", pair.image, pair.previous)
+        if pair.box is None:
+            return method(pair.image, pair.previous), method(pair.previous, pair.image)
+        image, previous = (np.ascontiguousarray(whole[pair.box]) for whole in (pair.image, pair.previous))
+        flows = np.zeros((2, *pair.image.shape[:2], 2), np.float32)
+        flows[0][pair.box], flows[1][pair.box] = method(image, previous), method(previous, image)
+        return flows[0], flows[1]
+
+    return source
+
+
+def check_images(place: str, image: np.ndarray, previous: np.ndarray) -> None:
+    """Raise ValueError unless both images are RGB of one size [H, W, 3].
+
+    Args:
+        place: the public function that the error names.
+        image: the first image.
+        previous: the second image.
+    """
+    if image.ndim != 3 or image.shape[2] != 3 or image.shape != previous.shape:
+        raise ValueError(
+            f"{place}: `image` and `previous` must be RGB of one size [H, W, 3], got {image.shape} and "
+            f"{previous.shape}."
+        )

@@ -1,0 +1,122 @@
+"""Optical flow by OpenCV's methods (eq. 4).
+
+Notation: the flow F(x) lives on frame t's pixel grid and points from x_t to x_{t-1}, so I_t(x) is
+I_{t-1}(x + F(x)). The motion x_t - x_{t-1} of the rendered motion map is -F. Units are pixels, x to the right and
+y down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import cv2
+import numpy as np
+
+from morgs_mi.method.flow_sources.flow_config import FlowConfig
+from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowSource, both_directions, check_images
+
+__all__ = ["FLOW_METHODS", "optical_flow"]
+
+# Side of an image in pixels below which the methods have too little to match: DIS needs patches of 8 pixels on its
+# coarsest level.
+_MIN_SIDE = 16
+# Given None, OpenCV allocates its result; OpenCV's type stubs do not allow for it.
+_ALLOCATE: Any = None
+
+_Method = Callable[[np.ndarray, np.ndarray, FlowConfig], np.ndarray]
+
+
+def _on_gray(method: _Method) -> _Method:
+    def on_gray(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
+        return method(cv2.cvtColor(a, cv2.COLOR_RGB2GRAY), cv2.cvtColor(b, cv2.COLOR_RGB2GRAY), config)
+
+    return on_gray
+
+
+def _dis(preset: int, finest: Callable[[int, FlowConfig], int] | None = None) -> _Method:
+    """Return DIS with a preset.
+
+    Args:
+        preset: OpenCV's number of the preset.
+        finest: returns the last pyramid level (0 is full resolution) for a width; None: the preset's.
+    """
+
+    def flow(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
+        method = cv2.DISOpticalFlow.create(preset)
+        if finest is not None:
+            method.setFinestScale(finest(a.shape[1], config))
+        # DIS chooses its coarsest level by the width alone and crashes where the height is less than a patch.
+        rows, missing = a.shape[0], max(0, a.shape[1] // 2 - a.shape[0])
+        a, b = (cv2.copyMakeBorder(image, 0, missing, 0, 0, cv2.BORDER_REPLICATE) for image in (a, b))
+        return method.calc(a, b, _ALLOCATE)[:rows]
+
+    return _on_gray(flow)
+
+
+def _rlof(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
+    # The global motion prior is for moving cameras, and its grid never ends on images of less than 40 rows. The
+    # default interpolation (EPIC) crashes or returns NaN on small images; this one needs colours.
+    parameters = cv2.optflow.RLOFOpticalFlowParameter.create()
+    parameters.setUseGlobalMotionPrior(False)
+    return cv2.optflow.calcOpticalFlowDenseRLOF(
+        a, b, _ALLOCATE, rlofParam=parameters, interp_type=cv2.optflow.INTERP_GEO
+    )
+
+
+def _deepflow(a: np.ndarray, b: np.ndarray, config: FlowConfig) -> np.ndarray:
+    return cv2.optflow.createOptFlow_DeepFlow().calc(a, b, _ALLOCATE)
+
+
+# OpenCV's other methods are no better at any cost (Farneback, PCAFlow, dual TV-L1), or crash or return NaN on images
+# with too little to match (sparse-to-dense, SimpleFlow, RLOF with other interpolations): see docs/experiments/flow.md.
+# All take RGB as bytes.
+FLOW_METHODS: dict[str, _Method] = {
+    # The presets stop at half or quarter resolution, where patches of 8 pixels miss small objects in small images.
+    "dis": _dis(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM, lambda width, config: int(width > config.fine_width)),
+    "dis-fine": _dis(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM, lambda width, config: 0),
+    "dis-ultrafast": _dis(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST),
+    "rlof": _rlof,
+    "deepflow": _on_gray(_deepflow),
+}
+
+
+def optical_flow(
+    image: np.ndarray, previous: np.ndarray, method: str = "dis", config: FlowConfig | None = None
+) -> np.ndarray:
+    """Return the flow [H, W, 2] in pixels, float32, from I_t to I_{t-1} on frame t's grid (eq. 4).
+
+    Images with a side under `FlowConfig.min_side` have too little to match: their flow is zero.
+
+    Args:
+        image: I_t [H, W, 3], RGB, uint8 or float in [0, 1].
+        previous: I_{t-1}, likewise.
+        method: a key of `FLOW_METHODS`.
+        config: settings of the methods; None: the defaults.
+
+    Raises:
+        ValueError: an unknown method, images that are not RGB or differ in size.
+    """
+    if method not in FLOW_METHODS:
+        raise ValueError(f"optical_flow(): `method` must be one of {', '.join(FLOW_METHODS)}, got {method!r}.")
+    config = config or FlowConfig()
+    image, previous = np.asarray(image), np.asarray(previous)
+    check_images("optical_flow()", image, previous)
+    if min(image.shape[:2]) < _MIN_SIDE:
+        return np.zeros((*image.shape[:2], 2), np.float32)
+    return FLOW_METHODS[method](_bytes(image), _bytes(previous), config)
+
+
+def _make(method: str, argument: str, config: FlowConfig) -> FlowSource:
+    return both_directions(partial(optical_flow, method=method, config=config))
+
+
+for _name in FLOW_METHODS:
+    FLOW_SOURCES.register(_name)(partial(_make, _name))
+
+
+def _bytes(image: np.ndarray) -> np.ndarray:
+    if image.dtype != np.uint8:
+        image = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+    return np.ascontiguousarray(image)

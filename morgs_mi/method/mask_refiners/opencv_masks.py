@@ -1,0 +1,124 @@
+"""Motion masks refined by colours: GrabCut and superpixels of OpenCV."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from morgs_mi.method.mask_refiners.mask_config import MaskConfig
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS, MaskRefiner
+
+__all__ = ["clean_mask", "refine_mask", "vote_superpixels"]
+
+# Radius in pixels of the opening that removes specks.
+_OPENING = 1
+# Radius of the closing that fills holes, in widths of the mask; at least a pixel.
+_CLOSING = 0.005
+# Iterations of GrabCut.
+_ITERATIONS = 2
+# Distance from the flow mask within which GrabCut may add pixels, in longer sides of the image.
+_REACH = 0.05
+# Share of the image above which GrabCut is skipped: what is left has too few colours to learn from.
+_COVERAGE = 0.9
+# Side of a superpixel in pixels of the reduced image, iterations of SLIC, and its weight of distance against colour.
+_SIDE, _SLIC_ITERATIONS, _COMPACTNESS = 8, 5, 10.0
+
+
+def refine_mask(image: np.ndarray, mask: np.ndarray, config: MaskConfig | None = None) -> np.ndarray:
+    """Return the mask of the objects [H, W] bool that a motion mask lies on, by GrabCut on colours.
+
+    GrabCut (Rother, Kolmogorov and Blake, SIGGRAPH 2004) starts from the mask with specks removed and may add pixels
+    near it. If nothing is left of the mask, or it covers nearly everything, one side has no colours to learn from: the
+    mask is returned with its specks removed and holes closed.
+
+    Args:
+        image: [H, W, 3], RGB, uint8 or float in [0, 1].
+        mask: [H, W] bool.
+        config: settings of GrabCut; None: the defaults.
+
+    Raises:
+        ValueError: the sizes of image and mask differ.
+    """
+    if image.shape != (*mask.shape, 3):
+        raise ValueError(f"refine_mask(): `image` must be [H, W, 3] with H, W = {mask.shape}, got {image.shape}.")
+    config = config or MaskConfig()
+    clean = clean_mask(mask)
+    small = _reduced(image, config.working_width)
+    seed = cv2.resize(clean.astype(np.uint8), small.shape[1::-1], interpolation=cv2.INTER_NEAREST)
+    near = cv2.dilate(seed, _disc(int(max(seed.shape) * _REACH)))
+    if not seed.any() or near.all() or seed.mean() > _COVERAGE:
+        return clean
+    labels = np.where(near > 0, np.where(seed > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD).astype(np.uint8)
+    cv2.setRNGSeed(0)  # GrabCut's k-means starts at random
+    models = np.zeros((1, 65)), np.zeros((1, 65))
+    labels, _, _ = cv2.grabCut(small, labels, (0, 0, 0, 0), *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    return clean_mask(_enlarged(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)), mask.shape))
+
+
+def vote_superpixels(image: np.ndarray, mask: np.ndarray, config: MaskConfig | None = None) -> np.ndarray:
+    """Return the mask of the superpixels [H, W] bool three quarters of which are in a motion mask.
+
+    SLIC (Achanta et al., PAMI 2012) on colours in Lab. Flow that bleeds over an edge is removed, and so is any part of
+    the mask thinner than a superpixel, 8 pixels in an image 320 wide. An image with a side under two superpixels has
+    none (OpenCV crashes with a segmentation fault below one): its mask is returned unchanged.
+
+    Args:
+        image: [H, W, 3], RGB, uint8 or float in [0, 1].
+        mask: [H, W] bool.
+        config: settings of the superpixels; None: the defaults.
+
+    Raises:
+        ValueError: the sizes of image and mask differ.
+    """
+    if image.shape != (*mask.shape, 3):
+        raise ValueError(f"vote_superpixels(): `image` must be [H, W, 3] with H, W = {mask.shape}, got {image.shape}.")
+    config = config or MaskConfig()
+    small = _reduced(image, config.working_width)
+    if min(small.shape[:2]) < 2 * _SIDE:
+        return mask
+    lab = cv2.cvtColor(small, cv2.COLOR_RGB2LAB)
+    slic = cv2.ximgproc.createSuperpixelSLIC(lab, cv2.ximgproc.SLIC, _SIDE, _COMPACTNESS)
+    slic.iterate(_SLIC_ITERATIONS)
+    slic.enforceLabelConnectivity()
+    labels = np.asarray(slic.getLabels(), np.int32)
+    votes = cv2.resize(mask.astype(np.float32), labels.shape[::-1], interpolation=cv2.INTER_AREA)
+    shares = np.bincount(labels.ravel(), votes.ravel()) / np.maximum(np.bincount(labels.ravel()), 1)
+    return _enlarged(shares[labels] >= config.superpixel_share, mask.shape)
+
+
+def clean_mask(mask: np.ndarray) -> np.ndarray:
+    """Return a mask [H, W] bool with its specks removed and its holes closed.
+
+    Args:
+        mask: [H, W] bool.
+    """
+    opened = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, _disc(_OPENING))
+    return cv2.morphologyEx(opened, cv2.MORPH_CLOSE, _disc(max(1, int(mask.shape[1] * _CLOSING)))) > 0
+
+
+@MASK_REFINERS.register("grabcut")
+def _grabcut(argument: str, config: MaskConfig) -> MaskRefiner:
+    return lambda image, mask: mask | refine_mask(image, mask, config)
+
+
+@MASK_REFINERS.register("superpixels+grabcut")
+def _both(argument: str, config: MaskConfig) -> MaskRefiner:
+    return lambda image, mask: vote_superpixels(image, mask, config) | refine_mask(image, mask, config)
+
+
+def _reduced(image: np.ndarray, widest: int) -> np.ndarray:
+    """Return an image as bytes, no wider than `widest` pixels."""
+    if image.dtype != np.uint8:
+        image = (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+    height, width = image.shape[:2]
+    scale = min(1.0, widest / width)
+    size = (max(1, round(width * scale)), max(1, round(height * scale)))
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+
+
+def _enlarged(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    return cv2.resize(mask.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+
+
+def _disc(radius: int) -> np.ndarray:
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))

@@ -1,0 +1,80 @@
+"""Settings of the motion modules."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+from morgs_mi.core.ranges import AtLeast, AtMost, check_ranges
+from morgs_mi.method.active_set import ActiveSetConfig
+from morgs_mi.method.change import ChangeConfig
+from morgs_mi.method.flow_sources.flow_config import FlowConfig
+from morgs_mi.method.lift import LiftConfig
+from morgs_mi.method.mask_refiners.mask_config import MaskConfig
+from morgs_mi.method.search import SearchConfig
+
+__all__ = ["MotionConfig"]
+
+
+@dataclass(frozen=True)
+class MotionConfig:
+    """Settings of the motion modules; the first three are the rows of the paper's ablation.
+
+    With all three off, the residual-only baseline remains (eq. 3).
+
+    Raises:
+        ValueError: a number is out of range.
+    """
+
+    learn_motion: bool = True
+    """ML: optical flow on key views guides each Gaussian's motion (eq. 7)."""
+    learn_offset: bool = True
+    """MO: a learned offset corrects the flow-guided motion (eq. 8)."""
+    learn_confidence: bool = True
+    """MC: a learned confidence gates the residuals (eq. 12)."""
+    two_gates: bool = True
+    """Gate means and rotations only, so that appearance changes freely; False: one gate for all, as in the paper."""
+    lift_flow: bool = True
+    """Start each Gaussian's motion from lifted flow; False: from zero, as in the paper."""
+    constant_velocity: bool = False
+    """Without lifted flow: start each Gaussian's motion from that into the previous frame."""
+    propagate_motion: bool = True
+    """Also try the motion of the previous frame and of neighbours as starts; needs `lift_flow`."""
+    search_motion: bool = True
+    """Search for parts that neither flow nor proposals explain; needs `lift_flow`."""
+    refine_start: bool = True
+    """Refine the start of motion and colour by the images of the key views; needs `lift_flow` and `two_gates`."""
+    lift_confidence: bool = True
+    """Raise each Gaussian's confidence to that of lifted flow; False: carry it over, as in the paper."""
+    flow_method: str = "dis"
+    """Source of optical flow: a method of OpenCV (see docs/flow.md), files:FOLDER, or onnx:FILE for a network
+    (onnx-unit:FILE or onnx-signed:FILE if it takes values from 0 or -1 to 1 instead of bytes)."""
+    mask_method: str = "grabcut"
+    """Refinement of flow masks to objects: none, grabcut, superpixels+grabcut, or
+    sam2:ENCODER.onnx,DECODER.onnx (see docs/masks.md)."""
+    key_views: Annotated[int, AtLeast(1)] = 4
+    """Number of cameras with optical flow and masks."""
+    mask_interval: Annotated[int, AtLeast(1)] = 5
+    """Frames from one supervision of the confidence by masks to the next."""
+    cohesion_weight: Annotated[float, AtLeast(0)] = 50.0
+    """Weight of an opaque neighbour of the same colour against the evidence of motion of a Gaussian alone (see
+    `cohesion`); 0: no cohesion."""
+    model: str = "none"
+    """Motion that Gaussians share, fitted before the residual: none, or a registered model (see docs/extending.md)."""
+    model_share: Annotated[float, AtLeast(0), AtMost(1)] = 0.5
+    """Fraction of a later frame's epochs that fit this model, at least one epoch."""
+    flow: FlowConfig = field(default_factory=FlowConfig)
+    """Optical flow and its forward-backward check."""
+    masks: MaskConfig = field(default_factory=MaskConfig)
+    """Motion masks."""
+    lift: LiftConfig = field(default_factory=LiftConfig)
+    """Lifted flow."""
+    search: SearchConfig = field(default_factory=SearchConfig)
+    """Coarse search."""
+    active_set: ActiveSetConfig = field(default_factory=ActiveSetConfig)
+    """Selection of the Gaussians that a frame may change."""
+    change: ChangeConfig = field(default_factory=ChangeConfig)
+    """Detection of changed pixels."""
+
+    def __post_init__(self) -> None:
+        check_ranges(self)

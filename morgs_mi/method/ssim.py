@@ -1,0 +1,349 @@
+"""L_recon (eq. 2) and its derivative in two traced passes.
+
+L_recon is (1 - lambda) L1 + lambda (1 - SSIM). SSIM (Wang et al. 2004) has the 11x11 Gaussian window of sigma 1.5 and
+takes pixels outside the image as black. With x the image, y its target and M the mean over a window,
+
+    SSIM = (2 Mx My + C1) (2 (Mxy - Mx My) + C2) / ((Mx^2 + My^2 + C1) (Mxx - Mx^2 + Myy - My^2 + C2)).
+
+Two traced passes, over a whole view or a region of it: the first computes SSIM's derivatives D by Mx, Mxx and Mxy at
+every window, the second propagates them back through the window, which is its own transpose:
+
+    dL/dx = (1 - lambda) sign(x - y) - lambda (M D_x + 2 x M D_xx + y M D_xy).
+
+My and Myy come from a pass of their own, once per target and region. In all three, a SIMD lane walks down a run of rows
+of a strip (see `ssim_layout`). It blurs each row horizontally and adds it to the 11 windows that contain the row: every
+number is read once, and no blurred row is written to memory.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.core.checks import check_mask
+from morgs_mi.core.memory import from_numpy, owned_copy
+from morgs_mi.core.types import Bool, Float, Int32, Jit, Tensor, UInt32
+from morgs_mi.method.ssim_layout import (
+    COLUMN,
+    RADIUS,
+    STRIP,
+    Lanes,
+    Planes,
+    Runs,
+    packet_type,
+    read_packet,
+    write_packet,
+)
+from morgs_mi.render.backend import on_aligned_stack
+from morgs_mi.render.kernel_recording import recorded
+from morgs_mi.render.region import Region
+
+__all__ = ["OnRegion", "Target", "WholeView"]
+
+_Read = Callable[[Float], list[Float]]  # plane -> its numbers around the lane's row
+
+# Noise and rendered colours exceed [0, 1] by less, 8-bit values by more.
+_MARGIN = 1.0
+_C1, _C2 = 0.01**2, 0.03**2
+_TAPS = np.exp(-0.5 * (np.arange(-RADIUS, RADIUS + 1) / 1.5) ** 2)
+_TAPS = (_TAPS / _TAPS.sum()).astype(np.float32).tolist()
+
+
+@dataclass(frozen=True, eq=False)
+class _Windows:
+    """The windows that pixels of a region lie in, and the target's statistics there.
+
+    Attributes:
+        windows: runs of the centres of the windows.
+        pixels: runs of the pixels.
+        mean: planes of M y, defined on `windows`.
+        variance: planes of M yy - (M y)^2, likewise.
+    """
+
+    windows: Runs
+    pixels: Runs
+    mean: Float
+    variance: Float
+
+
+class Target:
+    """A target image. Its terms of SSIM are computed once for each region on which it is compared.
+
+    Args:
+        image: [H, W, 3], RGB, uint8 or float in [0, 1], display-referred.
+        mask: [H, W] bool; pixels that are False do not count. None: all pixels count.
+
+    Raises:
+        ValueError: an image of another shape or type, or that is not finite, or a mask of another shape or type.
+    """
+
+    def __init__(self, image: np.ndarray, mask: np.ndarray | None = None) -> None:
+        _check_image(image)
+        if mask is not None:
+            check_mask("Target()", mask, *image.shape[:2])
+        pixels = image.astype(np.float32)
+        if image.dtype == np.uint8:
+            pixels /= 255
+        self.shape: tuple[int, ...] = pixels.shape
+        self.planes = Planes(*pixels.shape[:2])
+        self.weight: Float | None = None
+        if mask is not None and not mask.all():
+            weight = np.repeat(mask[..., None], 3, axis=2).astype(np.float32)
+            pixels, self.weight = pixels * weight, self._planes(weight)
+        self.pixels = self._planes(pixels)
+        self.surroundings: Float | None = None
+        self._places: dict[Region, tuple[UInt32, Bool]] = {}
+        self._windows: dict[Region | None, _Windows] = {}
+
+    def _planes(self, image: np.ndarray) -> Float:
+        planes = self.planes.of(from_numpy(mi.Float, image))
+        dr.eval(planes)
+        return planes
+
+    def image(self) -> np.ndarray:
+        """Return the target [H, W, 3], float32 in [0, 1]; black where masked."""
+        return np.asarray(self.planes.image(self.pixels)).reshape(self.shape)
+
+    def difference(self, image: Tensor, region: Region | None = None) -> np.ndarray:
+        """Return the target minus an image, [H, W, 3] or on a region of it; 0 where masked."""
+        if region is None or region.whole:
+            error = self.pixels - self.masked(self.planes.of(owned_copy(dr.detach(image).array)))
+            return np.asarray(self.planes.image(error)).reshape(self.shape)
+        places, inside = self.places_on(region)
+        pixels = dr.gather(mi.Float, self.pixels, places, active=inside)
+        return np.asarray(pixels - self.masked(dr.detach(image).array, places)).reshape(region.shape(3))
+
+    def places_on(self, region: Region) -> tuple[UInt32, Bool]:
+        """Return (places of the numbers of an image on a region, mask of those in the view)."""
+        if region not in self._places:
+            self._places[region] = self.planes.places_on(region)
+        return self._places[region]
+
+    def windows_on(self, region: Region | None) -> _Windows:
+        """Return the windows that the pixels of a region lie in, those of the whole view for None."""
+        if region not in self._windows:
+            windows, pixels = (self.planes.runs(region, reach) for reach in (RADIUS, 0))
+            height = dr.opaque(mi.Int32, self.planes.height)
+            (mean, variance), _ = recorded(_statistics_pass, self.planes.size)(windows.lanes, height, self.pixels)
+            self._windows[region] = _Windows(windows, pixels, mean, variance)
+        return self._windows[region]
+
+    def set_surroundings(self, image: Tensor) -> None:
+        """Store a rendered image [H, W, 3] as the surroundings of the regions that are compared from now on."""
+        self.surroundings = self.masked(self.planes.of(owned_copy(dr.detach(image).array)))
+        dr.eval(self.surroundings)
+
+    def masked(self, values: Float, places: UInt32 | None = None) -> Float:
+        """Return planes, or their numbers at `places`, set to 0 where the mask is False."""
+        if self.weight is None:
+            return values
+        return values * (self.weight if places is None else dr.gather(mi.Float, self.weight, places))
+
+
+def _check_image(image: np.ndarray) -> None:
+    if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or not image.size:
+        found = list(image.shape) if isinstance(image, np.ndarray) else type(image).__name__
+        raise ValueError(f"Target(): `image` must be [H, W, 3], got {found}; pass one RGB image.")
+    if image.dtype == np.uint8:
+        return
+    low, high = (image.min(), image.max()) if image.dtype.kind == "f" else (np.nan, np.nan)
+    if not (low >= -_MARGIN and high <= 1 + _MARGIN):
+        found = f"{image.dtype} from {low:g} to {high:g}" if image.dtype.kind == "f" else str(image.dtype)
+        raise ValueError(
+            f"Target(): `image` must be uint8, or floats in [0, 1], got {found}; divide 8-bit values by 255."
+        )
+
+
+class _Recon(dr.CustomOp):
+    gradient: Float
+
+    def finish(self, gradient: Float, loss: Float) -> Float:
+        """Store the derivative for `backward`, and return the value."""
+        self.gradient = gradient
+        dr.eval(gradient, loss)
+        return loss
+
+    def backward(self) -> None:
+        self.set_grad_in("x", self.gradient * self.grad_out())
+
+    def forward(self) -> None:
+        self.set_grad_out(dr.dot(self.gradient, self.grad_in("x")))
+
+    def name(self) -> str:
+        return "morgs_mi.recon_loss"
+
+
+class WholeView(_Recon):
+    def eval(self, x: Float, target: Target, weight: float) -> Float:
+        planes = target.planes
+        image = target.masked(planes.of(x * dr.opaque(mi.Float, 1)))  # in memory allocated by Dr.Jit
+        gradient, loss = _passes(image, target, weight, target.windows_on(None))
+        return self.finish(planes.image(target.masked(gradient)), loss)
+
+
+class OnRegion(_Recon):
+    def eval(self, x: Float, target: Target, weight: float, region: Region) -> Float:
+        if target.surroundings is None:
+            target.surroundings = target.pixels + 0
+        image, (places, inside) = target.surroundings, target.places_on(region)
+        dr.scatter(image, target.masked(x, places), places, active=inside, mode=dr.ReduceMode.NoConflicts)
+        gradient, loss = _passes(image, target, weight, target.windows_on(region))
+        return self.finish(target.masked(dr.gather(mi.Float, gradient, places, active=inside), places), loss)
+
+
+def _passes(image: Float, target: Target, weight: float, on: _Windows) -> tuple[Float, Float]:
+    """Return dL/dx in planes, defined on the runs of `on.pixels`, and L over the runs of `on`."""
+    planes, scale = target.planes, dr.opaque(mi.Float, 1 / int(np.prod(target.shape)))
+    height = dr.opaque(mi.Int32, planes.height)
+    dr.eval(image)
+    arguments = (on.windows.lanes, height, image, target.pixels, on.mean, on.variance)
+    derivatives, ssim = recorded(_similarity_pass, planes.size)(*arguments)
+    arguments = (on.pixels.lanes, height, image, target.pixels, derivatives, scale)
+    (gradient,), error = recorded(_gradient_pass, planes.size, weight)(*arguments)
+    structure = dr.opaque(mi.Float, on.windows.num_pixels) - dr.sum(ssim)
+    return gradient, scale * ((1 - weight) * dr.sum(error) + weight * structure)
+
+
+def _statistics_pass(size: int, lanes: Lanes, height: Int32, target: Float) -> tuple[list[Float], Float]:
+    """Return the planes of M y and M yy - (M y)^2, and the sum of M y over each run."""
+
+    def moments(read: _Read) -> list[list[Float]]:
+        y = read(target)
+        return [y, [v * v for v in y]]
+
+    def statistics(read: _Read, blurred: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
+        mean, square = blurred
+        return [mean, [dr.fma(-m, m, s) for m, s in zip(mean, square, strict=True)]], mean
+
+    return _walk(size, lanes, height, moments, statistics, 2, 2)
+
+
+def _similarity_pass(
+    size: int, lanes: Lanes, height: Int32, image: Float, target: Float, mean: Float, variance: Float
+) -> tuple[list[Float], Float]:
+    """Return the planes of SSIM's derivatives by M x, M xx and M xy, and the sum of SSIM over each run."""
+
+    def products(read: _Read) -> list[list[Float]]:
+        x, y = read(image), read(target)
+        return [x, [v * v for v in x], [v * w for v, w in zip(x, y, strict=True)]]
+
+    def similarity(read: _Read, blurred: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
+        terms = [_similarity(*values) for values in zip(*blurred, read(mean), read(variance), strict=True)]
+        ssim, *derivatives = map(list, zip(*terms, strict=True))
+        return derivatives, ssim
+
+    return _walk(size, lanes, height, products, similarity, 3, 3)
+
+
+def _similarity(mx: Float, xx: Float, xy: Float, my: Float, variance: Float) -> tuple[Float, Float, Float, Float]:
+    """Return SSIM of a window and its derivatives by M x, M xx and M xy."""
+    a1, a2 = dr.fma(2 * mx, my, _C1), dr.fma(2.0, dr.fma(-mx, my, xy), _C2)
+    b1, b2 = dr.fma(mx, mx, dr.fma(my, my, _C1)), dr.fma(-mx, mx, xx) + (variance + _C2)
+    r1, r2 = dr.rcp(b1), dr.rcp(b2)
+    r12 = r1 * r2
+    ssim = a1 * a2 * r12
+    d_x = 2 * dr.fma(my * r12, a2 - a1, mx * ssim * (r2 - r1))
+    return ssim, d_x, -ssim * r2, 2 * a1 * r12
+
+
+def _gradient_pass(
+    size: int,
+    weight: float,
+    lanes: Lanes,
+    height: Int32,
+    image: Float,
+    target: Float,
+    derivatives: list[Float],
+    scale: Float,
+) -> tuple[list[Float], Float]:
+    """Return the planes of dL/dx, and the sum of |x - y| over each run."""
+
+    def unchanged(read: _Read) -> list[list[Float]]:
+        return [read(plane) for plane in derivatives]
+
+    def gradient(read: _Read, blurred: list[list[Float]]) -> tuple[list[list[Float]], list[Float]]:
+        row, errors = [], []
+        for x, y, d_x, d_xx, d_xy in zip(read(image), read(target), *blurred, strict=True):
+            error, structure = x - y, dr.fma(y, d_xy, dr.fma(2 * x, d_xx, d_x))
+            sign = dr.select(error > 0, 1.0, dr.select(error < 0, -1.0, 0.0))
+            row.append(scale * ((1 - weight) * sign - weight * structure))
+            errors.append(dr.abs(error))
+        return [row], errors
+
+    return _walk(size, lanes, height, unchanged, gradient, 3, 1)
+
+
+def _walk(
+    size: int,
+    lanes: Lanes,
+    height: Int32,
+    across: Callable[[_Read], list[list[Float]]],
+    finish: Callable[[_Read, list[list[Float]]], tuple[list[list[Float]], list[Float]]],
+    inputs: int,
+    outputs: int,
+) -> tuple[list[Float], Float]:
+    """Walk down the runs with a window: blur the rows that `across` returns, and write those that `finish` returns.
+
+    Args:
+        size: size of the planes.
+        lanes: the runs.
+        height: height of the image.
+        across: read -> rows of numbers, wider than a strip by 5 on both sides.
+        finish: (read, these rows blurred, of a strip) -> (rows of a strip to write, row of a strip to sum).
+        inputs: number of rows to blur.
+        outputs: number of rows to write.
+
+    Returns:
+        The planes that were written, defined on the runs, and the sum over the pixels of each run.
+    """
+    packet = packet_type()
+    targets = [dr.empty(mi.Float, size) for _ in range(outputs)]
+
+    def blurred(row: Int32, height: Int32, places: tuple[UInt32, UInt32, UInt32]) -> Jit:
+        inside, down = (row >= 0) & (row < height), mi.UInt32(row) * COLUMN
+
+        def wide(plane: Float) -> list[Float]:
+            numbers = [v for place in places for v in read_packet(plane, place + down, inside)]
+            return numbers[STRIP - RADIUS : 2 * STRIP + RADIUS]
+
+        sums = []
+        for values in across(wide):
+            shifted = [packet(values[k : k + STRIP]) for k in range(2 * RADIUS + 1)]
+            total = shifted[0] * _TAPS[0]
+            for tap, v in zip(_TAPS[1:], shifted[1:], strict=True):
+                total = dr.fma(v, tap, total)
+            sums += list(total)
+        return packet(sums)
+
+    def body(row, end, first, places, columns, height, windows, total, targets):
+        # Two rows per turn, so that the windows are read and written half as often. Window k ends k rows further down.
+        a, b, w = blurred(row, height, places), blurred(row + 1, height, places), _TAPS
+        done = dr.fma(a, w[0], windows[0]), dr.fma(b, w[0], dr.fma(a, w[1], windows[1]))
+        windows = [dr.fma(a, w[k], dr.fma(b, w[k - 1], windows[k])) for k in range(2, 2 * RADIUS)]
+        windows += [dr.fma(a, w[-1], b * w[-2]), b * w[-1]]
+
+        inside = [columns > k for k in range(STRIP)]
+        for k in range(2):
+            at = row + k - RADIUS
+            center, ready = places[1] + mi.UInt32(at) * COLUMN, (at >= first) & (at < end)
+
+            def narrow(plane: Float, center: UInt32 = center, ready: Bool = ready) -> list[Float]:
+                return list(read_packet(plane, center, ready))
+
+            sums = list(done[k])
+            written, summed = finish(narrow, [sums[STRIP * c : STRIP * (c + 1)] for c in range(inputs)])
+            for target, values in zip(targets, written, strict=True):
+                write_packet(target, [dr.select(t, v, 0) for t, v in zip(inside, values, strict=True)], center, ready)
+            for t, v in zip(inside, summed, strict=True):
+                total = total + dr.select(t & ready, v, 0)
+        return row + 2, end, first, places, columns, height, windows, total, targets
+
+    windows = [packet([mi.Float(0) for _ in range(inputs * STRIP)]) for _ in range(2 * RADIUS)]
+    end = on_aligned_stack(lanes.end)
+    state = (lanes.first - RADIUS, end, lanes.first, lanes.places, lanes.columns, height, windows, mi.Float(0), targets)
+    *_, total, targets = dr.while_loop(state, lambda row, end, *_: row < end + RADIUS, body, label="window")
+    return targets, total

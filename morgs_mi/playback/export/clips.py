@@ -1,0 +1,183 @@
+"""Export of a stream's frames: one file per frame, or a video along a camera path."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.codec.packets import CodedFrame, frames_near, play, seek
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.files import atomic_folder, atomic_path
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.io.video_writer import playable_format, write_video
+from morgs_mi.playback.export.formats import VIDEO, choose_format
+from morgs_mi.playback.export.frames import pad_to_even
+from morgs_mi.playback.export.paths import CameraPath
+from morgs_mi.playback.player import channel_image, render, render_config
+from morgs_mi.playback.visualise import side_by_side
+
+__all__ = ["frame_numbers", "repeated_frames", "repeated_seconds", "select_frames", "write_each", "write_flight"]
+
+Progress = Callable[[int, int], None] | None
+
+
+def frame_numbers(stream: StreamReader) -> list[int]:
+    """Return the indices of a stream's frames, without decoding them.
+
+    Raises:
+        ValueError: the stream has no frame.
+    """
+    numbers = list(dict.fromkeys(frame for _, frame, _ in stream.index()))
+    if not numbers:
+        raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has only a header.")
+    return numbers
+
+
+def select_frames(stream: StreamReader, span: str | None) -> list[int]:
+    """Return the frames of a stream that `span` selects: ``12``, ``10:20`` (without 20), ``::5``; None selects all.
+
+    Raises:
+        ValueError: `span` has another syntax, or selects no frame of the stream.
+    """
+    numbers = frame_numbers(stream)
+    if span is None:
+        return numbers
+    try:
+        start, stop, step = (*(int(part) if part.strip() else None for part in span.split(":")), *([None] * 2))[:3]
+        if span.count(":") > 2 or (step is not None and step < 1):
+            raise ValueError
+    except ValueError:
+        raise ValueError(f"select_frames(): `span` must be like 12, 10:20 or 0:100:5, got {span!r}.") from None
+    if ":" not in span:
+        start, stop = start, None if start is None else start + 1
+    low, high = numbers[0] if start is None else start, numbers[-1] + 1 if stop is None else stop
+    wanted = set(range(low, high, step or 1))
+    if not (selected := [number for number in numbers if number in wanted]):
+        raise ValueError(
+            f"select_frames(): `span` must select frames of {stream.path}, {numbers[0]} to {numbers[-1]}, got {span!r}."
+        )
+    return selected
+
+
+def write_each(
+    clip: Iterable[tuple[int, Gaussians]],
+    output: str | Path,
+    suffix: str,
+    write: Callable[[Path, Gaussians], None],
+    frames: Sequence[int],
+    progress: Progress = None,
+) -> None:
+    """Write frames as ``0000.ply``, ``0001.ply``, ... into a new folder, or one frame as a file; atomically.
+
+    Args:
+        clip: (frame, Gaussians) of all frames, as `play` and `by_place` yield them.
+        output: a folder that does not exist, or for one frame a file with a name that ends in `suffix`.
+        suffix: of the files, e.g. ``.ply``.
+        write: function that writes the Gaussians of one frame.
+        frames: indices of the frames, ascending.
+        progress: called with (files done, total number of files).
+
+    Raises:
+        ValueError: a broken packet, or several frames for one file.
+        OSError: the folder exists, or a file cannot be written.
+    """
+    wanted, done = set(frames), 0
+    single = Path(output).name.lower().endswith(suffix)
+    if single and len(wanted) > 1:
+        raise ValueError(
+            f"{output}: expected one frame for one file, got {len(wanted)}; select one (--frames), or name a folder."
+        )
+    with (atomic_path if single else atomic_folder)(output, "write_each()") as partial:
+        for frame, gaussians in clip:
+            if frame in wanted:
+                write(partial if single else partial / f"{frame:04d}{suffix}", gaussians)
+                done += 1
+                if progress is not None:
+                    progress(done, len(wanted))
+            if done == len(wanted):
+                break
+
+
+def write_flight(
+    stream: StreamReader,
+    path: CameraPath,
+    output: str | Path,
+    channels: Sequence[str] = ("color",),
+    clip: Iterator[Gaussians] | None = None,
+    progress: Progress = None,
+) -> None:
+    """Render a stream along a camera path into a video at the stream's frame rate; the file is written atomically.
+
+    Args:
+        stream: the file.
+        path: the moving camera; it determines the duration of the video.
+        output: ``FILE.mp4``.
+        channels: out of `CHANNELS`, drawn side by side.
+        clip: Gaussians of each image of the video; None: `repeated_frames`.
+        progress: called with (images done, total number of images).
+
+    Raises:
+        ValueError: another type of file, an unknown channel, or a broken packet.
+        OSError: the file cannot be written.
+    """
+    choose_format(VIDEO, output)
+    frame_numbers(stream)
+    count, config = max(1, round(path.seconds * stream.fps)), render_config(stream)
+
+    def images() -> Iterator[np.ndarray]:
+        for i, gaussians in zip(range(count), clip or repeated_frames(stream), strict=False):
+            rendered = render(gaussians, path.at(i / stream.fps), channels, config)
+            yield pad_to_even(side_by_side([channel_image(name, values) for name, values in rendered.items()]))
+            if progress is not None:
+                progress(i + 1, count)
+
+    write_video(output, images(), stream.fps, playable_format()[1])
+
+
+def repeated_seconds(clip: float, least: float) -> float:
+    """Return the duration of as many plays of a clip as last at least `least` seconds, at least one.
+
+    Raises:
+        ValueError: `least` is negative or not finite.
+    """
+    if not 0 <= least < math.inf:
+        raise ValueError(f"repeated_seconds(): `least` must be finite and not negative, got {least}.")
+    return clip * max(1, math.ceil(least / clip - 1e-9))
+
+
+def repeated_frames(
+    stream: StreamReader, freeze: int | None = None, back_and_forth: bool = False
+) -> Iterator[Gaussians]:
+    """Yield the frames of a stream without end.
+
+    Args:
+        stream: the file.
+        freeze: index of a single frame to yield; None: all.
+        back_and_forth: go backwards after the last frame. Motion is then the one of the clip, opposite to the motion
+            that is shown.
+
+    Raises:
+        ValueError: the stream has no such frame, or a packet is broken.
+    """
+    frozen = None if freeze is None else seek(stream, freeze).gaussians
+    while True:
+        yield from (frozen,) if frozen is not None else (gaussians for _, gaussians in play(stream))
+        if frozen is None and back_and_forth:
+            yield from _frames_backwards(stream)
+
+
+def _frames_backwards(stream: StreamReader) -> Iterator[Gaussians]:
+    """Yield the frames between the first and the last one backwards, decoded from one keyframe to the next."""
+    between = frame_numbers(stream)[1:-1]
+    while between:
+        block: list[CodedFrame] = []
+        for coded in frames_near(stream, between[-1]):
+            block = [*(before for before in block if before.frame < coded.frame), coded]
+            if coded.frame == between[-1]:
+                break
+        # A keyframe has no motion of its own: it follows from the residual, in the block before.
+        yield from (coded.gaussians for coded in block[:0:-1])
+        between = [frame for frame in between if frame <= block[0].frame]

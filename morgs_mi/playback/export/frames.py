@@ -1,0 +1,131 @@
+"""Export of rendered frames: videos for common players, EXR files for compositing, PNG files."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.core.files import atomic_folder
+from morgs_mi.io.cryptomatte import cryptomatte
+from morgs_mi.io.exr import write_exr
+from morgs_mi.io.video_writer import playable_format, write_video
+from morgs_mi.playback.export.formats import IMAGES, choose_format
+from morgs_mi.playback.player import channel_image, render_stream
+from morgs_mi.playback.visualise import side_by_side, write_png
+
+__all__ = ["MATTE", "exr_channels", "exr_layers", "pad_to_even", "write_frames", "write_images"]
+
+MATTE = "matte:"
+"""Beginning of the name of a matte among rendered images."""
+
+
+def write_frames(
+    stream: StreamReader,
+    camera: Camera,
+    output: str | Path,
+    channels: Sequence[str] | None = None,
+    progress: Callable[[int], None] | None = None,
+    format: str | None = None,
+) -> None:
+    """Render a stream for one camera into files, which are written atomically.
+
+    Args:
+        stream: the file.
+        camera: any view.
+        output: ``FILE.mp4`` for a video of the channels side by side, a folder ending in ``png`` for the same images as
+            ``0000.png`` ..., any other folder for multichannel ``0000.exr`` ... (see `exr_channels`).
+        channels: out of `CHANNELS`; default: the colour, for EXR files all channels that the stream stores.
+        progress: called with the number of frames done.
+        format: mp4, png or exr; None: that of the output's name.
+
+    Raises:
+        ValueError: an unknown channel, a channel that the stream does not store, another type of video, or a stream
+            that is truncated, broken or has no frame.
+        OSError: the folder exists, or a file cannot be written.
+    """
+    if not stream.index():
+        raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has only a header.")
+    chosen = choose_format(IMAGES, output, format).name
+    channels = channels or (None if chosen == "exr" else ("color",))
+    write_images(render_stream(stream, camera, channels), stream.fps, output, progress, chosen)
+
+
+def write_images(
+    rendered: Iterable[tuple[int, Mapping[str, np.ndarray]]],
+    fps: float,
+    output: str | Path,
+    progress: Callable[[int], None] | None = None,
+    format: str | None = None,
+) -> None:
+    """Write rendered frames, pairs of index and channels [H, W, C] by name, into files as `write_frames` does.
+
+    Raises:
+        ValueError: another type of video.
+        OSError: the folder exists, or a file cannot be written.
+    """
+    chosen = choose_format(IMAGES, output, format).name
+
+    def frames() -> Iterator[tuple[int, Mapping[str, np.ndarray]]]:
+        for done, (frame, images) in enumerate(rendered, start=1):
+            yield frame, images
+            if progress is not None:
+                progress(done)
+
+    if chosen == "mp4":
+        padded = (pad_to_even(_combined_image(images)) for _, images in frames())
+        write_video(output, padded, fps, playable_format()[1])
+        return
+    with atomic_folder(output, "write_frames()") as folder:
+        for frame, images in frames():
+            if chosen == "png":
+                write_png(folder / f"{frame:04d}.png", _combined_image(images))
+            else:
+                write_exr(folder / f"{frame:04d}.exr", *exr_layers(images))
+
+
+def exr_layers(images: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Return the channels of an EXR file, see `exr_channels`, and its attributes; images ``matte:NAME`` are mattes."""
+    mattes = {key.removeprefix(MATTE): image[..., 0] for key, image in images.items() if key.startswith(MATTE)}
+    channels = exr_channels({key: image for key, image in images.items() if not key.startswith(MATTE)})
+    if not mattes:
+        return channels, {}
+    ids, attributes = cryptomatte(mattes)
+    return {**channels, **ids}, attributes
+
+
+def exr_channels(images: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return rendered images [H, W, C] as EXR channels [H, W] under the names of the renderer's AOVs.
+
+    Colour is R, G, B in linear light, as EXR readers expect, and alpha is A. Other channels are called ``depth.Y`` if
+    they have one component, ``motion.X``, ``motion.Y`` if they have several. Motion is in pixels, depth in world units.
+    """
+    planes = {**images, **({"color": srgb_to_linear(images["color"])} if "color" in images else {})}
+    return {
+        name: plane[..., i] for key, plane in planes.items() for i, name in enumerate(_exr_names(key, plane.shape[2]))
+    }
+
+
+def _exr_names(channel: str, components: int) -> list[str]:
+    if channel == "color":
+        return ["R", "G", "B"]
+    if channel == "alpha":
+        return ["A"]
+    if channel in ("splats", "surfaces", "shadow"):  # layers of an inserted scene, see `insert`
+        return [f"{channel}.{letter}" for letter in "RGBA"[:components]]
+    suffixes = "Y" if components == 1 else "XYZW"[:components] if components <= 4 else map(str, range(components))
+    return [f"{channel}.{suffix}" for suffix in suffixes]
+
+
+def pad_to_even(image: np.ndarray) -> np.ndarray:
+    """Return the image [H, W, 3] with its last row and column repeated where their number is odd."""
+    H, W = image.shape[:2]
+    return np.pad(image, ((0, H % 2), (0, W % 2), (0, 0)), mode="edge")
+
+
+def _combined_image(images: Mapping[str, np.ndarray]) -> np.ndarray:
+    return side_by_side([channel_image(name, image) for name, image in images.items()])

@@ -1,0 +1,299 @@
+"""A Mitsuba scene inserted into a stream: its objects stand among the Gaussians of every frame.
+
+A scene is an XML file, which is the same in all frames, or a Python file with a function
+
+    build(frame: int, time: float) -> dict
+
+that returns the entries of a Mitsuba scene: shapes, emitters, and optionally an `integrator` for them. The time is in
+seconds. World space and its units are the stream's.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+from xml.etree import ElementTree
+
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.codec.packets import play
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import LARGEST, bounded, check_number
+from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.gaussian_integrator import ellipsoids
+from morgs_mi.playback.export.clips import frame_numbers
+from morgs_mi.playback.export.frames import MATTE
+from morgs_mi.playback.player import available_channels
+from morgs_mi.plugins.light_probe import light_probe
+from morgs_mi.plugins.mattes import mattes
+from morgs_mi.plugins.shadows import shadow_ratio, shadowed
+from morgs_mi.plugins.splat_path import rays_for, traced
+from morgs_mi.plugins.surface_view import lights
+from morgs_mi.render.channels import exr_names
+from morgs_mi.render.rasterize import rasterize
+from morgs_mi.synth.scene import failures_in
+
+__all__ = [
+    "LAYERS",
+    "InsertConfig",
+    "Light",
+    "captured_light",
+    "inserted_channels",
+    "load_insert",
+    "render_inserted",
+    "selected",
+]
+
+LAYERS = ("splats", "surfaces", "shadow", "mattes")
+"""Further channels, for compositing: the splats alone and the surfaces alone, in linear light with alpha, the shadow of
+the surfaces on the splats, a factor of their linear light, and ``matte:NAME`` for every shape and the splats."""
+
+Light = Literal["probe", "traced"]
+
+Build = Callable[[int, float], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class InsertConfig:
+    """Rendering of an inserted scene."""
+
+    samples: int = 16
+    """Samples per pixel of its surfaces."""
+    shadows: bool = True
+    """Whether its surfaces throw shadows on the Gaussians, see `shadow_ratio`."""
+    light: Light = "probe"
+    """``probe`` lights the surfaces by an environment map, see `captured_light`; ``traced`` traces rays through the
+    Gaussians (`splat_path`), which also throw shadows on them."""
+
+    def __post_init__(self) -> None:
+        check_number("render_inserted()", "samples", self.samples, "[1, inf)")
+
+
+def load_insert(path: str | Path) -> Build:
+    """Return the function (frame, seconds) -> entries of a Mitsuba scene of an XML or Python file.
+
+    Raises:
+        ValueError: there is no such file, it is of another type, or it fails; the sentence names the file, and the line
+            of a Python file.
+    """
+    path = Path(path)
+    if path.suffix not in (".xml", ".py") or not path.is_file():
+        found = f"{path.suffix!r}" if path.is_file() else "none"
+        raise ValueError(f"{path}: expected a scene to insert, FILE.xml or FILE.py, got {found}; check the path.")
+    if path.suffix == ".xml":
+        entries = _xml_entries(path)
+        return lambda frame, time: entries
+    spec = importlib.util.spec_from_file_location(f"morgs_mi_insert_{path.stem}", path)
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    with failures_in(path):
+        spec.loader.exec_module(module)
+    build = getattr(module, "build", None)
+    if not callable(build):
+        raise ValueError(
+            f"{path}: expected a function `build(frame, time)` that returns the entries of a Mitsuba scene, found "
+            "none; add it."
+        )
+
+    def checked(frame: int, time: float) -> dict[str, Any]:
+        with failures_in(path):
+            entries = build(frame, time)
+            if not isinstance(entries, dict):
+                raise TypeError(f"`build` must return a dict, got a {type(entries).__name__}")
+            return entries
+
+    return checked
+
+
+def inserted_channels(stream: StreamReader) -> tuple[str, ...]:
+    """Return all channels of a stream with an inserted scene, for EXR files.
+
+    Raises:
+        ValueError: a broken packet, or no frame.
+    """
+    frame_numbers(stream)
+    _, gaussians = next(iter(play(stream)))
+    return ("color", "alpha", *(name for name in available_channels(gaussians) if name != "color"), *LAYERS)
+
+
+def selected(stream: StreamReader, frames: Sequence[int]) -> list[int]:
+    """Return `frames` in ascending order, each once.
+
+    Raises:
+        ValueError: the stream does not have one of them.
+    """
+    numbers = frame_numbers(stream)
+    missing = sorted(set(frames) - set(numbers))
+    if missing:
+        raise ValueError(
+            f"{stream.path}: the frames must be out of {numbers[0]} to {numbers[-1]}, got {missing[0]}; choose others."
+        )
+    return sorted(set(frames))
+
+
+def render_inserted(
+    stream: StreamReader,
+    camera: Camera,
+    build: Build,
+    frames: Sequence[int] | None = None,
+    channels: Sequence[str] = ("color",),
+    config: InsertConfig | None = None,
+) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    """Render frames of a stream for one camera with a Mitsuba scene inserted.
+
+    An inserted scene without emitters is lit by the Gaussians, see `captured_light`.
+
+    Args:
+        stream: the file.
+        camera: any view.
+        build: see `load_insert`.
+        frames: indices of the frames to render; None: all.
+        channels: out of ``color``, ``alpha``, the AOVs of `gaussian_splat`, and `LAYERS`.
+        config: settings.
+
+    Yields:
+        (frame, images) as `render_stream` does; the layer ``mattes`` is one image per name.
+
+    Raises:
+        ValueError: a broken packet, or a scene that Mitsuba or `gaussian_splat` refuses.
+    """
+    config = config or InsertConfig()
+    for frame, gaussians in play(stream):
+        if frames is None or frame in frames:
+            entries = build(frame, frame / stream.fps)
+            yield frame, _render(gaussians, camera, entries, channels, config)
+
+
+def captured_light(gaussians: Gaussians, camera: Camera, position: np.ndarray) -> dict[str, Any]:
+    """Return the `light_probe` at a point, where directions without Gaussians have the mean colour of a view.
+
+    A capture rarely shows what is behind the cameras; black there would take half of the light away.
+    """
+    return light_probe(gaussians, position, background=_mean_color(gaussians, camera))
+
+
+def _mean_color(gaussians: Gaussians, camera: Camera) -> list[float]:
+    return np.clip(np.asarray(rasterize(gaussians, camera, ("color",)).color), 0, 1).mean((0, 1)).tolist()
+
+
+def _in_background_light(entries: dict[str, Any], gaussians: Gaussians, camera: Camera) -> Any:
+    """Return the inserted scene with the light that comes from behind all Gaussians, as for `captured_light`."""
+    radiance = srgb_to_linear(np.array(_mean_color(gaussians, camera))).tolist()
+    lamp = {"type": "constant", "radiance": {"type": "rgb", "value": radiance}}
+    return mi.load_dict({"type": "scene", **entries, "captured light": lamp})
+
+
+def _integrator(chosen: Any, light: Light) -> Any:
+    """Return the integrator of the surfaces: the inserted scene's own, if it has one.
+
+    Raises:
+        ValueError: it does not light them as the option demands.
+    """
+    chosen = chosen or {"type": "splat_path" if light == "traced" else "path"}
+    nested = mi.load_dict(chosen) if isinstance(chosen, dict) else chosen
+    if hasattr(nested, "splats") != (light == "traced"):
+        found = type(nested).__name__ if hasattr(nested, "splats") else nested.class_name()
+        raise ValueError(
+            f"The inserted scene: with light {light!r}, expected {'an' if light == 'traced' else 'no'} integrator "
+            f"`splat_path`, got {found}; remove `integrator` from the scene, or choose the other light."
+        )
+    return nested
+
+
+def _render(
+    gaussians: Gaussians, camera: Camera, entries: dict[str, Any], channels: Sequence[str], config: InsertConfig
+) -> dict[str, np.ndarray]:
+    entries = {name: value for name, value in entries.items() if name not in ("type", "sensor")}
+    nested = _integrator(entries.pop("integrator", None), config.light)
+    ratio, found = np.ones(len(gaussians), np.float32), {}
+    try:
+        inserted: Any = mi.load_dict({"type": "scene", **entries})
+        if not (inserted.shapes() or inserted.emitters()):
+            raise ValueError("The inserted scene: expected at least one shape, got none; add one.")
+        if inserted.shapes() and not bounded(np.array([inserted.bbox().min, inserted.bbox().max])):
+            raise ValueError(
+                f"The inserted scene: expected shapes within {LARGEST:g} world units, got {inserted.bbox().min} to "
+                f"{inserted.bbox().max}; correct their places and sizes."
+            )
+        lit = inserted
+        if not inserted.emitters():
+            lamp = captured_light(gaussians, camera, np.array(inserted.bbox().center()).ravel())
+            lit = mi.load_dict({"type": "scene", **entries, "captured light": lamp})
+            inserted = lit if config.light == "probe" else _in_background_light(entries, gaussians, camera)
+        if "mattes" in channels:
+            # Before other scenes rename the shapes.
+            found = mattes(gaussians, camera, inserted)
+        if config.shadows:
+            ratio = shadow_ratio(gaussians, lit, camera.position)
+        dark = shadowed(gaussians, ratio)
+        images = _plugin_images(dark, camera, inserted, nested, channels, config.samples)
+        if "surfaces" in channels:
+            with traced(nested, rays_for(nested, dark), srgb=True):
+                images["surfaces"] = np.asarray(nested.render(inserted, _sensor(camera), spp=config.samples))
+    except RuntimeError as error:
+        raise ValueError(f"The inserted scene: {_reason(error)}; correct it.") from error
+    if {"splats", "shadow"} & set(channels):
+        alone, less = (rasterize(part, camera) for part in (gaussians, dark))
+        bright, less = (srgb_to_linear(np.asarray(image.color)) for image in (alone, less))
+        images["splats"] = np.concatenate([bright, np.asarray(alone.alpha)], axis=2)
+        images["shadow"] = np.where(bright > 0, less / np.maximum(bright, 1e-6), 1)
+    images |= {f"{MATTE}{name}": part[..., None] for name, part in found.items()}
+    names = [name for name in channels if name != "mattes"] + [f"{MATTE}{name}" for name in found]
+    return {name: images[name].astype(np.float32) for name in names}
+
+
+def _plugin_images(
+    gaussians: Gaussians, camera: Camera, inserted: Any, nested: Any, channels: Sequence[str], samples: int
+) -> dict[str, np.ndarray]:
+    """Return the colour, alpha and AOVs of `gaussian_splat` with an inserted scene."""
+    aovs = [name for name in channels if name not in ("color", "alpha", *LAYERS)]
+    scene = mi.load_dict(
+        {
+            "type": "scene",
+            "gaussians": ellipsoids(gaussians),
+            "sensor": _sensor(camera),
+            "integrator": {"type": "gaussian_splat", "surfaces": nested, "aovs": ",".join(aovs)},
+            **{f"part{i}": part for i, part in enumerate(_parts(inserted))},
+        }
+    )
+    image = np.asarray(scene.integrator().render(scene, spp=samples))
+    images, first = {"color": linear_to_srgb(image[..., :3]), "alpha": image[..., 3:4]}, 4
+    for name in aovs:
+        size = len(exr_names(name))
+        images[name] = image[..., first : first + size]
+        first += size
+    return images
+
+
+def _sensor(camera: Camera) -> Any:
+    return mi.load_dict(camera.sensor(pixel_format="rgba"))
+
+
+def _xml_entries(path: Path) -> dict[str, Any]:
+    """Return the shapes, lights and integrator of a scene file."""
+    try:
+        scene: Any = mi.load_file(str(path))
+    except RuntimeError as error:
+        raise ValueError(f"{path}: {_reason(error)}; correct the scene file.") from error
+    parts = {part.id() or f"part{i}": part for i, part in enumerate(_parts(scene))}
+    # Mitsuba adds an integrator to files without one.
+    chosen = ElementTree.parse(path).find("integrator") is not None
+    return {**parts, "integrator": scene.integrator()} if chosen else parts
+
+
+def _reason(error: RuntimeError) -> str:
+    """Return Mitsuba's reason in one line, without the places in its own source."""
+    return re.sub(r"\[\w+\.\w+:\d+\] ", "", " ".join(str(error).split())).rstrip(".")
+
+
+def _parts(scene: Any) -> list[Any]:
+    """Return the shapes of a scene, and its emitters that are not on one."""
+    return [*scene.shapes(), *lights(scene)]

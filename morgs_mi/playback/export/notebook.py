@@ -1,0 +1,44 @@
+"""Streams in notebooks: a player in the output of a cell, or an image where the stream is too long for one."""
+
+from __future__ import annotations
+
+import base64
+import html
+
+from morgs_mi.codec.packets import play
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.io.png import png_bytes
+from morgs_mi.playback.export.web import web_page
+from morgs_mi.playback.player import channel_image, render, render_config, stream_name
+
+__all__ = ["stream_html"]
+
+# Largest stream that is stored in a notebook, in bytes; the player adds a bit more than a megabyte.
+_LARGEST = 4_000_000
+# Width and height of the player in pixels, unless the output of the cell is narrower.
+_WIDTH, _HEIGHT = 800, 600
+_STYLE = "width:100%;max-width:{width:.0f}px;aspect-ratio:{aspect:.4f};border:0;border-radius:8px"
+_PLAYER = '<iframe sandbox="allow-scripts" allow="fullscreen" title="{title}" style="{style}" srcdoc="{page}"></iframe>'
+_POSTER = '<img alt="{title}" style="{style}" src="data:image/png;base64,{image}"><div>{text}</div>'
+
+
+def stream_html(stream: StreamReader) -> str:
+    """Return a stream as HTML: the player of `morgs-mi export web`, or the first frame where it would be too large.
+
+    A stream that cannot be read becomes the sentence that describes why.
+    """
+    try:
+        camera, size = stream.cameras[0], stream.path.stat().st_size
+        aspect = camera.width / camera.height
+        style = _STYLE.format(width=min(_WIDTH, _HEIGHT * aspect), aspect=aspect)
+        title = html.escape(stream_name(stream))
+        if size <= _LARGEST:
+            page = web_page(stream).decode().replace("&", "&amp;").replace('"', "&quot;")
+            return _PLAYER.format(title=title, style=style, page=page)
+        gaussians = next(gaussians for _, gaussians in play(stream))
+        image = channel_image("color", render(gaussians, camera, ("color",), render_config(stream))["color"])
+    except (OSError, ValueError, StopIteration) as error:
+        return f"<div>{html.escape(str(error) or f'{stream.path}: expected at least one frame, got none.')}</div>"
+    command = f"morgs-mi export web {stream.path} page.html"
+    text = f"Frame 0 of {size / 1e6:.0f} MB. To play it, write a page with <code>{html.escape(command)}</code>."
+    return _POSTER.format(title=title, style=style, image=base64.b64encode(png_bytes(image)).decode(), text=text)

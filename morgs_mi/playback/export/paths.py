@@ -1,0 +1,234 @@
+"""Camera paths: splines through key views, and paths that are derived from a rig.
+
+A path has K key views at increasing times in seconds. Between them the position follows a cubic spline, the rotation a
+rotation spline (both with continuous acceleration), the focal lengths and the principal point a cubic spline in pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation, RotationSpline
+
+from morgs_mi.core.camera import Camera, rigid
+from morgs_mi.io.bounded import read_json
+from morgs_mi.playback.export.axes import up_direction
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
+
+__all__ = ["CameraPath", "focus", "load_path", "orbit", "through_cameras"]
+
+# Weight of the Gaussians' median relative to an optical axis; it matters only where the axes do not meet.
+_MEDIAN_WEIGHT = 0.01
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """A camera that moves through key views.
+
+    Attributes:
+        times: seconds [K], increasing from 0.
+        keys: the K views, all of the same image size.
+
+    Raises:
+        ValueError: fewer than two keys, times that do not increase from 0, or different image sizes.
+    """
+
+    times: np.ndarray
+    keys: tuple[Camera, ...]
+
+    def __post_init__(self) -> None:
+        times = np.asarray(self.times, np.float64)
+        object.__setattr__(self, "times", times)
+        if len(self.keys) < 2 or times.shape != (len(self.keys),):
+            raise ValueError(
+                f"CameraPath(): at least two key views with a time each were expected, got {len(self.keys)} views and "
+                f"{times.size} times."
+            )
+        if times[0] != 0 or not np.all(np.diff(times) > 0):
+            raise ValueError(f"CameraPath(): `times` must increase from 0, got {times.tolist()}.")
+        sizes = {(key.width, key.height) for key in self.keys}
+        if len(sizes) > 1:
+            raise ValueError(f"CameraPath(): `keys` must have the same image size, got {sorted(sizes)}; resize them.")
+
+    @property
+    def seconds(self) -> float:
+        """Duration of the path."""
+        return float(self.times[-1])
+
+    def at(self, time: float) -> Camera:
+        """Return the view at a time in seconds; before the first and after the last key, that key."""
+        time = float(np.clip(time, 0, self.seconds))
+        positions, rotations, intrinsics = self._splines
+        R = rotations(time).as_matrix().T
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = R, -R @ positions(time)
+        log_fx, log_fy, cx, cy = intrinsics(time)
+        K = np.array([[np.exp(log_fx), 0, cx], [0, np.exp(log_fy), cy], [0, 0, 1]])
+        return replace(self.keys[0], K=K, viewmat=viewmat, name="path")
+
+    def with_duration(self, seconds: float) -> CameraPath:
+        """Return the same path at another speed, with a duration of `seconds`.
+
+        Raises:
+            ValueError: `seconds` is not positive and finite.
+        """
+        if not (np.isfinite(seconds) and seconds > 0):
+            raise ValueError(f"CameraPath.with_duration(): `seconds` must be positive, got {seconds}.")
+        return replace(self, times=self.times * (seconds / self.seconds))
+
+    @cached_property
+    def _splines(self) -> tuple[CubicSpline, RotationSpline, CubicSpline]:
+        from scipy.interpolate import CubicSpline  # not at the start of every command, which it slows down
+
+        K = np.stack([key.K for key in self.keys])
+        # With logarithms the focal lengths stay positive where the spline overshoots.
+        intrinsics = np.stack([np.log(K[:, 0, 0]), np.log(K[:, 1, 1]), K[:, 0, 2], K[:, 1, 2]], axis=1)
+        rotations = Rotation.from_matrix(np.stack([np.asarray(key.viewmat, np.float64)[:3, :3].T for key in self.keys]))
+        positions = np.stack([key.position for key in self.keys])
+        return (
+            CubicSpline(self.times, positions),
+            RotationSpline(self.times, rotations),
+            CubicSpline(self.times, intrinsics),
+        )
+
+
+def focus(cameras: Sequence[Camera], means: np.ndarray) -> np.ndarray:
+    """Return the point [3] that the rig looks at: the nearest point to all optical axes.
+
+    The median of the Gaussians' centres [N, 3] has a small weight; it determines the distance of parallel axes.
+    """
+    weight = _MEDIAN_WEIGHT * len(cameras)
+    A, b = weight * np.eye(3), weight * np.median(means, axis=0)
+    for camera in cameras:
+        axis = np.asarray(camera.viewmat, np.float64)[2, :3]
+        across = np.eye(3) - np.outer(axis, axis)
+        A, b = A + across, b + across @ camera.position
+    return np.linalg.solve(A, b)
+
+
+def orbit(
+    cameras: Sequence[Camera], center: np.ndarray, degrees: float | None = None, seconds: float = 1
+) -> CameraPath:
+    """Return the path of the first camera around the vertical axis through `center` [3], looking at `center`.
+
+    An orbit of less than 360 degrees extends by half of it to either side. By default it is as wide as the rig, and a
+    full circle if the rig surrounds the scene.
+
+    Raises:
+        ValueError: the camera is at the centre or directly above it, or `degrees` is not in 1..360.
+    """
+    first, up = cameras[0], up_direction(cameras)
+    arm = first.position - center
+    if np.linalg.norm(np.cross(arm, up)) < 1e-3 * np.linalg.norm(arm) or not arm.any():
+        raise ValueError(
+            f"orbit(): the camera {first.name!r} must stand beside the scene, got it directly above; use another path."
+        )
+    degrees = _rig_width(cameras, center, up) if degrees is None else degrees
+    if not 1 <= degrees <= 360:
+        raise ValueError(f"orbit(): `degrees` must be 1 to 360, got {degrees:g}.")
+    start = 0 if degrees == 360 else -degrees / 2
+    angles = np.linspace(start, start + degrees, max(5, round(degrees / 10) + 1))
+    positions = center + Rotation.from_rotvec(np.deg2rad(angles)[:, None] * up).apply(arm)
+    keys = tuple(_look_at(position, center, up, first) for position in positions)
+    return CameraPath(np.linspace(0, seconds, len(keys)), keys)
+
+
+def through_cameras(cameras: Sequence[Camera], seconds: float = 1) -> CameraPath:
+    """Return the path through all cameras at constant speed, from the first one always to the nearest remaining one.
+
+    All cameras are resized to the first one's image size.
+
+    Raises:
+        ValueError: there are fewer than two cameras.
+    """
+    if len(cameras) < 2:
+        raise ValueError(
+            f"through_cameras(): at least two cameras were expected to move between, got {len(cameras)}; use the path "
+            "`orbit`."
+        )
+    remaining = [camera.resized(cameras[0].width, cameras[0].height) for camera in cameras]
+    keys = [remaining.pop(0)]
+    while remaining:
+        distances = [np.linalg.norm(camera.position - keys[-1].position) for camera in remaining]
+        keys.append(remaining.pop(int(np.argmin(distances))))
+    steps = np.linalg.norm(np.diff([key.position for key in keys], axis=0), axis=-1)
+    # A rotation between cameras at the same position takes time too.
+    steps = np.maximum(steps, 0.1 * steps.mean() if steps.any() else 1)
+    return CameraPath(np.concatenate([[0], np.cumsum(steps)]), tuple(keys)).with_duration(seconds)
+
+
+def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
+    """Read a path from a JSON object with `keys` and, common to all of them, `width`, `height`, `fov_x` and `up`.
+
+    A key has a `time` in seconds and one of `camera` (a name of the rig), `viewmat` (world to camera, OpenCV's axes,
+    4x4) and `position` with `target`; the last two may have their own `fov_x` (horizontal, degrees) and `up`. The
+    defaults are the size and intrinsics of the rig's first camera and the rig's mean up.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: the file is not JSON, or a key is not as described.
+    """
+    if not Path(file).is_file():
+        raise FileNotFoundError(f"{file}: expected a camera path, found none; check the path.")
+    document = read_json(file)
+    try:
+        keys = [dict(key) for key in document["keys"]]
+    except (ValueError, TypeError, KeyError) as error:
+        raise ValueError(f"{file}: expected a JSON object with a list `keys` of objects, got {error!r}.") from None
+    common = {name: value for name, value in document.items() if name != "keys"}
+    views, times = [], []
+    for i, key in enumerate(keys):
+        try:
+            times.append(float(key["time"]))
+            views.append(_key_view({**common, **key}, cameras))
+        except KeyError as error:
+            raise ValueError(f"{file}: key {i}: {error.args[0]!r} is missing.") from None
+        except (ValueError, TypeError, OverflowError) as error:
+            raise ValueError(f"{file}: key {i}: {error}") from None
+    try:
+        return CameraPath(np.asarray(times), tuple(views))
+    except ValueError as error:
+        raise ValueError(f"{file}: {error}") from None
+
+
+def _key_view(key: Mapping[str, Any], cameras: Sequence[Camera]) -> Camera:
+    """Return the view of one key of a JSON path."""
+    first = cameras[0]
+    like = first.resized(int(key.get("width", first.width)), int(key.get("height", first.height)))
+    if "camera" in key:
+        named = {camera.name: camera for camera in cameras}
+        if key["camera"] not in named:
+            raise ValueError(f"`camera` must be one of {', '.join(named)}, got {key['camera']!r}.")
+        return named[key["camera"]].resized(like.width, like.height)
+    if "fov_x" in key:
+        f = 0.5 * like.width / np.tan(np.deg2rad(0.5 * float(key["fov_x"])))
+        like = replace(like, K=np.array([[f, 0, 0.5 * like.width], [0, f, 0.5 * like.height], [0, 0, 1]]))
+    if "viewmat" in key:
+        return replace(like, viewmat=rigid("`viewmat`", np.asarray(key["viewmat"], np.float64)))
+    position, target = (np.asarray(key[name], np.float64) for name in ("position", "target"))
+    up = np.asarray(key["up"], np.float64) if "up" in key else up_direction(cameras)
+    if any(v.shape != (3,) for v in (position, target, up)) or not np.cross(target - position, up).any():
+        raise ValueError("`position`, `target` and `up` must have 3 numbers each, and the view must not be along `up`.")
+    return _look_at(position, target, up, like)
+
+
+def _rig_width(cameras: Sequence[Camera], center: np.ndarray, up: np.ndarray) -> float:
+    """Return the angle in degrees that the rig covers around the vertical: at least 10; 360 without a gap of 90."""
+    arms = np.stack([camera.position - center for camera in cameras])
+    level = arms[0] - (arms[0] @ up) * up
+    angles = np.sort(np.rad2deg(np.arctan2(arms @ np.cross(up, level), arms @ level)))
+    gap = np.diff(angles, append=angles[0] + 360).max()
+    return 360 if gap < 90 else max(10, 360 - gap)
+
+
+def _look_at(position: np.ndarray, target: np.ndarray, up: np.ndarray, like: Camera) -> Camera:
+    """Return the view from a position to a target with the intrinsics of another camera."""
+    view = Camera.look_at(position, target, up, 60, like.width, like.height).viewmat
+    return replace(like, viewmat=view, name="path")

@@ -1,0 +1,80 @@
+"""Tracks of a stream's Gaussians: the position of each one in each frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.codec.packets import frames_with_lasting_ids
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.files import atomic_path
+from morgs_mi.playback.export.formats import TRACKS, choose_format
+
+__all__ = ["Tracks", "extract_tracks", "write_tracks"]
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Tracks of N Gaussians through T frames.
+
+    Attributes:
+        ids: uint32 [N], the Gaussians' ids in the stream, ascending.
+        frames: int64 [T], indices of the frames.
+        positions: float32 [T, N, 3], centres in world units; NaN before birth and after death.
+        confidence: float32 [T, N] in [0, 1]; NaN before birth, after death, and throughout if the stream stores none.
+    """
+
+    ids: np.ndarray
+    frames: np.ndarray
+    positions: np.ndarray
+    confidence: np.ndarray
+
+
+def extract_tracks(stream: StreamReader, progress: Callable[[int], None] | None = None) -> Tracks:
+    """Return the tracks of all Gaussians of a stream; they take 16 bytes of memory per Gaussian and frame.
+
+    Where a keyframe starts a new set of Gaussians with ids from 0, these ids continue after the earlier ones.
+
+    Args:
+        stream: the file.
+        progress: called with the number of frames done.
+
+    Raises:
+        ValueError: a broken packet, or a stream without a frame.
+    """
+    ids_of_frames, rows, frames = [], [], []
+    for ids, coded in frames_with_lasting_ids(stream):
+        gaussians = coded.gaussians
+        has_confidence = gaussians.confidence is not None
+        confidence = np.asarray(gaussians.confidence) if has_confidence else np.full(len(coded), np.nan, np.float32)
+        frames.append(coded.frame)
+        ids_of_frames.append(ids)
+        rows.append((gaussians.numpy()["means"], confidence))
+        if progress is not None:
+            progress(len(frames))
+    if not frames:
+        raise ValueError(f"{stream.path}: at least one frame was expected, got none; the stream has only a header.")
+    ids = np.unique(np.concatenate(ids_of_frames))
+    positions = np.full((len(frames), len(ids), 3), np.nan, np.float32)
+    confidences = np.full((len(frames), len(ids)), np.nan, np.float32)
+    for t, (present, (means, confidence)) in enumerate(zip(ids_of_frames, rows, strict=True)):
+        columns = np.searchsorted(ids, present)
+        positions[t, columns], confidences[t, columns] = means, confidence
+    return Tracks(ids.astype(np.uint32), np.asarray(frames), positions, confidences)
+
+
+def write_tracks(path: str | Path, tracks: Tracks) -> None:
+    """Write tracks as .npz with the arrays `ids`, `frames`, `positions`, `confidence`; the file is written atomically.
+
+    Raises:
+        ValueError: `path` does not end in .npz.
+        OSError: the file cannot be written.
+    """
+    choose_format(TRACKS, path)
+    with atomic_path(path, "write_tracks()") as partial, open(partial, "wb") as file:
+        np.savez_compressed(
+            file, ids=tracks.ids, frames=tracks.frames, positions=tracks.positions, confidence=tracks.confidence
+        )

@@ -1,0 +1,175 @@
+"""A stream as a web page that plays it: one file, or a folder for a web server.
+
+The page is built from `web/` and part of the package. It contains its script, compressed, and in a single file the
+stream as well. Both are stored as text with 7 bits per character, see "In a web page" in docs/stream-format.md.
+"""
+
+from __future__ import annotations
+
+import gzip
+import html
+import io
+import re
+from collections.abc import Callable, Sequence
+from importlib.metadata import version
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.codec.container import StreamWriter
+from morgs_mi.codec.packets import coded_frames
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.files import atomic_folder, atomic_path
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.playback.player import MOTION_SCALE, metadata_entry, stream_name
+
+__all__ = ["text_of_bytes", "web_page", "write_web_folder", "write_web_page"]
+
+Progress = Callable[[int], None]
+
+# What an HTML parser replaces (NUL, carriage return) or could take for the end of a script (<).
+_UNSAFE = (0x00, 0x0D, 0x3C)
+_STREAM = "stream.morgs"
+# Gaussians per frame and camera from which the scale of the motion is estimated.
+_SAMPLES = 500
+# Smallest scale, as a fraction of the width per frame; with a smaller one, a still scene would show the fit's noise.
+_LEAST_SCALE = 0.001
+
+
+def write_web_page(
+    stream: StreamReader, path: str | Path, title: str | None = None, progress: Progress | None = None
+) -> int:
+    """Write a self-contained page that plays a stream, and return its number of bytes.
+
+    It is one HTML file that runs from a disk and requests nothing. The stream's metadata is left out, except for the
+    renderer's settings, because it contains paths of the machine that made the fit; the scale of the motion is added.
+
+    Args:
+        stream: the file.
+        path: the page.
+        title: its title; by default the name of the stream's folder or file.
+        progress: called with the number of frames that were checked.
+
+    Raises:
+        ValueError: a packet of the stream or its metadata is broken.
+        OSError: the page cannot be written.
+    """
+    page = web_page(stream, title, progress)
+    with atomic_path(path, "write_web_page()") as partial:
+        partial.write_bytes(page)
+    return len(page)
+
+
+def web_page(stream: StreamReader, title: str | None = None, progress: Progress | None = None) -> bytes:
+    """Return the page that `write_web_page` writes; arguments and errors are the same."""
+    data = _script("stream", _published(stream, progress))
+    return _page(title or stream_name(stream), data, "data: blob:")
+
+
+def write_web_folder(
+    stream: StreamReader, path: str | Path, title: str | None = None, progress: Progress | None = None
+) -> int:
+    """Write a folder for a web server, with the page `index.html` and the stream as a file, and return their bytes.
+
+    Args:
+        stream: the file.
+        path: the new folder.
+        title: as for `write_web_page`.
+        progress: as for `write_web_page`.
+
+    Raises:
+        FileExistsError: `path` exists.
+        ValueError: a packet of the stream or its metadata is broken.
+        OSError: the folder cannot be written.
+    """
+    data = _published(stream, progress)
+    place = f'<i id="stream" data-address="{_STREAM}" hidden></i>'
+    page = _page(title or stream_name(stream), place, "'self' data: blob:")
+    with atomic_folder(path, "write_web_folder()") as partial:
+        (partial / "index.html").write_bytes(page)
+        (partial / _STREAM).write_bytes(data)
+    return len(page) + len(data)
+
+
+def text_of_bytes(data: bytes) -> str:
+    """Return bytes as text with 7 bits per character, which HTML stores in a script without changing it.
+
+    Bits are taken from the highest down, the last ones are filled up with zeros. 128 is added to the characters that
+    HTML would change, so that a reader takes the low 7 bits of each. As UTF-8, the text is 1.17 times as long as
+    random bytes; base64 is 1.33 times as long.
+    """
+    bits = np.unpackbits(np.frombuffer(data, np.uint8))
+    septets = np.pad(bits, (0, -len(bits) % 7)).reshape(-1, 7)
+    codes = np.packbits(septets, axis=1)[:, 0] >> 1
+    return (codes + np.uint8(128) * np.isin(codes, _UNSAFE)).tobytes().decode("latin-1")
+
+
+def _published(stream: StreamReader, progress: Progress | None) -> bytes:
+    """Return the stream with the metadata that the page reads, after decoding it once."""
+    render = metadata_entry(stream, "config.render", {}, dict)
+    packets, speeds = list(stream), []
+    for coded in coded_frames(packets):
+        speeds.append(_speeds(coded.gaussians, stream.cameras))
+        if progress is not None:
+            progress(len(speeds))
+    if not speeds:
+        raise ValueError(f"{stream.path}: expected at least one frame to show, got none.")
+    sink, metadata = io.BytesIO(), {"config": {"render": render}, "motion_scale": _motion_scale(*np.hstack(speeds))}
+    with StreamWriter(sink, stream.cameras, stream.fps, metadata) as writer:
+        for packet in packets:
+            writer.write(packet)
+    return sink.getvalue()
+
+
+def _motion_scale(speeds: np.ndarray, weights: np.ndarray) -> float:
+    """Return the speed that the page draws fully saturated: the 99th percentile of speeds [S] with weights [S].
+
+    It is not the maximum, because a few Gaussians that the fit has lost are several times as fast as the scene.
+    """
+    if not weights.any():
+        return MOTION_SCALE
+    return max(_LEAST_SCALE, float(np.percentile(speeds, 99, weights=weights, method="inverted_cdf")))
+
+
+def _speeds(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
+    """Return speeds of moving Gaussians in the images of the cameras, and their weights there [2, S].
+
+    A speed is a fraction of the image's width per frame. A weight is the opacity times the area on the screen.
+    """
+    if gaussians.motion is None:
+        return np.zeros((2, 0))
+    motion = np.asarray(gaussians.motion)
+    rows = np.flatnonzero(motion.any(axis=1))
+    rows = rows[:: len(rows) // _SAMPLES + 1]
+    motion, raw = motion[rows], gaussians.numpy()
+    means, log_sizes = raw["means"][rows], raw["log_scales"][rows].mean(axis=1)
+    # A stream may contain any scale; the bound keeps the weights finite.
+    weights, found = np.asarray(gaussians.opacities)[rows] * np.exp(2 * np.minimum(log_sizes, 20)), []
+    for camera in cameras:
+        pixels, depths = camera.project(means)
+        seen = (depths > camera.near) & ((pixels > 0) & (pixels < (camera.width, camera.height))).all(axis=1)
+        motions = np.einsum("nij,nj->ni", camera.projection_jacobian(means[seen]), motion[seen])
+        speeds = np.linalg.norm(motions, axis=1) / camera.width
+        found.append([speeds, weights[seen] / depths[seen] ** 2])
+    return np.hstack(found)
+
+
+def _page(title: str, data: str, connect: str) -> bytes:
+    player = files("morgs_mi.playback.export") / "web_player"
+    code = gzip.compress((player / "player.js").read_bytes(), 9, mtime=0)
+    page = (player / "player.html").read_text(encoding="utf-8")
+    values = {
+        "{version}": version("morgs-mi"),
+        "{connect}": connect,
+        "{title}": html.escape(title),
+        "{notice}": (player / "NOTICE").read_text(encoding="utf-8").replace("--", "- "),
+        "{data}": data + "\n" + _script("code", code),
+    }
+    page = re.sub("|".join(map(re.escape, values)), lambda match: values[match[0]], page)
+    return page.encode(errors="replace")
+
+
+def _script(name: str, data: bytes) -> str:
+    return f'<script type="text/plain" id="{name}" data-bytes="{len(data)}">{text_of_bytes(data)}</script>'

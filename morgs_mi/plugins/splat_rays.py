@@ -1,0 +1,314 @@
+"""Gaussians along arbitrary rays: colour and transmittance of segments that no rasteriser can draw.
+
+In the coordinates x' = diag(1 / s) R' (x - mean) of a Gaussian, a ray o + t d passes the centre at the distance
+p = |o' x d'| / |d'|, nearest at t* = -o'.d' / |d'|^2. The response is largest there,
+
+    alpha = opacity exp(-p^2 / 2),
+
+and along the ray it is a Gaussian with mean t* and standard deviation 1 / |d'|. A segment [0, end] has the fraction
+f = Phi(|d'| (end - t*)) - Phi(-|d'| t*) of the optical depth, so that 1 - (1 - alpha)^f takes the place of alpha. It is
+the response of the rasteriser without the affine approximation and the low-pass filter. Colours are blended in the
+order of t*.
+
+The Gaussians are the leaves of a complete binary tree of boxes, whose node n has the children 2 n and 2 n + 1. All
+nodes of a level are split along the same axis, so that a ray meets the children in an order that depends on the signs
+of its direction alone. Flipping bits of n by those signs gives an order from front to back, in which the next node
+follows from n without a stack.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import sqrt
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from morgs_mi.core.gaussians import ActivatedGaussians
+from morgs_mi.core.memory import from_numpy
+from morgs_mi.core.types import Bool, Float, Jit, UInt32
+from morgs_mi.render.projection import FARTHEST
+from morgs_mi.render.render_config import RenderConfig
+
+__all__ = ["SplatRays"]
+
+# Gaussians that one walk through the tree sorts.
+_SORTED = 16
+# Smallest aspect of a Gaussian: float32 has no digits for thinner ones.
+_THINNEST = 1e-4
+
+
+@dataclass(frozen=True)
+class _Tree:
+    """Boxes of a complete binary tree with 2^depth leaves.
+
+    Attributes:
+        depth: of the leaves; that of the root is 0.
+        flips: for each axis, the bits of a leaf's number that choose a side along it.
+        boxes: lower and upper corner of every node, from 1, in rows of eight floats.
+    """
+
+    depth: UInt32
+    flips: tuple[UInt32, UInt32, UInt32]
+    boxes: Float
+
+    @staticmethod
+    def of(centers: np.ndarray, halves: np.ndarray) -> tuple[_Tree, np.ndarray]:
+        """Return the tree of N boxes, and the box of each leaf [2^depth]; N where there is none.
+
+        Args:
+            centers: of the boxes [N, 3].
+            halves: half their sizes [N, 3].
+        """
+        N = len(centers)
+        depth = max(N - 1, 0).bit_length()
+        order, flips = np.arange(1 << depth), [0, 0, 0]
+        # Leaves without a box are at the end of every axis.
+        placed = np.concatenate([centers, np.full((len(order) - N, 3), np.inf)])
+        for level in range(depth):
+            order = order.reshape(1 << level, -1)
+            axis = _longest_axis(placed[order])
+            flips[axis] |= 1 << (depth - 1 - level)
+            order = np.take_along_axis(order, placed[order, axis].argpartition(order.shape[1] // 2 - 1, axis=1), axis=1)
+        order = np.minimum(order.ravel(), N)
+        # Rounding must not make a box smaller.
+        halves = halves * (1 + 1e-5) + 1e-6 * np.abs(centers)
+        lows = [np.concatenate([centers - halves, [[np.inf] * 3]])[order]]
+        highs = [np.concatenate([centers + halves, [[-np.inf] * 3]])[order]]
+        while len(lows[-1]) > 1:
+            lows.append(lows[-1].reshape(-1, 2, 3).min(1))
+            highs.append(highs[-1].reshape(-1, 2, 3).max(1))
+        # From the root down; node 0 does not exist.
+        low, high = (np.concatenate([levels[-1], *levels[::-1]]) for levels in (lows, highs))
+        rows = np.zeros((len(low), 8))
+        # What is empty is a point at infinity, which no ray reaches.
+        rows[:, :3], rows[:, 4:7] = low, np.where(low > high, np.inf, high)
+        return _Tree(_opaque(depth), tuple(map(_opaque, flips)), from_numpy(mi.Float, rows)), order
+
+    def walk(
+        self,
+        ray: Any,
+        active: Bool,
+        state: tuple[Jit, ...],
+        visit: Callable[[tuple[Jit, ...], UInt32, Bool], tuple[Jit, ...]],
+        span: Callable[[tuple[Jit, ...]], tuple[Float, Float]],
+    ) -> tuple[Jit, ...]:
+        """Visit the leaves whose boxes meet a part of each ray, about from front to back, and return the last state.
+
+        Args:
+            ray: rays [M].
+            active: those that are traced.
+            state: values [M].
+            visit: (state, leaf, active) -> state, called for the leaves.
+            span: state -> the part of the ray that is searched, from and to.
+        """
+        inverse = dr.rcp(ray.d)
+        signs = zip(ray.d, self.flips, strict=True)
+        flip = sum((dr.select(d < 0, bits, 0) for d, bits in signs), mi.UInt32(0))
+
+        def step(node: UInt32, level: UInt32, state: tuple[Jit, ...]) -> tuple[Any, ...]:
+            actual = node ^ (flip >> (self.depth - level))
+            corners = (dr.gather(mi.Vector4f, self.boxes, 2 * actual + k) for k in range(2))
+            # A ray in the plane of a face gives NaN, which minimum and maximum ignore.
+            sides = [(mi.Point3f(v.x, v.y, v.z) - ray.o) * inverse for v in corners]
+            low, high = span(state)
+            enter = dr.maximum(dr.max(dr.minimum(*sides)), low)
+            leave = dr.minimum(dr.min(dr.maximum(*sides)), high)
+            hit = enter <= leave
+            leaf = hit & (level == self.depth)
+            state = dr.if_stmt(
+                (state, actual - (mi.UInt32(1) << self.depth)),
+                leaf,
+                lambda state, index: visit(state, index, mi.Bool(True)),
+                lambda state, index: state,
+                label="leaf",
+            )
+            down = hit & ~leaf
+            up = dr.tzcnt(node + 1)
+            node = dr.select(down, 2 * node, (node + 1) >> up)
+            level = dr.select(down, level + 1, level - up)
+            return dr.select(node == 1, 0, node), level, state
+
+        start = dr.select(active, mi.UInt32(1), 0)
+        return dr.while_loop((start, mi.UInt32(0), state), lambda node, *_: node != 0, step, label="tree")[2]
+
+
+class SplatRays:
+    """N Gaussians, prepared for rays; detached from the gradient graph.
+
+    Args:
+        gaussians: N Gaussians, at least one.
+        config: cut-offs; the low-pass filter has no meaning here.
+
+    Example:
+        >>> rays = morgs_mi.SplatRays(gaussians)
+        >>> color, transmittance = rays.trace(mi.Ray3f((0, 0, -3), (0, 0, 1)))
+
+    Raises:
+        ValueError: `gaussians` are none, or have numbers that are not finite.
+    """
+
+    def __init__(self, gaussians: ActivatedGaussians, config: RenderConfig | None = None) -> None:
+        if not hasattr(gaussians, "means") or not int(gaussians.means.shape[0]):
+            raise ValueError(
+                "SplatRays(): `gaussians` must be at least one Gaussian, got a "
+                f"{type(gaussians).__name__} without any; pass some."
+            )
+        self._config = config or RenderConfig()
+        values = {name: _finite(gaussians, name) for name in ("means", "scales", "quats", "opacities", "sh_coeffs")}
+        means, scales, quats, opacities, coeffs = values.values()
+        scales = np.maximum(scales, np.maximum(_THINNEST * scales.max(1, keepdims=True), 1e-30))
+        quats = np.where(np.linalg.norm(quats, axis=1, keepdims=True) > 0, quats, [1, 0, 0, 0])
+        axes = Rotation.from_quat(quats, scalar_first=True).as_matrix()
+        reach = np.sqrt(2 * np.log(np.maximum(opacities.ravel() / self._config.alpha_min, 1)))
+        drawn = np.flatnonzero(reach > 0)
+        halves = reach[:, None] * np.linalg.norm(axes * scales[:, None], axis=2)
+        self._tree, order = _Tree.of(means[drawn], halves[drawn])
+        index = np.concatenate([drawn, [0]])[order]
+        # Four floats each, which are read as one packet.
+        rows = np.zeros((len(index), 4, 4))
+        rows[:, :3, :3], rows[:, :3, 3] = (axes / scales[:, None]).transpose(0, 2, 1)[index], means[index]
+        rows[:, 3, 0] = np.where(order < len(drawn), opacities.ravel()[index], 0)
+        padded = np.zeros((*coeffs.shape[:2], 4))
+        padded[..., :3] = coeffs
+        self._rows, self._coeffs = from_numpy(mi.Float, rows), from_numpy(mi.Float, padded[index])
+        self._degree = round(sqrt(coeffs.shape[1])) - 1
+
+    def transmittance(self, ray: Any, active: Bool = True) -> Float:
+        """Return the fraction of light that passes the Gaussians along rays [M].
+
+        Args:
+            ray: `mi.Ray3f` with directions of length 1; segments end at `maxt`.
+            active: rays that are traced; the others get 1.
+        """
+
+        def visit(state: tuple[Jit, ...], leaf: UInt32, active: Bool) -> tuple[Jit, ...]:
+            return (state[0] * (1 - self._response(ray, leaf)[1]),)
+
+        def span(state: tuple[Jit, ...]) -> tuple[Float, Float]:
+            return mi.Float(0), dr.select(state[0] < self._config.stop_transmittance, -1, ray.maxt)
+
+        with dr.suspend_grad():
+            ray = mi.Ray3f(dr.detach(ray))
+            return self._tree.walk(ray, mi.Bool(active), (mi.Float(1),), visit, span)[0]
+
+    def trace(self, ray: Any, active: Bool = True) -> tuple[Any, Float]:
+        """Return the colour, weighted like that of `rasterize`, and the transmittance of the Gaussians along rays [M].
+
+        View-dependent colours are those of the ray's direction.
+
+        Args:
+            ray: `mi.Ray3f` with directions of length 1; segments end at `maxt`.
+            active: rays that are traced; the others get 0 and 1.
+        """
+        with dr.suspend_grad():
+            ray = mi.Ray3f(dr.detach(ray))
+            basis = dr.sh_eval(ray.d, self._degree)
+
+            def blend(color: Any, passed: Float, nearest: Any, last: Any) -> tuple[Any, ...]:
+                ((depth, *depths), (row, *rows), count) = nearest
+                alpha = self._response(ray, row)[1]
+                color = color + passed * alpha * self._color(basis, row)
+                kept = ([*depths, mi.Float(dr.inf)], [*rows, mi.UInt32(0)], count)
+                return color, passed * (1 - alpha), kept, (depth, row)
+
+            def advance(active: Bool, color: Any, passed: Float, last: Any) -> tuple[Any, ...]:
+                nearest = self._nearest(ray, active, last)
+                color, passed, nearest, last = dr.while_loop(
+                    (color, passed, nearest, last),
+                    lambda color, passed, nearest, last: (nearest[0][0] < dr.inf) & self._open(passed),
+                    blend,
+                    label="blend",
+                )
+                # Where fewer were found than can be sorted, none is left.
+                return active & self._open(passed) & (nearest[2] >= _SORTED), color, passed, last
+
+            state = (mi.Bool(active), mi.Color3f(0), mi.Float(1), (mi.Float(-dr.inf), mi.UInt32(0)))
+            _, color, passed, _ = dr.while_loop(state, lambda active, *_: active, advance, label="trace")
+            return color, passed
+
+    def _open(self, passed: Float) -> Bool:
+        return passed >= self._config.stop_transmittance
+
+    def _nearest(self, ray: Any, active: Bool, last: tuple[Float, UInt32]) -> tuple[list[Float], list[UInt32], UInt32]:
+        """Return depths and rows of the next Gaussians after `last`, ordered by both, and how many were found."""
+
+        def visit(state: tuple[Jit, ...], row: UInt32, active: Bool) -> tuple[Jit, ...]:
+            depths, rows, count = state
+            depths, rows = list(depths), list(rows)
+            depth, alpha = self._response(ray, row)
+            found = (alpha > 0) & _before(*last, depth, row)
+            depth = dr.select(found, depth, dr.inf)
+            for j in range(_SORTED):
+                before = _before(depth, row, depths[j], rows[j])
+                depths[j], depth = dr.select(before, depth, depths[j]), dr.select(before, depths[j], depth)
+                rows[j], row = dr.select(before, row, rows[j]), dr.select(before, rows[j], row)
+            return depths, rows, count + dr.select(found, mi.UInt32(1), 0)
+
+        def span(state: tuple[Jit, ...]) -> tuple[Float, Float]:
+            # The largest response of a Gaussian that reaches into the segment may be beyond either end.
+            return dr.clip(last[0], 0, ray.maxt), dr.clip(state[0][-1], 0, ray.maxt)
+
+        start = ([mi.Float(dr.inf)] * _SORTED, [mi.UInt32(0)] * _SORTED, mi.UInt32(0))
+        return self._tree.walk(ray, active, start, visit, span)
+
+    def _response(self, ray: Any, row: UInt32) -> tuple[Float, Float]:
+        """Return the depth of a Gaussian's largest response along rays, and its alpha on the segment."""
+        x, y, z, more = (dr.gather(mi.Vector4f, self._rows, 4 * row + k) for k in range(4))
+        offset = ray.o - mi.Point3f(x.w, y.w, z.w)
+        W = [mi.Vector3f(v.x, v.y, v.z) for v in (x, y, z)]
+        o, d = (mi.Vector3f(*(dr.dot(w, v) for w in W)) for v in (mi.Vector3f(offset), ray.d))
+        dd = dr.squared_norm(d)
+        depth, r_sigma = -dr.dot(o, d) / dd, dr.sqrt(dd)
+        # The distance as a cross product: a difference of squares would cancel for thin Gaussians.
+        alpha = more.x * dr.exp(-0.5 * dr.squared_norm(dr.cross(o, d)) / dd)
+        alpha = dr.select(alpha >= self._config.alpha_min, dr.minimum(alpha, self._config.alpha_max), 0)
+        passed = _phi(r_sigma * (dr.minimum(ray.maxt, FARTHEST) - depth)) - _phi(-r_sigma * depth)
+        return depth, 1 - dr.exp2(passed * dr.log2(1 - alpha))
+
+    def _color(self, basis: list[Float], row: UInt32) -> Any:
+        """Return max(0.5 + SH, 0) of a Gaussian."""
+        K = len(basis)
+        total = mi.Color3f(0.5)
+        for k, value in enumerate(basis):
+            c = dr.gather(mi.Vector4f, self._coeffs, K * row + k)
+            total += value * mi.Color3f(c.x, c.y, c.z)
+        return dr.maximum(total, 0)
+
+
+def _finite(gaussians: ActivatedGaussians, name: str) -> np.ndarray:
+    """Return an attribute in float64, detached."""
+    values = np.array(dr.detach(getattr(gaussians, name)), np.float64)
+    bad = np.argwhere(~np.isfinite(values))
+    if len(bad):
+        raise ValueError(
+            f"SplatRays(): `{name}` must be finite, got {values[tuple(bad[0])]} at {bad[0].tolist()} ({len(bad)} such "
+            "values); remove these Gaussians."
+        )
+    return values
+
+
+def _longest_axis(points: np.ndarray) -> int:
+    """Return the axis along which groups of points [G, M, 3] extend most; points at infinity are left out."""
+    finite = np.isfinite(points)
+    extent = np.where(finite, points, -np.inf).max(1) - np.where(finite, points, np.inf).min(1)
+    return int(np.where(finite.any(1), extent, 0).mean(0).argmax())
+
+
+def _before(depth: Float, row: UInt32, other: Float, other_row: UInt32) -> Bool:
+    """Return whether a Gaussian is blended before another one; at equal depths, rows decide."""
+    return (depth < other) | ((depth == other) & (row < other_row))
+
+
+def _phi(q: Float) -> Float:
+    """Return the distribution function of the normal distribution."""
+    return dr.fma(0.5, dr.erf(q * sqrt(0.5)), 0.5)
+
+
+def _opaque(value: int) -> UInt32:
+    """Return a number that is no constant of a kernel, which would be compiled for every scene."""
+    return dr.opaque(mi.UInt32, value)

@@ -1,0 +1,34 @@
+"""Flow sources by name, and the page that describes them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from morgs_mi.method.flow_sources.flow_config import FlowConfig
+from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, flow_source
+from morgs_mi.method.flow_sources.opencv_flow import FLOW_METHODS
+
+ROOT = Path(__file__).parents[3]
+
+
+def test_flow_source__is_cached_by_name_and_config():
+    assert flow_source("dis") is flow_source("dis", FlowConfig())
+    assert flow_source("dis") is not flow_source("dis", FlowConfig(fine_width=0))
+
+
+def test_flow_sources__include_every_method_of_opencv():
+    assert FLOW_SOURCES.names == tuple(FLOW_METHODS)
+
+
+@pytest.mark.parametrize("method", ["raft", "files", "files:", "dis:", "dis:1", "", ":FLOW"])
+def test_flow_source__rejects_unknown_methods_with_the_known_ones(method):
+    known = "one of dis, dis-fine, .*, files:FOLDER, onnx:FILE, onnx-unit:FILE, onnx-signed:FILE, got "
+    with pytest.raises(ValueError, match=rf"flow_source\(\): `flow_method` must be {known}{method!r}\."):
+        flow_source(method)
+
+
+def test_flow_page__lists_every_source():
+    text = (ROOT / "docs/flow.md").read_text(encoding="utf-8")
+    assert [usage for usage in FLOW_SOURCES.usages if f"`{usage}`" not in text] == []

@@ -1,0 +1,123 @@
+"""Optical flow and the flow observation: sign, grid, reliability."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.method.flow import observe_flow
+from morgs_mi.method.flow_sources.flow_config import FlowConfig
+from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
+from morgs_mi.method.flow_sources.opencv_flow import FLOW_METHODS, optical_flow
+from tests.method.moving_disc import moving_disc, texture
+
+
+@pytest.mark.parametrize("method", FLOW_METHODS)
+def test_optical_flow__recovers_a_translation_with_its_sign(method):
+    scene = texture(140, 180, seed=1)
+    for dx, dy in ((5, 3), (-4, 0), (0, -2)):
+        previous, image = scene[10:130, 10:170], scene[10 - dy : 130 - dy, 10 - dx : 170 - dx]
+        motion = -optical_flow(image, previous, method)
+        error = np.linalg.norm(motion - (dx, dy), axis=-1)[10:-10, 10:-10]
+        assert np.median(error) < 0.5, (dx, dy)  # `dis-ultrafast` stops at a quarter of the resolution
+
+
+def test_observe_flow__motion_is_the_shift_on_frame_ts_grid():
+    previous, image, disc = moving_disc(240, 320, shift=(6, -4))
+    observation = observe_flow(image, previous)
+    motion, reliable = observation.motion, observation.reliable
+    # 0.25 px: DIS smooths over 8x8 patches.
+    assert np.abs(motion[disc & reliable] - (6, -4)).mean() < 0.25
+    assert np.linalg.norm(motion[~disc & reliable], axis=-1).mean() < 0.25
+    assert reliable[disc].mean() > 0.8
+
+
+def test_observe_flow__uncovered_pixels_are_unreliable():
+    previous, image, disc = moving_disc(240, 320, shift=(10, 0))
+    reliable = observe_flow(image, previous).reliable
+    uncovered = np.roll(disc, (0, -10), (0, 1)) & ~disc
+    assert reliable[uncovered].mean() < 0.5 < 0.95 < reliable.mean()
+
+
+def test_optical_flow__float_and_bytes_agree():
+    previous, image, _ = moving_disc(64, 96, shift=(2, 1))
+    as_bytes = [(frame * 255 + 0.5).astype(np.uint8) for frame in (image, previous)]
+    np.testing.assert_array_equal(optical_flow(image, previous), optical_flow(*as_bytes))
+
+
+@pytest.mark.parametrize("method", FLOW_METHODS)
+@pytest.mark.parametrize("size", [(1, 40), (16, 90), (90, 16)])
+def test_optical_flow__is_finite_at_any_size(method, size):
+    rng = np.random.default_rng(0)
+    image, previous = rng.integers(0, 255, (2, *size, 3), dtype=np.uint8)
+    flow = optical_flow(image, previous, method)
+    assert flow.shape == (*size, 2)
+    assert flow.dtype == np.float32
+    assert np.isfinite(flow).all()
+    assert min(size) >= 16 or not flow.any()
+
+
+@pytest.mark.parametrize("method", FLOW_METHODS)
+def test_optical_flow__is_finite_with_nothing_to_match(method):
+    scene = (255 * texture(130, 150, seed=3)).astype(np.uint8)
+    image, flat = scene[:60, :80], np.full((60, 80, 3), 90, np.uint8)
+    textured_left = np.where(np.arange(80)[:, None] < 20, image, flat)
+    same = ((flat, flat), (textured_left, textured_left))
+    for previous, following in (*same, (flat, image), (image, flat), (image, scene[70:, 70:])):
+        flow = optical_flow(following, previous, method)
+        assert np.isfinite(flow).all()
+    # Every method finds no motion between equal images; RLOF interpolates between sparse matches.
+    assert np.abs(optical_flow(image, image, method)).max() < 0.1
+
+
+RGB = np.zeros((20, 20, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((RGB, RGB, "raft"), "dis-fine.*got 'raft'"),
+        ((RGB, RGB[:18]), "one size"),
+        ((RGB[..., 0], RGB[..., 0]), r"RGB .* \(20, 20\)"),
+    ],
+)
+def test_optical_flow__rejects_bad_input(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        optical_flow(*arguments)
+
+
+def test_flow_source__passes_its_config_to_the_method():
+    previous, image, _ = moving_disc(144, 200, shift=(6, 1))
+    flow, changed = (optical_flow(image, previous, config=FlowConfig(fine_width=width)) for width in (480, 64))
+    assert not np.array_equal(flow, changed)
+    source_flow, _ = flow_source("dis", FlowConfig(fine_width=64))(FramePair(image, previous))
+    np.testing.assert_array_equal(source_flow, changed)
+
+
+def test_flow_config__fine_width_selects_the_finest_level_of_dis():
+    previous, image, _ = moving_disc(64, 96, shift=(6, 1))
+    fine, half = (optical_flow(image, previous, "dis", FlowConfig(fine_width=width)) for width in (96, 95))
+    np.testing.assert_array_equal(fine, optical_flow(image, previous, "dis-fine"))
+    gray = (cv2.cvtColor((255 * a + 0.5).astype(np.uint8), cv2.COLOR_RGB2GRAY) for a in (image, previous))
+    method = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)  # at half resolution
+    np.testing.assert_array_equal(half, method.calc(*gray, None))
+
+
+@pytest.mark.parametrize(("least", "is_any"), [(64, True), (65, False)])
+def test_optical_flow__is_zero_in_images_below_a_least_side(monkeypatch, least, is_any):
+    previous, image, _ = moving_disc(64, 96, shift=(6, 1))
+    monkeypatch.setattr("morgs_mi.method.flow_sources.opencv_flow._MIN_SIDE", least)
+    assert optical_flow(image, previous).any() == is_any
+
+
+def test_both_directions__computes_flow_inside_the_box_alone():
+    previous, image, _ = moving_disc(64, 96, shift=(6, 1))
+    box = slice(10, 60), slice(20, 90)
+    flow, forward_flow = flow_source("dis")(FramePair(image, previous, box=box))
+    np.testing.assert_array_equal(flow[box], optical_flow(image[box], previous[box]))
+    np.testing.assert_array_equal(forward_flow[box], optical_flow(previous[box], image[box]))
+    for each in (flow, forward_flow):
+        outside = each.copy()
+        outside[box] = 0
+        assert not outside.any()

@@ -1,0 +1,80 @@
+"""GrabCut and superpixels: objects from partial masks, any mask and size, repeatable results."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.evaluate.metrics import iou
+from morgs_mi.method.mask_refiners.mask_config import MaskConfig
+from morgs_mi.method.mask_refiners.opencv_masks import clean_mask, refine_mask, vote_superpixels
+from tests.method.moving_disc import moving_disc
+
+CAMERA_NOISE = 2 / 255  # standard deviation of a video camera in room light
+
+
+def test_refine_mask__recovers_an_object_from_a_part_of_it():
+    _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
+    partial = disc.copy()
+    partial[120:140] = False
+    assert iou(refine_mask(image, partial), disc) > 0.95 > iou(partial, disc)
+
+
+def test_vote_superpixels__removes_flow_that_bleeds_over_an_edge():
+    _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
+    bleeding = cv2.dilate(disc.astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+    voted = vote_superpixels(image, bleeding)
+    assert iou(voted, disc) > 0.9 > iou(bleeding, disc)
+    assert voted[disc].mean() > 0.98
+
+
+def test_vote_superpixels__removes_specks():
+    _, image, _ = moving_disc(240, 320, (0, 0))
+    specks = np.zeros((240, 320), bool)
+    specks[10:230:12, 10:310:12] = True
+    assert not vote_superpixels(image, specks).any()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (40, 30), (700, 20)])
+@pytest.mark.parametrize("refine", [refine_mask, vote_superpixels])
+def test_refine_mask__and_vote_superpixels_accept_any_mask(refine, size):
+    image, rows, center = np.random.default_rng(0).random((*size, 3)), np.arange(size[0]), (size[0] // 2, size[1] // 2)
+    masks = {name: np.full(size, name == "all") for name in ("nothing", "speck", "all", "half")}
+    masks["speck"][center] = True
+    masks["half"][rows < size[0] // 2] = True
+    refined = {name: refine(image, mask) for name, mask in masks.items()}
+    assert {(mask.shape, mask.dtype) for mask in refined.values()} == {(size, np.dtype(bool))}
+    assert not refined["nothing"].any()
+    assert refined["all"].all()
+
+
+def test_clean_mask__removes_specks_and_closes_holes():
+    mask = np.zeros((200, 400), bool)
+    mask[50:150, 50:150] = True
+    mask[100:102, 100:102] = False
+    mask[10:12, 300:302] = True
+    cleaned = clean_mask(mask)
+    assert cleaned[52:148, 52:148].all()
+    assert not cleaned[:, 250:].any()
+
+
+@pytest.mark.parametrize(
+    ("refine", "settings"),
+    [
+        (refine_mask, {"working_width": 160}),
+        (vote_superpixels, {"working_width": 160, "superpixel_share": 0.5}),
+    ],
+)
+def test_mask_config__every_setting_acts(refine, settings):
+    _, image, disc = moving_disc(240, 320, (3, 0), CAMERA_NOISE)
+    mask = np.roll(disc, (25, 19), (0, 1))
+    usual = refine(image, mask)
+    for name, value in settings.items():
+        assert not np.array_equal(refine(image, mask, MaskConfig(**{name: value})), usual), name
+
+
+@pytest.mark.parametrize("refine", [refine_mask, vote_superpixels])
+def test_refine_mask__and_vote_superpixels_reject_another_size(refine):
+    with pytest.raises(ValueError, match=r"got \(4, 4, 3\)"):
+        refine(np.zeros((4, 4, 3)), np.ones((3, 4), bool))

@@ -1,0 +1,297 @@
+"""The losses against float64 reference implementations, and their derivatives against central differences."""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi.core.memory import from_numpy
+from morgs_mi.evaluate.metrics import ssim
+from morgs_mi.method.losses import depth_loss, flow_loss, mask_loss, offset_loss, recon_loss
+from morgs_mi.method.ssim import Target
+from morgs_mi.render.region import Region
+from tests import tolerances as tol
+from tests.assertions import assert_close
+
+SIZE = (19, 23, 3)
+
+
+@pytest.fixture(scope="module")
+def images():
+    """Return a noisy image and its target."""
+    rng = np.random.default_rng(0)
+    target = rng.uniform(0, 1, SIZE).astype(np.float32)
+    return (target + rng.normal(0, 0.2, SIZE)).astype(np.float32), target
+
+
+def item(value):
+    return np.asarray(value).item()
+
+
+def slow_recon(image, target, weight, window=11, sigma=1.5):
+    """Eq. 2 in float64, window by window, zeros outside."""
+    x, y = image.astype(np.float64), target.astype(np.float64)
+    r = window // 2
+    g = np.exp(-0.5 * (np.arange(-r, r + 1) / sigma) ** 2)
+    g = np.outer(g / g.sum(), g / g.sum())[..., None]
+    px, py = (np.pad(v, ((r, r), (r, r), (0, 0))) for v in (x, y))
+    total = 0.0
+    for i in range(x.shape[0]):
+        for j in range(x.shape[1]):
+            a, b = px[i : i + window, j : j + window], py[i : i + window, j : j + window]
+            ma, mb = (g * a).sum((0, 1)), (g * b).sum((0, 1))
+            va, vb, cab = (g * a * a).sum((0, 1)) - ma**2, (g * b * b).sum((0, 1)) - mb**2, (g * a * b).sum((0, 1))
+            top = (2 * ma * mb + 1e-4) * (2 * (cab - ma * mb) + 9e-4)
+            total += (top / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))).sum()
+    return (1 - weight) * np.abs(x - y).mean() + weight * (1 - total / x.size)
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_recon_loss__agrees_with_the_reference(images, weight):
+    image, target = images
+    found = item(recon_loss(mi.TensorXf(image), Target(target), weight))
+    assert found == pytest.approx(slow_recon(image, target, weight), rel=tol.LOSS_REL)
+
+
+def test_recon_loss__of_identical_images_is_zero(images):
+    target = images[1]
+    assert item(recon_loss(mi.TensorXf(target), Target(target))) == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("weight", [0.0, 0.2, 1.0])
+def test_recon_loss__gradient_agrees_with_central_differences(images, weight):
+    image, target = images
+    x = mi.TensorXf(image)
+    dr.enable_grad(x)
+    dr.backward(recon_loss(x, Target(target), weight))
+    grad, rng = np.asarray(dr.grad(x), np.float64), np.random.default_rng(1)
+    for _ in range(3):
+        # Steps that do not cross the kink of |I - I*|.
+        v = rng.normal(size=SIZE) * (np.abs(image - target) > 2e-3)
+        h = 1e-4
+        up, down = (slow_recon(image + s * h * v, target, weight) for s in (1, -1))
+        assert np.vdot(grad, v) == pytest.approx((up - down) / (2 * h), rel=tol.LOSS_GRADIENT_REL, abs=1e-6)
+
+
+def test_recon_loss__ignores_masked_pixels(images):
+    image, target = images
+    mask = np.ones(SIZE[:2], bool)
+    mask[3:9, 5:11] = False
+    other = image.copy()
+    other[~mask] = 7.0
+    losses = [item(recon_loss(mi.TensorXf(v), Target(target, mask))) for v in (image, other)]
+    assert losses[0] == pytest.approx(losses[1], rel=1e-6)
+
+
+def test_recon_loss__dssim_agrees_with_the_metric_away_from_the_border():
+    """The metric excludes the border, the loss pads it: on images that are black there both agree."""
+    rng = np.random.default_rng(2)
+    a, b = (np.zeros((48, 48, 3), np.float32) for _ in range(2))
+    for image in (a, b):
+        image[12:-12, 12:-12] = rng.uniform(0, 1, (24, 24, 3))
+    dssim = item(recon_loss(mi.TensorXf(a), Target(b), 1.0))
+    inside = ssim(a, b)
+    full = 1 - dssim
+    # Outside, SSIM is 1 in both; they differ in the number of such pixels that they count.
+    assert (1 - full) * 48**2 == pytest.approx((1 - inside) * _counted(48), rel=1e-3)
+
+
+def _counted(side):
+    return (side - 10) ** 2
+
+
+def test_flow_loss__is_the_mean_endpoint_error():
+    rng = np.random.default_rng(3)
+    motion, observed = rng.normal(size=(2, 8, 9, 2)).astype(np.float32)
+    reliable = (rng.uniform(size=(8, 9)) > 0.3).astype(np.float32)
+    x = mi.TensorXf(motion)
+    dr.enable_grad(x)
+    loss = flow_loss(x, mi.TensorXf(observed), mi.TensorXf(reliable))
+    error = np.linalg.norm(motion - observed, axis=-1)
+    assert item(loss) == pytest.approx((error * reliable).mean(), rel=1e-3)
+    dr.backward(loss)
+    expected = (motion - observed) / error[..., None] * reliable[..., None] / reliable.size
+    assert_close(dr.grad(x), expected, atol=1e-2 / reliable.size)
+
+
+def test_flow_loss__has_a_finite_gradient_where_both_agree():
+    x = mi.TensorXf(np.ones((4, 4, 2), np.float32))
+    dr.enable_grad(x)
+    dr.backward(flow_loss(x, mi.TensorXf(np.ones((4, 4, 2), np.float32)), mi.TensorXf(np.ones((4, 4), np.float32))))
+    assert np.asarray(dr.grad(x)).max() == 0
+
+
+def test_mask_loss__is_the_mean_absolute_difference():
+    rng = np.random.default_rng(4)
+    confidence, mask = rng.uniform(size=(6, 5, 1)).astype(np.float32), rng.uniform(size=(6, 5)) > 0.5
+    found = item(mask_loss(mi.TensorXf(confidence), mi.TensorXf(mask.astype(np.float32))))
+    assert found == pytest.approx(np.abs(confidence[..., 0] - mask).mean(), rel=1e-5)
+
+
+def depth_images():
+    """Return a rendered depth with undrawn pixels, inverse depth to match, and weights."""
+    rng = np.random.default_rng(5)
+    depth, target, weights = rng.uniform(1, 4, (7, 8, 1)), rng.uniform(0.2, 1, (7, 8)), rng.uniform(0, 1, (7, 8))
+    depth[2:4, 3:6] = 0
+    return depth.astype(np.float32), target.astype(np.float32), weights.astype(np.float32)
+
+
+def slow_depth(depth, target, weights, unit):
+    """The depth term in float64."""
+    depth = depth[..., 0].astype(np.float64)
+    error = np.abs(1 / np.where(depth > 0, depth, 1) - target) * weights / unit
+    return np.where(depth > 0, error, 0).mean()
+
+
+def test_depth_loss__agrees_with_the_reference():
+    depth, target, weights = depth_images()
+    found = item(depth_loss(*(mi.TensorXf(each) for each in (depth, target, weights)), 0.4))
+    assert found == pytest.approx(slow_depth(depth, target, weights, 0.4), rel=1e-5)
+
+
+def test_depth_loss__gradient_agrees_with_central_differences():
+    depth, target, weights = depth_images()
+    x = mi.TensorXf(depth)
+    dr.enable_grad(x)
+    dr.backward(depth_loss(x, mi.TensorXf(target), mi.TensorXf(weights), 0.4))
+    grad, rng = np.asarray(dr.grad(x), np.float64), np.random.default_rng(6)
+    assert np.all(grad[2:4, 3:6] == 0)
+    # Steps that cross neither the kink of the absolute value nor the limit of what is drawn.
+    free = (depth > 0) & (np.abs(1 / np.maximum(depth, 1) - target[..., None]) > 1e-3)
+    for _ in range(3):
+        v, h = rng.normal(size=depth.shape) * free, 1e-4
+        up, down = (slow_depth(depth + s * h * v, target, weights, 0.4) for s in (1, -1))
+        assert np.vdot(grad, v) == pytest.approx((up - down) / (2 * h), rel=tol.LOSS_GRADIENT_REL)
+
+
+def test_offset_loss__is_the_mean_l1_norm_in_scene_extents():
+    offset = np.random.default_rng(4).normal(size=(7, 3)).astype(np.float32)
+    assert item(offset_loss(mi.TensorXf(offset), 2.0)) == pytest.approx(np.abs(offset).sum(1).mean() / 2, rel=1e-5)
+
+
+@pytest.mark.parametrize("width", [64, 77])
+@pytest.mark.parametrize("masked", [False, True])
+def test_recon_loss__gradient_on_a_region_agrees_with_the_full_view(width, masked):
+    """If only a region has changed, its derivative is the full view's, and the value changes by the same amount."""
+    height, rng = 150, np.random.default_rng(4)
+    y, x = np.mgrid[:height, :width]
+    drawn = (x - 30) ** 2 + (y - 100) ** 2 < 15**2
+    drawn[0, 0] = drawn[-1, -1] = drawn[70, 5] = True
+    region = Region(drawn)
+    truth, before = (np.float32(rng.uniform(size=(height, width, 3))) for _ in range(2))
+    changed = region.crop(before) + np.float32(rng.normal(size=region.shape(3))) * region.inside()[..., None] * 0.1
+    after = region.paste(changed, before)
+    target = Target(truth, rng.uniform(size=drawn.shape) < 0.8 if masked else None)
+    target.set_surroundings(mi.TensorXf(before))
+
+    def evaluate(image, where):
+        tensor = mi.TensorXf(np.float32(image))
+        dr.enable_grad(tensor)
+        loss = recon_loss(tensor, target, 0.3, where)
+        dr.backward(loss)
+        return item(loss), np.asarray(dr.grad(tensor))
+
+    found, found_grad = evaluate(changed, region)
+    expected, expected_grad = evaluate(after, None)
+    scale = np.abs(expected_grad).max()
+    assert_close(found_grad, region.crop(expected_grad), atol=tol.SUM_ORDER_REL * scale)
+    (old, _), (old_on_region, _) = evaluate(before, None), evaluate(region.crop(before), region)
+    assert found - old_on_region == pytest.approx(expected - old, abs=tol.LOSS_REL * expected)
+    again, again_grad = evaluate(changed, region)  # the surroundings are unchanged
+    assert (again, np.abs(again_grad - found_grad).max()) == (found, 0)
+
+
+@pytest.mark.parametrize("width", [23, 24])
+def test_target__difference_is_that_of_every_pixel(width):
+    rng = np.random.default_rng(0)
+    image, truth = (np.float32(rng.uniform(size=(19, width, 3))) for _ in range(2))
+    mask = rng.uniform(size=(19, width)) < 0.7
+    target, expected = Target(truth, mask), (truth - image) * mask[..., None]
+    assert np.allclose(target.difference(mi.TensorXf(image)), expected, atol=1e-6)
+    drawn = np.zeros(mask.shape, bool)
+    drawn[-1, -1] = drawn[3, 5] = True
+    region = Region(drawn)
+    found = target.difference(mi.TensorXf(region.crop(image)), region)
+    assert np.allclose(found, region.crop(expected), atol=1e-6)
+
+
+def test_target__is_its_own_surroundings_by_default():
+    rng = np.random.default_rng(0)
+    truth = np.float32(rng.uniform(size=(32, 40, 3)))
+    mask = np.zeros((32, 40), bool)
+    mask[3, 4] = True
+    region, given, default = Region(mask), Target(truth), Target(truth)
+    given.set_surroundings(mi.TensorXf(truth))
+    image = mi.TensorXf(region.crop(truth) + 0.1)
+    assert item(recon_loss(image, default, region=region)) == item(recon_loss(image, given, region=region)) > 0
+
+
+def test_recon_loss__refuses_an_image_of_another_size(images):
+    image, target = (np.zeros((32, 40, 3), np.float32) for _ in range(2))
+    mask = np.zeros((32, 40), bool)
+    mask[3, 4] = True
+    region = Region(mask)
+    with pytest.raises(ValueError, match=r"`image` must be \[1, 4, 8, 3\]"):
+        recon_loss(mi.TensorXf(image), Target(target), region=region)
+    with pytest.raises(ValueError, match="`region` must be of a 23x19 view like its target, got 40x32"):
+        recon_loss(mi.TensorXf(region.crop(image)), Target(images[1]), region=region)
+
+
+def test_recon_loss__compiles_its_kernels_once_for_all_sizes():
+    rng = np.random.default_rng(0)
+
+    def step(height, width):
+        # An array of NumPy may not be aligned, which needs a kernel of its own.
+        image = from_numpy(mi.TensorXf, rng.uniform(size=(height, width, 3))) * dr.opaque(mi.Float, 1)
+        dr.eval(image)
+        dr.enable_grad(image)
+        dr.backward(recon_loss(image, Target(np.asarray(image))))
+        dr.eval(dr.grad(image))
+        dr.sync_thread()
+
+    step(40, 48)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        step(90, 72)
+        compiled = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT and not k["cache_hit"]]
+    assert not compiled, [k["operation_count"] for k in compiled]
+
+
+def tensor(*shape):
+    return mi.TensorXf(np.ones(shape, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: flow_loss(tensor(4, 5, 2), tensor(2, 2, 2), tensor(4, 5)), r"`target` must be \[4, 5, 2\]"),
+        (lambda: flow_loss(tensor(4, 5, 2), tensor(4, 5, 2), tensor(5, 4)), r"`reliable` must be \[4, 5\]"),
+        (lambda: flow_loss(np.ones((4, 5, 2)), tensor(4, 5, 2), tensor(4, 5)), "`motion` must be a .*TensorXf"),
+        (lambda: mask_loss(tensor(4, 5, 1), tensor(1, 1)), r"`mask` must be \[4, 5\]"),
+        (lambda: depth_loss(tensor(4, 5, 1), tensor(4, 5), tensor(4, 4), 1.0), r"`weights` must be \[4, 5\]"),
+        (lambda: depth_loss(tensor(4, 5, 1), tensor(4, 5), tensor(4, 5), 0.0), "`unit` must be a number"),
+        (lambda: offset_loss(tensor(4, 2), 1.0), r"`offset` must be \[4, 3\]"),
+        (lambda: offset_loss(tensor(4, 3), np.nan), r"`extent` must be a number in \(0, inf\), got nan"),
+        (lambda: recon_loss(tensor(4, 5, 3), Target(np.ones((4, 5, 3))), np.nan), "`dssim_weight` must be a number"),
+        (lambda: Target(np.ones((4, 5))), r"`image` must be \[H, W, 3\], got \[4, 5\]"),
+        (lambda: Target(np.full((4, 5, 3), 255.0)), r"floats in \[0, 1\], got float64 from 255 to 255"),
+        (lambda: Target(np.full((4, 5, 3), np.nan)), r"floats in \[0, 1\], got float64 from nan to nan"),
+        (lambda: Target(np.ones((4, 5, 3)), np.ones((5, 4), bool)), r"mask must be bool \[4, 5\] like its image"),
+        (lambda: Target(np.ones((4, 5, 3)), np.ones((4, 5))), "got float64"),
+    ],
+)
+def test_losses__refuse_bad_input(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_target__is_not_changed_by_later_writes_to_its_image():
+    image = np.zeros((300, 400, 3), np.float32)
+    targets = []
+    for frame in range(5):
+        image[:] = frame / 4
+        targets.append(Target(image))
+    black = mi.TensorXf(np.zeros_like(image))
+    assert [float(target.difference(black)[0, 0, 0]) for target in targets] == [0, 0.25, 0.5, 0.75, 1]

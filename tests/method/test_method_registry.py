@@ -1,0 +1,89 @@
+"""Registries of flow sources and mask refiners: look-up by string, and extension by one file."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import morgs_mi
+from morgs_mi.method.method_registry import Registry
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def registry() -> Registry[str, int]:
+    registry: Registry[str, int] = Registry("paint()", "brush")
+    registry.register("file", "PATH")(lambda argument, config: f"file {argument} {config}")
+    registry.register("round")(lambda argument, config: f"round {argument}{config}")
+    return registry
+
+
+def test_registry__makes_what_a_string_selects(registry):
+    assert registry.make("round", 3) == "round 3"
+    assert registry.make("file:a:b.png", 3) == "file a:b.png 3"
+
+
+def test_registry__lists_names_without_argument_first(registry):
+    assert registry.names == ("round",)
+    assert registry.usages == ("round", "file:PATH")
+
+
+@pytest.mark.parametrize("text", ["flat", "", "file", "file:", "round:", "round:3", ":3"])
+def test_registry__rejects_other_strings_with_the_known_ones(registry, text):
+    with pytest.raises(ValueError, match=rf"^paint\(\): `brush` must be one of round, file:PATH, got '{text}'\.$"):
+        registry.make(text, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"), [("", "got ''"), ("a:b", "got 'a:b'"), ("round", "is registered already")]
+)
+def test_registry__rejects_bad_and_taken_names(registry, name, message):
+    with pytest.raises(ValueError, match=message):
+        registry.register(name)
+
+
+# Both run in a copy of the package, in which the page's example is one more module.
+FLOW = """
+import numpy as np
+from morgs_mi.method.motion_config import MotionConfig
+from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
+source = flow_source(MotionConfig(flow_method="constant:3,0").flow_method)
+flow, forward_flow = source(FramePair(*np.zeros((2, 4, 5, 3))))
+assert flow.shape == forward_flow.shape == (4, 5, 2)
+assert (forward_flow == (3, 0)).all() and (flow == (-3, 0)).all()
+"""
+MASKS = """
+import sys
+import numpy as np
+from morgs_mi.method.motion_config import MotionConfig
+from morgs_mi.method.mask_refiners.mask_registry import mask_refiner
+mask = np.zeros((9, 9), bool)
+mask[4, 4] = True
+assert mask_refiner(MotionConfig(mask_method="dilate:1").mask_method)(np.zeros((9, 9, 3)), mask).sum() == 5
+assert "onnxruntime" not in sys.modules  # imported by the refiner that needs it
+"""
+
+
+@pytest.mark.parametrize(
+    ("page", "module", "program"),
+    [
+        ("flow.md", "flow_sources/constant.py", FLOW),
+        ("masks.md", "mask_refiners/dilate.py", MASKS),
+    ],
+)
+def test_registry__finds_a_new_module_of_its_package(tmp_path, page, module, program):
+    shutil.copytree(Path(morgs_mi.__file__).parent, tmp_path / "morgs_mi", ignore=shutil.ignore_patterns("__pycache__"))
+    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / page).read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "morgs_mi/method" / module).write_text(example, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    result = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert result.returncode == 0, result.stderr

@@ -1,0 +1,254 @@
+"""`morgs-mi export` and `render`: one file per frame and videos, through the command line."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi import cli
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.color_space import srgb_to_linear
+from morgs_mi.io.ply import read_ply
+from morgs_mi.io.splats import read_splats
+from morgs_mi.playback.export.clips import _frames_backwards, repeated_seconds, select_frames, write_flight
+from morgs_mi.playback.export.formats import IMAGES, PLY, USD, WEB, choose_format
+from morgs_mi.playback.export.frames import exr_channels, pad_to_even, write_frames
+from morgs_mi.playback.export.paths import through_cameras
+from morgs_mi.render.rasterize import rasterize
+from tests.assertions import assert_close
+from tests.codec.forge import forged_streams
+from tests.scenes.changing_splats import rig, write_stream
+from tests.scenes.short_clip import FRAMES, short_clip
+
+
+@pytest.fixture
+def stream(tmp_path):
+    return write_stream(tmp_path / "stream.morgs")
+
+
+def run(*args: object) -> int:
+    return cli.main([str(arg) for arg in args])
+
+
+def video(path) -> list[np.ndarray]:
+    file, frames = cv2.VideoCapture(str(path)), []
+    while (result := file.read())[0]:
+        frames.append(cv2.cvtColor(result[1], cv2.COLOR_BGR2RGB))
+    return frames
+
+
+def test_export_ply__writes_every_frame(stream, tmp_path):
+    assert run("export", "ply", tmp_path) == 0
+    assert [path.name for path in sorted((tmp_path / "ply").iterdir())] == [f"{t:04d}.ply" for t in range(4)]
+    for t, state in enumerate(stream):
+        read = read_ply(tmp_path / "ply" / f"{t:04d}.ply")
+        np.testing.assert_array_equal(read.numpy()["means"], state.gaussians.numpy()["means"])
+
+
+def test_export_ply__writes_compressed_files(stream, tmp_path):
+    assert run("export", "ply", tmp_path, "--format", "compressed.ply", "--frames", "2:") == 0
+    files = sorted((tmp_path / "compressed-ply").iterdir())
+    assert [path.name for path in files] == ["0002.compressed.ply", "0003.compressed.ply"]
+    for path, state in zip(files, stream[2:], strict=True):
+        read, expected = (np.sort(g.numpy()["means"], axis=0) for g in (read_splats(path), state.gaussians))
+        assert_close(read, expected, atol=2e-3)
+
+
+@pytest.mark.parametrize(("kind", "name"), [("ply", "a.ply"), ("ply", "a.compressed.ply"), ("gltf", "a.glb")])
+def test_export__writes_one_frame_into_a_file(stream, tmp_path, capsys, kind, name):
+    suffix = name.removeprefix("a")
+    assert run("export", kind, tmp_path, tmp_path / name, "--frames", 2) == 0
+    assert capsys.readouterr().out.rstrip().endswith(" file.")
+    assert run("export", kind, tmp_path, tmp_path / "folder", "--frames", 2, *format_of(name)) == 0
+    assert (tmp_path / name).read_bytes() == (tmp_path / "folder" / f"0002{suffix}").read_bytes()
+
+
+def format_of(name: str) -> tuple[str, ...]:
+    return ("--format", "compressed.ply") if "compressed" in name else ()
+
+
+@pytest.mark.parametrize(
+    ("formats", "output", "name", "expected"),
+    [
+        (WEB, None, None, "html"),
+        (WEB, None, "folder", "folder"),
+        (WEB, "a/site", None, "folder"),
+        (WEB, "a/Page.HTML", None, "html"),
+        (WEB, "a/page.html", "folder", "folder"),
+        (PLY, "a/v1.2", None, "ply"),
+        (PLY, "a/v1.2", "compressed.ply", "compressed.ply"),
+        (PLY, "a/b.compressed.ply", None, "compressed.ply"),
+        (IMAGES, "a/b", None, "exr"),
+        (IMAGES, "a/frames-png", None, "png"),
+        (IMAGES, "a/b", "png", "png"),
+        (IMAGES, "b.mp4", None, "mp4"),
+        (USD, "b.usda", "usda", "usda"),
+    ],
+)
+def test_choose_format__follows_the_name_of_the_format_or_of_the_output(formats, output, name, expected):
+    assert choose_format(formats, output, name).name == expected
+
+
+def test_choose_format__names_the_formats():
+    with pytest.raises(ValueError, match="`format` must be mp4, exr or png, got 'gif'"):
+        choose_format(IMAGES, "a", "gif")
+
+
+def test_export__refuses_a_folder_in_place_of_a_file_before_it_begins(stream, tmp_path, capsys):
+    (tmp_path / "page.html").mkdir()
+    for args in (("web", tmp_path, tmp_path / "page.html"), ("web", tmp_path, "--format", "folder")):
+        (tmp_path / "web").mkdir(exist_ok=True)
+        assert run("export", *args) == 1
+    errors = capsys.readouterr().err.splitlines()
+    assert errors[0] == f"{tmp_path}/page.html: expected a file to write, got a folder; choose another name."
+    assert errors[-1] == f"{tmp_path}/web: expected a new folder, got one that exists; remove it first."
+
+
+def test_export_gltf__writes_selected_frames(stream, tmp_path):
+    assert run("export", "gltf", tmp_path / "stream.morgs", tmp_path / "g", "--frames", "1:4:2") == 0
+    assert [path.name for path in sorted((tmp_path / "g").iterdir())] == ["0001.glb", "0003.glb"]
+
+
+def test_export_tracks__writes_all_ids(stream, tmp_path):
+    assert run("export", "tracks", tmp_path) == 0
+    assert np.load(tmp_path / "tracks.npz")["positions"].shape == (4, 42, 3)
+
+
+def test_write_flight__shows_rendered_images_and_restarts_the_clip(stream, tmp_path):
+    keys = [{"time": 0, "camera": "middle"}, {"time": 0.6, "camera": "middle"}]
+    (tmp_path / "still.json").write_text(json.dumps({"keys": keys}))
+    assert run("export", "video", tmp_path, "--path", tmp_path / "still.json") == 0
+    expected = [np.clip(np.array(rasterize(state.gaussians, rig()[1]).color), 0, 1) for state in stream]
+    frames = video(tmp_path / "still.mp4")
+    assert len(frames) == 6
+    for t, frame in enumerate(frames):
+        errors = [np.abs(frame / 255 - image).mean() for image in expected]
+        assert np.argmin(errors) == t % 4
+        assert errors[t % 4] < 0.03  # the error of the lossy codec on such a small image
+
+
+def test_write_flight__plays_back_and_forth(stream, tmp_path):
+    keys = [{"time": 0, "camera": "middle"}, {"time": 0.9, "camera": "middle"}]
+    (tmp_path / "still.json").write_text(json.dumps({"keys": keys}))
+    assert run("export", "video", tmp_path, "--path", tmp_path / "still.json", "--back-and-forth") == 0
+    expected = [np.clip(np.array(rasterize(state.gaussians, rig()[1]).color), 0, 1) for state in stream]
+    shown = [
+        np.argmin([np.abs(frame / 255 - image).mean() for image in expected]) for frame in video(tmp_path / "still.mp4")
+    ]
+    assert shown == [0, 1, 2, 3, 2, 1, 0, 1, 2]
+
+
+def test_frames_backwards__are_those_of_the_clip_with_their_motion(tmp_path):
+    states = write_stream(tmp_path / "stream.morgs", 7, keyframe_interval=2)
+    backwards = list(_frames_backwards(StreamReader(tmp_path / "stream.morgs")))
+    assert len(backwards) == 5
+    for gaussians, state in zip(backwards, states[-2:0:-1], strict=True):
+        for name, values in state.gaussians.numpy().items():
+            np.testing.assert_array_equal(gaussians.numpy()[name], values)
+
+
+def test_frames_backwards__are_those_of_the_clip_if_a_keyframe_is_forged(tmp_path):
+    clip = short_clip()
+    (tmp_path / "s").write_bytes(forged_streams(clip)[0])
+    frames = _frames_backwards(StreamReader(tmp_path / "s"))
+    for frame, gaussians in zip(range(FRAMES - 2, 0, -1), frames, strict=True):
+        np.testing.assert_array_equal(gaussians.means, clip.states[frame].gaussians.means)
+
+
+@pytest.mark.parametrize("write", [write_frames, write_flight])
+def test_export__writes_videos_in_the_playable_format(stream, tmp_path, monkeypatch, write):
+    monkeypatch.setattr(f"{write.__module__}.playable_format", lambda: (".mp4", "mp4v"))
+    reader = StreamReader(tmp_path / "stream.morgs")
+    view = reader.cameras[0] if write is write_frames else through_cameras(reader.cameras, 0.2)
+    write(reader, view, tmp_path / "a.mp4")
+    code = int(cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FOURCC))
+    assert code.to_bytes(4, "little") in (b"mp4v", b"FMP4")
+
+
+def test_repeated_seconds__plays_whole_clips():
+    seconds = [repeated_seconds(clip, least) for clip, least in ((0.4, 5), (2.0, 5), (5.0, 5), (7.0, 5), (0.4, 0))]
+    assert_close(np.array(seconds), np.array([5.2, 6, 5, 7, 0.4]), atol=1e-9)
+
+
+def test_export_video__repeats_a_short_clip(stream, tmp_path):
+    assert run("export", "video", tmp_path, "--least-seconds", 1, "--width", 32) == 0
+    assert len(video(tmp_path / "between.mp4")) == 12  # three plays of 4 frames at 10 frames per second
+    assert run("export", "video", tmp_path, "--least-seconds", 0, "--width", 32) == 0
+    assert len(video(tmp_path / "between.mp4")) == 4
+
+
+def test_write_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
+    more = ("--freeze", 2, "--seconds", 0.5, "--width", 32, "--channels", "color", "depth")
+    assert run("export", "video", tmp_path, "--path", "orbit", *more) == 0
+    assert [frame.shape for frame in video(tmp_path / "orbit.mp4")] == [(24, 68, 3)] * 5
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (("ply", "--frames", "9"), "stream.morgs, 0 to 3, got '9'"),
+        (("ply", "--frames", "a:b"), "--frames must be like 12, 10:20 or 0:100:5, got 'a:b'"),
+        (("video", "x.avi"), "x.avi: the output must be FILE.mp4, got '.avi'."),
+        (("tracks", "stream.morgs"), "stream.morgs: the output must be FILE.npz, got '.morgs'."),
+        (("tracks", "folder"), "folder: the output must be FILE.npz, got 'folder'."),
+        (
+            ("ply", "a.glb"),
+            "must be a folder, FILE.ply for one frame or FILE.compressed.ply for one frame, got '.glb'.",
+        ),
+        (("ply", "a.ply"), "a.ply: expected one frame for one file, got 4; select one (--frames), or name a folder."),
+        (("gltf", "a.usd"), "a.usd: the output must be a folder or FILE.glb for one frame, got '.usd'."),
+        (("web", "a.htm"), "a.htm: the output must be FILE.html or a folder, got '.htm'."),
+        (("usd", "a.usdz", "--format", "usda"), "a.usdz: the output must be FILE.usda, got '.usdz'."),
+        (("video", "--freeze", "7"), "--freeze must be in 0 to 3, got 7"),
+        (("video", "--width", "0"), "--width must be at least 1, got 0"),
+        (("video", "--seconds", "-1"), "--seconds must be positive"),
+        (("video", "--least-seconds", "-1"), "--least-seconds must be finite and not negative, got -1"),
+        (("video", "--path", "none.json"), "expected a camera path, found none"),
+    ],
+)
+def test_export__errors_are_one_sentence(stream, tmp_path, capsys, args, message):
+    assert run("export", args[0], tmp_path, *args[1:]) == 1
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_select_frames__like_slices(stream, tmp_path):
+    reader = StreamReader(tmp_path / "stream.morgs")
+    selected = {span: select_frames(reader, span) for span in ("2", "1:3", ":2", "::2", "3:")}
+    assert selected == {"2": [2], "1:3": [1, 2], ":2": [0, 1], "::2": [0, 2], "3:": [3]}
+
+
+def test_exr_channels__are_read_by_mitsuba(stream, tmp_path):
+    assert run("render", tmp_path, tmp_path / "exr", "--camera", "middle") == 0
+    image = mi.Bitmap(str(tmp_path / "exr" / "0001.exr"))
+    names = [field.name for field in image.struct_()]
+    assert sorted(names) == sorted(["R", "G", "B", "motion.X", "motion.Y", "confidence.Y", "depth.Y"])
+    planes = dict(zip(names, np.moveaxis(np.array(image), -1, 0), strict=True))
+    rendered = rasterize(stream[1].gaussians, rig()[1], ("color", "motion", "confidence", "depth"))
+    assert_close(planes["motion.X"], np.array(rendered.motion)[..., 0], atol=1e-5)
+    assert_close(planes["confidence.Y"], np.array(rendered.confidence)[..., 0], atol=1e-6)
+    assert_close(planes["depth.Y"], np.array(rendered.depth)[..., 0], atol=1e-5)
+    linear = srgb_to_linear(np.array(rendered.color))
+    assert_close(np.stack([planes[c] for c in "RGB"], -1), linear, atol=1e-6)
+
+
+def test_exr_channels__names_follow_the_number_of_components():
+    sizes = {"color": 3, "alpha": 1, "wetness": 1, "offset": 2, "normal": 3, "wide": 5}
+    images = {name: np.random.default_rng(0).uniform(size=(2, 3, size)) for name, size in sizes.items()}
+    planes = exr_channels(images)
+    wide = [f"wide.{i}" for i in range(5)]
+    normal = ["normal.X", "normal.Y", "normal.Z"]
+    assert list(planes) == ["R", "G", "B", "A", "wetness.Y", "offset.X", "offset.Y", *normal, *wide]
+    np.testing.assert_array_equal(planes["offset.Y"], images["offset"][..., 1])
+
+
+def test_pad_to_even__repeats_the_last_row_and_column():
+    image = np.arange(45, dtype=np.uint8).reshape(3, 5, 3)
+    padded = pad_to_even(image)
+    assert padded.shape == (4, 6, 3)
+    np.testing.assert_array_equal(padded[:3, :5], image)
+    np.testing.assert_array_equal(padded[3, 5], image[2, 4])
+    np.testing.assert_array_equal(pad_to_even(padded), padded)

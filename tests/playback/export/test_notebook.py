@@ -1,0 +1,68 @@
+"""Streams and images in the output of a notebook's cell."""
+
+from __future__ import annotations
+
+import base64
+import html
+import re
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.codec.container import StreamWriter
+from morgs_mi.playback.export import notebook
+from morgs_mi.playback.export.notebook import stream_html
+from morgs_mi.playback.export.web import web_page
+from morgs_mi.playback.player import channel_image, open_stream, render, render_config
+from morgs_mi.render.rasterize import rasterize
+from tests.scenes.changing_splats import rig, splats, write_stream
+
+
+def decoded(png: bytes) -> np.ndarray:
+    image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
+    assert image is not None
+    return image[..., ::-1]
+
+
+def test_stream_html__is_the_player_in_a_frame_without_access_to_the_notebook(tmp_path):
+    write_stream(tmp_path / "stream.morgs")
+    stream = open_stream(tmp_path)
+    text = stream._repr_html_()
+    assert 'sandbox="allow-scripts"' in text
+    source = re.search(r'srcdoc="([^"]*)"></iframe>$', text, re.DOTALL)
+    assert source is not None
+    assert html.unescape(source[1]).encode() == web_page(stream)
+
+
+def test_stream_html__of_a_large_stream_is_its_first_frame_and_the_command_for_a_page(tmp_path, monkeypatch):
+    states = write_stream(tmp_path / "stream.morgs")
+    stream = open_stream(tmp_path)
+    monkeypatch.setattr(notebook, "_LARGEST", 1000)
+    text = stream_html(stream)
+    assert f"morgs-mi export web {stream.path} page.html" in text
+    source = re.search(r"base64,([^\"]+)", text)
+    assert source is not None
+    image = render(states[0].gaussians, stream.cameras[0], ("color",), render_config(stream))["color"]
+    np.testing.assert_array_equal(decoded(base64.b64decode(source[1])), channel_image("color", image))
+
+
+@pytest.mark.parametrize("largest", [0, 10**9])
+def test_stream_html__of_a_stream_that_does_not_play_says_why(tmp_path, monkeypatch, largest):
+    monkeypatch.setattr(notebook, "_LARGEST", largest)
+    with StreamWriter(tmp_path / "empty.morgs", rig(), 30):
+        pass
+    assert "expected at least one frame" in stream_html(open_stream(tmp_path / "empty.morgs"))
+    write_stream(tmp_path / "stream.morgs")
+    stream = open_stream(tmp_path)
+    data = bytearray(stream.path.read_bytes())
+    data[stream.index()[0][2] + 100] ^= 1
+    stream.path.write_bytes(data)
+    assert re.fullmatch(r"<div>.*stream\.morgs: packet . at byte .*</div>", stream_html(stream))
+
+
+def test_image__shows_its_colour():
+    image = rasterize(splats(), rig()[0], ("color", "alpha"))
+    expected = channel_image("color", np.array(image.color))
+    np.testing.assert_array_equal(decoded(image._repr_png_() or b""), expected)
+    assert rasterize(splats(), rig()[0], ("alpha",))._repr_png_() is None

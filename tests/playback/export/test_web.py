@@ -1,0 +1,572 @@
+"""The web page in headless Chromium: what it decodes, what it draws, its controls, and damaged streams."""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import itertools
+import os
+import re
+import shutil
+import threading
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib.resources import files
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.cli import main
+from morgs_mi.codec.container import StreamWriter
+from morgs_mi.codec.packets import CodedFrame, coded_frames, reemitted_keyframe, residual_packet
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.playback.export.notebook import stream_html
+from morgs_mi.playback.export.web import text_of_bytes, write_web_folder, write_web_page
+from morgs_mi.playback.player import channel_image, open_stream, render, render_config
+from tests.scenes.cameras import look_at_cameras
+from tests.scenes.changing_splats import rig, splats, write_stream
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
+WIDTH, HEIGHT = 480, 360
+# A software rasteriser on a busy machine starts slowly.
+TIMEOUT_MS = 60_000
+FRAMES = 4
+HIDDEN = "#bar, #legend, #message {visibility: hidden}"
+
+
+# --------------------------------------------------------------------------------------------------
+#  Without a browser
+# --------------------------------------------------------------------------------------------------
+
+
+def bytes_of_text(text: str, count: int) -> bytes:
+    """Return the bytes as docs/stream-format.md specifies them."""
+    bits = "".join(f"{ord(character) & 127:07b}" for character in text)
+    return bytes(int(bits[8 * i : 8 * i + 8], 2) for i in range(count))
+
+
+@pytest.mark.parametrize("count", [0, 1, 6, 7, 8, 1000])
+def test_text_of_bytes__keeps_every_byte_and_avoids_what_html_changes(count):
+    data = np.random.default_rng(count).integers(0, 256, count, np.uint8).tobytes()
+    text = text_of_bytes(data)
+    assert bytes_of_text(text, count) == data
+    assert not set(text) & {"\0", "\r", "<"}
+
+
+def test_text_of_bytes__is_at_most_a_fifth_longer():
+    data = np.random.default_rng(0).integers(0, 256, 100_000, np.uint8).tobytes()
+    assert len(text_of_bytes(data).encode()) < 1.2 * len(data)
+
+
+def test_write_web_page__does_not_publish_the_metadata_of_the_fit(tmp_path):
+    states = write_stream(tmp_path / "stream.morgs", metadata={"capture": "/home/user/secret"})
+    write_web_page(open_stream(tmp_path), tmp_path / "page.html")
+    write_web_folder(open_stream(tmp_path), tmp_path / "folder")
+    published = open_stream(tmp_path / "folder")
+    assert "capture" not in published.metadata
+    assert [state.digest.tobytes() for state in coded_frames(published)] == [state.digest.tobytes() for state in states]
+
+
+def test_write_web_page__refuses_a_damaged_stream_and_writes_nothing(tmp_path):
+    write_stream(tmp_path / "stream.morgs")
+    data = bytearray((tmp_path / "stream.morgs").read_bytes())
+    data[len(data) // 2] ^= 1
+    (tmp_path / "stream.morgs").write_bytes(data)
+    with pytest.raises(ValueError, match=r"stream\.morgs: packet 1 at byte .* damaged"):
+        write_web_page(open_stream(tmp_path), tmp_path / "page.html")
+    assert not (tmp_path / "page.html").exists()
+
+
+@pytest.mark.parametrize("config", [3, {"render": []}])
+def test_write_web_page__refuses_settings_of_another_type(tmp_path, config):
+    write_stream(tmp_path / "stream.morgs", metadata={"config": config})
+    with pytest.raises(ValueError, match=r"`config.render` of the header's metadata must be an object"):
+        write_web_page(open_stream(tmp_path), tmp_path / "page.html")
+
+
+def test_write_web_page__refuses_a_second_residual_of_a_frame(tmp_path):
+    write_stream(tmp_path / "stream.morgs")
+    packets = list(open_stream(tmp_path))
+    with StreamWriter(tmp_path / "stream.morgs", rig(), 30) as writer:
+        for packet in (*packets, packets[-1]):
+            writer.write(packet)
+    with pytest.raises(ValueError, match="its frame must be above 3, that of the state before, got 3"):
+        write_web_page(open_stream(tmp_path), tmp_path / "page.html")
+
+
+@pytest.mark.parametrize("placeholder", ["{data}", "{notice}", "{title}"])
+def test_write_web_page__fills_nothing_into_the_title(tmp_path, placeholder):
+    write_stream(tmp_path / "stream.morgs")
+    size = write_web_page(open_stream(tmp_path), tmp_path / "page.html", title="A clip")
+    longer = write_web_page(open_stream(tmp_path), tmp_path / "page.html", title=placeholder)
+    assert f"<title>{placeholder}</title>".encode() in (tmp_path / "page.html").read_bytes()
+    assert abs(longer - size) < 100
+
+
+def test_write_web_page__replaces_bytes_of_a_name_that_are_not_utf_8(tmp_path):
+    folder = tmp_path / os.fsdecode(b"clip\xff")
+    folder.mkdir()
+    write_stream(folder / "stream.morgs")
+    write_web_page(open_stream(folder), tmp_path / "named.html")
+    write_web_page(open_stream(folder), tmp_path / "titled.html", title="clip\udcff")
+    assert "<title>clip\N{REPLACEMENT CHARACTER}</title>" in (tmp_path / "named.html").read_text(encoding="utf-8")
+    assert "<title>clip?</title>" in (tmp_path / "titled.html").read_text(encoding="utf-8")
+    assert "clip\N{REPLACEMENT CHARACTER}" in stream_html(open_stream(folder)).encode().decode()
+
+
+def test_write_web_page__scales_motion_by_its_99th_percentile(tmp_path):
+    start = splats(600)
+    means, log_scales = start.numpy()["means"].copy(), start.numpy()["log_scales"].copy()
+    means[0], log_scales[0] = (0, -3.4, 0.9), -5  # small and close to the camera in the middle
+    states = write_stream(tmp_path / "stream.morgs", start=replace(start, means=means, log_scales=log_scales))
+    write_web_folder(open_stream(tmp_path), tmp_path / "folder")
+    speeds = np.hstack([screen_speeds(state.gaussians, camera) for state in states[1:] for camera in rig()])
+    speed, weight = speeds[:, np.argsort(speeds[0])]
+    expected = speed[np.searchsorted(np.cumsum(weight), 0.99 * weight.sum())]
+    scale = open_stream(tmp_path / "folder").metadata["motion_scale"]
+    assert scale == pytest.approx(expected, rel=0.02)
+    assert speed.max() > 2 * scale
+
+
+def test_write_web_page__keeps_a_still_scene_still(tmp_path):
+    cameras = rig(1920, 1440)
+    state = write_stream(tmp_path / "stream.morgs", 1, cameras=cameras)[0]
+    noise = replace(state.gaussians, means=state.gaussians.numpy()["means"] + np.float32([0.0005, 0, 0]))
+    packets = [*open_stream(tmp_path), residual_packet(state, noise, np.arange(len(state)), cameras)]
+    with StreamWriter(tmp_path / "stream.morgs", cameras, 30) as writer:
+        for packet in packets:
+            writer.write(packet)
+    write_web_folder(open_stream(tmp_path), tmp_path / "folder")
+    assert open_stream(tmp_path / "folder").metadata["motion_scale"] == 0.001
+
+
+def screen_speeds(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """Return the speeds of moving Gaussians in an image, by differences, and their weights [2, S].
+
+    Speeds are fractions of the image's width per frame; weights are opacity times area.
+    """
+    motion = np.asarray(gaussians.motion, np.float64)
+    moves = motion.any(axis=1)
+    means, motion = gaussians.numpy()["means"][moves].astype(np.float64), motion[moves]
+    pixels, depths = camera.project(means)
+    seen = (depths > camera.near) & (pixels > 0).all(axis=1) & (pixels < (camera.width, camera.height)).all(axis=1)
+    step = 1e-4 * motion[seen]
+    ahead, behind = camera.project(means[seen] + step)[0], camera.project(means[seen] - step)[0]
+    scales = np.asarray(gaussians.scales, np.float64)[moves][seen]
+    areas = np.prod(scales, axis=1) ** (2 / 3) / depths[seen] ** 2
+    speeds = np.linalg.norm(ahead - behind, axis=1) / 2e-4 / camera.width
+    return np.stack([speeds, np.asarray(gaussians.opacities)[moves][seen] * areas])
+
+
+def test_notice__names_the_runtime_of_assemblyscript():
+    notice = (files("morgs_mi.playback.export") / "web_player" / "NOTICE").read_text(encoding="utf-8")
+    assert re.search(r"^assemblyscript [\d.]+ \(Apache-2.0\)$", notice, re.MULTILINE)
+    assert "Apache License" in notice
+
+
+def test_write_web_page__escapes_the_title(tmp_path):
+    write_stream(tmp_path / "stream.morgs")
+    write_web_page(open_stream(tmp_path), tmp_path / "page.html", title="</title><script>alert()</script>")
+    assert b"<title>&lt;/title&gt;" in (tmp_path / "page.html").read_bytes()
+
+
+def test_export_web__writes_a_page_or_a_folder(tmp_path, capsys):
+    write_stream(tmp_path / "stream.morgs")
+    assert main(["export", "web", str(tmp_path)]) == 0
+    assert main(["export", "web", str(tmp_path), str(tmp_path / "site"), "--title", "A clip"]) == 0
+    assert (tmp_path / "player.html").stat().st_size > 1e6
+    assert b"<title>A clip</title>" in (tmp_path / "site" / "index.html").read_bytes()
+    assert "player.html: 4 frames" in " ".join(capsys.readouterr().out.split())
+
+
+# --------------------------------------------------------------------------------------------------
+#  In the browser
+# --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module", params=[pytest.param("chromium", marks=pytest.mark.slow)])
+def browser():
+    playwright = pytest.importorskip(
+        "playwright.sync_api", reason="install it with pip install 'morgs-mi[viewer-test]'"
+    )
+    if CHROMIUM is None:
+        pytest.skip("no Chromium found; install it with tools/setup_browser.sh (apt-get install chromium)")
+    with playwright.sync_playwright() as driver:
+        options = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=options)
+        yield browser
+        browser.close()
+
+
+class Page:
+    """A page of the player, with what it requested and what it reported."""
+
+    def __init__(self, browser, address: str, expected: str | None = None, **context):
+        options = {"viewport": {"width": WIDTH, "height": HEIGHT}, **context}
+        self.page = browser.new_context(**options).new_page()
+        self.page.set_default_timeout(TIMEOUT_MS)
+        self.errors: list[str] = []
+        self.requests: list[str] = []
+        self.page.on("console", lambda m: self.errors.append(m.text) if m.type in ("error", "warning") else None)
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto(address)
+        if expected is None:
+            self.wait("!!window.player && player.settled")
+        else:
+            self.page.get_by_text(expected).wait_for()
+
+    def __enter__(self) -> Page:
+        return self
+
+    def __exit__(self, *error) -> None:
+        self.page.context.close()
+
+    def wait(self, condition: str) -> None:
+        """Wait for a condition; wait_for_function() needs `eval`, which the page forbids."""
+        for _ in range(TIMEOUT_MS // 50):
+            if self.page.evaluate(condition):
+                return
+            self.page.wait_for_timeout(50)
+        raise AssertionError(f"{condition} does not become true; {self.text('#message')} {self.errors}")
+
+    def show(self, frame: int) -> None:
+        self.page.evaluate(f"player.playback.seek({frame})")
+        self.wait(f"player.playback.position === {frame} && player.settled")
+
+    def text(self, selector: str) -> str:
+        return self.page.locator(selector).inner_text()
+
+    def image(self) -> np.ndarray:
+        """Return the image behind the controls."""
+        style = self.page.add_style_tag(content=HIDDEN)
+        image = cv2.cvtColor(cv2.imdecode(np.frombuffer(self.page.screenshot(), np.uint8), 1), cv2.COLOR_BGR2RGB)
+        style.evaluate("node => node.remove()")
+        return image
+
+
+@pytest.fixture(scope="module")
+def clip(tmp_path_factory) -> tuple[Path, list[CodedFrame]]:
+    """Return the folder of a stream with SH of degree 3, births and a death, and its states."""
+    folder = tmp_path_factory.mktemp("web")
+    states = write_stream(folder / "stream.morgs", FRAMES, splats(degree=3), rig(WIDTH, HEIGHT))
+    write_web_page(open_stream(folder), folder / "page.html")
+    return folder, states
+
+
+@pytest.fixture(scope="module")
+def opened(browser, clip):
+    with Page(browser, (clip[0] / "page.html").as_uri() + "#pause") as page:
+        yield page
+
+
+@pytest.fixture
+def page(opened):
+    """Return the page of the clip, paused at the first frame, and check afterwards what it reported and requested."""
+    opened.page.evaluate("player.playback.play(false); player.playback.loop = true")
+    opened.page.evaluate("player.selectMode('color'); player.selectCamera(0); player.selectSpeed(3)")
+    opened.show(0)
+    yield opened
+    assert not opened.errors
+    # The workers are objects of the page itself.
+    elsewhere = [url for url in opened.requests if not url.startswith("blob:")]
+    assert elsewhere == [opened.page.url.split("#")[0]]
+
+
+def decodes(page: Page, position: int, coded: CodedFrame) -> bool:
+    """Return whether the page decodes a position to the integers of a state."""
+    found = page.page.evaluate(
+        """async (position) => {
+          const { ids, largest, exponents, values } = await player.playback.state(position);
+          return [ids, largest, ...exponents, ...values].map((column) => [...column]);
+        }""",
+        position,
+    )
+    expected = [coded.ids, coded.grid.largest_components, *coded.grid.exponents.T, *coded.grid.values.T]
+    return all(itertools.starmap(np.array_equal, zip(found, expected, strict=True)))
+
+
+def test_page__decodes_the_same_integers(page, clip):
+    assert all(decodes(page, position, clip[1][position]) for position in (0, 3, 1, 2))
+
+
+def test_page__plays_a_salvaged_stream(browser, clip, tmp_path):
+    states, packets = clip[1], list(open_stream(clip[0]))
+    # Frame 1 is lost; keyframes were re-emitted at frames 2 and 3.
+    kept = [packets[0], reemitted_keyframe(states[2]), packets[3], reemitted_keyframe(states[3])]
+    with StreamWriter(tmp_path / "stream.morgs", rig(WIDTH, HEIGHT), 10) as writer:
+        for packet in kept:
+            writer.write(packet)
+    write_web_page(open_stream(tmp_path), tmp_path / "page.html")
+    with Page(browser, (tmp_path / "page.html").as_uri() + "#pause&frame=3") as page:
+        assert page.text("#count") == "3 / 3"
+        assert all(decodes(page, position, states[frame]) for position, frame in enumerate((0, 2, 3)))
+
+
+# Motion is divided by alpha, so it depends on rounding where little is drawn. A camera that is off by a degree: 20 dB.
+@pytest.mark.parametrize(("mode", "least"), [("color", 40), ("motion", 30), ("confidence", 40)])
+def test_page__shows_the_images_of_the_renderer(page, clip, mode, least):
+    folder, states = clip
+    stream = open_stream(folder)
+    page.page.evaluate(f"player.selectMode('{mode}')")
+    for camera, frame in ((0, 0), (0, 3), (2, 2), (2, 1)):
+        page.page.locator("#camera").select_option(str(camera))
+        page.show(frame)
+        image = render(states[frame].gaussians, stream.cameras[camera], (mode,), render_config(stream))[mode]
+        scale = WIDTH * page.page.evaluate("player.motionScale")
+        assert psnr(page.image() / 255, channel_image(mode, image, scale) / 255) > least
+
+
+def test_page__plays_to_the_end_and_scrubs_back(page, clip):
+    page.page.keyboard.press("l")
+    page.page.keyboard.press(" ")
+    page.wait(f"!player.playback.playing && player.playback.position === {FRAMES - 1} && player.settled")
+    played = page.image()
+    page.page.locator("#slider").fill("1")
+    page.wait("player.playback.position === 1 && player.settled")
+    assert page.text("#count") == f"1 / {FRAMES - 1}"
+    page.page.keyboard.press("End")
+    page.wait(f"player.playback.position === {FRAMES - 1} && player.settled")
+    # By residuals, one after the other, and by a jump: the same image.
+    assert np.array_equal(page.image(), played)
+
+
+def test_page__steps_to_frames_that_are_being_decoded(page):
+    page.show(3)
+    jumped = page.image()
+    page.show(0)
+    decoded = page.page.evaluate("player.playback.decodeTimes.length")
+    page.page.evaluate("for (let position = 1; position <= 3; position++) player.playback.seek(position)")
+    page.wait("player.playback.position === 3 && player.settled")
+    assert np.array_equal(page.image(), jumped)
+    # Each intermediate frame was shown once, and none was decoded twice.
+    assert page.page.evaluate("player.playback.decodeTimes.length") <= decoded + 3
+
+
+def test_page__opens_on_the_first_frame_with_motion(browser, clip):
+    with Page(browser, (clip[0] / "page.html").as_uri() + "#pause") as page:
+        assert page.text("#count") == f"1 / {FRAMES - 1}"
+    with Page(browser, (clip[0] / "page.html").as_uri() + "#pause&frame=0&mode=motion") as page:
+        assert page.text("#count") == f"0 / {FRAMES - 1}"
+        assert "The first frame has no motion." in page.text("#legend")
+
+
+@pytest.mark.parametrize("mode", ["Motion", "Confidence"])
+def test_page__leaves_the_first_frame_when_a_mode_is_chosen_that_shows_motion(page, mode):
+    page.page.get_by_text(mode, exact=True).first.click()
+    page.wait("player.playback.position === 1 && player.settled")
+    assert "first frame" not in page.text("#legend").lower()
+
+
+# Sorting waits for `sortAll`.
+HOLD_SORTING = """() => {
+  const { sortWorker: worker } = player.splats.spark;
+  const held = new Promise((resolve) => (window.sortAll = resolve));
+  const call = worker.call.bind(worker);
+  worker.call = (...request) => held.then(() => { worker.call = call; return call(...request); });
+}"""
+
+
+def test_page__draws_a_new_mode_when_its_values_arrive(browser, clip):
+    with Page(browser, (clip[0] / "page.html").as_uri() + "#pause") as page:
+        page.show(3)
+        colors = page.image()
+        page.page.evaluate(HOLD_SORTING)
+        page.page.evaluate("player.playback.seek(1)")
+        page.wait("player.playback.position === 1")
+        for mode in ("motion", "confidence"):
+            page.page.evaluate(f"player.selectMode('{mode}')")
+            page.page.wait_for_timeout(300)
+            # The colours of frame 3 are displayed until those of frame 1 are sorted.
+            assert psnr(page.image() / 255, colors / 255) > 40
+            assert not page.page.locator("#legend").is_visible()
+        page.page.evaluate("sortAll()")
+        page.wait("player.settled")
+        arrived = page.image()
+        assert page.page.locator("#legend").is_visible()
+        assert psnr(arrived / 255, colors / 255) < 20
+        page.page.evaluate("player.selectMode('color')")
+        page.wait("player.settled")
+        page.page.evaluate("player.selectMode('confidence')")
+        page.wait("player.settled")
+        assert psnr(page.image() / 255, arrived / 255) > 40
+
+
+def test_page__repeats(page):
+    page.page.evaluate("player.selectSpeed(5)")
+    shown = page.page.evaluate("player.playback.decodeTimes.length")
+    page.page.get_by_label("Play", exact=True).click()
+    page.wait(f"player.playback.decodeTimes.length > {shown + 2 * FRAMES}")
+    assert page.page.evaluate("player.playback.playing")
+
+
+def test_page__orbits_and_returns_to_the_camera(page):
+    before = page.image()
+    page.page.mouse.move(WIDTH / 2, HEIGHT / 2)
+    page.page.mouse.down()
+    page.page.mouse.move(WIDTH / 2 + 60, HEIGHT / 2, steps=4)
+    page.page.mouse.up()
+    page.page.wait_for_timeout(500)
+    page.wait("player.settled")
+    assert psnr(page.image() / 255, before / 255) < 30
+    page.page.keyboard.press("r")
+    page.page.wait_for_timeout(500)
+    page.wait("player.settled")
+    assert psnr(page.image() / 255, before / 255) > 40
+
+
+VIEW = ("camera.position", "controls.target")
+AT_REST = """new Promise((resolve) => {
+  let before = null;
+  const look = () => {
+    const now = player.view.camera.matrixWorldInverse.elements.join();
+    if (now === before && player.settled) resolve(true);
+    else { before = now; setTimeout(look, 300); }
+  };
+  look();
+})"""
+
+
+def drag(page: Page, pixels: int, cameras: Sequence[Camera]) -> float:
+    """Return the angle in degrees from the view at rest after a drag to the nearest camera."""
+    page.page.mouse.move(WIDTH / 2, HEIGHT / 2)
+    page.page.mouse.down()
+    page.page.mouse.move(WIDTH / 2 + pixels, HEIGHT / 2, steps=4)
+    page.page.mouse.up()
+    page.wait(AT_REST)
+    position, target = (np.array(page.page.evaluate(f"player.view.{name}.toArray()")) for name in VIEW)
+    unit = page.page.evaluate("player.view.unit")
+    offset, directions = position - target, unit * np.stack([camera.position for camera in cameras]) - target
+    cosines = directions @ offset / np.linalg.norm(directions, axis=1) / np.linalg.norm(offset)
+    return float(np.degrees(np.arccos(cosines.max())))
+
+
+def test_page__draws_orbits_back_to_the_cameras_unless_it_is_switched_off(page):
+    assert drag(page, -8, rig()) > 1  # 8 degrees are free
+    page.page.keyboard.press("r")
+    assert drag(page, -90, rig()) == pytest.approx(8, abs=0.2)
+    page.page.keyboard.press("b")
+    assert page.page.get_by_label("Keep the view near the cameras").get_attribute("aria-pressed") == "false"
+    assert drag(page, -30, rig()) > 20
+    page.page.get_by_label("Keep the view near the cameras").click()
+    assert drag(page, 0, rig()) == pytest.approx(8, abs=0.2)
+
+
+def test_page__draws_orbits_back_farther_to_cameras_without_neighbours(browser, tmp_path):
+    cameras = tuple(look_at_cameras([(0, -4, 1), (4, 0, 1)], 45, WIDTH, HEIGHT, ("front", "side"), up=(0, 0, 1)))
+    write_stream(tmp_path / "stream.morgs", 2, cameras=cameras)
+    write_web_page(open_stream(tmp_path), tmp_path / "page.html")
+    with Page(browser, (tmp_path / "page.html").as_uri() + "#pause") as page:
+        assert drag(page, -20, cameras) == pytest.approx(4, abs=0.2)
+
+
+def test_page__is_operated_by_keyboard(page):
+    press = page.page.keyboard.press
+    press("ArrowRight")
+    page.wait("player.playback.position === 1 && player.settled")
+    press("2")
+    page.wait("player.settled")
+    percent = 100 * page.page.evaluate("player.motionScale")
+    assert f"rim: {percent:.2g} % of the width" in page.text("#legend")
+    press("3")
+    page.wait("player.settled")
+    assert "moving" in page.text("#legend")
+    press("c")
+    assert page.page.locator("#camera").input_value() == "1"
+    press(">")
+    assert page.page.locator("#speed").input_value() == "2"
+    press("?")
+    assert page.page.locator("#help").is_visible()
+    press("Escape")
+    assert not page.page.locator("#help").is_visible()
+
+
+def test_page__fits_a_phone_and_is_operated_by_touch(browser, clip):
+    phone = {"viewport": {"width": 390, "height": 780}, "has_touch": True, "is_mobile": True}
+    with Page(browser, (clip[0] / "page.html").as_uri() + "#pause&frame=1&mode=motion", **phone) as page:
+        assert page.text("#count") == f"1 / {FRAMES - 1}"
+        page.page.get_by_text("Confidence", exact=True).first.tap()
+        page.wait("player.settled")
+        assert "moving" in page.text("#legend")
+        for control in page.page.locator("#bar button, #bar select, #bar input").all():
+            box = control.bounding_box()
+            assert box is None or (box["x"] >= 0 and box["x"] + box["width"] <= 390 and box["height"] >= 32)
+        assert not page.errors
+
+
+@pytest.fixture
+def hosted(clip, tmp_path):
+    """Return the address and the stream of the folder for a web server."""
+    write_web_folder(open_stream(clip[0]), tmp_path / "web")
+    with served(tmp_path / "web") as address:
+        yield f"{address}/index.html#pause", open_stream(tmp_path / "web")
+
+
+def test_page__names_a_damaged_packet(browser, hosted):
+    address, stream = hosted
+    data = bytearray(stream.path.read_bytes())
+    data[stream.index()[2][2] + 100] ^= 1
+    stream.path.write_bytes(data)
+    with Page(browser, address) as page:
+        page.page.keyboard.press("End")
+        page.page.get_by_text("This stream is damaged: frame 2: the packet at byte").wait_for()
+        page.show(1)
+        assert not page.errors
+
+
+def test_page__names_a_truncated_stream(browser, hosted):
+    address, stream = hosted
+    data = stream.path.read_bytes()
+    stream.path.write_bytes(data[: stream.index()[2][2] + 100])
+    with Page(browser, address) as page:
+        assert "truncated or damaged at byte" in page.text("#message")
+        assert page.text("#count") == "1 / 1"
+
+
+def test_page__shows_the_frames_before_a_damaged_one_that_the_address_asks_for(browser, hosted):
+    address, stream = hosted
+    data = bytearray(stream.path.read_bytes())
+    data[stream.index()[2][2] + 100] ^= 1
+    stream.path.write_bytes(data)
+    with Page(browser, f"{address}&frame=3") as page:
+        page.page.get_by_text("The frames before that play.").wait_for()
+        page.show(1)
+
+
+def test_page__names_what_is_no_stream(browser, hosted):
+    address, stream = hosted
+    data = bytearray(stream.path.read_bytes())
+    data[stream.index()[0][2] + 100] ^= 1
+    for content, reason in ((b"something else", "this is not a .morgs stream"), (data, "frame 0: the packet at byte")):
+        stream.path.write_bytes(content)
+        with Page(browser, address, f"This page could not start: {reason}") as page:
+            assert "frames before" not in page.text("#message")
+    stream.path.unlink()
+    with Page(browser, address, "stream.morgs cannot be read: 404"):
+        pass
+
+
+class served:
+    """Serve a folder on this machine, as a context that returns its address."""
+
+    def __init__(self, folder: Path):
+        handler = functools.partial(_Quiet, directory=str(folder))
+        self.server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+
+    def __enter__(self) -> str:
+        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+        return f"http://127.0.0.1:{self.server.server_port}"
+
+    def __exit__(self, *error) -> None:
+        self.server.shutdown()
+        self.server.server_close()
+
+
+class _Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:
+        pass

@@ -1,0 +1,83 @@
+"""The commands of docs/cluster.md run."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import shlex
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from benchmarks.reports import __main__ as reports
+from morgs_mi import cli
+from morgs_mi.codec.reader import StreamReader
+from tests.cli.commands import QUICK
+from tests.scenes.recording import CONFIG, write_recording
+
+ROOT = Path(__file__).parents[2]
+TEXT = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"<!-- (run|start|file [^ ]+) -->\n```\w+\n(.*?)```", TEXT, re.DOTALL)
+FRAMES = 4
+REPORT = ("--stream.fit.num-gaussians", "80", "--stream.fit.first-frame-steps", "8", "--stream.fit.epochs", "1")
+
+
+def started(command: str) -> subprocess.Popen[str]:
+    """Start a command of Dask and wait until it listens."""
+    program, *args = shlex.split(command)
+    assert program == "dask"
+    env = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen([sys.executable, "-m", "dask", *args], stderr=subprocess.PIPE, text=True, env=env)
+    assert process.stderr is not None
+    next(line for line in process.stderr if "Scheduler at:" in line or "Registered to:" in line)
+    return process
+
+
+@pytest.fixture
+def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a small capture where the demo writes its own."""
+    write_recording(tmp_path / "out/demo/capture", FRAMES)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PWD", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr("morgs_mi.runs.cluster.jobs.StreamConfig", lambda: CONFIG)
+    return tmp_path
+
+
+@pytest.mark.slow
+def test_cluster_page__commands_run(workplace: Path) -> None:
+    pytest.importorskip("distributed", reason="comes with the extra `cluster`")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    with contextlib.ExitStack() as stack:
+        for kind, text in BLOCKS:
+            command = text.strip().replace("8786", port).replace("40000", "100")
+            if kind == "start":
+                process = started(command)
+                stack.callback(process.wait)
+                stack.callback(process.terminate)
+            elif kind == "run":
+                program, *args = shlex.split(os.path.expandvars(command))
+                if program == "python":
+                    assert reports.main([*args[2:], *REPORT]) == 0, command
+                    continue
+                assert program == "morgs-mi"
+                assert cli.main([*args, *(QUICK if args[0] == "fit" else [])]) == 0, command
+            else:
+                (workplace / kind.removeprefix("file ")).write_text(command)
+    streams = sorted(str(path.parent.relative_to("out")) for path in Path("out").rglob("stream.morgs"))
+    jobs = [f"sweep/capture-{name}-s{seed}" for name in ("detailed", "small") for seed in (0, 1)]
+    qualities = [f"codec/capture/{quality}" for quality in (1, 1000)]
+    assert streams == ["cluster", *qualities, "dask", "segments", *jobs, "url"]
+    for name in streams:
+        assert {frame for _, frame, _ in StreamReader(f"out/{name}/stream.morgs").index()} == set(range(FRAMES))
+
+
+def test_cluster_page__has_commands() -> None:
+    kinds = ["run", "run", "file sweep.toml", "run", "run", "start", "start", "run", "run"]
+    assert [kind for kind, _ in BLOCKS] == kinds

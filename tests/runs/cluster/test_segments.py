@@ -1,0 +1,280 @@
+"""Segments: the joined stream is an ordinary one, and what dies or is interrupted meanwhile leaves no trace."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import multiprocessing
+import os
+import shutil
+import signal
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi import cli
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.codec.container import PacketKind
+from morgs_mi.codec.packets import coded_frames, frames_with_lasting_ids, seek
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.fit.fit_config import ShortFitConfig
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.runs.cluster.executor import Workers, open_workers
+from morgs_mi.runs.cluster.seams import SeamConfig
+from morgs_mi.runs.cluster.segments import SegmentedFit, stream_segments
+from morgs_mi.runs.cluster.tasks import fit_segment_start
+from morgs_mi.runs.recorder import stream_capture
+from morgs_mi.runs.recording import FILES
+from tests.scenes.coded_clip import history
+from tests.scenes.recording import CONFIG, write_recording
+
+FRAMES, STARTS = 10, (0, 3, 7)
+# A keyframe that is re-emitted in the cross-fade, and one that falls on a seam.
+SETTINGS = replace(CONFIG, codec=replace(CONFIG.codec, keyframe_interval=3))
+SEAMS = SeamConfig(passes=2, epochs=1, overlap=2)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory: pytest.TempPathFactory) -> Capture:
+    return load_capture(write_recording(tmp_path_factory.mktemp("capture"), FRAMES))
+
+
+@pytest.fixture(scope="module")
+def workers() -> Iterator[Workers]:
+    with open_workers(count=2) as opened:
+        yield opened
+
+
+@pytest.fixture(autouse=True)
+def short_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tasks that end within the segments."""
+    monkeypatch.setattr("morgs_mi.runs.cluster.segments.TASK_FRAMES", 2)
+
+
+def fit(capture: Capture, out: Path, workers: Workers, **options) -> SegmentedFit:
+    given = {"config": SETTINGS, "segments": 3, "seams": SEAMS} | options
+    return stream_segments(capture, out, workers, **given)
+
+
+@pytest.fixture(scope="module")
+def whole(capture: Capture, workers: Workers, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A fit in three segments, undisturbed, with tasks of another length than those of the tests."""
+    out = tmp_path_factory.mktemp("whole")
+    fit(capture, out, workers)
+    return out
+
+
+def stream_of(out: Path) -> bytes:
+    return (out / "stream.morgs").read_bytes()
+
+
+def rows_of(out: Path) -> list[dict]:
+    rows = json.loads((out / "report.json").read_text())["frames"]
+    return [{name: value for name, value in row.items() if name != "seconds"} for row in rows]
+
+
+def test_stream_segments__of_one_is_the_fit_in_one_process(capture: Capture, workers: Workers, tmp_path: Path) -> None:
+    fit(capture, tmp_path / "one", workers, segments=1)
+    stream_capture(capture, tmp_path / "plain", SETTINGS)
+    assert stream_of(tmp_path / "one") == stream_of(tmp_path / "plain")
+    assert rows_of(tmp_path / "one") == rows_of(tmp_path / "plain")
+    assert sorted(path.name for path in (tmp_path / "one").iterdir()) == sorted(FILES)
+
+
+def test_stream_segments__joins_them_to_an_ordinary_stream(whole: Path) -> None:
+    reader = StreamReader(whole / "stream.morgs")
+    assert reader.closed()
+    assert sorted(path.name for path in whole.iterdir()) == sorted(FILES)
+    first = {frame: kind for kind, frame, _ in reversed(reader.index())}
+    assert [frame for frame, kind in sorted(first.items()) if kind == PacketKind.KEYFRAME] == list(STARTS)
+    states = list(coded_frames(reader))
+    assert [coded.frame for coded in states] == list(range(FRAMES))
+    for state in states:
+        assert history([seek(reader, state.frame)]) == history([state])
+    sets = [set[int]() for _ in STARTS]
+    for ids, coded in frames_with_lasting_ids(reader):
+        sets[np.searchsorted(STARTS, coded.frame, "right") - 1] |= set(ids.tolist())
+    assert len(set().union(*sets)) == sum(map(len, sets)), "no id is in two segments"
+
+
+def test_stream_segments__reports_frames_and_seams(whole: Path) -> None:
+    report = json.loads((whole / "report.json").read_text())
+    assert [row["frame"] for row in report["frames"]] == list(range(FRAMES))
+    sizes = {packet.frame: packet.num_bytes for packet in reversed(list(StreamReader(whole / "stream.morgs")))}
+    assert [row["num_bytes"] for row in report["frames"]] == [sizes[frame] for frame in range(FRAMES)]
+    assert [seam["frame"] for seam in report["seams"]] == list(STARTS[1:])
+    assert all(np.isfinite(list(seam.values())).all() for seam in report["seams"])
+    assert all(peak > 1e7 for peak in report["workers"].values())
+
+
+class Noted(Workers):
+    """Workers that note, when later frames are given to them, how many starts of segments are missing."""
+
+    def __init__(self, workers: Workers, starts: int) -> None:
+        self.place, self.workers, self.missing, self.noted = workers.place, workers, starts, []
+
+    @property
+    def count(self) -> int:
+        return self.workers.count
+
+    async def run(self, function, *args):
+        if function is fit_segment_start:
+            result = await self.workers.run(function, *args)
+            self.missing -= 1
+            return result
+        if args[1].start:
+            self.noted.append(self.missing)
+        return await self.workers.run(function, *args)
+
+
+def test_stream_segments__begins_segments_before_it_continues_others(
+    capture: Capture, workers: Workers, tmp_path: Path
+) -> None:
+    noted = Noted(workers, starts=2)
+    fit(capture, tmp_path, noted, seams=replace(SEAMS, overlap=0))  # the first segment waits for no other
+    assert noted.noted
+    assert max(noted.noted) < workers.count
+
+
+@pytest.mark.parametrize("command", [("eval",), ("export", "tracks"), ("render", "--camera", "0")])
+def test_stream_segments__is_read_by_the_commands(whole: Path, tmp_path: Path, command: tuple[str, ...]) -> None:
+    assert cli.main([*command, str(shutil.copytree(whole, tmp_path / "fit"))]) == 0
+
+
+def when_fitted(count: int, action: Callable[[], object]) -> Callable[[str, float, float], None]:
+    """Return a function that acts once, as soon as so many frames are fitted."""
+    left = [action]
+
+    def on_stage(stage: str, done: float, total: float) -> None:
+        if stage == "Fitting frames" and done >= count and left:
+            left.pop()()
+
+    return on_stage
+
+
+def interrupt() -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("count", [5, *(pytest.param(count, marks=pytest.mark.slow) for count in (0, 2, 9))])
+def test_stream_segments__interrupted_and_resumed_is_the_same(
+    capture: Capture, workers: Workers, whole: Path, tmp_path: Path, count: int
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        fit(capture, tmp_path, workers, on_stage=when_fitted(count, interrupt))
+    fit(capture, tmp_path, workers, resume=True)
+    assert stream_of(tmp_path) == stream_of(whole)
+    assert rows_of(tmp_path) == rows_of(whole)
+    again = fit(capture, tmp_path, workers, resume=True, on_stage=when_fitted(0, interrupt))
+    assert len(again.reports) == FRAMES, "nothing is fitted twice"
+
+
+def test_stream_segments__resumes_after_a_cut_packet(
+    capture: Capture, workers: Workers, whole: Path, tmp_path: Path
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        fit(capture, tmp_path, workers, on_stage=when_fitted(7, interrupt))
+    for path in (tmp_path / "segments").glob("*.morgs"):
+        os.truncate(path, path.stat().st_size - 200)
+    fit(capture, tmp_path, workers, resume=True)
+    assert stream_of(tmp_path) == stream_of(whole)
+
+
+@pytest.mark.parametrize("frame", [2, 6])  # in the overlap before a segment or in its cross-fade, and after the overlap
+def test_stream_segments__resumes_within_a_beginning_or_a_cross_fade(
+    capture: Capture, workers: Workers, whole: Path, tmp_path: Path, frame: int
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        fit(capture, tmp_path, workers, on_stage=when_fitted(FRAMES, interrupt))
+    for path in (tmp_path / "segments").glob("*.morgs"):
+        offset = next((at for _, found, at in StreamReader(path).index() if found >= frame), None)
+        if offset is not None:
+            os.truncate(path, offset)
+    fit(capture, tmp_path, workers, resume=True)
+    assert stream_of(tmp_path) == stream_of(whole)
+    assert rows_of(tmp_path) == rows_of(whole)
+
+
+@pytest.mark.slow
+def test_stream_segments__of_a_url_is_the_same(
+    capture: Capture, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("fsspec", reason="comes with the extra `cluster`")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "worker"))
+    with open_workers(count=1) as workers:
+        asyncio.run(workers.run(os.getpid))  # it has begun, with a cache of its own
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "client"))
+        fit(load_capture(f"file://{capture.path}"), tmp_path / "out", workers)
+    assert len(list((tmp_path / "worker").rglob("cam1"))) == 1
+    packets = ([p.encoded for p in StreamReader(out / "stream.morgs")] for out in (tmp_path / "out", whole))
+    assert next(packets) == next(packets)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [2, 4])
+def test_stream_segments__with_a_killed_process_is_the_same(
+    capture: Capture, whole: Path, tmp_path: Path, count: int
+) -> None:
+    with open_workers(count=2) as workers:
+
+        def kill() -> None:
+            os.kill(min(multiprocessing.active_children(), key=lambda child: child.pid).pid, signal.SIGKILL)
+
+        fit(capture, tmp_path, workers, on_stage=when_fitted(count, kill))
+    assert stream_of(tmp_path) == stream_of(whole)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"segments": 0}, r"`segments` must be 1 to 5 for 10 frames, 2 for each, got 0"),
+        ({"segments": 6}, r"`segments` must be 1 to 5 for 10 frames, 2 for each, got 6"),
+    ],
+)
+def test_stream_segments__refuses_too_many(capture: Capture, workers, tmp_path: Path, options, message) -> None:
+    with pytest.raises(ValueError, match=message):
+        fit(capture, tmp_path / "out", workers, **options)
+    assert not (tmp_path / "out").exists()
+
+
+def test_stream_segments__does_not_resume_other_settings(capture: Capture, workers: Workers, tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        fit(capture, tmp_path, workers, on_stage=when_fitted(2, interrupt))
+    with pytest.raises(ValueError, match=r"0\.morgs: expected to resume a fit with metadata\.config\.seed = 0, got 1"):
+        fit(capture, tmp_path, workers, config=replace(SETTINGS, seed=1), resume=True)
+    with pytest.raises(ValueError, match=r"expected to resume a fit with metadata\.segments\.starts = \[0, 3, 7\]"):
+        fit(capture, tmp_path, workers, segments=2, resume=True)
+
+
+def test_stream_segments__triangulates_points_where_there_are_few(
+    capture: Capture, workers: Workers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    few = replace(capture, points=capture.points[:3], point_colors=capture.point_colors[:3])
+    monkeypatch.setattr("morgs_mi.runs.recorder.with_points", lambda *_: capture)
+    fit(few, tmp_path / "few", workers, segments=1, config=StreamConfig(SETTINGS.fit, SETTINGS.motion))
+    assert len(next(coded_frames(StreamReader(tmp_path / "few" / "stream.morgs")))) == SETTINGS.fit.num_gaussians
+
+
+def test_stream_segments__refines_cameras_once(capture: Capture, workers: Workers, tmp_path: Path) -> None:
+    held_out = load_capture(capture.path, test_view=0)
+    how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
+    config = replace(SETTINGS, fit=replace(SETTINGS.fit, refine_cameras="on", short_fits=how))
+    fit(held_out, tmp_path / "three", workers, config=config)
+    stream, row = StreamReader(tmp_path / "three" / "stream.morgs"), rows_of(tmp_path / "three")[0]
+    assert not np.array_equal(stream.cameras[1].viewmat, capture.cameras[1].viewmat)
+    assert row["validation"]["refinement"]["held_out"]["registered_psnr"] > 0
+    stream_capture(held_out, tmp_path / "plain", config)
+    plain = StreamReader(tmp_path / "plain" / "stream.morgs")
+    assert stream.metadata["distortions"] == plain.metadata["distortions"]
+    assert [c.viewmat.tolist() for c in stream.cameras] == [c.viewmat.tolist() for c in plain.cameras]
+    first = [next(coded_frames(s)).gaussians for s in (stream, plain)]
+    assert np.array_equal(first[0].means, first[1].means)
+
+
+def test_stream_segments__refuses_to_estimate_exposures(capture: Capture, workers: Workers, tmp_path: Path) -> None:
+    config = replace(CONFIG, fit=replace(CONFIG.fit, exposure="on"))
+    with pytest.raises(ValueError, match=r"`fit\.exposure` must be off, got 'on'"):
+        stream_segments(capture, tmp_path / "out", workers, config, 2)

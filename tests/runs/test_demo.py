@@ -1,0 +1,73 @@
+"""The demonstration at a small size: its files exist and are consistent."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import pytest
+
+from morgs_mi.core.files import locked_folder
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.runs.demo import DemoConfig, _synthesize_clip, run_demo
+from morgs_mi.synth.synth_config import SynthConfig
+
+SMALL = DemoConfig(
+    clip=SynthConfig(cameras=6, frames=4, width=64, height=48, spp=4),
+    plain_frames=3,
+    stream=StreamConfig(fit=FitConfig(sh_degree=0, num_gaussians=500, first_frame_steps=20, epochs=1)),
+)
+
+pytestmark = pytest.mark.slow
+FIT_STAGES = ("trial", "first frame", "later frames")
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("demo")
+    steps: list[str] = []
+    run_demo(folder, SMALL, lambda step, done, total: steps.append(step))
+    fits = [f"Fitting{which}: {stage}" for which in ("", " without ML, MO, MC") for stage in FIT_STAGES]
+    assert list(dict.fromkeys(steps))[:7] == ["Path-tracing the clip", *fits]
+    return folder
+
+
+def test_run_demo__report_is_consistent(out: Path) -> None:
+    report = json.loads((out / "report.json").read_text())
+    assert (report["full"]["num_frames"], report["plain"]["num_frames"]) == (4, 3)
+    assert report["comparison"]["frames"] == [1, 2], "the first frame has no motion, the plain fit no fourth frame"
+    rows = report["full"]["frames"][1:3]
+    mean = sum(row["motion_error_moving"] for row in rows) / 2
+    assert report["comparison"]["full"]["motion_error_moving"] == pytest.approx(mean)
+    assert report["full"]["held_out"]
+    assert report["full"]["bytes"]["file"] == (out / "stream" / "stream.morgs").stat().st_size
+    assert {"machine", "versions", "seed", "seconds"} <= set(report)
+
+
+def test_run_demo__writes_a_video_and_a_contact_sheet(out: Path) -> None:
+    video = cv2.VideoCapture(str(out / "side_by_side.mp4"))
+    assert [video.read()[1].shape for _ in range(4)] == [(48, 4 * 64 + 3 * 4, 3)] * 4
+    assert not video.read()[0]
+    # Three frames of the full fit and, in the last row, one of the plain fit with the legend.
+    assert cv2.imread(str(out / "contact_sheet.png")).shape[0] == 3 * (48 + 4) + max(48, 96)
+
+
+def test_run_demo__reuses_a_clip_with_the_same_settings(out: Path) -> None:
+    marker = out / "capture" / "marker"
+    marker.write_text("kept")
+    _synthesize_clip(out / "capture", SMALL, lambda done, total: None)
+    assert marker.exists()
+    _synthesize_clip(out / "capture", replace(SMALL, clip=replace(SMALL.clip, frames=1)), lambda done, total: None)
+    assert not marker.exists()
+
+
+def test_run_demo__refuses_a_folder_into_which_another_demo_writes(tmp_path: Path) -> None:
+    with (
+        locked_folder(tmp_path, "test()"),
+        pytest.raises(BlockingIOError, match="expected a folder into which nothing else is written"),
+    ):
+        run_demo(tmp_path, SMALL)
+    assert list(tmp_path.iterdir()) == []
