@@ -149,12 +149,11 @@ def _in_words(kind: Any) -> str:
 
 
 def _expected(value: Any, kind: Any) -> str:
-    """Return what a value should be, without its type where it has that: "at least 1 or none"."""
-    words = []
+    """Return what a value should be: a range alone where its type is right, such as "at least 1"."""
     for arm in arms_of(kind):
-        base, *bounds = get_args(arm) if get_origin(arm) is Annotated else (arm,)
-        words.append(_bounds(bounds) if bounds and _fits(value, base) else _in_words(arm))
-    return " or ".join(words)
+        if get_origin(arm) is Annotated and _fits(value, get_args(arm)[0]):
+            return _bounds(get_args(arm)[1:])
+    return _in_words(kind)
 
 
 def _bounds(bounds: Any) -> str:

@@ -47,7 +47,7 @@ def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
 
 
 def test_fit__reports_what_to_expect_of_views_between_the_cameras(capture: Path, tmp_path: Path, run) -> None:
-    (tmp_path / "settings.toml").write_text("[fit.cross_validation]\nmin_views = 3\n")
+    (tmp_path / "settings.toml").write_text("[fit]\ncross_validation_views = 3\n")
     options = ("--test-view", "none", "--config", tmp_path / "settings.toml")
     code, output, _ = run("fit", capture, tmp_path / "out", *QUICK, *options)
     (first, *_) = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
@@ -66,7 +66,7 @@ def test_fit__names_cameras_of_other_exposure(tmp_path: Path, run) -> None:
     assert re.search(f"Warning: {sentence}", error)
     for options in ((), ("--deep",)):
         assert len(re.findall(sentence, run("info", path, *options)[1])) == 1
-    (tmp_path / "a.toml").write_text("[fit.exposures]\ngaussians = 40\nsteps = 2\nrounds = 1\n")
+    (tmp_path / "a.toml").write_text("[fit.short_fits]\ngaussians = 40\nsteps = 2\nrounds = 1\n")
     for options in (("--color", "linear"), ("--exposure", "on", "--config", tmp_path / "a.toml")):
         status, out, error = run("fit", path, tmp_path / "out", *QUICK, "--downscale", 2, *options)
         assert (status, "brighter" in error) == (0, False)
@@ -120,7 +120,7 @@ def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
         (["--epochs", "0", "--preset", "s"], ("--epochs must be at least 1, got 0",)),
         (["--sh-degree", "4"], ("--sh-degree must be at least 0 and at most 3, got 4",)),
         (["--quality", "nan"], ("--quality must be a finite number, above 0, got nan",)),
-        (["--target-size", "-1"], ("--target-size must not be negative, got -1",)),
+        (["--target-size", "-1"], ("--target-size must be at least 0, got -1",)),
         (["--flow", "none"], ("--flow must be one of dis,", "got 'none'")),
         (["--flow", "files:nowhere"], ("nowhere",)),
         (["--masks", "some"], ("--masks must be one of none,", "got 'some'")),
@@ -137,7 +137,10 @@ def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
             ["--config", "[fit.rates]\nmeans = nan"],
             ("bad.toml: `fit.rates.means` must be a finite number, at least 0",),
         ),
-        (["--config", "[render]\nblock_width = 17"], ("bad.toml: `render.block_width` must be 4, 8, 12 or 16",)),
+        (
+            ["--config", "[render]\nblock_width = 17"],
+            ("bad.toml: `render.block_width` must be at least 4, at most 16",),
+        ),
         (["--config", "[motion]\nflow_method = 'no'"], ("bad.toml: `motion.flow_method` must be one of dis,",)),
         (["--config", "[motion]\nmask_method = 'no'"], ("bad.toml: `motion.mask_method` must be one of none,",)),
         (["--config", "[motion]\nmodel = 'no'"], ("bad.toml: `motion.model` must be one of none",)),

@@ -85,7 +85,7 @@ def test_Live__ends_with_a_summary_on_ctrl_c(capture: Path, tmp_path: Path, vide
                 "; check that it exists and is not in use",
             ),
         ),
-        (("--frames", 0), ("--frames must be at least 1 or none, got 0",)),
+        (("--frames", 0), ("--frames must be at least 1, got 0",)),
         (("--timeout", 0), ("--timeout must be above 0, got 0",)),
         (("--test-view", "x", "--camera", "VIDEOS"), ("test_view` must be an index in 0..2, one of cam0, cam1, cam2",)),
     ],

@@ -239,7 +239,7 @@ def test_apply_values__builds_and_removes_an_optional_config() -> None:
         (
             StreamConfig(),
             "[render]\nblock_width = 17",
-            "`render.block_width` must be at least 4, at most 16 and a multiple of 4 or none, got 17.",
+            "`render.block_width` must be at least 4, at most 16 and a multiple of 4, got 17.",
         ),
         (StreamConfig(), "[fit]\nepochs = 0", "`fit.epochs` must be at least 1, got 0."),
         (StreamConfig(), "[fit.rates]\nmeans = nan", "`fit.rates.means` must be a finite number, at least 0, got nan."),

@@ -67,8 +67,16 @@ def test_render_stream__renders_the_available_channels(fitted_clip: Path, tmp_pa
         ({"config": 3}, render_config, r"`config.render` of the header's metadata must be an object, got None"),
         ({"config": {"render": []}}, render_config, r"`config.render` of .* must be an object, got \[\]"),
         ({"config": {"render": {"x": 1}}}, render_config, r"`config.render` of the header's metadata: `x` is unknown"),
-        ({"config": {"render": {"eps2d": "a"}}}, render_config, r"metadata: `eps2d` must be a number, got 'a'"),
-        ({"config": {"render": {"block_width": 5}}}, render_config, r"metadata: `block_width` must be 4, 8, 12 or 16"),
+        (
+            {"config": {"render": {"eps2d": "a"}}},
+            render_config,
+            r"metadata: `eps2d` must be a finite number, at least 0 and at most 1e",
+        ),
+        (
+            {"config": {"render": {"block_width": 5}}},
+            render_config,
+            r"metadata: `block_width` must be at least 4, at most 16 and a multiple of 4",
+        ),
         ({"config": {"motion": 1}}, has_confidence, r"`config.motion.learn_confidence` of .* must be true or false"),
         ({"num_frames": "many"}, num_frames, r"`num_frames` of the header's metadata must be an integer, got 'many'"),
         ({"downscale": None}, capture_of, r"`downscale` of .* must be an integer or a number, got None"),

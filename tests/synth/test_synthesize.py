@@ -106,13 +106,13 @@ def test_synthesize__removes_its_output_after_a_failure(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"cameras": 1}, "`cameras` must be at least 2 or none, got 1"),
+        ({"cameras": 1}, "`cameras` must be at least 2, got 1"),
         ({"frames": 0}, "`frames` must be at least 1, got 0"),
-        ({"spp": 0}, "`spp` must be at least 1 or none, got 0"),
+        ({"spp": 0}, "`spp` must be at least 1, got 0"),
         ({"seed": -1}, "`seed` must be at least 0, got -1"),
         ({"width": 63}, "`width` must be at least 2 and a multiple of 2, got 63"),
         ({"fps": 0}, "`fps` must be above 0, got 0"),
-        ({"noise": -0.1}, "`noise` must be at least 0 and below 1 or none, got -0.1"),
+        ({"noise": -0.1}, "`noise` must be at least 0 and below 1, got -0.1"),
     ],
 )
 def test_synthesize__rejects_settings_out_of_range(tmp_path, settings, message):
