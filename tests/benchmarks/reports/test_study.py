@@ -66,7 +66,7 @@ FAST = (random_scenes, estimates)
 
 def tiny_loop(cameras, points, colors, config, image_masks):
     """Return a loop that fits a few Gaussians in a few steps."""
-    fit = replace(TINY.fit, cross_validation=config.fit.cross_validation, dropping=config.fit.dropping)
+    fit = replace(TINY.fit, cross_validation_views=config.fit.cross_validation_views, dropping=config.fit.dropping)
     return StreamLoop(cameras, points, colors, replace(config, fit=fit, render=TINY.render), image_masks)
 
 
