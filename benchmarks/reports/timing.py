@@ -68,7 +68,7 @@ class Options(ClipOptions):
     """Steps of the first frame."""
 
     def study(self) -> Study:
-        """Return the study of the scenes, each of which is recorded by three rigs."""
+        """Return the study of the scenes, each recorded by three rigs; a cell has the rows of all seeds."""
         rigs = {
             "one-clock": Disturbances(),
             "apart": Disturbances(time_offset=self.time_offset),
@@ -78,8 +78,8 @@ class Options(ClipOptions):
         for seed in self.seeds:
             clips = (self.clip("random", f"random-{seed}-{n}", disturbances=d, seed=seed) for n, d in rigs.items())
             sources = tuple(map(Source.of, clips))
-            scenes.append(Scene({"scene": f"random {seed}"}, (*sources, self.readout, self.fitted)))
-        return Study(measure, scenes, [Variant({}, self.config(dropping=0.0))], self.fit_seeds)
+            scenes.append(Scene({"scene": f"random {seed}"}, (*sources, self.fitted, self.fit_seeds)))
+        return Study(measure, scenes, [Variant({}, self.config(dropping=0.0))])
 
     def table(self, rows: Sequence[Row]) -> str:
         """Return the errors of each scene's offsets, and PSNR where things move."""
@@ -87,14 +87,15 @@ class Options(ClipOptions):
 
 
 def measure(
-    clock: Source, apart: Source, rolling: Source, readout: float, num_frames: int, config: StreamConfig
-) -> dict[str, float]:
-    """Return the errors of a scene's offsets, and the scores of its fits by the way in which it is read."""
+    clock: Source, apart: Source, rolling: Source, num_frames: int, seeds: Sequence[int], config: StreamConfig
+) -> list[dict[str, float]]:
+    """Return the errors of a scene's offsets, and the scores of its fits by the way in which it is read, by seed."""
     synchronised, recorded, shutter = clock.open(), apart.open(), rolling.open()
     errors, offsets, reference = offset_errors(recorded)
     aligned = load_capture(recorded.path, reading=replace(recorded.reading, offset=offsets))
     first = int(aligned.metadata()["cameras"][recorded.names.index(reference)]["first_frame"])
-    cameras = tuple(replace(camera, readout=readout) for camera in shutter.cameras)
+    truth = load_disturbances(shutter.path / "truth")
+    cameras = tuple(replace(camera, readout=truth[camera.name].rolling_shutter) for camera in shutter.cameras)
     fits = {
         "synchronised": (synchronised, first),
         "recorded": (recorded, first),
@@ -102,11 +103,14 @@ def measure(
         "shutter": (shutter, first),
         "readout": (replace(shutter, cameras=cameras), first),
     }
-    found = dict(errors)
-    for name, (capture, begin) in fits.items():
-        for score, value in scores(capture, range(begin, begin + num_frames), first, config).items():
-            found[f"{name}_{score}"] = value
-    return found
+    rows = []
+    for seed in seeds:
+        row, own = {"fit_seed": seed, **errors}, replace(config, seed=seed)
+        for name, (capture, begin) in fits.items():
+            found = scores(capture, range(begin, begin + num_frames), first, own)
+            row |= {f"{name}_{score}": value for score, value in found.items()}
+        rows.append(row)
+    return rows
 
 
 def offset_errors(recorded: Capture) -> tuple[dict[str, float], dict[str, float], str]:
