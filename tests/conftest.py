@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 import drjit as dr
@@ -35,6 +36,15 @@ def llvm_variant():
     mi.set_variant("llvm_ad_rgb")
     yield
     mi.set_variant("llvm_ad_rgb")
+
+
+@pytest.fixture
+def two_threads() -> Iterator[None]:
+    """Two threads of Dr.Jit: with one, Mitsuba waits forever when it reads or writes EXR files."""
+    count = dr.thread_count()
+    dr.set_thread_count(max(count, 2))
+    yield
+    dr.set_thread_count(count)
 
 
 @pytest.fixture
