@@ -10,9 +10,8 @@ STAMP := $(VENV)/.installed
 demo: setup
 	$(BIN)/morgs-mi demo out/demo
 
-# One process per core; the tests of a file share their fixtures, and stay in one.
 test: setup
-	$(BIN)/pytest -n auto --dist loadfile
+	$(BIN)/pytest
 
 test-slow: setup
 	$(BIN)/pytest -m "slow and not gpu"

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Iterator
 from pathlib import Path
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
@@ -26,8 +23,6 @@ from tests.scenes.gaussians import NEW_ATTRIBUTES
 from tests.scenes.moving_splats import CAMERAS, DISTANCE, FRAMES, PIXELS, STEP, moved, write_stream
 
 mi.set_variant("llvm_ad_rgb")  # one for all tests, which then share its kernels
-if "PYTEST_XDIST_WORKER" in os.environ:
-    dr.set_thread_count(1)  # the processes share the cores
 
 
 @pytest.fixture(autouse=True)
@@ -36,15 +31,6 @@ def llvm_variant():
     mi.set_variant("llvm_ad_rgb")
     yield
     mi.set_variant("llvm_ad_rgb")
-
-
-@pytest.fixture
-def two_threads() -> Iterator[None]:
-    """Two threads of Dr.Jit: with one, Mitsuba waits forever when it reads or writes EXR files."""
-    count = dr.thread_count()
-    dr.set_thread_count(max(count, 2))
-    yield
-    dr.set_thread_count(count)
 
 
 @pytest.fixture

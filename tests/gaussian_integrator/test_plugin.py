@@ -24,7 +24,6 @@ from tests.scenes.gaussians import make_unit_scene, to_gaussians
 from tests.scenes.plugin import AOVS, make_mitsuba_scene
 
 
-@pytest.mark.usefixtures("two_threads")
 def test_gaussian_splat__writes_undeveloped_renders(raw, tmp_path):
     """The command `mitsuba scene.xml` requests no tensor and writes the film."""
     scene = make_mitsuba_scene(to_gaussians(raw), aovs=AOVS)
@@ -171,7 +170,6 @@ SCENE_FILE = """<scene version="3.0.0">
 </scene>"""
 
 
-@pytest.mark.usefixtures("two_threads")
 def test_gaussian_splat__renders_a_scene_file_as_the_limits_describe(tmp_path, raw):
     """The command `mitsuba` does not find the plugin; the Python command in docs/limits.md renders the same file."""
     write_ply(tmp_path / "gaussians.ply", to_gaussians(raw))
