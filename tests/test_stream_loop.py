@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, Gaussians, RenderConfig, observation, rasterize, stream_loop
+from morgs_mi import Camera, Gaussians, RenderConfig, rasterize, stream_loop
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.codec.container import PacketKind, encode_packet
 from morgs_mi.codec.packets import coded_frames, decode, play
@@ -19,6 +19,7 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.evaluate.metrics import endpoint_error, psnr
 from morgs_mi.fit.fit_config import DensityConfig, FitConfig, LearningRates, ShortFitConfig
+from morgs_mi.loop import observation
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.runs.recorder import stream_capture

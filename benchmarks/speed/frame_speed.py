@@ -34,17 +34,17 @@ from morgs_mi.stream_loop import StreamLoop
 
 # Stages of a frame: file and function that are timed.
 STAGES = {
-    "change": ("observation.py", "see_frame"),
-    "flow": ("observation.py", "_flows"),
+    "change": ("loop/observation.py", "see_frame"),
+    "flow": ("loop/observation.py", "_flows"),
     "part": ("stream_loop.py", "_active_set"),
-    "targets": ("losses/ssim.py", "__init__"),
+    "targets": ("method/ssim.py", "__init__"),
     "lift": ("method/lift.py", "lift_flow"),
     "propagation": ("method/propagation.py", "propagate_motion"),
     "search": ("method/search.py", "search_motion"),
     "refinement": ("method/photometric.py", "refine_displacement"),
     "colour": ("method/photometric.py", "mean_color_error"),
     "steps": ("fit/optimise.py", "optimise"),
-    "density": ("losses/attribution.py", "densification_scores"),
+    "density": ("method/attribution.py", "densification_scores"),
     "packet": ("codec/packets.py", "residual_packet"),
     "decoding": ("codec/packets.py", "decode"),
 }

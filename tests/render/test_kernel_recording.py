@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi.render import recording
+from morgs_mi.render import kernel_recording
 
 
 def scaled(factor: int, *arrays: Any) -> list[Any]:
@@ -22,9 +22,9 @@ def test_recorded__bounds_the_number_of_recordings(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     made, freeze = [], dr.freeze
-    monkeypatch.setattr(recording, "_MOST_RECORDINGS", 10)
+    monkeypatch.setattr(kernel_recording, "_MOST_RECORDINGS", 10)
     monkeypatch.setattr(dr, "freeze", lambda *args, **settings: made.append(freeze(*args, **settings)) or made[-1])
-    function = recording.recorded(scaled, 3)
+    function = kernel_recording.recorded(scaled, 3)
     for _ in range(2):
         for pattern in range(32):
             sizes = [2 + (pattern >> bit & 1) for bit in range(5)]

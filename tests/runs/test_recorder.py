@@ -66,7 +66,7 @@ def assert_same(out: Path, whole: Path) -> None:
 
 def process(out: Path, *left: int) -> subprocess.Popen:
     args = [sys.executable, "-m", "tests.scenes.recording", str(out), *map(str, left)]
-    started = subprocess.Popen(args, stdout=subprocess.PIPE, cwd=Path(__file__).parent.parent)
+    started = subprocess.Popen(args, stdout=subprocess.PIPE, cwd=Path(__file__).parents[2])
     assert started.stdout is not None
     assert started.stdout.readline() == b"ready\n"
     return started

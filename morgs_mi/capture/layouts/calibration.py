@@ -1,6 +1,6 @@
 """The interface of a capture layout, and helpers that the readers share.
 
-A reader module exposes a `Layout`, which `registry.py` lists.
+A reader module exposes a `Layout`, which `layout_registry.py` lists.
 """
 
 from __future__ import annotations

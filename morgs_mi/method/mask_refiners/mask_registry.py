@@ -30,7 +30,7 @@ def mask_refiner(mask_method: str, config: MaskConfig | None = None) -> MaskRefi
     The last few refiners are cached, so a network is loaded once.
 
     Args:
-        mask_method: one of `MASK_REFINERS.usages`, e.g. ``grabcut`` (see `opencv`) or
+        mask_method: one of `MASK_REFINERS.usages`, e.g. ``grabcut`` (see `opencv_masks`) or
             ``sam2:ENCODER.onnx,DECODER.onnx`` (see `network`).
         config: settings of the refiners; None: the defaults.
 

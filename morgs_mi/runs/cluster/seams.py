@@ -78,7 +78,7 @@ class SeamConfig:
     """Fits of the first frame of the overlap, one after the other, each with a round of density control."""
     epochs: Annotated[int, AtLeast(1)] = 4
     """Passes over all training views in each of them."""
-    overlap: Annotated[int, AtLeast(1)] = 10
+    overlap: Annotated[int, AtLeast(0)] = 10
     """Last frames of a segment that the next one fits too, and in which the stream fades to it."""
 
     def __post_init__(self) -> None:

@@ -12,7 +12,7 @@ import pytest
 from morgs_mi.calibration.checks.rig_check import MAX_ERROR, SharedFeatures, check_rig, match_capture
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.features import match_views
-from morgs_mi.capture.layouts import registry
+from morgs_mi.capture.layouts import layout_registry
 from morgs_mi.capture.layouts.calibration import PoseConvention
 from morgs_mi.capture.layouts.poses_bounds import read_poses_bounds, write_poses_bounds
 from morgs_mi.core.camera import Camera
@@ -55,9 +55,9 @@ def test_check_rig__names_another_pose_convention(
 ) -> None:
     """Each of the four conventions is read as the one that the layout expects."""
     expected = EXPECTED[layout]
-    toy = replace(registry.LAYOUTS[0], name=layout, poses=PoseConvention(*expected))
+    toy = replace(layout_registry.LAYOUTS[0], name=layout, poses=PoseConvention(*expected))
     if layout.startswith("toy"):
-        monkeypatch.setattr(registry, "LAYOUTS", (*registry.LAYOUTS, toy))
+        monkeypatch.setattr(layout_registry, "LAYOUTS", (*layout_registry.LAYOUTS, toy))
     given = [interpreted(POSES[kind](camera), *expected) for camera in capture.cameras]
     read = with_cameras(replace(capture, layout=layout), lambda i, c: replace(c, viewmat=given[i]))
     check = check_rig(read, shared)

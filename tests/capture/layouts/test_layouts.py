@@ -13,7 +13,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.capture.layouts import registry
+from morgs_mi.capture.layouts import layout_registry
 from morgs_mi.capture.layouts.calibration import Calibration, Layout, required_clips
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import MODELS, Lens
@@ -228,7 +228,7 @@ def test_find_layout__finds_a_layout_that_is_added(tmp_path: Path, monkeypatch: 
         return Calibration(tuple(rig(tuple(clips))), (Lens(),) * len(clips), tuple(clips.values()))
 
     toy = Layout("toy", ("toy.txt",), lambda path: (path / "toy.txt").is_file(), read)
-    monkeypatch.setattr(registry, "LAYOUTS", (*registry.LAYOUTS, toy))
+    monkeypatch.setattr(layout_registry, "LAYOUTS", (*layout_registry.LAYOUTS, toy))
     layouts.videos(path, names)
     with pytest.raises(FileNotFoundError, match=r"sparse/0, sparse, .*, poses_bounds.npy or toy.txt\), found none"):
         load_capture(path)
@@ -241,8 +241,10 @@ def test_find_layout__finds_a_layout_that_is_added(tmp_path: Path, monkeypatch: 
 
 
 def test_layout_called__returns_every_layout_by_its_name() -> None:
-    assert [registry.layout_called(layout.name) for layout in registry.LAYOUTS] == list(registry.LAYOUTS)
-    assert registry.layout_called("toy") is None
+    assert [layout_registry.layout_called(layout.name) for layout in layout_registry.LAYOUTS] == list(
+        layout_registry.LAYOUTS
+    )
+    assert layout_registry.layout_called("toy") is None
 
 
 def test_clips_by_camera__ignores_folders_without_clips(tmp_path: Path) -> None:

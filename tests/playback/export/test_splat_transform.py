@@ -18,7 +18,7 @@ from morgs_mi.io.splats import read_splats
 from tests.assertions import assert_close
 from tests.scenes.changing_splats import splats, write_stream
 
-PAGE = (Path(__file__).parents[2] / "docs/exports.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[3] / "docs/exports.md").read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^    (for .*npx .*; done)$", PAGE, re.MULTILINE)
 
 pytestmark = pytest.mark.slow

@@ -19,7 +19,7 @@ from morgs_mi.codec.reader import StreamReader
 from tests.cli.commands import QUICK
 from tests.scenes.recording import CONFIG, write_recording
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 TEXT = (ROOT / "docs" / "cluster.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"<!-- (run|start|file [^ ]+) -->\n```\w+\n(.*?)```", TEXT, re.DOTALL)
 FRAMES = 4

@@ -66,7 +66,7 @@ def test_read_jobs__has_default_settings_and_one_seed(tmp_path: Path) -> None:
         ('captures = ["x"]\nseeds = [1, 1]', r"jobs\.toml: `seeds` must be one or more that differ, got 1, 1"),
         (
             'captures = ["x"]\nseeds = ["a"]',
-            r"jobs\.toml: `seeds` must be a list \(each a whole number below 2\^64\), got \['a'\]",
+            r"jobs\.toml: `seeds` must be a list \(each a whole number below 2\^64\), got \('a',\)",
         ),
         ('captures = ["x"]\nseed = 1', r"jobs\.toml: `seed` is unknown, expected `seeds`"),
         (

@@ -108,7 +108,7 @@ def test_fit_live__reads_videos_through_pipes(tmp_path: Path, rig: Path) -> None
             playing.enter_context(in_background(piping(pipe, data, repeats * len(clip) / FPS)))
         rows = fit_live(pipes, tmp_path / "out", LiveConfig(rig, downscale=2, frames=4), CONFIG)
     assert len(rows) == 4
-    assert sum(row.dropped for row in rows) > 10, "the fit is slower than the clip"
+    assert sum(row.dropped for row in rows) > 0, "the fit is slower than the clip"
     assert sum(row.dropped + 1 for row in rows) <= repeats * len(clips()[0])
     assert max(row.skew for row in rows) <= 0.5
     assert not any(row.problems for row in rows)

@@ -92,7 +92,7 @@ def test_live_frames__refuse_bad_sources(rig: Capture, sources, error, message: 
 
 def test_live_page__loop_runs(rig: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
     """The loop over live frames in docs/live.md, with raw pipes in place of FFmpeg's."""
-    text = (Path(__file__).parents[2] / "docs" / "live.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[3] / "docs" / "live.md").read_text(encoding="utf-8")
     *_, example = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     reads, pushed = iter(NAMES), []
 
