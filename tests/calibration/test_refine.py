@@ -18,9 +18,10 @@ from morgs_mi.calibration.refine import (
 )
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.core.progress import Progress
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.fit.fit_config import CameraPriors, FitConfig, ShortFitConfig
-from morgs_mi.fit.view import View, rendered
+from morgs_mi.fit.view import View, rendered, withheld_blocks
 from morgs_mi.playback.visualise import to_uint8, write_png
 from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.runs.recorder import with_points
@@ -159,10 +160,22 @@ def test_refine_cameras__takes_cameras_with_which_withheld_pixels_gain(splat_cap
     assert np.array_equal(refined.points, splat_capture.points) is not taken
 
 
+def test_refine_cameras__compares_the_views_that_have_withheld_pixels(splat_capture, monkeypatch):
+    """Small views may have none."""
+
+    def with_an_empty_view(views, width, rng):
+        kept, unseen = withheld_blocks(views, width, rng)
+        return kept, [unseen[0]._replace(mask=np.zeros(unseen[0].image.shape[:2], bool)), *unseen[1:]]
+
+    monkeypatch.setattr("morgs_mi.calibration.refine.withheld_blocks", with_an_empty_view)
+    _, found = refine_cameras(splat_capture, LEAST)
+    assert np.isfinite(found.calibrated_psnr)
+
+
 @pytest.mark.long
 def test_refine_cameras__improves_withheld_pixels_of_disturbed_cameras(textured_capture):
     disturbed_capture = replace(textured_capture, cameras=tuple(disturbed(textured_capture.cameras, 1.5)))
-    capture = with_points(disturbed_capture, 0, lambda *_: None)
+    capture = with_points(disturbed_capture, 0, Progress())
     how = ShortFitConfig(steps=200, rounds=2, width=160)
     refined, found = refine_cameras(capture, FitConfig(refine_cameras="auto", short_fits=how))
     assert found.taken
