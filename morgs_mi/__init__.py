@@ -19,7 +19,8 @@ from morgs_mi.gaussian_integrator import ellipsoids  # noqa: E402  (registers th
 from morgs_mi.loop.stream_config import StreamConfig  # noqa: E402
 from morgs_mi.method.motion_config import MotionConfig  # noqa: E402
 from morgs_mi.playback.export.tracks import extract_tracks  # noqa: E402
-from morgs_mi.playback.player import channel_image, open_stream, render_stream  # noqa: E402
+from morgs_mi.playback.player import channel_image, render_stream  # noqa: E402
+from morgs_mi.playback.streams import open_stream  # noqa: E402
 from morgs_mi.playback.visualise import confidence_image, depth_image, motion_image  # noqa: E402
 from morgs_mi.plugins.light_probe import light_probe  # noqa: E402
 from morgs_mi.plugins.shadows import shadow_ratio, shadowed  # noqa: E402

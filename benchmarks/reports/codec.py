@@ -36,7 +36,7 @@ from morgs_mi.codec.packets import CodedFrame, coded_frames, decode, residual_pa
 from morgs_mi.codec.quantisation import step_sizes
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.playback.player import open_stream
+from morgs_mi.playback.streams import open_stream
 from morgs_mi.runs.cluster.executor import Workers, wait_for
 from morgs_mi.runs.cluster.segments import fit_in_segments
 from morgs_mi.runs.recorder import stream_capture

@@ -15,7 +15,7 @@ def write_pages(app: Sphinx, error: Exception | None) -> None:
 
     mi.set_variant("llvm_ad_rgb")
     from morgs_mi.playback.export.web import write_web_page
-    from morgs_mi.playback.player import open_stream
+    from morgs_mi.playback.streams import open_stream
 
     for stream in Path(app.srcdir, "gallery").glob("*.morgs"):
         page = Path(app.outdir, "gallery", f"{stream.stem}.html")

@@ -48,7 +48,7 @@ class Ply:
         from morgs_mi.io.ply import write_ply
         from morgs_mi.playback.export.clips import select_frames, write_each
         from morgs_mi.playback.export.order import by_place
-        from morgs_mi.playback.player import open_stream
+        from morgs_mi.playback.streams import open_stream
 
         stream = open_stream(self.out)
         frames = select_frames(stream, self.frames)
@@ -80,7 +80,7 @@ class Gltf:
         from morgs_mi.playback.export.axes import gltf_axes
         from morgs_mi.playback.export.clips import select_frames, write_each
         from morgs_mi.playback.export.gltf_export import write_gltf
-        from morgs_mi.playback.player import open_stream
+        from morgs_mi.playback.streams import open_stream
 
         stream = open_stream(self.out)
         frames = select_frames(stream, self.frames)
@@ -112,7 +112,7 @@ class Usd:
     def run(self) -> None:
         from morgs_mi.playback.export.clips import select_frames
         from morgs_mi.playback.export.usd import write_usd
-        from morgs_mi.playback.player import open_stream
+        from morgs_mi.playback.streams import open_stream
 
         stream = open_stream(self.out)
         frames = select_frames(stream, self.frames)
@@ -152,7 +152,7 @@ class Flight:
         from morgs_mi.codec.packets import play
         from morgs_mi.playback.export.clips import frame_numbers, repeated_frames, repeated_seconds, write_flight
         from morgs_mi.playback.export.paths import focus, load_path, orbit, through_cameras
-        from morgs_mi.playback.player import open_stream
+        from morgs_mi.playback.streams import open_stream
 
         stream = open_stream(self.out)
         frames = frame_numbers(stream)
@@ -191,7 +191,7 @@ class Tracks:
     def run(self) -> None:
         from morgs_mi.playback.export.clips import frame_numbers
         from morgs_mi.playback.export.tracks import extract_tracks, write_tracks
-        from morgs_mi.playback.player import open_stream
+        from morgs_mi.playback.streams import open_stream
 
         stream = open_stream(self.out)
         output, _ = destination(stream.path, self.output, TRACKS)
@@ -219,7 +219,7 @@ class Web:
     def run(self) -> None:
         from morgs_mi.playback.export.clips import frame_numbers
         from morgs_mi.playback.export.web import write_web_folder, write_web_page
-        from morgs_mi.playback.player import open_stream
+        from morgs_mi.playback.streams import open_stream
 
         stream = open_stream(self.out)
         output, chosen = destination(stream.path, self.output, WEB, self.format)

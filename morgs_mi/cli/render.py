@@ -65,7 +65,8 @@ class Render:
             render_inserted,
             selected,
         )
-        from morgs_mi.playback.player import find_camera, open_stream
+        from morgs_mi.playback.player import find_camera
+        from morgs_mi.playback.streams import open_stream
 
         stream = open_stream(self.out)
         camera = find_camera(stream, self.camera)

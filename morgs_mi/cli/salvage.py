@@ -27,7 +27,7 @@ class Salvage:
 
     def run(self) -> None:
         from morgs_mi.codec.salvage import write_salvaged
-        from morgs_mi.playback.player import open_stream
+        from morgs_mi.playback.streams import open_stream
 
         stream = open_stream(self.stream)
         frames, damaged = write_salvaged(stream, check_output(self.out))

@@ -13,7 +13,8 @@ from morgs_mi.evaluate.measures import Motion3D, Quality, Registration, Tracking
 from morgs_mi.evaluate.results import Evaluation, FrameScores, PlaybackTimes, Sizes, known_mean
 from morgs_mi.fit.forecast import forecast
 from morgs_mi.io.bounded import read_json
-from morgs_mi.playback.player import open_stream, playback_speed
+from morgs_mi.playback.player import playback_speed
+from morgs_mi.playback.streams import open_stream
 
 __all__ = ["evaluate_stream"]
 

@@ -15,11 +15,11 @@ from morgs_mi.playback.player import (
     channel_image,
     has_confidence,
     has_offset,
-    open_stream,
     open_stream_capture,
     render_stream,
     truth_for_camera,
 )
+from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.visualise import (
     confidence_image,
     confidence_legend,

@@ -40,7 +40,7 @@ __all__ = [
     "CHANNELS",
     "MOTION_SCALE",
     "OFFSET_SCALE",
-    "PlayableStream",
+    "STREAM",
     "available_channels",
     "channel_image",
     "find_camera",
@@ -49,7 +49,6 @@ __all__ = [
     "has_offset",
     "metadata_entry",
     "num_frames",
-    "open_stream",
     "open_stream_capture",
     "playback_speed",
     "render",
@@ -67,7 +66,8 @@ MOTION_SCALE = 0.03
 """Speed at which the colour of motion is fully saturated, as a fraction of the image width per frame."""
 OFFSET_SCALE = 0.1
 """The same for the learned offset, as a fraction of that speed: the offset is the smaller part of the motion."""
-_STREAM = "stream.morgs"
+STREAM = "stream.morgs"
+"""Name of the stream in the folder of a fit."""
 _MOST_TIMED_FRAMES = 30
 _JSON_TYPES = {
     dict: "an object",
@@ -79,42 +79,13 @@ _JSON_TYPES = {
 }
 
 
-class PlayableStream(StreamReader):
-    """A stream file that plays in the output of a notebook's cell."""
-
-    def _repr_html_(self) -> str:
-        # The page draws what this module renders, so it is imported when it is shown.
-        from morgs_mi.playback.export.notebook import stream_html
-
-        return stream_html(self)
-
-
-def open_stream(out: str | Path) -> PlayableStream:
-    """Open a stream file, or the ``stream.morgs`` in the folder of a fit.
-
-    Example:
-        >>> stream = morgs_mi.open_stream("out/arm_fit")
-        >>> for frame, images in morgs_mi.render_stream(stream, stream.cameras[0]):
-        ...     print(frame, images["color"].shape)
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: the file is not a stream, or its header is broken or missing.
-    """
-    path = Path(out)
-    path = path / _STREAM if path.is_dir() else path
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a stream, found none; check the path or fit a capture first.")
-    return PlayableStream(path)
-
-
 def stream_name(stream: StreamReader) -> str:
     """Return the name of a stream: that of its folder or file, without `.morgs`.
 
     Bytes of the name that are not UTF-8 are replaced, because pages and messages to a browser cannot contain them.
     """
     path = stream.path.resolve()
-    name = path.parent.name if path.name == _STREAM else path.stem
+    name = path.parent.name if path.name == STREAM else path.stem
     return os.fsencode(name).decode(errors="replace")
 
 

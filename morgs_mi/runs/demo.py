@@ -23,7 +23,8 @@ from morgs_mi.io.bounded import read_json
 from morgs_mi.io.video_writer import playable_format, write_video
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.export.frames import pad_to_even
-from morgs_mi.playback.player import channel_image, open_stream, render_stream, truth_for_camera
+from morgs_mi.playback.player import channel_image, render_stream, truth_for_camera
+from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.visualise import contact_sheet, label, motion_legend, side_by_side, write_png
 from morgs_mi.runs.recorder import stream_capture
 from morgs_mi.synth.synth_config import SynthConfig

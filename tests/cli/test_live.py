@@ -12,7 +12,7 @@ from morgs_mi.cli import live as module
 from morgs_mi.cli.live import Live, _Lines, _summary
 from morgs_mi.cli.settings import Settings
 from morgs_mi.io.video_writer import write_video
-from morgs_mi.playback.player import open_stream
+from morgs_mi.playback.streams import open_stream
 from morgs_mi.runs.live.fit_live import LiveFrame
 from tests.cli.commands import QUICK, assert_refused
 from tests.scenes import noise_capture

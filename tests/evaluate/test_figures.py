@@ -12,7 +12,7 @@ import pytest
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.evaluate.figures import draw_stream, motion_scale
-from morgs_mi.playback.player import open_stream
+from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.visualise import GAP
 from tests.assertions import assert_close
 from tests.scenes.moving_splats import CAMERAS, FRAMES, HEIGHT, PIXELS, WIDTH, write_stream

@@ -24,13 +24,13 @@ from morgs_mi.playback.player import (
     has_confidence,
     has_offset,
     num_frames,
-    open_stream,
     open_stream_capture,
     playback_speed,
     render_config,
     render_stream,
     truth_for_camera,
 )
+from morgs_mi.playback.streams import open_stream
 from tests.assertions import assert_close
 from tests.scenes.moving_splats import CAMERAS, FRAMES, HEIGHT, WIDTH, moved, write_stream
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from morgs_mi.codec.container import PacketKind, TruncatedStreamError
 from morgs_mi.codec.packets import CodedFrame, frames_near
-from morgs_mi.playback.player import open_stream
+from morgs_mi.playback.streams import open_stream
 
 __all__ = ["NO_TRAILS", "FrameCache", "Trails"]
 

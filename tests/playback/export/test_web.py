@@ -26,7 +26,8 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.playback.export.notebook import stream_html
 from morgs_mi.playback.export.web import text_of_bytes, write_web_folder, write_web_page
-from morgs_mi.playback.player import channel_image, open_stream, render, render_config
+from morgs_mi.playback.player import channel_image, render, render_config
+from morgs_mi.playback.streams import open_stream
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.changing_splats import rig, splats, write_stream
 

@@ -7,7 +7,7 @@ import pytest
 
 from morgs_mi.codec.packets import CodedFrame, coded_frames
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.playback.player import open_stream
+from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.viewer.frame_cache import FrameCache
 from tests.assertions import assert_close
 from tests.codec.forge import forged_streams

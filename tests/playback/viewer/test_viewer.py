@@ -19,7 +19,8 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.evaluate.metrics import psnr
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.export.axes import up_direction
-from morgs_mi.playback.player import channel_image, open_stream, render, render_config
+from morgs_mi.playback.player import channel_image, render, render_config
+from morgs_mi.playback.streams import open_stream
 from tests.scenes.captures import n3dv
 from tests.scenes.changing_splats import NAMES, write_stream
 

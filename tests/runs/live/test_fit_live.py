@@ -20,7 +20,7 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.evaluate.metrics import psnr_of
 from morgs_mi.io.png import png_bytes
-from morgs_mi.playback.player import open_stream
+from morgs_mi.playback.streams import open_stream
 from morgs_mi.runs.live.fit_live import fit_live
 from morgs_mi.runs.live.live_config import LiveConfig
 from morgs_mi.runs.recorder import stream_capture
