@@ -46,6 +46,7 @@ VALUES: dict[str, Any] = {
     "fit.density.split_scale": 1.0,
     "fit.density.min_opacity": 0.4,
     "motion.flow.fine_width": 32,
+    "motion.active_set.min_weight": 20.0,
     "motion.active_set.quiet_views": 1,
     "render.stop_transmittance": 0.5,
     "render.alpha_max": 0.5,
