@@ -1,4 +1,4 @@
-"""A still life under a swinging lamp with a flickering exposure: the light changes everywhere, few objects move.
+"""A still life under a swinging lamp with a flickering exposure: the light changes everywhere, and few objects move.
 
 From frame to frame every pixel becomes brighter or darker by up to a tenth in linear light, and shadows move by several
 pixels, while a few slow objects move by 1 to 4 pixels per frame at 320x240. Changes of shadow and light are not motion

@@ -1,4 +1,4 @@
-"""A scene that the seed draws afresh, rig and noise included: what is tuned to the other scenes is tested here."""
+"""A random scene for each seed, with its own rig and noise: it tests methods that are tuned to the other scenes."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def propeller(time: float, blade: int = 0) -> np.ndarray:
 
 
 def link(time: float, index: int) -> np.ndarray:
-    """Return the pose of a link of the rope: a travelling wave whose amplitude grows towards the end."""
+    """Return the pose of a link of the rope: a travelling wave with an amplitude that grows towards the end."""
     pose = translate(*HOOK)
     for k in range(index + 1):
         wave = 4.4 * time - 0.55 * k

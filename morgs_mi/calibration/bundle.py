@@ -1,21 +1,21 @@
-"""Bundle adjustment: the changes of calibrated cameras, and the points, that agree best with matched features.
+"""Bundle adjustment: changes of calibrated cameras, and points, that agree best with matched features.
 
 A point X lies at x = exp([w]) R (X - C - d) in the axes of a camera with the rotation R and the centre C, and at the
 pixel
 
-    u = (1 + s) f (1 + k1 r^2 + k2 r^4) x / z + c + p W ,    r = |(x, y)| / z ,
+    u = (1 + s) f (1 + k1 r^2 + k2 r^4) x / z + c + p W ,    r = |(x, y)| / z .
 
-so that the change of a camera has eleven numbers: a small rotation w [3], a displacement d [3] of its centre, the
-relative change s of its focal lengths, the displacement p [2] of its principal point in image widths W, and the radial
-distortion k [2] that is left in its images. They have independent normal priors around zero.
+The change of a camera has eleven numbers: a small rotation w [3], a displacement d [3] of its centre, the relative
+change s of its focal lengths, the displacement p [2] of its principal point in image widths W, and the radial
+distortion k [2] left in its images. They have independent normal priors around zero.
 
-Images do not determine a common similarity of cameras and points, and hardly a common change of the focal lengths,
-which depths compensate. Left to the priors, all cameras would turn where that costs less than displacements, away from
-every camera that takes no part. Constraints therefore fix the gauge: changes have no common part. By that, the shifts
-of pixels that changes cause for fixed points are orthogonal to the shifts by any similarity of the points, to first
-order and in the metric of the equations, and the mean of s is zero.
+Images do not determine a common similarity of cameras and points. They hardly determine a common change of the focal
+lengths, which depths compensate. With the priors alone, all cameras would turn together, relative to the cameras that
+are not adjusted, where a rotation costs less than displacements. Constraints therefore fix the gauge: changes have no
+common part. The mean of s is zero. The shifts of pixels that changes cause for fixed points are orthogonal to the
+shifts by any similarity of the points, to first order and in the metric of the equations.
 
-Reprojection errors have Cauchy's loss in units of their own scale, so that wrong matches do not count.
+Reprojection errors have Cauchy's loss in units of their own scale, so wrong matches have little influence.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ __all__ = [
     "undistorted",
 ]
 
-# Numbers that change a camera.
+# Number of parameters of a camera's change.
 CHANGES = 11
 # Steps, and the relative decrease of the loss below which they end.
 _STEPS, _LEAST_DECREASE = 60, 1e-6
-# Damping of Levenberg and Marquardt at the start and at most.
+# Initial and largest damping of Levenberg and Marquardt.
 _DAMPING, _MOST_DAMPING = 1e-3, 1e6
-# px, the scale of reprojection errors that cameras with the errors of the priors have, at least.
+# px, least scale of the reprojection errors of cameras with errors as large as the priors.
 _LARGE_ERROR = 1.7
 # px, the least scale of the reprojection errors. Cauchy's loss halves the weight of an error of 2.4 deviations.
 _LEAST_SCALE, _CAUCHY = 0.05, 2.4
@@ -60,7 +60,7 @@ def bundle_adjust(cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndar
     Args:
         cameras: V views as calibrated.
         tracks: features of P > 0 points, each with at most one in a view.
-        deviations: of the priors of a camera's changes [11], as from `likely_deviations`.
+        deviations: standard deviations of the priors of a camera's changes [11], as from `likely_deviations`.
     """
     damping, changes = _DAMPING, np.zeros((len(cameras), CHANGES))
     points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
@@ -91,12 +91,12 @@ def bundle_adjust(cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndar
 def likely_deviations(cameras: Sequence[Camera], tracks: Tracks, deviations: np.ndarray) -> np.ndarray:
     """Return the deviations [11] of the errors of calibrated cameras, which are small where features reproject well.
 
-    What such features leave open, for example a slow bend of the whole rig, would follow their noise otherwise.
+    Changes that these features do not determine, e.g. a slow bend of the rig, would otherwise follow their noise.
 
     Args:
         cameras: V views as calibrated.
         tracks: features of P > 0 points.
-        deviations: of the priors [11], the most that is returned.
+        deviations: standard deviations of the priors [11], the upper bound of the result.
     """
     points = intersect(tracks.ids, tracks.views, tracks.pixels, cameras, tracks.count)
     errors = _errors(cameras, np.zeros((len(cameras), CHANGES)), points, tracks)
@@ -114,14 +114,14 @@ def changed_camera(camera: Camera, changes: np.ndarray) -> Camera:
 
 
 def prior_deviations(extent: float, priors: CameraPriors) -> np.ndarray:
-    """Return the standard deviations [11] of the changes of a camera; `extent` of the scene, world units."""
+    """Return the standard deviations [11] of the changes of a camera; `extent` is the scene extent, world units."""
     of_pose = np.deg2rad(priors.rotation), priors.position * extent
     terms = priors.distortion, 0.2 * priors.distortion
     return np.repeat((*of_pose, priors.focal, priors.principal_point, *terms), (3, 3, 1, 2, 1, 1))
 
 
 def distorted(camera: Camera, pixels: np.ndarray, distortion: np.ndarray) -> np.ndarray:
-    """Return where radial distortion k [2] shows the pixels [n, 2] of a pinhole camera."""
+    """Return the positions [n, 2] at which radial distortion k [2] shows the pixels [n, 2] of a pinhole camera."""
     focal, centre = camera.K[[0, 1], [0, 1]], camera.K[:2, 2]
     square = np.sum(((pixels - centre) / focal) ** 2, axis=-1, keepdims=True)
     return pixels + (pixels - centre) * (distortion[0] + distortion[1] * square) * square
@@ -140,10 +140,10 @@ def camera_jacobian(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the derivatives of pixel positions by the changes of the camera [n, 2, 11] and by the points [n, 2, 3].
 
-    The derivative by w is that by a further small rotation, which is the same to first order.
+    The derivative by w is the derivative by a further small rotation, which is equal to first order.
 
     Args:
-        camera: with the changes so far.
+        camera: camera with the changes so far.
         factor: 1 + s.
         points: [n, 3], world units; the derivatives of points behind the near plane are zero.
         distortion: k [2] so far, of images that are not undistorted by it; default: none.
@@ -188,8 +188,8 @@ class NormalEquations:
         """Add the observations of n different points in a view.
 
         Args:
-            view: its index.
-            ids: of the points.
+            view: index of the view.
+            ids: indices of the points.
             jacobians: as from `camera_jacobian`.
             G: [n, 2, 2].
             b: [n, 2].
@@ -202,7 +202,7 @@ class NormalEquations:
         self._across[ids, view] += left @ of_point
 
     def add_camera(self, view: int, of_camera: np.ndarray, G: np.ndarray, b: np.ndarray) -> None:
-        """Add observations of points that stay where they are; arguments as for `add`."""
+        """Add observations of fixed points; arguments as for `add`."""
         left = of_camera.transpose(0, 2, 1) @ G
         self._cameras[view] += np.tensordot(left, of_camera, axes=((0, 2), (0, 1)))
         self._right[view] += np.einsum("nij,ni->j", of_camera, b)
@@ -227,10 +227,10 @@ class NormalEquations:
         """Return the step of Levenberg and Marquardt for cameras [V, 11] and points [P, 3], by Schur's complement.
 
         Args:
-            changes: of the cameras so far [V, 11].
-            deviations: of the priors of a camera's changes [11].
+            changes: changes of the cameras so far [V, 11].
+            deviations: standard deviations of the priors of a camera's changes [11].
             damping: relative increase of the diagonal.
-            frame: constraints that the changes meet after the step, as from `frame`; None: none.
+            frame: constraints on the changes after the step, as from `frame`; None: no constraints.
         """
         views, size = changes.shape
         precision = deviations**-2.0
@@ -249,7 +249,7 @@ class NormalEquations:
 
 
 def _solved(A: np.ndarray, b: np.ndarray, rows: np.ndarray, value: np.ndarray) -> np.ndarray:
-    """Return the x of least x' A x / 2 - b' x for which `rows` x = `value`; rows of zeros count for nothing."""
+    """Return the x that minimises x' A x / 2 - b' x with `rows` x = `value`; rows of zeros are ignored."""
     scale = np.diag(A).mean()
     lengths = np.maximum(np.linalg.norm(rows, axis=1), 1e-30) / scale
     rows, value = rows / lengths[:, None], value / lengths
@@ -265,7 +265,7 @@ def _cross(vectors: np.ndarray) -> np.ndarray:
 
 
 def _damped(blocks: np.ndarray, damping: float) -> np.ndarray:
-    """Return blocks [..., k, k] with an increased diagonal; that of a singular block becomes a little more than 0."""
+    """Return blocks [..., k, k] with an increased diagonal, which is above 0 for singular blocks, too."""
     diagonal = np.einsum("...ii->...i", blocks)
     added = damping * diagonal + 1e-9 * diagonal.max(axis=-1, keepdims=True) + 1e-30
     return blocks + added[..., None] * np.eye(blocks.shape[-1])

@@ -30,7 +30,7 @@ __all__ = ["CalibrateConfig", "CalibrationResult", "calibrate"]
 # With fewer features in a view COLMAP cannot register it.
 _MIN_FEATURES = 100
 _TRIES = 3
-# COLMAP registers a camera with fewer points, but its pose then rests on a few of them.
+# COLMAP registers a camera with fewer points, but its pose then depends on a few of them.
 _MIN_POINTS = 50
 _MORE_TEXTURE = "light the scene evenly, add textured objects, or record a frame with such objects before the take"
 
@@ -63,7 +63,7 @@ class CalibrationResult:
         left_out: names of the cameras that could not be calibrated.
         points: number of points.
         error: mean reprojection error of the points, px.
-        checks: result of every camera, those that are left out included; `matches` is the number of its points.
+        checks: result of every camera, including the ones left out; `matches` is the number of its points.
     """
 
     model: Path
@@ -88,11 +88,11 @@ def calibrate(
         config: settings.
         overwrite: whether to replace an existing model.
         progress: called with (stage, done, total).
-        without: names of cameras that are left out.
+        without: names of the cameras to leave out.
 
     Raises:
         FileNotFoundError: there is no such folder.
-        FileExistsError: there is a `sparse` folder and `overwrite` is not given.
+        FileExistsError: there is a `sparse` folder and `overwrite` is not set.
         ValueError: fewer than two clips, clips that cannot be read, or views that do not determine the cameras; the
             message names them and suggests a remedy.
         OSError: the model cannot be written.
@@ -155,7 +155,7 @@ def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
 def _frames(
     path: Path, config: CalibrateConfig, without: Sequence[str]
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Return one image of each camera by its name, and the masks of the opaque pixels where not all are."""
+    """Return one image per camera by its name, and the masks of opaque pixels of images with transparent ones."""
     clips = clips_by_camera(path) or photos(path)
     clips = {name: clips[name] for name in names_without(path, clips, without)}
     if len(clips) < 2:
@@ -200,7 +200,7 @@ def _map(
     masked.mkdir()
     for name, image in images.items():
         _write_png(folder / f"{name}.png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
-        if masks:  # COLMAP needs one for every image, or none at all
+        if masks:  # COLMAP needs a mask for every image, or none
             opaque = masks.get(name, np.ones(image.shape[:2], bool))
             _write_png(masked / f"{name}.png.png", 255 * opaque.astype(np.uint8))
     pycolmap.set_random_seed(config.seed)
@@ -269,7 +269,7 @@ def _opened(database: Path) -> Iterator[Any]:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence COLMAP's log on standard error; failures are reported by our own messages."""
+    """Silence COLMAP's log on standard error; this module reports failures itself."""
     import pycolmap
 
     before = pycolmap.logging.minloglevel

@@ -1,9 +1,9 @@
 """Matches of views that are too far apart to be matched without their poses.
 
-Of the features of two views, only those on each other's epipolar lines are compared. A match is accepted if the patches
-that the two features describe agree: seen from the other camera, a patch at the triangulated point, on a plane that
-faces both cameras, has about the size and the orientation that were found there. Without this test, half of the matches
-at 60 degrees are wrong.
+Only features on each other's epipolar lines are compared. A match is accepted if the patches that the two features
+describe agree. Take a patch at the triangulated point, on a plane that faces both cameras. Seen from the other camera,
+it must have about the size and the orientation of the other feature. Without this test, half of the matches at 60
+degrees are wrong.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from morgs_mi.core.camera import Camera
 
 __all__ = ["match_guided"]
 
-# Largest distance from an epipolar line, px, and of two descriptors, which are of length 1.
+# Largest distance from an epipolar line, px, and between two descriptors of length 1.
 _BAND, _MAX_DISTANCE = 1.0, 0.9
 # Largest difference of the patches in size, octaves, and in orientation, degrees.
 _MAX_OCTAVES, _MAX_TURN = 0.7, 30.0
-# Distance of two cameras, relative to that from the origin, that rounding can cause.
+# Distance of two cameras that rounding can cause, relative to their distance from the origin.
 _ROUNDING = 1e-9
 
 
 def match_guided(
     features: Sequence[Features], cameras: Sequence[Camera], pairs: Iterable[tuple[int, int]]
 ) -> list[Match]:
-    """Return the matches of some pairs of views, found with the poses of their cameras."""
+    """Return the matches of pairs of views, found with the poses of their cameras."""
     matches = []
     for i, j in pairs:
         a, b = features[i], features[j]
@@ -47,7 +47,7 @@ def _line_distances(x: np.ndarray, y: np.ndarray, a: Camera, b: Camera) -> np.nd
     """Return the larger distance of two pixel positions, [K, 2] and [L, 2], from each other's lines, [K, L], px."""
     centres = np.array([a.position, b.position], np.float64)
     if np.linalg.norm(centres[1] - centres[0]) <= _ROUNDING * np.linalg.norm(centres):
-        return np.full((len(x), len(y)), np.inf)  # two cameras at one place have no lines
+        return np.full((len(x), len(y)), np.inf)  # two cameras at one position have no lines
     relative = np.asarray(b.viewmat, np.float64) @ np.linalg.inv(np.asarray(a.viewmat, np.float64))
     (tx, ty, tz), R = relative[:3, 3], relative[:3, :3]
     essential = np.array([[0, -tz, ty], [tz, 0, -tx], [-ty, tx, 0]]) @ R

@@ -1,27 +1,27 @@
-"""Equations of the time offsets of cameras: Gaussians of one instant, and images that show them at times of their own.
+"""Equations of the time offsets of cameras, from Gaussians of one instant and images of slightly different times.
 
 Gaussian k moves by d_k in a frame, which view v shows as m = J_v d_k pixels, with J_v the derivative of its projection.
-If the clock of the view is o_v frames ahead, the image shows the Gaussian o_v m further along. Gaussians that are
-fitted to all views at once lie between what these show, x_k away from their places. With the error e = image - render
-and the gradient g of the image,
+If the clock of the view is o_v frames ahead, the image shows the Gaussian displaced by o_v m. Gaussians that are fitted
+to all views at once lie between the positions in these views, at a distance x_k from their true positions. With the
+error e = image - render and the gradient g of the image,
 
     e + g . (o_v m - J_v x_k) = 0
 
-in each pixel and colour. A Gaussian's weight in a pixel weights its equations, so that the sums over the pixels
+in each pixel and colour. A Gaussian's weight in a pixel weights its equations. The sums over the pixels
 
     A_vk = sum w_k g g^T ,    b_vk = sum w_k e g
 
-are backprojections of two images. Least squares in the offsets and in the places, with the places eliminated as points
-are in bundle adjustment (Schur complement; Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, section 6.1),
-leaves one equation per view,
+are backprojections of two images. Least squares in the offsets and the positions, with the positions eliminated like
+points in bundle adjustment (Schur complement; Triggs et al., Bundle Adjustment - A Modern Synthesis, 2000, section
+6.1), leaves one equation per view,
 
     sum_w S_vw o_w = r_v ,    c_vk = J_v^T A_vk J_v d_k ,    H_k = sum_w J_w^T A_wk J_w + lambda ,
     S_vw = sum_k (d_k^T c_vk [v = w] - c_vk^T H_k^-1 c_wk) ,
     r_v = sum_k (c_vk^T H_k^-1 sum_w J_w^T b_wk - d_k^T J_v^T b_vk) ,
 
-where w runs over the training views. A held-out view has an equation, too, but its offset is in no other. Offsets that
-all views have in common solve S o = 0: they move the Gaussians along their motion. So do, nearly, offsets that other
-places of the Gaussians explain, as with motion along the epipolar lines of two cameras.
+where w runs over the training views. A held-out view also has an equation, but its offset is in no other equation.
+Equal offsets of all views solve S o = 0: they move the Gaussians along their motion. Offsets that other positions of
+the Gaussians explain nearly solve it, too, for example with motion along the epipolar lines of two cameras.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ __all__ = ["UNKNOWN", "OffsetEquations", "offset_equations"]
 
 # lambda, as a fraction of a Gaussian's mean curvature along an axis.
 _PRIOR = 1e-4
-# Added to the eigenvalues of S, as a fraction of its mean diagonal without elimination: of a step, and of its error.
+# Added to the eigenvalues of S for a step and for its error, as fractions of its mean diagonal without elimination.
 _DAMPING, _FLOOR = 0.03, 1e-3
-# Standard deviation in frames of an offset of which nothing is known.
+# Standard deviation in frames of an unknown offset.
 UNKNOWN = 1.0
-# Mean number of Gaussians of a group, whose errors count as one: neighbours share pixels, and are wrong together.
+# Mean number of Gaussians of a group, which counts as one error: neighbours share pixels and have similar errors.
 _GROUP = 32
 
 
@@ -57,8 +57,8 @@ class OffsetEquations:
         matrix: S [V, V]; the columns of held-out views are zero off the diagonal.
         right: r [V].
         scatter: sum over groups of neighbouring Gaussians of the products of their parts of r [V, V].
-        own: sum of d^T c [V], the diagonal of S if the Gaussians were in their places.
-        train: which of the views are training views, bool [V].
+        own: sum of d^T c [V], the diagonal of S if the Gaussians were in their true positions.
+        train: mask of the training views, bool [V].
     """
 
     matrix: np.ndarray
@@ -77,7 +77,7 @@ class OffsetEquations:
         )
 
     def solution(self, share: float = 1.0) -> np.ndarray:
-        """Return o [V] in frames, of which those of the training views have a mean of zero.
+        """Return o [V] in frames, with a mean of zero over the training views.
 
         Args:
             share: part of the training views' offsets that their equations show.
@@ -85,10 +85,10 @@ class OffsetEquations:
         return self._inverse(_DAMPING, share) @ self.right
 
     def errors(self, reference: int) -> np.ndarray:
-        """Return the standard error [V] in frames of each offset from that of the view `reference`.
+        """Return the standard error [V] in frames of each offset relative to the view `reference`.
 
         The parts of r of groups of neighbouring Gaussians count as independent: a sandwich estimate with clusters
-        (Liang and Zeger, Biometrika 73(1), 1986). What the equations leave open counts with a frame.
+        (Liang and Zeger, Biometrika 73(1), 1986). Offsets that the equations do not determine have an error of a frame.
         """
         found = self._inverse(_FLOOR)
         unseen = np.eye(len(found)) - found @ self.matrix
@@ -115,12 +115,12 @@ def offset_equations(
     """Return the equations of an instant.
 
     Args:
-        gaussians: N Gaussians that are fitted to the instant, with their `motion` in one frame.
+        gaussians: N Gaussians fitted to the instant, with their `motion` in one frame.
         views: V views.
         targets: their images, at about that instant.
-        train: which of the views the Gaussians are fitted to, bool [V].
-        blur: standard deviation in pixels of a Gaussian filter of errors and gradients. Offsets are found that displace
-            by up to about as much; 0 leaves the images as they are.
+        train: mask of the views that the Gaussians are fitted to, bool [V].
+        blur: standard deviation in pixels of a Gaussian filter of errors and gradients. Offsets
+            with displacements up to about this value can be found; 0: no filter.
     """
     motion = np.asarray(gaussians.motion, np.float64)
     moving = (motion != 0).any(axis=1)
@@ -144,7 +144,7 @@ def offset_equations(
 
 
 def _grouped(parts: np.ndarray, means: np.ndarray) -> np.ndarray:
-    """Return sums of the parts [V, n] of Gaussians over groups: those that are nearest to the same one of a few."""
+    """Return sums of the parts [V, n] of Gaussians over groups: Gaussians with the same nearest centre form one."""
     if not len(means):
         return parts
     _, labels = KDTree(means[::_GROUP]).query(means)

@@ -1,24 +1,24 @@
 """Refinement of calibrated cameras on the first frame: poses, focal lengths, principal points and radial distortion.
 
-Beyond the paper. Feature matches give a first estimate by bundle adjustment (see `bundle`), where there are enough.
-Then rounds of a short fit of Gaussians, and of Gauss-Newton steps for all cameras and the means of all Gaussians at
-once, lower the difference between images and renderings. With the blend weights w fixed, the error e = target - image
-of a view is linear in the shift u of a splat (Lucas and Kanade 1981; as in `method.photometric`): with the gradient g,
-it becomes e + g . u, so that a Gaussian is an observation of `NormalEquations` in each view, with
+Beyond the paper. With enough feature matches, bundle adjustment gives a first estimate (see `bundle`). Rounds then
+lower the difference between images and renderings. A round is a short fit of Gaussians, followed by Gauss-Newton steps
+for all cameras and the means of all Gaussians at once. With the blend weights w fixed, the error e = target - image of
+a view is linear in the shift u of a splat (Lucas and Kanade 1981; as in `method.photometric`): with the gradient g, it
+becomes e + g . u. A Gaussian is therefore an observation of `NormalEquations` in each view, with
 
     G = sum_x w g g' / v,    b = sum_x w e g / v,
 
-where the variance v is the mean square error times the number of pixels whose errors are alike.
+where the variance v is the mean square error times the number of pixels with similar errors.
 
-Refined cameras are judged by pixels that no fit has seen: blocks that are withheld from every training view. Fits from
-the same start with the calibrated cameras, with those of the bundle adjustment and with those after the rounds are
-compared by the PSNR of these pixels: where features are many and sharp, the rounds only lose accuracy.
+Refined cameras are evaluated on withheld pixels: blocks of every training view that no fit uses. Three fits from the
+same start are compared by the PSNR of these pixels: with the calibrated cameras, with the cameras of the bundle
+adjustment, and with the cameras after the rounds. If there are many sharp features, the rounds only lose accuracy.
 
-Distortion is removed from the images, by what is known of it in each round, so that Gaussians see pinhole cameras.
+Each round removes the distortion estimated so far from the images, because Gaussians are rendered with pinhole cameras.
 
-Cameras stay in the frame of reference of the calibration, and keep their mean focal length (see `bundle`), so that a
-camera that is not refined fits as before. Points move so that their projections stay. The held-out view keeps its
-calibrated camera; `register_camera` fits a camera to its image while the Gaussians are frozen.
+Cameras stay in the calibration's frame of reference and keep their mean focal length (see `bundle`). A camera that is
+not refined therefore fits as before. Points move with the cameras to keep their projections. The held-out view keeps
+its calibrated camera; `register_camera` fits a camera to its image while the Gaussians are frozen.
 """
 
 from __future__ import annotations
@@ -59,18 +59,18 @@ __all__ = ["Refinement", "refine_cameras", "register_camera"]
 
 # A camera with features in fewer tracks is not determined by them.
 _MIN_TRACKS = 40
-# Pixels whose errors are alike, because the fit lacks a detail there: they count as one. Without it, priors would not
-# count at all, and cameras would follow the errors of a short fit.
+# Number of pixels with similar errors, because the fit lacks a detail there. They count as one pixel: otherwise priors
+# would have no influence, and cameras would follow the errors of a short fit.
 _ALIKE = 10.0
 # Gauss-Newton steps of a round, their damping, and the longest step of a mean in scene extents.
 _STEPS, _DAMPING, _LONGEST = 3, 1e-3, 0.02
 # px, standard deviations of the blur of images and gradients in the first rounds, for errors of several pixels.
 _BLURS = (2.0, 1.0)
-# Error at which a pixel has half its weight, relative to white: it shows what the fit lacks.
+# Error at which a pixel has half its weight, relative to white: larger errors are details that the fit lacks.
 _HALF_WEIGHT = 0.1
-# Least mean square error: that of a rendering that is compared with itself is 0.
+# Least mean square error: a rendering compared with itself has an error of 0.
 _LEAST_ERROR = 1e-10
-# Deviation of a distortion that is not to change; share of a resampled pixel that has to be valid.
+# Deviation of a fixed distortion; least valid share of a resampled pixel.
 _NO_DISTORTION, _VALID = 1e-4, 0.999
 # Steps of the registration of a camera, which end when they change its pixels by less than this, px.
 _REGISTRATION_STEPS, _LEAST_SHIFT = 30, 1e-3
@@ -84,13 +84,13 @@ class Refinement:
 
     Attributes:
         taken: whether the refined cameras are used.
-        calibrated_psnr: of withheld pixels in a fit with the calibrated cameras, dB; NaN where they were not compared.
-        refined_psnr: of the same pixels in a fit with the refined cameras, dB.
-        tracks: number of points in the bundle adjustment; 0 where there were too few.
+        calibrated_psnr: PSNR of withheld pixels in a fit with the calibrated cameras, dB; NaN without a comparison.
+        refined_psnr: PSNR of the same pixels in a fit with the refined cameras, dB.
+        tracks: number of points in the bundle adjustment; 0 if there were too few.
         rotation: largest change of a rotation, degrees.
         position: largest change of a position, world units.
         focal: largest relative change of a focal length.
-        distortion: largest shift of a pixel by the distortion that was left, in image widths.
+        distortion: largest shift of a pixel by the remaining distortion, in image widths.
     """
 
     taken: bool
@@ -104,7 +104,7 @@ class Refinement:
 
     @property
     def sentence(self) -> str:
-        """What was changed, and why."""
+        """The change of the cameras and its reason, in a sentence."""
         sizes = f"by up to {self.rotation:.2g} degrees, {self.position:.2g} units, {100 * self.focal:.2g} % of the "
         sizes += f"focal length and {100 * self.distortion:.2g} % of the image's width by the lens"
         scores = f"withheld pixels have {self.refined_psnr:.2f} dB instead of {self.calibrated_psnr:.2f} dB"
@@ -122,13 +122,13 @@ def refine_cameras(
     seed: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> tuple[Capture, Refinement]:
-    """Return the capture with refined training cameras and moved points, if they are better, and what was found.
+    """Return the capture with refined training cameras and moved points, if these are better, and the result.
 
     Args:
-        capture: its first frame and its points are used; the held-out view is not.
-        config: of the fit; `refine_cameras` "on" takes the refined cameras in any case.
+        capture: its first frame and its points are used, without the held-out view.
+        config: settings of the fit; `refine_cameras` "on" always selects the refined cameras.
         render: cut-offs.
-        seed: of all random choices.
+        seed: seed of all random choices.
         progress: called with (fits done, fits in all).
 
     Raises:
@@ -137,7 +137,7 @@ def refine_cameras(
     rounds, report = config.short_fits.rounds, progress or (lambda done, count: None)
     problem = _Problem.of(capture, config, render or RenderConfig(), seed)
     matched, tracks, deviations = _matched(capture, problem.indices, problem.deviations)
-    # The calibrated cameras, those of the bundle adjustment, and those of the images; one alone is not compared.
+    # Cameras of the calibration, of the bundle adjustment, and of the images; a single set is not compared.
     compared = config.refine_cameras == "auto"
     estimates = [0 * matched] * compared + [matched] * bool(tracks)
     fits = rounds + len(estimates) + bool(estimates)
@@ -157,17 +157,17 @@ def refine_cameras(
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """The cameras that are refined, and the images that this is judged by.
+    """Cameras to refine, and the images that evaluate them.
 
     Attributes:
-        capture: with the calibrated cameras.
-        indices: of the V training views with an image.
-        views: these, reduced, without the withheld blocks.
+        capture: capture with the calibrated cameras.
+        indices: indices of the V training views with an image.
+        views: these views, reduced, without the withheld blocks.
         unseen: their withheld blocks.
-        extent: of the scene, world units.
-        config: of the fit.
+        extent: scene extent, world units.
+        config: settings of the fit.
         render: cut-offs.
-        seed: of all random choices.
+        seed: seed of all random choices.
     """
 
     capture: Capture
@@ -212,9 +212,9 @@ class _Problem:
         """Return the changes [V, 11] after rounds of fitting Gaussians to the images and of joint steps.
 
         Args:
-            changes: to start from [V, 11].
-            deviations: of the priors [11].
-            report: called with the number of fits that are done.
+            changes: initial changes [V, 11].
+            deviations: standard deviations of the priors [11].
+            report: called with the number of completed fits.
         """
         problem = self._begun(changes)
         for done in range(self.config.short_fits.rounds):
@@ -228,7 +228,7 @@ class _Problem:
         return changes
 
     def score(self, changes: np.ndarray) -> float:
-        """Return the PSNR of the withheld pixels in a fit with changed cameras, dB."""
+        """Return the PSNR of the withheld pixels after a fit with changed cameras, dB."""
         unseen = [view for view in _changed(self.unseen, changes) if np.any(view.mask)]
         return mean_psnr(self._fitted(self._begun(changes)), unseen, self.render)
 
@@ -262,17 +262,17 @@ class _Problem:
 def register_camera(
     gaussians: Gaussians, view: View, extent: float, config: FitConfig, render: RenderConfig | None = None
 ) -> Camera:
-    """Return the camera, near the given one, from which frozen Gaussians look most like an image.
+    """Return the camera, near the given one, with which frozen Gaussians fit an image best.
 
     Args:
         gaussians: frozen.
         view: the calibrated camera and its image.
-        extent: of the scene, world units.
-        config: has the priors of the changes.
+        extent: scene extent, world units.
+        config: settings with the priors of the changes.
         render: cut-offs.
     """
     render, camera, target = render or RenderConfig(), view.camera, view.target
-    priors = replace(config.camera_priors, distortion=_NO_DISTORTION)  # the image stays as it is
+    priors = replace(config.camera_priors, distortion=_NO_DISTORTION)  # the image is not changed
     deviations, best = prior_deviations(extent, priors), np.zeros((1, CHANGES))
     means = np.asarray(gaussians.means, np.float64)
     for blur in (*_BLURS, 0.0):
@@ -295,7 +295,7 @@ def register_camera(
 def _matched(capture: Capture, train: Sequence[int], deviations: np.ndarray) -> tuple[np.ndarray, int, np.ndarray]:
     """Return the changes [V, 11] by bundle adjustment, the number of its points, and the likely deviations [11].
 
-    Without enough points, there are no changes, and the deviations are those of the priors.
+    Without enough points, there are no changes, and the deviations equal the priors' deviations.
     """
     recorded = capture.at_recorded_size()
     images, cameras = next(recorded.partial_frames(0, 1)).images, [recorded.cameras[v] for v in train]
@@ -308,7 +308,7 @@ def _matched(capture: Capture, train: Sequence[int], deviations: np.ndarray) -> 
 
 
 def _changed(views: Sequence[View], changes: np.ndarray) -> list[View]:
-    """Return views with changed cameras, whose distortion is removed from the images and masks."""
+    """Return views with changed cameras, and images and masks without the cameras' distortion."""
     return [_changed_view(*view, change) for view, change in zip(views, changes, strict=True)]
 
 
@@ -330,7 +330,7 @@ def _largest_shift(camera: Camera, change: np.ndarray) -> float:
 
 
 def _moved(points: np.ndarray, cameras: Sequence[Camera], changes: np.ndarray) -> np.ndarray:
-    """Return points [P, 3] whose projections in changed cameras are those that they had in the views that show them."""
+    """Return points [P, 3] moved to keep their projections in the views that show them, with changed cameras."""
     changed = [changed_camera(*pair) for pair in zip(cameras, changes, strict=True)]
     seen = [seen_points(camera, points)[:2] for camera in cameras]
     ids = np.concatenate([np.flatnonzero(inside) for inside, _ in seen])
@@ -392,7 +392,7 @@ def _shifts(
     image = view.render(gaussians).color
     error = target.difference(image)
     square = max(float(np.mean(error**2)), _LEAST_ERROR)
-    # The image that the target would be without the error, also where it is masked.
+    # The mean of the rendering and the target, or the rendering where the target is masked.
     gradient = image_gradient(blurred((np.asarray(image) + 0.5 * error).astype(np.float32), blur))
     error = blurred(error, blur)
     weight = 1 / (1 + np.sum(error**2, axis=-1) / _HALF_WEIGHT**2)

@@ -1,7 +1,7 @@
-"""Dense points from pairs of neighbouring cameras, where these are close enough for stereo matching.
+"""Dense points from pairs of neighbouring cameras that are close enough for stereo matching.
 
-A pair is rectified, so that a point lies in the same row of both images, and matched by OpenCV's semi-global block
-matching. A point is kept if both directions of matching agree, and if some third camera that sees it shows its colour.
+A pair is rectified, which puts a point into the same row of both images, and matched by OpenCV's semi-global block
+matching. A point is returned if both directions of matching agree and a third camera that sees it shows its colour.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from morgs_mi.core.rig import angles_to, scene_depths, seen_points
 
 __all__ = ["stereo_points"]
 
-# Images are reduced to this number of pixels: points are a start for the fit, which is more exact.
+# Images are reduced to this number of pixels: the points only initialise a fit, which is more exact.
 _PIXELS = 2e5
-# Each camera is matched with its nearest ones, if they are at least and at most this far, degrees.
+# Number of nearest cameras that each is matched with, and their least and largest angle, degrees.
 _NEIGHBOURS, _MIN_ANGLE, _MAX_ANGLE = 2, 0.5, 25.0
 # Points per pair.
 _POINTS = 4000
-# A pair is searched for depths around those of the known points: fractions of their near and far end. Without at least
-# so many points, around the depth that the cameras look at.
+# Range of searched depths, as fractions of the near and far end of the known points. With fewer than this many points,
+# the search is around the depth that the cameras look at.
 _NEAR, _FAR, _KNOWN = 0.6, 1.6, 10
 _BLIND = 3.0
 # px, largest difference between the disparities of both directions; largest difference of a colour.
 _MAX_DIFFERENCE, _MAX_COLOR = 1.0, 0.08
 _BLOCK = 5
-# Depth of a view's corners before the rectified plane, for depth 1 before the camera, below which they are too oblique.
+# Least depth of a view's corners in the rectified view, for depth 1 in the camera: less is too oblique.
 _LEAST_DEPTH = 0.2
 
 
@@ -41,14 +41,14 @@ def stereo_points(
     known: np.ndarray,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return points [P, 3], world units, and their colours [P, 3] in [0, 1]; none where no cameras are close.
+    """Return points [P, 3], world units, and their colours [P, 3] in [0, 1]; none if no cameras are close.
 
     Args:
         cameras: C views.
         images: per view uint8 [H, W, 3], RGB.
-        masks: per view [H, W] bool of valid pixels, or None.
+        masks: per view the mask of valid pixels [H, W] bool, or None.
         known: points [K, 3] of the scene, which limit the depths.
-        rng: draws a part of the points.
+        rng: random generator for the selection of points.
     """
     views = [_View.of(*view) for view in zip(cameras, images, masks, strict=True)]
     found = [np.zeros((0, 6))]
@@ -67,7 +67,7 @@ class _View:
     """A view, reduced.
 
     Attributes:
-        camera: with the size of the image.
+        camera: camera of the image's size.
         image: uint8 [H, W, 3].
         valid: uint8 [H, W], 255 where the pixel is valid.
     """
@@ -112,12 +112,12 @@ class _Rectified:
     """Two views on one plane along the line between their cameras.
 
     Attributes:
-        axes: of the plane, rows right, down and forward in the world [3, 3].
-        focal: px.
+        axes: axes of the plane, rows right, down and forward in the world [3, 3].
+        focal: focal length, px.
         baseline: distance of the cameras, world units.
-        homographies: from the pixels of each view to those of its rectified image.
+        homographies: mappings from the pixels of each view to the pixels of its rectified image.
         corners: position of each image's first column relative to the optical axis, px, and of their first row.
-        size: of both images, width and height.
+        size: width and height of both images.
     """
 
     axes: np.ndarray
@@ -129,7 +129,7 @@ class _Rectified:
 
     @classmethod
     def of(cls, a: Camera, b: Camera) -> _Rectified | None:
-        """Return the rectification of two views, None if no plane shows both, as if one camera is before the other."""
+        """Return the rectification of two views, None if no plane shows both, e.g. with one camera behind the other."""
         right = b.position - a.position
         baseline = float(np.linalg.norm(right))
         right, forward = right / baseline, a.viewmat[2, :3] + b.viewmat[2, :3]
@@ -188,7 +188,7 @@ def _matched(a: _View, b: _View, depths: tuple[float, float]) -> np.ndarray:
 
 def _disparity(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> np.ndarray:
     """Return the disparity of each pixel of the left image [H, W], px, below `lowest` where there is none."""
-    # OpenCV leaves out the columns whose partners may lie outside the image.
+    # OpenCV leaves out the columns with partners that may lie outside the image.
     pad = count + abs(lowest) + _BLOCK
     wide = [cv2.copyMakeBorder(image, 0, 0, pad, pad, cv2.BORDER_CONSTANT) for image in (left, right)]
     area = 3 * _BLOCK**2
@@ -207,7 +207,7 @@ def _disparity(left: np.ndarray, right: np.ndarray, lowest: int, count: int) -> 
 
 
 def _confirmed(points: np.ndarray, others: Sequence[_View]) -> np.ndarray:
-    """Return which points with colours [P, 6] have their colour in a valid pixel of another view that sees them."""
+    """Return the mask of points with colours [P, 6] that have their colour in a valid pixel of another view."""
     confirmed = np.zeros(len(points), bool)
     for view in others:
         seen, pixels, _ = seen_points(view.camera, points[:, :3])

@@ -1,19 +1,19 @@
-"""Time offsets of the cameras of a rig whose clocks are apart, from what moves in their images.
+"""Time offsets of the cameras of a rig with unsynchronised clocks, from the motion in their images.
 
 At an instant, Gaussians are fitted to the images of all training views, and the flow of the views is lifted to their
-displacement in one frame (see `method.lift`). `offset_equations` gives the offsets that explain what the Gaussians then
-leave of the images. With the images interpolated at the instants that these offsets give, the Gaussians are fitted
-again: Gauss-Newton steps, first with blurred images, because the equations hold only for small displacements.
+displacement in one frame (see `method.lift`). `offset_equations` gives the offsets that explain the remaining error of
+the images. The images are interpolated at the times that these offsets give, and the Gaussians are fitted again. These
+are Gauss-Newton steps. The first ones use blurred images, because the equations hold only for small displacements.
 
-A fit hides part of the offsets, in shapes and colours. Which part kappa remains to be seen follows from the last two
-rounds of one blur (the secant method),
+A fit compensates part of the offsets with shapes and colours. The visible part kappa follows from the last two rounds
+of one blur (the secant method),
 
     kappa = - sum_v s_v (o'_v - o_v) / sum_v s_v^2 ,
 
-with s the step between them and o, o' what the equations gave before and after it, for the training views. Where
-cameras are far apart, a fit can hide the whole offset, since it explains each image by Gaussians of its own; then any
-offset looks right. So a last round moves the clocks by half a frame, and the errors of the offsets are divided by the
-part of it that the equations find back.
+with s the step between them and o, o' the solutions of the equations before and after it, for the training views. If
+cameras are far apart, a fit can hide the whole offset, because it explains each image by separate Gaussians; then any
+offset fits. A last round therefore moves the clocks by half a frame. The errors of the offsets are divided by the part
+of this move that the equations recover.
 """
 
 from __future__ import annotations
@@ -47,17 +47,17 @@ from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["TimeOffsets", "estimate_time_offsets"]
 
-# px, least width of the images: a small image is fitted fast, and an offset displaces by few pixels.
+# px, least width of the images: small images are fitted fast, and an offset displaces them by few pixels.
 _WIDTH = 160
-# Frames from the start of the recording that are used, and instants, spread over them, that Gaussians are fitted at.
+# Number of frames used from the start of the recording, and of instants among them at which Gaussians are fitted.
 _FRAMES, _INSTANTS = 12, 2
 # Gaussians and steps of the fit at an instant; half as many of both for blurred images.
 _GAUSSIANS, _STEPS = 8000, 600
 # Standard deviations in pixels of the filters of the first rounds, one round each.
 _BLURS = (6.0, 3.0, 1.5)
-# Rounds at most after these, with images that are not blurred.
+# Largest number of rounds after these, with unblurred images.
 _ROUNDS = 6
-# Largest step in frames of the last round: an offset is found to about half of it.
+# Largest step in frames of the last round: an offset is accurate to about half of it.
 _TOLERANCE = 0.02
 # Largest offset from the mean of the training views, frames.
 _LARGEST = 3
@@ -65,7 +65,7 @@ _BLUR_OF_ROUND = (*_BLURS, *[0.0] * _ROUNDS)
 
 # Bounds of kappa, and of a step in frames.
 _SHARES, _LONGEST_STEP = (0.2, 1.2), 1.0
-# Frames by which the last round moves the clocks, and the least part of it that counts as found.
+# Frames by which the last round moves the clocks, and the least part of it that counts as recovered.
 _MOVED, _LEAST_FOUND = 0.5, 0.05
 
 
@@ -77,9 +77,9 @@ class TimeOffsets:
         offsets: by name, the frame of each camera's clip that is simultaneous with frame 0 of the reference's, as in
             `ReadConfig.offset`; negative for a camera that began later.
         errors: by name, standard errors of the offsets, frames: large where the images hardly depend on the offset.
-        reference: name of the held-out camera, or of the first one, whose offset is as it was.
+        reference: name of the held-out camera, or of the first one; its offset does not change.
         change: largest change in the last round, frames.
-        converged: whether it is within the tolerance, which does not say that the offsets are right: see `errors`.
+        converged: whether `change` is within the tolerance; the accuracy of the offsets is in `errors`.
     """
 
     offsets: dict[str, float]
@@ -96,15 +96,15 @@ def estimate_time_offsets(
 ) -> TimeOffsets:
     """Return the time offsets of a capture's cameras in frames, see `TimeOffsets`.
 
-    They include those that the capture was read with: its `reading` with the result as `offset` aligns the clips. Two
-    runs differ by up to 0.02 frames, as gradients are summed in any order.
+    They include the offsets that the capture was read with: its `reading` with the result as `offset` aligns the clips.
+    Two runs differ by up to 0.02 frames, because the order of summed gradients varies.
 
-    No Gaussian is fitted to the held-out view, whose offset follows from its own error and from the others' offsets.
+    No Gaussian is fitted to the held-out view. Its offset follows from its own error and from the others' offsets.
 
     Args:
-        capture: a capture, whose clips have one frame rate.
+        capture: a capture with clips of one frame rate.
         progress: called with (fits done, fits at most).
-        seed: of the fits.
+        seed: seed of the fits.
 
     Raises:
         ValueError: the recording has one camera or fewer than four frames, an image is missing, or nothing moves.
@@ -127,7 +127,7 @@ def estimate_time_offsets(
 
 
 def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, OffsetEquations]:
-    """Return offsets [V] of at most `largest`, and the last step [V] with the equations that it was taken from."""
+    """Return offsets [V] of at most `largest`, the last step [V], and the equations of that step."""
     clips = rounds.clips
     offsets, step, left = np.zeros(len(clips.cameras)), np.zeros(len(clips.cameras)), None
     for index, blur in enumerate(_BLUR_OF_ROUND):
@@ -142,12 +142,12 @@ def _aligned(rounds: _Rounds, largest: int) -> tuple[np.ndarray, np.ndarray, Off
 
 
 def _share(step: np.ndarray, change: np.ndarray) -> float:
-    """Return kappa (see the module), within its bounds, from a step and the change of what is left after it."""
+    """Return kappa (see the module), within its bounds, from a step and the change of the solution after it."""
     return float(np.clip(-np.sum(step * change) / np.sum(step**2), *_SHARES)) if step.any() else 1.0
 
 
 def _found_back(rounds: _Rounds, offsets: np.ndarray, equations: OffsetEquations, reference: int) -> np.ndarray:
-    """Return which part [V] the equations find if the clocks are moved against that of `reference`."""
+    """Return the part [V] that the equations recover of a move of the clocks relative to the clock of `reference`."""
     moved = np.where(np.arange(len(offsets)) % 2, _MOVED, -_MOVED)
     moved[reference] = 0
     change = rounds.equations(offsets + moved, 0.0).solution() - equations.solution()
@@ -157,14 +157,14 @@ def _found_back(rounds: _Rounds, offsets: np.ndarray, equations: OffsetEquations
 
 @dataclass(eq=False)
 class _Rounds:
-    """Fits of one round after the other.
+    """Fits of successive rounds.
 
     Attributes:
-        clips: what Gaussians are fitted to.
-        instants: frames that they are fitted at.
-        seed: of all fits.
+        clips: images to fit.
+        instants: frames at which Gaussians are fitted.
+        seed: seed of all fits.
         progress: called with (fits done, fits at most), or None.
-        done: number of fits that are done.
+        done: number of completed fits.
     """
 
     clips: _Clips
@@ -217,7 +217,7 @@ class _Clips:
         clips = [[_checked(image) for image in capture.images(v, 0, _FRAMES)] for v in range(len(capture.cameras))]
         views = zip(capture.cameras, (clip[0] for clip in clips), capture.masks, strict=True)
         small, _, masks = zip(*(View(*view).reduced(_WIDTH) for view in views), strict=True)
-        # The images are whole frames: rendered at the time that the capture gives them, they would be displaced twice.
+        # The images are whole frames: with the capture's delays they would be displaced twice.
         cameras = tuple(camera.without_delays() for camera in small)
         images = tuple(tuple(_resized(i, c) for i in clip) for clip, c in zip(clips, cameras, strict=True))
         return cls(
@@ -230,7 +230,7 @@ class _Clips:
         return len(self.images[0])
 
     def at(self, times: np.ndarray) -> list[np.ndarray]:
-        """Return the image of each view at a time of its own [V], in frames."""
+        """Return the image of each view at its own time [V], in frames."""
         times = np.clip(times, 0, self.num_frames - 1)
         first = np.minimum(np.floor(times).astype(int), self.num_frames - 2)
         views = zip(self.images, first, times - first, strict=True)
@@ -248,7 +248,7 @@ def _resized(image: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 def _equations_at(clips: _Clips, times: np.ndarray, blur: float, seed: int) -> OffsetEquations:
-    """Return the equations of an instant, which each view shows at a time of its own [V]."""
+    """Return the equations of an instant, which each view shows at its own time [V]."""
     images, after = clips.at(times), clips.at(times + 1)
     targets = [Target(image, mask) for image, mask in zip(images, clips.masks, strict=True)]
     gaussians = _fitted(clips, images, 2 if blur else 1, seed)
@@ -260,13 +260,13 @@ def _equations_at(clips: _Clips, times: np.ndarray, blur: float, seed: int) -> O
 
 
 def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int) -> Gaussians:
-    """Return Gaussians that are fitted to the images of the training views at one instant.
+    """Return Gaussians fitted to the images of the training views at one instant.
 
     Args:
-        clips: what they are fitted to.
-        images: of all views.
-        divisor: of the number of Gaussians and of the number of steps.
-        seed: of the fit.
+        clips: cameras and points of the fit.
+        images: images of all views.
+        divisor: divisor of the numbers of Gaussians and steps.
+        seed: seed of the fit.
     """
     fit = FitConfig(
         sh_degree=0,
@@ -282,7 +282,7 @@ def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int
 
 
 def _relative(capture: Capture, offsets: np.ndarray, errors: np.ndarray, change: float) -> TimeOffsets:
-    """Return the result with the offsets from the reference's, in addition to those of the capture."""
+    """Return the result with the offsets relative to the reference, in addition to the capture's offsets."""
     reference = capture.test_view or 0
     known = capture.reading.offset
     apart = offsets - [camera.delay for camera in capture.cameras]

@@ -29,7 +29,7 @@ class CameraSource:
         shares: the share of the time to the clip's next frame that has passed at each instant [T]; None: none has.
         color_correction: the colour correction, or None.
         opaque: the mask of the recorded pixels that are not transparent [H, W], or None if all are opaque.
-        delay: frames of the clip by which its frames are later than the instants that they show.
+        delay: time from an instant to the frame that shows it, in frames of the clip.
     """
 
     reader: FrameReader
@@ -82,7 +82,7 @@ class CameraSource:
         if self.undistortion is not None:
             valid = self.undistortion.mask
             if self.opaque is not None:
-                # No transparent pixel may contribute; cubic weights are negative too.
+                # Transparent pixels must not contribute; cubic weights can also be negative.
                 valid = valid & (np.abs(self.undistortion(self.opaque.astype(np.float32)) - 1) < 1e-3)
         if valid is None or valid.all():
             return None

@@ -1,6 +1,6 @@
 """A multi-view recording: pinhole cameras and their synchronised frames.
 
-`layouts/registry.py` determines the layout of a capture folder and `layouts/clips.py` finds each camera's clip. An
+`layouts/layout_registry.py` determines the layout of a capture folder, `layouts/clips.py` finds each camera's clip. An
 optional ``capture.json`` has settings (see `timeline.read_settings`); ``truth/`` may hold ground truth.
 """
 
@@ -55,7 +55,7 @@ class PartialFrame:
         index: position in the recording, from 0.
         images: as in `Frame`, None for a missing image.
         problems: one sentence per missing image.
-        recorded: the images that those of the next frame are compared with; None if these are `images`.
+        recorded: reference images for the next frame's images; None if these are `images`.
     """
 
     index: int
@@ -64,7 +64,7 @@ class PartialFrame:
     recorded: tuple[np.ndarray | None, ...] | None = None
 
     def comparable(self, views: Sequence[int]) -> list[np.ndarray | None]:
-        """Return the images of some views that those of the next frame are compared with."""
+        """Return the reference images of some views for the images of the next frame."""
         images = self.images if self.recorded is None else self.recorded
         return [images[view] for view in views]
 
@@ -87,9 +87,9 @@ class Capture:
         layout: name of the folder's layout, e.g. ``COLMAP``.
         reading: how clips that do not match are read.
         colors: the colour correction of the cameras, or None.
-        notes: a sentence for everything about the clips that was not as expected, e.g. a variable frame rate.
-        distortions: per camera the radial terms k1, k2 that its lens left in the images and that are removed, too;
-            empty if none are.
+        notes: a sentence for each unexpected property of the clips, e.g. a variable frame rate.
+        distortions: per camera the radial terms k1, k2 of the distortion left in the images, which is removed as well;
+            empty if there is none.
     """
 
     path: Path
@@ -140,8 +140,8 @@ class Capture:
 
         Args:
             cameras: one per view, of the same sizes.
-            distortions: per camera the radial terms k1, k2 that its lens leaves in the images, which are undistorted by
-                them, too; empty: none.
+            distortions: per camera the radial terms k1, k2 of the distortion left in the images, which is removed as
+                well; empty: none.
         """
         rig = replace(self, cameras=tuple(cameras))
         if not np.any(distortions):
@@ -159,7 +159,7 @@ class Capture:
         return self._sources[view].process(image, self.cameras[view])
 
     def metadata(self) -> dict[str, Any]:
-        """Return how the frames were read, in JSON types, as stored in the `capture.json` beside a stream."""
+        """Return the reading of the frames in JSON types, as stored in the `capture.json` beside a stream."""
         views = zip(self.cameras, self._sources, self.masks, strict=True)
         fit = self.colors
         colors = fit and {"reference": self.names[fit.reference], "delta_e_before": fit.before, "delta_e": fit.after}
@@ -215,7 +215,7 @@ class Capture:
         return self._sources[view].images(self.cameras[view], start, stop)
 
     def with_delays(self, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
-        """Return the cameras of a stream of this capture with the delays and readouts of the capture's."""
+        """Return the cameras of a stream of this capture with the delays and readouts of the capture's cameras."""
         pairs = zip(cameras, self.cameras, strict=True)
         return tuple(replace(camera, delay=own.delay, readout=own.readout) for camera, own in pairs)
 
@@ -244,7 +244,7 @@ class Capture:
     def _at_first_instant(self, images: Sequence[np.ndarray | None]) -> tuple[np.ndarray | None, ...]:
         """Return the images of the first frame, interpolated at its instant.
 
-        No motion is known there that could be rendered.
+        The motion in the first frame is unknown, so delays cannot be rendered.
         """
         views = zip(images, self._sources, self.cameras, strict=True)
         found = (next(s.at_instants().images(c, 0, 1)) if s.delay and i is not None else i for i, s, c in views)
@@ -261,7 +261,7 @@ def load_capture(
     """Open a capture folder: read the calibration and the header of every clip.
 
     Args:
-        path: the folder, or its URL (see `io.remote`); `layouts/registry.py` lists the supported layouts.
+        path: the folder, or its URL (see `io.remote`); `layouts/layout_registry.py` lists the supported layouts.
         downscale: factor by which images are downscaled (area averages, rounded to the nearest whole size).
         test_view: index or name of the held-out camera, None for none; "auto" uses the value in `capture.json`, then
             the layout's own, then 0 as N3DV does, or none with fewer than six cameras.
@@ -327,7 +327,7 @@ def load_capture(
         point_colors=calibration.point_colors,
         masks=tuple(s.mask(c) for s, c in zip(sources, cameras, strict=True)),
         test_view=_test_view(path, test_view, settings, every, calibration),
-        # The frames of the ground truth are numbered like those of the clips.
+        # The frames of the ground truth are numbered like the frames of the clips.
         truth=path / "truth" if common.unchanged and (path / "truth").is_dir() else None,
         _sources=sources,
         downscale=downscale,
@@ -354,7 +354,7 @@ def _readouts(path: Path, every: Sequence[str], names: Sequence[str], settings: 
 
 
 def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, str]:
-    """Return the mask of the pixels that are not transparent, None if all are opaque or it varies, and a note.
+    """Return the mask of the opaque pixels, None if all are opaque or the mask varies, and a note.
 
     Raises:
         ValueError: no pixel is opaque.
@@ -390,7 +390,7 @@ def _check_downscale(downscale: float, cameras: Sequence[Camera], recorded: Sequ
 
 
 def _color_corrected(capture: Capture, color: str) -> Capture:
-    """Return the capture with colours that are corrected between cameras; `color` as in `ReadConfig`."""
+    """Return the capture with colours corrected between cameras; `color` as in `ReadConfig`."""
     method, _, name = color.partition(":")
     if method != "linear" or (name and name not in capture.names):
         raise ValueError(
@@ -413,7 +413,7 @@ def _resized(camera: Camera, downscale: float) -> Camera:
 def _test_view(
     path: Path, requested: int | str | None, settings: dict[str, Any], every: Calibration, used: Calibration
 ) -> int | None:
-    """Return the index of the held-out camera among those that are used; a setting of the capture counts all."""
+    """Return the index of the held-out camera among the used ones; a setting of the capture counts all cameras."""
     if requested != "auto":
         return _view_called(path, requested, used.names)
     own = every.test_view
@@ -427,7 +427,7 @@ def _test_view(
 
 
 def _view_called(place: Path, view: int | str | None, names: Sequence[str]) -> int | None:
-    """Return the index of a camera that is given by index or name, or None.
+    """Return the index of a camera given by index or name, or None.
 
     Raises:
         ValueError: there is none; `place` is where it was requested.

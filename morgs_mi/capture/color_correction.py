@@ -1,9 +1,9 @@
 """Colour correction between cameras.
 
-A correction is a matrix on (R, G, B) in linear light, as are differences of gain, white balance and cross-talk between
-sensors. Matrices are fitted to the colours of points that views share: features that match and on which the poses
-agree. The reference camera is not changed. Then, one by one, the camera that shares most points with those already
-corrected is fitted to them.
+A correction is a matrix on (R, G, B) in linear light. It models differences of gain, white balance and cross-talk
+between sensors. Matrices are fitted to the colours of shared points: matching features that are consistent with the
+poses. The reference camera is not changed. The other cameras are corrected one by one: the next one is the camera that
+shares most points with the corrected ones.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class ColorFit:
         matrices: per camera [3, 3]; None for the reference, and for a camera that shares too few points with the
             others.
         samples: per camera, number of points shared with others.
-        before: per camera, mean dE2000 of these against the other views' colours; NaN without any.
+        before: per camera, mean dE2000 of its points against the other views' colours; NaN without points.
         after: the same after the correction.
     """
 
@@ -80,11 +80,11 @@ def fit_colors(
     masks: Sequence[np.ndarray | None],
     reference: int | None = None,
 ) -> ColorFit:
-    """Fit the correction that maps each view's colours of shared points to those in the reference view.
+    """Fit the correction that maps each view's colours of shared points to the colours in the reference view.
 
     Args:
         cameras: C views.
-        images: per view an image of one instant, uint8 [H, W, 3], or None: the view is not corrected.
+        images: per view an image of one instant, uint8 [H, W, 3]; None for a view that is not corrected.
         masks: per view the mask of valid pixels [H, W], or None.
         reference: index of the reference view; by default the one that shares most points with the others.
     """
@@ -123,11 +123,11 @@ def matched_colors(
     features: Sequence[Features],
     matches: Sequence[Match],
 ) -> tuple[list[Match], list[np.ndarray]]:
-    """Return the matches on which poses agree and that are well exposed, and the linear colours [K, 3] of all features.
+    """Return the well-exposed matches that fit the poses, and the linear colours [K, 3] of all features.
 
     Args:
         cameras: C views.
-        images: per view uint8 [H, W, 3], or None: it has no features.
+        images: per view uint8 [H, W, 3], or None for a view without features.
         features: per view, in pixels of `images`.
         matches: from `match_views`.
     """
@@ -138,8 +138,8 @@ def matched_colors(
 def _colors_at(image: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the linear colours [K, 3] around points [K, 2].
 
-    Features are edges, which two views sample differently: the wider the mean, the smaller that error (dE2000 of 3.2
-    between equal cameras with 1 px, 2.1 with 2.6 px at a width of 320), until the mean includes the background.
+    Features are edges, which two views sample differently. A wider mean reduces this error (dE2000 between equal
+    cameras: 3.2 with 1 px, 2.1 with 2.6 px at a width of 320), until the mean includes the background.
     """
     light = cv2.GaussianBlur(_LINEAR[image], (0, 0), max(1.0, _BLUR * image.shape[1]))
     columns, rows = np.clip(points.astype(int), 0, (image.shape[1] - 1, image.shape[0] - 1)).T
@@ -149,7 +149,7 @@ def _colors_at(image: np.ndarray, points: np.ndarray) -> np.ndarray:
 def _reliable(
     match: Match, features: Sequence[Features], cameras: Sequence[Camera], colors: Sequence[np.ndarray]
 ) -> Match:
-    """Return the features of a match on which the poses agree and that are well exposed in both views."""
+    """Return the features of a match that fit the poses and are well exposed in both views."""
     good = reprojection_errors(match, features, cameras) <= _MAX_ERROR
     for k, view in enumerate(match.views):
         matched = colors[view][match.features[:, k]]

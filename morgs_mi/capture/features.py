@@ -1,7 +1,7 @@
 """Points seen in several views of one instant: features, matches and triangulation.
 
 Notation: a feature x [2] is a pixel position with pixel centres at +0.5, as in `Camera`; a match is a pair of features
-in two views. Matching does not use the poses, so the poses can be checked against the matches; `guided_matching` does.
+in two views. Matching does not use the poses, so poses can be checked against matches. `guided_matching` uses them.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ __all__ = [
     "triangulate",
 ]
 
-# Larger images do not add corners that other views see too, and SIFT is slow.
+# Larger images add no corners that other views also see, and SIFT is slow.
 _DETECTION_PIXELS = 1.3e6
 _MAX_FEATURES = 2500
 # Lowe's ratio; with more cameras than this, each is matched with its nearest neighbours only.
@@ -95,7 +95,7 @@ class Tracks:
 
 
 def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features:
-    """Return the SIFT features of an image uint8 [H, W, 3] where `mask` [H, W] is true; none if the image is None."""
+    """Return the SIFT features of an image uint8 [H, W, 3] where `mask` [H, W] is true; none without an image."""
     none = Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 2)))
     if image is None:
         return none
@@ -113,7 +113,7 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
     points = (np.array([k.pt for k in found]) + 0.5) * enlarged
     angles, sizes = np.deg2rad([k.angle for k in found]), np.array([k.size for k in found])
     axes = 0.5 * sizes[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1) * enlarged
-    # RootSIFT: square roots of the normalised descriptors are easier to tell apart (Arandjelovic 2012).
+    # RootSIFT: square roots of the normalised descriptors are easier to distinguish (Arandjelovic 2012).
     descriptors = np.sqrt(descriptors / descriptors.sum(1, keepdims=True))
     columns, rows = np.clip(points.astype(int), 0, (width - 1, height - 1)).T
     return Features(points, descriptors, image[rows, columns].astype(np.float32) / 255, axes)
@@ -122,7 +122,7 @@ def detect(image: np.ndarray | None, mask: np.ndarray | None = None) -> Features
 def match_views(features: Sequence[Features], cameras: Sequence[Camera], neighbours: int | None = None) -> list[Match]:
     """Return the matches between all pairs of views, or between near views if there are many cameras.
 
-    Only matches that are consistent with a common epipolar geometry are kept, whatever that geometry is.
+    Only matches that are consistent with a common epipolar geometry are returned, for any such geometry.
 
     Args:
         features: per view.
@@ -181,7 +181,7 @@ def reprojection_errors(match: Match, features: Sequence[Features], cameras: Seq
     """Return the reprojection error of each match [M], px.
 
     A match is triangulated from its two features. Its error is the mean distance of the point's projections from
-    them, and infinite for a point behind a camera.
+    the features; it is infinite for a point behind a camera.
     """
     count = len(match.features)
     tracks = np.tile(np.arange(count), 2)
@@ -224,7 +224,7 @@ def triangulate(
 
 
 def join_matches(matches: Sequence[Match], features: Sequence[Features]) -> Tracks:
-    """Return the tracks of features that are matched directly or by others, all of them in different views."""
+    """Return the tracks of features that are matched directly or through other features, all in different views."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
@@ -250,7 +250,7 @@ def intersect(
     Observation k is the pixel position `pixels[k]` of point `track[k]` in view `views[k]`.
     """
     V = np.array([np.asarray(camera.viewmat, np.float64)[:3] for camera in cameras])
-    # Relative to the centre and the size of the rig, which makes the system well conditioned.
+    # Positions relative to the rig's centre and size make the system well conditioned.
     positions = np.array([camera.position for camera in cameras])
     middle, scale = positions.mean(0), np.linalg.norm(positions - positions.mean(0), axis=1).max() or 1.0
     V = np.concatenate([V[:, :, :3], ((V[:, :, :3] @ middle + V[:, :, 3]) / scale)[..., None]], axis=2)[views]

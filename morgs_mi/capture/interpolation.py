@@ -1,9 +1,9 @@
-"""Images between two frames of a clip, by optical flow: what a camera would have shown at the time of another one.
+"""Interpolation of images between two frames of a clip by optical flow, at the time of another camera's frame.
 
 A point that moves by the flow F from the first frame to the second has moved by s F at the share s of the time between
 them. So the pixel x shows the point p of the first frame with p + s F(p) = x, and the point q of the second frame with
 q + (1 - s) B(q) = x, with B the flow back. Both are found by fixed-point iteration, and their colours are averaged with
-the weights 1 - s and s. A point whose flow is not reliable, because the other frame does not show it, hardly counts.
+the weights 1 - s and s. A point with unreliable flow, because the other frame does not show it, has a small weight.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from morgs_mi.method.flow_sources.flow_registry import FramePair, flow_source
 
 __all__ = ["image_between"]
 
-# Rounds of the fixed-point iteration: flow is smooth, so that each one gains about a digit.
+# Rounds of the fixed-point iteration: flow is smooth, so each round gains about a digit.
 _ROUNDS = 5
-# Weight of an unreliable point: it counts where neither frame has a reliable one.
+# Weight of an unreliable point: it matters only where neither frame has a reliable one.
 _LEAST_WEIGHT = 1e-3
 
 
@@ -27,7 +27,7 @@ def image_between(first: np.ndarray, second: np.ndarray, share: float) -> np.nda
 
     Args:
         first: uint8 [H, W, 3], RGB.
-        second: likewise.
+        second: uint8 [H, W, 3], RGB.
         share: in [0, 1]; 0 for the first frame, 1 for the second.
 
     Raises:
@@ -55,6 +55,6 @@ def _origins(flow: np.ndarray, share: float) -> np.ndarray:
 
 
 def _sampled(image: np.ndarray, places: np.ndarray, how: int) -> np.ndarray:
-    """Return the values of an image [H, W, ...] at some places [H, W, 2], in pixels."""
+    """Return the values of an image [H, W, ...] at positions [H, W, 2] in pixels."""
     x, y = np.ascontiguousarray(places[..., 0]), np.ascontiguousarray(places[..., 1])
     return cv2.remap(image, x, y, how, borderMode=cv2.BORDER_REPLICATE)

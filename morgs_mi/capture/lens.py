@@ -99,12 +99,12 @@ class Undistortion:
 def undistortion(camera: Camera, lens: Lens, refined: tuple[Camera, Lens] | None = None) -> Undistortion | None:
     """Return the undistortion of `lens`, or None for a lens without distortion.
 
-    The undistorted view has the same K and size as the recorded one, so corners of a barrel-shaped
-    image are lost and those of a pincushion-shaped one are empty (see `Undistortion.mask`).
+    The undistorted view has the same K and size as the recorded one, so a barrel-shaped image loses its
+    corners and a pincushion-shaped one has empty corners (see `Undistortion.mask`).
 
     Args:
         camera: at the size of the recorded images.
-        lens: its lens.
+        lens: lens of the camera.
         refined: intrinsics of the view instead of the camera's, and the distortion that `lens` leaves in its images.
     """
     stages = [(camera, lens)] if any(lens.distortion) else []
@@ -121,7 +121,7 @@ def undistortion(camera: Camera, lens: Lens, refined: tuple[Camera, Lens] | None
 
 
 def _maps(camera: Camera, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return columns and rows [H, W] px where the lens shows the pixels of a pinhole camera, and which are valid."""
+    """Return the columns and rows [H, W] px at which the lens shows a pinhole camera's pixels, and the valid ones."""
     K = camera.K.copy()
     K[:2, 2] -= 0.5
     size = (camera.width, camera.height)
@@ -135,8 +135,8 @@ def _maps(camera: Camera, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarra
 def _folded(x: np.ndarray, y: np.ndarray, camera: Camera) -> np.ndarray:
     """Return the mask of pixels beyond the angle up to which the lens model is valid [H, W].
 
-    A polynomial that was fitted to the recorded rays decreases again farther out, where it would repeat the inner
-    part of the image, mirrored.
+    A polynomial that was fitted to the recorded rays decreases again farther out. It would mirror the inner part of
+    the image there.
     """
     # Sampling every few pixels is accurate enough, and fast.
     step = max(1, min(x.shape) // 256)

@@ -1,4 +1,4 @@
-"""Protection of captures against being written into: a new file in a capture may be read as a part of it."""
+"""Protection of captures against outputs in their folders: a new file may be read as a part of the capture."""
 
 from __future__ import annotations
 

@@ -4,9 +4,9 @@ An instant t = 0, 1, ... is a frame of the recording. It is shown by frame k of 
 
     k = o + r t,    with o the clip's offset and r its frame rate divided by the lowest frame rate.
 
-In a clip of variable frame rate k is a position on its regular clock, and the frame nearest to it shows the instant.
-If o is not whole, the clip has no frame of the instant. With a whole r the nearest one is always later by the same
-time, the camera's delay (see `Camera`), and is used as it is. Otherwise one is interpolated between two (see
+In a clip of variable frame rate, k is a position on its regular clock, and the nearest frame shows the instant. If o is
+not whole, the clip has no frame of the instant. With a whole r, the nearest frame is used unchanged: it is always later
+by the same time, the camera's delay (see `Camera`). Otherwise an image is interpolated between two frames (see
 `interpolation`).
 """
 
@@ -65,9 +65,9 @@ class Timeline:
 
     Attributes:
         frame_indices: per camera the clip's frames in ascending order, -1 for none, int [T].
-        shares: per camera the share of the time to the next frame [T] that has passed at each instant; None: no image
+        shares: per camera the share of the time to the next frame that has passed at each instant [T]; None: no image
             is interpolated.
-        delays: per camera the frames of its clip by which those are later than the instants that they show.
+        delays: per camera the time from an instant to the frame that shows it, in frames of its clip.
         rates: per camera the frames of its clip per instant.
         fps: instants per second.
         unchanged: whether instant t is frame t of every clip.
@@ -99,7 +99,7 @@ def timeline(
         readers: one clip per camera.
         config: how clips that do not match are read.
         max_frames: number of instants at most.
-        fps: true frame rate of all clips, or None for the rates in their headers.
+        fps: actual frame rate of all clips, or None for the rates in their headers.
 
     Raises:
         ValueError: lengths or rates differ or a rate varies and `config` does not resolve it, a clip is cut off, the
@@ -206,7 +206,7 @@ def nearest_frames(reader: FrameReader, positions: np.ndarray) -> tuple[np.ndarr
 
 
 def _note(reader: FrameReader, indices: np.ndarray) -> str:
-    """Return how irregular the times of a clip are, and how its instants are shown."""
+    """Return a note on the irregular times of a clip and the frames that show its instants."""
     assert reader.positions is not None
     assert reader.fps
     late = np.abs(reader.positions - np.rint(reader.positions)).max() / reader.fps
@@ -220,7 +220,7 @@ def _note(reader: FrameReader, indices: np.ndarray) -> str:
 
 
 def _periods(reader: FrameReader) -> int:
-    """Return the number of positions that a clip covers: that of its frames, if their rate is constant."""
+    """Return the number of positions that a clip covers: its number of frames if their rate is constant."""
     return reader.num_frames if reader.positions is None else round(reader.positions[-1]) + 1
 
 
@@ -245,7 +245,7 @@ def _check_complete(reader: FrameReader, required: int) -> None:
 
 
 def _check_even(reader: FrameReader, required: int) -> None:
-    """Check that each of the first `required` frames of a clip shows the instant of its number."""
+    """Check that frame t of a clip shows instant t, for the first `required` frames."""
     if reader.positions is None:
         return
     late = reader.positions[:required] - np.arange(len(reader.positions[:required]))
@@ -298,8 +298,8 @@ def read_settings(path: Path) -> dict[str, Any]:
     """Return the settings in a capture's `capture.json`, or {} without such a file.
 
     They are ``fps``, ``test_view``, ``meters_per_unit``, the length of a world unit in metres, and ``readout``, the
-    frames from the exposure of an image's first row to that of its last: a number for all cameras, or an object with
-    those that are not 0, by the cameras' names.
+    frames from the exposure of an image's first row to the exposure of its last row: a number for all cameras, or an
+    object with the numbers that are not 0, by the cameras' names.
 
     Raises:
         ValueError: the file is not a JSON object, or a setting is not valid.

@@ -1,7 +1,7 @@
 """Animated glTF models as deforming vertices: node hierarchies, morph targets and linear-blend skinning.
 
 With W_n the matrix of node n to the world, B_j the inverse bind matrix of joint j and w_j its weight at a vertex, a
-skinned vertex is at sum_j w_j W_j B_j x, and any other one at W_n x. Morph targets are added to x.
+skinned vertex is at sum_j w_j W_j B_j x, and any other vertex at W_n x. Morph targets are added to x.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ class Posed:
     """The nodes of a model at one time.
 
     Attributes:
-        matrices: from each node to the world [N, 4, 4].
-        weights: of the morph targets of each node.
+        matrices: transform from each node to the world [N, 4, 4].
+        weights: weights of each node's morph targets.
     """
 
     matrices: np.ndarray
@@ -47,7 +47,7 @@ def sample(channel: Channel, time: float) -> np.ndarray:
         return values[i]
     if channel.path == "rotation":
         first, second = Rotation.from_quat(values[i]), Rotation.from_quat(values[j])
-        # The rotation vector of the difference is the shorter way.
+        # The rotation vector of the difference takes the shorter way.
         return (first * Rotation.from_rotvec(u * (first.inv() * second).as_rotvec())).as_quat()
     return (1 - u) * values[i] + u * values[j]
 
@@ -85,13 +85,13 @@ def _local(node: Node, moved: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def deform(model: Gltf, index: int, posed: Posed, to_world: np.ndarray) -> Deformed:
-    """Return the vertices of all primitives of a node, one after the other, with normals where one of them has some.
+    """Return the concatenated vertices of a node's primitives, with normals if any primitive has them.
 
     Args:
         model: the model.
-        index: of the node.
-        posed: its nodes.
-        to_world: from the model to the world [4, 4].
+        index: index of the node.
+        posed: nodes of the model at the time.
+        to_world: transform from the model to the world [4, 4].
     """
     node = model.nodes[index]
     primitives = model.meshes[node.mesh]
@@ -128,10 +128,10 @@ def _vertex_matrices(model: Gltf, node: Node, primitive: Primitive, posed: Posed
 
 
 def _inverses(matrices: np.ndarray) -> np.ndarray:
-    """Return the adjugates [V, 3, 3], which are the inverses up to a factor, and exist for flattened parts, too."""
+    """Return the adjugates [V, 3, 3]: the inverses up to a factor, which also exist for flattened parts."""
     a, b, c = np.swapaxes(matrices, 1, 2).swapaxes(0, 1)
     rows = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
-    # The factor is the determinant, of which the sign matters.
+    # The factor is the determinant. Its sign matters.
     return rows * np.where(np.linalg.det(matrices) < 0, -1, 1)[:, None, None]
 
 

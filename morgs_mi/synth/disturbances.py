@@ -1,4 +1,4 @@
-"""Disturbances of a recording: clocks that are apart, rolling shutters, changes of exposure, lenses, and compression.
+"""Disturbances of a recording: time offsets, rolling shutters, changes of exposure, lens distortion, and compression.
 
 Frame k of a camera with the time offset o is exposed at (k + o) / fps, and its row r of H at
 (k + o + s ((r + 0.5) / H - 0.5)) / fps, with s the rolling shutter: the time of a frame is the time of its middle row.
@@ -38,7 +38,7 @@ __all__ = [
 class Disturbances:
     """Strength of the disturbances of a recording; by default there are none.
 
-    The held-out camera is the reference: it has no time offset, and exposure as it should be.
+    The held-out camera is the reference: it has no time offset and the correct exposure.
     """
 
     time_offset: Annotated[float, AtLeast(0)] = 0.0
@@ -66,7 +66,7 @@ class CameraDisturbance:
         rolling_shutter: time from the first row to the last, frames.
         gains: factor on the linear light of each frame [T].
         distortion: k of COLMAP's SIMPLE_RADIAL lens.
-        jpeg_quality: of the compression; 0 for none.
+        jpeg_quality: quality of the compression; 0 for none.
     """
 
     time_offset: float
@@ -89,7 +89,7 @@ class CameraDisturbance:
 def draw_disturbances(
     disturbances: Disturbances, num_cameras: int, num_frames: int, seed: int
 ) -> tuple[CameraDisturbance, ...]:
-    """Return the disturbance of each camera; a setting changes nothing but its own draws.
+    """Return the disturbance of each camera; a setting affects only its own draws.
 
     Raises:
         ValueError: a setting is out of range.
@@ -116,7 +116,7 @@ def draw_disturbances(
 
 
 def undistorted(camera: Camera, lens: Lens | None, pixels: np.ndarray) -> np.ndarray:
-    """Return where the pinhole `camera` sees what `lens` shows at `pixels` [P, 2], float64 [P, 2]."""
+    """Return the pixels of the pinhole `camera` that `lens` shows at `pixels` [P, 2], float64 [P, 2]."""
     if lens is None or not any(lens.distortion):
         return pixels
     precise = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-10)

@@ -21,7 +21,7 @@ __all__ = ["gltf_scene"]
 # The largest box of a model in the room [3], world units, and its centre on the floor.
 _BOX = np.array([2.8, 1.7, 2.4])
 _CENTER = np.array([0.0, 0.0, 0.2])
-# glTF's models face +z, where the cameras are. From the side, they show more of a walk.
+# glTF's models face +z, towards the cameras. The side view shows more of a walk.
 _TURN = np.deg2rad(40.0)
 # Times at which the box of an animated model is measured.
 _NUM_TIMES = 48
@@ -30,17 +30,17 @@ _NUM_TIMES = 48
 def gltf_scene(path: str | Path, animation: str | None = None, seed: int = 0) -> Scene:
     """Return a scene with an animated glTF model, scaled to the room and standing on its floor.
 
-    Skinning, morph targets and moving nodes are supported, base colours, roughness and metalness with their textures.
+    Skinning, morph targets, moving nodes, and base colours, roughness and metalness with textures are supported.
     The animation is repeated. Each node with a mesh is an object. Transparent materials are opaque.
 
     Args:
         path: a .glb or .gltf file.
         animation: name of the animation; None for the first.
-        seed: of the room's textures.
+        seed: seed of the room's textures.
 
     Raises:
         FileNotFoundError: the file, or one that it names, does not exist.
-        ValueError: the file is broken, or it has no mesh, no animation, or none of the name `animation`.
+        ValueError: the file is broken, or it has no mesh, no animation, or no animation named `animation`.
     """
     path = Path(path)
     model = read_gltf(path)
@@ -62,7 +62,7 @@ def gltf_scene(path: str | Path, animation: str | None = None, seed: int = 0) ->
 
 
 def _chosen(path: Path, model: Gltf, name: str | None) -> Animation:
-    """Return the animation of a name, or the first."""
+    """Return the animation with this name, or the first one."""
     if not model.animations:
         raise ValueError(f"{path}: expected an animation, got none; export the model with its animation.")
     if name is None:
@@ -77,10 +77,10 @@ def _chosen(path: Path, model: Gltf, name: str | None) -> Animation:
 def _placement(
     path: Path, model: Gltf, drawn: list[int], posed: Callable[[float], Posed], duration: float
 ) -> np.ndarray:
-    """Return the matrix [4, 4] that puts what a model sweeps on the floor, as large as fits."""
+    """Return the matrix [4, 4] that scales a model to the room and puts its swept box on the floor."""
     turned = rotate("y", _TURN)
     low, high = np.full(3, np.inf), np.full(3, -np.inf)
-    with np.errstate(over="ignore", invalid="ignore"):  # products of many scales, which are refused below
+    with np.errstate(over="ignore", invalid="ignore"):  # products of many scales, which are rejected below
         for time in np.linspace(0, duration, _NUM_TIMES, endpoint=False):
             points = np.concatenate([deform(model, i, posed(float(time)), turned).vertices for i in drawn])
             low, high = np.minimum(low, points.min(axis=0)), np.maximum(high, points.max(axis=0))
@@ -95,14 +95,14 @@ def _placement(
 def _object(
     model: Gltf, index: int, posed: Callable[[float], Posed], placed: np.ndarray, materials: list[dict[str, Any]]
 ) -> DeformingObject:
-    """Return the object of a node, whose meshes are the primitives of its mesh."""
+    """Return the object of a node, with one mesh per primitive."""
     primitives = model.meshes[model.nodes[index].mesh]
     counts = [len(primitive.positions) for primitive in primitives]
     uvs = np.concatenate([np.zeros((len(p.positions), 2)) if p.uvs is None else p.uvs for p in primitives])
     starts = np.cumsum([0, *counts])
     meshes = {f"mesh{i}": _mesh(p, int(starts[i]), uvs, materials) for i, p in enumerate(primitives)}
 
-    # The ground truth of a frame needs its vertices several times, and those of its neighbours.
+    # The ground truth of a frame uses the vertices of the frame and of its neighbours several times.
     @lru_cache(maxsize=4)
     def shape(time: float) -> Deformed:
         return deform(model, index, posed(time), placed)
@@ -138,7 +138,7 @@ def _bitmap(texture: Texture, values: np.ndarray) -> dict[str, Any]:
 
 
 def _names(names: Iterable[str], taken: set[str]) -> list[str]:
-    """Return names that differ from one another and from `taken`, without what Mitsuba does not accept."""
+    """Return names that differ from one another and from `taken`, without characters that Mitsuba rejects."""
     found: list[str] = []
     counts: dict[str, int] = {}
     for name in names:

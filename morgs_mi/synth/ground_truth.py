@@ -1,8 +1,8 @@
 """Exact ground truth of a clip: motion, depth, object ids and motion masks.
 
-A surface point x_t of a rigid object with pose M_t was at x_{t-1} = M_{t-1} M_t^{-1} x_t. That of a deforming object
-has barycentric coordinates b_i in a triangle, and x_t - x_{t-1} = sum_i b_i (v_{i,t} - v_{i,t-1}) with its vertices
-v_i. With pi the projection, the motion map of frame t is pi(x_t) - pi(x_{t-1}) at each pixel of frame t.
+A surface point x_t of a rigid object with pose M_t was at x_{t-1} = M_{t-1} M_t^{-1} x_t. A point of a deforming
+object has barycentric coordinates b_i in a triangle, and x_t - x_{t-1} = sum_i b_i (v_{i,t} - v_{i,t-1}) with its
+vertices v_i. With pi the projection, the motion map of frame t is pi(x_t) - pi(x_{t-1}) at each pixel of frame t.
 
 On disk: ``truth/cam00/0000.exr`` holds one camera's frame, ``truth/tracks.npz`` the clip's trajectories.
 """
@@ -30,7 +30,7 @@ class SurfacePoints:
     """Points on the objects of a scene at one time.
 
     Attributes:
-        positions: [..., 3], world units; meaningless where the id is negative.
+        positions: [..., 3], world units; undefined where the id is negative.
         ids: object id [...]; -1 where there is no surface, or a lamp.
         corners: indices of the three vertices around a point of a deforming object [..., 3].
         weights: barycentric coordinates of the point [..., 3].
@@ -52,17 +52,17 @@ class SurfacePoints:
         return SurfacePoints(self.positions.reshape(*shape, 3), self.ids.reshape(shape), *vectors)
 
     def pick(self, pixels: np.ndarray) -> SurfacePoints:
-        """Return the points of some pixels, given their indices in row-major order [P]."""
+        """Return the points of the pixels with these indices [P] in row-major order."""
         flat = self.reshaped(self.ids.size)
         return SurfacePoints(flat.positions[pixels], flat.ids[pixels], flat.corners[pixels], flat.weights[pixels])
 
 
-# Of each object: its pose [4, 4], or the vertices of a deforming one.
+# Per object: its pose [4, 4], or the vertices of a deforming object.
 Poses = Sequence[np.ndarray | Deformed]
 
 
 def move_with_objects(surface: SurfacePoints, poses: Poses, new_poses: Poses) -> np.ndarray:
-    """Return the positions of surface points after their objects have moved [..., 3].
+    """Return the positions [..., 3] of surface points after the motion of their objects.
 
     Points that do not move are returned bit for bit.
 
@@ -96,12 +96,12 @@ def compute_ground_truth(
         after: the same in the next frame, which determines the mask of the first frame.
     """
     hit = surface.ids >= 0
-    # Where there is no surface, any point in front of the camera avoids a division by zero; its values are not used.
+    # Where there is no surface, a point in front of the camera avoids a division by zero; its values are not used.
     points = np.where(hit[..., None], surface.positions, camera.position + np.asarray(camera.viewmat)[2, :3])
     pixels, depth = camera.project(points)
     other = move_with_objects(replace(surface, positions=points), poses, after if before is None else before)
     motion = np.zeros_like(pixels) if before is None else pixels - camera.project(other)[0]
-    # Coordinates are single-precision: motion below their rounding error counts as none.
+    # Coordinates are single-precision: motion below their rounding error counts as zero.
     mask = np.linalg.norm(other - points, axis=-1) > 1e-6 * np.abs(points).max()
     return GroundTruth(
         motion.astype(np.float32), np.where(hit, depth, 0).astype(np.float32), surface.ids.astype(np.int32), mask

@@ -18,7 +18,7 @@ from morgs_mi.synth.scene import Deformed, DeformingObject, Mesh, Object, Scene
 
 __all__ = ["PathTracer", "developed", "srgb_bytes"]
 
-# Share of a point's distance in which a hit is its own surface: intersections are single-precision.
+# A hit within this share of a point's distance is its own surface: intersections are single-precision.
 _OWN_SURFACE = 1e-4
 
 
@@ -35,10 +35,10 @@ def developed(linear: np.ndarray, noise: float, seed: int) -> np.ndarray:
     """Return exposed light [H, W, 3] as an image, sRGB-encoded [H, W, 3], uint8.
 
     Args:
-        linear: the light, of which 1 is white.
+        linear: the light; 1 is white.
         noise: standard deviation of the sensor noise per channel, relative to white. It does not depend on the
             brightness: photon noise grows with the square root of the light, which the sRGB encoding approximates.
-        seed: of the noise.
+        seed: seed of the noise.
     """
     grain = noise * np.random.default_rng([seed, 1]).standard_normal(linear.shape) if noise else 0.0
     return srgb_bytes(linear, grain)
@@ -48,13 +48,13 @@ def _load(name: str, content: dict[str, Any]) -> Any:
     try:
         return mi.load_dict(content, optimize=False)
     except RuntimeError as error:
-        # Mitsuba's sentence begins with a line of its own source.
+        # Mitsuba's message begins with a line of its own source.
         reason = re.sub(r"^\[\w+\.cpp:\d+\] ", "", str(error)).rstrip(".! ")
         raise ValueError(f"scene {name!r}: Mitsuba cannot load it: {reason}; correct the dictionary.") from error
 
 
 def _mesh(place: str, name: str, mesh: Mesh, used: np.ndarray, faces: np.ndarray) -> Any:
-    """Return a Mitsuba mesh of the vertices `used` of an object; `faces` [F, 3] index into these."""
+    """Return a Mitsuba mesh of the vertices `used` of an object; `faces` [F, 3] are indices into these."""
     props = mi.Properties()
     props["bsdf"] = _load(place, mesh.bsdf)
     props["face_normals"] = not mesh.smooth
@@ -75,7 +75,7 @@ def _pose_of(item: Object | DeformingObject, time: float) -> np.ndarray | Deform
 
 @dataclass(frozen=True)
 class _Part:
-    """A mesh of a deforming object in Mitsuba: its name, its object, and the object's vertices that it has [V]."""
+    """A mesh of a deforming object in Mitsuba: its name, its object, and the indices of its vertices [V]."""
 
     name: str
     owner: str
@@ -86,8 +86,8 @@ class _Part:
 class PathTracer:
     """Path tracer of a scene at one time.
 
-    The scene is loaded once. Moving objects are instances of which only the transforms change, or meshes of which only
-    the vertices do, so all views and frames run the same kernels.
+    The scene is loaded once. Only the transforms of instances and the vertices of deforming meshes change, so all views
+    and frames run the same kernels.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -117,7 +117,7 @@ class PathTracer:
                 shapes = {name: {"type": "instance", "group": {"type": "ref", "id": f"{name}_group"}}}
             content |= shapes
             owners |= dict.fromkeys(shapes, index)
-        # The optimisation would merge meshes that share a material, even those of different objects.
+        # The optimisation would merge meshes that share a material, even meshes of different objects.
         self._scene: Any = _load(scene.name, content)
         shapes = [shape for shape in self._scene.shapes() if shape.id() in owners]
         self._owners = [(mi.ShapePtr(shape), owners[shape.id()], faces.get(shape.id())) for shape in shapes]
@@ -125,13 +125,13 @@ class PathTracer:
         moving = {name: light.pose for name, light in scene.lights.items() if light.pose is not None}
         self._lamps = {f"{name}.to_world": (pose, self._lamp_transform(name)) for name, pose in moving.items()}
         self._exposure = 1.0
-        # Only lamps are sampled: 16 samples have as little noise as 64 with a sky, which take seven times longer.
+        # Only lamps are sampled: 16 samples have as little noise as 64 samples with a sky, and are seven times faster.
         self._integrator: Any = mi.load_dict({"type": "direct", "emitter_samples": 1, "bsdf_samples": 0})
         self.set_time(0.0)
 
     @property
     def has_emitters(self) -> bool:
-        """Whether anything emits light."""
+        """Whether the scene has an emitter."""
         return bool(self._scene.emitters())
 
     def _lamp_transform(self, light: str) -> np.ndarray:
@@ -148,7 +148,7 @@ class PathTracer:
         return [_pose_of(item, time) for item in self.scene.objects.values()]
 
     def set_time(self, time: float) -> None:
-        """Set the poses of all objects and lamps, and the exposure, to those at `time` in seconds."""
+        """Set the poses of all objects and lamps, and the exposure, to `time` in seconds."""
         for name, item in self.scene.objects.items():
             if isinstance(item, DeformingObject):
                 self._set_shape(name, item.shape(time))
@@ -172,7 +172,7 @@ class PathTracer:
         Args:
             camera: the view.
             spp: samples per pixel.
-            seed: of the samples and the noise.
+            seed: seed of the samples and the noise.
             noise: standard deviation of the sensor noise per channel, as for `developed`.
         """
         return developed(self.light(camera, spp, seed), noise, seed)
@@ -190,20 +190,20 @@ class PathTracer:
 
         Args:
             camera: the view without distortion.
-            rows: their indices [R].
+            rows: indices of the rows [R].
             spp: samples per pixel.
-            seed: of the samples.
-            lens: its distortion; None for a pinhole.
+            seed: seed of the samples.
+            lens: the distortion; None for a pinhole.
         """
         sampler: Any = mi.load_dict({"type": "multijitter", "sample_count": spp})
-        spp = sampler.sample_count()  # which it has rounded up
+        spp = sampler.sample_count()  # rounded up by the sampler
         sampler.set_samples_per_wavefront(spp)
         sampler.seed(seed, len(rows) * camera.width * spp)
         # The samples of a pixel follow one another.
         corners = np.stack(np.meshgrid(np.arange(camera.width), rows), axis=-1).reshape(-1, 1, 2)
         pixels = corners + np.array(sampler.next_2d()).T.reshape(len(corners), -1, 2)
         origin, directions = camera.rays(undistorted(camera, lens, pixels.reshape(-1, 2)))
-        # As an array, because a literal would be compiled into a kernel of its own for every camera.
+        # An array, because a literal would compile a separate kernel for every camera.
         origins = np.repeat(origin[:, None], len(directions), axis=1)
         ray: Any = mi.RayDifferential3f(mi.Point3f(origins), mi.Vector3f(directions.T))
         light = np.array(self._integrator.sample(self._scene, sampler, ray, None, mi.Bool(True))[0])

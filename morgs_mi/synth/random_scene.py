@@ -1,8 +1,8 @@
 """Random scenes: the seed draws the objects, their motion, textures, lights, the rig and the noise.
 
 `draw_scene` draws everything but the colours, without Mitsuba; `build` adds walls, textures and lights. Objects never
-touch one another: the boxes that they sweep are disjoint. Speeds are those of an object's fastest point in the held-out
-view, in pixels per frame at 320x240 and 30 frames per second.
+touch one another: their swept boxes are disjoint. The speed of an object is the speed of its fastest point in the
+held-out view, in pixels per frame at 320x240 and 30 frames per second.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ SPEEDS = (2.0, 12.0)
 THIN_SPEEDS = (7.0, 12.0)
 ROOM_HEIGHT, ROOM_DEPTH, FRONT = 3.2, 1.7, 2.0
 GAP = 0.04
-# All paths have this period of phases, in radians.
+# Period of all paths in the phase, radians.
 PHASES = np.linspace(0, 4 * np.pi, 129)
 # Faster oscillations would turn back within a few frames, and faster spins alias.
 MAX_RATE = 7.0
@@ -40,12 +40,12 @@ Path = Callable[[Any], np.ndarray]
 
 @dataclass(frozen=True)
 class Body:
-    """A solid with its place and motion.
+    """A solid with its position and motion.
 
     Attributes:
         solid: its shape.
         motion: one of `MOTIONS`, or ``static``.
-        speed: of the fastest point in the held-out view, px per frame; 0 if static.
+        speed: speed of the fastest point in the held-out view, px per frame; 0 if static.
         pose: seconds -> object-to-world matrix [4, 4].
         bounds: lowest and highest corner of the box that it sweeps [2, 3], world units.
     """
@@ -59,13 +59,13 @@ class Body:
 
 @dataclass(frozen=True)
 class RandomScene:
-    """What a seed determines besides the colours.
+    """Objects, rig and noise of a random scene, without its colours.
 
     Attributes:
-        bodies: by name.
+        bodies: bodies by name.
         rig: positions of the cameras.
         recording: number of cameras and noise.
-        half_width: of the room, world units.
+        half_width: half the width of the room, world units.
         swing: amplitude of the lamp's motion about the vertical axis, radians; 0 for a static lamp.
     """
 
@@ -138,10 +138,10 @@ def _place(
     camera: Camera,
     fits: Callable[[np.ndarray], bool],
 ) -> Body | None:
-    """Return a body whose bounds fit, or None if the room is full.
+    """Return a body with bounds that fit, or None if the room is full.
 
     Args:
-        rng: of all draws.
+        rng: generator of all draws.
         motion: one of `MOTIONS`, or ``static``.
         thin: whether it is a rod, which is fast if it moves.
         pace: mean speed of the other moving objects, px per frame.
@@ -228,7 +228,7 @@ def _inside(bounds: np.ndarray, half_width: float) -> bool:
 
 
 def _seen(bounds: np.ndarray, cameras: list[Camera]) -> bool:
-    """Return whether all but a quarter of the cameras see a box, the held-out one included."""
+    """Return whether the held-out camera, and at least three quarters of all cameras, see a box."""
     corners = np.stack(np.meshgrid(*bounds.T), axis=-1).reshape(-1, 3)
     pixels = np.stack([camera.project(corners)[0] for camera in cameras])
     seen: np.ndarray = np.all((pixels > 0) & (pixels < [WIDTH, HEIGHT]), axis=(1, 2))
@@ -245,7 +245,7 @@ def _move(poses: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _rigid(shift: np.ndarray | float, turn: np.ndarray) -> np.ndarray:
-    """Return the rotations about the vectors `turn` [..., 3] by their lengths in radians, then shifts, [..., 4, 4]."""
+    """Return rotations about the vectors `turn` [..., 3] by their lengths in radians, then shifts, as [..., 4, 4]."""
     matrix = np.broadcast_to(np.eye(4), (*turn.shape[:-1], 4, 4)).copy()
     matrix[..., :3, :3] = Rotation.from_rotvec(turn).as_matrix()
     matrix[..., :3, 3] = shift

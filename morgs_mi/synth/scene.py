@@ -49,7 +49,7 @@ class Object:
 
     Attributes:
         shapes: Mitsuba shape dictionaries by name, in object space.
-        pose: seconds -> rigid object-to-world matrix [4, 4]; None for a static object, whose space is the world's.
+        pose: seconds -> rigid object-to-world matrix [4, 4]; None for a static object, in world space.
     """
 
     shapes: Mapping[str, dict[str, Any]]
@@ -88,11 +88,11 @@ class Mesh:
 
 @dataclass(frozen=True)
 class DeformingObject:
-    """An object of triangles whose vertices move.
+    """An object of triangles with moving vertices.
 
     Attributes:
-        meshes: by name.
-        shape: seconds -> its vertices, as many at all times.
+        meshes: meshes by name.
+        shape: seconds -> its vertices, in constant number.
     """
 
     meshes: Mapping[str, Mesh]
@@ -105,7 +105,7 @@ class Light:
 
     Attributes:
         shape: Mitsuba dictionary of an emitter, or of a shape with one, in the lamp's space.
-        pose: seconds -> rigid lamp-to-world matrix [4, 4]; None for a static lamp, whose space is the world's.
+        pose: seconds -> rigid lamp-to-world matrix [4, 4]; None for a static lamp, in world space.
     """
 
     shape: dict[str, Any]
@@ -118,9 +118,9 @@ class Rig:
 
     Attributes:
         center: point that the cameras look at [3].
-        distance: from the cameras to the centre, world units.
+        distance: distance of the cameras from the centre, world units.
         fov: horizontal field of view, degrees.
-        elevation: of the cap's centre above the horizon, degrees.
+        elevation: elevation of the cap's centre above the horizon, degrees.
         spread: half-width and half-height of the cap, degrees.
     """
 
@@ -147,10 +147,10 @@ class Rig:
 
 @dataclass(frozen=True)
 class RecordingDefaults:
-    """How a scene is recorded unless `synthesize` is given other values.
+    """Default settings of a scene's recording, for `synthesize`.
 
     Attributes:
-        num_cameras: including the held-out view.
+        num_cameras: number of cameras, including the held-out view.
         spp: samples per pixel.
         noise: standard deviation of the sensor noise, relative to white.
     """
@@ -166,7 +166,7 @@ class Scene:
 
     Attributes:
         name: the scene's name in the capture.
-        objects: by name; an object's index in this mapping is its id in the ground truth.
+        objects: objects by name; the index in this mapping is the id in the ground truth.
         lights: lamps by name.
         rig: positions of the cameras.
         exposure: seconds -> exposure factor of all cameras; None for 1.
@@ -199,7 +199,7 @@ def load_scene(scene: str | Path, seed: int = 0) -> Scene:
     assert spec
     assert spec.loader
     module = importlib.util.module_from_spec(spec)
-    # Dataclasses look up the names of their postponed annotations there.
+    # Dataclasses look up the names of their postponed annotations in `sys.modules`.
     sys.modules[spec.name] = module
     with failures_in(path):
         spec.loader.exec_module(module)
@@ -281,7 +281,7 @@ def _nodes(item: Object | DeformingObject | Light) -> Mapping[str, Any]:
 
 
 def item_ids(name: str, item: Object | DeformingObject | Light) -> list[str]:
-    """Return the names by which Mitsuba knows the shapes of an object or a lamp."""
+    """Return the names of an object's or a lamp's shapes in Mitsuba."""
     if isinstance(item, DeformingObject):
         return [f"{name}_{part}" for part in item.meshes]
     if isinstance(item, Object):
@@ -290,7 +290,7 @@ def item_ids(name: str, item: Object | DeformingObject | Light) -> list[str]:
 
 
 def _check_node(where: str, node: Any) -> None:
-    """Check a Mitsuba dictionary, whose errors would not name the object, or end the process."""
+    """Check a Mitsuba dictionary, because Mitsuba's errors do not name the object or end the process."""
     if not isinstance(node, Mapping) or "type" not in node:
         expected = "expected a Mitsuba dictionary with a `type`"
         raise ValueError(f"{where}: {expected}, got {node!r:.60}; see {page('scenes')}.")
@@ -364,7 +364,7 @@ def rotate(axis: str, angle: float) -> np.ndarray:
 
 
 def _scene_files() -> dict[str, Path]:
-    """Return the package's scenes: from the repository, or from the data files that pip installed."""
+    """Return the package's scenes, from the repository or from the installed data files."""
     checkout = Path(__file__).parents[2] / "scenes"
     if checkout.is_dir():
         return {path.stem: path for path in checkout.glob("*.py")}

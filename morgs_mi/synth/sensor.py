@@ -13,7 +13,7 @@ from morgs_mi.synth.synth_config import SynthConfig
 
 __all__ = ["check_lenses", "record_light"]
 
-# Rows that a rolling shutter reads at one time; at 10 pixels a frame, objects move by 0.2 pixels meanwhile.
+# Rows that a rolling shutter reads at one time; at 10 pixels per frame, objects move by 0.2 pixels in this time.
 _BAND = 4
 
 
@@ -38,14 +38,14 @@ def check_lenses(cameras: Sequence[Camera], disturbed: Sequence[CameraDisturbanc
 def record_light(
     tracer: PathTracer, camera: Camera, own: CameraDisturbance, frame: int, config: SynthConfig
 ) -> np.ndarray:
-    """Return the light of a frame as a camera with its clock, shutter and lens receives it, linear [H, W, 3].
+    """Return the light of a frame that a camera with its clock, shutter and lens receives, linear [H, W, 3].
 
     Args:
         tracer: the scene; its time is changed.
         camera: the view without distortion.
-        own: its disturbance, of which exposure and compression are not applied.
+        own: the camera's disturbance; its exposure and compression are not applied.
         frame: index of the frame.
-        config: has the samples per pixel, their seed and the frame rate.
+        config: samples per pixel, their seed and the frame rate.
     """
     assert config.spp is not None
     if not own.rolling_shutter and not own.distortion:

@@ -23,7 +23,7 @@ class Solid:
     Attributes:
         kind: the shape's name.
         points: centres of spheres that enclose it [P, 3], world units.
-        margin: radius of these spheres.
+        margin: radius of the spheres.
         parts: returns Mitsuba shapes by name, given a function from a texture's aspect ratio to a material.
     """
 
@@ -34,7 +34,7 @@ class Solid:
 
 
 def draw_solid(rng: np.random.Generator, hangs: bool, thin: bool) -> Solid:
-    """Return a solid that stands or floats, or one that hangs from the origin; a rod if it is to be thin."""
+    """Return a solid that stands or floats, or one that hangs from the origin; a rod if `thin`."""
     if thin:
         return _rod(rng, hangs)
     if hangs:

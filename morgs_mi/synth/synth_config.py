@@ -51,11 +51,11 @@ class SynthConfig:
         check_ranges(self, "synthesize()")
 
     def completed(self, recording: RecordingDefaults) -> SynthConfig:
-        """Return the settings with the scene's own ones where none are given."""
+        """Return the settings, with the scene's own values for missing ones."""
         own = {"cameras": recording.num_cameras, "spp": recording.spp, "noise": recording.noise}
         return replace(self, **{name: value for name, value in own.items() if getattr(self, name) is None})
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the settings as they stand in `capture.json`."""
+        """Return the settings as stored in `capture.json`."""
         values = asdict(self)
         return {"num_cameras": values.pop("cameras"), "num_frames": values.pop("frames"), **values}

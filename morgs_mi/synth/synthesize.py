@@ -57,9 +57,10 @@ def synthesize(
     """Path-trace a moving scene into a multi-view capture in N3DV's layout, with exact ground truth.
 
     Writes ``frames/cam00/0000.png`` ..., ``cam00.mp4`` ... for players (see `playable_format`), ``poses_bounds.npy``, a
-    COLMAP text model ``sparse/0`` with points like those of structure from motion, ``capture.json`` and ``truth/`` (see
+    COLMAP text model ``sparse/0`` with points as from structure from motion, ``capture.json`` and ``truth/`` (see
     `ground_truth` and `disturbances`). ``cam00`` is the central camera of the rig and the held-out test view, as in
-    N3DV. With lens distortion there is no ``poses_bounds.npy``, which cannot hold it. The folder is written atomically.
+    N3DV. With lens distortion there is no ``poses_bounds.npy``, which cannot represent it. The folder is written
+    atomically.
 
     Tracks are at the times of the frames of ``cam00``, the other ground truth at the times of each camera.
 
@@ -115,7 +116,7 @@ class _Rig:
     """Cameras that record a scene.
 
     Attributes:
-        cameras: without distortion.
+        cameras: cameras without distortion.
         disturbed: disturbance of each camera.
         config: complete settings.
     """
@@ -131,7 +132,7 @@ class _Rig:
         return cls(cameras, draw_disturbances(config.disturbances, config.cameras, config.frames, config.seed), config)
 
     def times(self) -> list[float]:
-        """Return the times of the frames and after the last, and the extreme times of rows that are read, seconds."""
+        """Return the times of the frames, the time after the last one, and the extreme times of read rows, seconds."""
         ends = (0, 0), (self.config.frames, -1)
         read = [own.row_times(frame, self.config.height)[row] for own in self.disturbed for frame, row in ends]
         return [float(t) / self.config.fps for t in sorted({*range(self.config.frames + 1), min(read), max(read)})]

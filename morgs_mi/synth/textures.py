@@ -29,10 +29,10 @@ def pattern(seed: int, first: RGB, second: RGB, cells: int, finest: float, size:
     """Return a reflectance texture [size, size, 3], linear: a checker of two colours under coloured noise.
 
     Args:
-        seed: of the noise.
+        seed: seed of the noise.
         first: one colour of the checker.
         second: the other.
-        cells: squares across; even, so that the texture is periodic.
+        cells: squares across; an even number gives a periodic texture.
         finest: highest frequency of the noise in cycles across.
         size: texels across.
     """
@@ -52,8 +52,8 @@ def textured(
 
     Args:
         texture: reflectance [size, size, 3], linear.
-        roughness: of the plastic; None for diffuse.
-        repeat: repetitions of the texture along u and v, so that it is not stretched on long, thin shapes.
+        roughness: roughness of the plastic; None for diffuse.
+        repeat: repetitions of the texture along u and v, which avoid stretching on long, thin shapes.
     """
     import mitsuba as mi
 

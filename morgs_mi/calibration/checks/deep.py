@@ -1,7 +1,7 @@
-"""Check of a whole recording: which cameras differ from the others in time, exposure, sharpness or place.
+"""Check of a whole recording: cameras that differ from the others in time, exposure, sharpness or position.
 
-The poses are checked on the first frame by `rig_check`; here many frames are read. A finding is a sentence with numbers
-and advice. The limits are far above what clips without faults show, so that a finding is worth a look.
+`rig_check` checks the poses on the first frame; this module reads many frames. A finding is a sentence with numbers and
+advice. The limits are far above the values of clips without faults.
 """
 
 from __future__ import annotations
@@ -31,22 +31,22 @@ from morgs_mi.core.rig import overlaps
 
 __all__ = ["MAX_FRAMES", "DeepCheck", "Finding", "check_deep", "check_exposures"]
 
-# Frames that are read: the faults of a longer recording show in its beginning.
+# Largest number of frames that are read: the start of a longer recording shows its faults.
 MAX_FRAMES = 120
 # px, and multiple of the rig's median, above which a reprojection error is a finding.
 _ERROR, _TIMES_ERROR = 0.7, 3.0
-# Frames. A time offset is a finding if a whole frame is nearer to it than none, by more than its error.
+# Frames. A time offset is a finding if it is nearer to a whole frame than to zero, by more than its error.
 _OFFSET, _OFFSET_CHANGE, _MIN_HALF = 0.65, 0.75, 24
 # Differences of log gains: about 10 % of exposure, and 5 % of one channel against the mean of all.
 _EXPOSURE, _BALANCE, _MIN_SAMPLES = 0.1, 0.05, 16
 _CORRECTIONS = "--exposure auto or --color linear"
-# For a quick check of the exposures: width to which images are reduced, px, and near views with which each is matched.
+# Quick check of the exposures: width of the reduced images, px, and number of near views that each is matched with.
 _QUICK_WIDTH, _QUICK_NEIGHBOURS = 480, 3
 # Error of a median log ratio that no number of points removes, because surfaces look different from two sides.
 _LOG_ERROR = 0.02
 # Threshold on the range of the log brightness over time, about 8 %: people walking through a room cause up to 5 %.
 _VARIATION = 0.08
-# Octaves by which an image is less sharp than those of the rig, and than the others of its camera.
+# Octaves by which an image is less sharp than the images of the rig, and than the others of its camera.
 _BLUR, _BLURRED_FRAME, _SPREADS = 1.0, 0.5, 6.0
 # Share of a camera's image that the camera with the largest overlap sees.
 _OVERLAP = 0.3
@@ -55,10 +55,10 @@ _MAX_LISTED = 6
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is wrong with a recording.
+    """A fault of a recording.
 
     Attributes:
-        question: what was checked: error, time, exposure, variation, flicker, blur, repeats or overlap.
+        question: name of the check: error, time, exposure, variation, flicker, blur, repeats or overlap.
         cameras: names of the cameras that it concerns.
         sentence: numbers and advice.
     """
@@ -70,23 +70,23 @@ class Finding:
 
 @dataclass(frozen=True)
 class DeepCheck:
-    """Result of checking a recording; what could not be measured is NaN.
+    """Result of checking a recording; missing measurements are NaN.
 
     Attributes:
-        names: of the C cameras.
+        names: names of the C cameras.
         frames: number T of frames that were read.
         fps: frames per second.
-        given: time offset that each camera was read with, frames.
+        given: time offset with which each camera was read, frames.
         errors: median reprojection error of each camera [C], px.
         offsets: time offset of each camera from the median [C], frames.
         halves: the same in the first and the last half of the frames [2, C].
         gains: log gain of each camera's channels in linear light, relative to the median [C, 3].
         brightness: log brightness of each camera over time, relative to its median [T, C].
-        sharpness: of each image [T, C], octaves.
-        repeated: per camera the frames that repeat the one before.
+        sharpness: per image [T, C], octaves.
+        repeated: per camera the frames that repeat the previous one.
         lamps: per camera the flicker of lamps, or None.
-        overlaps: share of each camera's image that each other one sees [C, C].
-        findings: what is wrong.
+        overlaps: share of each camera's image that each other camera sees [C, C].
+        findings: faults.
     """
 
     names: tuple[str, ...]
@@ -106,7 +106,7 @@ class DeepCheck:
 
     @property
     def unmeasured(self) -> str:
-        """What could not be measured for which cameras, in a sentence; empty if all was."""
+        """The missing measurements and their cameras, in a sentence; empty if none is missing."""
         values = {"time offsets": self.offsets, "exposure against the other cameras": self.gains.mean(axis=1)}
         missing = {what: [self.names[view] for view in np.flatnonzero(np.isnan(v))] for what, v in values.items()}
         parts = [f"{what} of {_listed(names, len(self.names))}" for what, names in missing.items() if names]
@@ -118,12 +118,12 @@ class DeepCheck:
 
 
 def check_deep(capture: Capture, shared: SharedFeatures, rig: RigCheck, signals: Signals) -> DeepCheck:
-    """Return what is wrong with a recording.
+    """Return the measurements and the faults of a recording.
 
     Args:
         capture: at its recorded size.
         shared: features of its first frame.
-        rig: result of checking the poses with these.
+        rig: result of checking the poses with these features.
         signals: measurements of its frames.
     """
     bands = brightness(signals)
@@ -149,11 +149,11 @@ def check_deep(capture: Capture, shared: SharedFeatures, rig: RigCheck, signals:
 
 
 def check_exposures(capture: Capture, shared: SharedFeatures | None = None) -> list[Finding]:
-    """Return which cameras differ from the others in exposure or white balance, by the first frame.
+    """Return a finding for each camera with a different exposure or white balance in the first frame.
 
     Args:
         capture: a capture.
-        shared: features of its first frame in its size; None: those of reduced images, in about 0.3 s per view.
+        shared: features of its first frame in its size; None: features of reduced images, in about 0.3 s per view.
     """
     capture = _reduced(capture) if shared is None else capture
     images = next(capture.partial_frames(0, 1)).images
@@ -173,7 +173,7 @@ def _reduced(capture: Capture) -> Capture:
 
 
 def _gains(cameras: Sequence[Camera], images: Sequence[np.ndarray | None], shared: SharedFeatures) -> np.ndarray:
-    """Return the log gains of all cameras [C, 3] that explain the colours of points that two of them see."""
+    """Return the log gains of all cameras [C, 3] that explain the colours of points in two views."""
     pairs, colors = matched_colors(cameras, images, shared.features, shared.matches)
     pairs = [pair for pair in pairs if len(pair.features) >= _MIN_SAMPLES]
     ratios = []
@@ -186,7 +186,7 @@ def _gains(cameras: Sequence[Camera], images: Sequence[np.ndarray | None], share
     return np.stack([consensus(len(colors), views, channel, weights) for channel in middles.T], axis=1)
 
 
-# The cameras that a finding concerns, and what is wrong with them.
+# The cameras that a finding concerns, and their fault.
 _Found = tuple[Sequence[int], str]
 
 
@@ -227,7 +227,7 @@ def _times(check: DeepCheck) -> Iterator[_Found]:
 
 
 def _exposures(gains: np.ndarray) -> Iterator[_Found]:
-    """Yield the cameras of other exposure or white balance; `gains` are the log gains of their channels [C, 3]."""
+    """Yield the cameras with a different exposure or white balance; `gains` are log gains per channel [C, 3]."""
     for view, (own, mean) in enumerate(zip(gains, gains.mean(axis=1), strict=True)):
         if abs(mean) > _EXPOSURE:
             amount = f"{100 * abs(np.expm1(mean)):.0f} % {'brighter' if mean > 0 else 'darker'}"
@@ -254,7 +254,7 @@ def _flicker(check: DeepCheck) -> Iterator[_Found]:
 def _variations(check: DeepCheck) -> Iterator[_Found]:
     common = known_median(check.brightness, axis=1)[:, None]
     span, rest = _span(common)[0], _usual(_span(check.brightness - common))
-    # The range of a flicker is twice its amplitude; twice as much is no flicker alone.
+    # The range of a flicker is twice its amplitude; twice that range has another cause as well.
     limits = np.array([max(_VARIATION, 4 * lamp.amplitude if lamp else 0) for lamp in check.lamps])
     lit = len(check.names) > 2 and span > limits.max() and rest < 0.5 * span
     if lit:
@@ -275,7 +275,7 @@ def _variations(check: DeepCheck) -> Iterator[_Found]:
 
 
 def _span(values: np.ndarray) -> np.ndarray:
-    """Return the range over time of values [T, C] where known, NaN without any [C]."""
+    """Return the range over time of the known values of [T, C], NaN without any [C]."""
     known = np.isfinite(values)
     spans = np.where(known, values, -np.inf).max(axis=0) - np.where(known, values, np.inf).min(axis=0)
     return np.where(known.any(axis=0), spans, np.nan)
@@ -293,7 +293,7 @@ def _blur(check: DeepCheck) -> Iterator[_Found]:
             )
     relative = check.sharpness - levels
     for view, values in enumerate(relative.T):
-        # Compression changes from frame to frame, in all cameras alike if they share an encoder.
+        # Compression changes from frame to frame, equally in all cameras if they share an encoder.
         dips = values - known_median(np.delete(relative, view, axis=1), axis=1)
         dips = dips if np.isfinite(dips).any() else values
         spread = 1.5 * _usual(np.abs(dips - _usual(dips)))
@@ -336,12 +336,12 @@ _QUESTIONS: dict[str, Callable[[DeepCheck], Iterator[_Found]]] = {
 
 
 def _usual(values: np.ndarray) -> float:
-    """Return the median of what is not NaN, or NaN."""
+    """Return the median of the values that are not NaN, or NaN."""
     return float(known_median(values, axis=0))
 
 
 def _frames(frames: Sequence[int] | np.ndarray) -> str:
-    """Return frame numbers as text, a few of many."""
+    """Return frame numbers as text, shortened if there are many."""
     listed = ", ".join(str(frame) for frame in frames[:_MAX_LISTED])
     if len(frames) > _MAX_LISTED:
         return f"{len(frames)} frames ({listed}, ...)"

@@ -13,9 +13,9 @@ from morgs_mi.calibration.checks.deep import DeepCheck
 __all__ = ["draw_deep"]
 
 _USUAL, _FOUND, _CHANNELS = "tab:blue", "tab:red", ("indianred", "seagreen", "royalblue")
-_BAR = 0.7  # width of a bar or of a group of them, as a share of its place
+_BAR = 0.7  # width of a bar or of a group of them, as a share of its slot
 _MAX_LINES, _LINE = 16, 140  # of the findings, and characters of each
-# Title, and the values that the vertical axis contains at least: differences that do not matter look small.
+# Title, and the least range of the vertical axis: negligible differences look small.
 _PANELS: dict[str, tuple[str, tuple[float, float] | None]] = {
     "error": ("Reprojection error, px", (0, 1)),
     "time": ("Time offset, frames", (-1, 1)),
@@ -32,7 +32,7 @@ def draw_deep(figure: Any, check: DeepCheck) -> None:
     """Plot a check: a panel per question, and the findings.
 
     The panels show reprojection error, time offset, exposure per channel, brightness and sharpness over time, repeated
-    frames and overlap. Cameras with a finding are red; a question mark stands for what was not measured.
+    frames and overlap. Cameras with a finding are red; a question mark stands for a missing measurement.
 
     Args:
         figure: an empty figure or subfigure of matplotlib.
@@ -74,7 +74,7 @@ def _bars(panel: Any, check: DeepCheck, question: str, values: np.ndarray) -> No
 
 
 def _curves(panel: Any, check: DeepCheck, questions: Sequence[str], values: np.ndarray) -> None:
-    """Draw a curve per camera, for values [T, C]; those with a finding are drawn last, with their names."""
+    """Draw a curve per camera, for values [T, C]; cameras with a finding are drawn last, with their names."""
     for view, curve in enumerate(values.T):
         found = _is_found(check, questions, view)
         panel.plot(curve, color=_color(check, questions, view), linewidth=1, zorder=3 if found else 2)
@@ -113,7 +113,7 @@ def _matrix(panel: Any, check: DeepCheck) -> None:
 
 
 def _sentences(panel: Any, check: DeepCheck) -> None:
-    """Write the findings, and what was not measured."""
+    """Write the findings and the missing measurements."""
     sentences = [*(finding.sentence for finding in check.findings), check.unmeasured]
     lines = "\n".join(fill(sentence, _LINE, subsequent_indent="  ") for sentence in sentences).splitlines()
     lines = lines if len(lines) <= _MAX_LINES else [*lines[: _MAX_LINES - 1], "..."]
@@ -123,7 +123,7 @@ def _sentences(panel: Any, check: DeepCheck) -> None:
 
 
 def _name_cameras(axis: Any, check: DeepCheck, questions: Sequence[str], rotation: float = 0) -> None:
-    """Label the places along an axis with the cameras' names, red for those with a finding."""
+    """Label the positions along an axis with the cameras' names, red with a finding."""
     axis.set_ticks(np.arange(len(check.names)), check.names, fontsize=8, rotation=rotation)
     for view, label in enumerate(axis.get_ticklabels()):
         label.set_color(_FOUND if _is_found(check, questions, view) else "black")

@@ -30,7 +30,7 @@ __all__ = [
 _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 _HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 _ABOUT_FACE = np.diag([-1.0, 1.0, -1.0, 1.0])
-# Corrects a camera whose columns right, up were read as down, right.
+# Corrects columns right, up of a camera that were read as down, right.
 _UPRIGHT = np.array([[0, 1.0, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 _AXES = {"OpenCV": "OpenCV's axes (x right, y down, z forward)", "OpenGL": "OpenGL's axes (x right, y up, z backward)"}
 # Share of the rig's radius, and entries of a rotation: neighbours of a dense rig differ by far more than this.
@@ -42,7 +42,7 @@ _FACTOR_OCTAVES, _FACTOR_STEP = 2.0, 0.25
 
 
 def same_poses(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
-    """Return the pairs of cameras with one pose."""
+    """Return the pairs of cameras with the same pose."""
     positions = np.array([camera.position for camera in cameras])
     rotations = np.array([np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in cameras])
     near = _SAME * np.linalg.norm(positions - positions.mean(0), axis=1).max()
@@ -58,7 +58,7 @@ def rig_candidates(capture: Capture, wrong: Sequence[int]) -> Iterator[tuple[Seq
 
     Args:
         capture: the capture.
-        wrong: the views whose poses do not fit, among which the order may be wrong.
+        wrong: the views with poses that do not fit; their order may be wrong.
     """
     if capture.layout == poses_bounds.LAYOUT.name:
         yield from _other_rows(capture)
@@ -93,7 +93,7 @@ def camera_candidates(camera: Camera) -> Iterator[tuple[Camera, str]]:
 
     mirrored = np.array([[0, 0, camera.width], [0, 0, camera.height], [0, 0, 2]])
     upside_down = "its images are upside down relative to its pose: turn the clip or the pose by 180 degrees"
-    # A turned pose has the principal point of the image, a turned image the opposite one.
+    # A turned pose keeps the principal point; a turned image has the opposite one.
     yield moved(_HALF_TURN), upside_down
     turned_image = np.concatenate([camera.K[:, :2], (mirrored - camera.K)[:, 2:]], axis=1)
     yield replace(moved(_HALF_TURN), K=turned_image), upside_down
@@ -107,16 +107,16 @@ def camera_candidates(camera: Camera) -> Iterator[tuple[Camera, str]]:
 
 
 def best_focal_factor(error: Callable[[float], float]) -> float:
-    """Return the factor on a focal length, from 1/4 to 4, with the least `error` of the factor."""
+    """Return the factor on a focal length, from 1/4 to 4, that minimises `error`."""
 
     def of_octaves(octaves: float) -> float:
-        # A bound, because the search cannot compare infinite errors.
+        # The search cannot compare infinite errors.
         return min(error(float(2.0**octaves)), 1e9)
 
     steps = np.arange(-_FACTOR_OCTAVES, _FACTOR_OCTAVES + _FACTOR_STEP, _FACTOR_STEP)
     start = min(steps, key=of_octaves)
     bounds = (start - _FACTOR_STEP, start + _FACTOR_STEP)
-    from scipy.optimize import minimize_scalar  # not at the start of every command, which it slows down
+    from scipy.optimize import minimize_scalar  # imported here because it slows down the start of every command
 
     found: Any = minimize_scalar(of_octaves, bounds=bounds, method="bounded", options={"xatol": 3e-3})
     return float(2.0**found.x)

@@ -1,10 +1,10 @@
-"""Check of the camera poses against feature matches, which are found without the poses.
+"""Check of the camera poses against feature matches that are found without the poses.
 
-A camera fits if most of its matches with the other cameras that fit have a small reprojection error. If a pose does not
-fit, the common mistakes of `mistakes` are tried, and the one that explains the matches is reported.
+A camera fits if most of its matches with other fitting cameras have a small reprojection error. If a pose does not fit,
+the common mistakes of `mistakes` are tried. The check reports the mistake that explains the matches.
 
-Features are found at the recorded size, and pixels are those of that size, however far the capture is downscaled: the
-smaller the images, the fewer features are found, and the less exactly.
+Features are found at the recorded size, and pixels refer to that size, even if the capture is downscaled. Smaller
+images have fewer and less exact features.
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ __all__ = [
 
 # px. Distortion that a layout cannot represent causes errors of about a pixel, a wrong pose tens of pixels.
 MAX_ERROR = 2.0
-# With a wrong pose a handful of matches may fit by chance, but not this many.
+# With a wrong pose a few matches may fit by chance, but not this many.
 _MIN_MATCHES = 50
 # px. Features of two cameras at different places are farther apart.
 _SAME_IMAGE = 0.5
 # A correction must lower the error by this factor, and to less than twice the error of the poses that fit or to this
-# many pixels: with enough candidates, one that is wrong too may be a little better than the given poses.
+# many pixels: among many candidates, a wrong one may be slightly better than the given poses.
 _GAIN, _GOOD_ERROR = 3.0, 0.5
 # Factors nearer to 1 than this are no mistake in the calibration's image size or field of view.
 _LEAST_FACTOR = 0.1
-# Matches of a pair, and pairs, with which candidates are compared: more are slow, and not more accurate.
+# Number of matches of a pair, and of pairs, to compare candidates with: more are slower, but not more accurate.
 _SAMPLE, _FACTOR_PAIRS = 40, 8
 # A view that matches fewer others without its pose is also matched with it, which takes longer.
 _MIN_PARTNERS = 3
@@ -67,10 +67,10 @@ class CameraCheck:
     """Result of checking the pose of one camera.
 
     Attributes:
-        name: of the camera.
+        name: name of the camera.
         matches: number of its matches with other cameras.
-        error: median reprojection error of its matches with the cameras that fit, or with all if it has none with
-            these, px. NaN without matches, infinite if most of the points lie behind a camera.
+        error: median reprojection error of its matches with the cameras that fit, or of all its matches if there are
+            none, px. NaN without matches, infinite if most of the points lie behind a camera.
         fits: whether the pose fits the images; None if that could not be checked.
         advice: the reason and a remedy; empty if the pose fits.
     """
@@ -144,7 +144,7 @@ def match_capture(capture: Capture, progress: Callable[[int, int], None] | None 
 
 
 def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
-    """Return how well the capture's cameras fit the matches between its views."""
+    """Return the result of checking the capture's cameras against the matches between its views."""
     capture = capture.at_recorded_size()
     pairs, views = _Pairs.of(shared, capture.cameras), range(len(capture.cameras))
     group = pairs.agreeing()
@@ -168,10 +168,10 @@ def check_rig(capture: Capture, shared: SharedFeatures) -> RigCheck:
 
 
 def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
-    """Return the capture with its points replaced by ones triangulated from its training views.
+    """Return the capture with points triangulated from its training views instead of its own.
 
-    Views that match few others without their poses are matched with them. Views that share few features give few points
-    or none, which the fit reports. The held-out view is not used.
+    Views with few matches are also matched by their poses. Views that share few features give few points or none, which
+    the fit reports. The held-out view is not used.
     """
     cameras = capture.at_recorded_size().cameras
     matches = [match for match in shared.matches if capture.test_view not in match.views]
@@ -181,12 +181,12 @@ def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
 
 
 def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Capture:
-    """Return the capture with its points replaced by triangulated ones and, where cameras are close, those of stereo.
+    """Return the capture with triangulated points instead of its own, and with stereo points where cameras are close.
 
     Args:
         capture: a capture; its held-out view is not used.
         shared: features of its first frame.
-        seed: of the choice among the points of stereo.
+        seed: seed of the selection of stereo points.
     """
     sparse, recorded = triangulate_points(capture, shared), capture.at_recorded_size()
     images = next(recorded.partial_frames(0, 1)).images
@@ -203,7 +203,7 @@ def dense_points(capture: Capture, shared: SharedFeatures, seed: int = 0) -> Cap
 
 
 def _unmatched(views: Sequence[int], matches: Sequence[Match]) -> list[tuple[int, int]]:
-    """Return the pairs without matches of those views that match few others."""
+    """Return the unmatched pairs of views that match few others."""
     matched = {match.views for match in matches}
     partners = Counter(view for pair in matched for view in pair)
     few = {view for view in views if partners[view] < _MIN_PARTNERS}
@@ -242,13 +242,13 @@ class _Pairs:
         return _median(_Pairs.of(replace(self.shared, matches=tuple(matches)), cameras).of_view(view))
 
     def sampled(self, max_pairs: int | None = None) -> _Pairs:
-        """Return the same for a part of each pair's matches, and for the `max_pairs` pairs with the most matches."""
+        """Return the errors of a part of each pair's matches, for the `max_pairs` pairs with the most matches."""
         largest = sorted(self.shared.matches, key=lambda match: -len(match.features))[:max_pairs]
         few = (replace(m, features=m.features[:: -(-len(m.features) // _SAMPLE)]) for m in largest)
         return self.of(replace(self.shared, matches=tuple(few)), self.cameras)
 
     def with_cameras(self, cameras: Sequence[Camera]) -> _Pairs:
-        """Return the same for other poses."""
+        """Return the errors with other poses."""
         return self.of(self.shared, cameras)
 
     def worst(self) -> float:
@@ -257,7 +257,7 @@ class _Pairs:
         return max(medians, default=float("nan"))
 
     def agreeing(self) -> set[int]:
-        """Return the views most of whose matches with each other have a small error.
+        """Return the views with mostly small errors in the matches between them.
 
         The view with the largest share of large errors is removed until no share exceeds a half, because a wrong pose
         spoils the matches of the other views too.
@@ -300,7 +300,7 @@ def _check(view: int, pairs: _Pairs, group: set[int]) -> CameraCheck:
 
 
 def _correct_rig(capture: Capture, pairs: _Pairs, checks: Sequence[CameraCheck]) -> tuple[Sequence[Camera], str] | None:
-    """Return the corrected cameras for a mistake in several poses, and its description; None if none explains all."""
+    """Return the cameras corrected for a mistake in several poses, and its description; None if none explains all."""
     wrong = [view for view, check in enumerate(checks) if check.fits is False]
     largest, given = pairs.sampled(_FACTOR_PAIRS), pairs.worst()
 
@@ -317,7 +317,7 @@ def _correct_rig(capture: Capture, pairs: _Pairs, checks: Sequence[CameraCheck])
 
 
 def _copies(shared: SharedFeatures, checks: Sequence[CameraCheck], cameras: Sequence[Camera]) -> dict[int, str]:
-    """Return the reason for each camera that has the pose or the clip of another one."""
+    """Return the reason for each camera with the pose or the clip of another one."""
     found: dict[int, str] = {}
     for pair in same_poses(cameras):
         # If one of the two fits, the pose is its own.
@@ -338,7 +338,7 @@ def _copies(shared: SharedFeatures, checks: Sequence[CameraCheck], cameras: Sequ
 
 
 def _with_reason(view: int, check: CameraCheck, pairs: _Pairs, group: set[int], reasons: dict[int, str]) -> CameraCheck:
-    """Return the result with the reason why a pose does not fit, from `reasons` or by trying the common mistakes."""
+    """Return the result with the reason for a pose that does not fit, from `reasons` or from the common mistakes."""
     if view in reasons:
         return replace(check, fits=False, advice=reasons[view])
     if check.fits is not False:
@@ -378,7 +378,7 @@ def _focal_mistake(what: str, factor: float) -> str:
 
 
 def _summary(checks: Sequence[CameraCheck]) -> str:
-    """Return which poses fit, which do not, and which were not checked."""
+    """Return a sentence on the poses that fit, do not fit, and were not checked."""
     wrong, open_ = (", ".join(c.name for c in checks if c.fits is fits) for fits in (False, None))
     count = sum(c.fits is True for c in checks)
     if not wrong and not count:

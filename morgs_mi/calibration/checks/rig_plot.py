@@ -43,7 +43,7 @@ def check_plot(path: Path) -> None:
 
 
 def write_rig(path: Path, capture: Capture, deep: DeepCheck | None = None) -> None:
-    """Write the plot of a capture's rig, and below it that of a check; the file appears whole or not at all.
+    """Write the plot of a capture's rig, and below it the plot of a check; the file is written atomically.
 
     Args:
         path: .png, .jpg, .svg or .pdf.
@@ -59,7 +59,7 @@ def write_rig(path: Path, capture: Capture, deep: DeepCheck | None = None) -> No
     from matplotlib.figure import Figure
 
     heights, data = [_RIG_HEIGHT, *([_DEEP_HEIGHT] if deep else [])], BytesIO()
-    # Names may contain dollars, and letters that the font has not, which are drawn as boxes.
+    # Names may contain dollars, and letters that the font lacks and draws as boxes.
     with rc_context({"text.parse_math": False}), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
         figure = Figure(figsize=(_WIDTH, sum(heights)), layout="constrained")
@@ -84,7 +84,7 @@ def draw_rig(
     Args:
         figure: an empty figure or subfigure of matplotlib.
         cameras: the rig.
-        points: places [P, 3] in world units and colours [P, 3] in [0, 1]; distant ones are cut off.
+        points: positions [P, 3] in world units and colours [P, 3] in [0, 1]; distant ones are cut off.
         test_view: index of the held-out camera, drawn in red.
     """
     right, forward, up = _directions(cameras)
@@ -118,7 +118,7 @@ def _directions(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the rig's right, forward and up [3, 3], orthonormal."""
     axes = np.array([np.asarray(camera.viewmat, np.float64)[:3, :3] for camera in cameras])
     up = -axes[:, 1].mean(0)
-    # Cameras all around a scene have no common forward direction: use that of the first one.
+    # Cameras all around a scene have no common forward direction: use the first camera's direction.
     forward = axes[:, 2].mean(0)
     up = up if np.linalg.norm(up) > 1e-3 else -axes[0, 1]
     up = up / np.linalg.norm(up)

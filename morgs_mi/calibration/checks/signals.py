@@ -1,7 +1,7 @@
 """Measurements of each camera's images over time: brightness, sharpness, repeated frames, flicker of lamps.
 
 Notation: T frames, C cameras; an image is reduced to a grey thumbnail [h, w] of display-referred values in [0, 255], on
-which all but the sharpness is measured. What is missing is NaN.
+which all but the sharpness is measured. Missing values are NaN.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ __all__ = [
 ]
 
 _WIDTH = 128  # of a thumbnail, px
-# Values of a thumbnail from which a gain follows; darker ones are noise, brighter ones clipped.
+# Range of thumbnail values that determine a gain; darker ones are noise, brighter ones are clipped.
 _DARK, _BRIGHT, _MIN_PIXELS = 20, 240, 30
 # Bands of rows: a rolling shutter reads each at another phase of a lamp.
 _BANDS = 6
-# A repeated frame changes by less than this share of the usual change, while the other cameras change by more than
-# half of theirs.
+# A repeated frame changes by less than this share of its camera's usual change, while the other cameras change by more
+# than half of their usual change.
 _REPEATED, _CHANGING = 0.1, 0.5
 # Lamps flicker at twice the frequency of the mains, Hz.
 _MAINS = (50, 60)
@@ -43,11 +43,11 @@ _MIN_FLICKER_FRAMES, _MIN_PERIODS = 20, 2
 
 @dataclass(frozen=True)
 class Signals:
-    """What is measured while the frames of a capture are read.
+    """Measurements taken while the frames of a capture are read.
 
     Attributes:
         thumbs: per camera float32 [T, h, w], NaN where no pixel was recorded.
-        sharpness: of each image [T, C], octaves: log2 of the detail at the finest scale relative to the next one.
+        sharpness: per image [T, C], octaves: log2 of the detail at the finest scale relative to the next one.
     """
 
     thumbs: tuple[np.ndarray, ...]
@@ -59,9 +59,9 @@ class Lamp:
     """Flicker of lamps in a camera's images.
 
     Attributes:
-        mains: frequencies of the mains that explain it, Hz.
+        mains: frequencies of the mains that explain the flicker, Hz.
         alias: the frequency at which the images become brighter and darker, Hz.
-        amplitude: of the brightness, as a share.
+        amplitude: amplitude of the brightness, as a share.
     """
 
     mains: tuple[int, ...]
@@ -107,7 +107,7 @@ def brightness(signals: Signals) -> np.ndarray:
 
 
 def repeated_frames(signals: Signals) -> tuple[tuple[int, ...], ...]:
-    """Return per camera the frames that repeat the one before while the other cameras' images change."""
+    """Return per camera the frames that repeat the previous one while the other cameras' images change."""
     changes = np.stack([_mean_change(thumbs) for thumbs in signals.thumbs], axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         # The upper quartile is the usual change even if every second frame is repeated.
@@ -117,7 +117,7 @@ def repeated_frames(signals: Signals) -> tuple[tuple[int, ...], ...]:
     for camera, own in enumerate(relative.T):
         others = np.delete(relative, camera, axis=1)
         moving = known_median(others, axis=1) > _CHANGING
-        # Motion that pauses in a view does so gradually.
+        # Motion in a view pauses gradually.
         before, after = np.append(np.nan, own[:-1]), np.append(own[1:], np.nan)
         isolated = np.fmax(before, after) > _CHANGING
         found.append(tuple((np.flatnonzero((own < _REPEATED) & moving & isolated) + 1).tolist()))
@@ -127,9 +127,9 @@ def repeated_frames(signals: Signals) -> tuple[tuple[int, ...], ...]:
 def lamp_flicker(bands: np.ndarray, fps: float) -> Lamp | None:
     """Return the flicker of lamps in one camera's `brightness` [T, bands], or None.
 
-    A lamp flickers at 100 or 120 Hz, which a camera sees at the difference to the nearest multiple of its frame rate.
-    A frequency with which fewer than two periods pass is not found; nor is a multiple of the frame rate, at which each
-    frame sees the same phase.
+    A lamp flickers at 100 or 120 Hz. A camera sees this frequency at its difference from the nearest multiple of the
+    frame rate. A flicker of fewer than two periods is not found. A multiple of the frame rate is not found, either,
+    because each frame sees the same phase.
     """
     count = len(bands)
     if count < _MIN_FLICKER_FRAMES or not np.isfinite(bands).any():
@@ -154,7 +154,7 @@ def lamp_flicker(bands: np.ndarray, fps: float) -> Lamp | None:
 
 
 def known_median(values: np.ndarray, axis: int) -> np.ndarray:
-    """Return the median of what is not NaN, and NaN without a warning where all is."""
+    """Return the median of the values that are not NaN; NaN, without a warning, where all are NaN."""
     empty = np.isnan(values).all(axis=axis)
     if empty.all():
         return np.full(empty.shape, np.nan)

@@ -1,9 +1,9 @@
-"""Time offsets between calibrated cameras, from where their images change.
+"""Time offsets between calibrated cameras, from the changes of their images.
 
-An object lies between the same two epipolar planes of a pair of cameras in both views. So the change per epipolar plane
-and frame, the *epipolar profile* of a view, is similar in both at the same time, and shifted in time by the difference
-of the cameras' time offsets (after Pundik and Moses, Video Synchronization Using Temporal Signals from Epipolar Lines,
-ECCV 2010).
+An object lies between the same two epipolar planes of a pair of cameras in both views. The *epipolar profile* of a view
+is the change per epipolar plane and frame. The profiles of both views are similar, but shifted in time by the
+difference of the cameras' time offsets (after Pundik and Moses, Video Synchronization Using Temporal Signals from
+Epipolar Lines, ECCV 2010).
 
 Notation: frame k of camera i shows the time k + o_i, with o_i its time offset in frames.
 """
@@ -24,7 +24,7 @@ __all__ = ["consensus", "time_offsets"]
 _PLANES = 48
 # Grey levels, and multiples of a frame's median change, below which a change is noise or compression.
 _NOISE, _MEDIANS = 6.0, 5.0
-# Frames of the largest shift, and as a share of the clip: fewer overlapping frames correlate by chance.
+# Largest shift, in frames and as a share of the clip: fewer overlapping frames correlate by chance.
 _MAX_SHIFT, _MAX_SHARE = 15, 0.25
 # A pair's peak counts if it is this high, and higher by this much than three frames beside it.
 _MIN_CORRELATION, _MIN_PROMINENCE = 0.3, 0.05
@@ -40,10 +40,10 @@ class _PairShift:
     """Difference of the time offsets of two cameras.
 
     Attributes:
-        views: the two cameras i and j.
+        views: indices of the two cameras i and j.
         frames: o_j - o_i.
-        correlation: of the epipolar profiles at this shift.
-        weight: by how much it exceeds that of other shifts.
+        correlation: correlation of the epipolar profiles at this shift.
+        weight: difference from the correlation at other shifts.
     """
 
     views: tuple[int, int]
@@ -56,11 +56,11 @@ def time_offsets(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> np.
     """Return the time offset of each camera from the others' median [C], frames; NaN where it is not determined.
 
     An offset is determined if three quarters of the camera's pairs with others agree about it. It is accurate to 0.4
-    frames where things hardly move across the epipolar planes (see `timing` for fractions of frames).
+    frames where objects hardly move across the epipolar planes (see `timing` for fractions of frames).
 
     Args:
         cameras: C views.
-        thumbs: per camera thumbnails [T, h, w] of the same instants, values in [0, 255], NaN where there is none.
+        thumbs: per camera thumbnails [T, h, w] of the same instants, values in [0, 255], NaN where missing.
     """
     shifts = _pair_shifts(cameras, thumbs)
     views = np.array([shift.views for shift in shifts]).reshape(-1, 2).astype(int)
@@ -77,7 +77,7 @@ def time_offsets(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> np.
 def consensus(count: int, views: np.ndarray, differences: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Return values x [count] that best explain differences x_j - x_i [P] of pairs (i, j) [P, 2], by weighted L1.
 
-    The median of x, or the lower one of two, is zero; x is NaN for what is in no pair.
+    The median of x, or the lower one of two, is zero; x is NaN for an index in no pair.
     """
     values = np.full(count, np.nan)
     if not len(views):
@@ -95,7 +95,7 @@ def consensus(count: int, views: np.ndarray, differences: np.ndarray, weights: n
 
 
 def _pair_shifts(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> list[_PairShift]:
-    """Return the shifts of all pairs of cameras that see common motion distinctly."""
+    """Return the shifts of all pairs of cameras with distinct common motion."""
     changes = [_changes(own) for own in thumbs]
     rays = [_rays(camera, own.shape[1:]) for camera, own in zip(cameras, thumbs, strict=True)]
     found = []
@@ -110,7 +110,7 @@ def _pair_shifts(cameras: Sequence[Camera], thumbs: Sequence[np.ndarray]) -> lis
 
 
 def _changes(thumbs: np.ndarray) -> np.ndarray:
-    """Return the change of each pixel from frame to frame beyond noise [T - 1, h * w]."""
+    """Return the change of each pixel from frame to frame above the noise [T - 1, h * w]."""
     frames = thumbs.reshape(len(thumbs), -1)
     level = known_median(frames, axis=1)[:, None]
     # A change of the exposure is no motion.

@@ -1,12 +1,12 @@
-"""Calibrations in Anipose's TOML format, which Pose2Sim, caliscope and FreeMoCap write too.
+"""Calibrations in Anipose's TOML format, which Pose2Sim, caliscope and FreeMoCap also write.
 
 A table per camera (``[cam_0]``, or nested as ``[cameras.0]``) has ``name``, ``size`` [w, h], ``matrix`` [3, 3],
 ``distortions`` in OpenCV's order (k1 k2 p1 p2 k3, or k1 to k4 if ``fisheye`` is true), ``rotation`` (Rodrigues vector
 or matrix) and ``translation``: world -> camera with OpenCV's axes. Tables without any of these, such as ``[metadata]``,
 are ignored. OpenCV puts pixel centres at integers, so the principal point is shifted by half a pixel.
 
-World units are those of the file, which does not state them: millimetres or whatever the calibration board was measured
-in for Anipose and FreeMoCap, metres for Pose2Sim and caliscope.
+World units are the units of the file, which does not state them: millimetres or the units of the calibration board for
+Anipose and FreeMoCap, metres for Pose2Sim and caliscope.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from morgs_mi.io.bounded import MAX_TOML, read_bytes, read_toml
 __all__ = ["LAYOUT", "read_anipose"]
 
 _KEYS = ("matrix", "distortions", "rotation", "translation")
-# Recognises a calibration without parsing it, so that a broken one is reported as such.
+# Recognises a calibration without parsing it; a broken one is then reported as a broken calibration.
 _MARKS = [re.compile(rf"^[ \t]*{key}[ \t]*=".encode(), re.MULTILINE) for key in ("matrix", "rotation")]
 
 

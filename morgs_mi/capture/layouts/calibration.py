@@ -1,4 +1,4 @@
-"""The interface of a capture layout, and helpers that the readers share.
+"""Interface of a capture layout, and helpers that the readers share.
 
 A reader module exposes a `Layout`, which `layout_registry.py` lists.
 """
@@ -92,7 +92,7 @@ class PoseConvention:
     """Meaning of the 4x4 pose matrices in a calibration file.
 
     Attributes:
-        direction: from which frame to which the matrices map points.
+        direction: source and target frame of the matrices.
         axes: OpenCV's (x right, y down, z forward) or OpenGL's (x right, y up, z backward).
     """
 
@@ -110,8 +110,8 @@ class Layout:
         find: returns whether a capture folder holds such a calibration.
         read: returns the calibration of a capture folder. Raises FileNotFoundError if a file or clip is missing and
             ValueError if a file is broken or does not match the clips.
-        poses: convention of the pose matrices, by which the rig check names a wrong one; None if poses are not stored
-            as 4x4 matrices.
+        poses: convention of the pose matrices, which the rig check compares with other ones; None if poses are not
+            stored as 4x4 matrices.
     """
 
     name: str
@@ -122,7 +122,7 @@ class Layout:
 
 
 def calibration_files(path: Path, pattern: str) -> list[Path]:
-    """Return the files of a capture whose names match a pattern, in it or in its folder `calibration`."""
+    """Return the files with a name that matches a pattern, in a capture or in its folder `calibration`."""
     return [file for folder in (path, path / "calibration") for file in sorted(folder.glob(pattern))]
 
 
@@ -163,7 +163,7 @@ def match_clips(
         path: the capture folder; its photos and frame folders are used if they match more cameras than `clips`.
         source: file or folder of the calibration, for messages.
         clips: from `required_clips`.
-        cameras: one or more per fixed camera; their names are those of the calibration's images.
+        cameras: one or more per fixed camera, named as the calibration's images.
         lenses: one per camera.
 
     Raises:
@@ -191,8 +191,8 @@ class _Match:
     """Clips and the cameras that they belong to.
 
     Attributes:
-        clips: by name.
-        index: of the first camera of each clip that has one, by the clip's name.
+        clips: clips by name.
+        index: index of the first camera of each clip that has one, by the clip's name.
         without: names of the cameras that have no clip.
     """
 
@@ -204,7 +204,7 @@ class _Match:
 def _best_match(
     path: Path, source: Path, clips: Mapping[str, Clip], cameras: Sequence[Camera], lenses: Sequence[Lens]
 ) -> _Match:
-    """Return the match of `clips`, photos or frame folders that has most cameras; see `match_clips`."""
+    """Return the match of `clips`, photos or frame folders with the most cameras; see `match_clips`."""
     found, errors = [], []
     for find in (lambda _: clips, photos, clips_by_frame):
         try:
@@ -230,7 +230,7 @@ def _best_match(
 
 
 def _matched(source: Path, clips: Mapping[str, Clip], cameras: Sequence[Camera], lenses: Sequence[Lens]) -> _Match:
-    """Return which of some clips belong to which cameras.
+    """Return the match between clips and cameras.
 
     Raises:
         ValueError: two images of one clip have different poses or lenses.

@@ -32,7 +32,7 @@ __all__ = [
 EXAMPLE = "one folder per camera: cam01/0000.png, cam01/0001.png, ..., cam02/0000.png, cam02/0001.png, ..."
 """The layout of a recording in images, for messages."""
 
-# Folders without clips, and folders whose own images do not belong to a camera.
+# Folders without clips, and folders with images that do not belong to a camera.
 _NOT_CLIPS = {"sparse", "truth", "masks", "seg"}
 # Nerfstudio writes downscaled copies to `images_2`, `images_4`, ...
 _NOT_CAMERAS = re.compile(rf"{'|'.join(_NOT_CLIPS)}|frames|images(_[0-9]+)?|\..*")
@@ -84,7 +84,7 @@ def check_frames(path: Path, clips: Mapping[str, Sequence[Path]]) -> None:
 
 
 def names_without(path: Path, names: Collection[str], without: Collection[str]) -> list[str]:
-    """Return the names of the cameras that are not among `without`; `path` is the capture, for messages.
+    """Return the names of the cameras except `without`; `path` is the capture, for messages.
 
     Raises:
         ValueError: a camera that is left out does not exist, or all are left out.
@@ -108,7 +108,7 @@ def view_of_image(views: Collection[str], image: str) -> str | None:
 
 
 def clip_of_camera(clips: Collection[str], camera: str) -> str | None:
-    """Return the clip called `camera`, or else the only one whose name contains it as a word (``trial_2-camA``)."""
+    """Return the clip called `camera`, otherwise the only one with this word in its name (``trial_2-camA``)."""
     if camera in clips:
         return camera
     word = re.compile(rf"(?<![A-Za-z0-9]){re.escape(camera)}(?![A-Za-z0-9])")

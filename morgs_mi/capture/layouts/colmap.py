@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 __all__ = ["LAYOUT", "ColmapModel", "find_colmap", "read_colmap", "write_colmap", "write_reconstruction"]
 
 _FILES = ("cameras", "images", "points3D")
-# More than any camera model's line of a text file has.
+# More values than a line of any camera model has in a text file.
 _MAX_CAMERA_FIELDS = 20
 # Memory of a `Camera`, which a line of a few characters may describe.
 _CAMERA_BYTES = 500
@@ -64,7 +64,7 @@ def find_colmap(folder: Path) -> Path | None:
     for place in (folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0"):
         if any((place / f"cameras.{kind}").exists() for kind in ("bin", "txt")):
             return place
-    # In the capture folder itself all three files are required: a single name may belong to something else.
+    # In the capture folder itself all three files are required: a single name may have another meaning.
     here = any(all((folder / f"{name}.{kind}").exists() for name in _FILES) for kind in ("bin", "txt"))
     return folder if here else None
 
@@ -170,7 +170,7 @@ def write_colmap(
 
 
 def write_reconstruction(model: pycolmap.Reconstruction, folder: str | Path) -> None:
-    """Write a model as text, all of its files or none; the folder is created if it is missing.
+    """Write all files of a model as text, or none; the folder is created if it is missing.
 
     Raises:
         OSError: a file could not be written.
@@ -319,7 +319,7 @@ def _binary_cameras(path: Path) -> Iterator[tuple[int, str, int, int, tuple[floa
     for _ in range(*file.take("Q")):
         camera_id, model, width, height = file.take("IiQQ")
         if not 0 <= model < len(names):
-            # lens_and_intrinsics refuses this name; the rest of the file cannot be read.
+            # lens_and_intrinsics rejects this name; the rest of the file cannot be read.
             yield camera_id, f"number {model}", width, height, ()
             return
         focals, coefficients = MODELS[names[model]]

@@ -72,7 +72,7 @@ def _check_counts(path: Path, meta: dict[str, Any]) -> None:
 
 
 def _camera(path: Path, meta: dict[str, Any], name: str, columns: Sequence[int]) -> MetaCamera:
-    """Return a camera, which is in the columns `columns` of the frames."""
+    """Return the camera in the columns `columns` of the frames."""
     where = f"{path}, camera {name}"
     try:
         K, w2c = (

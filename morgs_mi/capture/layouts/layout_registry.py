@@ -23,12 +23,12 @@ _READERS = (
     "poses_bounds",
 )
 LAYOUTS: tuple[Layout, ...] = tuple(import_module(f"{__package__}.{name}").LAYOUT for name in _READERS)
-"""The layouts in order of precedence, for folders with several calibrations: the most complete one comes first, which
-is COLMAP's with lenses, principal points and points."""
+"""The layouts in order of precedence, for folders with several calibrations. COLMAP's is the most complete one: it has
+lenses, principal points and points."""
 
 
 def find_layout(path: Path) -> Layout:
-    """Return the first layout whose calibration the capture folder `path` holds.
+    """Return the first layout with a calibration in the capture folder `path`.
 
     Raises:
         FileNotFoundError: there is no calibration.
@@ -51,7 +51,7 @@ def find_layout(path: Path) -> Layout:
 
 
 def _fitted_capture(path: Path) -> str:
-    """Return what to do with the capture of a fit in the folder `path`; empty if it names none."""
+    """Return advice on the capture of a fit in the folder `path`; empty if the folder names none."""
     try:
         about = read_json(path / "capture.json")
     except (OSError, ValueError):

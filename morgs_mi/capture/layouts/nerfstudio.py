@@ -2,8 +2,8 @@
 
 Each of its `frames` names a file and has a `transform_matrix` [4, 4]: camera -> world, x right, y up, z backward.
 Intrinsics (`fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`) and lens coefficients are keys of the file or of a frame; the frame's
-take precedence. Pixel centres lie at +0.5, as in `Camera`. World units are those of the matrices: `applied_transform`
-and `applied_scale` are not undone.
+take precedence. Pixel centres lie at +0.5, as in `Camera`. World units are the units of the matrices:
+`applied_transform` and `applied_scale` are not undone.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def _lens(where: str, values: Mapping[str, Any]) -> Lens:
             "undistort the images first."
         )
     if k4:
-        # Nerfstudio's k4 is the coefficient of r^8, OpenCV's is in the denominator: COLMAP has no model for the former.
+        # Nerfstudio's k4 is the coefficient of r^8, for which COLMAP has no model. OpenCV's k4 is in the denominator.
         raise ValueError(f"{where}: `k4` must be 0 in a perspective camera, got {k4}; undistort the images first.")
     return opencv_lens((k1, k2, p1, p2, k3))
 

@@ -1,7 +1,7 @@
 """`poses_bounds.npy`, the calibration of LLFF and of Neural 3D Video (N3DV).
 
-One row [17] per camera, in the order of the existing videos by number: a 3x5 matrix in row-major order,
-whose columns are the camera's down, right and backward axes, its centre (all in the world) and
+One row [17] per camera, in the order of the existing videos by number: a 3x5 matrix in row-major order with
+the columns down, right and backward axis of the camera, its centre (all in the world) and
 (height, width, focal length); then the nearest and farthest depth. The principal point is the image centre.
 """
 

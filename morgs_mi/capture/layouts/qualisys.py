@@ -8,9 +8,8 @@ A ``camera`` has a ``serial``, and three elements:
 - ``intrinsic``: focal lengths and principal point in 1/64 pixel from the sensor's corner, and the distortion
   coefficients of OpenCV's model, which have no unit.
 
-The format is not documented. The signs and units are those of files of Qualisys systems and of the programs that read
-them; Pose2Sim also divides the distortion coefficients by 64, which makes them vanish. Positions are converted to
-metres.
+The format is not documented. Signs and units follow files of Qualisys systems and the programs that read them. Pose2Sim
+also divides the distortion coefficients by 64, which makes them negligible. Positions are converted to metres.
 """
 
 from __future__ import annotations
@@ -78,7 +77,7 @@ def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
 
 
 class _Plain(ElementTree.TreeBuilder):
-    """Builder of a document without a document type, whose entities could expand without bound."""
+    """Builder of a document without a document type, because its entities could expand without bound."""
 
     def doctype(self, *_: str | None) -> None:
         raise ValueError("it declares a document type")
