@@ -2,7 +2,7 @@
 
     python -m benchmarks.pictures
 
-The clip is that of `morgs-mi demo`: made in `out/demo/capture` unless it is there. All pictures show one key view.
+The clip of `morgs-mi demo` is made in `out/demo/capture` unless it is there. All images show one key view.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Options:
     capture: Path = Path("out/demo/capture")
     """Capture of the demo; made if missing."""
     out: Path = Path("docs/how-it-works")
-    """Folder of the pictures."""
+    """Folder of the images."""
     frame: int = 5
     """The frame; a multiple of `mask_interval`, at which motion masks are computed."""
     variant: str = "llvm_ad_rgb"
@@ -64,7 +64,7 @@ def main(options: Options) -> None:
 
 
 def draw(loop: StreamLoop, images: Sequence[np.ndarray | None]) -> dict[str, np.ndarray]:
-    """Push the next frame and return the picture [H, W, 3] of each stage in the key view that changes most, by name."""
+    """Push the next frame and return the image [H, W, 3] of each stage in the key view that changes most, by name."""
     setup, state = loop.setup, loop.state
     observed = observe_frame(setup, state.frame, state.seen, images)
     changes = observed.changes or {}

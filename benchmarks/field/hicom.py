@@ -3,9 +3,9 @@
 The space of the Gaussians is divided into cubic cells, at several levels from coarse to fine. Every cell of every level
 has a translation and a rotation, and a Gaussian moves by the sum over the cells that contain it,
 
-    d_i = sum_l t_l(i),    r_i = 1 + sum_l q_l(i),
+    d_i = sum_l t_l(i),    r_i = 1 + sum_l q_l(i).
 
-so that the coarse levels move objects and the fine ones what is left. Only cells with Gaussians have parameters.
+The coarse levels move objects, and the fine ones move the remainder. Only cells with Gaussians have parameters.
 """
 
 from __future__ import annotations

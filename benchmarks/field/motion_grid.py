@@ -1,13 +1,13 @@
-"""Motion grid whose rate is part of the loss, after 4DGC (Hu et al., CVPR 2025).
+"""Motion grid with its rate in the loss, after 4DGC (Hu et al., CVPR 2025).
 
 Grids at several levels have a translation and a rotation at every corner of a cell with Gaussians. A Gaussian moves by
 the sum over the levels, each interpolated between the 8 corners around its mean. The values count in steps, to which
 they are rounded (the gradient passes the rounding unchanged), and the loss contains the bits that an entropy coder
 would need for them: the values x of a level are logistic with a learned scale b,
 
-    bits = -log2(S((x + 1/2) / b) - S((x - 1/2) / b)),    S the sigmoid,
+    bits = -log2(S((x + 1/2) / b) - S((x - 1/2) / b)),    S the sigmoid.
 
-so that motion which the images hardly need becomes 0.
+Motion that the images hardly need becomes 0.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from morgs_mi.method.motion_model import MOTION_MODELS, MotionModel, MotionModel
 
 __all__ = ["GridConfig", "bits", "corner_matrix", "motion_grid"]
 
-# Least probability of a value, so that its bits are finite.
+# Least probability of a value, which bounds its bits.
 _LEAST = 1e-6
 
 

@@ -5,9 +5,9 @@ in the previous frame, and a small network maps the code to its displacement and
 
     (d_i / s, q_i) = C max(0, B max(0, A h(mu_i))),    r_i = 1 + q_i.
 
-Level l has cells of side s_l, whose corners are entries of a table of limited size by a hash of their coordinates; h
+Level l has cells of side s_l. Their corners are entries of a table of limited size by a hash of their coordinates; h
 are the entries of all levels, each interpolated between the 8 corners around the mean. The means do not change while
-the cache is fitted, so that h is the product of a constant sparse matrix and the tables. C starts at 0: nothing moves.
+the cache is fitted: h is the product of a constant sparse matrix and the tables. C starts at 0: nothing moves.
 """
 
 from __future__ import annotations

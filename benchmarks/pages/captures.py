@@ -71,7 +71,7 @@ def estimates() -> str:
 
 
 def disturbances() -> str:
-    """Return what each kind of disturbance costs."""
+    """Return the loss of quality by each kind of disturbance."""
     columns = (
         Column("PSNR, dB", "psnr"),
         Column("moving, dB", "psnr_moving"),
@@ -82,7 +82,7 @@ def disturbances() -> str:
 
 
 def cameras() -> str:
-    """Return what refinement brings back, by the error of the poses, and of denied lenses."""
+    """Return the quality that refinement restores, by the error of the poses, and of denied lenses."""
     fits, rows = committed("cameras")["fits"], []
     groups = {
         f"poses off by {degrees:g} degrees": own

@@ -38,7 +38,7 @@ class Options(Common):
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run a report and return the exit status; `args` default to those of the process."""
+    """Run a report and return the exit status; `args` default to the process's."""
     return run(Options, "python -m benchmarks.reports", args)
 
 

@@ -173,7 +173,7 @@ def camera_errors(given: Capture, capture: Capture) -> dict[str, float]:
 
 
 def lens_clips(options: Options, seed: int) -> tuple[Path, Path]:
-    """Return a clip through lenses with distortion, and a copy whose calibration denies it for the training views."""
+    """Return a clip through lenses with distortion, and a copy with a calibration without it for the training views."""
     true = options.clips / f"random-{seed}-lens-{options.lens:g}"
     denied, own = true.with_name(f"{true.name}-denied"), Disturbances(distortion=options.lens)
     capture = synthetic("random", true, SynthConfig(frames=1, seed=seed, disturbances=own))

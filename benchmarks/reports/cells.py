@@ -23,7 +23,7 @@ _LOG = logging.getLogger("morgs_mi")
 
 @dataclass(frozen=True, kw_only=True)
 class OnWorkers:
-    """Base of the reports whose fits other processes can do."""
+    """Base of the reports with fits that other processes can do."""
 
     workers: int | None = None
     """Number of processes on this machine for the fits, which share its cores; default: this process fits alone."""

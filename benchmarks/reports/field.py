@@ -41,7 +41,7 @@ _RIGID = {"rigid_weight": 0.4, "rotation_weight": 0.4, "isometry_weight": 0.2}
 # themselves where they are imported.
 METHODS: dict[str, tuple[str, dict[str, Any]]] = {
     "baseline": ("baseline", {}),
-    "baseline, 4x rate": ("baseline", _FAST),  # of the means, tuned like those of the other methods
+    "baseline, 4x rate": ("baseline", _FAST),  # of the means, tuned like the rates of the other methods
     "hicom": ("baseline", {"motion": {"model": "hicom"}}),
     "rigidity": ("rigidity", {}),
     "cache": ("baseline", {"motion": {"model": "cache"}}),
@@ -60,7 +60,7 @@ _PLOTTED = (
     ("motion_error_moving", "motion error where things move, px"),
 )
 _OVER_TIME = ("psnr", "psnr_moving", "motion_error_moving")
-# Scores whose standard deviation over the fits is in the table.
+# Scores with their standard deviation over the fits in the table.
 _SPREAD = ("psnr", "psnr_moving", "Dynamic 3D Gaussians average_jaccard", "Dynamic 3D Gaussians median_error")
 # Of the columns: title, name of the score, factor, decimals.
 _COLUMNS = (

@@ -239,7 +239,7 @@ def _references(clip: Row) -> str:
 
 
 def _edges(clip: Row) -> str:
-    """Return a warning about presets whose best rate is the largest one measured, empty if there are none."""
+    """Return a warning about presets with their best rate at the largest one measured, empty if there are none."""
     tried: dict[str, set[float]] = {row["preset"]: set() for row in clip["rows"]}
     for row in clip["rows"]:
         tried[row["preset"]].add(row["rates"])

@@ -1,6 +1,6 @@
 """Reference implementation of the renderer in double precision, with which its error is measured.
 
-NumPy float64, for a list of pixels instead of a whole image, so that scenes of any size can be evaluated by a sample.
+NumPy float64, for a list of pixels instead of a whole image. Scenes of any size can be evaluated by a sample.
 Every pixel evaluates every Gaussian: there are no lists, and no early stop. N Gaussians, P pixels; A = alpha before the
 cap, T = transmittance in front of a Gaussian, w = T alpha, values c = (colour, 1).
 
@@ -98,7 +98,7 @@ class Reference64:
             yield chunk, (dx, dy), light * alpha, light, alpha, drawn & free
 
     def _to_attributes(self, incoming: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the gradients of the attributes, given those of splats and colours [N, 9]."""
+        """Return the gradients of the attributes, given the gradients of splats and colours [N, 9]."""
         raw, grads = self._float64(), {}
         for name in _GEOMETRY:
             columns = raw[name].reshape(len(incoming), -1)

@@ -35,7 +35,7 @@ __all__ = ["Row", "Scene", "Study", "StudyOptions", "Variant", "method_version",
 
 Row = Mapping[str, Any]
 _SHOWN = 300  # characters of a cell's scores that are printed
-# Options that say where files are and which processes fit.
+# Options for the paths of files and for the processes that fit.
 _WORK = ("json", "workers", "scheduler", "store", "plot", "clips", "captures", "model")
 
 

@@ -2,7 +2,7 @@
 
 It shares only the projection and the cut-offs with the package, hence renders the same image. Its lists have one level
 and test only the bounding box, every pixel gathers every record itself, and its adjoint scatters nine numbers for every
-pair of pixel and Gaussian. The notation is that of `morgs_mi.render.compositing`.
+pair of pixel and Gaussian. The notation follows `morgs_mi.render.compositing`.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ class Options:
     baselines: bool = False
     """Whether to also time Mitsuba's volprim_rf_basic and a renderer with one lane per pixel."""
     seed: int = 1
-    """Seed of the pixels whose error is measured."""
+    """Seed of the pixels for measuring the error."""
 
 
 def figures(gaussians: Gaussians, camera: Camera, options: Options) -> dict[str, Any]:

@@ -3,8 +3,8 @@
     python -m benchmarks.speed.surfaces --json benchmarks/results/surfaces_speed.json
 
 Scenes are balls of Gaussians with a sphere before their middle, which covers about a quarter of the
-view. Times are those of the process on all its threads: on a busy machine they vary less than those of the clock. The
-ratio `together` is that of both in one image to the sum of the two.
+view. Times are CPU times of the process on all its threads: on a busy machine they vary less than wall times. The
+ratio `together` is the time of both in one image to the sum of the two.
 """
 
 from __future__ import annotations

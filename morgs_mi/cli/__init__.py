@@ -82,7 +82,7 @@ class Options(Common):
 
 
 def main(args: Sequence[str] | None = None) -> int:
-    """Run the command line and return the exit status; `args` default to those of the process."""
+    """Run the command line and return the exit status; `args` default to the process's."""
     return run(Options, "morgs-mi", args)
 
 
@@ -120,7 +120,7 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
 
 
 def _answer(prog: str, args: Sequence[str]) -> str:
-    """Return what --version or --completion print; nothing with other arguments."""
+    """Return the output of --version or --completion; nothing with other arguments."""
     match args:
         case ["--version"]:
             return f"{prog} {version('morgs-mi')}"

@@ -110,7 +110,7 @@ def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
 
 
 def first_frame_sentences(validation: Mapping[str, Any]) -> Iterator[str]:
-    """Yield what the report of the first frame says about its views, sentence by sentence."""
+    """Yield the sentences about the views in the report of the first frame."""
     refined = validation.get("refinement", {})
     if refined:
         yield refined["sentence"]

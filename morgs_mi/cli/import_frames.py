@@ -26,7 +26,7 @@ _PATHS = (
 class Import:
     """Write frames of other tools, one file of Gaussians each, as a stream."""
 
-    # One list, like that of `cp`: the parser cannot split two of them where options follow.
+    # One list, as for `cp`: the parser cannot split two of them where options follow.
     paths: Annotated[
         Positional[tuple[Path, ...]], arg(metavar="FRAMES [FRAMES ...] OUT", help=_PATHS, help_behavior_hint="")
     ] = ()

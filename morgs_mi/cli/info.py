@@ -177,7 +177,7 @@ def _time_lines(found: TimeOffsets) -> list[str]:
 
 
 def _forecast_lines(capture: Capture) -> list[str]:
-    """Return what to expect of views between the training cameras, if there are several."""
+    """Return the expected quality of views between the training cameras, if there are several."""
     cameras = [capture.cameras[v] for v in capture.train_views]
     return [forecast(cameras, capture.points).sentence] if len(cameras) > 1 else []
 

@@ -91,7 +91,7 @@ class _Lines:
 
 
 def _summary(out: Path, rows: Sequence[LiveFrame]) -> str:
-    """Return what a live fit has done, in one sentence."""
+    """Return a summary of a live fit in one sentence."""
     stream, later = out / "stream.morgs", rows[1:]
     dropped = sum(row.dropped for row in rows)
     text = (

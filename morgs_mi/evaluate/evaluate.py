@@ -103,6 +103,6 @@ def _of_fit(stream: Path) -> tuple[dict[int, float], dict[str, Any]]:
 
 
 def _forecast(recording: Capture) -> str:
-    """Return what the rig lets expect of views between the training cameras, empty with a single one."""
+    """Return the expected quality of views between the training cameras, empty with a single one."""
     cameras = [recording.cameras[v] for v in recording.train_views]
     return forecast(cameras, recording.points).sentence if len(cameras) > 1 else ""

@@ -1,4 +1,4 @@
-"""Errors of images, motions and masks, in NumPy and float64, so that every backend is evaluated alike.
+"""Errors of images, motions and masks, in NumPy and float64 for every backend.
 
 Images are display-referred RGB (or one channel), float in [0, 1] or uint8.
 """
@@ -38,7 +38,7 @@ def psnr_of(error: float) -> float:
 def ssim(image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return the mean structural similarity, in [-1, 1] and 1 for equal images (Wang et al. 2004).
 
-    The window is an 11x11 Gaussian of sigma 1.5, the moments are those of the population, and only windows inside
+    The window is an 11x11 Gaussian of sigma 1.5, the moments are the population's, and only windows inside
     the image count. Channels are averaged.
 
     Args:
@@ -96,7 +96,7 @@ def iou(mask: np.ndarray, truth: np.ndarray) -> float:
 def mean_over(values: np.ndarray, mask: np.ndarray | None = None) -> float:
     """Return the mean of a map [h, w, ...] over `mask` [H, W], or over all pixels; NaN if there are none.
 
-    A map that is smaller than the mask is centred in it, like that of `ssim_map`.
+    A map that is smaller than the mask is centred in it, like the map of `ssim_map`.
     """
     if mask is not None:
         rows, columns = (slice((n - m) // 2, (n - m) // 2 + m) for n, m in zip(mask.shape, values.shape, strict=False))

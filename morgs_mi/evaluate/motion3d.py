@@ -1,6 +1,7 @@
 """Displacements in 3D of Gaussians on moving objects, compared with the objects' true trajectories.
 
-d_i is the displacement of Gaussian i from frame t-1 to frame t, and d*_i that of the surface on which it lay at t-1:
+d_i is the displacement of Gaussian i from frame t-1 to frame t, and d*_i the displacement of the surface on which it
+lay at t-1:
 
 1. A Gaussian lies on the surface of object k if, in some view at t-1, the pixel under its centre shows k within 1 % of
    the centre's depth, and the same holds for no other object in any view.
@@ -106,7 +107,7 @@ def compare_motion(motion: np.ndarray, truth: np.ndarray) -> Motion3DScores:
 
 
 def surface_ids(points: np.ndarray, views: Sequence[tuple[Camera, GroundTruth]]) -> np.ndarray:
-    """Return the id of the object on whose visible surface each point [N, 3] lies; -1 for none or several."""
+    """Return the id of the object with each point [N, 3] on its visible surface; -1 for none or several."""
     ids = np.full(len(points), -1, np.int64)
     several = np.zeros(len(points), bool)
     for camera, truth in views:

@@ -1,6 +1,6 @@
 """Perceived difference of two images: maps of FLIP and of the colour difference dE2000, one value per pixel.
 
-Images are display-referred RGB [H, W, 3], sRGB-encoded, float in [0, 1] or uint8. FLIP's constants are those of
+Images are display-referred RGB [H, W, 3], sRGB-encoded, float in [0, 1] or uint8. FLIP's constants are from
 Andersson, Nilsson, Akenine-Moller, Oskarsson, Astrom and Fairchild, "FLIP: a difference evaluator for alternating
 images", HPG 2020: the image is filtered by the eye's contrast sensitivity, colours are compared by HyAB in
 Hunt-adjusted CIELAB, and differing edges or points increase the error.
@@ -143,7 +143,7 @@ def _features(luminance: np.ndarray, pixels_per_degree: float) -> tuple[np.ndarr
     smooth = gaussian / gaussian.sum()
 
     def strength(kernel: np.ndarray) -> np.ndarray:
-        # The weights of each sign sum to one, so that the strength lies in [0, 1].
+        # The weights of each sign sum to one, hence the strength lies in [0, 1].
         kernel = kernel / np.where(kernel > 0, kernel[kernel > 0].sum(), -kernel[kernel < 0].sum())
         return np.hypot(_separable(luminance, kernel, smooth), _separable(luminance, smooth, kernel))
 

@@ -132,7 +132,7 @@ def bind(gaussians: Gaussians, points: np.ndarray, num_gaussians: int) -> tuple[
     inverse = axes @ axes.transpose(0, 2, 1)
     moment = np.einsum("nij,nj->ni", inverse, means)
     log_opacity = -np.logaddexp(0, -raw["logit_opacities"].astype(np.float64))
-    # The logarithm of the response is a quadratic polynomial in x, so that all of them are one matrix product.
+    # The logarithm of the response is a quadratic polynomial in x, hence all of them are one matrix product.
     i, j = np.triu_indices(3)
     double = np.where(i == j, -0.5, -1.0)
     polynomial = np.vstack(

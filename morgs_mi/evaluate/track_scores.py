@@ -13,7 +13,7 @@ tracks. What counts:
 
 - TAPVid-3D (Koppula et al. 2024): each view is a video of its own, in which the other views do not matter. All frames
   count, the query's and earlier ones too, all points of a video are counted together, and videos are averaged. The
-  thresholds are 1, 2, 4, 8 and 16 pixels of an image whose shorter side has 256, on a plane through the true point:
+  thresholds are 1, 2, 4, 8 and 16 pixels of an image with a shorter side of 256, on a plane through the true point:
   d z / f in world units, with its depth z and the focal length f. The benchmark's global scale of the prediction is 1,
   because calibrated views determine it. It defines no MTE and no survival.
 - Dynamic 3D Gaussians (Luiten et al. 2024), with the measures of PointOdyssey (Zheng et al. 2023) in centimetres:
@@ -49,7 +49,7 @@ class Protocol:
         name: name in tables.
         thresholds: of the distance: pixels if `per_view`, otherwise centimetres.
         survival: distance at which a track fails, cm; None if the protocol defines neither survival nor MTE.
-        per_view: whether each view is a video of its own, whose points are counted together in all frames.
+        per_view: whether each view is a video of its own, with its points counted together in all frames.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Comparison:
         found_visible: bool [P, T], whether the tracked point is predicted to be visible.
         alive: bool [P, T], whether the tracked point is bound to a living Gaussian.
         queries: int [P], the index of each track's query frame.
-        pixel: [P, T], width of a pixel at the true point in world units, for an image whose shorter side has 256;
+        pixel: [P, T], width of a pixel at the true point in world units, for an image with a shorter side of 256;
             None for several views.
     """
 
@@ -174,8 +174,8 @@ def _counts(protocol: Protocol, video: Comparison, evaluated: np.ndarray, meters
 def _shares(counts: np.ndarray) -> np.ndarray:
     """Return AJ, delta_avg and OA [M, 3] from numbers of points [6, M, D]; NaN where none is visible.
 
-    They are those of visible points, of those within the threshold, of true positives, of false positives, of points
-    whose visibility is right, and of all points.
+    The numbers count visible points, visible points within the threshold, true positives, false positives, points with
+    the right visibility, and all points.
     """
     visible, within, hits, false_positives, right, everything = counts
     with np.errstate(invalid="ignore", divide="ignore"):

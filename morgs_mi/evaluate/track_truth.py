@@ -1,9 +1,9 @@
-"""True 3D tracks of a recording: those of synthetic captures, and annotations of TAPVid-3D.
+"""True 3D tracks of a recording: ground truth of synthetic captures, and annotations of TAPVid-3D.
 
-TAPVid-3D (Koppula et al. 2024) annotates the recordings of Panoptic Studio that Dynamic 3D Gaussians uses, whose layout
-is that of `train_meta.json`. A file ``NAME_CAMERA.npz`` holds the tracks of one view: ``tracks_XYZ`` [T, P, 3] in the
-camera's axes (OpenCV's), ``visibility`` [T, P], ``queries_xyt`` [P, 3] and ``fx_fy_cx_cy`` [4]. NAME is that of the
-capture's folder; the files lie in that folder or beside it.
+TAPVid-3D (Koppula et al. 2024) annotates the recordings of Panoptic Studio that Dynamic 3D Gaussians uses, in the layout
+of `train_meta.json`. A file ``NAME_CAMERA.npz`` holds the tracks of one view: ``tracks_XYZ`` [T, P, 3] in the
+camera's axes (OpenCV's), ``visibility`` [T, P], ``queries_xyt`` [P, 3] and ``fx_fy_cx_cy`` [4]. NAME is the name of
+the capture's folder; the files lie in that folder or beside it.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class TrackTruth:
 
     @property
     def pixel(self) -> np.ndarray | None:
-        """Width of a pixel at each point [P, T], world units, for an image whose shorter side has 256; of one view."""
+        """Width of a pixel at each point [P, T], world units, for an image with a shorter side of 256; of one view."""
         if len(self.cameras) != 1:
             return None
         (camera,) = self.cameras
@@ -75,7 +75,7 @@ def tapvid3d_tracks(capture: Capture) -> list[TrackTruth]:
         ValueError: as `read_annotation`.
     """
     folder = capture.path.resolve()
-    # The frames of the annotations are numbered like those of the clips.
+    # The frames of the annotations are numbered like the frames of the clips.
     if capture.reading.aligns_clips or not (folder / "train_meta.json").is_file():
         return []
     files = [file for place in (folder, folder.parent) for file in place.glob(f"{folder.name}_*.npz")]

@@ -29,7 +29,7 @@ def evaluate_tracks(stream: StreamReader, recording: Capture, views: Sequence[in
 
     Args:
         stream: the file.
-        recording: its capture, whose `capture.json` may state `meters_per_unit`, 1 by default.
+        recording: its capture. Its `capture.json` may state `meters_per_unit`, 1 by default.
         views: the views that are evaluated.
 
     Raises:

@@ -61,7 +61,7 @@ __all__ = [
 _ATTRIBUTE_CHANNELS = {row.channel: row.name for row in ATTRIBUTES if row.channel is not None}
 
 CHANNELS = ("color", "motion", *_ATTRIBUTE_CHANNELS, "offset", "depth", "alpha")
-"""All channels that can be shown: those of the renderer, and the learned offset."""
+"""All channels that can be shown: the renderer's, and the learned offset."""
 MOTION_SCALE = 0.03
 """Speed at which the colour of motion is fully saturated, as a fraction of the image width per frame."""
 OFFSET_SCALE = 0.1
@@ -80,7 +80,7 @@ _JSON_TYPES = {
 
 
 def stream_name(stream: StreamReader) -> str:
-    """Return the name of a stream: that of its folder or file, without `.morgs`.
+    """Return the name of a stream: the name of its folder or file, without `.morgs`.
 
     Bytes of the name that are not UTF-8 are replaced, because pages and messages to a browser cannot contain them.
     """
@@ -113,7 +113,7 @@ def render_stream(
     Args:
         stream: the file.
         camera: any view, not necessarily one of the rig.
-        channels: out of `CHANNELS`; None for those of `available_channels`.
+        channels: out of `CHANNELS`; None for `available_channels`.
 
     Yields:
         (frame, images): per channel a float32 array [H, W, C], colour display-referred, motion and offset in pixels,
@@ -205,7 +205,7 @@ def truth_for_camera(capture: Capture, camera: Camera, frame: int) -> GroundTrut
 
 
 def available_channels(gaussians: Gaussians) -> tuple[str, ...]:
-    """Return the channels of a stream's Gaussians: color, motion, depth and those of the attributes that they have."""
+    """Return the channels of a stream's Gaussians: color, motion, depth, and channels of their attributes."""
     attributes = (name for name, attribute in _ATTRIBUTE_CHANNELS.items() if getattr(gaussians, attribute) is not None)
     return ("color", "motion", "depth", *attributes)
 
@@ -278,7 +278,7 @@ def open_stream_capture(stream: StreamReader, capture: str | Path | None, frames
 
     Args:
         stream: the file.
-        capture: folder of the capture; default: that of the fit, which the ``capture.json`` beside the stream names.
+        capture: folder of the capture; default: the fit's, which the ``capture.json`` beside the stream names.
         frames: indices of the stream's frames.
 
     Raises:
@@ -304,7 +304,7 @@ def open_stream_capture(stream: StreamReader, capture: str | Path | None, frames
             f"{stream.path}: expected consecutive frames out of the {recording.num_frames} of {path}, got {frames}; "
             "pass the capture that was fitted (--capture)."
         )
-    # Other refined cameras change no image, and ground truth refers to those of the recording.
+    # Other refined cameras change no image, and ground truth refers to the recording's cameras.
     return as_fitted(recording, stream) if "distortions" in stream.metadata else recording
 
 

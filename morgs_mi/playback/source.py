@@ -13,7 +13,7 @@ __all__ = ["about_lenses", "as_fitted"]
 
 
 def as_fitted(capture: Capture, stream: StreamReader) -> Capture:
-    """Return a capture with the cameras of a stream, whose fit may have refined them.
+    """Return a capture with the cameras of a stream, which its fit may have refined.
 
     Raises:
         ValueError: the distortions in the stream's header are no pairs of numbers.

@@ -36,7 +36,7 @@ GAP = 4
 BACKGROUND = 255
 """Grey level of that space."""
 UNDEFINED = (128, 128, 128)
-"""Colour of pixels whose value is not finite, or whose depth is not positive."""
+"""Colour of pixels with a value that is not finite, or a depth that is not positive."""
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
@@ -92,7 +92,7 @@ def motion_image(motion: np.ndarray, scale_px: float) -> np.ndarray:
 
 
 def motion_wheel(scale_px: float, size: int = 96) -> np.ndarray:
-    """Return the colours of `motion_image` as a disc [size, size, 3] whose rim is `scale_px`."""
+    """Return the colours of `motion_image` as a disc [size, size, 3] with `scale_px` at its rim."""
     axis = np.linspace(-scale_px, scale_px, size, dtype=np.float32)
     motion = np.stack(np.meshgrid(axis, axis), -1)
     motion[np.hypot(*np.moveaxis(motion, -1, 0)) > scale_px] = 0
@@ -139,8 +139,8 @@ def depth_image(depth: np.ndarray, near: float | None = None, far: float | None 
 
     Args:
         depth: world units; values that are not positive and finite are grey.
-        near: depth of the red end; default: that of `depth_range`.
-        far: depth of the blue end; default: that of `depth_range`.
+        near: depth of the red end; default: from `depth_range`.
+        far: depth of the blue end; default: from `depth_range`.
     """
     depth = np.asarray(depth, np.float64).reshape(np.shape(depth)[:2])
     known = np.isfinite(depth) & (depth > 0)
@@ -197,7 +197,7 @@ def write_png(path: str | os.PathLike[str], image: np.ndarray) -> None:
 
     Raises:
         OSError: the file cannot be written; the message names it and the cause.
-        ValueError: the image has no pixels, or another shape than those of `to_uint8`.
+        ValueError: the image has no pixels, or a shape that `to_uint8` does not accept.
     """
     image = to_uint8(image)
     if not image.size:

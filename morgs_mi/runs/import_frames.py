@@ -85,7 +85,7 @@ def import_frames(
 
     Args:
         sources: one folder, or the files in the order of the frames, see `find_frames`.
-        out: new file whose name ends in ``.morgs``, or a folder for ``stream.morgs``; folders are created.
+        out: new file with a name that ends in ``.morgs``, or a folder for ``stream.morgs``; folders are created.
         fps: frames per second.
         config: precision of the stream.
         axes: direction that is up.

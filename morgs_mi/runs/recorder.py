@@ -112,7 +112,7 @@ class Prepared:
 
     Attributes:
         capture: with enough points, and with refined cameras where the settings ask for them.
-        refinement: of the cameras; None if they are those of the calibration.
+        refinement: of the cameras; None if they are the calibration's.
     """
 
     capture: Capture
@@ -135,7 +135,7 @@ class Prepared:
     def completed(
         self, report: FrameReport, gaussians: Gaussians | None, frame: PartialFrame, config: StreamConfig
     ) -> FrameReport:
-        """Return the report of a frame; the first one says what was found about the cameras.
+        """Return the report of a frame; the first one includes the findings about the cameras.
 
         Args:
             report: of the frame.

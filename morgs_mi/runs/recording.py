@@ -282,7 +282,7 @@ def _without_folder(method: str) -> str:
 
 
 def described_capture(capture: Capture, earlier: Path | None) -> dict[str, Any]:
-    """Return the content of `capture.json`: that of an earlier fit if there is one, with the capture's present path."""
+    """Return the content of `capture.json`: an earlier fit's if there is one, with the capture's present path."""
     about = None
     if earlier is not None:
         with suppress(OSError, ValueError):

@@ -19,7 +19,7 @@ class Format:
     Attributes:
         name: of the format.
         ending: end of the names of its outputs; empty: of names without a suffix.
-        default: name of the output beside a stream; ``{}`` stands for that of a camera or a path.
+        default: name of the output beside a stream; ``{}`` stands for the name of a camera or a path.
         folder: whether it is a folder with a file per frame, or for a web server. With an `ending` that begins with a
             dot, the file of a single frame is one, too.
     """
@@ -79,8 +79,8 @@ def destination(
     Args:
         stream: path of the stream, beside which an output without a name is written.
         output: the given file or folder, or None.
-        formats: those of the export.
-        name: that of the given format, or None.
+        formats: formats of the export.
+        name: name of the given format, or None.
         stem: name of a camera or a path, for the name of the output.
 
     Raises:

@@ -41,7 +41,7 @@ def write_frames(
             ``0000.png`` ..., any other folder for multichannel ``0000.exr`` ... (see `exr_channels`).
         channels: out of `CHANNELS`; default: the colour, for EXR files all channels that the stream stores.
         progress: called with the number of frames done.
-        format: mp4, png or exr; None: that of the output's name.
+        format: mp4, png or exr; None: by the output's name.
 
     Raises:
         ValueError: an unknown channel, a channel that the stream does not store, another type of video, or a stream

@@ -10,8 +10,8 @@ has its own accessor and buffer view, little-endian float32:
     KHR_gaussian_splatting:SH_DEGREE_l_COEF_n       VEC3    RGB coefficient of degree l and order n - l
     COLOR_0                                         VEC4    linear RGB and opacity, for viewers that draw points
 
-glTF's axes have y up. Centres, rotations and spherical harmonics are rotated rather than the node, so that a viewer
-does not have to rotate the harmonics.
+glTF's axes have y up. Centres, rotations and spherical harmonics are rotated rather than the node: a viewer does
+not have to rotate the harmonics.
 """
 
 from __future__ import annotations

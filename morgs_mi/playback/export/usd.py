@@ -11,16 +11,16 @@ Each frame is a time code. The attributes follow the schema, which differs from 
     extent                                      float3[2]     box around three standard deviations
 
 A prim has an element for each Gaussian that lives in any frame, in the order of their ids. In frames outside of its
-life its opacity is 0, and its other attributes are those at its birth or death. USD would also accept arrays whose
-lengths change with time. But between two time samples, as for motion blur, it interpolates arrays of equal length
+life its opacity is 0, and its other attributes are as at its birth or death. USD would also accept arrays with
+lengths that change with time. But between two time samples, as for motion blur, it interpolates arrays of equal length
 element by element: where as many Gaussians die as are born, it would mix different ones, and where the numbers differ,
 nothing would move. With constant lengths all survivors move, and a Gaussian fades in during the frame before its birth
 and out during the frame after its last. Arrays that do not change have no further samples, and few Gaussians are born
-in later frames, so that the additional elements take little room.
+in later frames. The additional elements take little room.
 
 Where a keyframe starts a new set of Gaussians, a new prim begins, and `visibility` switches between them.
 
-The stage has y up, like that of glTF: centres, rotations and harmonics are rotated, because not every renderer rotates
+The stage has y up, like glTF's: centres, rotations and harmonics are rotated, because not every renderer rotates
 the harmonics with a prim. The unit of a capture is unknown; `metersPerUnit` is 1.
 """
 
@@ -105,7 +105,7 @@ def _write_stage(
     half: bool,
     progress: Callable[[int, int], None] | None,
 ) -> None:
-    """Write a file that is not a package; the arguments are those of `write_usd`."""
+    """Write a file that is not a package; the arguments are the same as for `write_usd`."""
     axes, wanted, unsaved = gltf_axes(stream.cameras), set(frames), 0
 
     def selected() -> Iterator[tuple[int, CodedFrame]]:
@@ -117,7 +117,7 @@ def _write_stage(
     fields = _fields(pxr, stage, sets, frames, half)
     for done, (first_id, coded) in enumerate(selected(), start=1):
         unsaved += fields[first_id].put(coded, axes)
-        # A binary file is appended to, so that memory is bounded; a text would be written again.
+        # A binary file is appended to, which bounds the memory; a text would be written again.
         if unsaved > _UNSAVED_BYTES and path.suffix.lower() != ".usda":
             stage.Save()
             unsaved = 0
@@ -278,7 +278,7 @@ def _fields(pxr: Any, stage: Any, sets: dict[int, _Set], frames: Sequence[int], 
 
 @contextmanager
 def _system_errors(pxr: Any) -> Iterator[None]:
-    """Raise errors of OpenUSD, which are those of the file system here, as `OSError`."""
+    """Raise errors of OpenUSD, which are file system errors here, as `OSError`."""
     try:
         yield
     except pxr.Tf.ErrorException as error:

@@ -97,7 +97,7 @@ def text_of_bytes(data: bytes) -> str:
     """Return bytes as text with 7 bits per character, which HTML stores in a script without changing it.
 
     Bits are taken from the highest down, the last ones are filled up with zeros. 128 is added to the characters that
-    HTML would change, so that a reader takes the low 7 bits of each. As UTF-8, the text is 1.17 times as long as
+    HTML would change; a reader takes the low 7 bits of each. As UTF-8, the text is 1.17 times as long as
     random bytes; base64 is 1.33 times as long.
     """
     bits = np.unpackbits(np.frombuffer(data, np.uint8))

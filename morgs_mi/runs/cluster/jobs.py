@@ -59,7 +59,7 @@ class BatchConfig:
     test_view: str = "auto"
     """Held-out camera, by index or name; none: all are fitted; auto: the capture's own."""
     reading: ReadConfig = field(default_factory=ReadConfig)
-    """How clips that do not match are read, and which cameras are left out."""
+    """Reading of clips that do not match, and cameras that are left out."""
 
 
 @dataclass(frozen=True)

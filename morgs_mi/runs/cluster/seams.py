@@ -2,16 +2,16 @@
 
 All segments start from one common model, the first two frames of the recording. A segment is fitted from some frames
 before its first one (*overlap*). The first of these is fitted like a later frame of the common model, several times
-over, so that Gaussians that have travelled far since then arrive; the others follow as usual. What has not changed
+over, until Gaussians that have travelled far since then arrive; the others follow as usual. What has not changed
 since the first frames stays as it is, to the bit, and every other Gaussian keeps the number that it has in the common
 model.
 
 The segment before has followed the recording for many frames, and ends elsewhere. In the overlap, the stream fades from
-its Gaussians to those of the next segment (*cross-fade*), so that the difference does not appear within one frame, as a
+its Gaussians to the next segment's (*cross-fade*). Otherwise the difference would appear within one frame, as a
 flicker. With the share s of the next segment, which grows from 0 to 1 with a slope of zero at both ends:
 
 - A Gaussian that both have inherited from the common model, and have at nearly the same place, is interpolated.
-- Any other is drawn beside those of the other segment, with a part of its optical depth: its opacity o becomes
+- Any other is drawn beside the other segment's, with a part of its optical depth: its opacity o becomes
   1 - (1 - o)^s if it belongs to the next segment, and 1 - (1 - o)^(1 - s) otherwise. Two that coincide are then as
   opaque together as each alone.
 """

@@ -99,7 +99,7 @@ def stream_segments(
         out: folder, made if missing.
         workers: from `open_workers`.
         config: settings.
-        segments: number of segments of about the same length; with one, the stream is that of `stream_capture`.
+        segments: number of segments of about the same length; with one, the stream equals `stream_capture`'s.
         seams: settings of the seams.
         resume: continue the segments in `out`. With `RenderConfig(reproducible=True)` the stream has the same bytes as
             without an interruption.
@@ -127,7 +127,7 @@ def noting_segments(out: Path) -> Iterator[None]:
 
 
 def _num_finished(path: Path) -> int:
-    """Return the number of frames in the stream of a segment, without those of the overlap before it."""
+    """Return the number of frames in the stream of a segment, without the overlap before it."""
     stream = StreamReader(path)
     start = stream.metadata.get("segments", {"starts": [0]})["starts"][int(path.stem)]
     return len({frame for _, frame, _ in stream.index() if frame >= start})
@@ -191,8 +191,8 @@ class _Run:
             self.metadata["segments"] = {"starts": list(starts[:-1]), **asdict(seams)}
         self.prepared: Prepared | None = None  # where this run begins the recording
         self.peaks: dict[str, int] = {}
-        self.active = 0  # segments whose later frames are being fitted
-        self.starting = 0  # segments whose start is fitted, or waits for a worker
+        self.active = 0  # segments with later frames being fitted
+        self.starting = 0  # segments with a start that is being fitted, or waits for a worker
 
     async def fit(self, resume: bool) -> SegmentedFit:
         """Fit, or continue, all segments and join them."""
@@ -350,7 +350,7 @@ class _Segment:
             await asyncio.sleep(_POLL)
 
     def packets(self) -> Iterator[Packet]:
-        """Yield the packets of the segment, without those of the overlap before it."""
+        """Yield the packets of the segment, without the overlap before it."""
         return dropwhile(
             lambda p: (p.kind, p.frame) != (PacketKind.KEYFRAME, self.start), StreamReader(self.files.stream)
         )

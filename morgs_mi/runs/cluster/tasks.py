@@ -1,7 +1,7 @@
-"""What workers do: fit a few frames of a segment, or the first frame of one.
+"""Tasks of the workers: fit a few frames of a segment, or the first frame of one.
 
 A task gets the state as packets, reads the recording from a path that the worker sees, and returns packets. It writes
-no files, so that it can be repeated anywhere. A worker keeps the loop of its last task: where the next one continues
+no files and can be repeated anywhere. A worker keeps the loop of its last task: where the next one continues
 it, nothing is read twice.
 """
 
@@ -83,7 +83,7 @@ Rig = tuple[tuple[Camera, ...], tuple[tuple[float, float], ...]]
 
 @dataclass(frozen=True)
 class Fit:
-    """What all tasks of a fit share.
+    """Data that all tasks of a fit share.
 
     Attributes:
         source: the recording.
@@ -91,7 +91,7 @@ class Fit:
         seams: settings of the seams.
         variant: Mitsuba variant.
         versions: as `installed` returns them to the client.
-        rig: refined cameras and distortions, as `Capture.with_cameras` takes them; None: those of the recording.
+        rig: refined cameras and distortions, as `Capture.with_cameras` takes them; None: the recording's.
     """
 
     source: Source

@@ -16,13 +16,13 @@ __all__ = ["CameraFeed"]
 
 # Images of a camera from which the one that agrees best with the others is chosen: networks deliver them in bursts.
 _KEPT = 4
-# Largest skew of a bundle, s: that of unsynchronised cameras with one image per second.
+# Largest skew of a bundle, s: the skew of unsynchronised cameras with one image per second.
 _MAX_SKEW = 0.5
 _CLOSING = 12.0  # longest wait for the threads, s; a connection or a driver may take 10 s to fail
 
 
 class CameraFeed:
-    """Live images of cameras that are read side by side; its methods are those of `Feed`.
+    """Live images of cameras that are read side by side; it has the methods of `Feed`.
 
     Images are bundled by the times of their arrival: the newest one of the slowest camera, and of each other camera the
     one that is nearest in time.

@@ -121,7 +121,7 @@ def _check_outside(out: Path, sources: Sequence[Source]) -> None:
 
 
 class _LiveFrames:
-    """Frames of a live capture, processed like those of any capture.
+    """Frames of a live capture, processed like the frames of any capture.
 
     Args:
         feed: the cameras.
@@ -146,7 +146,7 @@ class _LiveFrames:
                 _LOG.warning("the fit ends after frame %d: %s", frame - 1, self._feed.ended())
 
     def report(self, bundle: Bundle, frame: PartialFrame) -> LiveFrame:
-        """Return the report of a frame whose fit has ended."""
+        """Return the report of a fitted frame."""
         since, latency = bundle.time - self._first.time, time.monotonic() - bundle.time
         return LiveFrame(frame.index, since, latency, bundle.skew, bundle.dropped, frame.problems)
 
@@ -214,7 +214,7 @@ def _fit(
 
 
 def _record(frames: _LiveFrames, out: Path, bundle: Bundle, frame: PartialFrame) -> None:
-    """Write the recorded images of a frame into the capture; those of the first are there already."""
+    """Write the recorded images of a frame into the capture; the first frame's are there already."""
     if frames.config.record and frame.index:
         kept = [None if done is None else image for image, done in zip(bundle.images, frame.images, strict=True)]
         write_images(out / "capture", frames.capture.names, kept, frame.index)

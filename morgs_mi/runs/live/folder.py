@@ -32,7 +32,7 @@ _Found = Mapping[str, _Numbered]
 
 
 class FolderFeed:
-    """Live images in a folder that another program fills; its methods are those of `Feed`.
+    """Live images in a folder that another program fills; it has the methods of `Feed`.
 
     Images with one number are of one time, and an image that is not complete yet is not read. Newer images have larger
     numbers. If none come, images that were written `_PAUSE` after the last bundle are newer, too: the program may count
@@ -41,7 +41,7 @@ class FolderFeed:
     Args:
         folder: with one folder of images per camera.
         timeout: seconds to wait for a camera before it is left out.
-        names: names of the cameras; by default those of the folders that have images when the second number begins.
+        names: names of the cameras; by default the names of the folders that have images when the second number begins.
 
     Raises:
         FileNotFoundError: there is no such folder.
@@ -140,7 +140,7 @@ class FolderFeed:
             )
 
     def _lack(self) -> str:
-        """Return what the images lack for a first bundle."""
+        """Return a description of the images that are missing for a first bundle."""
         found = self._found(-1, 0.0)
         names = self.names or tuple(found)
         if silent := [name for name in names if name not in found]:

@@ -1,6 +1,6 @@
 """The capture of a live fit: a folder with the calibration and the images that are fitted.
 
-It is a capture like any other, so that a stream can be evaluated, and its frames fitted again.
+It is a capture like any other: a stream can be evaluated on it, and its frames fitted again.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ __all__ = ["LiveConfig"]
 
 @dataclass(frozen=True)
 class LiveConfig:
-    """Settings of a live fit, besides those of the loop."""
+    """Settings of a live fit, besides the loop's."""
 
     calibration: Path | None = None
     """Folder of a calibrated capture of the same cameras; by default they are calibrated by their first images."""
@@ -28,7 +28,7 @@ class LiveConfig:
     seconds: Annotated[float, Above(0)] | None = None
     """Time in seconds for the frames after the first one; by default until the cameras end."""
     record: bool = True
-    """Store the images of all fitted frames; otherwise those of the first one alone."""
+    """Store the images of all fitted frames; otherwise of the first one alone."""
     fps: Annotated[float, Above(0)] = 30
     """Frames per second at which the stream is played."""
     timeout: Annotated[float, Above(0)] = 10

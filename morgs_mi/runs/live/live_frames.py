@@ -42,7 +42,7 @@ def live_frames(rig: Capture, sources: Sequence[Source], newest: bool = False) -
 
     Raises:
         OSError: a source cannot be opened.
-        ValueError: the number of sources differs from that of the cameras, or an image from the size of the rig's.
+        ValueError: the number of sources differs from the number of cameras, or an image from the size of the rig's.
     """
     if len(sources) != len(rig.cameras):
         raise ValueError(

@@ -27,7 +27,7 @@ def open_feed(sources: Sequence[Source], config: LiveConfig, names: Sequence[str
     Args:
         sources: the folder alone, or one source per camera, in the order of `names`.
         config: settings.
-        names: names of the cameras; by default those of the folders in a folder, otherwise cam0, cam1, ...
+        names: names of the cameras; by default the names of the folders in a folder, otherwise cam0, cam1, ...
 
     Raises:
         FileNotFoundError: there is no such folder.
