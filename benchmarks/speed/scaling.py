@@ -3,8 +3,8 @@
     python -m benchmarks.speed.scaling --json benchmarks/results/scaling.json --plot benchmarks/results/scaling.png
 
 A synthetic clip is fitted in segments with one and with two workers of one thread each. The efficiency is the
-throughput of W workers over W times the throughput of one: of the later frames, which all workers fit side by side, and of the
-whole fit.
+throughput of W workers over W times the throughput of one: of the later frames, which all workers fit side by side,
+and of the whole fit.
 
 The model predicts the wall time of a long recording from the measured times of one worker. Its stages follow one
 another:

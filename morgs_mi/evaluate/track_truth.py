@@ -1,7 +1,7 @@
 """True 3D tracks of a recording: ground truth of synthetic captures, and annotations of TAPVid-3D.
 
-TAPVid-3D (Koppula et al. 2024) annotates the recordings of Panoptic Studio that Dynamic 3D Gaussians uses, in the layout
-of `train_meta.json`. A file ``NAME_CAMERA.npz`` holds the tracks of one view: ``tracks_XYZ`` [T, P, 3] in the
+TAPVid-3D (Koppula et al. 2024) annotates the recordings of Panoptic Studio that Dynamic 3D Gaussians uses, in the
+layout of `train_meta.json`. A file ``NAME_CAMERA.npz`` holds the tracks of one view: ``tracks_XYZ`` [T, P, 3] in the
 camera's axes (OpenCV's), ``visibility`` [T, P], ``queries_xyt`` [P, 3] and ``fx_fy_cx_cy`` [4]. NAME is the name of
 the capture's folder; the files lie in that folder or beside it.
 """
