@@ -251,8 +251,11 @@ def _first_confidence(
     assert previous is not None
     if state.frame != 1 or not flows or not config.motion.learn_confidence:
         return previous
-    how = config.motion.mask_method, config.motion.masks
-    masks = {v: motion_mask(state.seen.images[v], f.forward_flow, f.forward_reliable, *how) for v, f in flows.items()}
+    motion, images = config.motion, state.seen.images
+    masks = {
+        v: motion_mask(images[v], flow.forward_flow, flow.forward_reliable, motion.mask_method, motion.masks)
+        for v, flow in flows.items()
+    }
     return fit_confidence(previous, dict(enumerate(setup.cameras)), masks, config.fit, config.render, rng)[0]
 
 

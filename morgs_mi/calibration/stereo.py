@@ -53,8 +53,7 @@ def stereo_points(
     views = [_View.of(*view) for view in zip(cameras, images, masks, strict=True)]
     found = [np.zeros((0, 6))]
     for i, j in _neighbours(cameras, known):
-        pair = views[i], views[j]
-        points = _matched(*pair, _depth_range(cameras, i, known))
+        points = _matched(views[i], views[j], _depth_range(cameras, i, known))
         others = [view for k, view in enumerate(views) if k not in (i, j)]
         points = points[_confirmed(points, others)] if others else points
         found.append(rng.permutation(points)[:_POINTS])

@@ -66,8 +66,9 @@ def _compared(stream: StreamReader, videos: Sequence[TrackTruth], start: int) ->
     queries = np.concatenate([video.queries for video in videos]) + start
     tracks = track_points(stream, np.concatenate(points), queries)
     ends = np.cumsum([len(video.queries) for video in videos])
-    parts = np.split(tracks.points, ends[:-1]), np.split(tracks.alive, ends[:-1])
-    found = [(p[:, : v.points.shape[1]], a[:, : v.points.shape[1]]) for v, p, a in zip(videos, *parts, strict=True)]
+    points, alive = np.split(tracks.points, ends[:-1]), np.split(tracks.alive, ends[:-1])
+    lengths = [video.points.shape[1] for video in videos]
+    found = [(p[:, :length], a[:, :length]) for p, a, length in zip(points, alive, lengths, strict=True)]
     seen = _seen(stream, videos, [positions for positions, _ in found])
     return [
         Comparison(video.points, positions, video.visible, mask & alive, alive, video.queries, video.pixel)

@@ -30,15 +30,18 @@ def mattes(gaussians: ActivatedGaussians, camera: Camera, scene: Any) -> dict[st
         camera: the view.
         scene: Mitsuba scene with the surfaces.
     """
-    size, crop = (camera.height, camera.width), (0, 0, camera.width, camera.height)
-    view = (scene, mi.load_dict(camera.sensor()), camera, crop)
+    size, crop, sensor = (
+        (camera.height, camera.width),
+        (0, 0, camera.width, camera.height),
+        mi.load_dict(camera.sensor()),
+    )
     with dr.suspend_grad():
         shapes = [shape for shape in scene.shapes() if not shape.is_ellipsoids()]
-        covered, depth = (np.array(v).reshape(size) for v in coverage_and_depth(*view))
+        covered, depth = (np.array(v).reshape(size) for v in coverage_and_depth(scene, sensor, camera, crop))
         whole = np.asarray(rasterize(gaussians, camera, ("alpha",)).alpha)[..., 0]
         front = np.asarray(rasterize(gaussians, camera, ("alpha",), depth_limit=depth).alpha)[..., 0]
         result = {SPLATS: covered * front + (1 - covered) * whole}
         for shape in shapes:
-            part = np.array(coverage_and_depth(*view, shape)[0]).reshape(size) * (1 - front)
+            part = np.array(coverage_and_depth(scene, sensor, camera, crop, shape)[0]).reshape(size) * (1 - front)
             result[shape.id()] = result.get(shape.id(), 0) + part
     return {name: part.astype(np.float32) for name, part in result.items()}

@@ -50,8 +50,8 @@ def refine_mask(image: np.ndarray, mask: np.ndarray, config: MaskConfig | None =
         return clean
     labels = np.where(near > 0, np.where(seed > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD), cv2.GC_BGD).astype(np.uint8)
     cv2.setRNGSeed(0)  # GrabCut's k-means starts at random
-    models = np.zeros((1, 65)), np.zeros((1, 65))
-    labels, _, _ = cv2.grabCut(small, labels, (0, 0, 0, 0), *models, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
+    back, front = np.zeros((1, 65)), np.zeros((1, 65))
+    labels, _, _ = cv2.grabCut(small, labels, (0, 0, 0, 0), back, front, _ITERATIONS, cv2.GC_INIT_WITH_MASK)
     return clean_mask(_enlarged(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)), mask.shape))
 
 

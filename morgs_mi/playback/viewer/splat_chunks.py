@@ -150,5 +150,10 @@ class SplatChunks:
 
     def _added(self, index: int) -> Any:
         """Return a new chunk with one transparent Gaussian, as viser's objects are not empty."""
-        chunk = np.zeros((1, 3)), np.eye(3)[None], np.zeros((1, 3), np.uint8), np.zeros((1, 1))
-        return self._scene.add_gaussian_splats(f"/splats/{index}", *chunk)
+        means, covariances, colors, opacities = (
+            np.zeros((1, 3)),
+            np.eye(3)[None],
+            np.zeros((1, 3), np.uint8),
+            np.zeros((1, 1)),
+        )
+        return self._scene.add_gaussian_splats(f"/splats/{index}", means, covariances, colors, opacities)
