@@ -1,8 +1,8 @@
-"""Balance of the cameras: their exposures in the first frame, from what Gaussians that they share look like.
+"""Balance of the cameras: their exposures in the first frame, from renderings of Gaussians that they share.
 
 Rounds of a short fit of Gaussians and of the closed form of `method.exposure`, view by view, take turns. The Gaussians
-have no view-dependent colours, which would hide wrong exposures. A fit from the same start with the cameras as recorded
-is compared by pixels that no fit has seen: blocks that are withheld from every view.
+have no view-dependent colours, which would hide wrong exposures. A fit from the same start to the recorded images is
+compared in withheld pixels, blocks of every view that no fit has seen.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ class Balance:
     """Result of balancing cameras.
 
     Attributes:
-        exposures: of each camera; those found, taken or not.
+        exposures: estimated exposure of each camera, used or not.
         taken: whether they are used.
         recorded_psnr: of withheld pixels in a fit to the images as recorded, dB; NaN where they were not compared.
-        balanced_psnr: of the same pixels in a fit to the balanced images, dB; likewise.
+        balanced_psnr: of the same pixels in a fit to the balanced images, dB; NaN where they were not compared.
     """
 
     exposures: tuple[Exposure, ...]
@@ -47,7 +47,7 @@ class Balance:
 
     @property
     def sentence(self) -> str:
-        """What was changed, and why."""
+        """Sentence on the change of the cameras and its reason."""
         change = f"exposures differ by up to {100 * max(exposure.change for exposure in self.exposures):.1f} % of white"
         scores = f"withheld pixels have {self.balanced_psnr:.2f} dB instead of {self.recorded_psnr:.2f} dB"
         if np.isnan(self.recorded_psnr):
@@ -76,7 +76,7 @@ def balance_cameras(
     """Return the exposures with which the cameras agree, and whether withheld pixels show that they are better.
 
     Args:
-        problem: what is fitted, with a start as for `balance_config`.
+        problem: the data of the first frame, with a start as for `balance_config`.
         config: of the fit; `exposure` "on" takes the exposures in any case.
         seed: of all random choices.
         progress: of the fits, in one stage.

@@ -15,7 +15,7 @@ __all__ = ["steps_within"]
 
 # Steps that are timed, and the least number that a first frame gets.
 _TIMED, _LEAST = 20, 100
-# Mean time of a step over that of the first ones, whose Gaussians density control doubles.
+# Mean time of a step relative to the first steps; density control later doubles the number of Gaussians.
 _GROWTH = 1.5
 
 
@@ -27,7 +27,7 @@ def steps_within(seconds: float, problem: FirstFrameProblem, config: FitConfig, 
 
     Args:
         seconds: the time.
-        problem: what is fitted.
+        problem: the data of the first frame.
         config: settings of the fit.
         trials: number of trials before the first frame, at most.
         seed: of the steps that are timed.

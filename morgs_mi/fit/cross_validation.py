@@ -2,8 +2,8 @@
 
 Some training views are withheld, and a short fit to the others is evaluated by their PSNR. Among six views and more it
 chooses the probability of dropping (see `dropping`): where images are noisy or few, dropping helps; where they are many
-and clean, it only costs. Candidates are tried in rising order until one is no better than the last. Of fewer views, the
-noise of the images chooses it, as a rig that lacks one of them is too different.
+and clean, it only costs. Candidates are tried in rising order until one is no better than the last. With fewer views,
+it follows from the noise of the images, because the rig without one of them is too different.
 
 A withheld view has more error than the others. This excess grows with its angle to them, until the view shows nothing
 that they show. Views halfway between neighbouring cameras are nearer, and have less of it (see `excess_share`).
@@ -40,11 +40,11 @@ __all__ = [
 ]
 
 TRIAL_STEPS = 0.4
-"""Steps of a trial, as a fraction of those of the first frame."""
+"""Steps of a trial, as a fraction of the steps of the first frame."""
 
 # Probabilities of dropping that are tried, in rising order.
 _CANDIDATES = (0.0, 0.2, 0.4)
-# One view of that many is withheld, at least one.
+# Number of views per withheld view; at least one view is withheld.
 _WITHHELD = 6
 # px, of the images of a trial, which are reduced by the largest whole factor that leaves this width.
 _WIDTH = 640
@@ -77,7 +77,7 @@ class CrossValidation:
     Attributes:
         withheld: names of the withheld views.
         cameras: number of cameras, with the withheld ones.
-        spacing: mean angle from a camera to its nearest one, as seen from what they look at, in degrees.
+        spacing: mean angle from a camera to its nearest one, seen from the scene, in degrees.
         withheld_angle: mean angle from a withheld view to the nearest of the others, in degrees.
         trials: the fits, by rising probability of dropping.
         training_psnr: mean PSNR of the first frame itself in the training views, dB; None: not fitted yet.
@@ -112,7 +112,7 @@ class CrossValidation:
 
     @property
     def sentence(self) -> str:
-        """What to expect of views between the cameras."""
+        """Sentence on the expected quality of views between the cameras."""
         training_psnr = self.training_psnr or self.best.training_psnr
         them = "them" if len(self.withheld) > 1 else "it"
         source = f"estimated from {', '.join(self.withheld)} in a trial without {them}"
@@ -122,7 +122,7 @@ class CrossValidation:
 
 
 def excess_share(angle: float, withheld_angle: float, trained: int) -> float:
-    """Return the excess of error at an angle to the nearest view, relative to that of withheld views.
+    """Return the excess of error at an angle to the nearest view, relative to the excess of withheld views.
 
     The excess grows in proportion to the angle and ends at about 20 degrees, where neighbours show something else. Few
     views lose more with the withheld one: its excess is larger then, by a power of the angle (measured, see

@@ -2,10 +2,10 @@
 
 N Gaussians become M. `parent` [M] is the index among the N of the Gaussian that each one is or was made from; `source`
 [M] is the same for survivors, which come first in ascending order, and -1 for births, which come last. Survivors keep
-their means, so that their tracks do not jump; births are drawn from the density of their parents.
+their means, as their tracks must not jump. Births are drawn from the density of their parents.
 
 In the first frame, `plan_growth` (Kerbl et al. 2023): a large parent is split, and both shrink by 1.6; a small one is
-cloned, and both get the opacity 1 - sqrt(1 - o), so that together they cover what one did (Bulo et al. 2024). In a
+cloned, and both get the opacity 1 - sqrt(1 - o), with which they cover as much as the parent (Bulo et al. 2024). In a
 later frame, `plan_additions` (Sun et al. 2024): parents stay unchanged, because the few remaining steps could not
 repair them; births are small and faint, and gain opacity or are pruned.
 
@@ -31,7 +31,7 @@ __all__ = ["DensityPlan", "Room", "apply_plan", "plan_additions", "plan_growth",
 
 # float32 has no opacity closer to 1.
 _MAX_OPACITY = 1 - 1e-6
-# Opacity of a birth in a later frame: what is not needed there is pruned soon.
+# Opacity of a birth in a later frame: low, because unnecessary births are then pruned soon.
 _BIRTH_OPACITY = 0.1
 # Logarithm of the factor by which a split Gaussian, and a birth in a later frame, is smaller than its parent (3DGS).
 _LOG_SHRINK = -float(np.log(1.6))
@@ -44,7 +44,7 @@ class DensityPlan:
     Attributes:
         parent: int [M], index among the N Gaussians before.
         source: int [M], the same for survivors, -1 for births.
-        edits: what is added to raw attributes, by name, [M, ...]; other attributes stay unchanged.
+        edits: changes added to raw attributes, by name, [M, ...]; other attributes stay unchanged.
     """
 
     parent: np.ndarray
@@ -110,7 +110,7 @@ def plan_additions(
         scores: their densification scores.
         config: thresholds.
         rng: draws the means of the births.
-        num_static: number of Gaussians besides, which stay unchanged.
+        num_static: number of the other Gaussians, which stay unchanged.
     """
     births = round(config.births * (len(gaussians) + num_static))
     room = Room(births, max(config.max_gaussians - num_static, 0))
@@ -124,13 +124,13 @@ def plan_additions(
 def _select(
     gaussians: Gaussians, scores: DensificationScores, room: Room, min_error: float, config: DensityConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices of the survivors, and those of the parents among them: the ones with the largest error.
+    """Return the indices of the survivors, and the indices of the parents: survivors with the largest error.
 
     Gaussians fainter than `min_opacity` are pruned, and so are those that cover least where births would exceed
     the limit.
     """
     visible = np.asarray(gaussians.opacities) >= config.min_opacity
-    # A scene cannot come back from no Gaussians at all.
+    # Without any Gaussian, the scene could not recover.
     survivors = np.flatnonzero(visible) if visible.any() else np.arange(len(visible))
     candidates = survivors[scores.error[survivors] > min_error]
     parents = candidates[np.argsort(-scores.error[candidates], kind="stable")][: room.births]
@@ -178,12 +178,12 @@ def apply_plan(gaussians: Gaussians, plan: DensityPlan) -> Gaussians:
 
 
 def resize_optimizer(optimizer: Adam, plan: DensityPlan, edits: Mapping[str, np.ndarray] | None = None) -> None:
-    """Give an optimiser's parameters [N, ...] the rows of a plan [M, ...], with their moments; those of births are 0.
+    """Replace an optimiser's parameters [N, ...] and moments by the rows of a plan [M, ...]; moments of births are 0.
 
     Args:
         optimizer: holds tensors of N rows; its learning rates and its count of steps stay.
         plan: one round of density control.
-        edits: what is added to the parameters, by name.
+        edits: changes added to the parameters, by name.
     """
     born = plan.source < 0
 

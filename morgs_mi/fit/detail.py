@@ -1,8 +1,9 @@
 """The number of Gaussians of the first frame, from the detail of its images.
 
 An image is averaged over blocks of 2x2 pixels, again and again. A value that differs from the mean of its block by more
-than a threshold and the noise is a detail. Flat areas and noise have none, edges have some at every level. What several
-views see is counted once: the details of all views are divided by the mean number of views that see a point.
+than a threshold and the noise is a detail. Flat areas and noise have none, edges have some at every level. Details
+that several views see are counted once: the number of details of all views is divided by the mean number of views that
+see a point.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """The first frame: all attributes from its images, then the confidence from its masks.
 
 Where the number of steps is not given, it follows from the images. A capture with much detail still improves when
-others have converged: if L_recon falls by more than 15 % in the last third of the steps, they
-are doubled, and the learning rates continue on the schedule of twice as many steps. Noise, which no step removes,
-is part of the loss, so that noisy captures end early.
+others have converged. If L_recon falls by more than 15 % in the last third of the steps, the number of steps is
+doubled, and the learning rates continue on the longer schedule. Noisy captures end early, because no step removes the
+noise from the loss.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _PASSES, _LEAST = 4, 8
 _LEAST_DECREASE = 0.15
 # Fraction of the steps after which another SH band is added, as in 3DGS.
 _BAND = 1 / 30
-# First and last round of density control, as fractions of the steps: the rest of them fits what was added.
+# First and last round of density control, as fractions of the steps: the remaining steps fit the births.
 _FIRST_ROUND, _LAST_ROUND = 0.1, 0.5
 # Learning rates at the end, as a fraction of those at the start.
 _FINAL_RATE = 0.1

@@ -43,7 +43,7 @@ def first_settings(
     strength of dropping is given, and of two views, it is a forecast.
 
     Args:
-        problem: what is fitted.
+        problem: the data of the first frame.
         config: settings of the fit.
         seed: of the trials.
         progress: of the trials, a stage each.

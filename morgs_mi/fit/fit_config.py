@@ -29,7 +29,7 @@ _USUAL_EPOCHS = 8
 class LearningRates:
     """Adam's learning rate of every parameter, per step.
 
-    The defaults are those of a later frame. They were chosen on the clip `spheres`, held-out view, from 1x to
+    The defaults are for a later frame. They were chosen on the clip `spheres`, held-out view, from 1x to
     8x the rates of 3DGS (Kerbl et al. 2023): 3DGS takes thousands of steps where a frame here has under a hundred.
     """
 
@@ -63,7 +63,7 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class DensityConfig:
-    """Settings of density control (see `density`); thresholds are those of the literature."""
+    """Settings of density control (see `density`), with thresholds from the literature."""
 
     rounds: Annotated[int, AtLeast(0)] = 6
     """Rounds of density control in the first frame; 0: none. With them, the first frame starts from half of its
@@ -213,7 +213,7 @@ class FitConfig:
     first_frame_rates: LearningRates = field(
         default_factory=lambda: LearningRates(means=2e-3, scales=0.02, quats=0.02, opacities=0.2, confidence=0.2)
     )
-    """Learning rates at the start of the first frame. That of the confidence is constant: nothing else changes then."""
+    """Learning rates at the start of the first frame. The confidence is fitted alone, at a constant rate."""
 
     def __post_init__(self) -> None:
         check_ranges(self)

@@ -32,7 +32,7 @@ class Forecast:
 
     Attributes:
         cameras: number of cameras.
-        spacing: mean angle from a camera to its nearest one, as seen from what they look at, degrees.
+        spacing: mean angle from a camera to its nearest one, seen from the scene, degrees.
         overlap: mean share of a camera's image that its nearest one sees as well.
         reach: mean angle from a camera to the nearest one that sees the same point, degrees, 90 where there is none.
         training_psnr: mean PSNR of the first frame in the training views, dB; None: not fitted yet.
@@ -55,7 +55,7 @@ class Forecast:
 
     @property
     def sentence(self) -> str:
-        """What to expect of views between the cameras."""
+        """Sentence on the expected quality of views between the cameras."""
         bound = "" if self.training_psnr is None else f" They have at most {self.training_psnr:.0f} dB."
         return (
             f"Views between the cameras will be {self.quality}: {self.cameras} cameras, {self.spacing:.0f} degrees "
@@ -96,8 +96,8 @@ def forecast(cameras: Sequence[Camera], points: np.ndarray) -> Forecast:
     """Return the forecast for a rig.
 
     Args:
-        cameras: those that are trained on, at least two.
-        points: [P, 3] of the scene, world units; without any, what the cameras look at is their `focus_point`.
+        cameras: the training cameras, at least two.
+        points: [P, 3] of the scene, world units; without any, `focus_point` of the cameras replaces them.
     """
     measures = []
     for view, (camera, depth) in enumerate(zip(cameras, scene_depths(cameras, points), strict=True)):

@@ -31,10 +31,10 @@ from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["FrameProblem", "LaterFrame", "fit_later_frame"]
 
-# The round of density control, as a fraction of the epochs: the residual has shown by then what is missing, and enough
-# steps are left to fit what is added.
+# The round of density control, as a fraction of the epochs: the residual has shown by then where Gaussians are missing,
+# and enough steps are left to fit the births.
 _DENSITY_ROUND = 0.625
-# Views, spread over the rig, in which that round looks for what is missing.
+# Number of views, spread over the rig, that contribute to the densification scores of that round.
 _DENSITY_VIEWS = 8
 # Error that counts as noise there, in medians of the image's error: normal noise, independent in three colours, exceeds
 # 3 at 3 of 10,000 pixels.
@@ -43,7 +43,7 @@ _NOISE = 3.0
 
 @dataclass(frozen=True, eq=False)
 class FrameProblem:
-    """What one later frame is fitted to.
+    """Data to which one later frame is fitted.
 
     Attributes:
         previous: N Gaussians of the previous frame, detached.
@@ -89,7 +89,7 @@ def fit_later_frame(
     """Fit one frame's residual (eq. 12) by L_recon + L_mask + L_flow + L_off (eq. 13).
 
     Args:
-        problem: what it is fitted to.
+        problem: the data of the frame.
         config: epochs, rates, weights of the losses, density control.
         motion: which modules are on.
         rng: draws the order of the views and the positions of births.
@@ -174,7 +174,7 @@ class _Fit:
         scores = densification_scores(now, *views, _NOISE)
         num_static = len(problem.previous) - len(problem.active.indices)
         plan = plan_additions(now, scores, density, self._rng, num_static)
-        # A birth starts from its parent's past and shares its residual, so that its motion is the parent's.
+        # A birth has the motion of its parent: it starts from the parent's past and shares the residual.
         self._base, self.source = apply_plan(self._base, plan), plan.source
         self._neighbours = self._found_neighbours()
         resize_optimizer(self._optimizer, plan)

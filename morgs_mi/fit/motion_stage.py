@@ -29,13 +29,13 @@ def fit_motion(
     Args:
         problem: N Gaussians, the active views and their images.
         model: of their motion.
-        start: displacement from which it starts, and colour that the residual starts from; None: none.
+        start: displacement from which it starts, and colour from which the residual starts; None: none.
         steps: the steps, from the first one of the frame.
         dssim_weight: lambda of eq. 2.
 
     Returns:
-        The start of the residual, whose confidence is that of `start` or as before, and the losses by name, means over
-        the last round of views.
+        The start of the residual, with the confidence of `start` or of the previous frame, and the losses by name,
+        means over the last round of views.
     """
     gaussians, start = problem.gaussians, start or MotionStart.without_motion(problem.gaussians)
     begun = displaced(gaussians, start.displacement)

@@ -23,7 +23,7 @@ _OPACITY = 0.3
 
 @dataclass(frozen=True, eq=False)
 class FirstFrameProblem:
-    """What the first frame is fitted to.
+    """Data to which the first frame is fitted.
 
     Attributes:
         start: initial Gaussians.
@@ -48,7 +48,7 @@ class FirstFrameProblem:
         render: RenderConfig,
         rng: np.random.Generator,
     ) -> FirstFrameProblem:
-        """Return the problem whose Gaussians start from points, and from random ones where the views show none.
+        """Return the problem with Gaussians at the points, and at random points where the views show none.
 
         Args:
             views: V views, at least one.
