@@ -1,8 +1,8 @@
 """The causal loop from the frames of fixed cameras to a stream of residuals.
 
 The first frame is reconstructed and written as a keyframe; every later frame is a gated residual that is guided by the
-optical flow of a few key views. The mathematics is in `method`, the optimisation in `fit`. The next frame always starts
-from the decoded packet, so that encoder and decoder cannot drift apart.
+optical flow of a few key views. The mathematics is in `method`, the optimisation in `fit`. Encoder and decoder
+cannot drift apart, because the next frame always starts from the decoded packet.
 """
 
 from __future__ import annotations
@@ -58,13 +58,13 @@ class FrameReport:
         num_bytes: size of the packet in the stream.
         losses: means over the last steps, by the names of the terms.
         num_gaussians: number of Gaussians of the frame.
-        status: "ok", or a sentence about what was done instead.
+        status: "ok", or a sentence about a problem and how it was handled.
         missing_views: names of the views without an image.
-        active: what took part, as fractions of everything, by name: gaussians, views, pixels, epochs.
+        active: fractions that took part, by name: gaussians, views, pixels, epochs.
         validation: of the first frame, a `sentence` on views between the cameras and their `expected_psnr` in dB, with
             the result of cross-validation (see `fit.cross_validation`) or a forecast (see `fit.forecast`), for which
             that PSNR is None; empty with a single view.
-        steps: number of optimisation steps, without those of trials.
+        steps: number of optimisation steps, without the steps of trials.
         exposures: gain and bias of each view; empty if they are not estimated.
     """
 
@@ -85,7 +85,7 @@ class FrameReport:
 class StreamState:
     """State that one frame hands to the next.
 
-    It follows from the stream and the recording, so that an interrupted fit can be resumed exactly (see `recording`).
+    It follows from the stream and the recording. An interrupted fit can therefore be resumed exactly (see `recording`).
 
     Attributes:
         frame: index of the next frame.
@@ -111,13 +111,13 @@ def step(
     images: Sequence[np.ndarray | None] | FrameObservation,
     progress: Report | None = None,
 ) -> tuple[StreamState, Packet, FrameReport]:
-    """Fit one frame and return (state, packet, report). The function is pure: all state is in what it returns.
+    """Fit one frame and return (state, packet, report). The function is pure: all state is returned.
 
     Args:
-        setup: what all frames share, as from `prepare`.
+        setup: data that all frames share, as from `prepare`.
         state: as returned for the last frame; `StreamState()` before the first.
-        images: per training view uint8 [H, W, 3], RGB, or None where the view has no image. They are copied. Or what
-            `observe_frame` found in them.
+        images: per training view uint8 [H, W, 3], RGB, or None where the view has no image. They are copied.
+            Alternatively, the result of `observe_frame` for them.
         progress: called with (stage, done, total): the stages of the first frame, or the steps of a later one.
 
     Raises:
@@ -145,7 +145,7 @@ def step(
 def _fit_later_frame(
     setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress
 ) -> tuple[Packet, dict[str, Any]]:
-    """Return a later frame's packet and what its report says; the numbers are those of the paper's equations."""
+    """Return a later frame's packet and the entries of its report; numbers refer to the paper's equations."""
     assert state.coded is not None
     config, motion, images, flows = setup.config, setup.config.motion, observed.seen.images, observed.flows
     rng = rng_of(config.seed, Stream.LATER_FRAMES, state.frame)  # of its own for each frame: it is no state
@@ -169,7 +169,7 @@ def _fit_later_frame(
 def _fit_first_frame(
     setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress
 ) -> tuple[Packet, dict[str, Any]]:
-    """Return the first frame's packet and what its report says."""
+    """Return the first frame's packet and the entries of its report."""
     config, images = setup.config, observed.seen.images
     found = _balance(setup, images, progress)
     balance = _exposures_of(setup, images, found)
@@ -225,7 +225,7 @@ def _balanced(images: Images, balance: Sequence[Exposure]) -> dict[int, np.ndarr
 
 
 def _about_expected(expected: Expected | None, training_psnr: float) -> dict[str, Any]:
-    """Return what the first frame's report says about views between the cameras."""
+    """Return the entries of the first frame's report on views between the cameras."""
     if expected is None:
         return {}
     known = replace(expected, training_psnr=training_psnr)
@@ -233,7 +233,7 @@ def _about_expected(expected: Expected | None, training_psnr: float) -> dict[str
 
 
 def _about_balance(found: Balance | None) -> dict[str, Any]:
-    """Return what the first frame's report says about the balance of the cameras."""
+    """Return the entries of the first frame's report on the balance of the cameras."""
     if found is None:
         return {}
     scores = {"recorded_psnr": found.recorded_psnr, "balanced_psnr": found.balanced_psnr}
@@ -340,8 +340,8 @@ class StreamLoop:
             progress: as for `step`.
             upcoming: images of the frame after it, if they are there already: their optical flow is computed while
                 this frame is fitted. They change nothing else.
-            recorded: images that those of the next frame are compared with, if these are not `images`: of the first
-                frame, where those are interpolated because cameras have delays.
+            recorded: images with which the next frame's images are compared, if not with `images`: for the first
+                frame, where `images` are interpolated because cameras have delays.
         """
         start, frame, before = time.perf_counter(), self.state.frame, self.state.seen
         observed = self._observed_ahead(images) or observe_frame(self.setup, frame, before, images)
@@ -354,7 +354,7 @@ class StreamLoop:
         return packet, replace(report, seconds=time.perf_counter() - start)
 
     def _observed_ahead(self, images: Sequence[np.ndarray | None]) -> FrameObservation | None:
-        """Return what was observed ahead of time, if it was in the same images."""
+        """Return the observation made ahead of time, if its images are the same."""
         ahead, self._ahead = self._ahead, None
         if ahead is None or ahead[0] != self.state.frame:
             return None

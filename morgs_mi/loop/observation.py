@@ -1,6 +1,7 @@
-"""What the loop sees: the rig, and what the images of a frame say without the Gaussians.
+"""Input of the loop: the rig, and the observations of a frame that follow from its images alone.
 
-Changes and optical flow follow from the images alone, so those of the next frame may be found while this one is fitted.
+Changes and optical flow do not depend on the Gaussians. They can be computed for the next frame while this one is
+fitted.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class FrameObservation:
-    """What the images of a frame say without the Gaussians.
+    """Observations of a frame that follow from its images alone.
 
     Attributes:
         seen: the images.
@@ -94,7 +95,7 @@ class FrameObservation:
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """What all frames share; made by `prepare`.
+    """Data that all frames share; made by `prepare`.
 
     Attributes:
         cameras: the V training views.
@@ -127,7 +128,7 @@ def prepare(
     config: StreamConfig | None = None,
     masks: Sequence[np.ndarray | None] | None = None,
 ) -> Setup:
-    """Return what all frames share; arguments and errors are those of `StreamLoop`."""
+    """Return the data that all frames share; arguments and errors as for `StreamLoop`."""
     config = StreamConfig() if config is None else config
     check_type("StreamLoop()", "config", config, StreamConfig)
     if not isinstance(cameras, Sequence) or not cameras:
@@ -152,10 +153,10 @@ def prepare(
 
 
 def observe_frame(setup: Setup, frame: int, before: Seen, images: Sequence[np.ndarray | None]) -> FrameObservation:
-    """Return what the images of a frame say: changes, flow (eq. 4) and masks (eqs. 9, 10).
+    """Return the observations of a frame: changes, flow (eq. 4) and masks (eqs. 9, 10).
 
     Args:
-        setup: what all frames share.
+        setup: data that all frames share.
         frame: its index.
         before: images up to the frame before; `Seen()` for the first.
         images: per training view uint8 [H, W, 3], RGB, or None where the view has no image. They are copied.
@@ -226,7 +227,7 @@ def _flows(
 
 
 def _frame_key_views(setup: Setup, before: Images, images: Images) -> tuple[int, ...]:
-    """Return the key views of a frame: those of the setup, with others in place of those that lack an image."""
+    """Return the key views of a frame: the key views of the setup, or others if some of them lack an image."""
     both = sorted(before.keys() & images.keys())
     key_views = tuple(v for v in setup.key_views if v in both)
     if len(key_views) == len(setup.key_views) or not both:

@@ -160,7 +160,7 @@ def read_config(path: str | Path) -> dict[str, Any]:
 def config_toml(config: Any) -> str:
     """Return a config as TOML: every setting with its docstring as a comment.
 
-    `apply_values` on any config of the same type with what `read_config` returns for this text gives an equal config.
+    `apply_values`, given the values that `read_config` returns for this text, makes any config of the same type equal.
 
     Raises:
         TypeError: a value has no TOML form here, see `apply_values`.
