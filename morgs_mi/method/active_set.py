@@ -1,15 +1,14 @@
 """The active set of a frame: the Gaussians that may change, and the pixels of the views where they are visible.
 
 A Gaussian is active if its responsibility for the changes of all views exceeds a threshold (see `responsibility`), or
-if it moved in the previous frame, so that its confidence can fall. A view is rendered where an active Gaussian is
-visible and where the image changed, and skipped where neither is the case. Where active Gaussians hardly changed, some
-views that are spread over the rig show well enough that they stay as they are; the others are rendered where more
-changed. All other Gaussians are static splats.
+if it moved in the previous frame, because its confidence must be able to fall. A view is rendered where an active
+Gaussian is visible or the image changed. Active Gaussians that hardly changed are rendered only in some views, spread
+over the rig, which suffice to hold them in place. All other Gaussians are static splats.
 
-What appears in front of a static background changes another part of it in every view, so that no Gaussian is
-responsible. Where active Gaussians cover less than half of a connected change, all Gaussians on it are active that lie
-in it by more than half. Where more than half of all pixels changed, all Gaussians are active: leaving out the others
-would cost more than it saves.
+An object that appears in front of a static background hides a different part of it in each view, and no Gaussian is
+responsible. If active Gaussians cover less than half of a connected change, the Gaussians that lie in it by more than
+half are active. If more than half of all pixels changed, all Gaussians are active: leaving out the others would cost
+more than it saves.
 """
 
 from __future__ import annotations
@@ -38,8 +37,8 @@ _EXPLAINED = 0.5
 _CLUSTER = 5
 # Fraction of all pixels above which all Gaussians are active: leaving out the others would cost more than it saves.
 _MOST_CHANGED = 0.5
-# Half side of the box, as a fraction of the Gaussian's extent: two standard deviations of an opaque one, whose extent
-# reaches the alpha cut-off at three and a third.
+# Half side of the box, as a fraction of the Gaussian's extent: two standard deviations of an opaque one. Its
+# extent reaches the alpha cut-off at three and a third.
 _CORE = 0.6
 # Responsibility below which an active Gaussian is rendered in `quiet_views` only.
 _QUIET = 0.2
@@ -150,7 +149,7 @@ def with_zero_motion(gaussians: Gaussians) -> Gaussians:
 def _drawn(
     active: np.ndarray, changing: np.ndarray, views: Mapping[int, ChangedView], config: ActiveSetConfig
 ) -> dict[int, np.ndarray]:
-    """Return the masks [H, W] of what is rendered, by view index: changes, and boxes of active Gaussians [N]."""
+    """Return the masks [H, W] of rendered pixels, by view index: changes, and boxes of active Gaussians [N]."""
     indices = list(views)
     some = {indices[k] for k in choose_key_views([view.camera for view in views.values()], config.quiet_views)}
     chosen = {v: active if v in some else active & changing for v in views}

@@ -40,7 +40,7 @@ def densification_scores(
         gaussians: N Gaussians.
         views: V active views.
         targets: their images.
-        tolerance: in medians of an image's error; what does not exceed it does not count.
+        tolerance: in medians of an image's error; smaller errors do not count.
     """
     gaussians = gaussians.detached()
     attributed = [attribute_error(gaussians, *pair, tolerance) for pair in zip(views, targets, strict=True)]
@@ -55,7 +55,7 @@ def attribute_error(gaussians: Gaussians, view: ActiveView, target: Target, tole
         gaussians: N Gaussians, detached.
         view: the active view.
         target: its image.
-        tolerance: in medians of the image's error; what does not exceed it does not count.
+        tolerance: in medians of the image's error; smaller errors do not count.
     """
     error = np.abs(target.difference(view.render(gaussians).color, view.region)).mean(axis=-1)
     positive = error[error > 0]  # masked pixels are 0

@@ -1,4 +1,4 @@
-"""Boxes of pixels around projected Gaussians, and what masks cover of them."""
+"""Boxes of pixels around projected Gaussians, and the parts of them that masks cover."""
 
 from __future__ import annotations
 

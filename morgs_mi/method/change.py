@@ -1,11 +1,13 @@
 """Detection of the pixels of a fixed camera that changed by more than noise.
 
 Brightness and two differences of colours are compared, the latter at half the resolution, as video stores them. Each is
-averaged over a window, which averages out noise and keeps what is visible. A threshold follows from the noise: from
-that of the whole image, the median absolute deviation of the averaged change, which holds while most of the image is
-static and is bounded by a grey level; and from that of the surroundings, where it is larger, as in penumbrae of a path
-tracer. There, it is the median absolute deviation of mixed differences, (a - b) - (c - d) of 2 x 2 pixels, to which
-motion and shadows hardly contribute.
+averaged over a window, which removes noise and preserves visible changes. The threshold follows from the larger of two
+estimates of the noise:
+
+- of the whole image: the median absolute deviation of the averaged change, at most a grey level. It holds while most of
+  the image is static.
+- of the surroundings, e.g. in penumbrae of a path tracer: the median absolute deviation of mixed differences,
+  (a - b) - (c - d) of 2 x 2 pixels, to which motion and shadows hardly contribute.
 """
 
 from __future__ import annotations
@@ -99,7 +101,7 @@ def _noise_of_surroundings(change: np.ndarray, step: int) -> np.ndarray:
 
 
 def moving_region(change: np.ndarray) -> np.ndarray:
-    """Return the pixels [H, W] that may have moved: the changed ones and what they enclose.
+    """Return the pixels [H, W] that may have moved: the changed pixels and those that they enclose.
 
     The inside of a plain object does not change where it moves, but its outline does.
 

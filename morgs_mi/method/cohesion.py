@@ -1,9 +1,8 @@
 """Cohesion: neighbours of similar colour are parts of one object, and move or stand still together.
 
-Flow is evidence of motion in one place and none in the next: inside an object whose texture is weak it is zero, and
-beside the object it bleeds onto the background, where shadows have flow, too. But objects are mostly separate from
-their surroundings in space or in colour. So the logit u_i of the confidence of each active Gaussian is replaced by z_i,
-an approximate solution of
+Flow is unreliable evidence of motion. It is zero inside an object with weak texture, it bleeds onto the background
+beside the object, and shadows have flow, too. But objects are mostly separate from their surroundings in space or in
+colour. So the logit u_i of the confidence of each active Gaussian is replaced by z_i, an approximate solution of
 
     z_i = (u_i + lambda sum_j a_ij z_j) / (1 + lambda sum_j a_ij),    a_ij = o_j exp(-|c_i - c_j|^2 / (2 s^2)),
 
@@ -25,7 +24,7 @@ from morgs_mi.method.neighbours import NeighbourIndex
 
 __all__ = ["share_confidence"]
 
-# Of 1: chromaticity of what is darker is noise.
+# Of 1: the chromaticity of darker colours is noise.
 _LEAST_COLOR = 0.02
 # Number of nearest Gaussians: more of them would pull along thin objects of few Gaussians.
 _NEIGHBOURS = 12

@@ -2,10 +2,10 @@
 
 A camera shows the display-referred colours x of the scene as y = gain x + bias. As sRGB is 1.055 l^(1/2.4) - 0.055 of
 the light l, a factor on the light is such a map, except in the darkest tones. It is solved in closed form by least
-squares with a prior, weighted against outliers: what moved, highlights, and what a rendering lacks.
+squares with a prior, weighted against outliers: motion, highlights, and errors of a rendering.
 
-Between cameras, x is a rendering of Gaussians that all cameras share (see `fit.balance`). Over time, x is the image of
-the same camera that changes are detected against, so that static pixels do not change where the exposure does.
+Between cameras, x is a rendering of Gaussians that all cameras share (see `fit.balance`). Over time, x is the
+reference image of the same camera. Static pixels then do not change with the exposure.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ LEAST_CHANGE = 3e-3
 """Change of tones over time, of 1, below which an image is not corrected: it is an error of the measurement."""
 
 # Weights of the priors of gain and bias, relative to all pixels. The first acts where nearly all pixels are dark. The
-# second, for the bias beyond that of a factor on the light, acts where images have little contrast, so that a gain
-# explains a change there.
+# second, for the bias beyond the bias of a factor on the light, acts where images have little contrast: a gain explains
+# a change there.
 _WEIGHTS = (1e-4, 0.02)
 # Values, of 1, that are neither nearly black nor nearly white.
 _DARK, _BRIGHT = 0.03, 0.97
@@ -57,7 +57,7 @@ class Exposure:
         return colors * np.array(self.gain) + np.array(self.bias)
 
     def corrected(self, image: np.ndarray) -> np.ndarray:
-        """Return the image, uint8 [H, W, 3], in the colours of the scene; what was clipped stays lost."""
+        """Return the image, uint8 [H, W, 3], in the colours of the scene; clipped values stay lost."""
         if self == Exposure():
             return image
         table = 255 * self.inverse(np.arange(256)[:, None] / 255)
@@ -116,7 +116,7 @@ def fit_exposure(
 
 def _line(x: np.ndarray, y: np.ndarray, prior: Sequence[float], weights: tuple[float, float]) -> tuple[float, float]:
     """Return slope and intercept of y over x [P] by reweighted least squares (Geman and McClure 1987)."""
-    # The change of the gain, and of the bias beyond that of a factor on the light.
+    # The change of the gain, and of the bias beyond the bias of a factor on the light.
     rows, rest = np.stack([x + _TOE, np.ones_like(x)]), y - prior[0] * x - prior[1]
     regular, counts = len(x) * np.diag(weights), np.ones_like(x)
     for _ in range(_STEPS):
@@ -140,7 +140,7 @@ def centred(exposures: Mapping[int, Exposure]) -> dict[int, Exposure]:
 
 
 def common_change(exposures: Sequence[Exposure]) -> Exposure:
-    """Return the change that all cameras show, which is that of the scene's light, or none if they differ too much.
+    """Return the change that all cameras show, due to the scene's light, or no change if they differ too much.
 
     The cameras' common change is their median, if most are nearer to it than half of its size.
     """
@@ -164,7 +164,7 @@ def follow_exposure(
         reference: the earlier image, uint8 [H, W, 3].
         image: the later one, likewise.
         mask: pixels that count [H, W]; None: all.
-        last: exposure of the last frame, the prior; None: that of the reference.
+        last: exposure of the last frame, the prior; None: the reference's exposure.
     """
     height, width = image.shape[:2]
     size = (min(width, _WIDTH), max(1, round(height * min(1, _WIDTH / width))))

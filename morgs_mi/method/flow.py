@@ -95,7 +95,7 @@ def _checked_flow(
     backward, forward = source(pair)
     reliable, forward_reliable = _reliable(pair, backward, forward, config)
     if pair.region is not None:
-        # Flow bleeds over the edges of what moves; what has not changed has not moved.
+        # Flow bleeds over the edges of moving objects; unchanged pixels have not moved.
         backward, forward = (np.where(pair.region[..., None], f, 0) for f in (backward, forward))
         still = ~pair.region if pair.valid is None else ~pair.region & pair.valid
         reliable, forward_reliable = reliable | still, forward_reliable | still

@@ -32,7 +32,7 @@ def gradient_products(
     """Return the sums of w g g^T [N, 2, 2] and of w e g [N, 2] over the pixels and colours of a view, per Gaussian.
 
     Args:
-        gaussians: N Gaussians, whose blend weights weight the pixels.
+        gaussians: N Gaussians; their blend weights weight the pixels.
         view: the whole view.
         error: e [H, W, 3].
         gradient: g, the derivatives [H, W, 3] along x and y, per px.

@@ -115,7 +115,7 @@ def lift_flow(
         views: active views, by view index.
         observations: flow of the key views, by view index; those without an active view are not used.
         config: settings.
-        masks: settings of the motion masks, whose floor is the noise of the flow.
+        masks: settings of the motion masks; their floor is the noise of the flow.
     """
     config = config or LiftConfig()
     means = gaussians.numpy()["means"].astype(np.float64)

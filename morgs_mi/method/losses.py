@@ -2,7 +2,7 @@
 
 The depth term of the first frame, which is not in the paper, is here as well.
 
-Every loss is a mean, over pixels or Gaussians, so that its weight does not depend on the size of the image.
+Every loss is a mean over pixels or Gaussians. Its weight does not depend on the size of the image.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ __all__ = ["depth_loss", "flow_loss", "mask_loss", "offset_loss", "recon_loss"]
 def recon_loss(image: Tensor, target: Target, dssim_weight: float = 0.2, region: Region | None = None) -> Tensor:
     """Return (1 - lambda) mean |I - I*| + lambda (1 - SSIM) (eq. 2), differentiable in `image`.
 
-    Value and derivative are computed together, so that the backward pass costs one multiplication.
+    Value and derivative are computed together, and the backward pass costs one multiplication.
 
     Args:
         image: rendered image [H, W, 3], or an image on the region.
         target: image to match.
         dssim_weight: lambda.
         region: the only pixels that have changed since `Target.set_surroundings` was called; without that call, the
-            target itself surrounds the region. The derivative is that of the whole view; the value leaves out what
-            cannot have changed: pixels outside, and SSIM windows that contain none inside.
+            target itself surrounds the region. The derivative equals the whole view's. The value omits pixels outside
+            the region and SSIM windows without pixels inside, because they cannot have changed.
 
     Raises:
         ValueError: image and target differ in size.
@@ -55,7 +55,7 @@ def flow_loss(motion: Tensor, target: Tensor, reliable: Tensor, num_pixels: int 
     Args:
         motion: rendered motion map [H, W, 2], px, x_t - x_{t-1}; or on a region.
         target: motion by optical flow on the same grid, of the same shape and sign, px.
-        reliable: [H, W] of 0 and 1, or on the region. The mean is over all pixels, so that few reliable pixels weigh
+        reliable: [H, W] of 0 and 1, or on the region. The mean is over all pixels: few reliable pixels weigh
             little.
         num_pixels: of the whole view; None: those given.
     """
@@ -91,7 +91,7 @@ def depth_loss(depth: Tensor, target: Tensor, weights: Tensor, unit: float) -> T
         depth: rendered depth [H, W, 1], world units; pixels where it is 0 do not count.
         target: inverse depth [H, W], 1 / world units.
         weights: [H, W], e.g. the rendered alpha, or 0 where the target is unknown. The mean is over all pixels.
-        unit: inverse depth by which errors are divided, 1 / world units, so that the scene's scale does not matter.
+        unit: inverse depth by which errors are divided, 1 / world units. The scene's scale then does not matter.
     """
     pixels = _shape_of(depth)[:-1]
     _check_shape("depth_loss()", "depth", depth, (*pixels, 1))
@@ -117,12 +117,12 @@ def offset_loss(offset: Tensor, extent: float, num_gaussians: int | None = None)
 
 
 def _shape_of(tensor: Tensor) -> tuple[int, ...]:
-    """Return the shape of a tensor, and () for what is none, which `_check_shape` refuses."""
+    """Return the shape of a tensor, or () for any other value, which `_check_shape` refuses."""
     return tuple(getattr(tensor, "shape", ()))
 
 
 def _check_shape(place: str, name: str, tensor: Tensor, shape: Sequence[int]) -> None:
-    """Raise an error unless a tensor has a shape, none of whose sizes is 0."""
+    """Raise an error unless a tensor has a shape and no size is 0."""
     check_type(place, name, tensor, mi.TensorXf)
     if tuple(tensor.shape) != tuple(shape) or 0 in shape:
         raise ValueError(

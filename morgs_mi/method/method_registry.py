@@ -56,7 +56,7 @@ class Registry(Generic[Made, Config]):
 
     @property
     def usages(self) -> tuple[str, ...]:
-        """What the setting may hold: the names that take no argument, then NAME:ARGUMENT of the others."""
+        """Values of the setting: the names that take no argument, then NAME:ARGUMENT of the others."""
         return (*self.names, *(f"{name}:{argument}" for name, argument in self._arguments.items() if argument))
 
     def make(self, text: str, config: Config) -> Made:

@@ -106,7 +106,7 @@ def _constant_velocity(gaussians: Gaussians) -> MotionStart:
 
 
 def _carried_confidence(start: MotionStart, gaussians: Gaussians) -> np.ndarray:
-    """Return the logits [M] of the previous frame, a little lower, or those of the start where they are higher."""
+    """Return the logits [M] of the previous frame, slightly lowered, or the start's logits where these are higher."""
     if gaussians.logit_confidence is None:
         return start.logit_confidence
     before = np.asarray(gaussians.logit_confidence)

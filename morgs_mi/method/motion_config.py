@@ -33,11 +33,11 @@ class MotionConfig:
     learn_confidence: bool = True
     """MC: a learned confidence gates the residuals (eq. 12)."""
     two_gates: bool = True
-    """Gate means and rotations only, so that appearance changes freely; False: one gate for all, as in the paper."""
+    """Gate means and rotations only, and let appearance change freely; False: one gate for all, as in the paper."""
     lift_flow: bool = True
     """Start each Gaussian's motion from lifted flow; False: from zero, as in the paper."""
     constant_velocity: bool = False
-    """Without lifted flow: start each Gaussian's motion from that into the previous frame."""
+    """Without lifted flow: start each Gaussian's motion from its motion in the previous frame."""
     propagate_motion: bool = True
     """Also try the motion of the previous frame and of neighbours as starts; needs `lift_flow`."""
     search_motion: bool = True
@@ -45,7 +45,7 @@ class MotionConfig:
     refine_start: bool = True
     """Refine the start of motion and colour by the images of the key views; needs `lift_flow` and `two_gates`."""
     lift_confidence: bool = True
-    """Raise each Gaussian's confidence to that of lifted flow; False: carry it over, as in the paper."""
+    """Raise each Gaussian's confidence to the confidence of lifted flow; False: carry it over, as in the paper."""
     flow_method: str = "dis"
     """Source of optical flow: a method of OpenCV (see docs/flow.md), files:FOLDER, or onnx:FILE for a network
     (onnx-unit:FILE or onnx-signed:FILE if it takes values from 0 or -1 to 1 instead of bytes)."""

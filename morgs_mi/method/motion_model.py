@@ -1,14 +1,14 @@
 """Motion models: a few parameters that move all Gaussians, fitted before each Gaussian has a residual of its own.
 
-3DGStream, HiCoM and 4DGC fit a later frame in two stages: first a motion that Gaussians share, then what it leaves
-over. A model is the first stage. It maps its parameters to a displacement d of every Gaussian and to a rotation r, a
+3DGStream, HiCoM and 4DGC fit a later frame in two stages: first a motion that Gaussians share, then the remaining
+change. A model is the first stage. It maps its parameters to a displacement d of every Gaussian and to a rotation r, a
 quaternion,
 
     mu' = mu + d,    q' = r q    (Hamilton product),
 
 and the residual (eq. 12) starts from there. `fit.motion_stage` fits it. The spherical harmonics are not rotated.
 
-The setting `motion.model` selects a model of `MOTION_MODELS`. The package has none; those of other publications are in
+The setting `motion.model` selects a model of `MOTION_MODELS`. The package has none; models of other publications are in
 benchmarks/field, and docs/extending.md describes how to register one.
 """
 
@@ -47,7 +47,7 @@ class MotionModel:
         parameters: tensors at their start, by name, for which nothing moves.
         rates: Adam's learning rate of each, by name.
         motion: parameters -> (displacements [N, 3] in world units, rotations [N, 4] minus the identity, wxyz).
-        losses: parameters -> weighted losses besides L_recon, by name.
+        losses: parameters -> weighted losses in addition to L_recon, by name.
     """
 
     parameters: Mapping[str, Tensor]

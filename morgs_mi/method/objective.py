@@ -4,8 +4,8 @@ A `Term` declares its weight, the channels that must be rendered for it, and the
 with. Which channels a view renders, which static splats it needs and which losses a report lists follow from `TERMS`.
 
 An observation is an array of one view at one frame, by name. `target` exists in all views, and so do `neighbours`, the
-Gaussians of the previous frame, where a term compares them; those of `OBSERVERS` exist in key views, where an observer
-returns them. A term acts in the views that have all its observations.
+Gaussians of the previous frame, where a term compares them. The observations of `OBSERVERS` exist in key views, where
+an observer returns them. A term acts in the views that have all its observations.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class ObjectiveConfig:
 
 @dataclass(frozen=True, eq=False)
 class KeyView:
-    """What observers read: one key view at one frame.
+    """Input of the observers: one key view at one frame.
 
     Attributes:
         pair: its images at frames t and t - 1.
@@ -86,7 +86,7 @@ class KeyView:
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What terms compare with the observations: one view at one step.
+    """Rendering of one view at one step, which terms compare with the observations.
 
     Attributes:
         image: the rendered channels.
@@ -207,7 +207,7 @@ def active_terms(observations: Observations, parameters: Mapping[str, Tensor], c
 
 
 def channels_of(observations: Observations, config: ObjectiveConfig) -> tuple[str, ...]:
-    """Return the channels to render in a view with these observations, besides its `target`."""
+    """Return the channels to render in a view with these observations in addition to its `target`."""
     terms = active_terms({"target": None, **observations}, {}, config)
     return tuple(dict.fromkeys(channel for term in terms for channel in term.channels))
 

@@ -7,7 +7,7 @@ component,
 
     e + g . J delta = 0 .
 
-The least squares over the pixels of all key views v, and over those of its nearest moving neighbours j, are
+The least squares over the pixels of the Gaussian and of its nearest moving neighbours j in all key views v are
 
     (sum_jv J_jv' G_jv J_jv + lambda I) delta = - sum_jv J_jv' b_jv,    G = sum_x w g g',    b = sum_x w e g .
 
@@ -34,15 +34,15 @@ __all__ = ["mean_color_error", "refine_displacement", "refine_start"]
 
 # Steps of the displacement; more gain nothing before the fit.
 _ROUNDS = 1
-# Nearest Gaussians whose pixels count, too, if they move: a small one alone may see one straight edge.
+# Nearest Gaussians. Their pixels count, too, if they move: a small Gaussian alone may cover one straight edge.
 _NEIGHBOURS = 8
 # Weight of the prior that a step is 0, in pixels on which the contrast is 1 per px.
 _PRIOR_PIXELS = 1e-3
 # Longest step, in px of the view where it is longest: farther away, the image is not linear.
 _LONGEST_PX = 2.0
-# Error, in pixels of full contrast, that is added to that of every Gaussian, see `propagation`.
+# Error, in pixels of full contrast, that is added to every Gaussian's error, see `propagation`.
 _FLOOR_PX = 0.01
-# Covered pixels at which the colour changes by half of the mean error: that of few pixels is noise.
+# Covered pixels at which the colour changes by half of the mean error: the mean of few pixels is noise.
 _HALF_COLOR_PIXELS = 10.0
 
 
@@ -59,7 +59,7 @@ def refine_start(problem: MotionProblem, start: MotionStart) -> MotionStart:
 
 
 def refine_displacement(problem: MotionProblem, start: MotionStart) -> MotionStart:
-    """Return a start whose moving Gaussians explain the images better; see `refine_start`."""
+    """Return a start with displacements that explain the images better; see `refine_start`."""
     previous, targets, d = problem.gaussians, problem.targets, start.displacement
     moves = np.any(d, axis=1)
     views = problem.views_around(moves, [d]) if moves.any() else {}

@@ -1,14 +1,15 @@
 """Motion proposals from the previous frame and from neighbours, where lifted flow fails.
 
-Flow fails where parts are thin and fast, or look alike; but motion mostly continues, and is shared with the
-surroundings. So each Gaussian gets further proposals, as PatchMatch gives them to pixels (Barnes et al. 2009): first
-its own motion of the previous frame, then, in each of some rounds, that of a random one of its nearest moving
-neighbours. All Gaussians try their proposals at once and are rendered in the key views. With the attributed error E_iv
-and the coverage W_iv there (see `method.attribution`), the error of a Gaussian is
+Flow fails where parts are thin and fast, or look alike. But motion mostly continues, and neighbours share it. So each
+Gaussian gets further proposals, as pixels do in PatchMatch (Barnes et al. 2009): first its own motion of the previous
+frame, then, in each round, the motion of a random one of its nearest moving neighbours. All Gaussians try their
+proposals at once and are rendered in the key views. With the attributed error E_iv and the coverage W_iv there (see
+`method.attribution`), the error of a Gaussian is
 
     (0.01 px + sum_v E_iv) / (1 px + sum_v W_iv) .
 
-A Gaussian whose error falls clearly accepts its proposal. Only the surroundings of what may move are rendered.
+A Gaussian accepts a proposal that clearly lowers its error. Only the surroundings of Gaussians that may move are
+rendered.
 """
 
 from __future__ import annotations
@@ -25,10 +26,10 @@ __all__ = ["propagate_motion"]
 _ROUNDS = 2
 # Nearest Gaussians that a proposal is drawn from.
 _NEIGHBOURS = 8
-# Ratio of the new error to the old one up to which a moving Gaussian accepts a proposal, and one that does not move
-# without it. Others move at the same time: a smaller gain is chance.
+# Ratio of the new error to the old one up to which a Gaussian accepts a proposal, if it moves otherwise and if not.
+# Others move at the same time: a smaller gain is chance.
 _ERROR_RATIO, _ERROR_RATIO_STATIC = 0.9, 0.8
-# Error, in pixels of full contrast, that is added to that of every Gaussian: one that is hardly visible does not change
+# Error, in pixels of full contrast, that is added to every Gaussian's error: a hardly visible Gaussian does not change
 # its motion.
 _FLOOR_PX = 0.01
 # Logit of the confidence of a Gaussian that accepted a motion: 0.57, as some accept a wrong one by chance.

@@ -41,7 +41,7 @@ class Neighbours:
 
     Attributes:
         first: matrix [E, N] that selects i.
-        difference: matrix [E, N] that subtracts the value of i from that of j.
+        difference: matrix [E, N] that subtracts the value of i from the value of j.
         weights: w [E], divided by E.
         edges: e [3, E], scene extents.
         inverse: inverse rotations, unit quaternions wxyz [4, N].

@@ -1,9 +1,9 @@
 """Coarse search: the motion of parts that neither flow nor motion proposals explain.
 
-Beyond the paper. A part that is thin and moves farther than it is wide leaves flow nothing to follow, and no neighbour
-knows its motion. It shows as connected Gaussians whose pixels no longer have their colours. Such a part is searched for
-as a whole: with the image I_{t-1} that the previous Gaussians have in a key view v, and with the blend weight m_v of
-the part there, a displacement d of the part costs
+Beyond the paper. Flow cannot follow a thin part that moves farther than it is wide, and no neighbour has its motion.
+It appears as connected Gaussians with colours that their pixels no longer have. Such a part is searched for as a whole.
+With the rendering I_{t-1} of the previous Gaussians in a key view v, and the blend weight m_v of the part there, a
+displacement d of the part costs
 
     C(d) = sum_v sum_x m_v(x) |I_t(x + s_v(d)) - I_{t-1}(x)|^2,    s_v(d) its projected shift in px.
 
@@ -40,9 +40,9 @@ _GRID = 16  # steps of the grid from 0 to its end, in each direction of each axi
 _UNEXPLAINED = 3.0
 # Nearest Gaussians that it forms a part with if they are not explained either, and the fewest Gaussians of a part.
 _NEIGHBOURS, _MIN_SIZE = 8, 4
-# Cost of a displacement, as a fraction of that of no displacement, up to which it is tested.
+# Cost of a displacement, relative to no displacement, up to which it is tested.
 _COST_RATIO = 0.3
-# Error of the images around a part, as a fraction of that without the displacement, up to which it is accepted.
+# Error of the images around a part, relative to the error without the displacement, up to which it is accepted.
 _ERROR_RATIO = 0.8
 # Logit of the confidence of a Gaussian that was found, see `propagation`.
 _LOGIT = 0.3
@@ -192,8 +192,8 @@ class _MatchedView:
 
     Attributes:
         view: the view.
-        color: what the previous Gaussians look like where it is drawn, laid out as by `ActiveView.crop`.
-        before: the same, reduced [h, w, 3].
+        color: rendering of the previous Gaussians where the view is drawn, laid out as by `ActiveView.crop`.
+        before: the same rendering, reduced [h, w, 3].
         after: the target, reduced [h, w, 3].
         scale: reduced pixels per pixel.
     """
@@ -212,7 +212,7 @@ class _MatchedView:
         return cls(view, color, _reduced(_uncropped(color, view), scale), _reduced(target.image(), scale), scale)
 
     def blend_weights(self, previous: Gaussians, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Return m [h, w, 3] of up to three parts: what a colour gains if that of a part grows by 1."""
+        """Return m [h, w, 3] of up to three parts: the increase of a pixel if the colour of a part increases by 1."""
         sh_coeffs = np.array(previous.sh_coeffs)
         for k, part in enumerate(parts):
             sh_coeffs[part, 0, k] += 1 / np.float32(SH_C0)

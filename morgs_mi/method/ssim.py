@@ -124,7 +124,7 @@ class Target:
         return self._places[region]
 
     def windows_on(self, region: Region | None) -> _Windows:
-        """Return the windows that the pixels of a region lie in, those of the whole view for None."""
+        """Return the windows that contain the pixels of a region, or all windows of the view for None."""
         if region not in self._windows:
             windows, pixels = (self.planes.runs(region, reach) for reach in (RADIUS, 0))
             height = dr.opaque(mi.Int32, self.planes.height)
@@ -320,7 +320,7 @@ def _walk(
         return packet(sums)
 
     def body(row, end, first, places, columns, height, windows, total, targets):
-        # Two rows per turn, so that the windows are read and written half as often. Window k ends k rows further down.
+        # Two rows per turn: the windows are read and written half as often. Window k ends k rows further down.
         a, b, w = blurred(row, height, places), blurred(row + 1, height, places), _TAPS
         done = dr.fma(a, w[0], windows[0]), dr.fma(b, w[0], dr.fma(a, w[1], windows[1]))
         windows = [dr.fma(a, w[k], dr.fma(b, w[k - 1], windows[k])) for k in range(2, 2 * RADIUS)]

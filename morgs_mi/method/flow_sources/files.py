@@ -5,7 +5,7 @@ Layout of a folder of flow, one folder per camera of the capture and direction:
     FLOW/cam00/forward/0000.flo     from frame 0 to frame 1, on frame 0's grid
     FLOW/cam00/backward/0001.flo    from frame 1 to frame 0, on frame 1's grid
 
-A file has the number of the frame on whose grid its flow lives. Flow tools name their output after the first image of
+A file has the number of the frame that its pixel grid belongs to. Flow tools name their output after the first image of
 a pair, so run the tool over the frames in order, then again in reverse order. The number is the last one in the file's
 name, with any prefix and any number of zeros (`frame_0001.flo`); frames count from 0.
 

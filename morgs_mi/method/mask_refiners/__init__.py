@@ -1,6 +1,6 @@
 """Refiners of motion masks.
 
-Every module of this package is imported here, so that a new one only has to register itself (see `mask_registry`).
+Every module of this package is imported here. A new one only has to register itself (see `mask_registry`).
 """
 
 from importlib import import_module

@@ -18,7 +18,7 @@ _CLOSING = 0.005
 _ITERATIONS = 2
 # Distance from the flow mask within which GrabCut may add pixels, in longer sides of the image.
 _REACH = 0.05
-# Share of the image above which GrabCut is skipped: what is left has too few colours to learn from.
+# Share of the image above which GrabCut is skipped: the rest has too few colours to learn from.
 _COVERAGE = 0.9
 # Side of a superpixel in pixels of the reduced image, iterations of SLIC, and its weight of distance against colour.
 _SIDE, _SLIC_ITERATIONS, _COMPACTNESS = 8, 5, 10.0

@@ -48,7 +48,7 @@ class SegmentNetwork:
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: `onnxruntime` is not installed, cannot load a file, or the networks' inputs and outputs are not
-            those of the module's docstring.
+            as in the module's docstring.
     """
 
     def __init__(self, encoder: str | Path, decoder: str | Path, count: int = MaskConfig.prompts) -> None:
@@ -79,7 +79,7 @@ class SegmentNetwork:
             mask: [H, W] bool.
 
         Raises:
-            ValueError: the decoder cannot run on the encoder's outputs, or its results are not those of SAM2.
+            ValueError: the decoder cannot run on the encoder's outputs, or its results differ from SAM2's.
         """
         objects = np.zeros(mask.shape, bool)
         components = _components(mask, self._count)
