@@ -22,7 +22,7 @@ from benchmarks.reports.study import Row, Scene, Study, Variant
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.cluster.executor import open_workers
-from morgs_mi.runs.cluster.seams import score_seam
+from morgs_mi.runs.cluster.seams import SegmentConfig, score_seam
 from morgs_mi.runs.cluster.segments import stream_segments
 from morgs_mi.runs.cluster.tasks import Source
 
@@ -80,7 +80,7 @@ def measure(source: Source, num_segments: int, config: StreamConfig) -> list[dic
     capture = source.open()
     with TemporaryDirectory() as name, open_workers(count=1) as workers:
         segments, whole = (Path(name) / part for part in ("segments", "whole"))
-        fit = stream_segments(capture, segments, workers, config, num_segments)
+        fit = stream_segments(capture, segments, workers, config, SegmentConfig(num_segments))
         stream_segments(capture, whole, workers, config)
         streams = [folder / "stream.morgs" for folder in (segments, whole)]
         same = [score_seam(StreamReader(streams[1]), capture, seam.frame) for seam in fit.seams]

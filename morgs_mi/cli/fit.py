@@ -85,13 +85,14 @@ class Fit:
     def _fit_in_segments(self, capture: Capture, config: StreamConfig) -> None:
         """Fit a capture in segments, and print the scores of the seams."""
         from morgs_mi.runs.cluster.executor import cores, open_workers
+        from morgs_mi.runs.cluster.seams import SegmentConfig
         from morgs_mi.runs.cluster.segments import noting_segments, stream_segments
 
         assert self.out is not None
-        count = self.segments or 1
-        workers = min(count, cores())
+        segments = SegmentConfig(self.segments or 1)
+        workers = min(segments.count, cores())
         with noting_segments(self.out), progress() as report, open_workers(self.scheduler, workers) as opened:
-            fit = stream_segments(capture, self.out, opened, config, count, resume=self.resume, on_stage=report)
+            fit = stream_segments(capture, self.out, opened, config, segments, resume=self.resume, on_stage=report)
         _print_summary(self.out / "stream.morgs", fit.reports)
         for seam in fit.seams:
             print_result(f"Seam before {seam}.")

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import astuple
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.io.video_writer import write_video
-from morgs_mi.runs.cluster.seams import SeamConfig
+from morgs_mi.runs.cluster.seams import SegmentConfig
 from morgs_mi.runs.cluster.segments import _Segment
 from morgs_mi.runs.cluster.tasks import Part
 from morgs_mi.stream_loop import StreamLoop
@@ -293,7 +294,8 @@ def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, 
 
 
 def test_fit__fits_segments_side_by_side(tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("morgs_mi.runs.cluster.segments.SeamConfig", lambda: SeamConfig(passes=1, epochs=1))
+    short = SegmentConfig(passes=1, epochs=1)
+    monkeypatch.setattr(SegmentConfig.__init__, "__defaults__", astuple(short))
     clip, out = write_recording(tmp_path / "clip", 4), tmp_path / "out"
     status, output, _ = run("fit", clip, out, *QUICK, "--segments", 2)
     assert status == 0

@@ -32,6 +32,7 @@ from morgs_mi.core.documentation import page
 from morgs_mi.io.remote import is_url
 from morgs_mi.loop.stream_config import StreamConfig, apply_preset, apply_values, read_config
 from morgs_mi.runs.cluster.executor import Workers, wait_for
+from morgs_mi.runs.cluster.seams import SegmentConfig
 from morgs_mi.runs.cluster.segments import fit_in_segments
 from morgs_mi.runs.cluster.tasks import Part
 
@@ -212,6 +213,22 @@ def run_batch(
     return states
 
 
+class _Noted(Workers):
+    """Workers that pass the result of every task to a function too."""
+
+    def __init__(self, workers: Workers, note: Callable[[Part], None]) -> None:
+        self.place, self._workers, self._note = workers.place, workers, note
+
+    @property
+    def count(self) -> int:
+        return self._workers.count
+
+    async def run(self, function: Callable[..., Part], *args: Any) -> Part:
+        part = await self._workers.run(function, *args)
+        self._note(part)
+        return part
+
+
 async def _fit(state: JobState, workers: Workers, changed: Callable[[], None]) -> None:
     """Fit a job, and note its progress and the size of its stream."""
     job, batch = state.job, state.job.batch
@@ -223,8 +240,7 @@ async def _fit(state: JobState, workers: Workers, changed: Callable[[], None]) -
             state.progress(int(done), int(total))
             changed()
 
-    fit = await fit_in_segments(
-        capture, job.out, workers, job.config, batch.segments, resume=True, on_stage=on_stage, on_part=state.note
-    )
+    noted, segments = _Noted(workers, state.note), SegmentConfig(batch.segments)
+    fit = await fit_in_segments(capture, job.out, noted, job.config, segments, resume=True, on_stage=on_stage)
     state.frames = state.num_frames = len(fit.reports)
     state.num_bytes = (job.out / "stream.morgs").stat().st_size

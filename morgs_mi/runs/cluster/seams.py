@@ -47,8 +47,8 @@ __all__ = [
     "COMMON_FRAMES",
     "Moment",
     "Overlap",
-    "SeamConfig",
     "SeamScores",
+    "SegmentConfig",
     "cross_fade",
     "fit_seam_frame",
     "score_seam",
@@ -71,9 +71,12 @@ _ATTRIBUTES = ("means", "quats", "log_scales", "logit_opacities", "sh_coeffs")
 
 
 @dataclass(frozen=True)
-class SeamConfig:
-    """Settings of the seams between segments."""
+class SegmentConfig:
+    """Segments of a fit, and the seams between them."""
 
+    count: int = 1
+    """Number of segments of about the same length, of two frames at least; with one, the stream equals
+    `stream_capture`'s."""
     passes: Annotated[int, AtLeast(1)] = 24
     """Fits of the first frame of the overlap, one after the other, each with a round of density control."""
     epochs: Annotated[int, AtLeast(1)] = 4
@@ -137,7 +140,7 @@ def fit_seam_frame(
     base: CodedFrame,
     earlier: Images,
     now: Moment,
-    config: SeamConfig,
+    config: SegmentConfig,
     progress: Report | None = None,
 ) -> tuple[CodedFrame, FrameReport]:
     """Fit a frame far from the common model, and return its state and its report.

@@ -27,7 +27,7 @@ from morgs_mi.core.progress import Progress, Report
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.source import about_lenses, as_fitted
 from morgs_mi.runs.cluster.executor import Workers, wait_for
-from morgs_mi.runs.cluster.seams import COMMON_FRAMES, SeamConfig, SeamScores, score_seam
+from morgs_mi.runs.cluster.seams import COMMON_FRAMES, SeamScores, SegmentConfig, score_seam
 from morgs_mi.runs.cluster.tasks import (
     Fit,
     Following,
@@ -79,16 +79,12 @@ class SegmentedFit:
     workers: Mapping[str, int] = field(default_factory=dict)
 
 
-OnPart = Callable[[Part], None]
-
-
 def stream_segments(
     capture: Capture,
     out: str | Path,
     workers: Workers,
     config: StreamConfig | None = None,
-    segments: int = 1,
-    seams: SeamConfig | None = None,
+    segments: SegmentConfig | None = None,
     resume: bool = False,
     on_stage: Report | None = None,
 ) -> SegmentedFit:
@@ -99,8 +95,7 @@ def stream_segments(
         out: folder, made if missing.
         workers: from `open_workers`.
         config: settings.
-        segments: number of segments of about the same length; with one, the stream equals `stream_capture`'s.
-        seams: settings of the seams.
+        segments: their number and the settings of the seams; None: one segment.
         resume: continue the segments in `out`. With `RenderConfig(reproducible=True)` the stream has the same bytes as
             without an interruption.
         on_stage: called with (name of the stage, done, total).
@@ -109,7 +104,7 @@ def stream_segments(
         OSError: as `stream_capture`, a worker died several times, or the scheduler was lost. The finished frames stay.
         ValueError: as `stream_capture`, or there are more segments than pairs of frames.
     """
-    return wait_for(fit_in_segments(capture, out, workers, config or StreamConfig(), segments, seams, resume, on_stage))
+    return wait_for(fit_in_segments(capture, out, workers, config or StreamConfig(), segments, resume, on_stage))
 
 
 @contextmanager
@@ -138,23 +133,19 @@ async def fit_in_segments(
     out: str | Path,
     workers: Workers,
     config: StreamConfig,
-    segments: int = 1,
-    seams: SeamConfig | None = None,
+    segments: SegmentConfig | None = None,
     resume: bool = False,
     on_stage: Report | None = None,
-    on_part: OnPart | None = None,
 ) -> SegmentedFit:
-    """Fit a capture in segments as `stream_segments`; `on_part` is called with the result of every task."""
+    """Fit a capture in segments as `stream_segments`, beside other fits on the same workers."""
     if config.fit.exposure != "off":
         raise ValueError(
             f"stream_segments(): `fit.exposure` must be off, got {config.fit.exposure!r}: exposures follow from all "
             "frames before; fit without segments, or match the colours of the cameras as the capture is read (--color)."
         )
-    out, seams = Path(out), seams or SeamConfig()
-    starts = _starts(capture.num_frames, segments)
-    check_outputs(out)
-    with locked_folder(out, "stream_segments()"):
-        run = _Run(capture, out, workers, config, seams, starts, on_stage or (lambda *_: None), on_part)
+    run = _Run(capture, Path(out), workers, config, segments or SegmentConfig(), on_stage or (lambda *_: None))
+    check_outputs(run.out)
+    with locked_folder(run.out, "stream_segments()"):
         return await run.fit(resume)
 
 
@@ -178,17 +169,15 @@ class _Run:
         out: Path,
         workers: Workers,
         config: StreamConfig,
-        seams: SeamConfig,
-        starts: Sequence[int],
+        segments: SegmentConfig,
         on_stage: Report,
-        on_part: OnPart | None,
     ) -> None:
-        self.capture, self.out, self.workers, self.seams = capture, out, workers, seams
-        self.starts, self.on_stage, self.on_part = starts, on_stage, on_part
-        self.task = Fit(Source.of(capture), config, seams, str(mi.variant()), installed())
+        self.capture, self.out, self.workers, self.on_stage = capture, out, workers, on_stage
+        self.starts = _starts(capture.num_frames, segments.count)
+        self.task = Fit(Source.of(capture), config, segments, str(mi.variant()), installed())
         self.metadata = stream_metadata(capture, next(capture.partial_frames(0, 1)), config)
-        if len(starts) > 2:
-            self.metadata["segments"] = {"starts": list(starts[:-1]), **asdict(seams)}
+        if segments.count > 1:
+            self.metadata["segments"] = {"starts": self.starts[:-1], **asdict(segments)}
         self.prepared: Prepared | None = None  # where this run begins the recording
         self.peaks: dict[str, int] = {}
         self.active = 0  # segments with later frames being fitted
@@ -242,8 +231,6 @@ class _Run:
         """Return the result of a task on a worker."""
         part = await self.workers.run(function, self.task, *args)
         self.peaks[part.worker] = max(part.peak_bytes, self.peaks.get(part.worker, 0))
-        if self.on_part is not None:
-            self.on_part(part)
         return part
 
     def show_progress(self) -> None:
@@ -311,7 +298,7 @@ class _Segment:
         if self.stop == self.run.starts[-1]:
             return self.stop
         first = self.start + 1 if self.number else COMMON_FRAMES
-        return min(max(self.stop - self.run.seams.overlap, first), self.stop)
+        return min(max(self.stop - self.run.task.segments.overlap, first), self.stop)
 
     async def fit(self, points: Points | None) -> None:
         """Fit what is missing of the segment, task after task."""

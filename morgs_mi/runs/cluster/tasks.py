@@ -33,7 +33,7 @@ from morgs_mi.core.environment import versions
 from morgs_mi.io.remote import url_of
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.cluster.executor import share_of_machine
-from morgs_mi.runs.cluster.seams import Moment, Overlap, SeamConfig, cross_fade, fit_seam_frame
+from morgs_mi.runs.cluster.seams import Moment, Overlap, SegmentConfig, cross_fade, fit_seam_frame
 from morgs_mi.runs.recorder import push_frame, with_next
 from morgs_mi.runs.recording import due_keyframe, restart_of
 from morgs_mi.stream_loop import FrameReport, StreamLoop
@@ -88,7 +88,7 @@ class Fit:
     Attributes:
         source: the recording.
         config: settings.
-        seams: settings of the seams.
+        segments: the segments, and the settings of their seams.
         variant: Mitsuba variant.
         versions: as `installed` returns them to the client.
         rig: refined cameras and distortions, as `Capture.with_cameras` takes them; None: the recording's.
@@ -96,7 +96,7 @@ class Fit:
 
     source: Source
     config: StreamConfig
-    seams: SeamConfig
+    segments: SegmentConfig
     variant: str
     versions: tuple[tuple[str, str], ...]
     rig: Rig | None = None
@@ -213,10 +213,10 @@ def fit_segment_start(fit: Fit, base: bytes, frame: int) -> Part:
     """
     with prepared(fit.variant, fit.versions) as messages:
         capture, coded = fit.open(), decode(None, decode_packet(base))
-        loop = StreamLoop.of(capture, fit.seams.overlap_config(fit.config))
-        first = max(frame - fit.seams.overlap, coded.frame + 1)
+        loop = StreamLoop.of(capture, fit.segments.overlap_config(fit.config))
+        first = max(frame - fit.segments.overlap, coded.frame + 1)
         earlier, now = _images(capture, coded.frame), Moment(first, _images(capture, first))
-        coded, report = fit_seam_frame(loop.setup, coded, earlier, now, fit.seams, _check_memory)
+        coded, report = fit_seam_frame(loop.setup, coded, earlier, now, fit.segments, _check_memory)
         loop.resume(coded, [[now.images.get(view) for view in range(len(loop.setup.cameras))]])
         before, packets, seconds = None, [reemitted_keyframe(coded)], report.seconds
         for recorded, upcoming in with_next(capture.partial_frames(first + 1, frame + 1)):

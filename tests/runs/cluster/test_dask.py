@@ -15,7 +15,7 @@ import pytest
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.runs.cluster.executor import open_workers
 from morgs_mi.runs.cluster.segments import stream_segments
-from tests.runs.cluster.test_segments import FRAMES, SEAMS, SETTINGS, stream_of, when_fitted
+from tests.runs.cluster.test_segments import FRAMES, SEGMENTS, SETTINGS, stream_of, when_fitted
 from tests.scenes.recording import write_recording
 
 distributed = pytest.importorskip("distributed", reason="comes with the extra `cluster`")
@@ -36,7 +36,7 @@ def whole(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The stream of processes without Dask."""
     out = tmp_path_factory.mktemp("whole")
     with open_workers(count=2) as workers:
-        stream_segments(capture, out, workers, SETTINGS, 3, SEAMS)
+        stream_segments(capture, out, workers, SETTINGS, SEGMENTS)
     return stream_of(out)
 
 
@@ -80,7 +80,7 @@ def test_stream_segments__with_a_killed_dask_worker_is_the_same(
             os.kill(killed[-1], signal.SIGKILL)
 
         with open_workers(scheduler) as workers:
-            stream_segments(capture, tmp_path, workers, SETTINGS, 3, SEAMS, on_stage=when_fitted(count, kill))
+            stream_segments(capture, tmp_path, workers, SETTINGS, SEGMENTS, on_stage=when_fitted(count, kill))
     assert len(killed) == 1
     assert stream_of(tmp_path) == whole
 
@@ -97,7 +97,7 @@ def test_stream_segments__names_a_lost_scheduler_and_is_resumed(
         ),
         open_workers(address(cluster)) as workers,
     ):
-        stream_segments(capture, tmp_path, workers, SETTINGS, 3, SEAMS, on_stage=lost)
+        stream_segments(capture, tmp_path, workers, SETTINGS, SEGMENTS, on_stage=lost)
     with open_workers(count=2) as workers:
-        stream_segments(capture, tmp_path, workers, SETTINGS, 3, SEAMS, resume=True)
+        stream_segments(capture, tmp_path, workers, SETTINGS, SEGMENTS, resume=True)
     assert stream_of(tmp_path) == whole

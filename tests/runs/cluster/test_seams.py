@@ -11,7 +11,7 @@ from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, reemitted_keyframe
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.cluster.seams import Moment, Overlap, SeamConfig, cross_fade, fit_seam_frame
+from morgs_mi.runs.cluster.seams import Moment, Overlap, SegmentConfig, cross_fade, fit_seam_frame
 from morgs_mi.stream_loop import StreamLoop
 from tests.assertions import assert_close
 from tests.scenes.coded_clip import CAMERAS, cloud
@@ -98,7 +98,7 @@ def test_fit_seam_frame__leaves_what_is_static_as_it_is() -> None:
         loop.push(list(frame.values()))
     base = loop.state.coded
     assert base is not None
-    config = SeamConfig(passes=2, epochs=1)
+    config = SegmentConfig(passes=2, epochs=1)
     coded, report = fit_seam_frame(loop.setup, base, images[1], Moment(4, images[4]), config)
     assert (coded.frame, report.frame) == (4, 4)
     _, then, now = np.intersect1d(base.ids, coded.ids, return_indices=True)
@@ -108,13 +108,13 @@ def test_fit_seam_frame__leaves_what_is_static_as_it_is() -> None:
 
 
 def test_fit_config__has_other_seeds_and_rates_for_each_pass() -> None:
-    first, second = (SeamConfig().fit_config(CONFIG, number) for number in (0, 1))
+    first, second = (SegmentConfig().fit_config(CONFIG, number) for number in (0, 1))
     assert first.seed != second.seed
     assert first.fit.rates.scales == pytest.approx(2 * CONFIG.fit.rates.scales)
 
 
 def test_overlap_config__has_more_epochs_and_the_same_other_settings() -> None:
     given = StreamConfig(fit=FitConfig(epochs=3))
-    found = SeamConfig().overlap_config(given)
+    found = SegmentConfig().overlap_config(given)
     assert found.fit.epochs == 6
     assert replace(found, fit=given.fit) == given

@@ -23,7 +23,7 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.fit.fit_config import ShortFitConfig
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.cluster.executor import Workers, open_workers
-from morgs_mi.runs.cluster.seams import SeamConfig
+from morgs_mi.runs.cluster.seams import SegmentConfig
 from morgs_mi.runs.cluster.segments import SegmentedFit, stream_segments
 from morgs_mi.runs.cluster.tasks import fit_segment_start
 from morgs_mi.runs.recorder import stream_capture
@@ -34,7 +34,7 @@ from tests.scenes.recording import CONFIG, write_recording
 FRAMES, STARTS = 10, (0, 3, 7)
 # A keyframe that is re-emitted in the cross-fade, and one that falls on a seam.
 SETTINGS = replace(CONFIG, codec=replace(CONFIG.codec, keyframe_interval=3))
-SEAMS = SeamConfig(passes=2, epochs=1, overlap=2)
+SEGMENTS = SegmentConfig(3, passes=2, epochs=1, overlap=2)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def short_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def fit(capture: Capture, out: Path, workers: Workers, **options) -> SegmentedFit:
-    given = {"config": SETTINGS, "segments": 3, "seams": SEAMS} | options
+    given = {"config": SETTINGS, "segments": SEGMENTS} | options
     return stream_segments(capture, out, workers, **given)
 
 
@@ -77,7 +77,7 @@ def rows_of(out: Path) -> list[dict]:
 
 
 def test_stream_segments__of_one_is_the_fit_in_one_process(capture: Capture, workers: Workers, tmp_path: Path) -> None:
-    fit(capture, tmp_path / "one", workers, segments=1)
+    fit(capture, tmp_path / "one", workers, segments=SegmentConfig(1))
     stream_capture(capture, tmp_path / "plain", SETTINGS)
     assert stream_of(tmp_path / "one") == stream_of(tmp_path / "plain")
     assert rows_of(tmp_path / "one") == rows_of(tmp_path / "plain")
@@ -134,7 +134,7 @@ def test_stream_segments__begins_segments_before_it_continues_others(
     capture: Capture, workers: Workers, tmp_path: Path
 ) -> None:
     noted = Noted(workers, starts=2)
-    fit(capture, tmp_path, noted, seams=replace(SEAMS, overlap=0))  # the first segment waits for no other
+    fit(capture, tmp_path, noted, segments=replace(SEGMENTS, overlap=0))  # the first segment waits for no other
     assert noted.noted
     assert max(noted.noted) < workers.count
 
@@ -228,15 +228,15 @@ def test_stream_segments__with_a_killed_process_is_the_same(
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("count", "message"),
     [
-        ({"segments": 0}, r"`segments` must be 1 to 5 for 10 frames, 2 for each, got 0"),
-        ({"segments": 6}, r"`segments` must be 1 to 5 for 10 frames, 2 for each, got 6"),
+        (0, r"`segments` must be 1 to 5 for 10 frames, 2 for each, got 0"),
+        (6, r"`segments` must be 1 to 5 for 10 frames, 2 for each, got 6"),
     ],
 )
-def test_stream_segments__refuses_too_many(capture: Capture, workers, tmp_path: Path, options, message) -> None:
+def test_stream_segments__refuses_too_many(capture: Capture, workers, tmp_path: Path, count, message) -> None:
     with pytest.raises(ValueError, match=message):
-        fit(capture, tmp_path / "out", workers, **options)
+        fit(capture, tmp_path / "out", workers, segments=SegmentConfig(count))
     assert not (tmp_path / "out").exists()
 
 
@@ -246,7 +246,7 @@ def test_stream_segments__does_not_resume_other_settings(capture: Capture, worke
     with pytest.raises(ValueError, match=r"0\.morgs: expected to resume a fit with metadata\.config\.seed = 0, got 1"):
         fit(capture, tmp_path, workers, config=replace(SETTINGS, seed=1), resume=True)
     with pytest.raises(ValueError, match=r"expected to resume a fit with metadata\.segments\.starts = \[0, 3, 7\]"):
-        fit(capture, tmp_path, workers, segments=2, resume=True)
+        fit(capture, tmp_path, workers, segments=replace(SEGMENTS, count=2), resume=True)
 
 
 def test_stream_segments__triangulates_points_where_there_are_few(
@@ -254,7 +254,7 @@ def test_stream_segments__triangulates_points_where_there_are_few(
 ) -> None:
     few = replace(capture, points=capture.points[:3], point_colors=capture.point_colors[:3])
     monkeypatch.setattr("morgs_mi.runs.recorder.with_points", lambda *_: capture)
-    fit(few, tmp_path / "few", workers, segments=1, config=StreamConfig(SETTINGS.fit, SETTINGS.motion))
+    fit(few, tmp_path / "few", workers, segments=SegmentConfig(1), config=StreamConfig(SETTINGS.fit, SETTINGS.motion))
     assert len(next(coded_frames(StreamReader(tmp_path / "few" / "stream.morgs")))) == SETTINGS.fit.num_gaussians
 
 
@@ -277,4 +277,4 @@ def test_stream_segments__refines_cameras_once(capture: Capture, workers: Worker
 def test_stream_segments__refuses_to_estimate_exposures(capture: Capture, workers: Workers, tmp_path: Path) -> None:
     config = replace(CONFIG, fit=replace(CONFIG.fit, exposure="on"))
     with pytest.raises(ValueError, match=r"`fit\.exposure` must be off, got 'on'"):
-        stream_segments(capture, tmp_path / "out", workers, config, 2)
+        stream_segments(capture, tmp_path / "out", workers, config, SegmentConfig(2))

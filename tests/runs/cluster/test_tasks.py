@@ -11,7 +11,7 @@ import pytest
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.runs.cluster import tasks
 from morgs_mi.runs.cluster.executor import cores
-from morgs_mi.runs.cluster.seams import SeamConfig
+from morgs_mi.runs.cluster.seams import SegmentConfig
 from morgs_mi.runs.cluster.tasks import Fit, FrameRange, Source, fit_frames, installed
 from tests.scenes.recording import CONFIG, write_recording
 
@@ -19,7 +19,7 @@ from tests.scenes.recording import CONFIG, write_recording
 @pytest.fixture(scope="module")
 def fit(tmp_path_factory: pytest.TempPathFactory) -> Fit:
     capture = load_capture(write_recording(tmp_path_factory.mktemp("clip"), 5))
-    return Fit(Source.of(capture), CONFIG, SeamConfig(), str(mi.variant()), installed())
+    return Fit(Source.of(capture), CONFIG, SegmentConfig(), str(mi.variant()), installed())
 
 
 def test_fit_frames__continues_the_loop_of_the_last_task_or_reads_it_again(
