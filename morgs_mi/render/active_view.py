@@ -59,7 +59,7 @@ class ActiveView:
         return image if self.region is None else self.region.crop(image)
 
     def narrowed(self, mask: np.ndarray) -> ActiveView | None:
-        """Return the view with those of its drawn blocks that contain a pixel of `mask` [H, W]; None if none does."""
+        """Return the view restricted to drawn blocks with a pixel of `mask` [H, W]; None if there are none."""
         mask = mask if self.region is None else mask & self.region.mask
         return replace(self, region=Region(mask, self.config)) if mask.any() else None
 

@@ -22,7 +22,7 @@ def block_shape(config: RenderConfig) -> tuple[int, int]:
 
 
 def stable_order(keys: UInt32, buckets: int) -> UInt32:
-    """Return the permutation that sorts `keys`, all below `buckets`, stably.
+    """Return the permutation that stably sorts `keys`, which are all below `buckets`.
 
     On a CPU one counting pass suffices. On a GPU that pass is stable for few buckets only.
     """

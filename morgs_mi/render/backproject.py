@@ -44,7 +44,7 @@ def backproject(
         float32 [N, C].
 
     Raises:
-        ValueError: the size of the image differs from that of the camera or the region.
+        ValueError: the size of the image does not match the camera or the region.
     """
     config, C = config or RenderConfig(), (np.shape(image) or (0,))[-1]
     region = region or full_view(camera.width, camera.height, config)
@@ -58,7 +58,7 @@ def backproject(
     if not len(sums):
         return sums
     with dr.suspend_grad():
-        # Lists of those that do not touch the region would take more time than the rest.
+        # Lists of Gaussians that do not touch the region would take more time than the rest.
         rows = dr.compress(touches(project(gaussians, camera, (), config), region))
         N = dr.width(rows)
         if not N:

@@ -1,12 +1,12 @@
 """Depth-ordered lists of the Gaussians that touch each block of pixels.
 
-Two levels. Coarse: every Gaussian is entered into the tiles (4 x 8 blocks) that its extent touches; one counting
-sort by tile, applied in depth order, gives the list of each tile. Fine: each entry of a tile's list is tested exactly
-against the tile's 32 blocks, one bit each; 32 entries by 32 blocks of bits are transposed in registers, so that
-every block has its own string of bits over its tile's list. The blending loops walk the set bits: a block's list is
-never written out, and a pair of Gaussian and block costs one bit.
+The lists have two levels. Coarse: every Gaussian is entered into the tiles (4 x 8 blocks) that its extent touches. One
+counting sort by tile, applied in depth order, gives the list of each tile. Fine: each entry of a tile's list is tested
+exactly against the tile's 32 blocks, one bit each. 32 entries by 32 blocks of bits are transposed in registers: every
+block has its own string of bits over its tile's list. The blending loops walk the set bits. A block's list is never
+written out, and a pair of Gaussian and block costs one bit.
 
-"Rank" is a Gaussian's place in depth order; equal depths keep the order of the input.
+The *rank* of a Gaussian is its place in depth order. Equal depths are in the order of the input.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class BlockLists:
         end: place past its last word [A].
         first: first entry of its tile [A].
         count: number of set bits of each block [A].
-        order: blocks by falling count, roughly [A], so that the lanes of a packet finish together.
+        order: blocks by falling count, roughly [A]: the lanes of a packet finish together.
         rank_of: rank of each splat [N].
         by_rank: splat of each rank [N].
     """
@@ -89,14 +89,14 @@ def build_lists(
     first = dr.gather(mi.UInt32, tiles.first, region.tile)
     count = _set_bits(words, begin, end)
     dr.eval(begin, end, first, count)
-    # Neighbours whose lengths differ by less than an eighth stay together: they draw the same splats and stop alike.
+    # Neighbours stay together if their lengths differ by less than an eighth: they draw the same splats and stop alike.
     bucket = mi.UInt32(6 * dr.log2(mi.Float(count) + 1))
     order = dr.detail.block_mkperm(255 - bucket, dr.width(count), 256)  # pyright: ignore[reportArgumentType]
     return BlockLists(records, words, tiles.entries, begin, end, first, count, order, rank_of, by_rank)
 
 
 def touches(splats: Splats, region: Region) -> Bool:
-    """Return the mask of the splats whose extent reaches a block of the region [N]."""
+    """Return the mask of the splats with an extent that reaches a block of the region [N]."""
     return splats.valid & (_cells_within(region.block_table, region, splats, (1, 1))[1] > 0)
 
 
@@ -300,7 +300,7 @@ def _block_bits(
             mask |= dr.select(touches, mi.UInt32(1 << (j * ACROSS + i)), mi.UInt32(0))
 
     if farthest_limits is not None:
-        # A limit in front hides what would hide later entries, so that none is left out for its transmittance.
+        # A depth limit may cut the entries that would hide later ones: no entry is omitted for its transmittance.
         dr.eval(mask)
         return _transposed_words(mask, tiles, first_word, end_word, num_words)
 

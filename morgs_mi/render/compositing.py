@@ -77,7 +77,7 @@ class _Blend(dr.CustomOp):
         self.set_grad_out(self._outputs(images))
 
     def _allocated(self) -> list[Float]:
-        """Return memory for the images: a frozen function cannot allocate arrays of a size of its own."""
+        """Return memory for the images: a frozen function cannot allocate arrays of a size that it computes."""
         return [dr.empty(mi.Float, self.region.num_pixels * size) for size in self.layout.sizes]
 
     def _outputs(self, images: list[Float]) -> list[Float]:
@@ -86,7 +86,7 @@ class _Blend(dr.CustomOp):
         return [*outputs, outputs[-1] + 0] if self.layout.alpha else outputs
 
     def _image_grads(self, grads: list[Float]) -> list[Float]:
-        """Return the gradients of the images from those of the outputs: the transpose of `_outputs`."""
+        """Return the gradients of the images from the gradients of the outputs: the transpose of `_outputs`."""
         if self.layout.alpha:
             *grads, alpha, coverage = grads
             grads = [*grads, alpha + coverage]
@@ -99,8 +99,8 @@ class _Blend(dr.CustomOp):
 def weighted_sums(images: list[Float], region: Region, lists: BlockLists, layout: Layout) -> list[Float]:
     """Return the sums of images' pixels, weighted by each splat's blend weights.
 
-    They are the gradients of the columns where the images are those of the blended image. A layout whose channels do
-    not reach the weights does without the blended image itself.
+    They are the gradients of the columns if the images are the gradients of the blended image. A layout with detached
+    channels does not need the blended image itself.
 
     Args:
         images: flat image of each channel on the region.
@@ -117,7 +117,7 @@ def weighted_sums(images: list[Float], region: Region, lists: BlockLists, layout
 def _gradients(
     blocks: Blocks, lists: BlockLists, layout: Layout, images: list[Float], grads: list[Float]
 ) -> list[Float]:
-    """Return the gradients of the geometry, if the layout reaches it, and of the columns, from those of the images."""
+    """Return the gradients of the geometry (if the layout reaches it) and the columns, from the images' gradients."""
     N, arrays, stride = dr.width(lists.by_rank), (blocks, lists.records, images, grads), 4 * record_packets(layout)
     if layout.config.reproducible:
         end = dr.cumsum(lists.count)

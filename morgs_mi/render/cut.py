@@ -1,7 +1,7 @@
 """The part of a splat in front of a depth limit, and its derivatives by hand.
 
-Along the ray of a pixel, a Gaussian is one in depth too, with mean z + gx dx + gy dy and standard deviation sigma (see
-`projection`). Up to the limit the ray has passed the fraction Phi of its optical depth -log(1 - alpha), so that
+Along the ray of a pixel, a Gaussian is also a Gaussian in depth, with mean z + gx dx + gy dy and standard deviation
+sigma (see `projection`). Up to the limit the ray has passed the fraction Phi of its optical depth -log(1 - alpha), and
 
     q = (limit - depth) / sigma        alpha' = 1 - (1 - alpha)^Phi(q)
 

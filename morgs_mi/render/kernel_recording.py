@@ -1,9 +1,9 @@
 """Recordings of traced functions (`dr.freeze`): tracing a long loop again costs several ms per call.
 
-In Dr.Jit 1.5 they are not safe with threads. A recording is replayed into memory of its own, so that two replays at
-once end the process. While Dr.Jit inspects the arguments, it holds a lock that `dr.backward` in another thread waits
-for, and waits for one that `dr.backward` holds: a deadlock. All recordings, and all derivatives that the package
-computes, hold `render_lock` therefore.
+In Dr.Jit 1.5 recordings are not thread-safe. A recording is replayed into its own memory: two simultaneous replays end
+the process. While Dr.Jit inspects the arguments, it holds a lock that `dr.backward` in another thread waits for, and
+waits for one that `dr.backward` holds: a deadlock. Therefore all recordings, and all derivatives that the package
+computes, hold `render_lock`.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _MOST_RECORDINGS = 500
 render_lock = RLock()
 """Lock of the renderer, which a thread may take more than once.
 
-`rasterize` and all that fits Gaussians take it. Hold it around `dr.backward` and `dr.forward` if another thread renders
-meanwhile.
+`rasterize` and all functions that fit Gaussians take it. Hold it around `dr.backward` and `dr.forward` if another
+thread renders at the same time.
 """
 
 
@@ -52,7 +52,7 @@ def recorded(function: Callable[..., Jit], *static: Any) -> Callable[..., Jit]:
 
     The other arguments are Dr.Jit arrays, or dataclasses of them. There is one recording per variant and `static`.
     Arguments that are not arrays must be in `static`: Dr.Jit 1.5 distinguishes other arguments by a hash in which two
-    booleans can cancel. Sizes inside a recording are those of its arguments, or static: `dr.empty` and similar
+    booleans can cancel. Sizes inside a recording are its arguments' sizes, or static: `dr.empty` and similar
     functions need a static size.
     """
 
@@ -80,13 +80,13 @@ def _recording(
 def _rebuilt(
     function: Callable[..., Jit], static: tuple[Any, ...], classes: tuple[type | None, ...], plain: tuple[Any, ...]
 ) -> Jit:
-    """Return the result of `function` for arguments of which the dataclasses have become dicts."""
+    """Return the result of `function` for arguments with their dataclasses converted to dicts."""
     return function(*static, *(c(**a) if c else a for a, c in zip(plain, classes, strict=True)))
 
 
 @contextmanager
 def _garbage_collection_off() -> Iterator[None]:
-    """Switch off Python's garbage collection meanwhile.
+    """Switch off Python's garbage collection inside the context.
 
     An array that is collected while Dr.Jit inspects the arguments waits for Dr.Jit's lock forever.
     """

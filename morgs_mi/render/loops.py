@@ -14,11 +14,11 @@ per pixel, the suffix S = <g, C_final> - sum_j<=i w_j <g, c_j>, and
 A channel is *attached* if its gradient reaches the weights w (geometry and opacity), detached if it reaches
 only the blended value itself. Alpha is blended as one more channel of ones.
 
-With depth limits, alpha' takes the place of alpha (see `cut`), and a record has the four numbers of the splat's profile
-after those of its shape. The limits are constants: they get no derivative.
+With depth limits, alpha' takes the place of alpha (see `cut`), and a record contains the splat's shape, followed by the
+four numbers of its profile. The limits are constants: they get no derivative.
 
-Every channel has its own image, rows of blocks times its columns (see `region`), so that a row of a block is a
-run of packets of 4 floats.
+Every channel has its own image, rows of blocks times its columns (see `region`). A row of a block is a run of packets
+of 4 floats.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class Layout:
 
     @property
     def geometry(self) -> int:
-        """The number of floats that decide alpha."""
+        """The number of floats that determine alpha."""
         return _SHAPE + (PROFILE if self.cut else 0)
 
     @property
@@ -107,7 +107,7 @@ class Layout:
 
 
 def record_packets(layout: Layout) -> int:
-    """Return the number of packets of 4 floats of a Gaussian's record, which is also that of its gradient."""
+    """Return the number of packets of 4 floats of a Gaussian's record, and of its gradient."""
     return -(-(layout.geometry + layout.columns) // 4)
 
 
@@ -247,7 +247,7 @@ def _load_image(block: _Block, size: int, image: Float) -> list[list[Float]]:
 
 
 def primal(layout: Layout, blocks: Blocks, records: Float, images: list[Float]) -> list[Float]:
-    """Blend the records' columns into the channels' images, whose contents are overwritten."""
+    """Blend the records' columns into the channels' images, which are overwritten."""
     block, G, C = _Block(layout, blocks), layout.geometry, layout.columns
 
     def body(walk, end, x, y, limits, T, sums, records, words, entries):
@@ -409,7 +409,7 @@ def _inner(g: list[Float], values: list[Float], layout: Layout, alpha: Float | N
 
 
 class _Moments:
-    """Sums over a block of d times 1, u, u dx, u dy, dy, dy^2; rows first, so that a pixel costs four additions."""
+    """Sums over a block of d times 1, u, u dx, u dy, dy, dy^2; rows first: a pixel costs four additions."""
 
     def __init__(self, block: _Block) -> None:
         self.width = block.width
@@ -453,7 +453,7 @@ class _Moments:
 
 
 def tangent(layout: Layout, blocks: Blocks, records: Float, tangents: Float, images: list[Float]) -> list[Float]:
-    """Write the directional derivative along the records' tangents to `images`, whose contents are overwritten."""
+    """Write the directional derivative along the records' tangents to `images`, which are overwritten."""
     block, G, C = _Block(layout, blocks), layout.geometry, layout.columns
 
     def body(walk, end, x, y, limits, T, dT, dsums, records, tangents, words, entries):

@@ -1,7 +1,7 @@
 """Projection of Gaussians in the world to splats on the screen, differentiated by Dr.Jit.
 
 Notation: x = R mean + t in camera space, z its depth, J the Jacobian of the projection at x, and
-U = J R Q diag(s) [2, 3], so that the screen covariance is U U' + eps2d I (EWA splatting, Zwicker 2001).
+U = J R Q diag(s) [2, 3]. The screen covariance is U U' + eps2d I (EWA splatting, Zwicker 2001).
 A pixel at offset d = (dx, dy) from the splat's centre gets alpha = 2^p with
 
     p = log2(opacity) - u^2 - v^2,    u = a dx + b dy,    v = c dy,
@@ -14,7 +14,7 @@ row of R Q diag(s). Along the ray of a pixel it is a Gaussian in depth, with mea
 w U' (U U' + eps2d I)^-1, and a variance that is the same for all pixels: the ratio of the two determinants.
 
 No intermediate value overflows: U is computed in units of the splat's own size, and a Gaussian that the camera cannot
-see is projected from a substitute position, so that 0 * inf does not reach a gradient. x is summed in double precision:
+see is projected from a substitute position, because 0 * inf would reach a gradient. x is summed in double precision:
 for scenes far from the origin, and cameras far from the scene, single precision would lose the digits that cancel.
 """
 
@@ -71,7 +71,7 @@ class Splats:
 
     @property
     def geometry(self) -> tuple[Float, ...]:
-        """The differentiable numbers that decide a splat's alpha at a pixel: `shape` and `profile`."""
+        """The differentiable numbers that determine a splat's alpha at a pixel: `shape` and `profile`."""
         return self.shape + self.profile
 
     def concatenated_with(self, other: Splats) -> Splats:
@@ -187,7 +187,7 @@ def _transformed(world: list[Float], pose: list[list[Float]]) -> tuple[Float, Fl
 
 
 def _guided_motion(gaussians: ActivatedGaussians, rows: UInt32) -> list[Float]:
-    """Return the part of the motion of Gaussians that flow guides: without the learned offset (eq. 8)."""
+    """Return the guided motion of Gaussians: their motion without the learned offset (eq. 8)."""
     motion = gaussians.rows("motion", rows)
     if getattr(gaussians, "offset", None) is None:
         return motion
@@ -230,7 +230,7 @@ def _rotation(quats: Jit) -> list[Jit]:
     """Return the columns of the rotation matrix of wxyz quaternions of any length; length 0 is the identity."""
     largest = dr.max(dr.abs(dr.detach(quats)))
     zero = largest < 1e-30
-    # Scaled so that squares neither over- nor underflow; by a product with 0 instead of a selection, so that NaN stays.
+    # Scaling prevents over- and underflow of the squares. A product with 0 preserves NaN, which a selection would not.
     scaled = quats * dr.select(zero, 0, dr.rcp(dr.minimum(largest, 1e30)))
     w, x, y, z = dr.normalize(scaled + mi.Vector4f(dr.select(zero, 1, 0), 0, 0, 0))
     return [
@@ -273,7 +273,7 @@ def _depth_profile(
 ) -> tuple[Float, Float, Float, Float]:
     """Return the depth z + gx dx + gy dy and the inverse standard deviation along rays, as (z, gx, gy, 1 / sigma).
 
-    The depth is that of the largest response along the ray in the affine approximation (RaDe-GS, Zhang et al. 2024).
+    The response along the ray is largest at that depth, in the affine approximation (RaDe-GS, Zhang et al. 2024).
     """
     (u0, u1, w), (xx, xy, yy) = rows, covariance
     zx, zy = dr.dot(u0, w), dr.dot(u1, w)

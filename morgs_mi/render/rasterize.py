@@ -42,7 +42,7 @@ class Image:
         color: display-referred colour [H, W, 3].
         alpha: 1 - transmittance [H, W, 1].
         depth: expected camera-space z [H, W, 1], world units; 0 where nothing is drawn.
-        motion: displacement from where each pixel came [H, W, 2], px, x_t - x_{t-1} (eq. 6); 0 where nothing is drawn.
+        motion: displacement since the previous frame [H, W, 2], px, x_t - x_{t-1} (eq. 6); 0 where nothing is drawn.
         confidence: blended motion confidence [H, W, 1].
         features: blended features [H, W, F].
         others: blended channels of further attributes, by name.
@@ -109,26 +109,26 @@ def rasterize(
             offset), and the channels of the table of attributes (``confidence``). Colour and the channels of attributes
             are sums weighted by T alpha; depth and motion are divided by the sum of those weights.
         background: display-referred colour [3] behind all Gaussians; None: black.
-        detach_weights: channels whose gradient reaches only the blended values, not opacity and geometry.
+        detach_weights: channels with a gradient that reaches only the blended values, not opacity and geometry.
         region: the blocks of pixels to draw; None: the whole view. Gaussians that touch none of its blocks are only
             projected.
         features: [N, F], further values to blend like a colour, returned as `Image.features`; F is at most 12.
         static_splats: further splats of this view that are drawn and get no gradients; they must have the channels.
         config: cut-offs and block shape.
         depth_limit: [H, W], the camera-space z of every pixel at which an opaque surface ends its ray, world units; inf
-            where there is none. Of a Gaussian around that depth, the part in front is drawn: the fraction of its
-            optical depth that the ray has passed. It gets no gradient. None: no limit, and no cost.
+            where there is none. A Gaussian around that depth is drawn in part: by the fraction of its optical depth
+            that the ray has passed. The limit gets no gradient. None: no limit, and no cost.
 
     Example:
         >>> image = morgs_mi.rasterize(gaussians, camera, channels=("color", "depth"))
         >>> dr.backward(dr.mean(dr.square(image.color - target), axis=None))
 
     Returns:
-        An `Image` with one tensor per requested channel. On a region, the pixels that are drawn and their gradients
-        are those of the full computation.
+        An `Image` with one tensor per requested channel. On a region, the drawn pixels and their gradients equal
+        the full computation's.
 
     Raises:
-        ValueError: an unknown channel, a channel whose attribute is missing, NaN or infinite attributes or poses, a
+        ValueError: an unknown channel, a channel with a missing attribute, NaN or infinite attributes or poses, a
             region of another view or block shape, `static_splats` together with a depth limit, a depth limit with
             gradients enabled, or a call inside a function under `dr.freeze`.
 

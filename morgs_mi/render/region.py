@@ -1,7 +1,7 @@
-"""Regions: the blocks of pixels that are drawn, all of a view's or some.
+"""Regions: the blocks of pixels that are drawn, all or some of the blocks of a view.
 
 A block is `block_width` x `block_height` pixels and belongs to one SIMD lane; a tile is 4 x 8 blocks. An image of a
-whole view is stored row by row, padded to whole blocks on the right; one of a region, block by block.
+whole view is stored row by row, padded to whole blocks on the right; an image of a region, block by block.
 """
 
 from __future__ import annotations

@@ -12,19 +12,19 @@ __all__ = ["RenderConfig"]
 
 @dataclass(frozen=True)
 class RenderConfig:
-    """Settings of the rasteriser. The defaults are those of 3DGS, so that its models look right."""
+    """Settings of the rasteriser. The defaults match 3DGS, because its models depend on them."""
 
     eps2d: Annotated[float, AtLeast(0), AtMost(1e18)] = 0.3  # beyond, float32 overflows
-    """Low-pass filter in px^2 added to the projected covariance, so that no splat falls between pixels."""
+    """Low-pass filter in px^2, added to the projected covariance; it prevents splats from falling between pixels."""
     alpha_min: Annotated[float, Above(0)] = 1.0 / 255.0
-    """A Gaussian whose alpha at a pixel is below this is skipped there: it cannot change an 8-bit image."""
+    """Alpha below which a Gaussian is skipped at a pixel: it cannot change an 8-bit image."""
     alpha_max: Annotated[float, Above(0), Below(1)] = 0.99
-    """Alpha is capped here, so that 1 / (1 - alpha) in the adjoint stays bounded."""
+    """Upper limit of alpha; it bounds 1 / (1 - alpha) in the adjoint."""
     stop_transmittance: Annotated[float, AtLeast(0), Below(1)] = 1e-4
-    """A block ends when its most transparent pixel falls below this; bounds the error of the colour."""
+    """Transmittance of its most transparent pixel below which a block ends; bounds the error of the colour."""
     block_width: Annotated[int, AtLeast(4), AtMost(16), MultipleOf(4)] | None = None
-    """Width in pixels of the block that one SIMD lane owns, which are read and written in packets of 4; None: 8 on the
-    CPU, 4 on the GPU."""
+    """Width in pixels of the block of one SIMD lane; pixels are read and written in packets of 4. None: 8 on the CPU, 4
+    on the GPU."""
     block_height: Annotated[int, AtLeast(1), AtMost(16)] | None = None
     """Height in pixels of that block, 1 to 16; None: 4."""
     reproducible: bool = False
