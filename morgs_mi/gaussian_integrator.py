@@ -3,7 +3,7 @@
     "integrator": {"type": "gaussian_splat", "aovs": "motion,depth"}
 
 It draws every `ellipsoids` (and `ellipsoidsmesh`) shape of a scene and reads the attributes that Mitsuba's own
-`volprim_rf_basic` reads, so that one scene file renders with both. N is the number of Gaussians of a shape,
+`volprim_rf_basic` reads: one scene file renders with both. N is the number of Gaussians of a shape,
 K = (degree + 1)^2:
 
     data [N, 10]          centre, standard deviations, quaternion xyzw
@@ -68,7 +68,7 @@ def _attribute_widths() -> dict[str, tuple[int, ...]]:
 def ellipsoids(gaussians: ActivatedGaussians) -> dict[str, Any]:
     """Return the dictionary of an `ellipsoids` shape with a copy of N Gaussians' activated attributes.
 
-    The parameters to optimise are then those of the scene: gradients do not reach `gaussians`.
+    Optimise the parameters of the scene: gradients do not reach `gaussians`.
 
     Example:
         >>> scene = mi.load_dict({"type": "scene", "gaussians": morgs_mi.ellipsoids(gaussians),
@@ -114,7 +114,7 @@ class _SceneGaussians:
 
 
 def _scene_gaussians(scene: Any, attributes: list[str], with_surfaces: bool) -> _SceneGaussians:
-    """Return the Gaussians of all shapes; those with fewer SH coefficients are padded with zeros."""
+    """Return the Gaussians of all shapes, padded with zeros to the largest number of SH coefficients."""
     shapes = [shape for shape in scene.shapes() if shape.is_ellipsoids()]
     for shape in scene.shapes():
         if not (with_surfaces or shape.is_ellipsoids()):
@@ -169,7 +169,7 @@ def _sensor_camera(sensor: Any, border: int) -> Camera:
     names = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
     fov, offset_x, offset_y = (float(params[name][0]) for name in names)
     f = 0.5 * W / np.tan(np.deg2rad(0.5 * fov))
-    # Mitsuba adds its offset to the pixel's position, so that the principal point moves the other way.
+    # Mitsuba adds its offset to the pixel's position: the principal point moves the other way.
     cx, cy = W * (0.5 - offset_x) + border, H * (0.5 - offset_y) + border
     K = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]])
     world_to_sensor = mi.TensorXf(dr.rcp(params["to_world"].matrix))[..., 0]
@@ -207,12 +207,12 @@ def _plugin() -> type:
              shapes are refused)
 
         The film's size, crop, border, reconstruction filter and pixel format are honoured; every pixel gets one
-        sample at its centre, so that `spp`, the seeds and the sampler have no effect. Emitters (with a warning), the
+        sample at its centre. Therefore `spp`, the seeds and the sampler have no effect. Emitters (with a warning), the
         sensor's far plane and shutter, and the shapes' `extent` are ignored. A crop saves no time.
 
-        With `surfaces`, that integrator renders the other shapes with `spp` samples, whose mean is the pixel's sample.
+        With `surfaces`, that integrator renders the other shapes with `spp` samples; their mean is the pixel's sample.
         A pixel's splats end at the mean depth of the surfaces in it, and are blended twice if they cover it in part.
-        Surfaces get no light or shadow from splats, and none reaches the splats; docs/surfaces.md has what does that.
+        Surfaces get no light or shadow from splats, and splats get none from surfaces; see docs/surfaces.md for both.
         """
 
         def __init__(self, props: Any) -> None:

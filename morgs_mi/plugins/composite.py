@@ -36,9 +36,8 @@ def composite(
 ) -> Columns:
     """Return the channels of splats and surfaces, differentiable in both, each a list of floats [P].
 
-    Colour is linear light. Alpha is 1 where a surface or the environment is seen, depth is the expected depth of splats
-    and surfaces together. Motion and the channels of attributes
-    belong to the splats in front of the surfaces.
+    Colour is linear light. Alpha is 1 where a surface or the environment is seen. Depth is the expected depth of splats
+    and surfaces together. Motion and the channels of attributes belong to the splats in front of the surfaces.
 
     Args:
         gaussians: N Gaussians.

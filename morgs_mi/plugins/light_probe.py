@@ -1,7 +1,7 @@
 """The light of a captured scene at a point, as an environment map (image-based lighting, Debevec 1998).
 
 The Gaussians around the point are rendered into the six faces of a cube, decoded to linear light and resampled to
-latitude and longitude. Display-referred video stores at most 1: what was brighter is guessed, see `light_probe`.
+latitude and longitude. Display-referred video stores at most 1: brighter light is guessed, see `light_probe`.
 """
 
 from __future__ import annotations
@@ -51,17 +51,17 @@ def light_probe(
 ) -> dict[str, Any]:
     """Return the dictionary of a Mitsuba `envmap` emitter with the light that Gaussians send to a point.
 
-    It stands for a scene at infinity: the light is that of `position` everywhere. Place it in the middle of the object
+    It represents a scene at infinity: every point gets the light at `position`. Place it in the middle of the object
     that it lights, and make one for every frame.
 
     Args:
-        gaussians: N Gaussians, whose colours are sRGB-encoded.
+        gaussians: N Gaussians with sRGB-encoded colours.
         position: the point [3], world units.
         height: rows of the map, which has twice as many columns.
         background: display-referred colour [3] behind all Gaussians; None: black.
         clipped: radiance of colours that the video clipped at 1. The default of two stops above white is a guess; 1
             takes the video as it is. Between display-referred 0.95 and 1, the radiance rises to this.
-        near: Gaussians nearer to the point than this are left out, world units: those inside the object.
+        near: distance in world units; nearer Gaussians, such as Gaussians inside the object, are left out.
 
     Example:
         >>> scene = mi.load_dict({"type": "scene", "gaussians": morgs_mi.ellipsoids(gaussians),
@@ -88,7 +88,7 @@ def light_probe(
 
 
 def _directions(height: int) -> np.ndarray:
-    """Return the directions [H, 2 H, 3] of the texels of an `envmap`, whose first and last rows are the poles."""
+    """Return the directions [H, 2 H, 3] of the texels of an `envmap`; its first and last rows are the poles."""
     theta = np.pi * np.arange(height)[:, None] / (height - 1)
     phi = 2 * np.pi * (np.arange(2 * height) + 0.5) / (2 * height)
     x, z = np.sin(theta) * np.sin(phi), -np.sin(theta) * np.cos(phi)
@@ -128,11 +128,11 @@ def _resampled(faces: list[tuple[Camera, np.ndarray]], directions: np.ndarray) -
 
 
 def radiance(color: Any, clipped: float, srgb: bool = True) -> Any:
-    """Return the linear light of display-referred colours (`mi.Color3f` [M]), those that are clipped up to `clipped`.
+    """Return the linear light of display-referred colours (`mi.Color3f` [M]); clipped colours get up to `clipped`.
 
     Args:
         color: blended colours of Gaussians.
-        clipped: radiance of what was clipped at 1; between display-referred 0.95 and 1, it rises to this.
+        clipped: radiance of colours that were clipped at 1; between display-referred 0.95 and 1, it rises to this.
         srgb: whether the colours are sRGB-encoded; others are linear light already, and were not clipped.
     """
     if not srgb:

@@ -22,8 +22,8 @@ SPLATS = "splats"
 def mattes(gaussians: ActivatedGaussians, camera: Camera, scene: Any) -> dict[str, np.ndarray]:
     """Return the weight in [0, 1] of every surface and of the splats in each pixel, float32 [H, W] by name.
 
-    A surface has the fraction of the pixel that it covers, times the transmittance of the splats in front; what is left
-    to 1 is the background. Names are those of the shapes in the scene; shapes of one name share a matte.
+    The weight of a surface is the fraction of the pixel that it covers, times the transmittance of the splats in front.
+    The rest is the background. The names are the shapes' names in the scene; shapes of one name share a matte.
 
     Args:
         gaussians: N Gaussians.

@@ -1,8 +1,8 @@
 """Shadows of inserted surfaces on Gaussians, by differential rendering (Debevec 1998).
 
-The colour of a Gaussian is light that it reflected in the recording. Surfaces that are inserted take a part of it away:
-the ratio of the irradiance with and without them, from the same lights. It is traced from the Gaussian's centre, with
-the same directions in numerator and denominator, so that it is 1 exactly where nothing is in the way.
+The colour of a Gaussian is light that it reflected in the recording. Inserted surfaces scale it by the ratio of the
+irradiance with and without them, from the same lights. The ratio is traced from the Gaussian's centre, with the same
+directions in numerator and denominator: it is exactly 1 where nothing is in the way.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def shadow_ratio(gaussians: Gaussians, scene: Any, viewpoint: ArrayLike, samples
         scene: Mitsuba scene with the surfaces and the lights of the recording, such as a `light_probe`; its
             `ellipsoids` are ignored.
         viewpoint: a point [3] from which the captured surfaces are seen, world units: a camera's position.
-        samples: directions per light, the same for all Gaussians, so that shadows have no noise.
+        samples: directions per light; they are the same for all Gaussians, and shadows have no noise.
 
     Raises:
         ValueError: a bad argument, or a scene without an emitter.
@@ -124,7 +124,7 @@ def _orientation(gaussians: Gaussians, means: np.ndarray) -> tuple[np.ndarray, n
     weights /= weights.sum(1, keepdims=True)
     ends = np.arange(0, near.size + 1, near.shape[1])
     mixture = csr_array((weights.ravel(), near.ravel(), ends), shape=(len(means), len(means)))
-    # The covariance of the mixture: the mean of its second moments, less that of its centre.
+    # The covariance of the mixture: the mean of its second moments, minus the second moment of its centre.
     centered = means - means.mean(0)
     moments = axes @ axes.transpose(0, 2, 1) + centered[:, :, None] * centered[:, None, :]
     center = mixture @ centered
@@ -134,7 +134,7 @@ def _orientation(gaussians: Gaussians, means: np.ndarray) -> tuple[np.ndarray, n
 
 
 def _irradiance(emitter: Any, receivers: _Receivers, blockers: Any, samples: int) -> tuple[Float, Float]:
-    """Return the irradiance of one light that surfaces block, and all of it without them."""
+    """Return the irradiance of one light that surfaces block, and its irradiance without surfaces."""
     far = mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite)
     it = dr.zeros(mi.Interaction3f, dr.width(receivers.centers))
     it.p = receivers.centers

@@ -1,4 +1,4 @@
-"""The Mitsuba integrator `splat_path`: paths among surfaces, on whose way the Gaussians emit and absorb light.
+"""The Mitsuba integrator `splat_path`: paths among surfaces, along which the Gaussians emit and absorb light.
 
     "integrator": {"type": "gaussian_splat", "surfaces": {"type": "splat_path"}}
 
@@ -7,11 +7,11 @@ radiance that arrives from behind:
 
     (1 - T) dec(C / (1 - T)) + T L
 
-`dec` decodes colours to linear light. The layer is linear in L, so that estimates of L may be noisy, and lights shine
+`dec` decodes colours to linear light. The layer is linear in L: estimates of L may be noisy, and lights shine
 through it by the factor T, from whichever side they are found. It is left out between the camera and the first surface:
 there, `gaussian_splat` blends the splats.
 
-Derivatives are those of path replay (Vicini et al. 2021), with the layers as constants.
+Derivatives are computed by path replay (Vicini et al. 2021), with the layers as constants.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ __all__ = ["rays_for", "traced"]
 
 
 def rays_for(integrator: Any, gaussians: ActivatedGaussians) -> SplatRays | None:
-    """Return N Gaussians prepared for a `splat_path`, and None for other integrators."""
+    """Return N Gaussians prepared for a `splat_path`; None for other integrators."""
     return SplatRays(gaussians) if hasattr(integrator, "splats") else None
 
 
 @contextmanager
 def traced(integrator: Any, splats: SplatRays | None, srgb: bool) -> Iterator[None]:
-    """Let an integrator trace rays through Gaussians meanwhile.
+    """Let an integrator trace rays through Gaussians inside the context.
 
     Args:
         integrator: any integrator.

@@ -6,14 +6,14 @@ p = |o' x d'| / |d'|, nearest at t* = -o'.d' / |d'|^2. The response is largest t
     alpha = opacity exp(-p^2 / 2),
 
 and along the ray it is a Gaussian with mean t* and standard deviation 1 / |d'|. A segment [0, end] has the fraction
-f = Phi(|d'| (end - t*)) - Phi(-|d'| t*) of the optical depth, so that 1 - (1 - alpha)^f takes the place of alpha. It is
+f = Phi(|d'| (end - t*)) - Phi(-|d'| t*) of the optical depth, and 1 - (1 - alpha)^f takes the place of alpha. It is
 the response of the rasteriser without the affine approximation and the low-pass filter. Colours are blended in the
 order of t*.
 
-The Gaussians are the leaves of a complete binary tree of boxes, whose node n has the children 2 n and 2 n + 1. All
-nodes of a level are split along the same axis, so that a ray meets the children in an order that depends on the signs
-of its direction alone. Flipping bits of n by those signs gives an order from front to back, in which the next node
-follows from n without a stack.
+The Gaussians are the leaves of a complete binary tree of boxes: node n has the children 2 n and 2 n + 1. All nodes of a
+level are split along the same axis: the order in which a ray meets the children depends only on the signs of its
+direction. Flipping bits of n by those signs gives an order from front to back, in which the next node follows from n
+without a stack.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class _Tree:
     """Boxes of a complete binary tree with 2^depth leaves.
 
     Attributes:
-        depth: of the leaves; that of the root is 0.
+        depth: depth of the leaves; the root has depth 0.
         flips: for each axis, the bits of a leaf's number that choose a side along it.
         boxes: lower and upper corner of every node, from 1, in rows of eight floats.
     """
@@ -61,7 +61,7 @@ class _Tree:
         """Return the tree of N boxes, and the box of each leaf [2^depth]; N where there is none.
 
         Args:
-            centers: of the boxes [N, 3].
+            centers: centres of the boxes [N, 3].
             halves: half their sizes [N, 3].
         """
         N = len(centers)
@@ -85,7 +85,7 @@ class _Tree:
         # From the root down; node 0 does not exist.
         low, high = (np.concatenate([levels[-1], *levels[::-1]]) for levels in (lows, highs))
         rows = np.zeros((len(low), 8))
-        # What is empty is a point at infinity, which no ray reaches.
+        # An empty box is a point at infinity, which no ray reaches.
         rows[:, :3], rows[:, 4:7] = low, np.where(low > high, np.inf, high)
         return _Tree(_opaque(depth), tuple(map(_opaque, flips)), from_numpy(mi.Float, rows)), order
 
@@ -97,14 +97,14 @@ class _Tree:
         visit: Callable[[tuple[Jit, ...], UInt32, Bool], tuple[Jit, ...]],
         span: Callable[[tuple[Jit, ...]], tuple[Float, Float]],
     ) -> tuple[Jit, ...]:
-        """Visit the leaves whose boxes meet a part of each ray, about from front to back, and return the last state.
+        """Visit the leaves with boxes that meet a part of each ray, roughly front to back, and return the last state.
 
         Args:
             ray: rays [M].
-            active: those that are traced.
+            active: rays that are traced.
             state: values [M].
             visit: (state, leaf, active) -> state, called for the leaves.
-            span: state -> the part of the ray that is searched, from and to.
+            span: state -> (start, end) of the part of the ray that is searched.
         """
         inverse = dr.rcp(ray.d)
         signs = zip(ray.d, self.flips, strict=True)
@@ -149,7 +149,7 @@ class SplatRays:
         >>> color, transmittance = rays.trace(mi.Ray3f((0, 0, -3), (0, 0, 1)))
 
     Raises:
-        ValueError: `gaussians` are none, or have numbers that are not finite.
+        ValueError: `gaussians` is empty, or has numbers that are not finite.
     """
 
     def __init__(self, gaussians: ActivatedGaussians, config: RenderConfig | None = None) -> None:
@@ -197,9 +197,9 @@ class SplatRays:
             return self._tree.walk(ray, mi.Bool(active), (mi.Float(1),), visit, span)[0]
 
     def trace(self, ray: Any, active: Bool = True) -> tuple[Any, Float]:
-        """Return the colour, weighted like that of `rasterize`, and the transmittance of the Gaussians along rays [M].
+        """Return the colour, weighted as in `rasterize`, and the transmittance of the Gaussians along rays [M].
 
-        View-dependent colours are those of the ray's direction.
+        View-dependent colours are evaluated in the ray's direction.
 
         Args:
             ray: `mi.Ray3f` with directions of length 1; segments end at `maxt`.
@@ -300,7 +300,7 @@ def _longest_axis(points: np.ndarray) -> int:
 
 
 def _before(depth: Float, row: UInt32, other: Float, other_row: UInt32) -> Bool:
-    """Return whether a Gaussian is blended before another one; at equal depths, rows decide."""
+    """Return whether a Gaussian is blended before another one; equal depths are ordered by row."""
     return (depth < other) | ((depth == other) & (row < other_row))
 
 
@@ -310,5 +310,5 @@ def _phi(q: Float) -> Float:
 
 
 def _opaque(value: int) -> UInt32:
-    """Return a number that is no constant of a kernel, which would be compiled for every scene."""
+    """Return a number that is not a literal of the kernel, which would otherwise be compiled for every scene."""
     return dr.opaque(mi.UInt32, value)

@@ -1,7 +1,7 @@
 """The surfaces of a Mitsuba scene as one camera sees them, rendered by one of Mitsuba's own integrators.
 
-The scene's shapes that are no Gaussians are put into a scene of their own, which shares the objects: gradients of a
-nested integrator such as `prb` reach the parameters of the whole scene.
+The scene's shapes other than Gaussians are put into a second scene, which shares the objects: gradients of a nested
+integrator such as `prb` reach the parameters of the whole scene.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _log = logging.getLogger(__name__)
 
 # Rays along each axis of a pixel that find its coverage and depth.
 _GRID = 3
-# Those of the grid that are cast in every pixel, and the others, row by row.
+# Rays of the grid that are cast in every pixel, and the others, row by row.
 _FIRST, _OTHERS = (1, 5, 6), (0, 2, 3, 4, 7, 8)
 
 
@@ -63,12 +63,12 @@ def surface_scene(scene: Any) -> Any:
 
 
 def lights(scene: Any) -> list[Any]:
-    """Return the emitters of a scene that are not on one of its surfaces, which come with those."""
+    """Return the emitters of a scene, without the emitters on its surfaces."""
     return [emitter for emitter in scene.emitters() if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface)]
 
 
 def shared_scene(parts: list[Any], whole: Any) -> Any:
-    """Return a scene of some shapes and emitters of a whole scene, which stays as it is.
+    """Return a scene of some shapes and emitters of a whole scene, which does not change.
 
     A new scene names its parts, and sets the extent of an environment to its own; both are set back.
     """
@@ -89,7 +89,7 @@ def _attached(thing: Any) -> list[str]:
 
 @contextmanager
 def _detached(shapes: list[Any]) -> Iterator[None]:
-    """Detach the parameters of shapes meanwhile.
+    """Detach the parameters of shapes inside the context.
 
     Calls of Mitsuba's virtual functions are traced for all shapes that exist, of any scene. In forward mode `prb` would
     depend on shapes that its scene does not have, and fail.
@@ -115,8 +115,8 @@ class SampledPixels:
         camera: the view.
         crop: its pixels, (x, y, width, height), P in all.
         template: sensor with the sampler and the far plane.
-        seed: of the samples.
-        spp: samples per pixel; 0: as the sampler has.
+        seed: seed of the samples.
+        spp: samples per pixel; 0: the sampler's number.
     """
 
     camera: Camera
@@ -156,7 +156,7 @@ class SurfaceView:
         depth: mean camera-space z of what is seen there [P], world units; inf where there is no surface.
         behind: radiance of the environment at the pixels' centres, `mi.Color3f` [P], a leaf of the gradient graph; None
             if there is none, or the integrator hides it.
-        splats: the Gaussians, for an integrator that traces rays through them; None for others.
+        splats: the Gaussians, for an integrator that traces rays through them; None for other integrators.
         srgb: whether their colours are sRGB-encoded.
     """
 
@@ -213,7 +213,7 @@ class SurfaceView:
             dr.set_grad(self.behind, dr.forward_to(values))
 
     def backward(self, params: Any) -> None:
-        """Add to the gradients of the surfaces' parameters what follows from the gradients of `image` and `behind`.
+        """Propagate the gradients of `image` and `behind` to the surfaces' parameters, adding to their gradients.
 
         Its samples differ from the samples of `image`: where an image is no linear function of the radiance, the
         product of two noisy factors would be biased.
@@ -225,7 +225,7 @@ class SurfaceView:
         with traced(self.integrator, self.splats, self.srgb):
             self.integrator.render_backward(self.scene, params, grad, self.sensor, **self._samples(seed))
         if self.behind is not None and dr.grad_enabled(values := _environment(self.scene, self.sensor)):
-            # `values` may be a parameter itself, whose gradient is added to.
+            # `values` may be a parameter itself: its gradient is added to.
             dr.backward(dr.sum(dr.dot(values, dr.grad(self.behind))))
 
     def _differentiates(self) -> bool:
