@@ -14,7 +14,7 @@ __all__ = ["CodecConfig"]
 class CodecConfig:
     """Settings of the encoder; a decoder needs none of them.
 
-    A step is twice the tolerated error, so that rounding stays within it. In a later frame, a group of numbers in which
+    A step is twice the tolerated error: rounding stays within it. In a later frame, a group of numbers in which
     no change reaches a step stays unchanged, as such changes are mostly jitter of the fit. The threshold of the base
     colour is half a step.
 

@@ -5,7 +5,7 @@
     payload = table length uint32, table (JSON: name, dtype and shape of each array), the arrays' bytes
 
 All numbers are little-endian. The CRC-32 covers the packet's first 16 bytes and its payload. Packet 0 is
-the header, whose payload is JSON alone: cameras, frame rate and free metadata. A stream that was closed ends with an
+the header, with a payload of JSON alone: cameras, frame rate and free metadata. A stream that was closed ends with an
 index: (kind uint32, frame uint32, offset uint64) of each packet except the header, then its own offset uint64 and a
 magic [8]. `codec.packets` defines the arrays; docs/stream-format.md specifies everything.
 """
@@ -188,7 +188,7 @@ class StreamWriter:
 
     @classmethod
     def continued(cls, path: str | Path, index: Sequence[tuple[int, int, int]], end: int) -> StreamWriter:
-        """Return the writer of a file whose writing was interrupted; the file is truncated at byte `end`.
+        """Return the writer of an interrupted stream; the file is truncated at byte `end`.
 
         Args:
             path: the file.

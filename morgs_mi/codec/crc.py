@@ -1,8 +1,8 @@
 """CRC-32 of many ranges of bytes that may overlap, in one pass over the bytes.
 
-A CRC is a polynomial over GF(2) modulo that of the code, its highest bit being the coefficient of x^0. Each byte that
-follows multiplies it by x^8, so the CRC of a range results from those of the bytes up to its two ends (as in zlib's
-`crc32_combine`).
+A CRC is a polynomial over GF(2) modulo the polynomial of the code; its highest bit is the coefficient of x^0. Each
+byte that follows multiplies it by x^8. The CRC of a range therefore results from the CRCs of the bytes up to its two
+ends (as in zlib's `crc32_combine`).
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ _X8 = np.uint32(1 << 31 - 8)
 def range_crcs(data: bytes, starts: np.ndarray, stops: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return `zlib.crc32(data[start:stop], value)` of each range, uint32 [K].
 
-    The time is that of one CRC of the data, plus K log(length).
+    It takes the time of one CRC of the data, plus K log(length).
 
     Args:
         data: the bytes.
         starts: int64 [K].
         stops: int64 [K], not before the starts.
-        values: uint32 [K], CRCs of what precedes each range.
+        values: uint32 [K], CRCs of the bytes that precede each range.
     """
     ends, where = np.unique(np.concatenate([starts, stops]), return_inverse=True)
     prefixes, crc, at = np.empty(len(ends), np.uint32), 0, 0

@@ -56,7 +56,7 @@ __all__ = [
     "seek",
 ]
 
-# An entropy code stores a column of one value in almost no bytes. So that a small packet cannot request much memory, it
+# An entropy code stores a column of one value in almost no bytes. A small packet must not request much memory: it
 # has a word for each 16 Gaussians that it adds, or for each 16 of their integers if the state has more than 2^22. The
 # integers of a fit take about four bits each, twice as much.
 _PER_WORD = 16

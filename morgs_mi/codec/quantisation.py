@@ -14,7 +14,7 @@ The columns of `values` [N, C] form groups, one per stored row of the attribute 
     any other row            optional attributes, e.g. logit_confidence with 1 column; a bit mask determines which exist
 
 `exponents` [N, E] has one e per axis of log_scales and one for every other group. A decoder computes everything element
-by element in float64, with operations whose rounding IEEE 754 determines: no machine, library or number of threads can
+by element in float64. IEEE 754 determines the rounding of the operations: no machine, library or number of threads can
 change a bit.
 """
 
@@ -114,7 +114,7 @@ class Grid:
         )
 
     def concatenate(self, other: Grid) -> Grid:
-        """Return these Gaussians followed by those of `other`, which has the same columns."""
+        """Return these Gaussians followed by `other`, which has the same columns."""
         both = {
             n: np.concatenate([getattr(self, n), getattr(other, n)])
             for n in ("values", "exponents", "largest_components")
@@ -273,14 +273,14 @@ def real_values(raw: Mapping[str, np.ndarray], grid: Grid) -> np.ndarray:
 
 
 def _exponents(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config: CodecConfig) -> np.ndarray:
-    """Return quarter octaves int8 [N, E]: steps whose half is the error that `config` tolerates."""
+    """Return quarter octaves int8 [N, E] of steps, which are twice the error that `config` tolerates."""
     precision = config.quality * config.birth_precision
     error, color = (2 * _tolerated(name) / precision for name in ("means", "sh_dc"))
     pixel, N = _world_per_pixel(raw["means"], cameras), len(raw["means"])
     sizes = np.maximum(np.exp(np.minimum(raw["log_scales"], 80.0)) / pixel[:, None], _MIN_SIZE_PX)  # px
     elongation = np.maximum(np.sqrt(sizes.max(1) ** 2 - sizes.min(1) ** 2), _MIN_SIZE_PX)  # a ball tolerates any turn
     one = np.ones(N)
-    # (what every Gaussian tolerates, what this one does in these units) for each exponent of a group.
+    # (tolerance of every Gaussian, tolerance of this one in these units) for each exponent of a group.
     steps = {
         "means": [(error, pixel)],
         "log_scales": [(error, 1 / size) for size in sizes.T],
@@ -308,9 +308,9 @@ def _exponents(raw: Mapping[str, np.ndarray], cameras: Sequence[Camera], config:
 
 
 def _generic_step(name: str, config: CodecConfig) -> float:
-    """Return the step whose half changes the activated value by the tolerated error where it is most sensitive.
+    """Return the step. Half of it changes the activated value by the tolerated error where it is most sensitive.
 
-    Where the slope of the activation has no bound, the error is that of the optimised value.
+    Where the slope of the activation has no bound, the error applies to the optimised value.
     """
     precision = config.quality * config.birth_precision
     return 2 * _tolerated(name) / precision / (_STORED[name].activation.largest_slope or 1.0)

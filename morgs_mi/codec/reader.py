@@ -175,7 +175,7 @@ class StreamReader:
                 number += 1
 
     def _checked(self, number: int, at: int) -> Iterator[tuple[int, bytes]]:
-        """Yield (offset, bytes) of every packet whose CRC is right, from packet `number` at byte `at` on.
+        """Yield (offset, bytes) of every packet with a correct CRC, from packet `number` at byte `at` on.
 
         There may be an index between packets, if a stream was closed and continued; it has no number.
         """

@@ -1,8 +1,8 @@
 """Recovery of the playable frames of a damaged stream: packets are found by their CRC, wherever they begin.
 
 Lengths, order and index are not trusted, so an intact packet is found whatever happened to the rest. A frame plays if
-it has an intact packet that is a keyframe or has a parent that plays. Of several packets of a frame, the one whose
-state is the parent of a residual plays, otherwise a residual before a keyframe.
+it has an intact packet that is a keyframe or has a parent that plays. Of several packets of a frame, the one
+with the state that a residual names as its parent plays, otherwise a residual before a keyframe.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def write_salvaged(stream: StreamReader, output: str | Path) -> tuple[list[int],
     """Write the playable packets of a damaged stream as a new stream, atomically.
 
     The packets are copied unchanged, by ascending frame. After a damaged range the new stream continues with a
-    keyframe, whose frame has no displacements. An undamaged stream is copied.
+    keyframe; its frame has no displacements. An undamaged stream is copied.
 
     Args:
         stream: the damaged stream; its header, with the cameras, must be intact.

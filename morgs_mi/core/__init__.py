@@ -1,1 +1,1 @@
-"""What all subpackages share: cameras, Gaussians, the attribute table, colour spaces, atomic files."""
+"""Foundations of all subpackages: cameras, Gaussians, the attribute table, colour spaces, atomic files."""

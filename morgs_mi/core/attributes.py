@@ -1,4 +1,4 @@
-"""The table of per-Gaussian attributes, from which all that depends on an attribute derives.
+"""The table of per-Gaussian attributes, from which all code that depends on an attribute derives.
 
 `Gaussians` (shapes, activations), learning rates, the residual (gates), the first frame, the stream (groups of
 integers) and the renderer (channels) read it. A new attribute is a row here and a field of `Gaussians` of that name.
@@ -63,7 +63,7 @@ class Attribute:
         required: whether every `Gaussians` has it.
         rate: field of `LearningRates`, or a learning rate; None where it is not optimised.
         rate_in_extents: whether that rate counts in scene extents.
-        gate: which gate its residual passes with two gates: the confidence for ``motion``, none for ``appearance``;
+        gate: of its residual with two gates: the confidence for ``motion``, none for ``appearance``;
             None where it has no residual (eq. 12).
         first_frame: whether the first frame fits it.
         error: of the activated value that the stream tolerates with `quality` 1; on screen in px for means, scales and
@@ -101,7 +101,7 @@ _ERROR_PX = 0.04
 # Of 1: the error of an image of 8 bits.
 _ERROR_COLOR = 1 / 255
 
-# The order is that of the stream's columns.
+# The stream's columns have the same order.
 ATTRIBUTES: tuple[Attribute, ...] = (
     # The residual of the means is motion + offset, below.
     Attribute(

@@ -27,7 +27,7 @@ class Camera:
     """A pinhole camera in OpenCV's convention.
 
     Attributes:
-        K: intrinsics [3, 3] in pixels, copied; an off-centre principal point is honoured.
+        K: intrinsics [3, 3] in pixels, copied; the principal point may be off-centre.
         viewmat: extrinsics [4, 4], world -> camera: a NumPy array, which is copied, or a Dr.Jit tensor for
             gradients of the pose.
         width: image width in pixels.
@@ -36,7 +36,7 @@ class Camera:
         near: depth in world units below which Gaussians are not rendered.
         delay: frames by which its images are later than the instants of the recording, at the middle row. Gaussians
             with motion are rendered where they are then.
-        readout: frames from the exposure of the first row to that of the last; 0 for a global shutter.
+        readout: frames between the exposures of the first and the last row; 0 for a global shutter.
 
     Example:
         >>> camera = morgs_mi.Camera.look_at((0, -4, 1), (0, 0, 0), up=(0, 0, 1), fov_x=40, width=320, height=240)

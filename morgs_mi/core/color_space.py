@@ -1,4 +1,4 @@
-"""The sRGB transfer functions (IEC 61966-2-1) in NumPy: their one home.
+"""The sRGB transfer functions (IEC 61966-2-1) in NumPy.
 
 Colours that are splatted, optimised and compared are display-referred (encoded); linear light is at the boundaries: the
 film, EXR files, the path tracer and colour correction. In traced code Mitsuba's own functions are used.

@@ -1,4 +1,4 @@
-"""Where the pages of the documentation are, for help and messages."""
+"""Paths and addresses of the documentation's pages, for help and messages."""
 
 from __future__ import annotations
 
@@ -20,5 +20,5 @@ def page(name: str) -> str:
 
 
 def with_pages(text: str) -> str:
-    """Return a text in which every path of a page, such as docs/flow.md, is what `page` returns."""
+    """Return a text with the result of `page` in place of every path of a page, such as docs/flow.md."""
     return re.sub(r"\bdocs/([\w/-]+)\.md\b", lambda match: page(match[1]), text)

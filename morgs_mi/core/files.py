@@ -134,7 +134,7 @@ def write_error(start: str, error: Exception, own: Path) -> OSError:
     if (file := getattr(error, "filename", None)) and str(file) != str(own):
         reason += f": {file}"
     failure = OSError(f"{start}: {reason}; check that its folder is writable and the disk has room.")
-    failure.strerror = reason  # so that a folder's sentence does not contain that of a file in it
+    failure.strerror = reason  # otherwise a folder's sentence would contain the sentence of a file in it
     return failure
 
 
@@ -150,7 +150,7 @@ def _locked(file: int) -> bool:
 
 
 def _remove_own(file: Path, lock: int) -> None:
-    """Remove a lock file unless it was replaced by that of another writer."""
+    """Remove a lock file unless another writer has replaced it."""
     if is_same_file(file, os.fstat(lock)):
         _remove(file)
 

@@ -77,7 +77,7 @@ def tensor_rows(tensor: Tensor, index: UInt32) -> list[Float]:
 
     Args:
         tensor: D numbers in each of N rows.
-        index: UInt32 [M], none of them twice: every element is read once, so that the adjoint needs no atomics.
+        index: UInt32 [M], none of them twice: every element is read once, and the adjoint needs no atomics.
     """
     size, mode = int(dr.prod(tensor.shape[1:])), dr.ReduceMode.NoConflicts
     if size in (3, 4):  # four at a time are read as one packet
@@ -129,7 +129,7 @@ class Gaussians:
         >>> image = morgs_mi.rasterize(gaussians, camera).color
 
     Raises:
-        ValueError: a shape that does not agree with `means`, a K that is not 1, 4, 9 or 16, or something else than
+        ValueError: a shape that does not agree with `means`, a K that is not 1, 4, 9 or 16, or other values than
             numbers.
     """
 
@@ -302,7 +302,7 @@ def join_sh(sh_dc: Tensor, sh_rest: Tensor | None) -> Tensor:
     if sh_rest is None:
         return sh_dc
     N, K = int(sh_dc.shape[0]), int(sh_rest.shape[1]) + 1
-    # One gather per part: every element is read once, so that the adjoint needs no atomics.
+    # One gather per part: every element is read once, and the adjoint needs no atomics.
     lane = dr.arange(mi.UInt32, N * K * 3)
     row, column = lane // (3 * K), lane % (3 * K)
     is_dc, mode = column < 3, dr.ReduceMode.NoConflicts

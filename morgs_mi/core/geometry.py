@@ -49,8 +49,8 @@ def colors_seen_from(gaussians: Gaussians, eye: np.ndarray) -> np.ndarray:
 def rotated(gaussians: Gaussians, R: np.ndarray) -> Gaussians:
     """Return the Gaussians rotated by R [3, 3]: means, rotations, spherical harmonics, motion and offset.
 
-    A colour that was seen along d is then seen along R d. A rotation maps the harmonics of one degree to themselves, so
-    that the new coefficients follow exactly from enough directions to make the basis invertible.
+    A colour that was seen along d is then seen along R d. A rotation maps the harmonics of one degree to
+    themselves: the new coefficients follow exactly from enough directions to make the basis invertible.
     """
     R = np.asarray(R, np.float64)
     turn = Rotation.from_matrix(R)

@@ -2,7 +2,7 @@
 
 Dr.Jit compiles its CPU kernels with the LLVM that it finds when `drjit` is first imported. It refuses version 14 and
 older; 15 and 16 abort the whole process on recent CPUs (``LLVM ERROR: Cannot select: f32 = fminimum``); 17 and newer
-work. This module needs the standard library only, so that it can run during set-up before anything is installed:
+work. This module needs the standard library only: it can run during set-up before anything is installed.
 ``python -P morgs_mi/core/llvm.py`` prints the library in use, or a sentence with exit status 1.
 """
 
@@ -34,7 +34,7 @@ _TRIAL = "import drjit as dr; from drjit.llvm import Float; dr.eval(dr.minimum(d
 
 
 def llvm_major(path: Path) -> int | None:
-    """Return the major version in the file name, or in that of the link's target; None if there is none."""
+    """Return the major version in the name of a file or of a link's target; None if there is none."""
     for name in (path.name, path.resolve().name):
         if (match := _NAME.fullmatch(name)) and (major := match[1] or match[2]):
             return int(major)
@@ -112,7 +112,7 @@ def choose_llvm(wanted: str | None = None, folders: Iterable[Path] | None = None
 
 
 def has_cuda() -> bool:
-    """Return whether an NVIDIA driver can be loaded, so that the variants cuda_* may work without LLVM."""
+    """Return whether an NVIDIA driver can be loaded: the variants cuda_* may then work without LLVM."""
     try:
         ctypes.CDLL("libcuda.so.1")
     except OSError:

@@ -27,7 +27,7 @@ class Stream(IntEnum):
     TIMING = auto()
     """Fits of the estimate of time offsets."""
     BUDGET = auto()
-    """Steps whose time is measured."""
+    """Timed steps."""
     TRIALS = auto()
     """Trials of the first frame."""
     FIRST_FRAME = auto()
@@ -44,5 +44,5 @@ def rng_of(seed: int, stream: Stream, index: int = 0) -> np.random.Generator:
         stream: purpose of the numbers.
         index: of the frame or the fit, where a stream has several.
     """
-    # NumPy fills short keys with zeros, so that keys of unequal length may collide.
+    # NumPy fills short keys with zeros: keys of unequal length may collide.
     return np.random.default_rng([seed, stream, index])

@@ -149,7 +149,7 @@ def _in_words(kind: Any) -> str:
 
 
 def _expected(value: Any, kind: Any) -> str:
-    """Return what a value should be: a range alone where its type is right, such as "at least 1"."""
+    """Return the expected value in words: a range alone where the type is right, such as "at least 1"."""
     for arm in arms_of(kind):
         if get_origin(arm) is Annotated and _fits(value, get_args(arm)[0]):
             return _bounds(get_args(arm)[1:])

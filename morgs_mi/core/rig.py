@@ -39,7 +39,7 @@ def scene_extent(cameras: Sequence[Camera]) -> float:
 def focus_point(cameras: Sequence[Camera]) -> np.ndarray:
     """Return the point [3] that is nearest to all optical axes in the least-squares sense.
 
-    Along a direction that all axes share it is that of the mean camera position.
+    Along a direction that all axes share, it lies at the mean camera position.
     """
     middle = np.mean([camera.position for camera in cameras], axis=0)
     system, right = 1e-9 * np.eye(3), np.zeros(3)
@@ -81,7 +81,7 @@ def choose_key_views(cameras: Sequence[Camera], count: int) -> tuple[int, ...]:
 
 
 def mean_views(cameras: Sequence[Camera], points: np.ndarray) -> float:
-    """Return the mean number of views that see a surface of the scene, at least 1, as far as their frustums tell.
+    """Return the mean number of views that see a surface of the scene, by their frustums; at least 1.
 
     Args:
         cameras: at least one.
@@ -91,7 +91,7 @@ def mean_views(cameras: Sequence[Camera], points: np.ndarray) -> float:
 
 
 def overlaps(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
-    """Return the share of each camera's image that each camera sees, as far as their frustums tell [C, C].
+    """Return the share of each camera's image that each camera sees, by their frustums [C, C].
 
     Args:
         cameras: C views.
@@ -104,7 +104,7 @@ def overlaps(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:
 def scene_depths(cameras: Sequence[Camera], points: np.ndarray) -> list[float]:
     """Return the median depth of the points in each view, world units.
 
-    For a view without points it is that of the `focus_point`, or far away if that is not in front of the camera.
+    Without points in a view, it is the depth of the `focus_point`, or 1e6 scene extents if that is not in front.
     """
     far, depths = 1e6 * scene_extent(cameras), []
     for camera, focus in zip(cameras, focus_depths(cameras), strict=True):

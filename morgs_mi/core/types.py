@@ -1,7 +1,7 @@
 """Names for Dr.Jit's types.
 
-Which class stands behind a name depends on the Mitsuba variant that is set while the program runs, so there is nothing
-to check statically: the names state what an argument or a result is.
+The class of a name depends on the Mitsuba variant, which is set while the program runs. It cannot be checked
+statically: the names describe arguments and results.
 """
 
 from __future__ import annotations

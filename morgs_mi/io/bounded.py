@@ -1,4 +1,4 @@
-"""Readers whose memory is bounded by the size of the file, whatever its header claims.
+"""Readers with memory bounded by the size of the file, whatever its header claims.
 
 A file may make its reader use 10 times its size plus 200 MB. The allowance is for small files that decode to large
 data without being broken, such as an image of one colour. Only regular files are read: a pipe in a folder would keep
@@ -23,7 +23,7 @@ import numpy as np
 __all__ = ["MAX_TOML", "array_names", "check_claim", "read_array", "read_bytes", "read_json", "read_toml", "regular"]
 
 _FACTOR, _ALLOWANCE = 10, 200_000_000
-# What NumPy and zipfile raise for broken files. NumPy parses headers as Python.
+# Errors of NumPy and zipfile for broken files. NumPy parses headers as Python.
 _BROKEN = (
     *(ValueError, TypeError, EOFError, KeyError, MemoryError, RuntimeError, OverflowError, zipfile.BadZipFile),
     *(zlib.error, SyntaxError, tokenize.TokenError),
@@ -33,7 +33,7 @@ _DICT_BYTES, _LIST_BYTES, _VALUE_BYTES = 240, 64, 40
 # Size of a TOML file, bytes that its parser takes for a table, and parts of a key: memory and time grow with the square
 # of their number.
 MAX_TOML, _TABLE_BYTES, _MAX_PARTS = 1_000_000, 1000, 32
-# What is between the keys and values of a TOML file, and the end of a part of a key; ornaments of dots are not keys.
+# Separators of the keys and values of a TOML file, and the end of a part of a key; ornaments of dots are not keys.
 _BETWEEN, _PART = re.compile(rb"[=,\[\]{}#\n]"), re.compile(rb"[^.\s][ \t]*\.")
 
 
@@ -43,7 +43,7 @@ def check_claim(path: str | Path, claimed: int, content: str, beside: int = 0) -
     Args:
         path: the file.
         claimed: bytes that the decoded content takes.
-        content: what the file claims to hold, for the message, e.g. ``an image of 20000x20000 pixels``.
+        content: claimed content of the file, for the message, e.g. ``an image of 20000x20000 pixels``.
         beside: bytes of further files that it names.
 
     Raises:

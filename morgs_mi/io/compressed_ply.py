@@ -87,7 +87,7 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
 def read_compressed_ply(path: str | Path) -> Gaussians:
     """Return the Gaussians in a compressed PLY file of any tool, SH of degree 0 to 3.
 
-    Opacities are at least 1e-6 and at most 1 - 1e-6, as those of `Gaussians.from_activated`.
+    Opacities are clipped to [1e-6, 1 - 1e-6], as in `Gaussians.from_activated`.
 
     Raises:
         FileNotFoundError: there is no such file.

@@ -130,7 +130,7 @@ class Skin:
 
     Attributes:
         joints: indices of nodes [J].
-        inverse_bind: from the space of the mesh to that of each joint, in the pose of the mesh [J, 4, 4].
+        inverse_bind: from the mesh's space to each joint's, in the pose of the mesh [J, 4, 4].
     """
 
     joints: np.ndarray
@@ -162,7 +162,7 @@ class Animation:
 
     Attributes:
         name: its own, or ``animation0`` etc.
-        channels: what it moves.
+        channels: keys of the properties that it moves.
     """
 
     name: str
@@ -365,7 +365,7 @@ class _Reader(GltfData):
 
     def animation(self, index: int, item: dict[str, Any], nodes: Sequence[Node]) -> Animation:
         name = str(item.get("name") or f"animation{index}")
-        # Channels without a node, and those of extensions, have no effect.
+        # Channels without a node, and channels of extensions, have no effect.
         own = [c for c in item["channels"] if c["target"]["path"] in _PATHS and "node" in c["target"]]
         if len({(c["target"]["node"], c["target"]["path"]) for c in own}) < len(own):
             raise self.refused(
@@ -395,7 +395,7 @@ class _Reader(GltfData):
         return Channel(node, path, times, values, interpolation)
 
     def check_rotations(self, where: str, quaternions: np.ndarray) -> None:
-        """Raise `ValueError` if quaternions [..., 4] are zero, which no rotation is."""
+        """Raise `ValueError` if a quaternion of [..., 4] is zero, which is no rotation."""
         if not np.linalg.norm(quaternions, axis=-1).all():
             raise self.refused(f"{where}: expected quaternions of length 1 as rotations, got zeros; export it again")
 

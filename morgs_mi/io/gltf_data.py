@@ -40,7 +40,7 @@ class GltfData:
         self._beside = self._claimed = 0
 
     def refused(self, fault: str) -> ValueError:
-        """Return an error whose sentence names the file."""
+        """Return an error with a sentence that names the file."""
         return ValueError(f"{self.path}: {fault}.")
 
     def all(self, kind: str) -> list[dict[str, Any]]:
@@ -101,7 +101,7 @@ class GltfData:
         return self.checked(f"accessor {index}", values)
 
     def _unsigned(self, where: str, item: dict[str, Any]) -> np.dtype:
-        """Return the type of an item whose numbers are indices, which glTF stores without a sign."""
+        """Return the type of an item of indices, which glTF stores without a sign."""
         dtype = np.dtype(_TYPES[item["componentType"]])
         if dtype.kind != "u" or item.get("normalized"):
             raise self.refused(f"{where}: expected unsigned integers as indices, got {dtype.name}; export it again")

@@ -27,7 +27,7 @@ class OnnxNetwork:
 
     Args:
         path: the ONNX file.
-        instead: another way that error messages name, e.g. " or use its flow from files".
+        instead: alternative that error messages name, e.g. " or use its flow from files".
 
     Attributes:
         path: the ONNX file.
@@ -77,7 +77,7 @@ class OnnxNetwork:
             inputs: arrays by name.
 
         Raises:
-            ValueError: `onnxruntime` cannot run the network on them, or it returns something else than numbers.
+            ValueError: `onnxruntime` cannot run the network on them, or it returns other values than numbers.
         """
         try:
             results = self._session.run(None, dict(inputs))

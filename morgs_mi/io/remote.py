@@ -1,7 +1,7 @@
 """Captures at URLs, such as ``s3://bucket/capture``, read through fsspec.
 
-A capture is mirrored in a folder of ``~/.cache/morgs_mi/captures``. Calibrations are fetched when it is opened; videos
-and images are empty files there until they are read, so that a process fetches only what it decodes. The name of the
+A capture is mirrored in a folder of ``~/.cache/morgs_mi/captures``. Calibrations are fetched when it is opened. Videos
+and images are empty files there until they are read: a process fetches only the files that it decodes. The name of the
 folder depends on names, sizes and versions of the remote files (time, ETag or checksum): a capture that has changed is
 fetched again, and one without versions at every opening. Ground truth is not fetched.
 """
@@ -134,7 +134,7 @@ def _folder(url: str, files: Mapping[str, Mapping[str, Any]]) -> Path:
 
 
 def _versions(about: Mapping[str, Any]) -> list[str]:
-    """Return what changes with a file, by an entry of a listing; empty if it has none of `_VERSION`."""
+    """Return the values of `_VERSION` in an entry of a listing, which change with its file; empty without any."""
     return [f"{key} {about[key]}" for key in _VERSION if about.get(key)]
 
 

@@ -33,7 +33,7 @@ def suffix_of(path: str | Path) -> str | None:
 
 
 def read_splats(path: str | Path) -> Gaussians:
-    """Return the Gaussians in a file, whose name determines its format; a `.ply` may also be compressed.
+    """Return the Gaussians in a file. Its name determines its format; a `.ply` may also be compressed.
 
     Raises:
         FileNotFoundError: there is no such file.

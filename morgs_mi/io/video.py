@@ -2,7 +2,7 @@
 
 A frame is an RGB uint8 array [H, W, 3]. `VideoReader` and `FolderReader` have the same members.
 
-Many cameras, above all those of phones, record at a variable frame rate: they delay or leave out frames. The container
+Many cameras, above all in phones, record at a variable frame rate: they delay or leave out frames. The container
 stores the time of each frame, so the reader knows where on a regular clock the frames lie.
 """
 
@@ -39,7 +39,7 @@ IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 _WITHOUT_TIMES = (".avi",)
 # Deviation from a constant rate that does not count: the exposure's, in frames, and the rounding of Matroska's times.
 _JITTER, _ROUNDING_SECONDS = 0.1, 1e-3
-# Difference up to which the header's frame rate, which may be a mean over pauses, is that of the clip's clock.
+# Difference up to which the header's frame rate, which may be a mean over pauses, is the rate of the clip's clock.
 _SAME_RATE = 0.01
 # Bytes of an image file in which its size is searched, and of memory that a pixel takes, in BGR and RGB.
 _MAX_HEADER, _BYTES_PER_PIXEL = 1_000_000, 6
@@ -58,7 +58,7 @@ def natural_key(name: str) -> list[str | int]:
 
 
 def numbering_gap(names: Sequence[str]) -> int | None:
-    """Return the index of the first name whose last number does not continue the sequence, or None."""
+    """Return the index of the first name with a last number that does not continue the sequence, or None."""
     numbers = [int((re.findall(r"[0-9]+", name) or ["-1"])[-1]) for name in names]
     steps = np.diff(numbers)
     if len(names) < 2 or (min(numbers) >= 0 and steps.min() >= 1 and steps.min() == steps.max()):
@@ -95,7 +95,7 @@ class VideoReader:
 
     @classmethod
     def open(cls, path: str | Path) -> VideoReader:
-        """Return the reader of a video whose first frame can be decoded.
+        """Return the reader of a video; the first frame is decoded.
 
         Raises:
             FileNotFoundError: there is no such file.
@@ -136,8 +136,8 @@ class VideoReader:
         """Yield the frames of ascending `indices`, with an error in place of each that cannot be decoded.
 
         The frames between are decoded too. Those before the first are skipped if the time stamps of the frames that are
-        decoded instead prove which ones they are. Its pixels are those of decoding from the start, except in streams
-        that refresh their images gradually instead of with keyframes.
+        decoded instead prove which ones they are. The pixels are the same as after decoding from the start,
+        except in streams that refresh their images gradually instead of with keyframes.
         """
         stream, done = self._opened_before(indices[0]) if len(indices) else (self._opened(), 0)
         ok = True
@@ -230,8 +230,8 @@ class FolderReader:
     def opaque(self) -> tuple[np.ndarray | None, bool]:
         """Return the mask of the pixels that no alpha channel makes transparent, and whether it is constant.
 
-        The first, the middle and the last image are compared. The mask [H, W] is that of the first one, None if it has
-        no transparent pixels.
+        The first, the middle and the last image are compared. The mask [H, W] belongs to the first one; it is None
+        without transparent pixels.
         """
         chosen = {0, self.num_frames // 2, self.num_frames - 1}
         masks = [_opaque(self.files[i]) for i in sorted(chosen)]
@@ -283,8 +283,7 @@ ImageOrError = np.ndarray | ValueError | FileNotFoundError
 def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
     """Return one reader per camera; with `gaps`, images may be missing or broken.
 
-    Folders are then aligned by the numbers of their images, so that a number that only other cameras have is a missing
-    image.
+    Folders are then aligned by the numbers of their images: a number that only other cameras have is a missing image.
 
     Raises:
         FileNotFoundError: a clip is missing, or one of its images.
@@ -348,7 +347,7 @@ def _frame_times(path: Path) -> np.ndarray:
     """Return the times of the frames in a video file in seconds, from the first, ascending.
 
     The packets are read but not decoded, 0.2 ms each at 1080x1920. They are in the order of decoding, which differs
-    from that of presentation where frames are predicted from later ones.
+    from the order of presentation where frames are predicted from later ones.
     """
     stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
     times = []
@@ -431,7 +430,7 @@ def _image_or_error(file: Path) -> ImageOrError:
 def _read_image(file: Path) -> np.ndarray:
     if not file.is_file():
         raise _no_image(file)
-    # The stored pixels, without EXIF's rotation: calibrations refer to those.
+    # The stored pixels, without EXIF's rotation: calibrations refer to them.
     image = _decoded(file, cv2.IMREAD_COLOR)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 

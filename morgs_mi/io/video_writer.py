@@ -17,7 +17,7 @@ __all__ = ["playable_format", "write_video"]
 
 @cache
 def playable_format() -> tuple[str, str]:
-    """Return the suffix and codec of videos that browsers and players open: VP9, or else H.264, in .mp4.
+    """Return the suffix and codec of videos that browsers and players open: VP9, otherwise H.264, in .mp4.
 
     OpenCV's wheels have VP9. Builds of OpenCV with neither encoder get lossless FFV1 in .mkv, which no browser plays.
     """
