@@ -1,8 +1,8 @@
 """Slow float64 reference implementations of the package's mathematics.
 
 They loop over all Gaussians and pixels, without blocks, early stop or rounding tricks. All of them are analytic in
-their floating-point inputs apart from the documented cut-offs, which depend on real parts only, so that
-`complex_step` returns derivatives that are exact to rounding.
+their floating-point inputs apart from the documented cut-offs, which depend on real parts only. So `complex_step`
+returns derivatives that are exact to rounding.
 """
 
 from __future__ import annotations

@@ -60,7 +60,7 @@ def compiles(example: str) -> bool:
 
 
 def offenders(pages: dict[str, str], wrong: Callable[[str, str], list]) -> dict[str, list]:
-    """Return what is wrong with each page; pages without mistakes are left out."""
+    """Return the mistakes of each page; pages without mistakes are left out."""
     return {page: found for page, text in pages.items() if (found := wrong(page, text))}
 
 

@@ -154,7 +154,7 @@ def test_gaussian_splat__agrees_between_cuda_and_llvm_among_surfaces():
 
 
 def test_stream_loop__fits_two_frames_alike_on_cuda_and_llvm():
-    """Steps amplify the rounding of sums, so that what is compared is the quality of the fits."""
+    """Steps amplify the rounding of sums, so the quality of the fits is compared."""
     config = StreamConfig(
         fit=FitConfig(
             sh_degree=0,

@@ -48,7 +48,7 @@ stream = lambda: morgs_mi.open_stream(out)
 
 
 def shown(cell) -> dict[str, str]:
-    """Return what a cell shows by MIME type, of several elements the last one."""
+    """Return the output of a cell by MIME type, of several elements the last one."""
     return {kind: data for output in cell.outputs for kind, data in output.get("data", {}).items()}
 
 

@@ -1,4 +1,4 @@
-"""The README is true: its examples run, its figures are those of the committed result, its commands exist."""
+"""The README is true: its examples run, its figures agree with the committed result, its commands exist."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ TRIALS = dataclasses.replace(QUICK.fit, first_frame_steps=20, dropping=None)
 def scene(frame: float) -> tuple[Gaussians, np.ndarray]:
     """A textured ball that moves by SHIFT in front of a static textured wall; and the mask of the moving Gaussians.
 
-    The wall is thick, so that its Gaussians lie in the same order in every view.
+    The wall is thick: its Gaussians lie in the same order in every view.
     """
     rng = np.random.default_rng(0)
     wall = rng.uniform((-2.4, -2.0, 0.6), (2.4, 2.0, 2.0), (500, 3))
@@ -532,7 +532,7 @@ def brighter(images, gains):
 
 @pytest.fixture(scope="module")
 def auto_exposed(clip):
-    """A static clip whose cameras differ, and change by up to 10 % in each frame; reports of a fit with exposures."""
+    """A static clip of cameras that differ, and change by up to 10 % in each frame; reports of a fit with exposures."""
     gains = [(0.9, 1.0, 0.95, 0.85), (0.9, 1.1, 0.95, 0.75), (1.0, 0.9, 0.9, 0.85)]
     frames = [brighter(clip[0][:4], each) for each in gains]
     loop = new_loop(EXPOSED)

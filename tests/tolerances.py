@@ -11,8 +11,8 @@ GRADIENT_REL = 2e-4
 ALPHA_PER_PIXEL = 3 * 1.1
 ALPHA_SLOPE_PER_PIXEL = 3 * 3.3
 # Sums over randomly weighted pixels may cancel. Of 2,000 seeds 90 % stay below 7e-6 and one exceeds this bound, 1090:
-# a confidence whose terms add up to 23 in absolute value and to -0.006 with their signs, off by 1.4e-5. The next are
-# tilts of needles thousands of px long whose centres are far from the pixels: u = a dx + b dy cancels.
+# the terms of a confidence add up to 23 in absolute value and to -0.006 with their signs, off by 1.4e-5. The next are
+# tilts of needles thousands of px long with centres far from the pixels: u = a dx + b dy cancels.
 FUZZ_GRADIENT_REL = 2e-3
 # Forward and reverse mode take different roundings of the same sums.
 DUALITY_REL = 2e-4

@@ -28,7 +28,7 @@ class OnWorkers:
     workers: int | None = None
     """Number of processes on this machine for the fits, which share its cores; default: this process fits alone."""
     scheduler: str | None = None
-    """Dask scheduler whose workers do the fits, such as tcp://host:8786, or local."""
+    """Dask scheduler of the workers that do the fits, such as tcp://host:8786, or local."""
 
     @contextmanager
     def opened(self) -> Iterator[Workers | None]:

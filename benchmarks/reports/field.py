@@ -4,7 +4,7 @@
 
 Each clip is `morgs-mi synth random --seed SEED`, made in `--clips` if it is not there. Settings were chosen on seeds 0
 to 2. All methods continue from the same first frame of a clip. Image and motion scores are means over the later frames
-of the held-out view, those of tracks are over the whole clip, all against the exact ground truth.
+of the held-out view, scores of tracks are over the whole clip, all against the exact ground truth.
 """
 
 from __future__ import annotations

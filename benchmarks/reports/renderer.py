@@ -4,7 +4,7 @@
 
 One scene, one setting changed at a time. The *exact* image has no cut-offs and no early stop. The *rounding* error
 compares with a reference that has the same `alpha_min`: only float32 and the early stop remain. Errors are
-measured on a sample of pixels: the loss whose gradients are compared has random weights at these pixels and zero
+measured on a sample of pixels: the loss of the compared gradients has random weights at these pixels and zero
 weights elsewhere. So the renderer runs unchanged while the reference stays affordable.
 
 A row of the JSON has the changed option (`knob`), its `value`, the errors of the `image` (`max`, `rms`, `psnr` in dB)

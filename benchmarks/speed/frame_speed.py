@@ -3,8 +3,8 @@
     python -m benchmarks.speed.frame_speed --json out.json [--sizes small n3dv] [--frames 3]
 
 The scene consists of Gaussians: a wall, a floor and 40 balls, of which some move and turn. Its images are rendered from
-them, with camera noise. The loop starts from the scene at frame 0 with small errors in its colours, similar to those of
-a fit. `small` is 640x480, 12 views, 50,000 Gaussians; `n3dv` 1352x1014, 20 views, 200,000 Gaussians. One more view is
+them, with camera noise. The loop starts from the scene at frame 0 with small errors in its colours, similar to a fit's.
+`small` is 640x480, 12 views, 50,000 Gaussians; `n3dv` 1352x1014, 20 views, 200,000 Gaussians. One more view is
 held out. Each setting is run on the same images: the default at several numbers of epochs, without skipping static
 parts, and the paper's scheme.
 """
@@ -161,8 +161,8 @@ def config_of(size: Size, **fit: Any) -> StreamConfig:
 def measure(scene: Scene, config: StreamConfig, recorded: list[list[np.ndarray]], live: bool = True) -> dict[str, Any]:
     """Fit the later frames but the last; return seconds by stage, shares of what is processed, bytes, held-out PSNR.
 
-    Unless they arrive `live`, the next frame is observed while one is fitted, in another thread, whose stages are not
-    timed.
+    Unless they arrive `live`, the next frame is observed while one is fitted, in another thread. The stages of that
+    thread are not timed.
     """
     cameras = scene.cameras()
     loop = StreamLoop(cameras[1:], np.zeros((200, 3)), np.zeros((200, 3)), config)

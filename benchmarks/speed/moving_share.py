@@ -3,7 +3,7 @@
     python -m benchmarks.speed.moving_share --json moving_share.json --plot moving_share.png
 
 The scene is `frame_speed`'s at the size `small`, in which 0 to 40 balls move; in the last row the light flickers,
-so that every pixel changes. Each scene is also fitted with nothing left out. One view is held out.
+and every pixel changes. Each scene is also fitted with nothing left out. One view is held out.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
     python -m benchmarks.speed.render_speed --workload W1.npz --json out.json [--yardstick BIN] [--baselines]
 
 The whole step is: projection, lists, forward, L1 loss against a constant, adjoint, the projection's adjoint, and the
-gradients of all attributes in memory; the optimised step has Adam's step, too. All programs run in turn, so that
-background load affects them equally: compare ratios.
+gradients of all attributes in memory; the optimised step has Adam's step, too. All programs run in turn:
+background load affects them equally, so compare ratios.
 """
 
 from __future__ import annotations

@@ -206,7 +206,7 @@ def stages(workers: int, run: Run, costs: Costs, efficiency: float, views: float
         run: of one worker.
         costs: of the client and the recording.
         efficiency: of the later frames.
-        views: cameras of the recording over those of the clip.
+        views: cameras of the recording over cameras of the clip.
         options: the recording.
     """
     share = options.long_frames / workers

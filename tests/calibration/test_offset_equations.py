@@ -1,4 +1,4 @@
-"""Equations of time offsets, on a ball whose images are rendered at known ones."""
+"""Equations of time offsets, on a ball with images rendered at known ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Refinement of cameras: with splats of a known scene, and on textured planes whose images are exact."""
+"""Refinement of cameras: with splats of a known scene, and on textured planes with exact images."""
 
 from __future__ import annotations
 

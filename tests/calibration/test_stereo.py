@@ -1,4 +1,4 @@
-"""Dense points of textured planes, whose depth is known."""
+"""Dense points of textured planes at known depths."""
 
 from __future__ import annotations
 

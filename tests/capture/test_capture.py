@@ -264,7 +264,7 @@ def test_with_cameras__reads_as_if_the_calibration_had_the_lens(tmp_path: Path) 
 
 
 def square(camera: Camera) -> Camera:
-    """Return a camera whose focal lengths are equal, as those of the lens models with one are."""
+    """Return a camera with equal focal lengths, as in the lens models with one focal length."""
     K = camera.K.copy()
     K[1, 1] = K[0, 0]
     return replace(camera, K=K)
@@ -355,7 +355,7 @@ def test_load_capture__does_not_clip_the_colours_of_a_point_cloud(tmp_path: Path
 
 
 def transparent(t: int = 0, kind: type = np.uint8) -> np.ndarray:
-    """Return an image [H, W, 4] whose left 10 columns and column 20 + t are transparent."""
+    """Return an image [H, W, 4]; its left 10 columns and column 20 + t are transparent."""
     image = np.full((HEIGHT, WIDTH, 4), np.iinfo(kind).max, kind)
     image[:, :10, 3] = 0
     image[:, 20 + t, 3] = np.iinfo(kind).max // 2
@@ -363,7 +363,7 @@ def transparent(t: int = 0, kind: type = np.uint8) -> np.ndarray:
 
 
 def with_images(path: Path, images: list[np.ndarray], **kwargs) -> Path:
-    """Write a capture of one camera whose images have any channels and type."""
+    """Write a capture of one camera with images of any channels and type."""
     write_colmap(path / "sparse", [make_camera(0, "cam01")], **kwargs)
     (path / "cam01").mkdir()
     for t, image in enumerate(images):

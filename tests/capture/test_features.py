@@ -77,7 +77,7 @@ def test_triangulate__finds_points_on_the_planes(textured_capture: Capture, text
     distance = textured.distance_to_planes(points)
     assert np.percentile(distance, 90) < 0.05
     assert np.percentile(distance, 98) < 0.3
-    # Their colours are those of the pixels onto which they project.
+    # Their colours are the colours of the pixels onto which they project.
     camera, image = textured_capture.cameras[2], next(textured_capture.frames()).images[2]
     pixels, depths = camera.project(points)
     u, v = pixels.astype(int).T

@@ -96,7 +96,7 @@ def test_undistortion__masks_the_empty_corners_of_a_pincushion() -> None:
 
 @pytest.mark.parametrize(("model", "fold"), [("SIMPLE_RADIAL", (3 * 0.5) ** -0.5), ("OPENCV_FISHEYE", None)])
 def test_undistortion__mask_ends_where_the_polynomial_folds(model: str, fold: float | None) -> None:
-    """R (1 - 0.5 r^2) decreases beyond r = 0.816; theta (1 - 0.5 theta^2) beyond that angle, whose tangent is 1.066."""
+    """R (1 - 0.5 r^2) decreases beyond r = 0.816; theta (1 - 0.5 theta^2) beyond that angle, of tangent 1.066."""
     radius = fold or np.tan((3 * 0.5) ** -0.5)
     cam = camera(focal=60.0)
     found = undistortion(cam, Lens(model, (-0.5,)))

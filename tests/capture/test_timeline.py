@@ -59,7 +59,7 @@ def test_timeline__aligns_clips(tmp_path: Path, clips, config, fps, instants) ->
 
 
 def brightening(path: Path, fps: dict[str, float]) -> Path:
-    """Write a capture whose clips have frames t of the colour 40 t."""
+    """Write a capture of clips with frames t of the colour 40 t."""
     layouts.n3dv(path, tuple(fps), lambda *_: None)
     for name, rate in fps.items():
         images = [np.full((layouts.HEIGHT, layouts.WIDTH, 3), 40 * t, np.uint8) for t in range(5)]
@@ -197,7 +197,7 @@ def timed(path: Path, **times: list[int]) -> Path:
         # Frame 1 of b is simultaneous with frame 0 of a; then frame 3 of b.
         ({"a": REGULAR, "b": LATE}, ReadConfig(offset={"b": 1}), [[0, 1], [1, 2], [2, 2], [3, 3], [4, 3], [5, 4]]),
         ({"a": REGULAR[:2], "b": LATE}, ReadConfig(offset={"b": 3}), [[0, 3], [1, 4]]),
-        # a has twice the rate: the instants are those of b.
+        # a has twice the rate: the instants are b's.
         (
             {"a": [25 * t for t in range(9)], "b": LATE},
             ReadConfig(trim=True),

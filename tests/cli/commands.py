@@ -1,4 +1,4 @@
-"""What tests of the commands share: the smallest fit, an interruption, and how a command refuses."""
+"""Helpers of the tests of commands: the smallest fit, an interruption, and the refusal of a command."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
 ROOT = Path(__file__).parents[2]
-# Appended to a command, so that it takes seconds.
+# Appended to a command, which then takes seconds.
 SMALLER = {
     "synth": "--cameras 7 --frames 3 --width 160 --height 120 --spp 4",
     "fit": "--num-gaussians 1500 --first-frame-steps 60 --epochs 1",

@@ -94,7 +94,7 @@ def with_forged_header(clip: Clip, rng: np.random.Generator) -> Forgery:
 
 
 def forged_streams(clip: Clip) -> tuple[bytes, bytes]:
-    """Return the stream with another keyframe of frame 3, and with an index whose second entry is no keyframe.
+    """Return the stream with another keyframe of frame 3, and with an index that has no keyframe as its second entry.
 
     Both play from the start as the clip does.
     """

@@ -99,7 +99,7 @@ def check_intact_frames(clip: Clip, data: bytes, path: Path) -> None:
 
 
 def playable(clip: Clip, intact: list[bool]) -> list[int]:
-    """Return the playable frames: those whose packets are intact back to a keyframe."""
+    """Return the playable frames; their packets are intact back to a keyframe."""
     frames: list[int] = []
     for piece, ok in zip(clip.pieces, intact, strict=True):
         known = bool(frames) and piece.frame in (frames[-1], frames[-1] + 1)

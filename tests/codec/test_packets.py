@@ -59,7 +59,7 @@ def test_residual_packet__stores_offsets_of_moving_gaussians_and_changes_nothing
     found = decode(state, residual_packet(state, after, None, CAMERAS, CodecConfig(offset=True))).gaussians.numpy()
     moved = found["motion"].any(1)
     assert 0.2 < moved.mean() < 0.6
-    # The step of a moved mean is four times that of its birth.
+    # The step of a moved mean is four times the step of its birth.
     error = np.abs(found["offset"] - after.numpy()["offset"])[moved] / (4 * state.grid.steps("means")[moved])
     assert 0.45 < error.max() <= 0.5 + 1e-4
     assert not found["offset"][~moved].any()

@@ -108,7 +108,7 @@ def test_atomic_path__restores_the_old_folder_after_a_failed_swap(
 
 
 def test_atomic_folder__removes_partial_output_of_killed_processes(tmp_path: Path) -> None:
-    """Partial output that may still be written stays: that of another name, and that of a running process."""
+    """Partial output of another name, or of a running process, may still be written and stays."""
     gone = subprocess.Popen(["true"])
     gone.wait()
     for number in (os.getpid(), gone.pid):

@@ -1,4 +1,4 @@
-"""Evaluation of streams whose recording was rendered from the same Gaussians."""
+"""Evaluation of streams of recordings that were rendered from the same Gaussians."""
 
 from __future__ import annotations
 
@@ -198,7 +198,7 @@ def test_evaluate_stream__reports_lpips_if_a_network_is_given(fitted_clip: Path,
     write_stream(tmp_path / "s.morgs", {"test_view": 0}, shift=1)
     network = squared_difference(tmp_path / "net.onnx", HEIGHT, WIDTH)
     result = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture", lpips=Lpips(network))
-    # The network's distance is the squared error on a scale twice as wide; the mean over frames is that of errors.
+    # The network's distance is the squared error on a scale twice as wide; the mean over frames is a mean of errors.
     errors = [4 * 10 ** (-row.scores.psnr_moving / 10) for row in result.frames]
     assert result.scores.lpips_moving == pytest.approx(np.mean(errors), rel=1e-5)
     single = squared_difference(tmp_path / "single.onnx", HEIGHT, WIDTH, spatial=False)

@@ -27,7 +27,7 @@ EXACT_ABS = 2e-5
 
 
 def write(path: Path, states: list[Gaussians], sources: list[list[int] | None] | None = None) -> StreamReader:
-    """Write a stream of these Gaussians; a source maps a frame's Gaussians to those of the frame before."""
+    """Write a stream of these Gaussians; a source maps a frame's Gaussians to the previous frame's."""
     packet = keyframe_packet(states[0], 0, [CAMERA], EXACT)
     with StreamWriter(path, [CAMERA], 25) as writer:
         writer.write(packet)

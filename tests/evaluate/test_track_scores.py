@@ -1,4 +1,4 @@
-"""Scores of point tracks on cases whose answers are computed by hand."""
+"""Scores of point tracks on cases with answers computed by hand."""
 
 from __future__ import annotations
 

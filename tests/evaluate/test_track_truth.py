@@ -18,7 +18,7 @@ from tests.scenes.captures import HEIGHT, WIDTH, rig
 
 
 def test_tapvid3d_tracks__finds_files_in_the_capture_and_beside_it(tmp_path: Path) -> None:
-    """The file of a camera that the rig does not have, and those of other captures, are ignored."""
+    """The file of a camera that the rig does not have, and files of other captures, are ignored."""
     path = annotated(tmp_path / "juggle", ("1", "10"))
     (path / "juggle_10.npz").rename(tmp_path / "juggle_10.npz")
     (tmp_path / "juggle_7.npz").write_bytes(b"")
@@ -62,7 +62,7 @@ def test_read_annotation__names_what_is_wrong(tmp_path: Path) -> None:
 
 
 def test_pixel__is_depth_over_focal_length_at_256_pixels() -> None:
-    """At half the resolution, an image whose shorter side has 46 pixels, f is 256 / 46 times as long."""
+    """At half the resolution, the shorter side of an image has 46 pixels: f is 256 / 46 times as long."""
     camera = rig(("a",))[0]
     points = camera.unproject(np.array([[(3.0, 4.0), (50, 20)]]), np.array([[2.0, 5.0]]))
     for view in (camera, camera.resized(2 * WIDTH, 2 * HEIGHT)):

@@ -79,7 +79,7 @@ def test_evaluate_tracks__scales_thresholds_by_the_length_of_a_unit(tmp_path: Pa
 
 
 def test_evaluate_stream__reports_point_tracks_of_a_synthetic_capture(fitted_clip: Path, tmp_path: Path) -> None:
-    """The clip stores no visibility, so that there is no occlusion accuracy."""
+    """The clip stores no visibility: there is no occlusion accuracy."""
     result = evaluate_stream(fitted_clip)
     assert [row.protocol for row in result.tracking] == PROTOCOLS
     for row in result.tracking:

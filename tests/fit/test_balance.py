@@ -1,4 +1,4 @@
-"""Balance of cameras whose exposures differ, against those that were applied to the images."""
+"""Balance of cameras with different exposures, against the exposures applied to the images."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.scenes.gaussians import isotropic
 
 RENDER = RenderConfig()
 CAMERAS = look_at_cameras(QUAD, 50, 96, 72)
-# Factors on the light, whose mean logarithm is 0, as that of the result.
+# Factors on the light; their mean logarithm is 0, as in the result.
 GAINS = np.exp([0.24, -0.24, 0.12, -0.12])
 TONES = np.array([0.3, 0.5, 0.7])[:, None]
 FIT = FitConfig(exposure="auto", short_fits=ShortFitConfig(gaussians=400, steps=100, rounds=6))

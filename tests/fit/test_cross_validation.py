@@ -1,4 +1,4 @@
-"""Cross-validation of the first frame: what it withholds, chooses and says."""
+"""Cross-validation of the first frame: its blocks, choice and report."""
 
 from __future__ import annotations
 

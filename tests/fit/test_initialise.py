@@ -59,7 +59,7 @@ def test_initial_points__are_given_ones_with_random_ones_where_these_are_few(kno
 
 
 def moved(camera: Camera, shift: np.ndarray) -> Camera:
-    """Return the camera in a world whose origin lies elsewhere."""
+    """Return the camera in a world with another origin."""
     viewmat = np.array(camera.viewmat, float)
     viewmat[:3, 3] -= viewmat[:3, :3] @ shift
     return replace(camera, viewmat=viewmat)

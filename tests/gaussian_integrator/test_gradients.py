@@ -66,7 +66,7 @@ def test_gaussian_splat__forward_agrees_with_the_reference(raw, weight, gradient
     params, rng = mi.traverse(scene), np.random.default_rng(2)
     slope = 0.0
     for name, gradient in gradients.items():
-        # The direction is the sign of the gradient, so that no cancellation hides an error.
+        # The direction is the sign of the gradient: no cancellation hides an error.
         direction = np.float32(np.sign(gradient) * rng.uniform(0.5, 1, gradient.shape))
         dr.enable_grad(params[name])
         dr.set_grad(params[name], mi.Float(direction))
@@ -97,7 +97,7 @@ def test_gaussian_splat__backward_agrees_with_central_differences(raw):
 
 
 def test_gaussian_splat__gradient_of_the_sensors_pose(raw):
-    """The camera moves to its left by t: to_world = M T(t), so that viewmat moves points to the right."""
+    """The camera moves to its left by t: to_world = M T(t), and viewmat moves points to the right."""
     scene = make_mitsuba_scene(to_gaussians(raw))
     params = mi.traverse(scene)
     t = mi.Float(0)

@@ -1,4 +1,4 @@
-"""Files whose headers claim more than they hold are refused before memory is allocated."""
+"""Files with headers that claim too much are refused before memory is allocated."""
 
 from __future__ import annotations
 

@@ -135,7 +135,7 @@ class Server(ThreadingHTTPServer):
     Attributes:
         versions: header fields of every file that has its time, e.g. ``ETag``.
         instead: body that is sent once in place of a file, by the end of its path; None: it is never finished.
-        fetched: paths whose body was requested.
+        fetched: paths of the requested bodies.
     """
 
     def __init__(self, folder: Path) -> None:

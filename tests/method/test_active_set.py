@@ -123,7 +123,7 @@ def test_find_active_set__draws_what_hardly_changed_in_some_views_only(before, a
 
 
 def test_find_active_set__keeps_what_moved_for_one_more_frame(before):
-    """So that its confidence can fall."""
+    """Its confidence can fall in that frame."""
     logits = np.where(np.arange(len(before)) == 7, 2.0, -2.0)
     nothing = {view: np.zeros((96, 128), bool) for view in range(V)}
     moved = replace(before, logit_confidence=logits)

@@ -47,7 +47,7 @@ def test_share_confidence__fills_gaps_in_an_object_that_is_separate_in_color():
 
 
 def test_share_confidence__rejects_evidence_on_a_part_of_a_static_surface():
-    """A shadow on the wall: its Gaussians are those of the patch, some of them dark."""
+    """A shadow on the wall: its Gaussians are the patch's, some of them dark."""
     found = shared(wall_and_object(0.0, GREY, brightness=0.6), moving(0.7))
     assert (found < 0).mean() > 0.98
 

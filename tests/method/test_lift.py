@@ -24,7 +24,7 @@ def rig(count=4):
 
 
 def cloud(n=200, seed=0):
-    """A sheet through the origin, so that the flow of one plane is the flow of all."""
+    """A sheet through the origin: the flow of one plane is the flow of all."""
     rng = np.random.default_rng(seed)
     means = rng.uniform((-0.5, -0.5, -0.03), (0.5, 0.5, 0.03), (n, 3))
     return isotropic(means, 0.06, 0.8)

@@ -64,7 +64,7 @@ def test_propagate_motion__continues_motion_without_flow(scene):
 
 
 def test_propagate_motion__ends_motion_that_has_stopped(scene):
-    """The images are those of `before`: nothing moves any more."""
+    """The images show `before`: nothing moves any more."""
     before, moves, views, _ = scene
     targets = {v: Target(np.asarray(view.render(before).color)) for v, view in views.items()}
     gone_on = start((before, moves, views, targets), still(460), SHIFT * moves[:, None])

@@ -38,7 +38,7 @@ def test_apply_residual__zero_changes_nothing(degree, config):
 @pytest.mark.parametrize("two_gates", [False, True])
 @pytest.mark.parametrize("degree", [0, 2])
 def test_apply_residual__gate_scales_every_attribute(degree, two_gates):
-    """A_t = A_{t-1} + m R_t (eq. 12); with two gates, that of the appearance is 1."""
+    """A_t = A_{t-1} + m R_t (eq. 12); with two gates, the appearance's gate is 1."""
     config, previous = MotionConfig(two_gates=two_gates), to_gaussians(make_scene(degree))
     parameters = random_parameters(previous, config)
     m = 1 / (1 + np.exp(-np.asarray(parameters["logit_confidence"], np.float64)))

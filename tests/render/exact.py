@@ -21,7 +21,7 @@ SIZES = {"color": 3, "motion": 2}
 ATTRIBUTES = ("means", "scales", "quats", "opacities", "sh_coeffs", "motion", "confidence")
 BACKGROUND = (0.2, 0.5, 0.9)
 AMBIGUOUS = 1e-3  # relative distance of an alpha to a cut-off
-# Practically no stop, so that gradients of opaque scenes can be compared with the reference, which has none.
+# Practically no stop: gradients of opaque scenes are compared with the reference, which has none.
 CONFIG = RenderConfig(stop_transmittance=1e-12)
 
 

@@ -100,7 +100,7 @@ def test_depth_limit__draws_nothing_where_the_gaussian_is_too_faint(scene):
 
 
 def test_depth_limit__inside_equals_the_list_cut_at_that_depth():
-    """Between two layers of small Gaussians, the image is that of the nearer layer."""
+    """Between two layers of small Gaussians, the image shows the nearer layer."""
     (camera,) = look_at_cameras([(0, 0, -4)], 45)
     rng = np.random.default_rng(3)
     means = np.stack([*rng.uniform(-1, 1, (2, 60)), np.repeat([-0.5, 0.5], 30)], axis=1)
@@ -139,7 +139,7 @@ def test_depth_limit__plane_through_a_gaussian_agrees_with_the_integral_along_th
     alpha = np.asarray(rasterize(gaussians, camera, ("alpha",)).alpha, np.float64)[rows, columns, 0]
     found = np.asarray(rasterize(gaussians, camera, ("alpha",), depth_limit=limit).alpha)[rows, columns, 0]
     assert 0.1 < fraction[alpha > 0.5].min() < 0.4 < fraction[alpha > 0.5].max() < 0.9
-    # The low-pass filter, the affine approximation over 3 degrees, and that of the distribution function.
+    # Low-pass filter, affine approximation over 3 degrees, and approximation of the distribution function.
     assert_close(found, 1 - (1 - alpha) ** fraction, atol=4e-3)
 
 

@@ -1,7 +1,7 @@
 """The renderer at the extremes: every case against the reference implementation, or finite within a stated bound.
 
-Gradients are compared by attribute, relative to the largest entry: those of scales, quaternions and opacities per
-relative change, as for an optimiser of logarithms.
+Gradients are compared by attribute, relative to the largest entry. Gradients of scales, quaternions and opacities are
+per relative change, as for an optimiser of logarithms.
 """
 
 from __future__ import annotations

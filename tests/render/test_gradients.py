@@ -93,7 +93,7 @@ def test_rasterize__backward_agrees_with_central_differences(scene):
     dr.backward(dr.sum(dr.square(rasterize(gaussians, camera, ("color",)).color), axis=None))
     rng = np.random.default_rng(4)
     for name in RAW[:5]:
-        # The direction is the sign of the gradient, so that no cancellation hides an error.
+        # The direction is the sign of the gradient: no cancellation hides an error.
         grad = np.asarray(dr.grad(getattr(gaussians, name)), np.float64)
         v = np.sign(grad) * rng.uniform(0.5, 1, grad.shape)
         h = 2e-3

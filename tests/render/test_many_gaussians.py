@@ -57,7 +57,7 @@ def test_rasterize__blends_many_equal_depths_in_the_order_of_the_input():
 
 @pytest.mark.long
 def test_rasterize__two_million_gaussians_mostly_out_of_view():
-    """All but 1,000 are out of view: the image is that of the 1,000, and their gradients are complete and finite."""
+    """All but 1,000 are out of view: the image shows the 1,000, and their gradients are complete and finite."""
     N, in_view = 2_000_000, 1_000
     rng = np.random.default_rng(0)
     values = {name: np.repeat(value, N // 1000, axis=0) for name, value in cloud(1000).items()}

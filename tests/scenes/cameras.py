@@ -50,14 +50,14 @@ def shift_principal_point(camera: Camera, x: float, y: float) -> Camera:
 
 
 def make_camera(width: int = 21, height: int = 18) -> Camera:
-    """Return a camera whose size no block divides, with an off-centre principal point and fx != fy."""
+    """Return a camera of a size that no block divides, with an off-centre principal point and fx != fy."""
     camera = Camera.look_at((0.3, -0.4, -3.0), (0, 0, 0), (0, -1, 0), 45.0, width, height)
     K = camera.K + np.array([[0, 0, 1.3], [0, 2.0, -0.7], [0, 0, 0]])
     return Camera(K, camera.viewmat, width, height)
 
 
 def make_wide_camera() -> Camera:
-    """Return a camera of several tiles, whose last blocks extend beyond the image on both sides."""
+    """Return a camera of several tiles; the last blocks extend beyond the image on both sides."""
     return Camera.look_at((0.3, -0.4, -3.0), (0, 0, 0), (0, -1, 0), 45.0, 101, 75)
 
 

@@ -47,7 +47,7 @@ def videos(path: Path, names: tuple[str, ...], suffix: str = ".mkv") -> None:
 
 
 def write_timed_video(path: Path, images: list[np.ndarray], times: list[int]) -> None:
-    """Write an .mp4 whose frames are shown at `times`, in ascending milliseconds from 0."""
+    """Write an .mp4 that shows its frames at `times`, in ascending milliseconds from 0."""
     write_video(path, images, 1000)
     data = path.read_bytes()
     # The box `stts` is a list of (number of frames, duration in units of the track); OpenCV's has one entry.
@@ -93,7 +93,7 @@ def meet_room(path: Path, clips: Callable = videos) -> Path:
 
 
 def colmap_text(folder: Path, cameras: list[Camera], model: str, params: list[list[float]], shared: bool) -> None:
-    """Write a model whose cameras have the parameters `params`; if `shared`, all have the first."""
+    """Write a model of cameras with the parameters `params`; if `shared`, all have the first."""
     folder.mkdir(parents=True)
     rows = [
         f"{i + 1} {model} {WIDTH} {HEIGHT} {' '.join(map(repr, p))}"
@@ -155,7 +155,7 @@ def dynamic3dgs(path: Path) -> Path:
 
 
 def anipose(path: Path, distortions: tuple[float, ...] = (0, 0, 0, 0, 0), clips: Callable = videos) -> Path:
-    """Write a calibration of Anipose, beside clips whose names contain those of the cameras."""
+    """Write a calibration of Anipose, beside clips with names that contain the cameras'."""
     path.mkdir(parents=True)
     names = ("camA", "camB", "camC")
     tables = []

@@ -1,4 +1,4 @@
-"""Random clouds whose attributes cover the range of the codec, and encoded clips of them."""
+"""Random clouds with attributes that cover the range of the codec, and encoded clips of them."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def eye(
     near: float = 0.01,
     viewmat: Any = None,
 ) -> Camera:
-    """Return a camera that sees the origin, whose size no block divides, with fx != fy and off-centre cx, cy."""
+    """Return a camera that sees the origin, of a size that no block divides, with fx != fy and off-centre cx, cy."""
     camera = Camera.look_at(origin, np.zeros(3), up, fov, width, height)
     K = camera.K + np.array([[0, 0, shift[0]], [0, 0.08 * camera.K[0, 0], shift[1]], [0, 0, 0]])
     viewmat = camera.viewmat if viewmat is None else viewmat
@@ -194,5 +194,5 @@ def random_case(seed: int) -> Case:
     between = rng.choice((depths + np.append(depths[1:], 2 * depths[-1])) / 2)
     near = max(0.01 * unit, rng.choice([0, 0, between]))
     camera = Camera(camera.K, viewmat, camera.width, camera.height, near=float(near))
-    # Needles whose end covers a pixel may have their centres 100 px away.
+    # The centre of a needle may be 100 px away from a pixel that its end covers.
     return Case(f"seed {seed}", values, camera, screen_bound(100)["image"], tol.FUZZ_GRADIENT_REL)

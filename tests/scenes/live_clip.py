@@ -40,7 +40,7 @@ CONFIG = StreamConfig(
 
 @cache
 def clips() -> list[list[np.ndarray]]:
-    """Return the clip of each camera: 16 frames that swing to and fro, so that they can be repeated."""
+    """Return the clip of each camera: 16 frames that swing to and fro and can be repeated."""
     forth = filmed.film(frames=9)
     return [[image for image in (*clip, *clip[-2:0:-1]) if image is not None] for clip in forth]
 

@@ -20,7 +20,7 @@ CAMERAS = [
     Camera.look_at((x, 0, -DISTANCE), (x, 0, 0), (0, -1, 0), 50, WIDTH, HEIGHT, f"cam{i}")
     for i, x in enumerate((0, 0.5))
 ]
-# As exact as float32, so that only the code under test contributes errors.
+# As exact as float32: only the code under test contributes errors.
 EXACT = CodecConfig(quality=1e5)
 # Pixels per frame of one step along x, in a plane that is parallel to both image planes.
 PIXELS = CAMERAS[0].K[0, 0] * STEP / DISTANCE

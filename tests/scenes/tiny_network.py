@@ -1,4 +1,4 @@
-"""Networks of a few operators whose flow is known, exported as ONNX files."""
+"""Networks of a few operators with known flow, exported as ONNX files."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-# Weights of red, green and blue per flow component. They all differ, so that any swap shows.
+# Weights of red, green and blue per flow component. They all differ: any swap shows.
 OF_IMAGE = np.array([[0.1, 0.2, 0.3], [0.02, 0.05, 0.01]], np.float32)
 OF_OTHER = np.array([[-0.3, 0.1, 0.2], [0.04, 0.03, -0.02]], np.float32)
 

@@ -120,7 +120,7 @@ def test_undistorted__is_the_inverse_of_the_lens(k: float) -> None:
 
 
 def test_synthesize__shows_a_camera_with_a_time_offset_at_its_own_time(tmp_path: Path) -> None:
-    """The motion of a camera's truth leads between its own times; tracks are at those of the reference."""
+    """The motion of a camera's truth leads between its own times; tracks are at the reference's times."""
     clip = synthesize("arm", tmp_path / "clip", replace(SIZE, disturbances=Disturbances(time_offset=2)))
     offset = load_disturbances(clip / "truth")["cam01"].time_offset
     assert abs(offset) > 0.2

@@ -32,7 +32,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 @pytest.fixture(scope="module")
 def bending(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The model from 3 cameras, 3 frames of 64x48 at 8 frames per second, so that it moves by several pixels."""
+    """The model from 3 cameras, 3 frames of 64x48 at 8 frames per second: it moves by several pixels."""
     folder = tmp_path_factory.mktemp("gltf")
     config = SynthConfig(cameras=3, frames=3, width=64, height=48, spp=4, fps=8, animation="bend")
     return synthesize(write_glb(folder / "model.glb"), folder / "clip", config)

@@ -76,7 +76,7 @@ def test_synthesize__rejects_a_non_empty_folder_and_replaces_a_capture_with_over
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(FileExistsError, match="not empty; choose another folder"):
         synthesize("spheres", tmp_path, TINY)
-    for content in (None, "{", '{"layout": "COLMAP"}'):  # the last is that of a fit; a recording may have one too
+    for content in (None, "{", '{"layout": "COLMAP"}'):  # the last belongs to a fit; a recording may have one too
         if content is not None:
             (tmp_path / "capture.json").write_text(content)
         with pytest.raises(FileExistsError, match="is not a synthetic capture"):

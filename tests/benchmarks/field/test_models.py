@@ -76,7 +76,7 @@ for _name, _config in SMALL.items():
 
 @pytest.mark.parametrize("name", SMALL)
 def test_fit_later_frame__finds_the_motion_that_gaussians_share(name):
-    """With as many steps, the motion of a rigid body is nearer to the truth than that of free Gaussians."""
+    """With as many steps, the motion of a rigid body is nearer to the truth than the motion of free Gaussians."""
     free, *shared = fit_shifted(PLAIN), *(fit_shifted(replace(PLAIN, model=f"small-{name}")) for _ in range(2))
     assert motion_error(shared[0]) < 0.7 * motion_error(free)
     assert psnr_of(shared[0]) > psnr_of(free)

@@ -1,4 +1,4 @@
-"""Pages of experiments: their tables, claims and figures are those of the committed results."""
+"""Pages of experiments: their tables, claims and figures agree with the committed results."""
 
 from __future__ import annotations
 

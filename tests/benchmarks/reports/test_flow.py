@@ -1,4 +1,4 @@
-"""Report on optical flow: errors compared with those of the flow."""
+"""Report on optical flow: errors compared with the flow's."""
 
 from __future__ import annotations
 

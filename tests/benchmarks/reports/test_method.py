@@ -1,4 +1,4 @@
-"""Report on the method: stored fits are reused, and every figure is that of the fits."""
+"""Report on the method: stored fits are reused, and every figure results from the fits."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def tiny(clip: Path, out: Path) -> Options:
 
 
 def made_up(source, first, config):
-    """Scores in place of those of a fit; more epochs and key views are better."""
+    """Return scores in place of a fit's; more epochs and key views are better."""
     score = 20.0 + config.fit.epochs + 0.1 * config.motion.key_views + 100 * config.fit.rates.means
     names = ("psnr", "psnr_moving", "psnr_still", "ssim", "motion_error_moving", "motion_error_still")
     names += ("true_motion_moving", "num_bytes", *(f"motion_3d_{name}" for name in method._MOTION_3D))

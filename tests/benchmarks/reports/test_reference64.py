@@ -1,4 +1,4 @@
-"""The sampled float64 reference compared with that of the tests, which loops over everything."""
+"""The sampled float64 reference compared with the tests' reference, which loops over everything."""
 
 from __future__ import annotations
 

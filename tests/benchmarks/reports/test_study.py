@@ -122,7 +122,7 @@ def test_study_options__of_workers_write_the_rows_of_one_process(report, clip: P
 
 
 def score(source: Source, config: StreamConfig) -> dict[str, float]:
-    """Return a score in place of that of a fit."""
+    """Return a score in place of a fit's."""
     CALLS.append(config.seed)
     return {"psnr": 30 + config.fit.epochs + config.seed / 3}
 

@@ -1,4 +1,4 @@
-"""What every benchmark writes beside its figures."""
+"""Metadata that every benchmark writes beside its figures."""
 
 from __future__ import annotations
 

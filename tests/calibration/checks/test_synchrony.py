@@ -29,7 +29,7 @@ def test_time_offsets__are_those_of_a_path_traced_clip(tmp_path: Path) -> None:
     capture = load_capture(tmp_path / "clip")
     true = np.array([camera.time_offset for camera in load_disturbances(tmp_path / "clip" / "truth").values()])
     found = time_offsets(capture.cameras, read_signals(capture, 20).thumbs)
-    # Near enough to tell whole frames.
+    # Near enough to distinguish whole frames.
     assert_close(found - found[0], true, atol=0.5)
 
 

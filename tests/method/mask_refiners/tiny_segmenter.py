@@ -18,7 +18,7 @@ MEAN, DEVIATION = np.array([0.485, 0.456, 0.406]), np.array([0.229, 0.224, 0.225
 
 
 def export_encoder(path: Path, open_size: bool = False) -> Path:
-    """Write an encoder whose features are the image itself, at a quarter, an eighth and a sixteenth of its side."""
+    """Write an encoder with the image itself as features, at a quarter, an eighth and a sixteenth of its side."""
     names = {"high_res_feats_0": 4, "high_res_feats_1": 8, "image_embed": 16}
     nodes = [
         helper.make_node("AveragePool", ["image"], [name], kernel_shape=[k, k], strides=[k, k])

@@ -18,7 +18,7 @@ from tests.scenes.changing_splats import rig, splats
 
 KHR = "KHR_gaussian_splatting"
 SIZES = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-# KHR_gaussian_splatting's table of attributes; all may be float, whose component type is 5126. All others are VEC3.
+# KHR_gaussian_splatting's table of attributes; all may be float, with the component type 5126. All others are VEC3.
 TYPES = {f"{KHR}:ROTATION": "VEC4", f"{KHR}:OPACITY": "SCALAR", "COLOR_0": "VEC4"}
 
 

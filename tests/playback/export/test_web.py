@@ -383,7 +383,7 @@ def test_page__draws_a_new_mode_when_its_values_arrive(browser, clip):
         for mode in ("motion", "confidence"):
             page.page.evaluate(f"player.selectMode('{mode}')")
             page.page.wait_for_timeout(300)
-            # The colours of frame 3 are displayed until those of frame 1 are sorted.
+            # The colours of frame 3 are displayed until the colours of frame 1 are sorted.
             assert psnr(page.image() / 255, colors / 255) > 40
             assert not page.page.locator("#legend").is_visible()
         page.page.evaluate("sortAll()")

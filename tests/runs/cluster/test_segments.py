@@ -61,7 +61,7 @@ def fit(capture: Capture, out: Path, workers: Workers, **options) -> SegmentedFi
 
 @pytest.fixture(scope="module")
 def whole(capture: Capture, workers: Workers, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A fit in three segments, undisturbed, with tasks of another length than those of the tests."""
+    """A fit in three segments, undisturbed, with tasks of another length than the tests'."""
     out = tmp_path_factory.mktemp("whole")
     fit(capture, out, workers)
     return out

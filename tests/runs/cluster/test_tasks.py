@@ -1,4 +1,4 @@
-"""Tasks: what a worker refuses, and what it keeps."""
+"""Tasks that a worker refuses, and results that it stores."""
 
 from __future__ import annotations
 

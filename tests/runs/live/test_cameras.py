@@ -17,7 +17,7 @@ IMAGE = np.zeros((4, 6, 3), np.uint8)
 
 
 class Source:
-    """A camera that delivers an image whenever the test says so; None ends it, an error is raised."""
+    """A camera that delivers an image whenever the test requests it; None ends it, an error is raised."""
 
     def __init__(self, shots: int = 0) -> None:
         self._images: SimpleQueue = SimpleQueue()

@@ -73,7 +73,7 @@ def test_fit_live__follows_a_folder_that_is_filled(tmp_path: Path, rig: Path, im
     report = json.loads((out / "report.json").read_text())
     assert [row["dropped"] for row in report["live"]] == [row.dropped for row in rows]
     assert open_stream(out).closed()
-    # The live fit is that of a recording of its frames, to the bit.
+    # The live fit equals the fit of a recording of its frames, to the bit.
     capture = load_capture(out / "capture", 4)
     assert capture.num_frames == 4
     stream_capture(capture, tmp_path / "again", CONFIG)
@@ -85,7 +85,7 @@ def test_fit_live__follows_a_folder_that_is_filled(tmp_path: Path, rig: Path, im
 
 
 def counts_what_is_dropped(dropped: list[int], recorded: list[Any], clip: list[np.ndarray]) -> bool:
-    """Return whether recorded images are those of a looped clip, from any frame on, without those that were dropped."""
+    """Return whether recorded images are a looped clip's, from any frame on, without the dropped ones."""
     numbers = np.cumsum([0, *(count + 1 for count in dropped[1:])])
     return any(
         all(np.array_equal(image, clip[(begin + n) % len(clip)]) for n, image in zip(numbers, recorded, strict=True))

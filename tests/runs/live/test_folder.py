@@ -52,7 +52,7 @@ def test_FolderFeed__reads_the_newest_number_that_is_complete(tmp_path: Path, su
 
 
 def test_FolderFeed__begins_when_all_cameras_do(tmp_path: Path) -> None:
-    """Of the folders at the time of the second number, because those of a first are made one after the other."""
+    """The folders count at the time of the second number: the first images' folders are made one after the other."""
     feed = FolderFeed(fill(tmp_path, range(1), "a", "b"), 5)
     timer = Timer(0.2, fill, (tmp_path, range(2), "a", "b", "c"))
     timer.start()
