@@ -34,15 +34,14 @@ from morgs_mi.stream_loop import StreamLoop
 
 # Stages of a frame: file and function that are timed.
 STAGES = {
-    "change": ("loop/observation.py", "see_frame"),
+    "change": ("loop/observation.py", "_seen"),
     "flow": ("loop/observation.py", "_flows"),
     "part": ("stream_loop.py", "_active_set"),
     "targets": ("method/ssim.py", "__init__"),
     "lift": ("method/lift.py", "lift_flow"),
     "propagation": ("method/propagation.py", "propagate_motion"),
     "search": ("method/search.py", "search_motion"),
-    "refinement": ("method/photometric.py", "refine_displacement"),
-    "colour": ("method/photometric.py", "mean_color_error"),
+    "refinement": ("method/photometric.py", "refine_start"),
     "steps": ("fit/optimise.py", "optimise"),
     "density": ("method/attribution.py", "densification_scores"),
     "packet": ("codec/packets.py", "residual_packet"),

@@ -6,16 +6,20 @@ With the error e(x) of a rendered view, E_i = sum_x w_i(x) e(x) is the error att
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.method.ssim import Target
+from morgs_mi.method.sweep import KeyImages
 from morgs_mi.render.active_view import ActiveView
 
-__all__ = ["DensificationScores", "attribute_error", "densification_scores"]
+__all__ = ["DensificationScores", "densification_scores"]
+
+# Share of the pixels of a view up to which views are drawn together: more of them would take more memory than time.
+_TOGETHER = 2.0
 
 
 @dataclass(frozen=True)
@@ -43,22 +47,22 @@ def densification_scores(
         tolerance: in medians of an image's error; smaller errors do not count.
     """
     gaussians = gaussians.detached()
-    attributed = [attribute_error(gaussians, *pair, tolerance) for pair in zip(views, targets, strict=True)]
-    error, weight = np.max([np.zeros((len(gaussians), 2), np.float32), *attributed], axis=0).T
+    error, weight = np.zeros((2, len(gaussians)), np.float32)
+    for few in _few_at_once(views):
+        images = KeyImages({v: views[v] for v in few}, dict(enumerate(targets)))
+        sums = images.sums(gaussians, ("error", "weight"), tolerance)
+        error, weight = np.maximum(error, sums["error"].max(0)), np.maximum(weight, sums["weight"].max(0))
     return DensificationScores(error, weight)
 
 
-def attribute_error(gaussians: Gaussians, view: ActiveView, target: Target, tolerance: float = 0.0) -> np.ndarray:
-    """Render one view and return E and W of each Gaussian there, [N, 2], in pixels of full contrast and in pixels.
-
-    Args:
-        gaussians: N Gaussians, detached.
-        view: the active view.
-        target: its image.
-        tolerance: in medians of the image's error; smaller errors do not count.
-    """
-    error = np.abs(target.difference(view.render(gaussians).color, view.region)).mean(axis=-1)
-    positive = error[error > 0]  # masked pixels are 0
-    if tolerance and len(positive):
-        error = np.maximum(error - tolerance * np.median(positive), 0)
-    return view.backproject(gaussians, np.stack([error, np.ones_like(error)], axis=-1))
+def _few_at_once(views: Sequence[ActiveView]) -> Iterator[list[int]]:
+    """Yield the indices of views that are drawn together, at least one."""
+    few, share = list[int](), 0.0
+    for index, view in enumerate(views):
+        if few and share + view.pixel_fraction > _TOGETHER:
+            yield few
+            few, share = [], 0.0
+        few.append(index)
+        share += view.pixel_fraction
+    if few:
+        yield few

@@ -31,18 +31,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
+import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.ranges import Above, AtLeast, check_ranges
 from morgs_mi.method.confidence import motion_floor
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.mask_refiners.mask_config import MaskConfig
 from morgs_mi.method.motion_start import MotionStart
 from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.view_group import ViewGroup
 
 __all__ = ["LiftConfig", "lift_flow"]
 
+# Numbers of a pixel that are summed per Gaussian.
+_FLOW_MAPS = 4
 # Weight of the prior that nothing moves, in fully covered pixels without motion: a Gaussian that is hardly visible
 # stays in place.
 _PRIOR_PIXELS = 0.3
@@ -119,15 +125,17 @@ def lift_flow(
     """
     config = config or LiftConfig()
     means = gaussians.numpy()["means"].astype(np.float64)
-    seen = [
-        _lift_view(
-            gaussians, means, views[v], observations[v], motion_floor(views[v].camera.width, masks), config.noise_px
-        )
-        for v in sorted(observations.keys() & views.keys())
-    ]
-    top = config.max_logit
-    if not seen:
+    top, chosen = config.max_logit, sorted(observations.keys() & views.keys())
+    if not chosen:
         return MotionStart(np.zeros((len(means), 3), np.float32), np.full(len(means), -top, np.float32))
+    group = ViewGroup([views[v] for v in chosen])
+    flow = group.crop([observations[v].forward_flow for v in chosen])
+    maps = _flow_maps(flow, group.crop([observations[v].forward_reliable for v in chosen]))
+    sums = group.draw(gaussians).sums(from_numpy(mi.Float, maps), _FLOW_MAPS).astype(float)
+    seen = [
+        _lift_view(own, means, camera, motion_floor(camera.width, masks), config.noise_px)
+        for own, camera in zip(sums, [views[v].camera for v in chosen], strict=True)
+    ]
     d = _solve(seen, [np.ones(len(means))] * len(seen))
     for _ in range(_ROUNDS):
         d = _solve(seen, [np.exp(-view.cost(d, view.project(d))) for view in seen])
@@ -142,21 +150,18 @@ def lift_flow(
     return MotionStart(np.where(logit[:, None] > 0, d, 0).astype(np.float32), logit.astype(np.float32))
 
 
-def _lift_view(
-    gaussians: Gaussians,
-    means: np.ndarray,
-    view: ActiveView,
-    observation: FlowObservation,
-    floor: float,
-    noise_px: float,
-) -> _LiftView:
-    reliable = observation.forward_reliable[..., None].astype(np.float32)
-    flow = observation.forward_flow
-    image = np.concatenate([flow * reliable, np.sum(flow**2, axis=2, keepdims=True) * reliable, reliable], axis=2)
-    sums = view.backproject(gaussians, view.crop(image)).astype(float)
+def _flow_maps(flow: np.ndarray, reliable: np.ndarray) -> np.ndarray:
+    """Return u, |u|^2 and 1 [..., 4] where the flow u [..., 2] is reliable [...]; 0 elsewhere."""
+    maps = np.empty((*reliable.shape, _FLOW_MAPS), np.float32)
+    maps[..., :2], maps[..., 2], maps[..., 3] = flow, np.sum(flow**2, axis=-1), 1
+    return maps * reliable[..., None]
+
+
+def _lift_view(sums: np.ndarray, means: np.ndarray, camera: Camera, floor: float, noise_px: float) -> _LiftView:
+    """Return the flow of a view at every Gaussian, from the sums of `_flow_maps` [N, 4]."""
     average = sums[:, :3] / np.maximum(sums[:, 3:], 1e-6)
     variance = np.maximum(average[:, 2] - np.sum(average[:, :2] ** 2, axis=1), 0)
-    jacobian = view.camera.projection_jacobian(means)
+    jacobian = camera.projection_jacobian(means)
     return _LiftView(sums[:, 3], average[:, :2], variance, jacobian, floor, noise_px)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from morgs_mi.method.boxes import boxes_around
 from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.neighbours import NeighbourIndex
 from morgs_mi.method.ssim import Target
+from morgs_mi.method.sweep import MAPS, KeyImages
 from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["MotionProblem", "MotionStart"]
@@ -59,14 +61,27 @@ class MotionProblem:
     targets: Mapping[int, Target]
     rng: np.random.Generator
     flows: Mapping[int, FlowObservation] = field(default_factory=dict)
+    _last: dict[str, Any] = field(default_factory=dict)
 
     @cached_property
     def neighbours(self) -> NeighbourIndex:
         """Neighbours of the Gaussians in the previous frame, one index for all stages."""
         return NeighbourIndex(np.asarray(self.gaussians.means))
 
-    def views_around(self, chosen: np.ndarray, displacements: Sequence[np.ndarray]) -> dict[int, ActiveView]:
-        """Return the views with the blocks that some Gaussians reach, in place or displaced; without empty ones.
+    @cached_property
+    def images(self) -> KeyImages:
+        """The images of all views, at least one."""
+        return KeyImages(self.views, self.targets)
+
+    def sums_at(self, displacement: np.ndarray) -> dict[str, np.ndarray]:
+        """Return the sums of all maps of a sweep, with the Gaussians displaced by d [N, 3]; kept until d is another."""
+        if self._last.get("displacement") is not displacement:
+            sums = self.images.sums(displaced(self.gaussians, displacement), [*MAPS])
+            self._last.update(displacement=displacement, sums=sums)
+        return self._last["sums"]
+
+    def images_around(self, chosen: np.ndarray, displacements: Sequence[np.ndarray]) -> KeyImages | None:
+        """Return the images in the blocks that some Gaussians reach, in place or displaced; None if there are none.
 
         Args:
             chosen: which Gaussians, bool [N].
@@ -79,4 +94,5 @@ class MotionProblem:
             boxes = [boxes_around(place, view.camera, view.config, 1.0) for place in places]
             shape, everyone = (view.camera.height, view.camera.width), np.ones(len(some), bool)
             narrowed[index] = view.narrowed(np.any([box.union(everyone, shape) for box in boxes], axis=0))
-        return {index: view for index, view in narrowed.items() if view is not None}
+        seen = {index: view for index, view in narrowed.items() if view is not None}
+        return KeyImages(seen, self.targets) if seen else None

@@ -24,16 +24,11 @@ from dataclasses import replace
 import numpy as np
 
 from morgs_mi.core.color_space import SH_C0
-from morgs_mi.core.gaussians import Gaussians, displaced
-from morgs_mi.method.image_gradient import image_gradient
+from morgs_mi.core.gaussians import displaced
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
-from morgs_mi.method.ssim import Target
-from morgs_mi.render.active_view import ActiveView
 
-__all__ = ["mean_color_error", "refine_displacement", "refine_start"]
+__all__ = ["refine_start"]
 
-# Steps of the displacement; more gain nothing before the fit.
-_ROUNDS = 1
 # Nearest Gaussians. Their pixels count, too, if they move: a small Gaussian alone may cover one straight edge.
 _NEIGHBOURS = 8
 # Weight of the prior that a step is 0, in pixels on which the contrast is 1 per px.
@@ -53,77 +48,45 @@ def refine_start(problem: MotionProblem, start: MotionStart) -> MotionStart:
         problem: N Gaussians, the key views and their images.
         start: of the motion.
     """
-    start = refine_displacement(problem, start)
-    moved = displaced(problem.gaussians, start.displacement)
-    return replace(start, color_change=mean_color_error(moved, problem.views, problem.targets))
-
-
-def refine_displacement(problem: MotionProblem, start: MotionStart) -> MotionStart:
-    """Return a start with displacements that explain the images better; see `refine_start`."""
-    previous, targets, d = problem.gaussians, problem.targets, start.displacement
+    if not problem.views:
+        return replace(start, color_change=np.zeros((len(problem.gaussians), 3), np.float32))
+    d = start.displacement
     moves = np.any(d, axis=1)
-    views = problem.views_around(moves, [d]) if moves.any() else {}
-    if not views:
-        return start
-    means = np.asarray(previous.means)
+    before = problem.sums_at(d)
+    if not moves.any():
+        return replace(start, color_change=_color_change(before["color"], before["weight"]))
     near = problem.neighbours.nearest(_NEIGHBOURS)
-    gradients = {v: _gradient(view, targets[v]) for v, view in views.items()}
-
-    def sums_of(d: np.ndarray) -> np.ndarray:
-        moved = displaced(previous, d)
-        return np.stack([_sums(moved, view, targets[v], gradients[v]) for v, view in views.items()])
-
-    def error_of(sums: np.ndarray) -> np.ndarray:
-        return (sums[..., 0].sum(0) + _FLOOR_PX) / (sums[..., 1].sum(0) + 1)
-
-    sums = sums_of(d)
-    for _ in range(_ROUNDS):
-        jacobians = np.stack([view.camera.projection_jacobian(means + d) for view in views.values()])
-        step = np.where(moves[:, None], _step(jacobians, sums, near, moves), 0)
-        new_sums = sums_of(d + step)
-        better = error_of(new_sums) < error_of(sums)
-        d, sums = d + np.where(better[:, None], step, 0), np.where(better[:, None], new_sums, sums)
-    return replace(start, displacement=d.astype(np.float32))
+    places = np.asarray(problem.gaussians.means) + d
+    jacobians = np.stack([view.camera.projection_jacobian(places) for view in problem.views.values()])
+    step = np.where(moves[:, None], _step(jacobians, before, near, moves), 0).astype(np.float32)
+    after = problem.images.sums(displaced(problem.gaussians, d + step), ("error", "weight", "color"))
+    better = _relative_error(after) < _relative_error(before)
+    color, weight = (
+        np.where(better[:, None] if name == "color" else better, after[name], before[name])
+        for name in ("color", "weight")
+    )
+    return replace(
+        start,
+        displacement=(d + np.where(better[:, None], step, 0)).astype(np.float32),
+        color_change=_color_change(color, weight),
+    )
 
 
-def mean_color_error(
-    gaussians: Gaussians, views: Mapping[int, ActiveView], targets: Mapping[int, Target]
-) -> np.ndarray:
-    """Return the change c [N, 3] of the constant SH coefficients that removes the mean error of each Gaussian's pixels.
-
-    Args:
-        gaussians: N Gaussians at their start in this frame, detached.
-        views: active views of the key views, by view index.
-        targets: their images, by view index.
-    """
-    sums = np.zeros((len(gaussians), 4), np.float32)
-    for v, view in views.items():
-        error = targets[v].difference(view.render(gaussians).color, view.region)
-        sums += view.backproject(gaussians, np.concatenate([error, np.ones_like(error[..., :1])], axis=-1))
-    return sums[:, :3] / (sums[:, 3:] + _HALF_COLOR_PIXELS) / np.float32(SH_C0)
+def _relative_error(sums: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the mean error of each Gaussian's pixels [N] from the sums [V, N]."""
+    return (sums["error"].sum(0) + _FLOOR_PX) / (sums["weight"].sum(0) + 1)
 
 
-def _gradient(view: ActiveView, target: Target) -> tuple[np.ndarray, np.ndarray]:
-    """Return the derivatives of a target along x and y, per px, on the pixels of the view."""
-    along_x, along_y = image_gradient(target.image())
-    return view.crop(along_x), view.crop(along_y)
+def _color_change(color: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Return the change c [N, 3] of the constant SH coefficients from the sums of e [V, N, 3] and of 1 [V, N]."""
+    return color.sum(0) / (weight.sum(0)[:, None] + _HALF_COLOR_PIXELS) / np.float32(SH_C0)
 
 
-def _sums(
-    gaussians: Gaussians, view: ActiveView, target: Target, gradient: tuple[np.ndarray, np.ndarray]
-) -> np.ndarray:
-    """Return the error, the weight, G (xx, xy, yy) and b (x, y) of each Gaussian [N, 7] in a view."""
-    error, (x, y) = target.difference(view.render(gaussians).color, view.region), gradient
-    products = [np.sum(a * b, axis=-1) for a, b in ((x, x), (x, y), (y, y), (error, x), (error, y))]
-    size = np.abs(error).mean(axis=-1)
-    return view.backproject(gaussians, np.stack([size, np.ones_like(size), *products], axis=-1))
-
-
-def _step(jacobians: np.ndarray, sums: np.ndarray, near: np.ndarray, moves: np.ndarray) -> np.ndarray:
-    """Return the step delta [N, 3] from J [V, N, 2, 3] and the sums [V, N, 7]."""
-    G = sums[..., [2, 3, 3, 4]].reshape(*sums.shape[:2], 2, 2)
+def _step(jacobians: np.ndarray, sums: Mapping[str, np.ndarray], near: np.ndarray, moves: np.ndarray) -> np.ndarray:
+    """Return the step delta [N, 3] from J [V, N, 2, 3] and the sums G [V, N, 3] (xx, xy, yy) and b [V, N, 2]."""
+    G = sums["normal"][..., [0, 1, 1, 2]].reshape(*sums["normal"].shape[:2], 2, 2)
     system = np.einsum("vnia,vnij,vnjb->nab", jacobians, G, jacobians, optimize=True)
-    right = -np.einsum("vnia,vni->na", jacobians, sums[..., 5:])
+    right = -np.einsum("vnia,vni->na", jacobians, sums["right"])
     counts = moves[near].astype(float)
     system = system + np.einsum("nk,nkab->nab", counts, system[near])
     right = right + np.einsum("nk,nka->na", counts, right[near])

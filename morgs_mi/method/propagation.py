@@ -17,7 +17,6 @@ from __future__ import annotations
 import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians, displaced
-from morgs_mi.method.attribution import attribute_error
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 
 __all__ = ["propagate_motion"]
@@ -49,14 +48,13 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
         return start
     near = problem.neighbours.nearest(_NEIGHBOURS)
     rounds = _ROUNDS if near.size else 0
-    views = problem.views_around(_reached(near, np.any([d, before], axis=(0, 2)), rounds), (d, before))
-    if not views:
+    images = problem.images_around(_reached(near, np.any([d, before], axis=(0, 2)), rounds), (d, before))
+    if images is None:
         return start
 
     def error_of(d: np.ndarray) -> np.ndarray:
-        moved = displaced(problem.gaussians, d)
-        sums = np.sum([attribute_error(moved, view, problem.targets[v]) for v, view in views.items()], axis=0)
-        return (sums[:, 0] + _FLOOR_PX) / (sums[:, 1] + 1)
+        sums = images.sums(displaced(problem.gaussians, d), ("error", "weight"))
+        return (sums["error"].sum(0) + _FLOOR_PX) / (sums["weight"].sum(0) + 1)
 
     error, continues = error_of(d), np.any(before, axis=1, keepdims=True)
     for k in range(1 + rounds):

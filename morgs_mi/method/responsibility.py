@@ -25,10 +25,12 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.method.boxes import Boxes
-from morgs_mi.render.backproject import backproject
+from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.region import Region
 from morgs_mi.render.render_config import RenderConfig
+from morgs_mi.render.view_group import ViewGroup
 
 __all__ = ["ChangedView", "responsibility"]
 
@@ -60,19 +62,24 @@ def responsibility(
         min_weight: blend weight summed over all changed blocks, in px, below which a Gaussian counts as hidden.
         width: views are reduced by the largest whole factor that leaves this width, in px.
     """
-    changed, weight = np.zeros(len(gaussians), np.float32), np.zeros(len(gaussians), np.float32)
     near, area = dr.zeros(mi.Float, len(gaussians)), dr.zeros(mi.Float, len(gaussians))
+    drawn, shares, factors = list[ActiveView](), list[np.ndarray](), list[int]()
     for view in views:
         area += view.boxes.area
         if not view.change.any():
             continue
-        factor = max(view.camera.width // width, 1)
-        c = _reduced(view.change, factor)
-        region = Region(c > 0, render)
-        small = view.camera.resized(c.shape[1], c.shape[0])
-        sums = backproject(gaussians, small, region.crop(np.stack([c, np.ones_like(c)], axis=-1)), render, region)
-        changed, weight = changed + factor**2 * sums[:, 0], weight + factor**2 * sums[:, 1]
+        factors.append(max(view.camera.width // width, 1))
+        shares.append(_reduced(view.change, factors[-1]))
+        region = Region(shares[-1] > 0, render)
+        drawn.append(ActiveView(view.camera.resized(*shares[-1].shape[::-1]), render, region))
         near += view.boxes.covered(_enlarged(region.mask, view.change.shape))
+    if not drawn:
+        return np.zeros(len(gaussians), np.float32)
+    group = ViewGroup(drawn)
+    change = group.crop(shares)
+    maps = from_numpy(mi.Float, np.stack([change, np.ones_like(change)], axis=-1))
+    sums = np.einsum("v,vnc->nc", np.square(factors, dtype=np.float32), group.draw(gaussians).sums(maps, 2))
+    changed, weight = sums.T
     seen = weight > min_weight
     # At least 1: the box of a Gaussian beside the view may be empty, although it reaches into the view.
     elsewhere = np.maximum(np.asarray(area / dr.maximum(near, 1)), 1)

@@ -13,7 +13,7 @@ on a grid of displacements in 3D. The best one is accepted if the image with the
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -30,7 +30,6 @@ from morgs_mi.core.ranges import Above, AtLeast, AtMost, check_ranges
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.neighbours import NeighbourIndex
 from morgs_mi.method.ssim import Target
-from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["SearchConfig", "search_motion"]
 
@@ -72,55 +71,39 @@ def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConf
         config: settings.
     """
     config = config or SearchConfig()
-    gaussians, views, targets = problem.gaussians, problem.views, problem.targets
-    started = displaced(gaussians, start.displacement)
-    errors = _errors(started, views, targets)
-    parts = _unexplained_parts(started, errors, views, config.max_parts)
+    if not problem.views:
+        return start
     displacement, logit = start.displacement, start.logit_confidence
+    parts = _unexplained_parts(problem, displacement, config.max_parts)
     for part, d in _find(problem, parts, config):
         proposal = np.where(part[:, None], d, displacement).astype(np.float32)
-        around = problem.views_around(part, [displacement, proposal])
-        moved = displaced(gaussians, proposal)
-        before = sum(float(errors[v][views[v].crop(_drawn(view))].sum()) for v, view in around.items())
-        after = sum(float(error.sum()) for error in _errors(moved, around, targets).values())
+        around = problem.images_around(part, [displacement, proposal])
+        if around is None:
+            continue
+        before, after = (around.total_error(displaced(problem.gaussians, d)) for d in (displacement, proposal))
         if after < _ERROR_RATIO * before:
             displacement, logit = proposal, np.where(part, np.maximum(logit, _LOGIT), logit)
-            errors = _errors(moved, views, targets)
     if displacement is start.displacement:
         return start
     return replace(start, displacement=displacement, logit_confidence=logit.astype(np.float32))
 
 
-def _errors(
-    gaussians: Gaussians, views: Mapping[int, ActiveView], targets: Mapping[int, Target]
-) -> dict[int, np.ndarray]:
-    """Return the mean absolute error of each drawn pixel by view index, laid out as by `ActiveView.crop`."""
-    return {
-        v: np.abs(targets[v].difference(view.render(gaussians).color, view.region)).mean(axis=-1)
-        * view.crop(np.ones((view.camera.height, view.camera.width), np.float32))
-        for v, view in views.items()
-    }
-
-
-def _unexplained_parts(
-    gaussians: Gaussians, errors: Mapping[int, np.ndarray], views: Mapping[int, ActiveView], count: int
-) -> list[np.ndarray]:
+def _unexplained_parts(problem: MotionProblem, displacement: np.ndarray, count: int) -> list[np.ndarray]:
     """Return the `count` parts with the largest errors that are not explained, or fewer, each as a mask [N]."""
-    sums = np.zeros((len(gaussians), 2), np.float32)
-    for v, view in views.items():
-        sums += view.backproject(gaussians, np.stack([errors[v], np.ones_like(errors[v])], axis=-1))
-    error, seen = sums[:, 0] / (sums[:, 1] + 1), sums[:, 1] > 1
+    sums = problem.sums_at(displacement)
+    attributed, weight = sums["error"].sum(0), sums["weight"].sum(0)
+    error, seen = attributed / (weight + 1), weight > 1
     if not seen.any():
         return []
     unexplained = seen & (error > _UNEXPLAINED * max(float(np.median(error[seen])), 1 / 255))
     if np.count_nonzero(unexplained) < _MIN_SIZE:
         return []
-    near = NeighbourIndex(np.asarray(gaussians.means)).nearest(_NEIGHBOURS)
+    near = NeighbourIndex(np.asarray(problem.gaussians.means) + displacement).nearest(_NEIGHBOURS)
     ends = unexplained[:, None] & unexplained[near]
     rows = np.broadcast_to(np.arange(len(near))[:, None], near.shape)[ends]
     graph = coo_array((np.ones(len(rows), bool), (rows, near[ends])), (len(near), len(near)))
     label = connected_components(graph, directed=False)[1]
-    size, total = np.bincount(label, unexplained), np.bincount(label, np.where(unexplained, sums[:, 0], 0))
+    size, total = np.bincount(label, unexplained), np.bincount(label, np.where(unexplained, attributed, 0))
     largest = np.argsort(-total, kind="stable")[:count]
     return [label == part for part in largest if size[part] >= _MIN_SIZE]
 
@@ -131,18 +114,34 @@ def _find(
     """Return the parts that are found elsewhere, each with its displacement [3]."""
     if not parts:
         return []
-    previous, views = problem.gaussians, problem.views
-    matched = {v: _MatchedView.of(previous, view, problem.targets[v], config.reach) for v, view in views.items()}
-    found = []
+    previous, found = problem.gaussians, []
     for first in range(0, len(parts), 3):
         few = parts[first : first + 3]
-        weights = {v: view.blend_weights(previous, few) for v, view in matched.items()}
+        images = problem.images_around(np.any(few, axis=0), [])
+        if images is None:
+            continue
+        renderings = [images.rendered(gaussians) for gaussians in (previous, _brighter(previous, few))]
+        matched = [
+            _MatchedView.of(view.camera, problem.targets[v], color, config.reach)
+            for (v, view), color in zip(images.views.items(), renderings[0], strict=True)
+        ]
+        pairs = zip(matched, *renderings, strict=True)
+        weights = [view.reduced(np.clip(brighter - color, 0, 1)) for view, color, brighter in pairs]
         for k, part in enumerate(few):
-            surfaces = [matched[v].cost_surface(weights[v][..., k]) for v in views if weights[v][..., k].any()]
+            pairs = zip(matched, weights, strict=True)
+            surfaces = [view.cost_surface(weight[..., k]) for view, weight in pairs if weight[..., k].any()]
             d = _best_displacement(np.asarray(previous.means)[part].mean(axis=0), surfaces, config.reach)
             if d.any():
                 found.append((part, d))
     return found
+
+
+def _brighter(gaussians: Gaussians, parts: Sequence[np.ndarray]) -> Gaussians:
+    """Return Gaussians with the red, green or blue of up to three parts increased by 1."""
+    sh_coeffs = np.array(gaussians.sh_coeffs)
+    for k, part in enumerate(parts):
+        sh_coeffs[part, 0, k] += 1 / np.float32(SH_C0)
+    return replace(gaussians, sh_coeffs=sh_coeffs)
 
 
 def _best_displacement(center: np.ndarray, surfaces: Sequence[_CostSurface], reach: float) -> np.ndarray:
@@ -191,36 +190,29 @@ class _MatchedView:
     """A view in which parts are looked for, with images reduced to 2 px per step of the grid.
 
     Attributes:
-        view: the view.
-        color: rendering of the previous Gaussians where the view is drawn, laid out as by `ActiveView.crop`.
-        before: the same rendering, reduced [h, w, 3].
+        camera: the view.
+        before: rendering of the previous Gaussians around the parts, reduced [h, w, 3].
         after: the target, reduced [h, w, 3].
         scale: reduced pixels per pixel.
     """
 
-    view: ActiveView
-    color: np.ndarray
+    camera: Camera
     before: np.ndarray
     after: np.ndarray
     scale: float
 
     @classmethod
-    def of(cls, previous: Gaussians, view: ActiveView, target: Target, reach: float) -> _MatchedView:
-        """Return the view with its images."""
-        scale = min(1.0, 2 * _GRID / (reach * view.camera.width))
-        color = np.asarray(view.render(previous).color)
-        return cls(view, color, _reduced(_uncropped(color, view), scale), _reduced(target.image(), scale), scale)
+    def of(cls, camera: Camera, target: Target, color: np.ndarray, reach: float) -> _MatchedView:
+        """Return the view with its images, from the target and the rendering [H, W, 3]."""
+        scale = min(1.0, 2 * _GRID / (reach * camera.width))
+        return cls(camera, _reduced(color, scale), _reduced(target.image(), scale), scale)
 
-    def blend_weights(self, previous: Gaussians, parts: Sequence[np.ndarray]) -> np.ndarray:
-        """Return m [h, w, 3] of up to three parts: the increase of a pixel if the colour of a part increases by 1."""
-        sh_coeffs = np.array(previous.sh_coeffs)
-        for k, part in enumerate(parts):
-            sh_coeffs[part, 0, k] += 1 / np.float32(SH_C0)
-        brighter = np.asarray(self.view.render(replace(previous, sh_coeffs=sh_coeffs)).color)
-        return _reduced(_uncropped(np.clip(brighter - self.color, 0, 1), self.view), self.scale)
+    def reduced(self, image: np.ndarray) -> np.ndarray:
+        """Return an image [H, W, C] at the size of the view's images."""
+        return _reduced(image, self.scale)
 
     def cost_surface(self, weight: np.ndarray) -> _CostSurface:
-        """Match the pixels of a part with the weight m [h, w], not all 0."""
+        """Match the pixels of a part with the weight m [h, w], not all 0: the increase if the part is brighter by 1."""
         margin = 4 * _GRID  # in reduced pixels: twice the grid along an axis, as its corners are farther
         rows, columns = np.nonzero(weight > 0.01 * weight.max())
         box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
@@ -228,22 +220,10 @@ class _MatchedView:
         around = around[box[0].start : box[0].stop + 2 * margin, box[1].start : box[1].stop + 2 * margin]
         mask = np.repeat(np.sqrt(weight[box])[..., None], 3, axis=2)  # squared by OpenCV
         cost = cv2.matchTemplate(around, self.before[box], cv2.TM_SQDIFF, mask=mask)
-        return _CostSurface(np.maximum(cost, 0) / self.scale**2, self.view.camera, self.scale)
+        return _CostSurface(np.maximum(cost, 0) / self.scale**2, self.camera, self.scale)
 
 
 def _reduced(image: np.ndarray, scale: float) -> np.ndarray:
     """Return an image [H, W, C], made smaller by a factor in (0, 1]."""
     size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
     return image if scale == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-
-
-def _uncropped(image: np.ndarray, view: ActiveView) -> np.ndarray:
-    """Return an image [H, W, ...] of which the view's region is drawn; the rest is 0."""
-    if view.region is None:
-        return image
-    return view.region.paste(image, np.zeros((view.camera.height, view.camera.width, *image.shape[3:]), np.float32))
-
-
-def _drawn(view: ActiveView) -> np.ndarray:
-    """Return the drawn pixels of a view, bool [H, W]."""
-    return np.ones((view.camera.height, view.camera.width), bool) if view.region is None else view.region.mask

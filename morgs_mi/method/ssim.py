@@ -96,6 +96,7 @@ class Target:
             pixels, self.weight = pixels * weight, self._planes(weight)
         self.pixels = self._planes(pixels)
         self.surroundings: Float | None = None
+        self._image: np.ndarray | None = None
         self._places: dict[Region, tuple[UInt32, Bool]] = {}
         self._windows: dict[Region | None, _Windows] = {}
 
@@ -105,17 +106,30 @@ class Target:
         return planes
 
     def image(self) -> np.ndarray:
-        """Return the target [H, W, 3], float32 in [0, 1]; black where masked."""
-        return np.asarray(self.planes.image(self.pixels)).reshape(self.shape)
+        """Return the target [H, W, 3], float32 in [0, 1]; black where masked. It is read-only."""
+        if self._image is None:
+            self._image = np.asarray(self.planes.image(self.pixels)).reshape(self.shape)
+            self._image.flags.writeable = False
+        return self._image
 
     def difference(self, image: Tensor, region: Region | None = None) -> np.ndarray:
         """Return the target minus an image, [H, W, 3] or on a region of it; 0 where masked."""
         if region is None or region.whole:
             error = self.pixels - self.masked(self.planes.of(owned_copy(dr.detach(image).array)))
             return np.asarray(self.planes.image(error)).reshape(self.shape)
+        pixels, weight = self.on(region)
+        drawn = dr.detach(image).array
+        return np.asarray(pixels - (drawn if weight is None else drawn * weight)).reshape(region.shape(3))
+
+    def on(self, region: Region) -> tuple[Float, Float | None]:
+        """Return the target on a region, flat, 0 outside the view, and the weights of its numbers; None: 1."""
         places, inside = self.places_on(region)
-        pixels = dr.gather(mi.Float, self.pixels, places, active=inside)
-        return np.asarray(pixels - self.masked(dr.detach(image).array, places)).reshape(region.shape(3))
+        weight = None if self.weight is None else dr.gather(mi.Float, self.weight, places)
+        return dr.gather(mi.Float, self.pixels, places, active=inside), weight
+
+    def gradient_on(self, region: Region) -> tuple[Float, Float]:
+        """Return the derivatives of the target along x and y on a region, flat, per px, by Sobel's filter."""
+        return self.planes.gradient_on(self.pixels, region)
 
     def places_on(self, region: Region) -> tuple[UInt32, Bool]:
         """Return (places of the numbers of an image on a region, mask of those in the view)."""

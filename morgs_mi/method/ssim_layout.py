@@ -113,6 +113,31 @@ class Planes:
 
     def places_on(self, region: Region) -> tuple[UInt32, Bool]:
         """Return the places of the numbers of a flat image on a region, and the mask of those in the view."""
+        component, x, y = self._pixels_of(region)
+        inside = (x < dr.opaque(mi.UInt32, self.width)) & (y < dr.opaque(mi.UInt32, self.height))
+        places = dr.select(inside, self._place(component, y, x), 0)
+        dr.eval(places, inside)
+        return places, inside
+
+    def gradient_on(self, planes: Float, region: Region) -> tuple[Float, Float]:
+        """Return the derivatives of an image in `planes` along x and y on a region, flat, per px, by Sobel's filter."""
+        component, x, y = self._pixels_of(region)
+        xs, ys = (
+            [dr.minimum(dr.maximum(mi.Int32(v) + step, 0), dr.opaque(mi.Int32, size - 1)) for step in (-1, 0, 1)]
+            for v, size in ((x, self.width), (y, self.height))
+        )
+        near = [
+            [dr.gather(mi.Float, planes, self._place(component, mi.UInt32(b), mi.UInt32(a))) for a in xs] for b in ys
+        ]
+        along_x, along_y = (
+            sum(w * (rows[k][2] - rows[k][0]) for k, w in enumerate((0.125, 0.25, 0.125)))
+            for rows in (near, [*zip(*near, strict=True)])
+        )
+        dr.eval(along_x, along_y)
+        return along_x, along_y
+
+    def _pixels_of(self, region: Region) -> tuple[UInt32, UInt32, UInt32]:
+        """Return (component, x, y) of the numbers of a flat image on a region."""
         width, height = region.block
         lane = dr.arange(mi.UInt32, 3 * region.num_blocks * width * height)
         pixel = lane // 3
@@ -120,11 +145,7 @@ class Planes:
         within = pixel - block * (width * height)
         x = dr.gather(mi.UInt32, region.x, block) + within % width
         y = dr.gather(mi.UInt32, region.y, block) + within // width
-        inside = (x < dr.opaque(mi.UInt32, self.width)) & (y < dr.opaque(mi.UInt32, self.height))
-        size = dr.opaque(mi.UInt32, self.height), dr.opaque(mi.UInt32, self.num_columns)
-        places = dr.select(inside, _place(lane - 3 * pixel, y, x, *size), 0)
-        dr.eval(places, inside)
-        return places, inside
+        return lane - 3 * pixel, x, y
 
     def runs(self, region: Region | None, reach: int) -> Runs:
         """Return the runs that cover a region, or the whole view, and `reach` <= 8 pixels around it."""

@@ -172,6 +172,8 @@ def _cells_within(
         return mi.UInt32(low), mi.UInt32(high)
 
     (x0, x1), (y0, y1) = span(0, across), span(1, down)
+    if splats.view is not None:
+        y0, y1 = y0 + splats.view * down, y1 + splats.view * down
     if region.whole:
         return (x0, y0, x1, y1), (x1 - x0) * (y1 - y0)
 

@@ -20,11 +20,13 @@ for scenes far from the origin, and cameras far from the scene, single precision
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import log2, sqrt
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians, tensor_rows
@@ -33,7 +35,7 @@ from morgs_mi.core.types import Bool, Float, Jit, Tensor, UInt32
 from morgs_mi.render.channels import attribute_channels
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["FARTHEST", "Splats", "concatenated", "project"]
+__all__ = ["FARTHEST", "Splats", "Views", "concatenated", "project"]
 
 _HALF_LOG2E = 0.5 * log2(2.718281828459045)
 
@@ -56,6 +58,7 @@ class Splats:
         finite: False where an attribute, or a value computed from it, is not finite.
         profile: (z, gx, gy, 1 / sigma), the Gaussian in depth along the ray of a pixel (see module docstring), world
             units, differentiable; empty if no depth limit cuts the splats.
+        view: index of the view that each splat belongs to, in a region of several views; None: there is one view.
     """
 
     shape: tuple[Float, ...]
@@ -65,6 +68,7 @@ class Splats:
     valid: Bool
     finite: Bool
     profile: tuple[Float, ...] = ()
+    view: UInt32 | None = None
 
     def __len__(self) -> int:
         return dr.width(self.depths)
@@ -84,7 +88,21 @@ class Splats:
             concatenated(self.valid, other.valid),
             concatenated(self.finite, other.finite),
             concatenated(self.profile, other.profile),
+            None if self.view is None else concatenated(self.view, other.view),
         )
+
+
+@dataclass(frozen=True)
+class Views:
+    """Several cameras, and the one that each lane projects to.
+
+    Attributes:
+        cameras: the cameras.
+        view: index of the camera of each lane.
+    """
+
+    cameras: Sequence[Camera]
+    view: UInt32
 
 
 def concatenated(a: Jit, b: Jit) -> Jit:
@@ -100,7 +118,7 @@ def concatenated(a: Jit, b: Jit) -> Jit:
 
 def project(
     gaussians: ActivatedGaussians,
-    camera: Camera,
+    camera: Camera | Views,
     channels: tuple[str, ...],
     config: RenderConfig,
     rows: UInt32 | None = None,
@@ -111,10 +129,10 @@ def project(
 
     Args:
         gaussians: N Gaussians with activated attributes.
-        camera: the view; a Dr.Jit `viewmat` receives gradients.
+        camera: the view; a Dr.Jit `viewmat` receives gradients. Or several views, without gradients.
         channels: names of `channel_sizes()`, or ``features``.
         config: cut-offs.
-        rows: indices of the Gaussians [M], without repetition; None: all N, in order.
+        rows: indices of the Gaussians [M], in one view without repetition; None: all N, in order.
         features: tensor [N, F] that the channel ``features`` blends.
         profile: whether the splats get a `profile`.
 
@@ -125,14 +143,16 @@ def project(
         rows = dr.arange(mi.UInt32, int(dr.prod(gaussians.means.shape[:1])))
     means, quats = gaussians.rows("means", rows), mi.Vector4f(*gaussians.rows("quats", rows))
     scales, (opacities,) = mi.Vector3f(*gaussians.rows("scales", rows)), gaussians.rows("opacities", rows)
-    R, pose, eye = _pose(camera.viewmat)
-    fx, fy, cx, cy, near, *limits = _intrinsics(camera)
+    R, pose, eye = _pose(camera)
+    fx, fy, cx, cy, near, *limits, delay, readout, height = _intrinsics(camera)
+    cameras = camera.cameras if isinstance(camera, Views) else (camera,)
 
     world = [mi.Float64(v) for v in means]
-    if (camera.delay or camera.readout) and gaussians.motion is not None:
+    if any(c.delay or c.readout for c in cameras) and gaussians.motion is not None:
         _, y, z = _transformed(world, pose)
-        delay = _delays(dr.fma(fy, y / dr.maximum(z, near), cy), camera)
-        world = [v + mi.Float64(delay * d) for v, d in zip(world, gaussians.rows("motion", rows), strict=True)]
+        row = dr.fma(fy, y / dr.maximum(z, near), cy)
+        late = dr.fma(readout, dr.clip(row / height, 0, 1) - 0.5, delay)  # frames after the instant
+        world = [v + mi.Float64(late * d) for v, d in zip(world, gaussians.rows("motion", rows), strict=True)]
     x, y, z = _transformed(world, pose)
     probe = dr.detach(x + y + z)
     front = dr.detach((z >= near) & (dr.maximum(dr.maximum(dr.abs(x), dr.abs(y)), z) < FARTHEST))
@@ -177,7 +197,8 @@ def project(
     finite = dr.isfinite(probe)  # pyright: ignore[reportArgumentType, reportCallIssue]
     valid = front & (reach > 0) & finite  # pyright: ignore[reportOperatorIssue]
     extent = (dr.sqrt(reach * xx) / s, dr.sqrt(reach * yy) / s)
-    return Splats(shape, blended, dr.detach(z), extent, valid, finite, profile=line)
+    view = camera.view if isinstance(camera, Views) else None
+    return Splats(shape, blended, dr.detach(z), extent, valid, finite, line, view)
 
 
 def _transformed(world: list[Float], pose: list[list[Float]]) -> tuple[Float, Float, Float]:
@@ -194,36 +215,47 @@ def _guided_motion(gaussians: ActivatedGaussians, rows: UInt32) -> list[Float]:
     return [a - b for a, b in zip(motion, gaussians.rows("offset", rows), strict=True)]
 
 
-def _delays(row: Float, camera: Camera) -> Float:
-    """Return the frames by which rows of a camera, in px, are exposed after the instant."""
-    delay, readout, height = (dr.opaque(mi.Float, value) for value in (camera.delay, camera.readout, camera.height))
-    return dr.fma(readout, dr.clip(row / height, 0, 1) - 0.5, delay)
-
-
-def _pose(viewmat: Tensor) -> tuple[list[list[Float]], list[list[Float]], list[Float]]:
+def _pose(camera: Camera | Views) -> tuple[list[list[Float]], list[list[Float]], list[Float]]:
     """Return R [3][3] in single, and [R t] [3][4] and the camera's centre -R't [3] in double precision.
 
-    All are width-1 Dr.Jit floats, attached to the gradient of a Dr.Jit `viewmat`.
+    All are Dr.Jit floats, of width 1 for one camera, and attached to the gradient of a Dr.Jit `viewmat`.
     """
-    flat = mi.Float64(viewmat.array) if dr.is_tensor_v(viewmat) else from_numpy(mi.Float64, viewmat)
-    rows = [[dr.gather(mi.Float64, flat, mi.UInt32(4 * i + k)) for k in range(4)] for i in range(3)]
+    if isinstance(camera, Views):
+        flat, first = (
+            from_numpy(mi.Float64, np.stack([np.asarray(c.viewmat) for c in camera.cameras])),
+            camera.view * 16,
+        )
+    else:
+        viewmat: Tensor = camera.viewmat
+        first = mi.UInt32(0)
+        flat = mi.Float64(viewmat.array) if dr.is_tensor_v(viewmat) else from_numpy(mi.Float64, viewmat)
+    rows = [[dr.gather(mi.Float64, flat, first + (4 * i + k)) for k in range(4)] for i in range(3)]
     eye = [-sum(row[k] * row[3] for row in rows) for k in range(3)]
     return [[mi.Float(v) for v in row[:3]] for row in rows], rows, eye
 
 
-def _intrinsics(camera: Camera) -> list[Float]:
-    """Return fx, fy, cx, cy, near and the bounds (low, high) of x/z and of y/z as width-1 Dr.Jit floats.
+def _intrinsics(camera: Camera | Views) -> list[Float]:
+    """Return fx, fy, cx, cy, near, the bounds (low, high) of x/z and of y/z, and delay, readout and height.
 
     They are read from memory: with Python numbers, every camera would compile its own kernels.
     """
+    if isinstance(camera, Views):
+        values = [_numbers_of(c) for c in camera.cameras]
+        memory, first = from_numpy(mi.Float, values), camera.view * len(values[0])
+        return [dr.gather(mi.Float, memory, first + i) for i in range(len(values[0]))]
+    values = _numbers_of(camera)
+    memory = from_numpy(mi.Float, values)
+    return [dr.gather(mi.Float, memory, mi.UInt32(i)) for i in range(len(values))]
+
+
+def _numbers_of(camera: Camera) -> list[float]:
+    """Return the numbers that `_intrinsics` describes."""
     K, bounds = camera.K, []
     for axis, size in enumerate((camera.width, camera.height)):
         f, c = K[axis, axis], K[axis, 2]
         margin = 0.15 * size / f  # 30 % of the half view on every side
         bounds += [-c / f - margin, (size - c) / f + margin]
-    values = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.near, *bounds]
-    memory = from_numpy(mi.Float, values)
-    return [dr.gather(mi.Float, memory, mi.UInt32(i)) for i in range(len(values))]
+    return [K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.near, *bounds, camera.delay, camera.readout, camera.height]
 
 
 def _rotation(quats: Jit) -> list[Jit]:

@@ -131,7 +131,7 @@ def test_cost_surface__is_the_weighted_squared_difference():
     before, after = rng.random((2, 48, 64, 3)).astype(np.float32)
     weight = np.zeros((48, 64), np.float32)
     weight[20:26, 30:35] = rng.random((6, 5))
-    surface = _MatchedView(ActiveView(camera), before, before, after, 1.0).cost_surface(weight)
+    surface = _MatchedView(camera, before, after, 1.0).cost_surface(weight)
     shifts = np.array([(0, 0), (4, -3), (-11, 9)])
     expected = [
         np.sum(weight[..., None].astype(float) * (np.roll(after, (-y, -x), (0, 1)).astype(float) - before) ** 2)

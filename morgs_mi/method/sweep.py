@@ -1,0 +1,150 @@
+"""One sweep over the key views: the sums over each Gaussian's pixels that the start of a frame is found from.
+
+With the blend weights w_i of Gaussian i in view v, the error e = target - image and the target's gradient g, one
+rendering and one back-projection of all views together give the sums sum_x w_i(x) m(x) of the maps
+
+    weight 1,   error |e|,   color e,   normal g g',   right e g
+
+where |e| is the mean over the colours, and products with g are summed over them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.memory import from_numpy
+from morgs_mi.core.types import Float
+from morgs_mi.method.ssim import Target
+from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.projection import concatenated
+from morgs_mi.render.view_group import Drawing, ViewGroup
+
+__all__ = ["MAPS", "KeyImages"]
+
+# Pixels of a view that are enough for the median of its error.
+_SAMPLED = 20_000
+
+_Map = Callable[[list[Float], list[Float], list[Float]], list[Float]]
+
+MAPS: dict[str, _Map] = {
+    "weight": lambda e, x, y: [mi.Float(1)],
+    "error": lambda e, x, y: [sum(abs(v) for v in e) / 3],
+    "color": lambda e, x, y: e,
+    "normal": lambda e, x, y: [_dot(x, x), _dot(x, y), _dot(y, y)],
+    "right": lambda e, x, y: [_dot(e, x), _dot(e, y)],
+}
+"""Name of a map -> its numbers at a pixel, from e and the derivatives of the target along x and y, three colours each.
+"""
+
+
+class KeyImages:
+    """Images of key views, which renderings are compared with.
+
+    Args:
+        views: V >= 1 active views, by view index.
+        targets: their images, by view index.
+    """
+
+    def __init__(self, views: Mapping[int, ActiveView], targets: Mapping[int, Target]) -> None:
+        self.views, self._targets = views, [targets[v] for v in views]
+        self.group = ViewGroup([*views.values()])
+
+    def sums(self, gaussians: Gaussians, names: Sequence[str], tolerance: float = 0.0) -> dict[str, np.ndarray]:
+        """Return the sums of some `MAPS` per view and Gaussian, float32 [V, N, ...] by name; one number has no axis.
+
+        Args:
+            gaussians: N Gaussians, detached.
+            names: of the maps.
+            tolerance: in medians of a view's |e|, where it is not 0; smaller |e| do not count.
+        """
+        drawing = self.group.draw(gaussians)
+        error = self._difference(drawing)
+        dr.eval(error)
+        image, sizes = self._maps(error, names, self._noise(error, tolerance) if tolerance else None)
+        ends = np.cumsum(sizes)
+        found = np.split(drawing.sums(image, int(ends[-1])), ends[:-1], axis=-1)
+        return {name: v[..., 0] if v.shape[-1] == 1 else v for name, v in zip(names, found, strict=True)}
+
+    def rendered(self, gaussians: Gaussians) -> list[np.ndarray]:
+        """Return the image of Gaussians in each view [H, W, 3]; 0 where the view is not drawn."""
+        color = np.asarray(self.group.draw(gaussians).color).reshape(self.group.region.shape(3))
+        parts = zip(self.group.regions, self.group.split(color), strict=True)
+        return [region.paste(part, np.zeros((region.height, region.width, 3), np.float32)) for region, part in parts]
+
+    def total_error(self, gaussians: Gaussians) -> float:
+        """Return the error |e| of Gaussians, summed over all drawn pixels."""
+        with dr.suspend_grad():
+            return float(dr.sum(dr.abs(self._difference(self.group.draw(gaussians))))[0]) / 3
+
+    def _maps(self, error: Float, names: Sequence[str], noise: Float | None) -> tuple[Float, list[int]]:
+        """Return the numbers of some maps at every pixel, flat, and how many numbers each map has.
+
+        Args:
+            error: e, flat.
+            names: of the maps.
+            noise: per pixel; |e| is lowered by it. None: 0.
+        """
+        with dr.suspend_grad():
+            images = [error, *(self._gradient if {"normal", "right"} & set(names) else (error, error))]
+            lane = dr.arange(mi.UInt32, self.group.region.num_pixels)
+            pixel = [[dr.gather(mi.Float, image, 3 * lane + c) for c in range(3)] for image in images]
+            columns = [MAPS[name](*pixel) for name in names]
+            if noise is not None:
+                place = names.index("error")
+                columns[place] = [dr.maximum(columns[place][0] - noise, 0)]
+            sizes = [len(column) for column in columns]
+            count = sum(sizes)
+            image = dr.empty(mi.Float, dr.width(lane) * count)
+            for k, value in enumerate(v for column in columns for v in column):
+                dr.scatter(image, value, lane * count + k, mode=dr.ReduceMode.NoConflicts)
+            dr.eval(image)
+        return image, sizes
+
+    def _noise(self, error: Float, tolerance: float) -> Float:
+        """Return, per pixel, a number of medians of its view's |e|, where that is not 0."""
+        sizes = [region.num_pixels for region in self.group.regions]
+        parts = np.split(np.asarray(error).reshape(-1, 3), np.cumsum(sizes)[:-1])
+        samples = (np.abs(part[:: 1 + len(part) // _SAMPLED]).mean(axis=1) for part in parts)
+        medians = [float(np.median(sample[sample > 0])) if sample.any() else 0.0 for sample in samples]
+        return from_numpy(mi.Float, np.repeat(np.multiply(tolerance, medians), sizes))
+
+    def _difference(self, drawing: Drawing) -> Float:
+        """Return e, flat [A * block_height * block_width * 3]; 0 where masked."""
+        pixels, weights = self._pixels
+        return pixels - (drawing.color if weights is None else drawing.color * weights)
+
+    @cached_property
+    def _pixels(self) -> tuple[Float, Float | None]:
+        """The targets on the group, and the weights of their numbers; None: 1."""
+        found = [target.on(region) for target, region in zip(self._targets, self.group.regions, strict=True)]
+        pixels, weights = ([*column] for column in zip(*found, strict=True))
+        if all(weight is None for weight in weights):
+            return _end_to_end(pixels), None
+        pairs = zip(weights, pixels, strict=True)
+        known = [dr.full(mi.Float, 1, dr.width(part)) if weight is None else weight for weight, part in pairs]
+        return _end_to_end(pixels), _end_to_end(known)
+
+    @cached_property
+    def _gradient(self) -> tuple[Float, Float]:
+        """The derivatives of the targets along x and y, per px, flat on the group."""
+        pairs = zip(self._targets, self.group.regions, strict=True)
+        x, y = zip(*(target.gradient_on(region) for target, region in pairs), strict=True)
+        return _end_to_end(x), _end_to_end(y)
+
+
+def _dot(a: list[Float], b: list[Float]) -> Float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _end_to_end(parts: Sequence[Float]) -> Float:
+    whole = parts[0]
+    for part in parts[1:]:
+        whole = concatenated(whole, part)
+    dr.eval(whole)
+    return whole

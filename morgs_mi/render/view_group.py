@@ -1,0 +1,176 @@
+"""Several active views that are drawn by the same launches, without gradients.
+
+A pass over a few small views takes longer to prepare than to compute. So all views share one region: a lane projects
+one Gaussian into one view, the lists of all blocks are built together, and one loop walks them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
+from morgs_mi.core.types import Float, UInt32
+from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.blocks import BlockLists, build_lists, pack_records, touches
+from morgs_mi.render.compositing import Channel, Layout, blend, weighted_sums
+from morgs_mi.render.kernel_recording import with_render_lock
+from morgs_mi.render.projection import Splats, Views, project
+from morgs_mi.render.region import Region, joined, quotient
+from morgs_mi.render.render_config import RenderConfig
+
+__all__ = ["Drawing", "ViewGroup"]
+
+
+class ViewGroup:
+    """Active views that are drawn together.
+
+    Images of the group are [A, block_height, block_width, C], the drawn blocks of all views, one view after the other.
+
+    Args:
+        views: V >= 1 views with the same cut-offs and block shape.
+
+    Attributes:
+        views: the views.
+        regions: their regions.
+        region: the blocks of all of them, see `joined`.
+    """
+
+    def __init__(self, views: Sequence[ActiveView]) -> None:
+        self.views = tuple(views)
+        self.regions = tuple(view.region or _everything(view) for view in views)
+        self.region = joined(self.regions)
+
+    @property
+    def config(self) -> RenderConfig:
+        """Cut-offs and block shape."""
+        return self.views[0].config
+
+    def crop(self, images: Sequence[np.ndarray]) -> np.ndarray:
+        """Return an image of the group from one image [H, W, ...] per view."""
+        return np.concatenate([region.crop(image) for region, image in zip(self.regions, images, strict=True)])
+
+    def split(self, image: np.ndarray) -> list[np.ndarray]:
+        """Return the image of each view on its region from an image of the group."""
+        ends = np.cumsum([region.num_blocks for region in self.regions])
+        return np.split(image, ends[:-1])
+
+    @with_render_lock
+    def draw(self, gaussians: ActivatedGaussians) -> Drawing:
+        """Project Gaussians into all views and list those that touch each block.
+
+        Args:
+            gaussians: N > 0 Gaussians.
+        """
+        N, V = int(gaussians.means.shape[0]), len(self.views)
+        cameras = [view.camera for view in self.views]
+        with dr.suspend_grad():
+            lane = dr.arange(mi.UInt32, N * V)
+            view = quotient(lane, N)
+            row = lane - view * dr.opaque(mi.UInt32, N)
+            lanes = dr.compress(touches(project(gaussians, Views(cameras, view), (), self.config, row), self.region))
+            splats = self._static
+            if dr.width(lanes):
+                view = quotient(lanes, N)
+                row = lanes - view * dr.opaque(mi.UInt32, N)
+                visible = project(gaussians, Views(cameras, view), ("color",), self.config, row)
+                splats = visible if splats is None else visible.concatenated_with(splats)
+            if splats is None:
+                return Drawing(self, None, lanes, N)
+            lists = build_lists(splats, list(splats.channels["color"]), self.region, self.config)
+        return Drawing(self, (splats, lists), lanes, N)
+
+    @cached_property
+    def _static(self) -> Splats | None:
+        """The static splats of all views that touch their regions; None if there are none."""
+        found: Splats | None = None
+        for index, view in enumerate(self.views):
+            if view.static_splats is not None:
+                own = replace(view.static_splats, view=dr.full(mi.UInt32, index, len(view.static_splats)))
+                own = replace(own, channels={"color": own.channels["color"]})
+                found = own if found is None else found.concatenated_with(own)
+        if found is None:
+            return None
+        rows = dr.compress(touches(found, self.region))
+        return _selected(found, rows) if dr.width(rows) else None
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """Gaussians in the views of a group.
+
+    Attributes:
+        group: the views.
+        drawn: the projected Gaussians that touch the group's blocks, with the static splats after them, and the lists
+            of the blocks; None if there are no splats.
+        lanes: (view * N + Gaussian) of the splats that are not static, ascending.
+        count: N.
+    """
+
+    group: ViewGroup
+    drawn: tuple[Splats, BlockLists] | None
+    lanes: UInt32
+    count: int
+
+    @cached_property
+    def color(self) -> Float:
+        """Colour of the group's pixels, flat [A * block_height * block_width * 3]; 0 outside the views."""
+        if self.drawn is None:
+            return dr.zeros(mi.Float, 3 * self.group.region.num_pixels)
+        (splats, lists), layout = self.drawn, Layout((Channel(3, True),), False, False, self.group.config)
+        with dr.suspend_grad():
+            (image,) = blend(splats.geometry, [splats.channels["color"]], self.group.region, lists, layout)
+            if self.group.region.weights is not None:
+                image = image * repeat_each(self.group.region.weights, 3)
+            dr.eval(image)
+        return image
+
+    @with_render_lock
+    def sums(self, image: Float, channels: int) -> np.ndarray:
+        """Return the sums of an image's pixels by blend weight, per view and Gaussian, float32 [V, N, C].
+
+        Args:
+            image: flat image of the group [A * block_height * block_width * C].
+            channels: C.
+        """
+        sums = np.zeros((len(self.group.views) * self.count, channels), np.float32)
+        if self.drawn is None or not dr.width(self.lanes):
+            return sums.reshape(-1, self.count, channels)
+        splats, lists = self.drawn
+        with dr.suspend_grad():
+            columns = [dr.zeros(mi.Float, len(splats)) for _ in range(channels)]
+            records = pack_records([*splats.geometry, *columns], lists.by_rank)
+            layout = Layout((Channel(channels, False),), False, False, self.group.config)
+            grads = weighted_sums([image], self.group.region, replace(lists, records=records), layout)
+            dr.eval(grads)
+        lanes = np.asarray(self.lanes)
+        sums[lanes] = np.stack([np.asarray(grad)[: len(lanes)] for grad in grads], axis=1)
+        return sums.reshape(-1, self.count, channels)
+
+
+def _everything(view: ActiveView) -> Region:
+    """Return the region of all blocks of a view, block by block."""
+    return Region(np.ones((view.camera.height, view.camera.width), bool), view.config)
+
+
+def _selected(splats: Splats, rows: UInt32) -> Splats:
+    """Return the splats at `rows`."""
+
+    def at(values):
+        return tuple(at(v) for v in values) if isinstance(values, tuple) else dr.gather(type(values), values, rows)
+
+    return replace(
+        splats,
+        shape=at(splats.shape),
+        channels={name: at(columns) for name, columns in splats.channels.items()},
+        depths=at(splats.depths),
+        extent=at(splats.extent),
+        valid=at(splats.valid),
+        finite=at(splats.finite),
+        view=None if splats.view is None else at(splats.view),
+    )

@@ -1,0 +1,78 @@
+"""Sums of a sweep over the key views, against each view rendered and back-projected on its own."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.method.image_gradient import image_gradient
+from morgs_mi.method.ssim import Target
+from morgs_mi.method.sweep import MAPS, KeyImages
+from morgs_mi.render.active_view import ActiveView
+from tests.assertions import assert_close
+from tests.scenes.cameras import look_at_cameras
+from tests.scenes.gaussians import isotropic, random_sheet
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A textured wall in three views of two sizes, one of them masked, with blurred noise as targets."""
+    rng = np.random.default_rng(0)
+    wall = isotropic(random_sheet(rng, 300, 1.2, 0.6), 0.06, 0.8, rng.uniform(-1.5, 1.5, (300, 1, 3)))
+    cameras = look_at_cameras([(x, 0.3, -3) for x in (-0.8, 0.1, 0.8)], 45, 80, 60)
+    views = {4: ActiveView(cameras[0]), 2: ActiveView(cameras[1].resized(53, 41)), 7: ActiveView(cameras[2])}
+    sizes = [(view.camera.height, view.camera.width) for view in views.values()]
+    images = [cv2.GaussianBlur(rng.random((*size, 3), np.float32), (0, 0), 2) for size in sizes]
+    masks = [None, rng.random(sizes[1]) > 0.3, None]
+    return wall, views, {v: Target(*pair) for v, pair in zip(views, zip(images, masks, strict=True), strict=True)}
+
+
+def expected(wall, view, target):
+    """Return the sums of one view by name, from NumPy's maps."""
+    error = target.difference(view.render(wall).color)
+    x, y = image_gradient(target.image())
+    maps = {
+        "weight": np.ones(error.shape[:2]),
+        "error": np.abs(error).mean(-1),
+        "color": error,
+        "normal": np.stack([(a * b).sum(-1) for a, b in ((x, x), (x, y), (y, y))], -1),
+        "right": np.stack([(error * a).sum(-1) for a in (x, y)], -1),
+    }
+    shape = (*error.shape[:2], -1)
+    return {name: view.backproject(wall, np.float32(m).reshape(shape)) for name, m in maps.items()}
+
+
+def test_sums__are_the_sums_of_each_view(scene):
+    wall, views, targets = scene
+    found = KeyImages(views, targets).sums(wall, [*MAPS])
+    # Sobel's filter reflects at the border in OpenCV, and repeats the last pixel here.
+    inside = np.abs(np.asarray(wall.means)[:, :2]).max(axis=1) < 0.5
+    assert inside.sum() > 20
+    for k, (v, view) in enumerate(views.items()):
+        for name, sums in expected(wall, view, targets[v]).items():
+            mine = found[name][k].reshape(sums.shape)
+            assert_close(mine[inside], sums[inside], rtol=1e-4, name=f"{name} of view {v}")
+
+
+def test_sums__ignores_errors_within_the_tolerance(scene):
+    wall, views, targets = scene
+    images = KeyImages(views, targets)
+    plain, tolerant = (images.sums(wall, ("error",), tolerance)["error"] for tolerance in (0.0, 1.0))
+    huge = images.sums(wall, ("weight", "error"), 1e3)
+    assert (tolerant <= plain + 1e-6).all()
+    assert tolerant.sum() < 0.8 * plain.sum()
+    assert not huge["error"].any()
+    assert huge["weight"].any()
+
+
+def test_total_error__is_the_sum_over_all_pixels(scene):
+    wall, views, targets = scene
+    total = sum(np.abs(targets[v].difference(view.render(wall).color)).sum() / 3 for v, view in views.items())
+    assert KeyImages(views, targets).total_error(wall) == pytest.approx(total, rel=1e-5)
+
+
+def test_rendered__is_the_image_of_each_view(scene):
+    wall, views, targets = scene
+    for view, image in zip(views.values(), KeyImages(views, targets).rendered(wall), strict=True):
+        assert_close(image, np.asarray(view.render(wall).color), rtol=1e-6)

@@ -1,0 +1,75 @@
+"""Views that are drawn together, against the same views drawn one by one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from morgs_mi import Camera, Gaussians, RenderConfig
+from morgs_mi.core.memory import from_numpy
+from morgs_mi.render.active_view import ActiveView, make_active_view
+from morgs_mi.render.view_group import ViewGroup
+from tests.assertions import assert_close
+from tests.scenes.cameras import make_wide_camera
+from tests.scenes.gaussians import make_wide_scene
+
+N, ACTIVE = 120, np.arange(0, 120, 5)
+
+
+@pytest.fixture(scope="module")
+def gaussians() -> Gaussians:
+    return Gaussians(**make_wide_scene(N))
+
+
+def moved(camera: Camera, x: float) -> Camera:
+    """Return a camera that is displaced sideways."""
+    viewmat = np.array(camera.viewmat)
+    viewmat[0, 3] += x
+    return replace(camera, viewmat=viewmat)
+
+
+def views_of(gaussians: Gaussians) -> list[ActiveView]:
+    """Return views of several sizes: in part, as a whole, with a rolling shutter, and without static Gaussians."""
+    wide, static = make_wide_camera(), gaussians.select(~np.isin(np.arange(N), ACTIVE))
+    cameras = [wide, moved(wide, 0.1), wide.resized(90, 37), replace(moved(wide, -0.2), delay=0.4, readout=0.3)]
+    views = []
+    for k, camera in enumerate(cameras):
+        y, x = np.mgrid[: camera.height, : camera.width]
+        mask = (x - 30) ** 2 + (y - 20) ** 2 < (10 + 5 * k) ** 2
+        views.append(make_active_view(camera, mask, static, ("color", "motion"), RenderConfig()))
+    return [*views, ActiveView(wide), make_active_view(cameras[1], mask, static.select(slice(0)), (), RenderConfig())]
+
+
+def test_view_group__draws_what_each_view_draws(gaussians):
+    views, active = views_of(gaussians), gaussians.select(ACTIVE)
+    group = ViewGroup(views)
+    drawing = group.draw(active)
+    images = group.split(np.asarray(drawing.color).reshape(group.region.shape(3)))
+    weights = [np.random.default_rng(k).normal(size=region.shape(2)) for k, region in enumerate(group.regions)]
+    sums = drawing.sums(from_numpy(mi.Float, np.concatenate(weights)), 2)
+    for view, region, image, weight, found in zip(views, group.regions, images, weights, sums, strict=True):
+        blocks = replace(view, region=region)
+        assert_close(image, np.asarray(blocks.render(active).color), rtol=1e-6, atol=1e-6)
+        assert_close(found, blocks.backproject(active, np.float32(weight)), rtol=1e-5, atol=1e-4)
+
+
+def test_view_group__crops_images_of_its_views(gaussians):
+    group = ViewGroup(views_of(gaussians)[:3])
+    images = [
+        np.random.default_rng(k).normal(size=(v.camera.height, v.camera.width)) for k, v in enumerate(group.views)
+    ]
+    for region, image, found in zip(group.regions, images, group.split(group.crop(images)), strict=True):
+        assert np.array_equal(found, region.crop(image))
+
+
+def test_view_group__of_gaussians_that_no_view_shows_is_black(gaussians):
+    camera = make_wide_camera()
+    group = ViewGroup([ActiveView(camera)])
+    place = camera.position - 10 * np.asarray(camera.viewmat)[2, :3]
+    behind = replace(gaussians, means=np.tile(place, (len(gaussians), 1)))
+    drawing = group.draw(behind)
+    assert not np.asarray(drawing.color).any()
+    assert not drawing.sums(from_numpy(mi.Float, np.ones(group.region.shape(1))), 1).any()
