@@ -14,6 +14,7 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, UInt32
 from morgs_mi.render.projection import project
+from morgs_mi.render.region import Region
 from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["Boxes", "boxes_around"]
@@ -52,6 +53,29 @@ class Boxes:
 
         left = sum_before(self.left, self.bottom) - sum_before(self.left, self.top)
         return mi.Float(sum_before(self.right, self.bottom) - sum_before(self.right, self.top) - left)
+
+    def within(self, region: Region, factor: int) -> Float:
+        """Return the number of pixels [N] of each box in the blocks of a region, in a view reduced by `factor`.
+
+        The number of pixels before a corner is linear within a block, along x and y: it is interpolated.
+        """
+        width, height = (factor * side for side in region.block)
+        rows, columns = region.grid_shape
+
+        def before(x: UInt32, y: UInt32) -> Float:
+            across, down = mi.Float(x) * (1 / width), mi.Float(y) * (1 / height)
+            i = dr.minimum(mi.UInt32(across), dr.opaque(mi.UInt32, columns - 1))
+            j = dr.minimum(mi.UInt32(down), dr.opaque(mi.UInt32, rows - 1))
+            place, pitch = j * dr.opaque(mi.UInt32, columns + 1) + i, dr.opaque(mi.UInt32, columns + 1)
+            a, b, c, d = (
+                mi.Float(dr.gather(mi.UInt32, region.block_table, place + step)) for step in (0, 1, pitch, pitch + 1)
+            )
+            u, v = dr.minimum(across - mi.Float(i), 1), dr.minimum(down - mi.Float(j), 1)
+            return dr.lerp(dr.lerp(a, b, u), dr.lerp(c, d, u), v)
+
+        right = before(self.right, self.bottom) - before(self.right, self.top)
+        left = before(self.left, self.bottom) - before(self.left, self.top)
+        return (right - left) * (width * height)
 
     def union(self, chosen: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
         """Return the mask [H, W] of the union of the `chosen` boxes [N], rounded up to cells of 4 x 4 pixels."""

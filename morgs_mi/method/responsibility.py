@@ -72,14 +72,15 @@ def responsibility(
         shares.append(_reduced(view.change, factors[-1]))
         region = Region(shares[-1] > 0, render)
         drawn.append(ActiveView(view.camera.resized(*shares[-1].shape[::-1]), render, region))
-        near += view.boxes.covered(_enlarged(region.mask, view.change.shape))
+        near += view.boxes.within(region, factors[-1])
     if not drawn:
         return np.zeros(len(gaussians), np.float32)
     group = ViewGroup(drawn)
     change = group.crop(shares)
-    maps = from_numpy(mi.Float, np.stack([change, np.ones_like(change)], axis=-1))
-    sums = np.einsum("v,vnc->nc", np.square(factors, dtype=np.float32), group.draw(gaussians).sums(maps, 2))
-    changed, weight = sums.T
+    blocks = [region.num_blocks for region in group.regions]
+    area_of = np.repeat(np.square(factors), blocks)[:, None, None]  # px of the view per reduced pixel
+    maps = from_numpy(mi.Float, np.stack([area_of * change, np.broadcast_to(area_of, change.shape)], axis=-1))
+    changed, weight = group.draw(gaussians).totals(maps, 2).T
     seen = weight > min_weight
     # At least 1: the box of a Gaussian beside the view may be empty, although it reaches into the view.
     elsewhere = np.maximum(np.asarray(area / dr.maximum(near, 1)), 1)
@@ -90,10 +91,3 @@ def _reduced(mask: np.ndarray, factor: int) -> np.ndarray:
     """Return the covered share of the pixels of a mask [H, W] at 1 / factor of its resolution, float32."""
     height, width = (max(size // factor, 1) for size in mask.shape)
     return cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
-
-
-def _enlarged(mask: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a mask at the resolution `shape` (H, W)."""
-    if mask.shape == shape:
-        return mask
-    return cv2.resize(mask.astype(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)

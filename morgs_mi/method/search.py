@@ -13,7 +13,7 @@ on a grid of displacements in 3D. The best one is accepted if the image with the
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated
 
@@ -29,7 +29,7 @@ from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.core.ranges import Above, AtLeast, AtMost, check_ranges
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.neighbours import NeighbourIndex
-from morgs_mi.method.ssim import Target
+from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["SearchConfig", "search_motion"]
 
@@ -120,13 +120,14 @@ def _find(
         images = problem.images_around(np.any(few, axis=0), [])
         if images is None:
             continue
-        renderings = [images.rendered(gaussians) for gaussians in (previous, _brighter(previous, few))]
+        factor = _reduction(images.views.values(), config.reach)
+        renderings = [images.rendered(gaussians, factor) for gaussians in (previous, _brighter(previous, few))]
         matched = [
-            _MatchedView.of(view.camera, problem.targets[v], color, config.reach)
+            _MatchedView(view.camera, color, _reduced(problem.targets[v].image(), factor), 1 / factor)
             for (v, view), color in zip(images.views.items(), renderings[0], strict=True)
         ]
-        pairs = zip(matched, *renderings, strict=True)
-        weights = [view.reduced(np.clip(brighter - color, 0, 1)) for view, color, brighter in pairs]
+        # The weight of a part is the increase of a pixel if the part is brighter by 1.
+        weights = [np.clip(brighter - color, 0, 1) for color, brighter in zip(*renderings, strict=True)]
         for k, part in enumerate(few):
             pairs = zip(matched, weights, strict=True)
             surfaces = [view.cost_surface(weight[..., k]) for view, weight in pairs if weight[..., k].any()]
@@ -187,7 +188,7 @@ class _CostSurface:
 
 @dataclass(frozen=True, eq=False)
 class _MatchedView:
-    """A view in which parts are looked for, with images reduced to 2 px per step of the grid.
+    """A view in which parts are looked for, with images reduced to 2 px or more per step of the grid.
 
     Attributes:
         camera: the view.
@@ -201,18 +202,8 @@ class _MatchedView:
     after: np.ndarray
     scale: float
 
-    @classmethod
-    def of(cls, camera: Camera, target: Target, color: np.ndarray, reach: float) -> _MatchedView:
-        """Return the view with its images, from the target and the rendering [H, W, 3]."""
-        scale = min(1.0, 2 * _GRID / (reach * camera.width))
-        return cls(camera, _reduced(color, scale), _reduced(target.image(), scale), scale)
-
-    def reduced(self, image: np.ndarray) -> np.ndarray:
-        """Return an image [H, W, C] at the size of the view's images."""
-        return _reduced(image, self.scale)
-
     def cost_surface(self, weight: np.ndarray) -> _CostSurface:
-        """Match the pixels of a part with the weight m [h, w], not all 0: the increase if the part is brighter by 1."""
+        """Match the pixels of a part with the weight m [h, w], not all 0."""
         margin = 4 * _GRID  # in reduced pixels: twice the grid along an axis, as its corners are farther
         rows, columns = np.nonzero(weight > 0.01 * weight.max())
         box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
@@ -223,7 +214,14 @@ class _MatchedView:
         return _CostSurface(np.maximum(cost, 0) / self.scale**2, self.camera, self.scale)
 
 
-def _reduced(image: np.ndarray, scale: float) -> np.ndarray:
-    """Return an image [H, W, C], made smaller by a factor in (0, 1]."""
-    size = max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale))
-    return image if scale == 1 else cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+def _reduction(views: Iterable[ActiveView], reach: float) -> int:
+    """Return the factor by which the images of views are reduced, which leaves 2 px per step of the grid."""
+    widest = max(view.camera.width for view in views)
+    return next(factor for factor in (4, 2, 1) if factor == 1 or 2 * _GRID * factor <= reach * widest)
+
+
+def _reduced(image: np.ndarray, factor: int) -> np.ndarray:
+    """Return the means of an image's squares of `factor` x `factor` pixels."""
+    height, width = image.shape[0] // factor, image.shape[1] // factor
+    whole = image[: height * factor, : width * factor]
+    return whole if factor == 1 else cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)

@@ -71,11 +71,18 @@ class KeyImages:
         found = np.split(drawing.sums(image, int(ends[-1])), ends[:-1], axis=-1)
         return {name: v[..., 0] if v.shape[-1] == 1 else v for name, v in zip(names, found, strict=True)}
 
-    def rendered(self, gaussians: Gaussians) -> list[np.ndarray]:
-        """Return the image of Gaussians in each view [H, W, 3]; 0 where the view is not drawn."""
+    def rendered(self, gaussians: Gaussians, factor: int = 1) -> list[np.ndarray]:
+        """Return the image of Gaussians in each view [H // factor, W // factor, 3]; 0 where the view is not drawn.
+
+        Args:
+            gaussians: N Gaussians, detached.
+            factor: by which images are reduced; it divides the sides of a block.
+        """
         color = np.asarray(self.group.draw(gaussians).color).reshape(self.group.region.shape(3))
+        A, height, width, _ = color.shape
+        color = color.reshape(A, height // factor, factor, width // factor, factor, 3).mean(axis=(2, 4))
         parts = zip(self.group.regions, self.group.split(color), strict=True)
-        return [region.paste(part, np.zeros((region.height, region.width, 3), np.float32)) for region, part in parts]
+        return [region.uncropped(part)[: region.height // factor, : region.width // factor] for region, part in parts]
 
     def total_error(self, gaussians: Gaussians) -> float:
         """Return the error |e| of Gaussians, summed over all drawn pixels."""

@@ -138,6 +138,11 @@ class Region:
         return self.num_blocks, self.block[1], self.block[0], channels
 
     @property
+    def grid_shape(self) -> tuple[int, int]:
+        """Rows and columns of the blocks of the view, padded to whole tiles."""
+        return self._grid.shape[0], self._grid.shape[1]
+
+    @property
     def mask(self) -> np.ndarray:
         """The drawn pixels, bool [H, W]."""
         width, height = self.block
@@ -167,6 +172,14 @@ class Region:
             part = image[y : y + height, x : x + width]
             cropped[k, : part.shape[0], : part.shape[1]] = part
         return cropped
+
+    def uncropped(self, values: np.ndarray) -> np.ndarray:
+        """Return an image in whole blocks from this region's values [A, height, width, ...], 0 in all other blocks."""
+        (row, column), (_, height, width, *rest) = self._blocks, values.shape
+        (rows, columns), dtype = self._grid.shape, values.dtype
+        blocks = np.zeros((rows, height, columns, width, *rest), dtype)
+        blocks[row, :, column] = values
+        return blocks.reshape(rows * height, columns * width, *rest)
 
     def paste(self, values: np.ndarray, image: np.ndarray) -> np.ndarray:
         """Return a copy of an image [H, W, ...] with this region's pixels replaced by `values`."""

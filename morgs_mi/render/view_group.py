@@ -130,7 +130,6 @@ class Drawing:
             dr.eval(image)
         return image
 
-    @with_render_lock
     def sums(self, image: Float, channels: int) -> np.ndarray:
         """Return the sums of an image's pixels by blend weight, per view and Gaussian, float32 [V, N, C].
 
@@ -138,19 +137,37 @@ class Drawing:
             image: flat image of the group [A * block_height * block_width * C].
             channels: C.
         """
-        sums = np.zeros((len(self.group.views) * self.count, channels), np.float32)
-        if self.drawn is None or not dr.width(self.lanes):
-            return sums.reshape(-1, self.count, channels)
+        sums, lanes = np.zeros((len(self.group.views) * self.count, channels), np.float32), np.asarray(self.lanes)
+        if len(lanes):
+            sums[lanes] = np.stack([np.asarray(own) for own in self._sums(image, channels)], axis=1)
+        return sums.reshape(-1, self.count, channels)
+
+    def totals(self, image: Float, channels: int) -> np.ndarray:
+        """Return the sums of an image's pixels by blend weight over all views, float32 [N, C]; see `sums`."""
+        if not dr.width(self.lanes):
+            return np.zeros((self.count, channels), np.float32)
+        view = quotient(self.lanes, self.count)
+        row = self.lanes - view * dr.opaque(mi.UInt32, self.count)
+        totals = [dr.zeros(mi.Float, self.count) for _ in range(channels)]
+        for total, own in zip(totals, self._sums(image, channels), strict=True):
+            dr.scatter_add(total, own, row)
+        dr.eval(totals)
+        return np.stack([np.asarray(total) for total in totals], axis=1)
+
+    @with_render_lock
+    def _sums(self, image: Float, channels: int) -> list[Float]:
+        """Return the sums of each channel, one per lane."""
+        assert self.drawn is not None
         splats, lists = self.drawn
         with dr.suspend_grad():
             columns = [dr.zeros(mi.Float, len(splats)) for _ in range(channels)]
             records = pack_records([*splats.geometry, *columns], lists.by_rank)
             layout = Layout((Channel(channels, False),), False, False, self.group.config)
             grads = weighted_sums([image], self.group.region, replace(lists, records=records), layout)
-            dr.eval(grads)
-        lanes = np.asarray(self.lanes)
-        sums[lanes] = np.stack([np.asarray(grad)[: len(lanes)] for grad in grads], axis=1)
-        return sums.reshape(-1, self.count, channels)
+            place = dr.arange(mi.UInt32, dr.width(self.lanes))  # static splats come after
+            own = [dr.gather(mi.Float, grad, place) for grad in grads]
+            dr.eval(own)
+        return own
 
 
 def _everything(view: ActiveView) -> Region:

@@ -7,6 +7,7 @@ import pytest
 
 from morgs_mi import RenderConfig
 from morgs_mi.method.boxes import Boxes, boxes_around
+from morgs_mi.render.region import Region
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic
 
@@ -42,3 +43,13 @@ def test_union__covers_the_chosen_boxes_and_little_more(boxes):
     assert found[expected].all()
     cells = expected.reshape(12, 4, 16, 4).any(axis=(1, 3))
     np.testing.assert_array_equal(found, cells.repeat(4, 0).repeat(4, 1))
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_within__counts_pixels_in_the_blocks_of_a_reduced_view(boxes, factor):
+    mask = np.random.default_rng(2).random((48 // factor, 64 // factor)) < 0.02
+    region = Region(mask, RenderConfig())
+    blocks = region.mask.repeat(factor, 0).repeat(factor, 1)
+    expected = [blocks[box].sum() for box in slices(boxes)]
+    assert 0 < np.mean(expected) < np.asarray(boxes.area).mean()
+    np.testing.assert_allclose(boxes.within(region, factor), expected, atol=0.05)

@@ -73,3 +73,10 @@ def test_view_group__of_gaussians_that_no_view_shows_is_black(gaussians):
     drawing = group.draw(behind)
     assert not np.asarray(drawing.color).any()
     assert not drawing.sums(from_numpy(mi.Float, np.ones(group.region.shape(1))), 1).any()
+
+
+def test_totals__are_the_sums_over_all_views(gaussians):
+    group = ViewGroup(views_of(gaussians))
+    drawing = group.draw(gaussians)
+    image = from_numpy(mi.Float, np.random.default_rng(0).normal(size=group.region.shape(2)))
+    assert_close(drawing.totals(image, 2), drawing.sums(image, 2).sum(axis=0), rtol=1e-5)
