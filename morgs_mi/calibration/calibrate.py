@@ -25,13 +25,16 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.video import FrameReader, open_frames
 
-__all__ = ["CalibrateConfig", "CalibrationResult", "calibrate"]
+__all__ = ["CalibrateConfig", "CalibrationResult", "Mapper", "calibrate"]
+
+Mapper = Literal["incremental", "global"]
 
 # With fewer features in a view COLMAP cannot register it.
 _MIN_FEATURES = 100
-_TRIES = 3
 # COLMAP registers a camera with fewer points, but its pose then depends on a few of them.
 _MIN_POINTS = 50
+# Files in the folder that COLMAP works in.
+_IMAGES, _DATABASE = "images", "database.db"
 _MORE_TEXTURE = "light the scene evenly, add textured objects, or record a frame with such objects before the take"
 
 
@@ -44,7 +47,7 @@ class CalibrateConfig:
     ] = "SIMPLE_RADIAL"
     """COLMAP camera model; one with more parameters needs more views, or shared intrinsics."""
     shared_intrinsics: bool = False
-    """One set of intrinsics for all cameras, which needs fewer views; for cameras of equal make and zoom."""
+    """One set of intrinsics for all cameras of an image size, which needs fewer views; for equal make and zoom."""
     frame: int = 0
     """Frame to calibrate on; in clips of variable frame rate, the one nearest in time."""
     partial: bool = False
@@ -64,6 +67,7 @@ class CalibrationResult:
         points: number of points.
         error: mean reprojection error of the points, px.
         checks: result of every camera, including the ones left out; `matches` is the number of its points.
+        mapper: COLMAP's mapper of the model, ``"incremental"`` or ``"global"``.
     """
 
     model: Path
@@ -72,6 +76,38 @@ class CalibrationResult:
     points: int
     error: float
     checks: tuple[CameraCheck, ...]
+    mapper: Mapper
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A model of COLMAP.
+
+    Attributes:
+        mapper: the mapper that made it.
+        model: pycolmap's reconstruction.
+        checks: result of every camera, including the ones without a pose.
+    """
+
+    mapper: Mapper
+    model: Any
+    checks: tuple[CameraCheck, ...]
+
+    @property
+    def error(self) -> float:
+        """Mean reprojection error of the points, px."""
+        return float(self.model.compute_mean_reprojection_error())
+
+    @property
+    def complete(self) -> bool:
+        """Whether every camera has a pose."""
+        return all(check.fits is not None for check in self.checks)
+
+    @property
+    def rank(self) -> tuple[int, int, float]:
+        """Number of cameras that fit, number of cameras with a pose, and the negative error; larger is better."""
+        fits = [check.fits for check in self.checks]
+        return fits.count(True), len(fits) - fits.count(None), -self.error
 
 
 def calibrate(
@@ -109,10 +145,12 @@ def calibrate(
     images, masks = _frames(path, config, without)
     report("Reading frames", 1, 1)
     with tempfile.TemporaryDirectory() as scratch, _quiet():
-        model = _map(path, images, masks, Path(scratch), config, report)
-        registered = {Path(model.image(i).name).stem for i in model.reg_image_ids()}
-        names = tuple(name for name in images if name in registered)
-        left_out = tuple(name for name in images if name not in registered)
+        _match(path, images, masks, Path(scratch), config, report)
+        report("Mapping", 0, 1)
+        best = _map(path, tuple(images), Path(scratch), config.seed)
+        report("Mapping", 1, 1)
+        names = tuple(check.name for check in best.checks if check.fits is not None)
+        left_out = tuple(name for name in images if name not in names)
         if left_out and not config.partial:
             raise ValueError(
                 f"{path}: expected to register all {len(images)} cameras, got {len(names)}, without "
@@ -120,9 +158,9 @@ def calibrate(
                 "calibrate on another frame (--frame), or accept the partial model (--partial)."
             )
         with atomic_path(path / "sparse", "calibrate()") as folder:
-            write_reconstruction(model, folder / "0")
-    error, checks = float(model.compute_mean_reprojection_error()), _checks(model, list(images))
-    return CalibrationResult(path / "sparse" / "0", names, left_out, model.num_points3D(), error, checks)
+            write_reconstruction(best.model, folder / "0")
+    points = best.model.num_points3D()
+    return CalibrationResult(path / "sparse" / "0", names, left_out, points, best.error, best.checks, best.mapper)
 
 
 def _checks(model: Any, names: Sequence[str]) -> tuple[CameraCheck, ...]:
@@ -169,12 +207,6 @@ def _frames(
         raise ValueError(f"{path}: frame {config.frame} is not in the clips of {', '.join(short)}; choose another.")
     at = {name: int(nearest_frames(reader, np.array([config.frame]))[0][0]) for name, reader in readers.items()}
     images = {name: next(reader.frames(at[name], at[name] + 1)) for name, reader in readers.items()}
-    sizes = {image.shape[1::-1] for image in images.values()}
-    if config.shared_intrinsics and len(sizes) > 1:
-        raise ValueError(
-            f"{path}: shared intrinsics need clips of one size, got {', '.join(f'{w}x{h}' for w, h in sorted(sizes))}; "
-            "give each camera its own."
-        )
     masks = {name: opaque_pixels(reader, name)[0] for name, reader in readers.items()}
     return images, {name: mask for name, mask in masks.items() if mask is not None}
 
@@ -184,54 +216,76 @@ def _last_position(reader: FrameReader) -> int:
     return reader.num_held - 1 if reader.positions is None else round(reader.positions[-1])
 
 
-def _map(
+def _match(
     path: Path,
     images: dict[str, np.ndarray],
     masks: dict[str, np.ndarray],
     scratch: Path,
     config: CalibrateConfig,
     report: Callable[[str, int, int], None],
-) -> Any:
-    """Return pycolmap's reconstruction with the most cameras."""
+) -> None:
+    """Write images, features and the matches of all pairs of views into a folder, for `_map`."""
     import pycolmap
 
-    folder, masked, database = scratch / "images", scratch / "masks", scratch / "database.db"
+    folder, masked, database = scratch / _IMAGES, scratch / "masks", scratch / _DATABASE
     folder.mkdir()
     masked.mkdir()
+    by_size: dict[tuple[int, ...], list[str]] = {}
     for name, image in images.items():
+        by_size.setdefault(image.shape[:2], []).append(f"{name}.png")
         _write_png(folder / f"{name}.png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
         if masks:  # COLMAP needs a mask for every image, or none
             opaque = masks.get(name, np.ones(image.shape[:2], bool))
             _write_png(masked / f"{name}.png.png", 255 * opaque.astype(np.uint8))
     pycolmap.set_random_seed(config.seed)
-    report("Finding features", 0, 1)
     mode = pycolmap.CameraMode.SINGLE if config.shared_intrinsics else pycolmap.CameraMode.PER_IMAGE
     reader = pycolmap.ImageReaderOptions(camera_model=config.camera_model)
     if masks:
         reader.mask_path = masked
-    pycolmap.extract_features(database, folder, camera_mode=mode, reader_options=reader, device=pycolmap.Device.cpu)
-    report("Finding features", 1, 1)
+    for done, (size, names) in enumerate(by_size.items()):  # each call makes a camera of its own
+        report("Finding features", done, len(by_size))
+        extraction = pycolmap.FeatureExtractionOptions(max_image_size=max(size))
+        pycolmap.extract_features(database, folder, names, mode, reader, extraction, pycolmap.Device.cpu)
+    report("Finding features", len(by_size), len(by_size))
     _check_features(path, database)
     report("Matching views", 0, 1)
     pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
     report("Matching views", 1, 1)
     _check_pairs(path, database)
-    report("Mapping", 0, 1)
-    models: list[Any] = []
-    # The initial pair and the registered views are partly random: another seed may register the missing views.
-    for attempt in range(_TRIES):
-        options = pycolmap.IncrementalPipelineOptions(min_model_size=2, random_seed=config.seed + attempt)
-        models += pycolmap.incremental_mapping(database, folder, scratch, options).values()
-        if any(model.num_reg_images() == len(images) for model in models):
-            break
-    report("Mapping", 1, 1)
-    if not models:
+
+
+def _map(path: Path, names: Sequence[str], scratch: Path, seed: int) -> _Candidate:
+    """Return the best model of incremental and of global mapping of the matches in a folder.
+
+    If none is complete, both map the matches that agree with focal lengths found from pairs of views, too.
+    """
+    import pycolmap
+
+    candidates = _mapped(names, scratch, seed)
+    if not any(candidate.complete for candidate in candidates):
+        pycolmap.calibrate_view_graph(scratch / _DATABASE, pycolmap.ViewGraphCalibrationOptions(random_seed=seed))
+        candidates += _mapped(names, scratch, seed)
+    if not candidates:
         raise ValueError(
-            f"{path}: the views match, but COLMAP found no pair to initialise from: their baselines may be too short "
-            f"or too wide, or all shared points may lie in one plane; try shared intrinsics (--shared-intrinsics), "
-            f"another frame (--frame), or {_MORE_TEXTURE}."
+            f"{path}: the views match, but neither incremental nor global mapping by COLMAP found poses: their "
+            "baselines may be too short or too wide, or all shared points may lie in one plane; try shared intrinsics "
+            f"(--shared-intrinsics), another frame (--frame), or {_MORE_TEXTURE}."
         )
-    return max(models, key=lambda model: (model.num_reg_images(), model.num_points3D()))
+    return max(candidates, key=lambda candidate: candidate.rank)
+
+
+def _mapped(names: Sequence[str], scratch: Path, seed: int) -> list[_Candidate]:
+    """Return the models of both mappers."""
+    import pycolmap
+
+    inputs = scratch / _DATABASE, scratch / _IMAGES, scratch
+    incremental = pycolmap.IncrementalPipelineOptions(min_model_size=2, random_seed=seed)
+    models: list[tuple[Mapper, Any]] = [
+        ("incremental", model) for model in pycolmap.incremental_mapping(*inputs, incremental).values()
+    ]
+    overall = pycolmap.GlobalPipelineOptions(random_seed=seed)
+    models += [("global", model) for model in pycolmap.global_mapping(*inputs, overall).values()]
+    return [_Candidate(mapper, model, _checks(model, names)) for mapper, model in models]
 
 
 def _check_features(path: Path, database: Path) -> None:

@@ -45,5 +45,5 @@ class Calibrate:
             print_warning(line)
         print_result(
             f"{found.model}: {len(found.cameras)} cameras, {found.points} points, mean reprojection error "
-            f"{found.error:.2f} px; scale and up direction of its world are arbitrary."
+            f"{found.error:.2f} px, by {found.mapper} mapping; scale and up direction of its world are arbitrary."
         )

@@ -13,8 +13,8 @@ import pycolmap
 import pytest
 
 from morgs_mi import cli
-from morgs_mi.calibration.calibrate import CalibrateConfig, _frames, calibrate
-from morgs_mi.calibration.checks.rig_check import check_rig, match_capture
+from morgs_mi.calibration.calibrate import CalibrateConfig, _Candidate, _frames, calibrate
+from morgs_mi.calibration.checks.rig_check import CameraCheck, check_rig, match_capture
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.core.camera import Camera
@@ -61,6 +61,47 @@ def test_calibrate__recovers_a_rig(tmp_path: Path, capsys) -> None:
     assert "sparse: expected no model, got one" in capsys.readouterr().err
 
 
+def test_calibrate__shares_intrinsics_among_clips_of_a_size(tmp_path: Path) -> None:
+    sizes = [(240, 180), (320, 240)] * 3
+    cameras = [camera.resized(*size) for camera, size in zip(textured.rig(), sizes, strict=True)]
+    found = calibrate(film(tmp_path, cameras), CalibrateConfig(shared_intrinsics=True))
+    assert len(pycolmap.Reconstruction(str(found.model)).cameras) == 2
+    capture = load_capture(tmp_path)
+    assert capture.recorded_sizes == tuple(sizes)
+    for camera, expected in zip(capture.cameras, cameras, strict=True):
+        np.testing.assert_allclose(camera.K[0, 0], expected.K[0, 0], rtol=5e-3)
+
+
+def test_calibrate__takes_global_mapping_where_incremental_mapping_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    film(tmp_path, [camera.resized(240, 180) for camera in textured.rig()])
+    monkeypatch.setattr(pycolmap, "incremental_mapping", lambda *_: {})
+    assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
+    assert re.search(r"6 cameras, .* by\s+global\s+mapping", capsys.readouterr().out)
+    monkeypatch.setattr(pycolmap, "global_mapping", lambda *_: {})
+    with pytest.raises(ValueError, match="neither incremental nor global mapping by COLMAP found poses"):
+        calibrate(tmp_path, overwrite=True)
+
+
+def test_candidate__ranks_fitting_cameras_then_poses_then_the_error() -> None:
+    class Model:
+        def __init__(self, error: float) -> None:
+            self.compute_mean_reprojection_error = lambda: error
+
+    def rank(error: float, *fits: bool | None) -> tuple[int, int, float]:
+        return _Candidate("global", Model(error), tuple(CameraCheck("", 0, 0.0, each) for each in fits)).rank
+
+    ordered = [
+        rank(0.1, True, None, None),
+        rank(0.9, True, False, None),
+        rank(0.3, True, True, None),
+        rank(0.2, True, True, None),
+        rank(0.9, True, True, True),
+    ]
+    assert ordered == sorted(ordered)
+
+
 def test_calibrate__names_a_camera_with_another_scene(tmp_path: Path) -> None:
     film(tmp_path, [camera.resized(240, 180) for camera in textured.rig()[1:5]])
     noise = np.random.default_rng(1).integers(0, 255, (90, 120, 3), np.uint8)
@@ -99,7 +140,9 @@ def test_calibrate__prints_a_verdict_per_camera(tmp_path: Path, capsys) -> None:
 def test_calibrate__of_a_full_disk_leaves_no_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_colmap(tmp_path / "found", textured.rig(4), np.random.default_rng(0).normal(size=(60, 3)))
     found, clips = pycolmap.Reconstruction(str(tmp_path / "found")), film(tmp_path / "clips", textured.rig(4))
-    monkeypatch.setattr("morgs_mi.calibration.calibrate._map", lambda *_: found)
+    checks = tuple(CameraCheck(camera.name, 60, 0.1, True) for camera in textured.rig(4))
+    monkeypatch.setattr("morgs_mi.calibration.calibrate._match", lambda *_: None)
+    monkeypatch.setattr("morgs_mi.calibration.calibrate._map", lambda *_: _Candidate("incremental", found, checks))
     size = (tmp_path / "found" / "points3D.txt").stat().st_size
     with pytest.raises(OSError, match=r"cannot write .*sparse, the partial output was removed"), files_end_at(size - 1):
         calibrate(clips)
@@ -147,11 +190,6 @@ def no_clip(path: Path) -> None:
     path.mkdir()
 
 
-def other_size(path: Path) -> None:
-    noise_clips(path)
-    write_video(path / "b.mkv", [np.full((100, 160, 3), 90, np.uint8)], 30)
-
-
 def calibrated(path: Path) -> None:
     noise_clips(path)
     (path / "sparse").mkdir()
@@ -172,7 +210,6 @@ def empty_clip(path: Path) -> None:
         (calibrated, {}, FileExistsError, "sparse: expected no model, got one"),
         (noise_clips, {"frame": 1}, ValueError, "frame 1 is not in the clips of a, b, c"),
         (noise_clips, {"frame": -1}, ValueError, "frame -1 is not in the clips of a, b, c"),
-        (other_size, {"shared_intrinsics": True}, ValueError, "clips of one size, got 160x100, 160x120"),
         (grey, {}, ValueError, "at least 100 features in every view, got 0 in b: too dark"),
         (noise_clips, {}, ValueError, "no two of the 3 views match"),
     ],
