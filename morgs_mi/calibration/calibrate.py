@@ -31,6 +31,8 @@ Mapper = Literal["incremental", "global"]
 
 # With fewer features in a view COLMAP cannot register it.
 _MIN_FEATURES = 100
+# Contrast of the weakest features. At COLMAP's 0.0067, views at the edge of a rig have too few matches for a pose.
+_PEAK = 0.002
 # COLMAP registers a camera with fewer points, but its pose then depends on a few of them.
 _MIN_POINTS = 50
 # Files in the folder that COLMAP works in.
@@ -182,7 +184,7 @@ def _check(name: str, image: Any | None, model: Any) -> CameraCheck:
     seen = [p for p in image.points2D if p.has_point3D()]
     projected = (image.project_point(model.point3D(p.point3D_id).xyz) for p in seen)
     errors = [np.inf if q is None else float(np.linalg.norm(q - p.xy)) for p, q in zip(seen, projected, strict=True)]
-    error, advice = float(np.median(errors)), ""
+    error, advice = float(np.median(errors)) if errors else float("nan"), ""
     if len(seen) < _MIN_POINTS:
         advice = f"only {len(seen)} points, {_MIN_POINTS} are needed for a reliable pose: {_MORE_TEXTURE}"
     elif error > MAX_ERROR:
@@ -245,10 +247,12 @@ def _match(
     for done, (size, names) in enumerate(by_size.items()):  # each call makes a camera of its own
         report("Finding features", done, len(by_size))
         extraction = pycolmap.FeatureExtractionOptions(max_image_size=max(size))
+        extraction.sift.peak_threshold = _PEAK
         pycolmap.extract_features(database, folder, names, mode, reader, extraction, pycolmap.Device.cpu)
     report("Finding features", len(by_size), len(by_size))
     _check_features(path, database)
     report("Matching views", 0, 1)
+    # Guided matching takes several times as long, and its poses are no better by matches of other features.
     pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
     report("Matching views", 1, 1)
     _check_pairs(path, database)
@@ -280,12 +284,15 @@ def _mapped(names: Sequence[str], scratch: Path, seed: int) -> list[_Candidate]:
 
     inputs = scratch / _DATABASE, scratch / _IMAGES, scratch
     incremental = pycolmap.IncrementalPipelineOptions(min_model_size=2, random_seed=seed)
-    models: list[tuple[Mapper, Any]] = [
-        ("incremental", model) for model in pycolmap.incremental_mapping(*inputs, incremental).values()
+    found: dict[Mapper, dict[int, Any]] = {
+        "incremental": pycolmap.incremental_mapping(*inputs, incremental),
+        "global": pycolmap.global_mapping(*inputs, pycolmap.GlobalPipelineOptions(random_seed=seed)),
+    }
+    return [
+        _Candidate(mapper, model, _checks(model, names))
+        for mapper, models in found.items()
+        for model in models.values()
     ]
-    overall = pycolmap.GlobalPipelineOptions(random_seed=seed)
-    models += [("global", model) for model in pycolmap.global_mapping(*inputs, overall).values()]
-    return [_Candidate(mapper, model, _checks(model, names)) for mapper, model in models]
 
 
 def _check_features(path: Path, database: Path) -> None:

@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 
 from morgs_mi import cli
-from morgs_mi.calibration.calibrate import CalibrateConfig, _Candidate, _frames, calibrate
+from morgs_mi.calibration.calibrate import CalibrateConfig, _Candidate, _check, _frames, calibrate
 from morgs_mi.calibration.checks.rig_check import CameraCheck, check_rig, match_capture
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import write_colmap
@@ -100,6 +100,13 @@ def test_candidate__ranks_fitting_cameras_then_poses_then_the_error() -> None:
         rank(0.9, True, True, True),
     ]
     assert ordered == sorted(ordered)
+
+
+@pytest.mark.filterwarnings("error")
+def test_check__of_a_camera_without_points_does_not_fit() -> None:
+    check = _check("a", pycolmap.Image(), pycolmap.Reconstruction())
+    assert (check.matches, check.fits) == (0, False)
+    assert np.isnan(check.error)
 
 
 def test_calibrate__names_a_camera_with_another_scene(tmp_path: Path) -> None:
