@@ -197,11 +197,11 @@ class FitConfig:
     confidence_steps: Annotated[int, AtLeast(0)] = 40
     """Steps that learn the confidence of the first frame from the masks of its key views."""
     epochs: Annotated[int, AtLeast(1)] = 8
-    """Passes over all training views for every later frame; the paper's small variant takes 5."""
+    """Most passes over all training views for every later frame; the paper's small variant takes 5."""
     skip_static: bool = True
     """Skip the Gaussians, blocks of pixels and views that cannot have changed (see `active_set`)."""
-    early_stopping_tolerance: Annotated[float, AtLeast(0)] = 1e-6
-    """Relative decrease of L_recon over an epoch below which a later frame ends early; 0: never."""
+    early_stopping_tolerance: Annotated[float, AtLeast(0)] = 0.05
+    """Relative decrease of the objective over two epochs below which a later frame ends early; 0: never."""
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     """Weights of the losses."""
     density: DensityConfig = field(default_factory=DensityConfig)

@@ -31,8 +31,8 @@ from morgs_mi.render.active_view import ActiveView
 
 __all__ = ["FrameProblem", "LaterFrame", "fit_later_frame"]
 
-# The round of density control, as a fraction of the epochs: the residual has shown by then where Gaussians are missing,
-# and enough steps are left to fit the births.
+# The round of density control is due when the loss hardly falls, and at this fraction of the epochs at the latest: the
+# residual has shown by then where Gaussians are missing, and enough steps are left to fit the births.
 _DENSITY_ROUND = 0.625
 # Number of views, spread over the rig, that contribute to the densification scores of that round.
 _DENSITY_VIEWS = 8
@@ -99,13 +99,14 @@ def fit_later_frame(
     if not active.views or not len(active.indices):
         return LaterFrame(with_zero_motion(previous), np.arange(len(previous)), {}, 0)
     fit = _Fit(problem, config, motion, rng, progress)
-    density_epoch = round(_DENSITY_ROUND * config.epochs)
+    last_chance, densifies = round(_DENSITY_ROUND * config.epochs), config.density.later_frames
     for epoch in range(fit.start(), config.epochs):
-        if epoch == density_epoch and config.density.later_frames:
+        if densifies and (fit.has_converged or epoch == last_chance):
             fit.densify()
-        fit.run_epoch(epoch)
-        if epoch >= density_epoch and fit.has_converged:
+            densifies = False
+        elif fit.has_converged:
             break
+        fit.run_epoch(epoch)
     gaussians, source = _merge(previous, active, fit.gaussians, fit.source)
     return LaterFrame(gaussians, source, fit.losses, fit.steps // len(active.views))
 
@@ -134,7 +135,7 @@ class _Fit:
         self._observations = _on_active_views(problem)
         self._base, self.source = problem.active.select(problem.previous), np.arange(len(problem.active.indices))
         self._neighbours = self._found_neighbours()
-        self._last_recon, self.losses, self.steps = np.inf, dict[str, float](), 0
+        self._objectives, self.losses, self.steps = list[float](), dict[str, float](), 0
 
     @property
     def gaussians(self) -> Gaussians:
@@ -144,9 +145,9 @@ class _Fit:
 
     @property
     def has_converged(self) -> bool:
-        """Whether L_recon hardly decreased in the last epoch."""
-        tolerance = self._config.early_stopping_tolerance
-        return tolerance > 0 and self.losses["recon"] > (1 - tolerance) * self._last_recon
+        """Whether the objective (eq. 13) hardly decreased over the last two epochs: a single one may overshoot."""
+        tolerance, values = self._config.early_stopping_tolerance, self._objectives
+        return tolerance > 0 and len(values) > 2 and values[-1] > (1 - tolerance) * values[-3]
 
     def start(self) -> int:
         """Fit the motion model, if there is one, start the residual, and return the number of epochs that this took."""
@@ -162,10 +163,10 @@ class _Fit:
 
     def run_epoch(self, epoch: int) -> None:
         """Make one step in every active view."""
-        self._last_recon = self.losses.get("recon", np.inf)
         rates = self._config.rates_at(epoch).by_parameter(self._problem.extent)
         weights = weights_of(self._config.objective)
         self.losses = optimise(self._optimizer, rates, self._losses_at, self._next_steps(1), weights)
+        self._objectives.append(sum(weights[name] * loss for name, loss in self.losses.items()))
 
     def densify(self) -> None:
         """Add and prune active Gaussians by density control."""
