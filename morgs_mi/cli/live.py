@@ -17,6 +17,7 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, print_warning, progress
 from morgs_mi.cli.settings import Flag, GivenSettings, Settings
+from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.live.live_config import LiveConfig
 
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
 
 __all__ = ["Live"]
 
+# Dropped frames cost more than the last epochs of a frame gain.
+_DEFAULT = StreamConfig(fit=FitConfig(epochs=2))
 _PERIOD = 1.0  # least time between two lines about frames, s
 _FIRST_SECONDS = 30.0  # of the first frame, during which nothing should move, unless its steps or its time are given
 
@@ -33,7 +36,8 @@ _FIRST_SECONDS = 30.0  # of the first frame, during which nothing should move, u
 class Live:
     """Reconstruct what cameras see, while they see it, into OUT/stream.morgs; Ctrl-C ends it.
 
-    Whenever a frame is fitted, the newest images follow, and those between are dropped.
+    Whenever a frame is fitted, the newest images follow, and those between are dropped. Frames have two epochs unless
+    --epochs, a preset or a file sets more.
     """
 
     out: Annotated[Positional[Path | None], arg(help_behavior_hint="(default: live-DATE-TIME)", metavar="[OUT]")] = None
@@ -51,7 +55,7 @@ class Live:
         from morgs_mi.runs.live.fit_live import fit_live
 
         out = self.out or Path(time.strftime("live-%Y%m%d-%H%M%S"))
-        config = _with_first_seconds(self.settings.stream_config())
+        config = _with_first_seconds(self.settings.stream_config(_DEFAULT))
         self.settings.check_methods(config)
         sources = [int(source) if source.isdecimal() else source for source in self.camera]
         with ExitStack() as viewer, progress() as report:
