@@ -12,14 +12,13 @@ import numpy as np
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.progress import Progress
-from morgs_mi.core.rig import choose_key_views
 from morgs_mi.core.types import Tensor
 from morgs_mi.fit.density import apply_plan, plan_additions, resize_optimizer
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.motion_stage import fit_motion
 from morgs_mi.fit.optimise import Steps, adam, optimise, values_of, view_order
 from morgs_mi.method.active_set import ActiveSet, with_zero_motion
-from morgs_mi.method.attribution import densification_scores
+from morgs_mi.method.attribution import Attribution
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_model import motion_model
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
@@ -29,16 +28,13 @@ from morgs_mi.method.rigidity import find_neighbours
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
 
+_SCORES = "scores"  # name of the loss of the densification scores, which is 0
+
 __all__ = ["FrameProblem", "LaterFrame", "fit_later_frame"]
 
 # The round of density control is due when the loss hardly falls, and at this fraction of the epochs at the latest: the
 # residual has shown by then where Gaussians are missing, and enough steps are left to fit the births.
 _DENSITY_ROUND = 0.625
-# Number of views, spread over the rig, that contribute to the densification scores of that round.
-_DENSITY_VIEWS = 8
-# Error that counts as noise there, in medians of the image's error: normal noise, independent in three colours, exceeds
-# 3 at 3 of 10,000 pixels.
-_NOISE = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,11 +95,10 @@ def fit_later_frame(
     if not active.views or not len(active.indices):
         return LaterFrame(with_zero_motion(previous), np.arange(len(previous)), {}, 0)
     fit = _Fit(problem, config, motion, rng, progress)
-    last_chance, densifies = round(_DENSITY_ROUND * config.epochs), config.density.later_frames
+    last_chance = round(_DENSITY_ROUND * config.epochs)
     for epoch in range(fit.start(), config.epochs):
-        if densifies and (fit.has_converged or epoch == last_chance):
+        if fit.can_densify and (fit.has_converged or epoch >= last_chance):
             fit.densify()
-            densifies = False
         elif fit.has_converged:
             break
         fit.run_epoch(epoch)
@@ -135,6 +130,7 @@ class _Fit:
         self._observations = _on_active_views(problem)
         self._base, self.source = problem.active.select(problem.previous), np.arange(len(problem.active.indices))
         self._neighbours = self._found_neighbours()
+        self._densifies, self._attribution = config.density.later_frames, None
         self._objectives, self.losses, self.steps = list[float](), dict[str, float](), 0
 
     @property
@@ -166,25 +162,42 @@ class _Fit:
         rates = self._config.rates_at(epoch).by_parameter(self._problem.extent)
         weights = weights_of(self._config.objective)
         self.losses = optimise(self._optimizer, rates, self._losses_at, self._next_steps(1), weights)
+        self.losses.pop(_SCORES, None)
         self._objectives.append(sum(weights[name] * loss for name, loss in self.losses.items()))
 
+    @property
+    def can_densify(self) -> bool:
+        """Whether the round of density control is still to come, and an epoch has shown where Gaussians are missing."""
+        return self._attribution is not None
+
     def densify(self) -> None:
-        """Add and prune active Gaussians by density control."""
-        problem, density = self._problem, self._config.density
-        now, views = self.gaussians, _spread(problem, _DENSITY_VIEWS)
-        scores = densification_scores(now, *views, _NOISE)
+        """Add and prune active Gaussians by density control, once."""
+        assert self._attribution is not None
+        problem, density, scores = self._problem, self._config.density, self._attribution.scores()
         num_static = len(problem.previous) - len(problem.active.indices)
-        plan = plan_additions(now, scores, density, self._rng, num_static)
+        plan = plan_additions(self.gaussians, scores, density, self._rng, num_static)
         # A birth has the motion of its parent: it starts from the parent's past and shares the residual.
         self._base, self.source = apply_plan(self._base, plan), plan.source
         self._neighbours = self._found_neighbours()
         resize_optimizer(self._optimizer, plan)
+        self._densifies, self._attribution = False, None
 
     def _next_steps(self, epochs: int) -> Steps:
         """Return the steps of the next epochs."""
         first, progress, total = self.steps, self._progress, len(self._order)
         self.steps += epochs * len(self._views)
-        on_step = None if progress is None else lambda done: progress(done, total)
+        # The first steps of an epoch still correct what the last ones show.
+        half = self.steps - (len(self._views) + 1) // 2
+        self._attribution = Attribution(len(self.source)) if self._densifies and half == first else None
+
+        def on_step(done: int) -> None:
+            if self._attribution is not None:
+                self._attribution.collect()
+            if self._densifies and done == half:
+                self._attribution = Attribution(len(self.source))
+            if progress is not None:
+                progress(done, total)
+
         return Steps(self._order[first : self.steps], first, on_step=on_step, last=len(self._views))
 
     def _losses_at(self, parameters: Mapping[str, Tensor], index: int) -> dict[str, Tensor]:
@@ -195,10 +208,13 @@ class _Fit:
         # The other terms are about motion and confidence, and must not move opacity and geometry.
         detached = [name for name in channels if name != "color"]
         now = apply_residual(self._base, parameters, self._motion)
-        image = view.render(now, channels, detached)
+        scores = self._attribution
+        features = None if scores is None else scores.features()
+        image = view.render(now, channels, [*detached, "features"] if scores else detached, features)
         num_pixels, num_gaussians = view.camera.width * view.camera.height, problem.active.num_gaussians
         prediction = Prediction(image, parameters, view.region, num_pixels, num_gaussians, problem.extent, now)
-        return losses_of(prediction, observed, objective)
+        losses = losses_of(prediction, observed, objective)
+        return losses if scores is None else losses | {_SCORES: scores.loss(image, problem.targets[index], view.region)}
 
     def _found_neighbours(self) -> Observations:
         """Return the observation of all views that compares neighbours, if a term does."""
@@ -207,13 +223,6 @@ class _Fit:
             return {}
         found = find_neighbours(self._base, self._problem.extent)
         return {} if found is None else {"neighbours": found}
-
-
-def _spread(problem: FrameProblem, count: int) -> tuple[list[ActiveView], list[Target]]:
-    """Return `count` active views that are spread over the rig, or all if there are fewer, and their targets."""
-    indices = sorted(problem.active.views)
-    chosen = choose_key_views([problem.active.views[v].camera for v in indices], count)
-    return [problem.active.views[indices[k]] for k in chosen], [problem.targets[indices[k]] for k in chosen]
 
 
 def _on_active_views(problem: FrameProblem) -> dict[int, Observations]:

@@ -2,6 +2,9 @@
 
 With the error e(x) of a rendered view, E_i = sum_x w_i(x) e(x) is the error attributed to Gaussian i there (Bulo et al.
 2024), and W_i = sum_x w_i(x) the number of pixels that it covers.
+
+Both are the gradients of sum_x f(x) e(x) and of sum_x f(x) for a feature that is blended like a colour and is 0
+everywhere: the adjoint of a step gives them along with the gradients of its losses.
 """
 
 from __future__ import annotations
@@ -9,15 +12,23 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.types import Float, Tensor
 from morgs_mi.method.ssim import Target
 from morgs_mi.method.sweep import KeyImages
 from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.rasterize import Image
+from morgs_mi.render.region import Region
 
-__all__ = ["DensificationScores", "densification_scores"]
+__all__ = ["Attribution", "DensificationScores", "densification_scores"]
 
+# Error that counts as noise, in typical errors of the image: normal noise, independent in three colours, exceeds 3 at
+# 3 of 10,000 pixels.
+_NOISE = 3.0
 # Share of the pixels of a view up to which views are drawn together: more of them would take more memory than time.
 _TOGETHER = 2.0
 
@@ -35,8 +46,60 @@ class DensificationScores:
     weight: np.ndarray
 
 
+class Attribution:
+    """Densification scores of N Gaussians from the steps of an optimisation, without a pass of their own.
+
+    Args:
+        count: N.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._count, self._probe = count, None
+        self._largest = dr.zeros(mi.Float, 2 * count)
+
+    def features(self) -> Tensor:
+        """Return the features [N, 2] to render in the next step, with detached weights."""
+        self._probe = probe = dr.zeros(mi.TensorXf, (self._count, 2))
+        dr.enable_grad(probe)
+        return probe
+
+    def loss(self, image: Image, target: Target, region: Region | None) -> Tensor:
+        """Return a loss of 0, of which the gradients of the features are E and W.
+
+        Errors below three times the typical error of the image do not count: they are noise.
+        """
+        pixels, weight = target.on(region)
+        drawn = dr.detach(image.color).array
+        difference = dr.abs(pixels - (drawn if weight is None else drawn * weight))
+        pixel = dr.arange(mi.UInt32, dr.width(difference) // 3) * 3
+        error = sum(dr.gather(mi.Float, difference, pixel + c) for c in range(3)) / 3
+        error = dr.maximum(error - _NOISE * _typical(error), 0)
+        maps = dr.zeros(mi.Float, 2 * dr.width(error)) + 1
+        dr.scatter(maps, error, 2 * dr.arange(mi.UInt32, dr.width(error)))
+        return dr.sum(image.features * mi.TensorXf(maps, image.features.shape), axis=None)
+
+    def collect(self) -> None:
+        """Take the scores of a step, if its features were rendered, after its gradients have been computed."""
+        if self._probe is not None:
+            self._largest = dr.maximum(self._largest, dr.grad(self._probe).array)
+            dr.eval(self._largest)
+            self._probe = None
+
+    def scores(self) -> DensificationScores:
+        """Return the scores of the steps so far."""
+        error, weight = np.asarray(self._largest).reshape(-1, 2).T
+        return DensificationScores(error, weight)
+
+
+def _typical(error: Float) -> Float:
+    """Return about the median of errors >= 0 that are not 0: the mean of those below twice the mean."""
+    mean = dr.sum(error) / dr.maximum(mi.Float(dr.count(error > 0)), 1)
+    small = (error > 0) & (error < 2 * mean)
+    return dr.sum(dr.select(small, error, 0)) / dr.maximum(mi.Float(dr.count(small)), 1)
+
+
 def densification_scores(
-    gaussians: Gaussians, views: Sequence[ActiveView], targets: Sequence[Target], tolerance: float = 0.0
+    gaussians: Gaussians, views: Sequence[ActiveView], targets: Sequence[Target]
 ) -> DensificationScores:
     """Render every view and return the densification scores of the Gaussians.
 
@@ -44,13 +107,12 @@ def densification_scores(
         gaussians: N Gaussians.
         views: V active views.
         targets: their images.
-        tolerance: in medians of an image's error; smaller errors do not count.
     """
     gaussians = gaussians.detached()
     error, weight = np.zeros((2, len(gaussians)), np.float32)
     for few in _few_at_once(views):
         images = KeyImages({v: views[v] for v in few}, dict(enumerate(targets)))
-        sums = images.sums(gaussians, ("error", "weight"), tolerance)
+        sums = images.sums(gaussians, ("error", "weight"))
         error, weight = np.maximum(error, sums["error"].max(0)), np.maximum(weight, sums["weight"].max(0))
     return DensificationScores(error, weight)
 

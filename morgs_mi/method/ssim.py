@@ -121,8 +121,10 @@ class Target:
         drawn = dr.detach(image).array
         return np.asarray(pixels - (drawn if weight is None else drawn * weight)).reshape(region.shape(3))
 
-    def on(self, region: Region) -> tuple[Float, Float | None]:
+    def on(self, region: Region | None) -> tuple[Float, Float | None]:
         """Return the target on a region, flat, 0 outside the view, and the weights of its numbers; None: 1."""
+        if region is None or region.whole:
+            return self.planes.image(self.pixels), None if self.weight is None else self.planes.image(self.weight)
         places, inside = self.places_on(region)
         weight = None if self.weight is None else dr.gather(mi.Float, self.weight, places)
         return dr.gather(mi.Float, self.pixels, places, active=inside), weight

@@ -18,7 +18,6 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
@@ -26,9 +25,6 @@ from morgs_mi.render.projection import concatenated
 from morgs_mi.render.view_group import Drawing, ViewGroup
 
 __all__ = ["MAPS", "KeyImages"]
-
-# Pixels of a view that are enough for the median of its error.
-_SAMPLED = 20_000
 
 _Map = Callable[[list[Float], list[Float], list[Float]], list[Float]]
 
@@ -55,18 +51,15 @@ class KeyImages:
         self.views, self._targets = views, [targets[v] for v in views]
         self.group = ViewGroup([*views.values()])
 
-    def sums(self, gaussians: Gaussians, names: Sequence[str], tolerance: float = 0.0) -> dict[str, np.ndarray]:
+    def sums(self, gaussians: Gaussians, names: Sequence[str]) -> dict[str, np.ndarray]:
         """Return the sums of some `MAPS` per view and Gaussian, float32 [V, N, ...] by name; one number has no axis.
 
         Args:
             gaussians: N Gaussians, detached.
             names: of the maps.
-            tolerance: in medians of a view's |e|, where it is not 0; smaller |e| do not count.
         """
         drawing = self.group.draw(gaussians)
-        error = self._difference(drawing)
-        dr.eval(error)
-        image, sizes = self._maps(error, names, self._noise(error, tolerance) if tolerance else None)
+        image, sizes = self._maps(drawing, names)
         ends = np.cumsum(sizes)
         found = np.split(drawing.sums(image, int(ends[-1])), ends[:-1], axis=-1)
         return {name: v[..., 0] if v.shape[-1] == 1 else v for name, v in zip(names, found, strict=True)}
@@ -89,22 +82,15 @@ class KeyImages:
         with dr.suspend_grad():
             return float(dr.sum(dr.abs(self._difference(self.group.draw(gaussians))))[0]) / 3
 
-    def _maps(self, error: Float, names: Sequence[str], noise: Float | None) -> tuple[Float, list[int]]:
-        """Return the numbers of some maps at every pixel, flat, and how many numbers each map has.
-
-        Args:
-            error: e, flat.
-            names: of the maps.
-            noise: per pixel; |e| is lowered by it. None: 0.
-        """
+    def _maps(self, drawing: Drawing, names: Sequence[str]) -> tuple[Float, list[int]]:
+        """Return the numbers of some maps at every pixel, flat, and how many numbers each map has."""
         with dr.suspend_grad():
+            error = self._difference(drawing)
+            dr.eval(error)
             images = [error, *(self._gradient if {"normal", "right"} & set(names) else (error, error))]
             lane = dr.arange(mi.UInt32, self.group.region.num_pixels)
             pixel = [[dr.gather(mi.Float, image, 3 * lane + c) for c in range(3)] for image in images]
             columns = [MAPS[name](*pixel) for name in names]
-            if noise is not None:
-                place = names.index("error")
-                columns[place] = [dr.maximum(columns[place][0] - noise, 0)]
             sizes = [len(column) for column in columns]
             count = sum(sizes)
             image = dr.empty(mi.Float, dr.width(lane) * count)
@@ -112,14 +98,6 @@ class KeyImages:
                 dr.scatter(image, value, lane * count + k, mode=dr.ReduceMode.NoConflicts)
             dr.eval(image)
         return image, sizes
-
-    def _noise(self, error: Float, tolerance: float) -> Float:
-        """Return, per pixel, a number of medians of its view's |e|, where that is not 0."""
-        sizes = [region.num_pixels for region in self.group.regions]
-        parts = np.split(np.asarray(error).reshape(-1, 3), np.cumsum(sizes)[:-1])
-        samples = (np.abs(part[:: 1 + len(part) // _SAMPLED]).mean(axis=1) for part in parts)
-        medians = [float(np.median(sample[sample > 0])) if sample.any() else 0.0 for sample in samples]
-        return from_numpy(mi.Float, np.repeat(np.multiply(tolerance, medians), sizes))
 
     def _difference(self, drawing: Drawing) -> Float:
         """Return e, flat [A * block_height * block_width * 3]; 0 where masked."""

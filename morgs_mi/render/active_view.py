@@ -10,6 +10,7 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
+from morgs_mi.core.types import Tensor
 from morgs_mi.render.backproject import backproject
 from morgs_mi.render.blocks import touches
 from morgs_mi.render.projection import Splats, project
@@ -37,15 +38,20 @@ class ActiveView:
     static_splats: Splats | None = None
 
     def render(
-        self, gaussians: ActivatedGaussians, channels: Sequence[str] = ("color",), detach_weights: Sequence[str] = ()
+        self,
+        gaussians: ActivatedGaussians,
+        channels: Sequence[str] = ("color",),
+        detach_weights: Sequence[str] = (),
+        features: Tensor | None = None,
     ) -> Image:
-        """Return the image of Gaussians in this view, see `rasterize`."""
+        """Return the image of Gaussians in this view, see `rasterize`; static splats have features of 0."""
         return rasterize(
             gaussians,
             self.camera,
             channels,
             detach_weights=detach_weights,
             region=self.region,
+            features=features,
             static_splats=self.static_splats,
             config=self.config,
         )

@@ -79,10 +79,13 @@ class Splats:
         return self.shape + self.profile
 
     def concatenated_with(self, other: Splats) -> Splats:
-        """Return these splats followed by the others."""
+        """Return these splats followed by the others, which are 0 in the channels that they lack."""
         return Splats(
             concatenated(self.shape, other.shape),
-            {name: concatenated(value, other.channels[name]) for name, value in self.channels.items()},
+            {
+                name: concatenated(value, other.channels.get(name) or _zeros(value, len(other)))
+                for name, value in self.channels.items()
+            },
             concatenated(self.depths, other.depths),
             concatenated(self.extent, other.extent),
             concatenated(self.valid, other.valid),
@@ -90,6 +93,10 @@ class Splats:
             concatenated(self.profile, other.profile),
             None if self.view is None else concatenated(self.view, other.view),
         )
+
+
+def _zeros(columns: tuple[Float, ...], count: int) -> tuple[Float, ...]:
+    return tuple(dr.zeros(mi.Float, count) for _ in columns)
 
 
 @dataclass(frozen=True)

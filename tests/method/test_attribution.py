@@ -1,0 +1,75 @@
+"""Densification scores from the adjoint of a step, against back-projections."""
+
+from __future__ import annotations
+
+import cv2
+import drjit as dr
+import numpy as np
+import pytest
+
+from morgs_mi import RenderConfig
+from morgs_mi.fit.fit_config import DensityConfig
+from morgs_mi.method.attribution import Attribution, densification_scores
+from morgs_mi.method.ssim import Target
+from morgs_mi.render.active_view import ActiveView, make_active_view
+from tests.assertions import assert_close
+from tests.scenes.cameras import look_at_cameras
+from tests.scenes.gaussians import isotropic, random_sheet
+
+N = 300
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A wall; the whole of one view and a part of another one, whose target is masked."""
+    rng = np.random.default_rng(0)
+    wall = isotropic(random_sheet(rng, N, 1.2, 0.6), 0.06, 0.8, rng.uniform(-1.5, 1.5, (N, 1, 3)))
+    cameras = look_at_cameras([(x, 0.3, -3) for x in (-0.8, 0.8)], 45, 80, 60)
+    part = np.zeros((60, 80), bool)
+    part[20:50, 10:60] = True
+    static = isotropic(random_sheet(rng, 40, 1.2, 0.3), 0.06, 0.8, rng.uniform(-1.5, 1.5, (40, 1, 3)))
+    views = [ActiveView(cameras[0]), make_active_view(cameras[1], part, static, ("color",), RenderConfig())]
+    images = [cv2.GaussianBlur(rng.random((60, 80, 3), np.float32), (0, 0), 2) for _ in views]
+    return wall, views, [Target(images[0]), Target(images[1], rng.random((60, 80)) > 0.3)]
+
+
+def scores_of(wall, views, targets):
+    """Return the scores of one step in each view, and the gradient of the colours from its loss."""
+    scores = Attribution(N)
+    for view, target in zip(views, targets, strict=True):
+        dr.enable_grad(wall.sh_coeffs)
+        image = view.render(wall, ("color",), ("features",), scores.features())
+        loss = scores.loss(image, target, view.region)
+        assert np.asarray(loss).item() == 0
+        dr.backward(loss)
+        scores.collect()
+    return scores.scores(), np.asarray(dr.grad(wall.sh_coeffs))
+
+
+def test_attribution__is_what_back_projection_gives(scene, monkeypatch):
+    monkeypatch.setattr("morgs_mi.method.attribution._NOISE", 0.0)
+    found, gradient = scores_of(*scene)
+    expected = densification_scores(*scene)
+    assert_close(found.error, expected.error, rtol=1e-4)
+    assert_close(found.weight, expected.weight, rtol=1e-4)
+    assert not gradient.any(), "the images must not change because of the scores"
+
+
+def test_attribution__ignores_noise():
+    """Of an image with noise, errors count only where something else is wrong."""
+    rng = np.random.default_rng(1)
+    wall = isotropic(random_sheet(rng, N, 1.2, 0.6), 0.06, 0.8, rng.uniform(-1.5, 1.5, (N, 1, 3)))
+    view = ActiveView(look_at_cameras([(0, 0.3, -3)], 45, 80, 60)[0])
+    image = np.asarray(view.render(wall).color) + rng.normal(0, 0.02, (60, 80, 3)).astype(np.float32)
+    image[20:30, 30:40] += 0.5
+    found = scores_of(wall, [view], [Target(np.clip(image, 0, 1))])[0].error
+    pixels, _ = view.camera.project(np.asarray(wall.means))
+    near = (np.abs(pixels - (35, 25)) < (12, 12)).all(axis=1)
+    assert found[~near].max() < 0.02 * found[near].max()
+    assert found[~near].max() < DensityConfig().min_error
+
+
+def test_attribution__without_a_step_is_zero():
+    scores = Attribution(3)
+    scores.collect()
+    assert not scores.scores().error.any()
