@@ -187,7 +187,7 @@ class _Fit:
         first, progress, total = self.steps, self._progress, len(self._order)
         self.steps += epochs * len(self._views)
         # The first steps of an epoch still correct what the last ones show.
-        half = self.steps - (len(self._views) + 1) // 2
+        half = self.steps - (len(self._views) + 3) // 4
         self._attribution = Attribution(len(self.source)) if self._densifies and half == first else None
 
         def on_step(done: int) -> None:

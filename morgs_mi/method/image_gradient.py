@@ -7,6 +7,7 @@ import numpy as np
 
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.view_group import backproject
 
 __all__ = ["blurred", "gradient_products", "image_gradient"]
 
@@ -40,5 +41,5 @@ def gradient_products(
     """
     x, y = gradient
     sums = [weight * np.sum(a * b, axis=-1) for a, b in ((x, x), (x, y), (y, y), (error, x), (error, y))]
-    sums = view.backproject(gaussians, np.stack(sums, axis=-1)).astype(np.float64)
+    sums = backproject(gaussians, view, np.stack(sums, axis=-1)).astype(np.float64)
     return sums[:, [0, 1, 1, 2]].reshape(-1, 2, 2), sums[:, 3:]

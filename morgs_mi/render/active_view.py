@@ -11,7 +11,6 @@ import numpy as np
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import ActivatedGaussians
 from morgs_mi.core.types import Tensor
-from morgs_mi.render.backproject import backproject
 from morgs_mi.render.blocks import touches
 from morgs_mi.render.projection import Splats, project
 from morgs_mi.render.rasterize import Image, rasterize
@@ -55,10 +54,6 @@ class ActiveView:
             static_splats=self.static_splats,
             config=self.config,
         )
-
-    def backproject(self, gaussians: ActivatedGaussians, image: np.ndarray) -> np.ndarray:
-        """Return the sums [N, C] of an image's pixels, laid out as by `crop`, weighted per Gaussian."""
-        return backproject(gaussians, self.camera, image, self.config, self.region, self.static_splats)
 
     def crop(self, image: np.ndarray) -> np.ndarray:
         """Return the drawn pixels of an image [H, W, ...] of the view."""

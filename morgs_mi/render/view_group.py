@@ -15,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Float, UInt32
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.blocks import BlockLists, build_lists, pack_records, touches
@@ -24,7 +25,7 @@ from morgs_mi.render.projection import Splats, Views, project
 from morgs_mi.render.region import Region, joined, quotient
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["Drawing", "ViewGroup"]
+__all__ = ["Drawing", "ViewGroup", "backproject"]
 
 
 class ViewGroup:
@@ -168,6 +169,33 @@ class Drawing:
             own = [dr.gather(mi.Float, grad, place) for grad in grads]
             dr.eval(own)
         return own
+
+
+def backproject(gaussians: ActivatedGaussians, view: ActiveView, image: np.ndarray) -> np.ndarray:
+    """Return sum_x w_i(x) image(x) for every Gaussian i, with the weights w_i = T_i alpha_i of eq. 1.
+
+    This is the transpose of blending: the renderer's channel adjoint with the image in place of a gradient.
+
+    Args:
+        gaussians: N > 0 Gaussians.
+        view: the view; its static splats are blended with the Gaussians and receive no sum.
+        image: [H, W, C], or of the view's region as by `ActiveView.crop`.
+
+    Returns:
+        float32 [N, C].
+
+    Raises:
+        ValueError: the size of the image does not match the view.
+    """
+    group, C = ViewGroup([view]), (np.shape(image) or (0,))[-1]
+    size = (view.camera.height, view.camera.width) if view.region is None else group.region.shape(0)[:-1]
+    if not C or image.shape != (*size, C):
+        raise ValueError(
+            f"backproject(): `image` must be [{', '.join(map(str, size))}, C] with C > 0, got {list(np.shape(image))}; "
+            "resize it to the camera, or crop it to the region."
+        )
+    blocks = group.crop([image]) if view.region is None else image
+    return group.draw(gaussians).sums(from_numpy(mi.Float, blocks), C)[0]
 
 
 def _everything(view: ActiveView) -> Region:

@@ -8,7 +8,8 @@ import pytest
 from morgs_mi import RenderConfig
 from morgs_mi.method.boxes import boxes_around
 from morgs_mi.method.responsibility import ChangedView, responsibility
-from morgs_mi.render.backproject import backproject
+from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.view_group import backproject
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 
@@ -33,7 +34,7 @@ def responsibility_for(gaussians, changes, width=640):
 def exact_ratio(gaussians, changes):
     """Return the ratio of blend weights over whole views, and their sum in px."""
     images = {view: np.stack([c, np.ones_like(c)], axis=-1).astype(np.float32) for view, c in changes.items()}
-    sums = sum(backproject(gaussians, CAMERAS[view], image).astype(float) for view, image in images.items())
+    sums = sum(backproject(gaussians, ActiveView(CAMERAS[view]), image).astype(float) for view, image in images.items())
     return sums[:, 0] / np.maximum(sums[:, 1], 1e-9), sums[:, 1]
 
 

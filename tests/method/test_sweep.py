@@ -10,6 +10,7 @@ from morgs_mi.method.image_gradient import image_gradient
 from morgs_mi.method.ssim import Target
 from morgs_mi.method.sweep import MAPS, KeyImages
 from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.view_group import backproject
 from tests.assertions import assert_close
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
@@ -40,7 +41,7 @@ def expected(wall, view, target):
         "right": np.stack([(error * a).sum(-1) for a in (x, y)], -1),
     }
     shape = (*error.shape[:2], -1)
-    return {name: view.backproject(wall, np.float32(m).reshape(shape)) for name, m in maps.items()}
+    return {name: backproject(wall, view, np.float32(m).reshape(shape)) for name, m in maps.items()}
 
 
 def test_sums__are_the_sums_of_each_view(scene):

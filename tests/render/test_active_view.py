@@ -9,7 +9,7 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.render.active_view import ActiveView, make_active_view
-from morgs_mi.render.backproject import backproject
+from morgs_mi.render.view_group import backproject
 from tests import tolerances as tol
 from tests.assertions import assert_close
 from tests.scenes.cameras import make_wide_camera
@@ -68,9 +68,9 @@ def test_active_view__renders_and_differentiates_like_the_full_view(camera, gaus
 def test_active_view__backproject_accounts_for_static_splats(camera, gaussians, mask):
     view, active = split(camera, gaussians, mask)
     image = np.float32(np.random.default_rng(1).uniform(size=(camera.height, camera.width, 2)))
-    expected = backproject(gaussians, camera, image * np.float32(drawn_pixels(view))[..., None])[ACTIVE]
+    expected = backproject(gaussians, ActiveView(camera), image * np.float32(drawn_pixels(view))[..., None])[ACTIVE]
     assert expected.max() > 10
-    assert_close(view.backproject(active, view.crop(image)), expected, rtol=tol.SUM_ORDER_REL)
+    assert_close(backproject(active, view, view.crop(image)), expected, rtol=tol.SUM_ORDER_REL)
 
 
 def test_make_active_view__accepts_no_static_gaussians(camera, gaussians, mask):

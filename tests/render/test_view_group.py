@@ -8,13 +8,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi import Camera, Gaussians, RenderConfig
+from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.render.active_view import ActiveView, make_active_view
-from morgs_mi.render.view_group import ViewGroup
+from morgs_mi.render.view_group import ViewGroup, backproject
+from tests import tolerances as tol
 from tests.assertions import assert_close
-from tests.scenes.cameras import make_wide_camera
-from tests.scenes.gaussians import make_wide_scene
+from tests.scenes.cameras import make_camera, make_wide_camera
+from tests.scenes.gaussians import as_float32, make_scene, make_wide_scene, to_gaussians
 
 N, ACTIVE = 120, np.arange(0, 120, 5)
 
@@ -53,7 +54,7 @@ def test_view_group__draws_what_each_view_draws(gaussians):
     for view, region, image, weight, found in zip(views, group.regions, images, weights, sums, strict=True):
         blocks = replace(view, region=region)
         assert_close(image, np.asarray(blocks.render(active).color), rtol=1e-6, atol=1e-6)
-        assert_close(found, blocks.backproject(active, np.float32(weight)), rtol=1e-5, atol=1e-4)
+        assert_close(found, backproject(active, blocks, np.float32(weight)), rtol=1e-5, atol=1e-4)
 
 
 def test_view_group__crops_images_of_its_views(gaussians):
@@ -80,3 +81,27 @@ def test_totals__are_the_sums_over_all_views(gaussians):
     drawing = group.draw(gaussians)
     image = from_numpy(mi.Float, np.random.default_rng(0).normal(size=group.region.shape(2)))
     assert_close(drawing.totals(image, 2), drawing.sums(image, 2).sum(axis=0), rtol=1e-5)
+
+
+def test_backproject__is_the_transpose_of_blending():
+    """<image, sum_i w_i c_i> = sum_i c_i <image, w_i> for the confidence channel, which is plain blending."""
+    raw, camera = as_float32(make_scene()), make_camera()
+    gaussians = to_gaussians(raw)
+    image = np.random.default_rng(0).normal(size=(camera.height, camera.width, 1)).astype(np.float32)
+    sums = backproject(gaussians, ActiveView(camera), image)
+    blended = np.asarray(rasterize(gaussians, camera, ("confidence",)).confidence, np.float64)
+    confidence = 1 / (1 + np.exp(-raw["logit_confidence"]))
+    assert np.vdot(sums[:, 0], confidence) == pytest.approx(np.vdot(blended, image), rel=tol.DUALITY_REL)
+
+
+def test_backproject__of_ones_sums_to_alpha():
+    raw, camera = as_float32(make_scene()), make_camera()
+    ones = np.ones((camera.height, camera.width, 3), np.float32)
+    sums = backproject(to_gaussians(raw), ActiveView(camera), ones)
+    alpha = np.asarray(rasterize(to_gaussians(raw), camera, ("alpha",)).alpha, np.float64)
+    assert_close(sums.sum(0), np.full(3, alpha.sum()), rtol=tol.DUALITY_REL)
+
+
+def test_backproject__refuses_an_image_of_another_size():
+    with pytest.raises(ValueError, match=r"`image` must be \[18, 21, C\] with C > 0, got \[4, 5, 1\]"):
+        backproject(to_gaussians(make_scene()), ActiveView(make_camera()), np.zeros((4, 5, 1), np.float32))
