@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.pages.results import Scores, committed
 from benchmarks.reports.plots import Column, grouped, markdown, means_over, scores_table
 
-__all__ = ["demo", "drift", "field", "frame_times", "gains", "parts", "search", "unseen"]
+__all__ = ["demo", "drift", "field", "frame_stages", "frame_times", "gains", "parts", "search", "unseen"]
 
 
 def demo() -> str:
@@ -126,6 +126,35 @@ def frame_times() -> str:
                 )
             )
     return markdown(("Gaussians", "epochs", "s", "PSNR, dB", "kB", "active Gaussians", "drawn pixels"), rows)
+
+
+_STAGES = {
+    "changes of the images": ("change",),
+    "optical flow": ("flow",),
+    "active set": ("part",),
+    "targets": ("targets",),
+    "lifted flow": ("lift",),
+    "propagation": ("propagation",),
+    "search": ("search",),
+    "refinement, colour": ("refinement", "colour"),
+    "steps": ("steps",),
+    "births": ("density",),
+    "packet, decoding": ("packet", "decoding"),
+}
+
+
+def frame_stages() -> str:
+    """Return the times of the stages of a live frame, before and after passes were shared."""
+    found, rows = committed("frame_stages"), []
+    runs = [found[size][version] for size in ("n3dv", "small") for version in ("before", "after")]
+    for title, names in _STAGES.items():
+        seconds = (sum(run.get(f"{name}_s", 0.0) for name in names) for run in runs)
+        rows.append((title, *(f"{1000 * value:.0f}" for value in seconds)))
+    rows.append(("whole frame", *(f"{1000 * run['seconds']:.0f}" for run in runs)))
+    rows.append(("PSNR, dB", *(f"{run['psnr']:.2f}" for run in runs)))
+    rows.append(("kB", *(f"{run['bytes'] / 1000:.0f}" for run in runs)))
+    titles = (f"{size}, {version}" for size in ("large", "small") for version in ("before", "now"))
+    return markdown(("ms", *titles), rows)
 
 
 def field() -> str:

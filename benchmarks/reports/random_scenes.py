@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +37,9 @@ COLUMNS = (
 )
 
 
+EPOCHS = Column("epochs, %", "epochs", 0, 100)
+
+
 @dataclass(frozen=True)
 class Options(StudyOptions):
     """Clips, work and output."""
@@ -48,17 +51,28 @@ class Options(StudyOptions):
     frames: int = 6
     """Number of frames that are fitted, the first included."""
     epochs: int = 2
-    """Epochs of a later frame."""
+    """Most epochs of a later frame."""
+    tolerances: tuple[float, ...] = ()
+    """Tolerances with which a frame ends early (`FitConfig.early_stopping_tolerance`) that are compared."""
 
     def study(self) -> Study:
         """Return the study of the clips."""
         sources = {seed: Source.of(random_capture(self.clips, seed)) for seed in self.seeds}
         scenes = [Scene({"seed": seed}, (source, self.frames)) for seed, source in sources.items()]
-        return Study(measure, scenes, [Variant({}, StreamConfig(FitConfig(epochs=self.epochs)))], self.fit_seeds)
+        fit = FitConfig(epochs=self.epochs)
+        compared = (replace(fit, early_stopping_tolerance=tolerance) for tolerance in self.tolerances)
+        variants = [Variant({"tolerance": f.early_stopping_tolerance}, StreamConfig(f)) for f in compared]
+        return Study(measure, scenes, variants or [Variant({}, StreamConfig(fit))], self.fit_seeds)
 
     def table(self, rows: Sequence[Row]) -> str:
         """Return the scores of each scene and of their means."""
-        return scores_table([*rows, *means_over(rows, "fit_seed", seed="mean")], {"seed": "seed"}, COLUMNS)
+        keys = {"seed": "seed", **({"tolerance": "tolerance"} if self.tolerances else {})}
+        means = [
+            mean
+            for tolerance in self.tolerances or (None,)
+            for mean in means_over([r for r in rows if r.get("tolerance") == tolerance], "fit_seed", seed="mean")
+        ]
+        return scores_table([*rows, *means], keys, (*COLUMNS, *((EPOCHS,) if self.tolerances else ())))
 
 
 def measure(source: Source, num_frames: int, config: StreamConfig) -> dict[str, float]:

@@ -43,7 +43,7 @@ STAGES = {
     "search": ("method/search.py", "search_motion"),
     "refinement": ("method/photometric.py", "refine_start"),
     "steps": ("fit/optimise.py", "optimise"),
-    "density": ("method/attribution.py", "densification_scores"),
+    "density": ("fit/later_frame.py", "densify"),
     "packet": ("codec/packets.py", "residual_packet"),
     "decoding": ("codec/packets.py", "decode"),
 }
