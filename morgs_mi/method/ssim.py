@@ -17,6 +17,7 @@ number is read once, and no blurred row is written to memory.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -85,23 +86,26 @@ class Target:
         _check_image(image)
         if mask is not None:
             check_mask("Target()", mask, *image.shape[:2])
-        pixels = image.astype(np.float32)
-        if image.dtype == np.uint8:
-            pixels /= 255
-        self.shape: tuple[int, ...] = pixels.shape
-        self.planes = Planes(*pixels.shape[:2])
+        self.shape: tuple[int, ...] = image.shape
+        self.planes = Planes(*image.shape[:2])
         self.weight: Float | None = None
+        self.pixels = self._planes(image)
         if mask is not None and not mask.all():
-            weight = np.repeat(mask[..., None], 3, axis=2).astype(np.float32)
-            pixels, self.weight = pixels * weight, self._planes(weight)
-        self.pixels = self._planes(pixels)
+            self.weight = self._planes(np.repeat(mask[..., None], 3, axis=2).astype(np.float32))
+            self.pixels = self.masked(self.pixels)
+            dr.eval(self.pixels)
         self.surroundings: Float | None = None
         self._image: np.ndarray | None = None
         self._places: dict[Region, tuple[UInt32, Bool]] = {}
         self._windows: dict[Region | None, _Windows] = {}
 
     def _planes(self, image: np.ndarray) -> Float:
-        planes = self.planes.of(from_numpy(mi.Float, image))
+        if image.dtype == np.uint8:  # a quarter of the memory to copy
+            pixels = mi.Float(from_numpy(sys.modules[mi.Float.__module__].UInt8, image)) / dr.opaque(mi.Float, 255)
+            dr.eval(pixels)
+        else:
+            pixels = from_numpy(mi.Float, image)
+        planes = self.planes.of(pixels)
         dr.eval(planes)
         return planes
 
