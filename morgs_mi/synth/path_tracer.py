@@ -6,6 +6,7 @@ import re
 from dataclasses import dataclass
 from typing import Any
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -217,6 +218,7 @@ class PathTracer:
         ray = mi.Ray3f(mi.Point3f(origins), mi.Vector3f(directions.T))
         found: Any = self._scene.ray_intersect_preliminary(ray)
         hit = found.compute_surface_interaction(ray)
+        dr.eval(found, hit)  # otherwise every array below would trace the rays again
         triangles, (u, v) = np.array(found.prim_index), np.array(found.prim_uv, float)
         points = SurfacePoints.rigid(np.array(hit.p, float).T.copy(), np.full(len(directions), -1, np.int32))
         for pointer, index, faces in self._owners:
