@@ -24,9 +24,11 @@ from morgs_mi.io.video_writer import playable_format, write_video
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.export.frames import pad_to_even
 from morgs_mi.playback.player import channel_image, render_stream, truth_for_camera
+from morgs_mi.playback.source import about_lenses, as_fitted
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.visualise import contact_sheet, label, motion_legend, side_by_side, write_png
 from morgs_mi.runs.recorder import stream_capture
+from morgs_mi.runs.recording import FitFiles, Recording, read_reports, stream_metadata
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
@@ -125,21 +127,22 @@ def _run(root: Path, config: DemoConfig, shown: Report | None) -> DemoReport:
         seconds[name] = time.perf_counter() - start
         return result
 
-    def fit(folder: str, settings: StreamConfig, frames: int | None) -> Callable[..., Any]:
-        capture = load_capture(root / "capture", max_frames=frames)
-        return lambda progress: stream_capture(
-            capture,
-            root / folder,
-            settings,
-            progress=lambda stage, done, total: progress.of(f"{progress.stage}: {stage.lower()}")(done, total),
-        )
+    def fit(capture: Capture, folder: str, settings: StreamConfig, progress: Progress, resume: bool = False) -> None:
+        def report(stage: str, done: float, total: float) -> None:
+            progress.of(f"{progress.stage}: {stage.lower()}")(done, total)
+
+        stream_capture(capture, root / folder, settings, resume, report)
+
+    def fit_plain(progress: Progress) -> None:
+        capture = load_capture(root / "capture", max_frames=min(config.plain_frames, config.clip.frames))
+        _begin_with_first_frame(root / "stream_plain", root / "stream", capture, plain)
+        fit(capture, "stream_plain", plain, progress, resume=True)
 
     run_step("Path-tracing the clip", lambda report: _synthesize_clip(root / "capture", config, report))
     off = {"learn_motion": False, "learn_offset": False, "learn_confidence": False}
     plain = replace(config.stream, motion=replace(config.stream.motion, **off))
-    run_step("Fitting", fit("stream", config.stream, None))
-    plain_frames = min(config.plain_frames, config.clip.frames)
-    run_step("Fitting without ML, MO, MC", fit("stream_plain", plain, plain_frames))
+    run_step("Fitting", lambda report: fit(load_capture(root / "capture"), "stream", config.stream, report))
+    run_step("Fitting without ML, MO, MC", fit_plain)
     results = {
         name: run_step(
             f"Evaluating {folder}", lambda report, folder=folder: evaluate_stream(root / folder, progress=report)
@@ -168,6 +171,24 @@ def _synthesize_clip(folder: Path, config: DemoConfig, report: Callable[[float, 
         report(1, 1)
         return
     synthesize(config.scene, folder, clip, overwrite=True, progress=report)
+
+
+def _begin_with_first_frame(out: Path, source: Path, capture: Capture, config: StreamConfig) -> None:
+    """Begin a fit with the first frame of another fit: it has no motion, so the settings of the motion change nothing.
+
+    Args:
+        out: folder of the fit, which `stream_capture` resumes.
+        source: folder of the other fit.
+        capture: what is fitted.
+        config: settings of the fit.
+    """
+    stream = open_stream(source)
+    capture = as_fitted(capture, stream)
+    metadata = stream_metadata(capture, next(capture.partial_frames()), config) | about_lenses(capture)
+    out.mkdir(exist_ok=True)
+    (out / "capture.json").unlink(missing_ok=True)
+    with Recording(FitFiles.of(out), capture, metadata) as recording:
+        recording.extend([next(iter(stream))], read_reports(FitFiles.of(source).report, range(1)))
 
 
 def _compare(results: Mapping[str, Evaluation]) -> tuple[list[int], dict[str, dict[str, float | None]]]:

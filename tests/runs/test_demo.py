@@ -9,9 +9,13 @@ from pathlib import Path
 import cv2
 import pytest
 
+from morgs_mi import RenderConfig, StreamLoop
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.core.files import locked_folder
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.method.motion_config import MotionConfig
+from morgs_mi.playback.streams import open_stream
 from morgs_mi.runs.demo import DemoConfig, _synthesize_clip, run_demo
 from morgs_mi.synth.synth_config import SynthConfig
 
@@ -22,7 +26,6 @@ SMALL = DemoConfig(
 )
 
 pytestmark = pytest.mark.slow
-FIT_STAGES = ("trial", "first frame", "later frames")
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +33,9 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo")
     steps: list[str] = []
     run_demo(folder, SMALL, lambda step, done, total: steps.append(step))
-    fits = [f"Fitting{which}: {stage}" for which in ("", " without ML, MO, MC") for stage in FIT_STAGES]
-    assert list(dict.fromkeys(steps))[:7] == ["Path-tracing the clip", *fits]
+    fits = [f"Fitting: {stage}" for stage in ("trial", "first frame", "later frames")]
+    plain = [f"Fitting without ML, MO, MC: {stage}" for stage in ("reading the fitted frames", "later frames")]
+    assert list(dict.fromkeys(steps))[:6] == ["Path-tracing the clip", *fits, *plain]
     return folder
 
 
@@ -45,6 +49,16 @@ def test_run_demo__report_is_consistent(out: Path) -> None:
     assert report["full"]["held_out"]
     assert report["full"]["bytes"]["file"] == (out / "stream" / "stream.morgs").stat().st_size
     assert {"machine", "versions", "seed", "seconds"} <= set(report)
+
+
+def test_run_demo__fits_the_first_frame_once(out: Path) -> None:
+    first, plain = (next(iter(open_stream(out / name))) for name in ("stream", "stream_plain"))
+    assert first.encoded == plain.encoded
+    capture, config = load_capture(out / "capture"), replace(SMALL.stream, render=RenderConfig(reproducible=True))
+    off = replace(config, motion=MotionConfig(learn_motion=False, learn_offset=False, learn_confidence=False))
+    images = next(capture.frames(0, 1)).images
+    packets = [StreamLoop.of(capture, c).push([images[v] for v in capture.train_views])[0] for c in (config, off)]
+    assert packets[0].encoded == packets[1].encoded
 
 
 def test_run_demo__writes_a_video_and_a_contact_sheet(out: Path) -> None:
