@@ -58,7 +58,7 @@ ELSEWHERE: dict[str, str] = {
     "render.reproducible": "changes the order of sums only: tests/render",
     "fit.detail": "the number of Gaussians is given here: tests/fit/test_detail.py",
     "fit.convergence": "the number of steps is given here: tests/fit/test_first_frame.py",
-    "fit.cross_validation_views": "fewer views here: tests/fit/test_cross_validation.py",
+    "fit.validate": "fewer views here: tests/fit/test_cross_validation.py",
     "fit.camera_priors": "cameras are refined by the recorder: tests/calibration/test_bundle.py",
     "fit.short_fits": "no cameras are refined here: tests/calibration/test_refine.py, tests/fit/test_balance.py",
     "fit.refine_cameras": "cameras are refined by the recorder: tests/calibration/test_refine.py",

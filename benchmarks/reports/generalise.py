@@ -1,79 +1,116 @@
-"""First frames with and without cross-validation: quality of the held-out view, and the estimate of it.
+"""First frames of clips that no setting was chosen on: quality of the held-out views, the estimate of it, and the time.
 
-    python -m benchmarks.reports.generalise --seeds 3 4 5 6 7 8 --fit-seeds 0 1 2 --json out.json
+    python -m benchmarks.reports.generalise --scenes random-201 random-202 random-203 spheres --json out.json
 
-Each clip is `morgs-mi synth random --seed SEED`, as in `random_scenes`. The first frame is fitted as by default, where
-cross-validation or the noise of few views chooses the probability of dropping, and without dropping.
+Each clip is the first frame of `morgs-mi synth SCENE --cameras 10` without sensor noise; random-N has the seed N. Some
+cameras that are spread over the rig are trained on, with sensor noise, and all others are held out, without noise.
 """
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import tyro
 
-from benchmarks.reports.fits import RandomOptions, first_frame, random_capture
+from benchmarks.reports.estimates import spread_views
+from benchmarks.reports.fits import new_loop, synthetic
 from benchmarks.reports.plots import Column, scores_table
-from benchmarks.reports.study import Row, Scene, Study, Variant
-from morgs_mi.fit.dropping import dropping_by_noise
+from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
+from morgs_mi.capture.capture import Capture
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.runs.cluster.tasks import Source
+from morgs_mi.synth.synth_config import SynthConfig
 
-_WITHOUT, _CHOSEN = {"variant": "without"}, {"variant": "chosen"}
 COLUMNS = (
-    Column("Gaussians", "gaussians", 0, spread=False, only=_CHOSEN),
-    Column("p = 0", "held_out", unit=" dB", only=_WITHOUT),
-    Column("chosen p", "dropping", only=_CHOSEN),
-    Column("with it", "held_out", unit=" dB", only=_CHOSEN),
+    Column("held-out views", "held_out", unit=" dB"),
+    Column("estimate", "estimate", 1, unit=" dB"),
+    Column("processor time", "cpu_s", 0, unit=" s"),
 )
+_CAMERAS = 10
 
 
 @dataclass(frozen=True)
-class Options(RandomOptions):
+class Options(StudyOptions):
     """Clips and output."""
 
-    downscale: float = 1
-    """Factor by which the clips are reduced."""
-    steps: int = 1500
-    """Steps of the first frame."""
+    scenes: tuple[str, ...] = ("random-201", "random-202", "random-203", "spheres")
+    """Scenes of the package; random-N is the random one of the seed N."""
+    clips: Path = Path("out/first_frames")
+    """Folder of the clips, which are made where they are missing."""
+    views: tuple[int, ...] = (9, 4)
+    """Numbers of training views."""
+    noises: tuple[float, ...] = (0.0, 0.02)
+    """Standard deviations of the sensor noise of the training views, relative to white."""
+    gaussians: int | None = None
+    """Number of Gaussians; default: by the detail of the images."""
+    steps: int | None = None
+    """Steps of the first frame; default: until it has converged."""
 
     def study(self) -> Study:
-        """Return the study of the clips without dropping and with the chosen probability."""
-        captures = {seed: random_capture(self.clips, seed, self.downscale) for seed in self.seeds}
-        scenes = [Scene({"seed": s, "views": len(c.train_views)}, (Source.of(c),)) for s, c in captures.items()]
-        variants = [Variant(_WITHOUT, self.config(dropping=0.0)), Variant(_CHOSEN, self.config())]
+        """Return the study of the clips by default and with cross-validation."""
+        scenes = []
+        for name in self.scenes:
+            scene, _, seed = name.partition("-")
+            config = SynthConfig(cameras=_CAMERAS, frames=1, noise=0.0, seed=int(seed or 0))
+            capture = synthetic(scene, self.clips / name, config)
+            for views in self.views:
+                train = spread_views(capture.cameras, views, capture.train_views)
+                for noise in self.noises:
+                    keys = {"clip": name, "views": views, "noise": noise}
+                    scenes.append(Scene(keys, (Source.of(capture), train, noise)))
+        fit = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps)
+        variants = [Variant({"variant": "default"}, StreamConfig(fit))]
+        variants.append(Variant({"variant": "validated"}, StreamConfig(replace(fit, validate=True))))
         return Study(measure, scenes, variants, self.fit_seeds)
 
     def table(self, rows: Sequence[Row]) -> str:
-        """Return the held-out PSNR of each clip without dropping and with the chosen probability."""
-        return scores_table(rows, {"seed": "seed", "training views": "views"}, COLUMNS)
+        """Return the quality, its estimate and the time of each clip and variant."""
+        return scores_table(rows, {name: name for name in ("clip", "views", "noise", "variant")}, COLUMNS)
 
 
-def measure(source: Source, config: StreamConfig) -> dict[str, Any]:
-    """Fit the first frame; return PSNR of the held-out view and the training views, and what was chosen and expected.
+def measure(source: Source, train: Sequence[int], noise: float, config: StreamConfig) -> dict[str, Any]:
+    """Fit the first frame; return the PSNR of held-out and training views, the estimate, and the work.
 
-    `estimate` is what `fit` expects of views between the cameras, None where dropping is given.
+    `dropping` is the probability with the best withheld views; None: there was no trial.
     """
     capture = source.open()
-    train, test = list(capture.train_views), capture.test_view
-    assert test is not None
-    scores, report = first_frame(capture, train, config)
-    trials, dropping = report.validation.get("trials"), config.fit.dropping
-    if trials:
-        dropping = max(trials, key=lambda trial: trial["withheld_psnr"])["dropping"]
-    elif dropping is None:
-        images = next(capture.frames(0, 1)).images
-        dropping = dropping_by_noise([images[v] for v in train])
+    images = next(capture.frames(0, 1)).images
+    loop = new_loop(capture, config, train)
+    start = time.process_time()
+    _, report = loop.push([_noisy(images[v], noise, v) for v in train])
+    seconds, found = time.process_time() - start, report.validation
+    trials = found.get("trials", ())
+    best = max(trials, key=lambda trial: trial["withheld_psnr"], default={"dropping": None})
     return {
-        "held_out": scores[test],
-        "training": scores[train].mean(),
-        "dropping": dropping,
-        "estimate": report.validation.get("expected_psnr"),
+        "held_out": _psnr(loop.gaussians, capture, images, sorted({*range(len(images))} - {*train})),
+        "training": _psnr(loop.gaussians, capture, images, train),
+        "estimate": found.get("expected_psnr"),
+        "dropping": best["dropping"],
+        "trials": len(trials),
+        "steps": report.steps,
         "gaussians": report.num_gaussians,
-        "seconds": report.seconds,
+        "cpu_s": seconds,
     }
+
+
+def _psnr(gaussians: Any, capture: Capture, images: Sequence[np.ndarray], views: Sequence[int]) -> float:
+    """Return the mean PSNR of some views without noise, dB."""
+    compared = [View(capture.cameras[v], images[v], capture.masks[v]) for v in views]
+    return mean_psnr(gaussians, compared, RenderConfig())
+
+
+def _noisy(image: np.ndarray, noise: float, seed: int) -> np.ndarray:
+    """Return an image with sensor noise, relative to white."""
+    grain = 255 * noise * np.random.default_rng(seed).standard_normal(image.shape)
+    return np.clip(np.rint(image + grain), 0, 255).astype(np.uint8)
 
 
 if __name__ == "__main__":

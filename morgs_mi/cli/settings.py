@@ -45,6 +45,7 @@ SETTINGS = {
     "keyframe_interval": "codec.keyframe_interval",
     "refine_cameras": "fit.refine_cameras",
     "exposure": "fit.exposure",
+    "validate": "fit.validate",
     "reproducible": "render.reproducible",
 }
 
@@ -182,6 +183,8 @@ class Settings:
     """Refinement of the cameras: off, on, or auto (if withheld pixels gain)."""
     exposure: Annotated[Estimation | None, setting("exposure"), one_of(get_args(Estimation))] = None
     """Estimation of exposures and white balances: off, on, or auto (between cameras if withheld pixels gain)."""
+    validate: Flag = False
+    """Long trials of the first frame that choose how strongly it is regularised."""
     reproducible: Flag = False
     """Same bytes on every run; about half as fast."""
 

@@ -6,7 +6,6 @@ import time
 from dataclasses import replace
 
 from morgs_mi.core.random_streams import Stream, rng_of
-from morgs_mi.fit.cross_validation import TRIAL_STEPS
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.problem import FirstFrameProblem
@@ -19,7 +18,7 @@ _TIMED, _LEAST = 20, 100
 _GROWTH = 1.5
 
 
-def steps_within(seconds: float, problem: FirstFrameProblem, config: FitConfig, trials: int, seed: int) -> int:
+def steps_within(seconds: float, problem: FirstFrameProblem, config: FitConfig, trials: float, seed: int) -> int:
     """Return the number of steps of the first frame, at least 100, that this machine makes in a time.
 
     The time of the measurement and of the trials is part of it. The same number as `first_frame_steps` gives the
@@ -29,7 +28,7 @@ def steps_within(seconds: float, problem: FirstFrameProblem, config: FitConfig, 
         seconds: the time.
         problem: the data of the first frame.
         config: settings of the fit.
-        trials: number of trials before the first frame, at most.
+        trials: steps of the trials before the first frame, at most, as a multiple of its own.
         seed: of the steps that are timed.
     """
     begin = time.perf_counter()
@@ -39,5 +38,5 @@ def steps_within(seconds: float, problem: FirstFrameProblem, config: FitConfig, 
         start = time.perf_counter()
         fit_first_frame(problem, timed, rng_of(seed, Stream.BUDGET))
         took = time.perf_counter() - start
-    per_step = _GROWTH * took / _TIMED * (1 + trials * TRIAL_STEPS)
+    per_step = _GROWTH * took / _TIMED * (1 + trials)
     return max(_LEAST, int((seconds - (time.perf_counter() - begin)) / per_step))

@@ -1,9 +1,11 @@
 """Cross-validation of the first frame: the quality of views between the cameras, and the dropping that improves it.
 
-Some training views are withheld, and a short fit to the others is evaluated by their PSNR. Among six views and more it
-chooses the probability of dropping (see `dropping`): where images are noisy or few, dropping helps; where they are many
-and clean, it only costs. Candidates are tried in rising order until one is no better than the last. With fewer views,
-it follows from the noise of the images, because the rig without one of them is too different.
+Some training views are withheld, and a short fit to the others, a trial, is evaluated by their PSNR. By default there
+is a single trial of half the size, which takes about a tenth of the time of the first frame.
+
+With `FitConfig.validate`, longer trials of six views and more choose the probability of dropping (see `dropping`).
+Candidates are tried in rising order until one is no better than the last. With fewer views, and by default, it follows
+from the noise of the images: a rig without one of few views is too different.
 
 A withheld view has more error than the others. This excess grows with its angle to them, until the view shows nothing
 that they show. Views halfway between neighbouring cameras are nearer, and have less of it (see `excess_share`).
@@ -29,25 +31,22 @@ from morgs_mi.fit.problem import FirstFrameProblem
 from morgs_mi.fit.view import decibels
 
 __all__ = [
-    "TRIAL_STEPS",
     "CrossValidation",
     "Trial",
     "candidates_of",
     "cross_validate",
     "excess_share",
-    "trial_steps",
+    "trial_share",
     "withheld_views",
 ]
-
-TRIAL_STEPS = 0.4
-"""Steps of a trial, as a fraction of the steps of the first frame."""
 
 # Probabilities of dropping that are tried, in rising order.
 _CANDIDATES = (0.0, 0.2, 0.4)
 # Number of views per withheld view; at least one view is withheld.
 _WITHHELD = 6
-# px, of the images of a trial, which are reduced by the largest whole factor that leaves this width.
-_WIDTH = 640
+# Steps of a trial as a fraction of the steps of the first frame, and width in px to which its images are reduced: by
+# default, and with `validate`, where reduced images would hide the noise that the dropping depends on.
+_SHARES, _WIDTHS = (0.15, 0.4), (320, 640)
 # Angle in degrees at which the excess of error ends, and power of the angle, times the number of views, with which it
 # grows in trials with few views.
 _FAR, _POWER = 20.0, 6.0
@@ -153,11 +152,12 @@ def cross_validate(
     cameras = problem.cameras
     withheld = withheld_views(cameras, _WITHHELD)
     kept = [view for view in range(len(cameras)) if view not in withheld]
-    small = problem.reduced(_WIDTH)
+    small = problem.reduced(_trial_width(cameras, config))
     trained, unseen = small.only(kept), small.only(withheld)
     candidates, trials = candidates_of(problem, config), []
     for number, dropping in enumerate(candidates, 1):
-        trial = replace(config, dropping=dropping, first_frame_steps=trial_steps(config))
+        steps = max(1, round(trial_share(config) * config.planned_steps))
+        trial = replace(config, dropping=dropping, first_frame_steps=steps)
         stage = progress.of(f"Trial {number} of {len(candidates)}" if len(candidates) > 1 else "Trial")
         fitted = fit_first_frame(trained, trial, rng_of(seed, Stream.TRIALS), stage).gaussians
         trials.append(Trial(dropping, unseen.psnr(fitted), trained.psnr(fitted)))
@@ -172,13 +172,19 @@ def cross_validate(
 
 def candidates_of(problem: FirstFrameProblem, config: FitConfig) -> tuple[float, ...]:
     """Return the probabilities of dropping that are tried."""
-    chosen = len(problem.views) >= config.cross_validation_views
-    return _CANDIDATES if chosen else (dropping_by_noise(problem.images),)
+    is_chosen = config.validate and len(problem.views) >= _CERTAIN
+    return _CANDIDATES if is_chosen else (dropping_by_noise(problem.images),)
 
 
-def trial_steps(config: FitConfig) -> int:
-    """Return the number of steps of one fit."""
-    return max(1, round(TRIAL_STEPS * config.planned_steps))
+def trial_share(config: FitConfig) -> float:
+    """Return the steps of a trial as a fraction of the steps of the first frame."""
+    return _SHARES[config.validate]
+
+
+def _trial_width(cameras: Sequence[Camera], config: FitConfig) -> int:
+    """Return the width to which the images of a trial are reduced, px."""
+    half = max(camera.width for camera in cameras) // 2
+    return _WIDTHS[1] if config.validate else min(half, _WIDTHS[0])
 
 
 def withheld_views(cameras: Sequence[Camera], share: int) -> tuple[int, ...]:

@@ -2,7 +2,8 @@
 
 Where training views are few or noisy, Gaussians overfit them together: one compensates for another in a single view. In
 every step of the first frame, each Gaussian is left out with probability p, and the opacities of the others are scaled
-by 1 / (1 - p). Cross-validation chooses p (see `cross_validation`), or, of few views, the noise of their images.
+by 1 / (1 - p). p follows from the number of views and their noise, or is chosen by cross-validation (see
+`cross_validation`).
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ __all__ = ["dropped", "dropping_by_noise"]
 
 # Logit of an opacity that no cut-off of the renderer lets pass, and the largest opacity.
 _INVISIBLE, _MOST = -30.0, 0.999
-# Probability with which few noisy views are fitted.
-_NOISY_DROPPING = 0.2
+# Probability with which noisy views are fitted if they are few, and the number from which they are not.
+_NOISY_DROPPING, _MANY = 0.2, 6
 
 
 def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) -> Gaussians:
@@ -44,9 +45,9 @@ def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) 
 
 
 def dropping_by_noise(images: Sequence[np.ndarray]) -> float:
-    """Return the probability of dropping for views that are too few for cross-validation, from their noise.
+    """Return the probability of dropping that follows from the noise of the images, of which six are many.
 
     Args:
-        images: [H, W, 3], uint8.
+        images: [H, W, 3], uint8, one per view.
     """
-    return _NOISY_DROPPING if is_noisy(images) else 0.0
+    return _NOISY_DROPPING if len(images) < _MANY and is_noisy(images) else 0.0

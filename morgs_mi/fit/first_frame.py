@@ -1,14 +1,16 @@
 """The first frame: all attributes from its images, then the confidence from its masks.
 
 Where the number of steps is not given, it follows from the images. A capture with much detail still improves when
-others have converged. If L_recon falls by more than 15 % in the last third of the steps, the number of steps is
+others have converged. If L_recon falls by more than 20 % in the last third of the steps, the number of steps is
 doubled, and the learning rates continue on the longer schedule. Noisy captures end early, because no step removes the
 noise from the loss.
+
+Up to the last round of density control, the images have half the size.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 
@@ -39,8 +41,8 @@ __all__ = ["FirstFrame", "fit_confidence", "fit_first_frame"]
 # Passes over all views of which the loss is averaged, and the least number of steps.
 _PASSES, _LEAST = 4, 8
 # Relative decrease of L_recon over the last third of the steps from which they are doubled. Captures that are fitted,
-# with noise or without it, decrease by 0.02 to 0.12 then; one with much more detail by 0.3.
-_LEAST_DECREASE = 0.15
+# with noise or without it, decrease by 0.02 to 0.17 then; one with much more detail by 0.3.
+_LEAST_DECREASE = 0.2
 # Fraction of the steps after which another SH band is added, as in 3DGS.
 _BAND = 1 / 30
 # First and last round of density control, as fractions of the steps: the remaining steps fit the births.
@@ -65,7 +67,11 @@ class FirstFrame:
 
 
 def fit_first_frame(
-    problem: FirstFrameProblem, config: FitConfig, rng: np.random.Generator, progress: Progress | None = None
+    problem: FirstFrameProblem,
+    config: FitConfig,
+    rng: np.random.Generator,
+    progress: Progress | None = None,
+    on_round: Callable[[Gaussians], None] | None = None,
 ) -> FirstFrame:
     """Fit Gaussians to the images of one instant by L_recon (eq. 2); the confidence stays unchanged.
 
@@ -78,11 +84,14 @@ def fit_first_frame(
         config: steps and rates.
         rng: draws the views and the means of births.
         progress: of the steps.
+        on_round: called with the Gaussians before each round of density control.
     """
     fit, steps, done, losses = _Fit(problem, config, rng, progress), config.planned_steps, 0, {}
     while done < steps:
         order = iter(view_order(len(problem.views), steps - done, rng))
         for start, stop in fit.stretches(done, steps):
+            if on_round is not None and fit.has_round(start):
+                on_round(fit.gaussians)
             fit.prepare(start)
             before, losses = losses, fit.run(islice(order, stop - start), start, steps)
         done = steps
@@ -99,13 +108,12 @@ class _Fit:
     ) -> None:
         self._problem, self._config, self._rng, self._progress = problem, config, rng, progress
         self._base, self._optimizer = problem.start, adam(_start(problem.start))
-        self._views = [ActiveView(camera, problem.render) for camera in problem.cameras]
-        self._targets = [view.target for view in problem.views]
         self._rates = config.first_frame_rates.by_parameter(problem.extent)
         self._bands = [
             int(band * config.planned_steps * _BAND + 1e-9) for band in range(1, problem.start.sh_degree + 1)
         ]
         self._rounds = density_rounds(config)
+        self._look_at(problem.halved() if self._rounds else problem)
 
     @property
     def gaussians(self) -> Gaussians:
@@ -117,11 +125,17 @@ class _Fit:
         stops = {*self._bands, *self._rounds, 2 * steps // 3, steps}
         return list(pairwise([done, *sorted(stop for stop in stops if stop > done)]))
 
+    def has_round(self, step: int) -> bool:
+        """Return whether a round of density control is due before a step."""
+        return step in self._rounds
+
     def prepare(self, step: int) -> None:
-        """Add the SH bands, and do the round of density control, that are due before a step."""
+        """Add the SH bands, do the round of density control, and enlarge the images, as is due before a step."""
         for _ in range(self._bands.count(step)):
             _add_band(self._optimizer, self._base)
-        if step in self._rounds:
+        if self._rounds and step == self._rounds[-1]:
+            self._look_at(self._problem)
+        if self.has_round(step):
             self._grow(len(self._rounds) - self._rounds.index(step))
 
     def run(self, views: Iterable[int], first: int, steps: int) -> dict[str, float]:
@@ -135,6 +149,11 @@ class _Fit:
             last=max(_LEAST, _PASSES * len(self._views)),
         )
         return optimise(self._optimizer, self._rates, self._losses_at, stretch)
+
+    def _look_at(self, problem: FirstFrameProblem) -> None:
+        """Fit the views of a problem."""
+        self._views = [ActiveView(camera, problem.render) for camera in problem.cameras]
+        self._targets = [view.target for view in problem.views]
 
     def _losses_at(self, values: Mapping[str, Tensor], view: int) -> dict[str, Tensor]:
         drawn = dropped(self._base.with_parameters(values), self._config.dropping or 0.0, self._rng)

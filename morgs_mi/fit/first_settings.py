@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from morgs_mi.core.progress import Progress
 from morgs_mi.fit.budget import steps_within
-from morgs_mi.fit.cross_validation import CrossValidation, candidates_of, cross_validate
+from morgs_mi.fit.cross_validation import CrossValidation, candidates_of, cross_validate, trial_share
 from morgs_mi.fit.dropping import dropping_by_noise
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.forecast import Forecast, forecast
@@ -39,7 +39,7 @@ def first_settings(
 ) -> FirstSettings:
     """Return the settings of the first frame.
 
-    The quality of views between the cameras is estimated by cross-validation of three views and more; where the
+    The quality of views between the cameras is estimated by a trial without some of three views and more; where the
     strength of dropping is given, and of two views, it is a forecast.
 
     Args:
@@ -53,7 +53,7 @@ def first_settings(
     views, is_chosen = len(problem.views), config.dropping is None
     validated = is_chosen and views >= _VALIDATED
     if config.first_frame_seconds is not None:
-        trials = len(candidates_of(problem, config)) if validated else 0
+        trials = len(candidates_of(problem, config)) * trial_share(config) if validated else 0
         steps = steps_within(config.first_frame_seconds, problem, config, trials, seed)
         config = replace(config, first_frame_steps=steps)
     if validated:

@@ -109,7 +109,7 @@ class DetailConfig:
 class ConvergenceConfig:
     """Settings of the number of steps of the first frame where none is given (see `first_frame`)."""
 
-    steps: Annotated[int, AtLeast(1)] = 1500
+    steps: Annotated[int, AtLeast(1)] = 1200
     """Steps that every first frame gets."""
     most_steps: Annotated[int, AtLeast(1)] = 6000
     """Largest number of steps."""
@@ -177,11 +177,10 @@ class FitConfig:
     convergence: ConvergenceConfig = field(default_factory=ConvergenceConfig)
     """Convergence of the first frame."""
     dropping: Annotated[float, AtLeast(0), Below(1)] | None = None
-    """Probability with which each step of the first frame leaves a Gaussian out (see `dropping`); None: chosen by
-    cross-validation, or by the noise of fewer than `cross_validation_views` views."""
-    cross_validation_views: Annotated[int, AtLeast(2)] = 6
-    """Number of views from which cross-validation chooses the dropping: a rig that lacks one of fewer differs too much
-    (see `cross_validation`)."""
+    """Probability with which each step of the first frame leaves a Gaussian out (see `dropping`); None: from the noise
+    of the images, or with `validate` chosen by cross-validation."""
+    validate: bool = False
+    """Choose the dropping among six views and more by cross-validation, in long trials (see `cross_validation`)."""
     noise_aware: bool = True
     """Fit the first frame to noisy images by L1 alone: SSIM makes the fit follow their noise."""
     refine_cameras: Literal["off", "auto", "on"] = "off"

@@ -17,6 +17,8 @@ from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["FirstFrameProblem"]
 
+# Least width of the images that `halved` returns, px.
+_COARSE_WIDTH = 160
 # Opacity of the Gaussians at the start: most can become opaque or vanish within the steps of a first frame.
 _OPACITY = 0.3
 
@@ -74,6 +76,11 @@ class FirstFrameProblem:
     def reduced(self, width: int) -> FirstFrameProblem:
         """Return the problem with reduced views, see `View.reduced`."""
         return replace(self, views=tuple(view.reduced(width) for view in self.views))
+
+    def halved(self) -> FirstFrameProblem:
+        """Return the problem with views of half the size; a view narrower than 320 px keeps its own."""
+        widths = (max(view.camera.width // 2, _COARSE_WIDTH) for view in self.views)
+        return replace(self, views=tuple(map(View.reduced, self.views, widths)))
 
     def only(self, indices: Sequence[int]) -> FirstFrameProblem:
         """Return the problem of some of the views."""

@@ -54,8 +54,8 @@ class DemoConfig:
     stream: StreamConfig = field(
         default_factory=lambda: StreamConfig(fit=FitConfig(num_gaussians=20_000, first_frame_steps=600, dropping=0.0))
     )
-    """The fit, with a shortened, smaller first frame, and without cross-validation, which chooses no dropping on a clip
-    without noise; its seed is also the clip's."""
+    """The fit, with a shortened, smaller first frame, and without a trial, because a view is held out; its seed is also
+    the clip's."""
 
 
 @dataclass(frozen=True)

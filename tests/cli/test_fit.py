@@ -48,9 +48,7 @@ def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
 
 
 def test_fit__reports_what_to_expect_of_views_between_the_cameras(capture: Path, tmp_path: Path, run) -> None:
-    (tmp_path / "settings.toml").write_text("[fit]\ncross_validation_views = 3\n")
-    options = ("--test-view", "none", "--config", tmp_path / "settings.toml")
-    code, output, _ = run("fit", capture, tmp_path / "out", *QUICK, *options)
+    code, output, _ = run("fit", capture, tmp_path / "out", *QUICK, "--test-view", "none", "--validate")
     (first, *_) = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
     assert code == 0
     assert first["validation"]["sentence"] in " ".join(output.split())

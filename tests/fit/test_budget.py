@@ -29,8 +29,8 @@ def test_steps_within__fill_the_time_that_the_measurement_leaves(steps):
 
 
 def test_steps_within__leave_time_for_the_trials(steps):
-    assert steps(45.4, trials=5) == pytest.approx(1000, abs=1)  # each has 0.4 times the steps
-    assert steps(27.4, trials=2) == pytest.approx(1000, abs=1)
+    assert steps(45.4, trials=2.0) == pytest.approx(1000, abs=1)
+    assert steps(27.4, trials=0.8) == pytest.approx(1000, abs=1)
 
 
 def test_steps_within__are_a_hundred_at_least(steps):

@@ -14,7 +14,7 @@ from morgs_mi.fit.cross_validation import (
     Trial,
     cross_validate,
     excess_share,
-    trial_steps,
+    trial_share,
     withheld_views,
 )
 from morgs_mi.fit.fit_config import FitConfig
@@ -23,8 +23,7 @@ from tests.scenes.ball import ball, bytes_of, images_of, opaque_ball, problem, v
 from tests.scenes.cameras import arc, look_at_cameras
 
 CONFIG = FitConfig(sh_degree=0, first_frame_steps=100, num_gaussians=150)
-# Among four views.
-CHOOSING = dataclasses.replace(CONFIG, cross_validation_views=4)
+VALIDATED = dataclasses.replace(CONFIG, validate=True)
 
 
 def validate(images, masks=None, config=CONFIG, report=None, render=None):
@@ -39,20 +38,29 @@ def test_withheld_views__lie_in_the_inner_half_of_the_rig():
     assert len(withheld_views(cameras[:3], 6)) == 1
 
 
-def test_cross_validate__tries_candidates_until_one_is_no_better():
+@pytest.mark.parametrize(("config", "steps"), [(CONFIG, 15), (VALIDATED, 40)])
+def test_cross_validate__makes_one_trial_of_few_views(config: FitConfig, steps: int):
     done = []
-    found = validate(bytes_of(images_of(opaque_ball())), config=CHOOSING, report=lambda *now: done.append(now))
+    found = validate(bytes_of(images_of(opaque_ball())), config=config, report=lambda *now: done.append(now))
+    assert [trial.dropping for trial in found.trials] == [0.0]
+    assert done == [("Trial", step, steps) for step in range(1, steps + 1)]
+
+
+def test_cross_validate__tries_candidates_until_one_is_no_better(monkeypatch):
+    monkeypatch.setattr("morgs_mi.fit.cross_validation._CERTAIN", 4)
+    done = []
+    found = validate(bytes_of(images_of(opaque_ball())), config=VALIDATED, report=lambda *now: done.append(now))
     values = [trial.withheld_psnr for trial in found.trials]
     assert len(values) == 3 or values[-1] <= values[-2]
     assert found.best.withheld_psnr == max(values)
     assert all(trial.training_psnr > trial.withheld_psnr > 15 for trial in found.trials)
-    steps = trial_steps(CONFIG)
+    steps = round(trial_share(VALIDATED) * CONFIG.planned_steps)
     stages = [f"Trial {number} of 3" for number in range(1, len(found.trials) + 1)]
     assert done == [(stage, step, steps) for stage in stages for step in range(1, steps + 1)]
 
 
 @pytest.mark.parametrize(("noise", "dropping"), [(0.0, 0.0), (0.05, 0.2)])
-def test_cross_validate__lets_the_noise_choose_the_dropping_of_few_views(noise: float, dropping: float):
+def test_cross_validate__lets_the_noise_choose_the_dropping(noise: float, dropping: float):
     grey = [0.2 + 0.6 * image for image in images_of(opaque_ball())]
     found = validate(bytes_of(grey, noise), config=dataclasses.replace(CONFIG, first_frame_steps=5))
     assert [trial.dropping for trial in found.trials] == [dropping]
@@ -84,10 +92,9 @@ def test_cross_validate__is_the_same_every_time():
     assert first == second
 
 
-def test_cross_validate__judges_reduced_images_with_their_masks(monkeypatch):
+def test_cross_validate__judges_reduced_images_with_their_masks():
     images = bytes_of(images_of(opaque_ball()))
     masks = [np.ones(image.shape[:2], bool) for image in images]
-    monkeypatch.setattr("morgs_mi.fit.cross_validation._WIDTH", images[0].shape[1] // 2)
     clean = validate(images).best
     for image, mask in zip(images, masks, strict=True):
         image[:10], mask[:10] = 255, False

@@ -46,11 +46,12 @@ def test_dropped__returns_the_same_without_probability():
     assert dropped(GAUSSIANS, 0.0, np.random.default_rng(0)) is GAUSSIANS
 
 
-def test_dropping_by_noise__drops_only_where_images_are_noisy():
+def test_dropping_by_noise__drops_only_where_images_are_noisy_and_few():
     clean, rng = [0.2 + 0.6 * image for image in images_of(opaque_ball())], np.random.default_rng(0)
 
-    def dropping(noise: float) -> float:
-        noisy = [255 * (image + rng.normal(0, noise, image.shape)) for image in clean]
+    def dropping(noise: float, times: int = 1) -> float:
+        noisy = [255 * (image + rng.normal(0, noise, image.shape)) for image in times * clean]
         return dropping_by_noise([np.uint8(np.clip(image + 0.5, 0, 255)) for image in noisy])
 
     assert [dropping(noise) for noise in (0.0, 0.008, 0.02)] == [0, 0, 0.2]
+    assert dropping(0.02, times=2) == 0

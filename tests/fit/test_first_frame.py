@@ -171,6 +171,25 @@ def test_fit_first_frame__prunes_what_is_invisible(images):
     assert len(fit(images, start, config).gaussians) == 50
 
 
+def test_fit_first_frame__sees_images_of_half_the_size_until_it_has_grown(images, monkeypatch):
+    monkeypatch.setattr("morgs_mi.fit.problem._COARSE_WIDTH", 32)
+    monkeypatch.setattr("morgs_mi.fit.view._MIN_SIDE", 24)
+    widths, render = [], ActiveView.render
+
+    def spy(view, gaussians, *channels, **more):
+        if dr.grad_enabled(gaussians.sh_coeffs):
+            widths.append(view.camera.width)
+        return render(view, gaussians, *channels, **more)
+
+    monkeypatch.setattr(ActiveView, "render", spy)
+    config = dataclasses.replace(CONFIG, first_frame_steps=20, density=DensityConfig(rounds=3))
+    fit(images, ball(60), config)
+    assert widths == 10 * [32] + 10 * [64]
+    widths.clear()
+    fit(images, ball(60), CONFIG)
+    assert widths == 8 * [64]
+
+
 # ---- images, masks and losses ----------------------------------------------------------------------------
 
 

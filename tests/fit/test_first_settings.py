@@ -52,8 +52,9 @@ def test_first_settings__withhold_a_view_of_three_and_more(views: int, expected,
     assert reported == stages
 
 
-def test_first_settings__choose_the_dropping_with_the_best_withheld_views():
-    config = replace(CHOOSING, first_frame_steps=60, cross_validation_views=4)
+def test_first_settings__choose_the_dropping_with_the_best_withheld_views(monkeypatch):
+    monkeypatch.setattr("morgs_mi.fit.cross_validation._CERTAIN", 4)
+    config = replace(CHOOSING, first_frame_steps=60, validate=True)
     stages = []
     found = settings(config, report=lambda stage, *_: stages.append(stage))
     assert isinstance(found.expected, CrossValidation)
@@ -61,8 +62,8 @@ def test_first_settings__choose_the_dropping_with_the_best_withheld_views():
     assert set(stages) == {f"Trial {number} of 3" for number in range(1, len(found.expected.trials) + 1)}
 
 
-@pytest.mark.parametrize("views", [1, 2])
-def test_first_settings__let_noise_choose_the_dropping_of_one_and_two_views(views: int):
+@pytest.mark.parametrize("views", [1, 2, 4])
+def test_first_settings__let_noise_choose_the_dropping(views: int):
     assert settings(CHOOSING, views).config.dropping == 0
     assert settings(CHOOSING, views, 0.05).config.dropping == 0.2
 
@@ -75,8 +76,11 @@ def test_first_settings__keep_a_given_dropping_without_trials():
     assert not stages
 
 
-@pytest.mark.parametrize(("views", "dropping", "trials"), [(4, None, 1), (2, None, 0), (4, 0.1, 0)])
-def test_first_settings__plan_the_steps_within_a_time_with_the_trials(monkeypatch, views, dropping, trials):
+@pytest.mark.parametrize(
+    ("views", "dropping", "validate", "trials"),
+    [(4, None, False, 0.15), (4, None, True, 0.4), (2, None, False, 0), (4, 0.1, True, 0)],
+)
+def test_first_settings__plan_the_steps_within_a_time_with_the_trials(monkeypatch, views, dropping, validate, trials):
     planned = []
 
     def steps_within(seconds, given, config, count, seed):
@@ -84,7 +88,7 @@ def test_first_settings__plan_the_steps_within_a_time_with_the_trials(monkeypatc
         return 7
 
     monkeypatch.setattr(module, "steps_within", steps_within)
-    config = replace(CONFIG, first_frame_steps=None, first_frame_seconds=20.0, dropping=dropping)
+    config = replace(CONFIG, first_frame_steps=None, first_frame_seconds=20.0, dropping=dropping, validate=validate)
     assert settings(config, views).config.first_frame_steps == 7
     assert planned == [(20.0, trials)]
 

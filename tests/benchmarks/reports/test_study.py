@@ -53,7 +53,7 @@ SMALL = {"frames": 3, "width": 64, "gaussians": 60, "steps": 3, "epochs": 1, "fi
 STUDIES = {
     random_scenes: ({"seeds": (1,), "frames": 2}, 1),
     estimates: ({**FIRST, "views": (3,)}, 1),
-    generalise: ({**FIRST, "seeds": (1, 2)}, 4),
+    generalise: ({"scenes": ("random-1",), "views": (3,), "steps": 3, "gaussians": 60}, 4),
     cameras: ({**FIRST, "degrees": (0.0, 0.5), "disturbances": (0,), "lens": 0.1}, 3),
     masks: ({"frames": 1, "loops": ("none",)}, 1),
     drift: ({**SMALL, "scenes": ("spheres",)}, 2),
@@ -68,7 +68,7 @@ FAST = (random_scenes, estimates)
 
 def tiny_loop(cameras, points, colors, config, image_masks):
     """Return a loop that fits a few Gaussians in a few steps."""
-    fit = replace(TINY.fit, cross_validation_views=config.fit.cross_validation_views, dropping=config.fit.dropping)
+    fit = replace(TINY.fit, validate=config.fit.validate, dropping=config.fit.dropping)
     return StreamLoop(cameras, points, colors, replace(config, fit=fit, render=TINY.render), image_masks)
 
 
@@ -182,8 +182,8 @@ def test_study_options__have_tables_of_the_committed_results():
 
 @pytest.mark.slow
 def test_run_cells__of_processes_gives_the_scores_of_one_process(clip: Path):
-    source = Source.of(load_capture(clip))
-    args = {seed: (source, replace(TINY, seed=seed)) for seed in (0, 1)}
+    capture = load_capture(clip)
+    args = {seed: (Source.of(capture), capture.train_views, 0.0, replace(TINY, seed=seed)) for seed in (0, 1)}
     with open_workers(count=2) as workers:
         ours, theirs = (run_cells(measure, args, each, lambda *_: None) for each in (workers, None))
     assert without_times(list(ours.values())) == without_times(list(theirs.values()))
