@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
@@ -110,6 +110,7 @@ def step(
     state: StreamState,
     images: Sequence[np.ndarray | None] | FrameObservation,
     progress: Report | None = None,
+    on_provisional: Callable[[Packet], None] | None = None,
 ) -> tuple[StreamState, Packet, FrameReport]:
     """Fit one frame and return (state, packet, report). The function is pure: all state is returned.
 
@@ -119,6 +120,7 @@ def step(
         images: per training view uint8 [H, W, 3], RGB, or None where the view has no image. They are copied.
             Alternatively, the result of `observe_frame` for them.
         progress: called with (stage, done, total): the stages of the first frame, or the steps of a later one.
+        on_provisional: called with provisional keyframes while the first frame is fitted.
 
     Raises:
         ValueError: an image has another size or type than its camera, or the first frame has no image at all.
@@ -126,7 +128,7 @@ def step(
     start, observed = time.perf_counter(), images
     if not isinstance(observed, FrameObservation):
         observed = observe_frame(setup, state.frame, state.seen, observed)
-    fit = _fit_first_frame if state.coded is None else _fit_later_frame
+    fit = partial(_fit_first_frame, on_provisional) if state.coded is None else _fit_later_frame
     packet, about = fit(setup, state, observed, Progress(progress, f"Frame {state.frame}"))
     coded, seen = decode(state.coded, packet), observed.seen
     balance = about.pop("balance", state.balance)
@@ -167,7 +169,11 @@ def _fit_later_frame(
 
 
 def _fit_first_frame(
-    setup: Setup, state: StreamState, observed: FrameObservation, progress: Progress
+    on_provisional: Callable[[Packet], None] | None,
+    setup: Setup,
+    state: StreamState,
+    observed: FrameObservation,
+    progress: Progress,
 ) -> tuple[Packet, dict[str, Any]]:
     """Return the first frame's packet and the entries of its report."""
     config, images = setup.config, observed.seen.images
@@ -177,8 +183,13 @@ def _fit_first_frame(
     fit = with_num_gaussians(config.fit, views, setup.points)
     problem = FirstFrameProblem.of(views, setup.cloud, fit, config.render, rng)
     chosen = first_settings(problem, fit, config.seed, progress)
-    fitted = fit_first_frame(problem, chosen.config, rng, progress.of("First frame"))
-    return keyframe_packet(fitted.gaussians, 0, setup.cameras, config.codec), {
+
+    def packed(gaussians: Gaussians) -> Packet:
+        return keyframe_packet(gaussians, 0, setup.cameras, config.codec)
+
+    on_round = None if on_provisional is None else lambda gaussians: on_provisional(packed(gaussians))
+    fitted = fit_first_frame(problem, chosen.config, rng, progress.of("First frame"), on_round)
+    return packed(fitted.gaussians), {
         "losses": fitted.losses,
         "status": _start_status(setup, fit),
         "validation": _about_expected(chosen.expected, problem.psnr(fitted.gaussians)) | _about_balance(found),
@@ -332,6 +343,7 @@ class StreamLoop:
         progress: Report | None = None,
         upcoming: Sequence[np.ndarray | None] | None = None,
         recorded: Sequence[np.ndarray | None] | None = None,
+        on_provisional: Callable[[Packet], None] | None = None,
     ) -> tuple[Packet, FrameReport]:
         """Fit the next frame and return its packet for the stream, and its report; see `step`.
 
@@ -342,6 +354,7 @@ class StreamLoop:
                 this frame is fitted. They change nothing else.
             recorded: images with which the next frame's images are compared, if not with `images`: for the first
                 frame, where `images` are interpolated because cameras have delays.
+            on_provisional: as for `step`.
         """
         start, frame, before = time.perf_counter(), self.state.frame, self.state.seen
         observed = self._observed_ahead(images) or observe_frame(self.setup, frame, before, images)
@@ -349,7 +362,7 @@ class StreamLoop:
         if upcoming is not None:
             copies = [None if image is None else np.array(image) for image in upcoming]
             self._ahead = frame + 1, in_background(partial(observe_frame, self.setup, frame + 1, seen, copies))
-        state, packet, report = step(self.setup, self.state, observed, progress)
+        state, packet, report = step(self.setup, self.state, observed, progress, on_provisional)
         self.state = replace(state, seen=seen)
         return packet, replace(report, seconds=time.perf_counter() - start)
 

@@ -52,6 +52,7 @@ class Live:
     settings: GivenSettings = field(default_factory=Settings)
 
     def run(self) -> None:
+        from morgs_mi.playback.player import PROVISIONAL
         from morgs_mi.runs.live.fit_live import fit_live
 
         out = self.out or Path(time.strftime("live-%Y%m%d-%H%M%S"))
@@ -59,14 +60,24 @@ class Live:
         self.settings.check_methods(config)
         sources = [int(source) if source.isdecimal() else source for source in self.camera]
         with ExitStack() as viewer, progress() as report:
-            lines = _Lines()
+            lines, is_shown = _Lines(), not self.view
+
+            def show() -> None:
+                nonlocal is_shown
+                if not is_shown:
+                    is_shown = True
+                    viewer.callback(_stop, _start_viewer(out, self.open_browser))
 
             def on_frame(row: LiveFrame, *_: Any) -> None:
                 lines.add(row)
-                if self.view and row.frame == 0:
-                    viewer.callback(_stop, _start_viewer(out, self.open_browser))
+                show()
 
-            rows = fit_live(sources, out, self.live, config, on_frame, report)
+            def on_stage(stage: str, done: float, total: float) -> None:
+                report(stage, done, total)
+                if (out / PROVISIONAL).exists():
+                    show()
+
+            rows = fit_live(sources, out, self.live, config, on_frame, on_stage)
         print_result(_summary(out, rows))
 
 

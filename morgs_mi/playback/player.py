@@ -40,6 +40,7 @@ __all__ = [
     "CHANNELS",
     "MOTION_SCALE",
     "OFFSET_SCALE",
+    "PROVISIONAL",
     "STREAM",
     "available_channels",
     "channel_image",
@@ -68,6 +69,8 @@ OFFSET_SCALE = 0.1
 """The same for the learned offset, as a fraction of that speed: the offset is the smaller part of the motion."""
 STREAM = "stream.morgs"
 """Name of the stream in the folder of a fit."""
+PROVISIONAL = "provisional.morgs"
+"""Name of the stream beside it that has a provisional first frame, until the fit has the first frame."""
 _MOST_TIMED_FRAMES = 30
 _JSON_TYPES = {
     dict: "an object",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
@@ -90,7 +90,7 @@ def _stream(capture: Capture, out: Path, config: StreamConfig, resume: bool, pro
     with Recording(files, prepared.capture, metadata | prepared.metadata, earlier) as recording:
         for frame, upcoming in with_next(frames):
             stage = progress.of("Later frames").part(frame.index - 1, last) if frame.index else progress
-            packet, report = push_frame(loop, frame, train, stage.report, upcoming)
+            packet, report = push_frame(loop, frame, train, stage.report, upcoming, recording.show)
             recording.push(packet, prepared.completed(report, loop.gaussians, frame, config), loop.state.coded)
     return recording.reports
 
@@ -177,12 +177,13 @@ def push_frame(
     train: Sequence[int],
     progress: Report | None = None,
     upcoming: PartialFrame | None = None,
+    on_provisional: Callable[[Packet], None] | None = None,
 ) -> tuple[Packet, FrameReport]:
     """Fit the next frame of a loop on the views `train`; the report's status names the images that are missing."""
     images, ahead = (None if f is None else [f.images[v] for v in train] for f in (frame, upcoming))
     assert images is not None
     recorded = None if frame.recorded is None else frame.comparable(train)
-    packet, report = loop.push(images, progress, ahead, recorded)
+    packet, report = loop.push(images, progress, ahead, recorded, on_provisional)
     status = "; ".join([*([report.status] if report.status != "ok" else []), *frame.problems]) or "ok"
     return packet, replace(report, status=status)
 

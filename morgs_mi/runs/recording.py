@@ -28,11 +28,12 @@ from morgs_mi.capture.outputs import check_output
 from morgs_mi.codec.container import Packet, PacketKind, StreamWriter, TruncatedStreamError, header_json
 from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.files import is_same_file, write_json
+from morgs_mi.core.files import atomic_path, is_same_file, write_json
 from morgs_mi.core.rig import choose_key_views
 from morgs_mi.io.bounded import read_json
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.exposure import Exposure
+from morgs_mi.playback.player import PROVISIONAL
 from morgs_mi.stream_loop import FrameReport
 
 __all__ = [
@@ -65,6 +66,11 @@ class FitFiles(NamedTuple):
     stream: Path
     report: Path
 
+    @property
+    def provisional(self) -> Path:
+        """Stream of a provisional first frame."""
+        return self.stream.with_name(PROVISIONAL)
+
     @classmethod
     def of(cls, out: Path) -> FitFiles:
         """Return the files of a fit in the folder `out`."""
@@ -96,9 +102,10 @@ class Recording:
     def __init__(
         self, files: FitFiles, capture: Capture, metadata: Mapping[str, Any], earlier: Interrupted | None = None
     ) -> None:
-        self._files, self._metadata = files, metadata
+        self._files, self._metadata, self._capture = files, metadata, capture
         self._interval: int = metadata["config"]["codec"]["keyframe_interval"]
         self.reports: list[FrameReport] = []
+        files.provisional.unlink(missing_ok=True)
         if earlier is None:
             self._writer = StreamWriter(files.stream, capture.cameras, capture.fps, metadata)
         else:
@@ -114,8 +121,21 @@ class Recording:
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._writer.close()
+        self._files.provisional.unlink(missing_ok=True)
         if kind is None:
             self._check_in_place()
+
+    def show(self, keyframe: Packet) -> None:
+        """Write a provisional first frame beside the stream, which viewers show until the stream has its first frame.
+
+        Raises:
+            OSError: the file cannot be written.
+        """
+        with (
+            atomic_path(self._files.provisional, "Recording.show()") as partial,
+            StreamWriter(partial, self._capture.cameras, self._capture.fps, self._metadata) as writer,
+        ):
+            writer.write(keyframe)
 
     def push(self, packet: Packet, report: FrameReport, coded: CodedFrame | None, **entries: Any) -> None:
         """Add a frame, and the keyframe that is due after it.
@@ -140,6 +160,7 @@ class Recording:
         write_json(self._files.report, {**self._metadata, "frames": rows, **entries})
         for packet in packets:
             self._writer.write(packet)
+        self._files.provisional.unlink(missing_ok=True)
         self.reports = reports
 
     def _check_in_place(self) -> None:

@@ -12,6 +12,7 @@ from morgs_mi.cli import live as module
 from morgs_mi.cli.live import Live, _Lines, _summary
 from morgs_mi.cli.settings import Settings
 from morgs_mi.io.video_writer import write_video
+from morgs_mi.playback.player import PROVISIONAL
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.runs.live.fit_live import LiveFrame
 from tests.cli.commands import QUICK, assert_refused
@@ -47,6 +48,20 @@ def test_Live__fits_videos_until_they_end(
     assert started == [(out, True), None]
     assert open_stream(out).closed()
     assert {path.name for path in out.iterdir()} == {"stream.morgs", "report.json", "capture.json", "capture"}
+
+
+def test_Live__starts_the_viewer_at_a_provisional_first_frame(
+    capture: Path, tmp_path: Path, videos: list[Path], run, monkeypatch
+) -> None:
+    found = []
+    monkeypatch.setattr(
+        module, "_start_viewer", lambda out, _: found.append(sorted(path.name for path in out.iterdir()))
+    )
+    monkeypatch.setattr(module, "_stop", lambda _: None)
+    args = ("--camera", *videos, "--calibration", capture, "--view", "--frames", 1, *QUICK, "--first-frame-steps", 20)
+    assert run("live", tmp_path / "out", *args)[0] == 0
+    assert len(found) == 1
+    assert PROVISIONAL in found[0]
 
 
 def test_Live__repeats_videos(capture: Path, tmp_path: Path, videos: list[Path], run, caplog) -> None:

@@ -20,13 +20,14 @@ import pytest
 from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.codec.codec_config import CodecConfig
-from morgs_mi.codec.container import PAYLOAD, TRAILER, StreamWriter
+from morgs_mi.codec.container import PAYLOAD, TRAILER, Packet, StreamWriter
 from morgs_mi.codec.packets import CodedFrame, coded_frames, play, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.fit.fit_config import ShortFitConfig
-from morgs_mi.playback.player import open_stream_capture
+from morgs_mi.fit.fit_config import DensityConfig, ShortFitConfig
+from morgs_mi.playback.player import PROVISIONAL, open_stream_capture
 from morgs_mi.playback.source import as_fitted
 from morgs_mi.runs.recorder import stream_capture, with_next
+from morgs_mi.runs.recording import Recording as Files
 from morgs_mi.runs.recording import _without_folder, stream_metadata
 from morgs_mi.stream_loop import StreamLoop
 from tests.codec.forge import damaged, with_forged_bytes, with_forged_header, with_forged_packets
@@ -90,6 +91,26 @@ def kill_and_resume(whole: Path, folder: Path, kills: int) -> None:
             killed += status == -9
         stream_capture(recording(), out, CONFIG, resume=True)
         assert_same(out, whole)
+
+
+def test_stream_capture__shows_a_provisional_first_frame(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stream beside the one that is written has a frame for each round of density control, and is removed."""
+    shown, show = [], Files.show
+
+    def spy(files: Files, keyframe: Packet) -> None:
+        show(files, keyframe)
+        provisional = StreamReader(tmp_path / PROVISIONAL)
+        shown.append([packet.encoded for packet in provisional])
+        assert provisional.metadata == StreamReader(tmp_path / "stream.morgs").metadata
+        assert not StreamReader(tmp_path / "stream.morgs").index()
+
+    monkeypatch.setattr(Files, "show", spy)
+    fit = replace(CONFIG.fit, num_gaussians=80, first_frame_steps=20, density=DensityConfig(rounds=3))
+    stream_capture(recording(num_frames=2), tmp_path, replace(CONFIG, fit=fit))
+    first = next(iter(StreamReader(tmp_path / "stream.morgs")))
+    assert len(shown) == 3
+    assert [first.encoded] not in shown
+    assert not (tmp_path / PROVISIONAL).exists()
 
 
 @pytest.mark.slow

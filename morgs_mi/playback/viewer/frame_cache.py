@@ -11,6 +11,8 @@ import numpy as np
 
 from morgs_mi.codec.container import PacketKind, TruncatedStreamError
 from morgs_mi.codec.packets import CodedFrame, frames_near
+from morgs_mi.core.files import is_same_file
+from morgs_mi.playback.player import PROVISIONAL
 from morgs_mi.playback.streams import open_stream
 
 __all__ = ["NO_TRAILS", "FrameCache", "Trails"]
@@ -28,6 +30,8 @@ NO_TRAILS: Trails = (np.zeros((0, 2, 3), np.float32), np.zeros(0))
 class FrameCache:
     """Frames of a stream file, which may still be written.
 
+    While the stream has no frame, the provisional first frame beside it is shown, if there is one.
+
     One frame is decoded at a time: the next one from the current one, any other from the keyframe before it.
 
     Args:
@@ -42,14 +46,16 @@ class FrameCache:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.stream = open_stream(path)
+        self._path = open_stream(path).path
         self._centres: OrderedDict[int, tuple[np.ndarray, np.ndarray]] = OrderedDict()
-        self._current: CodedFrame | None = None
-        self._upcoming: Iterator[CodedFrame] = iter(())
-        self._entries: list[tuple[int, int, int]] = []
-        self._size = 0
+        self._reopen()
         self.frames: list[int] = []
         self.refresh()
+
+    @property
+    def is_provisional(self) -> bool:
+        """Whether the frame is a provisional one."""
+        return self.stream.path != self._path
 
     def refresh(self) -> bool:
         """Read the index again; return whether it has changed. A file that was replaced is opened again.
@@ -57,6 +63,8 @@ class FrameCache:
         Raises:
             OSError, ValueError: the file is missing, or has no header yet.
         """
+        if (self.is_provisional or not self._entries) and not is_same_file(self._newest(), self._opened):
+            self._reopen()
         size = self.stream.path.stat().st_size
         if size < self._size:
             self._reopen()
@@ -125,9 +133,18 @@ class FrameCache:
         moved = (lines[:, 0] != lines[:, 1]).any(axis=1)
         return lines[moved], line_ages[moved]
 
+    def _newest(self) -> Path:
+        """Return the path of the stream, or of its provisional first frame while it has none."""
+        provisional = self._path.with_name(PROVISIONAL)
+        return provisional if provisional.is_file() and not open_stream(self._path).index() else self._path
+
     def _reopen(self) -> None:
-        self.stream = open_stream(self.stream.path)
-        self._current, self._upcoming, self._entries = None, iter(()), []
+        self.stream = open_stream(self._newest())
+        self._opened = self.stream.path.stat()
+        self._current: CodedFrame | None = None
+        self._upcoming: Iterator[CodedFrame] = iter(())
+        self._entries: list[tuple[int, int, int]] = []
+        self._size = 0
         self._centres.clear()
 
     def _keyframe_before(self, frame: int) -> int:

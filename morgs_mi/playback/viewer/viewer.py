@@ -35,6 +35,7 @@ __all__ = ["Viewer", "ViewerConfig"]
 
 _MOVING_MODES = ("motion", "confidence", "offset")
 _NO_OFFSET = ". This frame stores no offset: set codec.offset in --config to store it in every frame but the first."
+_PROVISIONAL = ". This frame is provisional: the first frame is still being fitted."
 _NO_MOTION = ". The first frame has no motion."
 _NOT_AT_CAMERA = ". Go to a camera to see its recorded image."
 _NOT_RECORDED = ". There is no recorded image of this camera at this frame."
@@ -233,6 +234,7 @@ class Viewer:
         own, mode = coded.gaussians, self._controls.mode.value
         lacks_offset, lacks_motion = mode == "offset" and own.offset is None, mode == "motion" and own.motion is None
         note = _NO_OFFSET if lacks_offset else _NO_MOTION if lacks_motion else ""
+        note += _PROVISIONAL if self._cache.is_provisional else ""
         return f"Frame {coded.frame} of {self._cache.frames[-1]}, {len(own)} Gaussians{note}"
 
     def _frame_at(self, index: int) -> int:

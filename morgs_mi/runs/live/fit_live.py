@@ -194,7 +194,7 @@ def _fit(
         try:
             for bundle, frame in frames:
                 recorded = in_background(partial(_record, frames, out, bundle, frame))
-                packet, report = push_frame(loop, frame, train, None if rows else on_stage)
+                packet, report = push_frame(loop, frame, train, None if rows else on_stage, None, recording.show)
                 report = prepared.completed(report, loop.gaussians, frame, config)
                 recorded.result()
                 row = frames.report(bundle, frame)

@@ -7,6 +7,7 @@ import pytest
 
 from morgs_mi.codec.packets import CodedFrame, coded_frames
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.playback.player import PROVISIONAL
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.viewer.frame_cache import FrameCache
 from tests.assertions import assert_close
@@ -58,6 +59,28 @@ def test_frame_cache__follows_a_growing_file_and_reopens_a_replaced_one(tmp_path
     growing.write_bytes(complete)
     assert cache.refresh()
     np.testing.assert_array_equal(cache.at(5).digest, states[5].digest)
+
+
+def test_frame_cache__shows_a_provisional_first_frame_until_the_stream_has_one(tmp_path, states):
+    stream, provisional = tmp_path / "stream.morgs", tmp_path / PROVISIONAL
+    complete, (_, _, start), (_, _, end) = stream.read_bytes(), *open_stream(stream).index()[:2]
+    write_stream(provisional, 1, splats(30, seed=3))
+    cache = FrameCache(tmp_path)
+    assert not cache.is_provisional
+    stream.write_bytes(complete[:start])
+    assert cache.refresh()
+    assert cache.is_provisional
+    assert (cache.frames, len(cache.at(0).gaussians)) == ([0], 30)
+    assert not cache.refresh()
+    write_stream(tmp_path / "next.morgs", 1, splats(40, seed=3))
+    (tmp_path / "next.morgs").replace(provisional)
+    assert cache.refresh()
+    assert len(cache.at(0).gaussians) == 40
+    stream.write_bytes(complete[:end])
+    provisional.unlink()
+    cache.refresh()
+    assert not cache.is_provisional
+    np.testing.assert_array_equal(cache.at(0).digest, states[0].digest)
 
 
 def test_trails__are_the_displacements_of_the_moving_gaussians(tmp_path, states):
