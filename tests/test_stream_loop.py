@@ -221,7 +221,7 @@ def test_push__replaces_too_few_points_and_reports_it(clip):
 
 
 def test_push__reports_what_cross_validation_of_the_first_frame_found(clip, monkeypatch):
-    monkeypatch.setattr("morgs_mi.fit.cross_validation._CERTAIN", 4)
+    monkeypatch.setattr("morgs_mi.fit.cross_validation.MANY_VIEWS", 4)
     ticks, fit = [], dataclasses.replace(TRIALS, validate=True)
     given = dataclasses.replace(QUICK, fit=dataclasses.replace(fit, dropping=0.0))
     _, report = new_loop(dataclasses.replace(QUICK, fit=fit)).push(clip[0][:4], lambda *tick: ticks.append(tick))

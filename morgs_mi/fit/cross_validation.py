@@ -23,7 +23,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.rig import angles_to, scene_depths
-from morgs_mi.fit.dropping import dropping_by_noise
+from morgs_mi.fit.dropping import MANY_VIEWS, dropping_by_noise
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.forecast import forecast, verdict
@@ -50,8 +50,8 @@ _SHARES, _WIDTHS = (0.15, 0.4), (320, 640)
 # Angle in degrees at which the excess of error ends, and power of the angle, times the number of views, with which it
 # grows in trials with few views.
 _FAR, _POWER = 20.0, 6.0
-# Number of cameras from which one is hardly missed, and the error of the estimate with fewer, dB.
-_CERTAIN, _UNCERTAINTY = 6, 4
+# Number of cameras from which the estimate is usually right by 1.5 dB, and its error with fewer, dB.
+_CERTAIN, _UNCERTAINTY = 8, 4
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,7 @@ def cross_validate(
 
 def candidates_of(problem: FirstFrameProblem, config: FitConfig) -> tuple[float, ...]:
     """Return the probabilities of dropping that are tried."""
-    is_chosen = config.validate and len(problem.views) >= _CERTAIN
+    is_chosen = config.validate and len(problem.views) >= MANY_VIEWS
     return _CANDIDATES if is_chosen else (dropping_by_noise(problem.images),)
 
 

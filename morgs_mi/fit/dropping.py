@@ -20,12 +20,15 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.fit.noise import is_noisy
 
-__all__ = ["dropped", "dropping_by_noise"]
+__all__ = ["MANY_VIEWS", "dropped", "dropping_by_noise"]
+
+MANY_VIEWS = 6
+"""Number of views of which one is hardly missed, and from which noisy ones are fitted without dropping."""
 
 # Logit of an opacity that no cut-off of the renderer lets pass, and the largest opacity.
 _INVISIBLE, _MOST = -30.0, 0.999
-# Probability with which noisy views are fitted if they are few, and the number from which they are not.
-_NOISY_DROPPING, _MANY = 0.2, 6
+# Probability with which few noisy views are fitted.
+_NOISY_DROPPING = 0.2
 
 
 def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) -> Gaussians:
@@ -45,9 +48,9 @@ def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) 
 
 
 def dropping_by_noise(images: Sequence[np.ndarray]) -> float:
-    """Return the probability of dropping that follows from the noise of the images, of which six are many.
+    """Return the probability of dropping that follows from the number of images and their noise.
 
     Args:
         images: [H, W, 3], uint8, one per view.
     """
-    return _NOISY_DROPPING if len(images) < _MANY and is_noisy(images) else 0.0
+    return _NOISY_DROPPING if len(images) < MANY_VIEWS and is_noisy(images) else 0.0

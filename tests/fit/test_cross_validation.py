@@ -47,7 +47,7 @@ def test_cross_validate__makes_one_trial_of_few_views(config: FitConfig, steps: 
 
 
 def test_cross_validate__tries_candidates_until_one_is_no_better(monkeypatch):
-    monkeypatch.setattr("morgs_mi.fit.cross_validation._CERTAIN", 4)
+    monkeypatch.setattr("morgs_mi.fit.cross_validation.MANY_VIEWS", 4)
     done = []
     found = validate(bytes_of(images_of(opaque_ball())), config=VALIDATED, report=lambda *now: done.append(now))
     values = [trial.withheld_psnr for trial in found.trials]

@@ -53,7 +53,7 @@ def test_first_settings__withhold_a_view_of_three_and_more(views: int, expected,
 
 
 def test_first_settings__choose_the_dropping_with_the_best_withheld_views(monkeypatch):
-    monkeypatch.setattr("morgs_mi.fit.cross_validation._CERTAIN", 4)
+    monkeypatch.setattr("morgs_mi.fit.cross_validation.MANY_VIEWS", 4)
     config = replace(CHOOSING, first_frame_steps=60, validate=True)
     stages = []
     found = settings(config, report=lambda stage, *_: stages.append(stage))
