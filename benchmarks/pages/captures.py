@@ -17,6 +17,7 @@ __all__ = [
     "dropping",
     "estimates",
     "exposure",
+    "first_frames",
     "live",
     "noise_aware",
     "points",
@@ -45,6 +46,19 @@ def dropping() -> str:
         row.append(plus_minus([_held_out(fit) for fit in own]))
     ordered = sorted(rows.items(), key=lambda item: (float(item[1][0]) < 0.015, int(item[0].partition("-")[2])))
     return markdown(("clip", "noise", "p = 0", "p = 0.2"), ((f"`{name}`", *row) for name, row in ordered))
+
+
+def first_frames() -> str:
+    """Return the held-out PSNR, its estimate and the processor time of first frames, before and now."""
+    rows = []
+    for (clip, views, noise), own in grouped(committed("generalise")["fits"], "clip", "views", "noise").items():
+        fits = [next(fit for fit in own if fit["variant"] == variant) for variant in ("before", "default")]
+        digits = {"held_out": 2, "estimate": 1, "cpu_s": 0}
+        pairs = {key: " / ".join(f"{fit[key]:.{count}f}" for fit in fits) for key, count in digits.items()}
+        pairs |= {"estimate": ""} if noise else {}  # it is of images with the noise
+        rows.append((f"`{clip}`", f"{views}", f"{noise:g}", *pairs.values(), f"{fits[1]['cpu_s'] / fits[0]['cpu_s']:.2f}"))
+    titles = "held out, dB", "estimate, dB", "processor time, s", "ratio"
+    return markdown(("clip", "views", "noise", *titles), rows)
 
 
 def noise_aware() -> str:

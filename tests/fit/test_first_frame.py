@@ -56,7 +56,8 @@ def values_of(gaussians: Gaussians) -> dict[str, bytes]:
 # ---- number of steps -------------------------------------------------------------------------------------
 
 
-def test_fit_first_frame__doubles_its_steps_while_the_loss_falls(images):
+def test_fit_first_frame__doubles_its_steps_while_the_loss_falls(images, monkeypatch):
+    monkeypatch.setattr("morgs_mi.fit.first_frame._LEAST_DECREASE", 0.15)
     done = []
     found = fit(images, ball(150), UNTIL_CONVERGED, progress=Progress(lambda *now: done.append(now), "First frame"))
     assert found.steps == 150
