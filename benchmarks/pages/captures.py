@@ -56,7 +56,9 @@ def first_frames() -> str:
         digits = {"held_out": 2, "estimate": 1, "cpu_s": 0}
         pairs = {key: " / ".join(f"{fit[key]:.{count}f}" for fit in fits) for key, count in digits.items()}
         pairs |= {"estimate": ""} if noise else {}  # it is of images with the noise
-        rows.append((f"`{clip}`", f"{views}", f"{noise:g}", *pairs.values(), f"{fits[1]['cpu_s'] / fits[0]['cpu_s']:.2f}"))
+        rows.append(
+            (f"`{clip}`", f"{views}", f"{noise:g}", *pairs.values(), f"{fits[1]['cpu_s'] / fits[0]['cpu_s']:.2f}")
+        )
     titles = "held out, dB", "estimate, dB", "processor time, s", "ratio"
     return markdown(("clip", "views", "noise", *titles), rows)
 
