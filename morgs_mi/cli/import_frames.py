@@ -10,7 +10,7 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, progress
-from morgs_mi.cli.settings import SETTINGS, setting
+from morgs_mi.cli.settings import setting
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.runs.import_frames import Axes
 
@@ -38,7 +38,7 @@ class Import:
     """Precision of the stream; 2 halves all errors."""
     target_size: Annotated[int | None, DisallowNone, setting("target_size")] = None
     """Most bytes of a frame that continues the one before; 0: no limit."""
-    keyframe_interval: Annotated[int | None, DisallowNone, setting("keyframe_interval")] = None
+    keyframe_interval: Annotated[int, arg(metavar="INT")] = CodecConfig().keyframe_interval
     """Frames between two keyframes; 0: only where they are needed."""
 
     def run(self) -> None:
@@ -47,8 +47,8 @@ class Import:
         if len(self.paths) < 2:
             raise ValueError("morgs-mi import: expected FRAMES and OUT, got fewer; see morgs-mi import --help.")
         *frames, out = self.paths
-        given = {name: getattr(self, name) for name in SETTINGS if getattr(self, name, None) is not None}
-        config = replace(CodecConfig(), **given)
+        given = {name: value for name in ("quality", "target_size") if (value := getattr(self, name)) is not None}
+        config = replace(CodecConfig(), keyframe_interval=self.keyframe_interval, **given)
         with progress() as report:
             result = import_frames(
                 frames,

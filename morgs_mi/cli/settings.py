@@ -42,7 +42,6 @@ SETTINGS = {
     "masks": "motion.mask_method",
     "quality": "codec.quality",
     "target_size": "codec.target_size",
-    "keyframe_interval": "codec.keyframe_interval",
     "refine_cameras": "fit.refine_cameras",
     "exposure": "fit.exposure",
     "validate": "fit.validate",
@@ -177,8 +176,6 @@ class Settings:
     """Precision of the stream; 2 halves all errors."""
     target_size: Annotated[int | None, setting("target_size")] = None
     """Most bytes of a later frame; 0: no limit."""
-    keyframe_interval: Annotated[int | None, setting("keyframe_interval")] = None
-    """Frames between two keyframes; 0: the first only."""
     refine_cameras: Annotated[Estimation | None, setting("refine_cameras"), one_of(get_args(Estimation))] = None
     """Refinement of the cameras: off, on, or auto (if withheld pixels gain)."""
     exposure: Annotated[Estimation | None, setting("exposure"), one_of(get_args(Estimation))] = None
