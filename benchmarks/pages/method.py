@@ -145,11 +145,11 @@ _STAGES = {
 
 def frame_stages() -> str:
     """Return the times of the stages of a live frame, before and after passes were shared."""
-    found, rows = committed("frame_stages"), []
+    found, rows = committed("frame_speed")["speedup"], []
     runs = [found[size][version] for size in ("n3dv", "small") for version in ("before", "after")]
     for title, names in _STAGES.items():
         seconds = (sum(run.get(f"{name}_s", 0.0) for name in names) for run in runs)
-        rows.append((title, *(f"{1000 * value:.0f}" for value in seconds)))
+        rows.append((title, *(f"{1000 * value:.0f}" if value else "not measured" for value in seconds)))
     rows.append(("whole frame", *(f"{1000 * run['seconds']:.0f}" for run in runs)))
     rows.append(("PSNR, dB", *(f"{run['psnr']:.2f}" for run in runs)))
     rows.append(("kB", *(f"{run['bytes'] / 1000:.0f}" for run in runs)))
