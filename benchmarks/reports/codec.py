@@ -38,7 +38,7 @@ from morgs_mi.evaluate.evaluate import evaluate_stream
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.streams import open_stream
 from morgs_mi.runs.cluster.executor import Workers, wait_for
-from morgs_mi.runs.cluster.segments import fit_in_segments
+from morgs_mi.runs.cluster.segments import SegmentedRun
 from morgs_mi.runs.recorder import stream_capture
 
 # The best preset of lzma takes several times as long and saves a few percent.
@@ -150,7 +150,7 @@ def plot_codec(clips: Sequence[Row], path: Path) -> None:
 
 async def _fit_all(capture: Capture, fits: Mapping[Path, StreamConfig], workers: Workers, resume: bool) -> None:
     """Fit a capture into several folders, side by side."""
-    fit = (fit_in_segments(capture, folder, workers, config, resume=resume) for folder, config in fits.items())
+    fit = (SegmentedRun(capture, folder, workers, config).fit(resume) for folder, config in fits.items())
     await asyncio.gather(*fit)
 
 

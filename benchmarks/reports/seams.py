@@ -21,9 +21,9 @@ from benchmarks.reports.plots import Column, scores_table
 from benchmarks.reports.study import Row, Scene, Study, Variant
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.cluster.executor import open_workers
+from morgs_mi.runs.cluster.executor import open_workers, wait_for
 from morgs_mi.runs.cluster.seams import SegmentConfig, score_seam
-from morgs_mi.runs.cluster.segments import stream_segments
+from morgs_mi.runs.cluster.segments import SegmentedRun
 from morgs_mi.runs.cluster.tasks import Source
 
 COLUMNS = (
@@ -80,8 +80,8 @@ def measure(source: Source, num_segments: int, config: StreamConfig) -> list[dic
     capture = source.open()
     with TemporaryDirectory() as name, open_workers(count=1) as workers:
         segments, whole = (Path(name) / part for part in ("segments", "whole"))
-        fit = stream_segments(capture, segments, workers, config, SegmentConfig(num_segments))
-        stream_segments(capture, whole, workers, config)
+        fit = wait_for(SegmentedRun(capture, segments, workers, config, SegmentConfig(num_segments)).fit())
+        wait_for(SegmentedRun(capture, whole, workers, config).fit())
         streams = [folder / "stream.morgs" for folder in (segments, whole)]
         same = [score_seam(StreamReader(streams[1]), capture, seam.frame) for seam in fit.seams]
         sizes = dict(zip(("num_bytes", "num_bytes_whole"), (path.stat().st_size for path in streams), strict=True))

@@ -45,9 +45,9 @@ from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.cluster.executor import Workers, open_workers
+from morgs_mi.runs.cluster.executor import Workers, open_workers, wait_for
 from morgs_mi.runs.cluster.seams import COMMON_FRAMES, SegmentConfig, score_seam
-from morgs_mi.runs.cluster.segments import TASK_FRAMES, SegmentedFit, stream_segments
+from morgs_mi.runs.cluster.segments import TASK_FRAMES, SegmentedFit, SegmentedRun
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
 
@@ -137,7 +137,7 @@ def measure(capture: Capture, options: Options, folder: Path) -> tuple[list[Run]
             asyncio.run(workers.run(os.getpid))
             start = time.perf_counter() - begin
             begin = time.perf_counter()
-            fit = stream_segments(capture, out, workers, _config(options), SegmentConfig(options.segments))
+            fit = wait_for(SegmentedRun(capture, out, workers, _config(options), SegmentConfig(options.segments)).fit())
             runs.append(_run(count, start, time.perf_counter() - begin, fit))
             costs = costs or _costs(capture, workers, out / "stream.morgs", fit)
     assert costs is not None

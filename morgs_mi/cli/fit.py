@@ -84,15 +84,16 @@ class Fit:
 
     def _fit_in_segments(self, capture: Capture, config: StreamConfig) -> None:
         """Fit a capture in segments, and print the scores of the seams."""
-        from morgs_mi.runs.cluster.executor import cores, open_workers
+        from morgs_mi.runs.cluster.executor import cores, open_workers, wait_for
         from morgs_mi.runs.cluster.seams import SegmentConfig
-        from morgs_mi.runs.cluster.segments import noting_segments, stream_segments
+        from morgs_mi.runs.cluster.segments import SegmentedRun, noting_segments
 
         assert self.out is not None
         segments = SegmentConfig(self.segments or 1)
         workers = min(segments.count, cores())
         with noting_segments(self.out), progress() as report, open_workers(self.scheduler, workers) as opened:
-            fit = stream_segments(capture, self.out, opened, config, segments, resume=self.resume, on_stage=report)
+            run = SegmentedRun(capture, self.out, opened, config, segments, report)
+            fit = wait_for(run.fit(self.resume))
         _print_summary(self.out / "stream.morgs", fit.reports)
         for seam in fit.seams:
             print_result(f"Seam before {seam}.")

@@ -130,18 +130,16 @@ def project(
     config: RenderConfig,
     rows: UInt32 | None = None,
     features: Tensor | None = None,
-    profile: bool = False,
 ) -> Splats:
     """Project Gaussians to the screen of `camera` and evaluate the requested channels.
 
     Args:
         gaussians: N Gaussians with activated attributes.
         camera: the view; a Dr.Jit `viewmat` receives gradients. Or several views, without gradients.
-        channels: names of `channel_sizes()`, or ``features``.
+        channels: names of `channel_sizes()`, ``features``, or ``profile``: the splats get a `profile`.
         config: cut-offs.
         rows: indices of the Gaussians [M], in one view without repetition; None: all N, in order.
         features: tensor [N, F] that the channel ``features`` blends.
-        profile: whether the splats get a `profile`.
 
     Returns:
         Splats of length M, differentiable in every attribute and in the camera's pose.
@@ -178,7 +176,7 @@ def project(
     a, b, c = s * yy * r_yy * r_det, -s * xy * r_yy * r_det, s * r_yy
     log2_opacity = dr.log2(dr.maximum(opacities, 1e-9))
     shape = (mean_x, mean_y, a, b, c, log2_opacity)
-    line = _depth_profile(z, (u0, u1, w), (xx, xy, yy), det, eps, r_focal, r_scale) if profile else ()
+    line = _depth_profile(z, (u0, u1, w), (xx, xy, yy), det, eps, r_focal, r_scale) if "profile" in channels else ()
 
     blended: dict[str, tuple[Float, ...]] = {}
     attributes = attribute_channels()

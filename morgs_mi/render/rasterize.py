@@ -141,7 +141,10 @@ def rasterize(
     """
     refuse_freezing("rasterize()")
     config = RenderConfig() if config is None else config
-    _check_types(gaussians, camera, channels, detach_weights, region, static_splats, config)
+    _check_types(gaussians, camera, config, {"channels": channels, "detach_weights": detach_weights})
+    for name, value, kind in (("region", region, Region), ("static_splats", static_splats, Splats)):
+        if value is not None:
+            check_type("rasterize()", name, value, kind)
     channels, sizes = tuple(dict.fromkeys(channels)), {**channel_sizes(), "alpha": 1}
     _check(gaussians, camera, channels, background, detach_weights)
     if features is not None:
@@ -154,12 +157,13 @@ def rasterize(
     if dr.prod(gaussians.means.shape[:1]) == 0:
         return _empty(channels, sizes, background, region)
     cut = limits is not None
+    projected = (*blended, "profile") if cut else blended
     if static_splats is not None:
-        splats = project(gaussians, camera, blended, config, features=features).concatenated_with(static_splats)
+        splats = project(gaussians, camera, projected, config, features=features).concatenated_with(static_splats)
     elif region.whole:
-        splats = project(gaussians, camera, blended, config, features=features, profile=cut)
+        splats = project(gaussians, camera, projected, config, features=features)
     else:
-        splats = _project_region(gaussians, camera, blended, region, features, config, cut)
+        splats = _project_region(gaussians, camera, projected, region, features, config)
     if splats is None:
         return _empty(channels, sizes, background, region)
     dr.schedule(splats.geometry, splats.channels, splats.depths, splats.extent, splats.valid)
@@ -199,7 +203,6 @@ def _project_region(
     region: Region,
     features: Tensor | None,
     config: RenderConfig,
-    profile: bool,
 ) -> Splats | None:
     """Project the Gaussians that touch the region; None if there are none."""
     with dr.suspend_grad():
@@ -208,7 +211,7 @@ def _project_region(
         dr.schedule(visible)
         _check_finite(bare.finite, gaussians, camera, features)
         rows = dr.compress(visible)
-    return project(gaussians, camera, channels, config, rows, features, profile) if dr.width(rows) else None
+    return project(gaussians, camera, channels, config, rows, features) if dr.width(rows) else None
 
 
 def _layout(
@@ -262,23 +265,16 @@ def _check_region(region: Region, camera: Camera, config: RenderConfig) -> None:
 def _check_types(
     gaussians: ActivatedGaussians,
     camera: Camera,
-    channels: Sequence[str],
-    detach_weights: Sequence[str],
-    region: Region | None,
-    static_splats: Splats | None,
     config: RenderConfig,
+    names: Mapping[str, Sequence[str]],
 ) -> None:
     if not hasattr(gaussians, "means"):
         raise ValueError(f"rasterize(): `gaussians` must be Gaussians, got a {type(gaussians).__name__}; pass some.")
     check_type("rasterize()", "camera", camera, Camera)
     check_type("rasterize()", "config", config, RenderConfig)
-    if region is not None:
-        check_type("rasterize()", "region", region, Region)
-    if static_splats is not None:
-        check_type("rasterize()", "static_splats", static_splats, Splats)
-    for name, names in (("channels", channels), ("detach_weights", detach_weights)):
-        if isinstance(names, str) or not isinstance(names, Sequence):
-            raise ValueError(f"rasterize(): `{name}` must be a sequence of names, got {names!r}; pass a tuple.")
+    for name, given in names.items():
+        if isinstance(given, str) or not isinstance(given, Sequence):
+            raise ValueError(f"rasterize(): `{name}` must be a sequence of names, got {given!r}; pass a tuple.")
 
 
 def _check(

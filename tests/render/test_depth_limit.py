@@ -146,7 +146,7 @@ def test_depth_limit__plane_through_a_gaussian_agrees_with_the_integral_along_th
 def test_profile__is_the_depth_of_the_largest_response_along_the_ray():
     """t* = d'S^-1 mu / d'S^-1 d for the ray direction d, in camera space."""
     gaussians, camera = _large_gaussian()
-    z, gx, gy, r_sigma = (float(v[0]) for v in project(gaussians, camera, (), RenderConfig(), profile=True).profile)
+    z, gx, gy, r_sigma = (float(v[0]) for v in project(gaussians, camera, ("profile",), RenderConfig()).profile)
     R = np.asarray(camera.viewmat)[:3, :3] @ reference.rotation(np.asarray(gaussians.quats[0]).ravel())
     precision = R @ np.diag(1 / np.array([0.5, 0.25, 0.4]) ** 2) @ R.T
     mean = np.array([0, 0, 40.0])

@@ -33,7 +33,7 @@ from morgs_mi.io.remote import is_url
 from morgs_mi.loop.stream_config import StreamConfig, apply_preset, apply_values, read_config
 from morgs_mi.runs.cluster.executor import Workers, wait_for
 from morgs_mi.runs.cluster.seams import SegmentConfig
-from morgs_mi.runs.cluster.segments import fit_in_segments
+from morgs_mi.runs.cluster.segments import SegmentedRun
 from morgs_mi.runs.cluster.tasks import Part
 
 __all__ = ["BatchConfig", "Job", "JobState", "read_jobs", "run_batch"]
@@ -241,6 +241,6 @@ async def _fit(state: JobState, workers: Workers, changed: Callable[[], None]) -
             changed()
 
     noted, segments = _Noted(workers, state.note), SegmentConfig(batch.segments)
-    fit = await fit_in_segments(capture, job.out, noted, job.config, segments, resume=True, on_stage=on_stage)
+    fit = await SegmentedRun(capture, job.out, noted, job.config, segments, on_stage).fit(resume=True)
     state.frames = state.num_frames = len(fit.reports)
     state.num_bytes = (job.out / "stream.morgs").stat().st_size

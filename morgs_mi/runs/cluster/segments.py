@@ -26,7 +26,7 @@ from morgs_mi.core.files import atomic_path, locked_folder, write_json
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.source import about_lenses, as_fitted
-from morgs_mi.runs.cluster.executor import Workers, wait_for
+from morgs_mi.runs.cluster.executor import Workers
 from morgs_mi.runs.cluster.seams import COMMON_FRAMES, SeamScores, SegmentConfig, score_seam
 from morgs_mi.runs.cluster.tasks import (
     Fit,
@@ -55,7 +55,7 @@ from morgs_mi.runs.recording import (
 )
 from morgs_mi.stream_loop import FrameReport
 
-__all__ = ["SegmentedFit", "fit_in_segments", "noting_segments", "stream_segments"]
+__all__ = ["SegmentedFit", "SegmentedRun", "noting_segments"]
 
 FOLDER = "segments"
 # Frames of a task: a few tasks are lost if a worker dies, and the progress is known that finely.
@@ -79,34 +79,6 @@ class SegmentedFit:
     workers: Mapping[str, int] = field(default_factory=dict)
 
 
-def stream_segments(
-    capture: Capture,
-    out: str | Path,
-    workers: Workers,
-    config: StreamConfig | None = None,
-    segments: SegmentConfig | None = None,
-    resume: bool = False,
-    on_stage: Report | None = None,
-) -> SegmentedFit:
-    """Fit a capture in segments, side by side, into the files that `stream_capture` writes.
-
-    Args:
-        capture: a capture from `load_capture`, at a path that all workers see.
-        out: folder, made if missing.
-        workers: from `open_workers`.
-        config: settings.
-        segments: their number and the settings of the seams; None: one segment.
-        resume: continue the segments in `out`. With `RenderConfig(reproducible=True)` the stream has the same bytes as
-            without an interruption.
-        on_stage: called with (name of the stage, done, total).
-
-    Raises:
-        OSError: as `stream_capture`, a worker died several times, or the scheduler was lost. The finished frames stay.
-        ValueError: as `stream_capture`, or there are more segments than pairs of frames.
-    """
-    return wait_for(fit_in_segments(capture, out, workers, config or StreamConfig(), segments, resume, on_stage))
-
-
 @contextmanager
 def noting_segments(out: Path) -> Iterator[None]:
     """Add to an interruption or a failure how many frames the segments of a fit in `out` hold."""
@@ -128,51 +100,53 @@ def _num_finished(path: Path) -> int:
     return len({frame for _, frame, _ in stream.index() if frame >= start})
 
 
-async def fit_in_segments(
-    capture: Capture,
-    out: str | Path,
-    workers: Workers,
-    config: StreamConfig,
-    segments: SegmentConfig | None = None,
-    resume: bool = False,
-    on_stage: Report | None = None,
-) -> SegmentedFit:
-    """Fit a capture in segments as `stream_segments`, beside other fits on the same workers."""
-    if config.fit.exposure != "off":
-        raise ValueError(
-            f"stream_segments(): `fit.exposure` must be off, got {config.fit.exposure!r}: exposures follow from all "
-            "frames before; fit without segments, or match the colours of the cameras as the capture is read (--color)."
-        )
-    run = _Run(capture, Path(out), workers, config, segments or SegmentConfig(), on_stage or (lambda *_: None))
-    check_outputs(run.out)
-    with locked_folder(run.out, "stream_segments()"):
-        return await run.fit(resume)
-
-
 def _starts(num_frames: int, segments: int) -> list[int]:
     """Return the first frames of segments of about the same length, and the number of frames."""
     most = max(1, num_frames // _MIN_FRAMES)
     if not 1 <= segments <= most:
         raise ValueError(
-            f"stream_segments(): `segments` must be 1 to {most} for {num_frames} frames, {_MIN_FRAMES} for each, got "
+            f"SegmentedRun(): `segments` must be 1 to {most} for {num_frames} frames, {_MIN_FRAMES} for each, got "
             f"{segments}."
         )
     return np.linspace(0, num_frames, segments + 1).round().astype(int).tolist()
 
 
-class _Run:
-    """A fit in segments that is under way."""
+class SegmentedRun:
+    """A fit of a capture in segments, side by side, into the files that `stream_capture` writes.
+
+    Args:
+        capture: a capture from `load_capture`, at a path that all workers see.
+        out: folder, made if missing.
+        workers: from `open_workers`; several runs may share them.
+        config: settings.
+        segments: their number and the settings of the seams; None: one segment.
+        on_stage: called with (name of the stage, done, total).
+
+    Example:
+        >>> fit = wait_for(SegmentedRun(capture, out, workers, config, SegmentConfig(3)).fit())
+
+    Raises:
+        ValueError: there are more segments than pairs of frames, or exposures are to be estimated.
+    """
 
     def __init__(
         self,
         capture: Capture,
-        out: Path,
+        out: str | Path,
         workers: Workers,
         config: StreamConfig,
-        segments: SegmentConfig,
-        on_stage: Report,
+        segments: SegmentConfig | None = None,
+        on_stage: Report | None = None,
     ) -> None:
-        self.capture, self.out, self.workers, self.on_stage = capture, out, workers, on_stage
+        if config.fit.exposure != "off":
+            raise ValueError(
+                f"SegmentedRun(): `fit.exposure` must be off, got {config.fit.exposure!r}: exposures follow from all "
+                "frames before; fit without segments, or match the colours of the cameras as the capture is read "
+                "(--color)."
+            )
+        segments = segments or SegmentConfig()
+        self.capture, self.out, self.workers = capture, Path(out), workers
+        self.on_stage: Report = on_stage or (lambda *_: None)
         self.starts = _starts(capture.num_frames, segments.count)
         self.task = Fit(Source.of(capture), config, segments, str(mi.variant()), installed())
         self.metadata = stream_metadata(capture, next(capture.partial_frames(0, 1)), config)
@@ -183,12 +157,24 @@ class _Run:
         self.active = 0  # segments with later frames being fitted
         self.starting = 0  # segments with a start that is being fitted, or waits for a worker
 
-    async def fit(self, resume: bool) -> SegmentedFit:
-        """Fit, or continue, all segments and join them."""
-        with ExitStack() as self.recordings:
-            if (reports := await self._fit_all(resume)) is not None:
-                return SegmentedFit(tuple(reports))
-        return self._joined(self.out / "stream.morgs")
+    async def fit(self, resume: bool = False) -> SegmentedFit:
+        """Fit, or continue, all segments and join them.
+
+        Args:
+            resume: continue the segments in `out`. With `RenderConfig(reproducible=True)` the stream has the same bytes
+                as without an interruption.
+
+        Raises:
+            OSError: as `stream_capture`, a worker died several times, or the scheduler was lost. The finished frames
+                stay.
+            ValueError: as `stream_capture`.
+        """
+        check_outputs(self.out)
+        with locked_folder(self.out, "SegmentedRun.fit()"):
+            with ExitStack() as self.recordings:
+                if (reports := await self._fit_all(resume)) is not None:
+                    return SegmentedFit(tuple(reports))
+            return self._joined(self.out / "stream.morgs")
 
     async def _fit_all(self, resume: bool) -> list[FrameReport] | None:
         """Fit what is missing of the segments; return the reports of all frames if they had been joined before."""
@@ -251,7 +237,7 @@ class _Run:
     def _joined(self, path: Path) -> SegmentedFit:
         """Join the segments into one stream, with its report and the scores of the seams."""
         reports = [report for segment in self.segments for report in segment.reports]
-        with atomic_path(path, "stream_segments()") as partial:
+        with atomic_path(path, "SegmentedRun()") as partial:
             with StreamWriter(partial, self.capture.cameras, self.capture.fps, self.metadata) as writer:
                 for segment in self.segments:
                     for packet in segment.packets():
@@ -271,7 +257,7 @@ class _Run:
 class _Segment:
     """One segment of a fit: its stream, its report, and the tasks that fit it."""
 
-    def __init__(self, run: _Run, number: int) -> None:
+    def __init__(self, run: SegmentedRun, number: int) -> None:
         self.run, self.number = run, number
         self.start, self.stop = run.starts[number], run.starts[number + 1]
         self.files = FitFiles(run.out / FOLDER / f"{number}.morgs", run.out / FOLDER / f"{number}.json")

@@ -13,8 +13,8 @@ from pathlib import Path
 import pytest
 
 from morgs_mi.capture.capture import Capture, load_capture
-from morgs_mi.runs.cluster.executor import open_workers
-from morgs_mi.runs.cluster.segments import stream_segments
+from morgs_mi.runs.cluster.executor import open_workers, wait_for
+from morgs_mi.runs.cluster.segments import SegmentedRun
 from tests.runs.cluster.test_segments import FRAMES, SEGMENTS, SETTINGS, stream_of, when_fitted
 from tests.scenes.recording import write_recording
 
@@ -36,7 +36,7 @@ def whole(capture: Capture, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """The stream of processes without Dask."""
     out = tmp_path_factory.mktemp("whole")
     with open_workers(count=2) as workers:
-        stream_segments(capture, out, workers, SETTINGS, SEGMENTS)
+        wait_for(SegmentedRun(capture, out, workers, SETTINGS, SEGMENTS).fit())
     return stream_of(out)
 
 
@@ -68,7 +68,7 @@ def test_open_workers__connects_to_a_scheduler(cluster: subprocess.Popen[str]) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 5])
-def test_stream_segments__with_a_killed_dask_worker_is_the_same(
+def test_SegmentedRun__with_a_killed_dask_worker_is_the_same(
     capture: Capture, whole: bytes, cluster: subprocess.Popen[str], tmp_path: Path, count: int
 ) -> None:
     scheduler, killed = address(cluster), []
@@ -80,13 +80,13 @@ def test_stream_segments__with_a_killed_dask_worker_is_the_same(
             os.kill(killed[-1], signal.SIGKILL)
 
         with open_workers(scheduler) as workers:
-            stream_segments(capture, tmp_path, workers, SETTINGS, SEGMENTS, on_stage=when_fitted(count, kill))
+            wait_for(SegmentedRun(capture, tmp_path, workers, SETTINGS, SEGMENTS, when_fitted(count, kill)).fit())
     assert len(killed) == 1
     assert stream_of(tmp_path) == whole
 
 
 @pytest.mark.slow
-def test_stream_segments__names_a_lost_scheduler_and_is_resumed(
+def test_SegmentedRun__names_a_lost_scheduler_and_is_resumed(
     capture: Capture, whole: bytes, cluster: subprocess.Popen[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("morgs_mi.runs.cluster.executor._TIMEOUT", 2)
@@ -97,7 +97,7 @@ def test_stream_segments__names_a_lost_scheduler_and_is_resumed(
         ),
         open_workers(address(cluster)) as workers,
     ):
-        stream_segments(capture, tmp_path, workers, SETTINGS, SEGMENTS, on_stage=lost)
+        wait_for(SegmentedRun(capture, tmp_path, workers, SETTINGS, SEGMENTS, lost).fit())
     with open_workers(count=2) as workers:
-        stream_segments(capture, tmp_path, workers, SETTINGS, SEGMENTS, resume=True)
+        wait_for(SegmentedRun(capture, tmp_path, workers, SETTINGS, SEGMENTS).fit(resume=True))
     assert stream_of(tmp_path) == whole

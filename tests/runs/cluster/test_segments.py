@@ -22,9 +22,9 @@ from morgs_mi.codec.packets import coded_frames, frames_with_lasting_ids, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.fit.fit_config import ShortFitConfig
 from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.cluster.executor import Workers, open_workers
+from morgs_mi.runs.cluster.executor import Workers, open_workers, wait_for
 from morgs_mi.runs.cluster.seams import SegmentConfig
-from morgs_mi.runs.cluster.segments import SegmentedFit, stream_segments
+from morgs_mi.runs.cluster.segments import SegmentedFit, SegmentedRun
 from morgs_mi.runs.cluster.tasks import fit_segment_start
 from morgs_mi.runs.recorder import stream_capture
 from morgs_mi.runs.recording import FILES
@@ -56,7 +56,8 @@ def short_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def fit(capture: Capture, out: Path, workers: Workers, **options) -> SegmentedFit:
     given = {"config": SETTINGS, "segments": SEGMENTS} | options
-    return stream_segments(capture, out, workers, **given)
+    resume = given.pop("resume", False)
+    return wait_for(SegmentedRun(capture, out, workers, **given).fit(resume))
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +77,7 @@ def rows_of(out: Path) -> list[dict]:
     return [{name: value for name, value in row.items() if name != "seconds"} for row in rows]
 
 
-def test_stream_segments__of_one_is_the_fit_in_one_process(capture: Capture, workers: Workers, tmp_path: Path) -> None:
+def test_SegmentedRun__of_one_is_the_fit_in_one_process(capture: Capture, workers: Workers, tmp_path: Path) -> None:
     fit(capture, tmp_path / "one", workers, segments=SegmentConfig(1))
     stream_capture(capture, tmp_path / "plain", SETTINGS)
     assert stream_of(tmp_path / "one") == stream_of(tmp_path / "plain")
@@ -84,7 +85,7 @@ def test_stream_segments__of_one_is_the_fit_in_one_process(capture: Capture, wor
     assert sorted(path.name for path in (tmp_path / "one").iterdir()) == sorted(FILES)
 
 
-def test_stream_segments__joins_them_to_an_ordinary_stream(whole: Path) -> None:
+def test_SegmentedRun__joins_them_to_an_ordinary_stream(whole: Path) -> None:
     reader = StreamReader(whole / "stream.morgs")
     assert reader.closed()
     assert sorted(path.name for path in whole.iterdir()) == sorted(FILES)
@@ -100,7 +101,7 @@ def test_stream_segments__joins_them_to_an_ordinary_stream(whole: Path) -> None:
     assert len(set().union(*sets)) == sum(map(len, sets)), "no id is in two segments"
 
 
-def test_stream_segments__reports_frames_and_seams(whole: Path) -> None:
+def test_SegmentedRun__reports_frames_and_seams(whole: Path) -> None:
     report = json.loads((whole / "report.json").read_text())
     assert [row["frame"] for row in report["frames"]] == list(range(FRAMES))
     sizes = {packet.frame: packet.num_bytes for packet in reversed(list(StreamReader(whole / "stream.morgs")))}
@@ -130,7 +131,7 @@ class Noted(Workers):
         return await self.workers.run(function, *args)
 
 
-def test_stream_segments__begins_segments_before_it_continues_others(
+def test_SegmentedRun__begins_segments_before_it_continues_others(
     capture: Capture, workers: Workers, tmp_path: Path
 ) -> None:
     noted = Noted(workers, starts=2)
@@ -140,7 +141,7 @@ def test_stream_segments__begins_segments_before_it_continues_others(
 
 
 @pytest.mark.parametrize("command", [("eval",), ("export", "tracks"), ("render", "--camera", "0")])
-def test_stream_segments__is_read_by_the_commands(whole: Path, tmp_path: Path, command: tuple[str, ...]) -> None:
+def test_SegmentedRun__is_read_by_the_commands(whole: Path, tmp_path: Path, command: tuple[str, ...]) -> None:
     assert cli.main([*command, str(shutil.copytree(whole, tmp_path / "fit"))]) == 0
 
 
@@ -160,7 +161,7 @@ def interrupt() -> None:
 
 
 @pytest.mark.parametrize("count", [5, *(pytest.param(count, marks=pytest.mark.slow) for count in (0, 2, 9))])
-def test_stream_segments__interrupted_and_resumed_is_the_same(
+def test_SegmentedRun__interrupted_and_resumed_is_the_same(
     capture: Capture, workers: Workers, whole: Path, tmp_path: Path, count: int
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
@@ -172,7 +173,7 @@ def test_stream_segments__interrupted_and_resumed_is_the_same(
     assert len(again.reports) == FRAMES, "nothing is fitted twice"
 
 
-def test_stream_segments__resumes_after_a_cut_packet(
+def test_SegmentedRun__resumes_after_a_cut_packet(
     capture: Capture, workers: Workers, whole: Path, tmp_path: Path
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
@@ -184,7 +185,7 @@ def test_stream_segments__resumes_after_a_cut_packet(
 
 
 @pytest.mark.parametrize("frame", [2, 6])  # in the overlap before a segment or in its cross-fade, and after the overlap
-def test_stream_segments__resumes_within_a_beginning_or_a_cross_fade(
+def test_SegmentedRun__resumes_within_a_beginning_or_a_cross_fade(
     capture: Capture, workers: Workers, whole: Path, tmp_path: Path, frame: int
 ) -> None:
     with pytest.raises(KeyboardInterrupt):
@@ -199,7 +200,7 @@ def test_stream_segments__resumes_within_a_beginning_or_a_cross_fade(
 
 
 @pytest.mark.slow
-def test_stream_segments__of_a_url_is_the_same(
+def test_SegmentedRun__of_a_url_is_the_same(
     capture: Capture, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("fsspec", reason="comes with the extra `cluster`")
@@ -215,7 +216,7 @@ def test_stream_segments__of_a_url_is_the_same(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 4])
-def test_stream_segments__with_a_killed_process_is_the_same(
+def test_SegmentedRun__with_a_killed_process_is_the_same(
     capture: Capture, whole: Path, tmp_path: Path, count: int
 ) -> None:
     with open_workers(count=2) as workers:
@@ -234,13 +235,13 @@ def test_stream_segments__with_a_killed_process_is_the_same(
         (6, r"`segments` must be 1 to 5 for 10 frames, 2 for each, got 6"),
     ],
 )
-def test_stream_segments__refuses_too_many(capture: Capture, workers, tmp_path: Path, count, message) -> None:
+def test_SegmentedRun__refuses_too_many(capture: Capture, workers, tmp_path: Path, count, message) -> None:
     with pytest.raises(ValueError, match=message):
         fit(capture, tmp_path / "out", workers, segments=SegmentConfig(count))
     assert not (tmp_path / "out").exists()
 
 
-def test_stream_segments__does_not_resume_other_settings(capture: Capture, workers: Workers, tmp_path: Path) -> None:
+def test_SegmentedRun__does_not_resume_other_settings(capture: Capture, workers: Workers, tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         fit(capture, tmp_path, workers, on_stage=when_fitted(2, interrupt))
     with pytest.raises(ValueError, match=r"0\.morgs: expected to resume a fit with metadata\.config\.seed = 0, got 1"):
@@ -249,7 +250,7 @@ def test_stream_segments__does_not_resume_other_settings(capture: Capture, worke
         fit(capture, tmp_path, workers, segments=replace(SEGMENTS, count=2), resume=True)
 
 
-def test_stream_segments__triangulates_points_where_there_are_few(
+def test_SegmentedRun__triangulates_points_where_there_are_few(
     capture: Capture, workers: Workers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     few = replace(capture, points=capture.points[:3], point_colors=capture.point_colors[:3])
@@ -258,7 +259,7 @@ def test_stream_segments__triangulates_points_where_there_are_few(
     assert len(next(coded_frames(StreamReader(tmp_path / "few" / "stream.morgs")))) == SETTINGS.fit.num_gaussians
 
 
-def test_stream_segments__refines_cameras_once(capture: Capture, workers: Workers, tmp_path: Path) -> None:
+def test_SegmentedRun__refines_cameras_once(capture: Capture, workers: Workers, tmp_path: Path) -> None:
     held_out = load_capture(capture.path, test_view=0)
     how = ShortFitConfig(gaussians=40, steps=4, rounds=1)
     config = replace(SETTINGS, fit=replace(SETTINGS.fit, refine_cameras="on", short_fits=how))
@@ -274,7 +275,7 @@ def test_stream_segments__refines_cameras_once(capture: Capture, workers: Worker
     assert np.array_equal(first[0].means, first[1].means)
 
 
-def test_stream_segments__refuses_to_estimate_exposures(capture: Capture, workers: Workers, tmp_path: Path) -> None:
+def test_SegmentedRun__refuses_to_estimate_exposures(capture: Capture, workers: Workers, tmp_path: Path) -> None:
     config = replace(CONFIG, fit=replace(CONFIG.fit, exposure="on"))
     with pytest.raises(ValueError, match=r"`fit\.exposure` must be off, got 'on'"):
-        stream_segments(capture, tmp_path / "out", workers, config, SegmentConfig(2))
+        SegmentedRun(capture, tmp_path / "out", workers, config, SegmentConfig(2))
