@@ -9,7 +9,7 @@ everywhere: the adjoint of a step gives them along with the gradients of its los
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import drjit as dr
@@ -29,8 +29,6 @@ __all__ = ["Attribution", "DensificationScores", "densification_scores"]
 # Error that counts as noise, in typical errors of the image: normal noise, independent in three colours, exceeds 3 at
 # 3 of 10,000 pixels.
 _NOISE = 3.0
-# Share of the pixels of a view up to which views are drawn together: more of them would take more memory than time.
-_TOGETHER = 2.0
 
 
 @dataclass(frozen=True)
@@ -67,10 +65,13 @@ class Attribution:
         """Return a loss of 0, of which the gradients of the features are E and W.
 
         Errors below three times the typical error of the image do not count: they are noise.
+
+        Args:
+            image: the rendering with the colour and the features.
+            target: its target.
+            region: the drawn blocks; None: the whole view.
         """
-        pixels, weight = target.on(region)
-        drawn = dr.detach(image.color).array
-        difference = dr.abs(pixels - (drawn if weight is None else drawn * weight))
+        difference = dr.abs(target.minus(dr.detach(image.color).array, region))
         pixel = dr.arange(mi.UInt32, dr.width(difference) // 3) * 3
         error = sum(dr.gather(mi.Float, difference, pixel + c) for c in range(3)) / 3
         error = dr.maximum(error - _NOISE * _typical(error), 0)
@@ -110,21 +111,7 @@ def densification_scores(
     """
     gaussians = gaussians.detached()
     error, weight = np.zeros((2, len(gaussians)), np.float32)
-    for few in _few_at_once(views):
-        images = KeyImages({v: views[v] for v in few}, dict(enumerate(targets)))
-        sums = images.sums(gaussians, ("error", "weight"))
-        error, weight = np.maximum(error, sums["error"].max(0)), np.maximum(weight, sums["weight"].max(0))
+    for view, target in zip(views, targets, strict=True):
+        sums = KeyImages({0: view}, {0: target}).sums(gaussians, ("error", "weight"))
+        error, weight = np.maximum(error, sums["error"][0]), np.maximum(weight, sums["weight"][0])
     return DensificationScores(error, weight)
-
-
-def _few_at_once(views: Sequence[ActiveView]) -> Iterator[list[int]]:
-    """Yield the indices of views that are drawn together, at least one."""
-    few, share = list[int](), 0.0
-    for index, view in enumerate(views):
-        if few and share + view.pixel_fraction > _TOGETHER:
-            yield few
-            few, share = [], 0.0
-        few.append(index)
-        share += view.pixel_fraction
-    if few:
-        yield few

@@ -26,6 +26,7 @@ import numpy as np
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import displaced
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
+from morgs_mi.method.sweep import relative_error
 
 __all__ = ["refine_start"]
 
@@ -35,8 +36,6 @@ _NEIGHBOURS = 8
 _PRIOR_PIXELS = 1e-3
 # Longest step, in px of the view where it is longest: farther away, the image is not linear.
 _LONGEST_PX = 2.0
-# Error, in pixels of full contrast, that is added to every Gaussian's error, see `propagation`.
-_FLOOR_PX = 0.01
 # Covered pixels at which the colour changes by half of the mean error: the mean of few pixels is noise.
 _HALF_COLOR_PIXELS = 10.0
 
@@ -60,21 +59,14 @@ def refine_start(problem: MotionProblem, start: MotionStart) -> MotionStart:
     jacobians = np.stack([view.camera.projection_jacobian(places) for view in problem.views.values()])
     step = np.where(moves[:, None], _step(jacobians, before, near, moves), 0).astype(np.float32)
     after = problem.images.sums(displaced(problem.gaussians, d + step), ("error", "weight", "color"))
-    better = _relative_error(after) < _relative_error(before)
-    color, weight = (
-        np.where(better[:, None] if name == "color" else better, after[name], before[name])
-        for name in ("color", "weight")
-    )
+    better = relative_error(after) < relative_error(before)
+    color = np.where(better[:, None], after["color"], before["color"])
+    weight = np.where(better, after["weight"], before["weight"])
     return replace(
         start,
         displacement=(d + np.where(better[:, None], step, 0)).astype(np.float32),
         color_change=_color_change(color, weight),
     )
-
-
-def _relative_error(sums: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Return the mean error of each Gaussian's pixels [N] from the sums [V, N]."""
-    return (sums["error"].sum(0) + _FLOOR_PX) / (sums["weight"].sum(0) + 1)
 
 
 def _color_change(color: np.ndarray, weight: np.ndarray) -> np.ndarray:

@@ -18,6 +18,7 @@ import numpy as np
 
 from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
+from morgs_mi.method.sweep import relative_error
 
 __all__ = ["propagate_motion"]
 
@@ -28,9 +29,6 @@ _NEIGHBOURS = 8
 # Ratio of the new error to the old one up to which a Gaussian accepts a proposal, if it moves otherwise and if not.
 # Others move at the same time: a smaller gain is chance.
 _ERROR_RATIO, _ERROR_RATIO_STATIC = 0.9, 0.8
-# Error, in pixels of full contrast, that is added to every Gaussian's error: a hardly visible Gaussian does not change
-# its motion.
-_FLOOR_PX = 0.01
 # Logit of the confidence of a Gaussian that accepted a motion: 0.57, as some accept a wrong one by chance.
 _LOGIT = 0.3
 
@@ -53,8 +51,7 @@ def propagate_motion(problem: MotionProblem, start: MotionStart) -> MotionStart:
         return start
 
     def error_of(d: np.ndarray) -> np.ndarray:
-        sums = images.sums(displaced(problem.gaussians, d), ("error", "weight"))
-        return (sums["error"].sum(0) + _FLOOR_PX) / (sums["weight"].sum(0) + 1)
+        return relative_error(images.sums(displaced(problem.gaussians, d), ("error", "weight")))
 
     error, continues = error_of(d), np.any(before, axis=1, keepdims=True)
     for k in range(1 + rounds):

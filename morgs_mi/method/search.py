@@ -13,8 +13,9 @@ on a grid of displacements in 3D. The best one is accepted if the image with the
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import gcd
 from typing import Annotated
 
 import cv2
@@ -29,7 +30,7 @@ from morgs_mi.core.gaussians import Gaussians, displaced
 from morgs_mi.core.ranges import Above, AtLeast, AtMost, check_ranges
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
 from morgs_mi.method.neighbours import NeighbourIndex
-from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.view_group import ViewGroup
 
 __all__ = ["SearchConfig", "search_motion"]
 
@@ -80,7 +81,7 @@ def search_motion(problem: MotionProblem, start: MotionStart, config: SearchConf
         around = problem.images_around(part, [displacement, proposal])
         if around is None:
             continue
-        before, after = (around.total_error(displaced(problem.gaussians, d)) for d in (displacement, proposal))
+        before, after = (around.total_error(displaced(problem.gaussians, at)) for at in (displacement, proposal))
         if after < _ERROR_RATIO * before:
             displacement, logit = proposal, np.where(part, np.maximum(logit, _LOGIT), logit)
     if displacement is start.displacement:
@@ -120,7 +121,7 @@ def _find(
         images = problem.images_around(np.any(few, axis=0), [])
         if images is None:
             continue
-        factor = _reduction(images.views.values(), config.reach)
+        factor = _reduction(images.group, config.reach)
         renderings = [images.rendered(gaussians, factor) for gaussians in (previous, _brighter(previous, few))]
         matched = [
             _MatchedView(view.camera, color, _reduced(problem.targets[v].image(), factor), 1 / factor)
@@ -214,10 +215,10 @@ class _MatchedView:
         return _CostSurface(np.maximum(cost, 0) / self.scale**2, self.camera, self.scale)
 
 
-def _reduction(views: Iterable[ActiveView], reach: float) -> int:
-    """Return the factor by which the images of views are reduced, which leaves 2 px per step of the grid."""
-    widest = max(view.camera.width for view in views)
-    return next(factor for factor in (4, 2, 1) if factor == 1 or 2 * _GRID * factor <= reach * widest)
+def _reduction(group: ViewGroup, reach: float) -> int:
+    """Return the factor by which the images of views are reduced: it leaves 2 px per step of the grid, if any does."""
+    widest, block = max(view.camera.width for view in group.views), gcd(*group.region.block)
+    return next(f for f in (4, 2, 1) if f == 1 or (2 * _GRID * f <= reach * widest and block % f == 0))
 
 
 def _reduced(image: np.ndarray, factor: int) -> np.ndarray:

@@ -121,9 +121,12 @@ class Target:
         if region is None or region.whole:
             error = self.pixels - self.masked(self.planes.of(owned_copy(dr.detach(image).array)))
             return np.asarray(self.planes.image(error)).reshape(self.shape)
+        return np.asarray(self.minus(dr.detach(image).array, region)).reshape(region.shape(3))
+
+    def minus(self, drawn: Float, region: Region | None) -> Float:
+        """Return the target minus an image, both flat on a region or the whole view; 0 where masked."""
         pixels, weight = self.on(region)
-        drawn = dr.detach(image).array
-        return np.asarray(pixels - (drawn if weight is None else drawn * weight)).reshape(region.shape(3))
+        return pixels - (drawn if weight is None else drawn * weight)
 
     def on(self, region: Region | None) -> tuple[Float, Float | None]:
         """Return the target on a region, flat, 0 outside the view, and the weights of its numbers; None: 1."""

@@ -24,7 +24,7 @@ from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.projection import concatenated
 from morgs_mi.render.view_group import Drawing, ViewGroup
 
-__all__ = ["MAPS", "KeyImages"]
+__all__ = ["MAPS", "KeyImages", "relative_error"]
 
 _Map = Callable[[list[Float], list[Float], list[Float]], list[Float]]
 
@@ -37,6 +37,16 @@ MAPS: dict[str, _Map] = {
 }
 """Name of a map -> its numbers at a pixel, from e and the derivatives of the target along x and y, three colours each.
 """
+
+
+# Error, in pixels of full contrast, and covered pixels, that are added to every Gaussian's: one that is hardly visible
+# has little of either.
+_FLOOR_PX, _FLOOR_WEIGHT = 0.01, 1.0
+
+
+def relative_error(sums: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the mean error of each Gaussian's pixels [N], of 1, from the sums of ``error`` and ``weight`` [V, N]."""
+    return (sums["error"].sum(0) + _FLOOR_PX) / (sums["weight"].sum(0) + _FLOOR_WEIGHT)
 
 
 class KeyImages:

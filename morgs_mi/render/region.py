@@ -156,7 +156,16 @@ class Region:
         return self.crop(np.ones((self.height, self.width), bool))
 
     def crop(self, image: np.ndarray) -> np.ndarray:
-        """Return this region's pixels [A, block_height, block_width, ...] of an image [H, W, ...], 0 outside it."""
+        """Return this region's pixels [A, block_height, block_width, ...] of an image [H, W, ...], 0 outside it.
+
+        Raises:
+            ValueError: the image has another size than the view.
+        """
+        if image.shape[:2] != (self.height, self.width):
+            raise ValueError(
+                f"Region.crop(): `image` must be [{self.height}, {self.width}, ...], got {list(image.shape)}; resize "
+                "it to the view."
+            )
         (row, column), (width, height) = self._blocks, self.block
         rows, columns = image.shape[0] // height, image.shape[1] // width
         (down, across, *rest), shape = image.strides, (rows, height, columns, width, *image.shape[2:])

@@ -12,9 +12,11 @@ from morgs_mi.method.flow import FlowObservation
 from morgs_mi.method.motion import initial_motion
 from morgs_mi.method.motion_config import MotionConfig
 from morgs_mi.method.motion_start import MotionProblem, MotionStart
-from morgs_mi.method.search import SearchConfig, _MatchedView, search_motion
+from morgs_mi.method.search import SearchConfig, _MatchedView, _reduction, search_motion
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView
+from morgs_mi.render.render_config import RenderConfig
+from morgs_mi.render.view_group import ViewGroup
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
 
@@ -141,3 +143,12 @@ def test_cost_surface__is_the_weighted_squared_difference():
     center = camera.unproject(origin, depth)[0]
     d = camera.unproject(origin + shifts, np.full(3, 3.0)) - center
     assert np.allclose(surface.at(center, d), expected, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("width", "block", "factor"), [(1352, (8, 4), 4), (1352, (4, 2), 2), (700, (8, 4), 2), (160, (8, 4), 1)]
+)
+def test_reduction__leaves_two_pixels_per_step_and_divides_the_blocks(width, block, factor):
+    camera = look_at_cameras([(0, 0, -3)], 45, width, 48)[0]
+    config = RenderConfig(block_width=block[0], block_height=block[1])
+    assert _reduction(ViewGroup([ActiveView(camera, config)]), 0.1) == factor

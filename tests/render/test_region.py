@@ -195,3 +195,9 @@ def test_rasterize__backward_reads_gradients_at_any_alignment(raw, offset):
     dr.enqueue(dr.ADMode.Backward, image)
     dr.traverse(dr.ADMode.Backward)
     assert np.isfinite(np.asarray(dr.grad(gaussians.means))).all()
+
+
+def test_region__refuses_to_crop_an_image_of_another_size():
+    region = Region(np.ones((18, 21), bool))
+    with pytest.raises(ValueError, match=r"`image` must be \[18, 21, ...\], got \[18, 22, 3\]; resize it"):
+        region.crop(np.zeros((18, 22, 3)))
