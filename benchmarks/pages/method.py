@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.pages.results import Scores, committed
 from benchmarks.reports.plots import Column, grouped, markdown, means_over, scores_table
 
-__all__ = ["demo", "drift", "field", "frame_stages", "frame_times", "gains", "parts", "search", "unseen"]
+__all__ = ["demo", "drift", "early_stop", "field", "frame_stages", "frame_times", "gains", "parts", "search", "unseen"]
 
 
 def demo() -> str:
@@ -126,6 +126,16 @@ def frame_times() -> str:
                 )
             )
     return markdown(("Gaussians", "epochs", "s", "PSNR, dB", "kB", "active Gaussians", "drawn pixels"), rows)
+
+
+def early_stop() -> str:
+    """Return the scores of frames that end early or not, means over the scenes."""
+    rows, fits = [], committed("early_stop")["fits"]
+    columns = ("psnr", 1, 2), ("psnr_moving", 1, 2), ("bytes", 1e-3, 0), ("epochs", 100, 0), ("cpu_s", 1, 2)
+    for (tolerance,), own in grouped(fits, "tolerance").items():
+        means = (f"{factor * np.mean([fit[name] for fit in own]):.{digits}f}" for name, factor, digits in columns)
+        rows.append(("never" if not tolerance else f"falls by less than {tolerance:.0%}", *means))
+    return markdown(("ends early if the objective", "PSNR, dB", "moving", "kB", "epochs, %", "processor time, s"), rows)
 
 
 _STAGES = {

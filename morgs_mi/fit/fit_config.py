@@ -199,7 +199,7 @@ class FitConfig:
     """Most passes over all training views for every later frame; the paper's small variant takes 5."""
     skip_static: bool = True
     """Skip the Gaussians, blocks of pixels and views that cannot have changed (see `active_set`)."""
-    early_stopping_tolerance: Annotated[float, AtLeast(0)] = 0.05
+    early_stopping_tolerance: Annotated[float, AtLeast(0)] = 1e-6
     """Relative decrease of the objective over two epochs below which a later frame ends early; 0: never."""
     objective: ObjectiveConfig = field(default_factory=ObjectiveConfig)
     """Weights of the losses."""

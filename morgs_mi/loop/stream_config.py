@@ -86,17 +86,15 @@ def _modules(motion: bool, offset: bool, confidence: bool) -> dict[str, Any]:
     return {"learn_motion": motion, "learn_offset": offset, "learn_confidence": confidence}
 
 
-_ALL_EPOCHS = {"early_stopping_tolerance": 0.0}  # the paper's frames never end early
-
 PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
-    "l": {"fit": {"epochs": 8, **_ALL_EPOCHS}},
-    "s": {"fit": {"epochs": 5, **_ALL_EPOCHS}},
-    "baseline": {"fit": _ALL_EPOCHS, "motion": _modules(False, False, False)},
-    "ml": {"fit": _ALL_EPOCHS, "motion": _modules(True, False, False)},
-    "ml-mo": {"fit": _ALL_EPOCHS, "motion": _modules(True, True, False)},
-    "ml-mo-mc": {"fit": _ALL_EPOCHS, "motion": _modules(True, True, True)},
+    "l": {"fit": {"epochs": 8}},
+    "s": {"fit": {"epochs": 5}},
+    "baseline": {"motion": _modules(False, False, False)},
+    "ml": {"motion": _modules(True, False, False)},
+    "ml-mo": {"motion": _modules(True, True, False)},
+    "ml-mo-mc": {"motion": _modules(True, True, True)},
     "paper": {
-        "fit": {"epochs": 8, "decay_means_rate": False, **_ALL_EPOCHS},
+        "fit": {"epochs": 8, "decay_means_rate": False},
         "motion": {
             "lift_flow": False,
             "propagate_motion": False,
@@ -112,7 +110,6 @@ PRESETS: dict[PresetName, dict[str, dict[str, Any]]] = {
             "objective": {"rigid_weight": 0.4, "rotation_weight": 0.4, "isometry_weight": 0.2},
             "density": {"later_frames": False},
             "decay_means_rate": False,
-            **_ALL_EPOCHS,
             "rates": {"means": 4e-3, "quats": 0.02, "scales": 0.0, "opacities": 0.0, "sh_dc": 0.0, "sh_rest": 0.0},
         },
         "motion": {"constant_velocity": True, **_modules(False, False, False)},
