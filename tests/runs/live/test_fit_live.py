@@ -66,7 +66,7 @@ def test_fit_live__follows_a_folder_that_is_filled(tmp_path: Path, rig: Path, im
         assert row.time > before.time
         assert row.latency >= 0
         assert not row.problems
-    assert sum(row.dropped for row in rows) > 10, "the fit is slower than the clip"
+    assert sum(row.dropped for row in rows) > 0, "the fit is slower than the clip"
     assert counts_what_is_dropped(
         [row.dropped for row in rows], list(load_capture(out / "capture").images(2)), clips()[2]
     )
