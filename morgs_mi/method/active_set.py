@@ -18,23 +18,26 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import cv2
+import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.ranges import AtLeast, check_ranges
 from morgs_mi.core.rig import choose_key_views
 from morgs_mi.method.boxes import boxes_around
 from morgs_mi.method.responsibility import ChangedView, responsibility
 from morgs_mi.render.active_view import ActiveView, make_active_view
+from morgs_mi.render.region import Region, summed_area
 from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["ActiveSet", "ActiveSetConfig", "find_active_set", "full_active_set", "with_zero_motion"]
 
 # Fraction of a connected change that active Gaussians must cover to explain it.
 _EXPLAINED = 0.5
-# Side of the smallest square of unexplained pixels that counts, in px.
-_CLUSTER = 5
+# Fraction of a block's pixels above which it belongs to a connected change: fewer are noise, or the rim of one.
+_CHANGED = 0.25
 # Fraction of all pixels above which all Gaussians are active: leaving out the others would cost more than it saves.
 _MOST_CHANGED = 0.5
 # Half side of the box, as a fraction of the Gaussian's extent: two standard deviations of an opaque one. Its
@@ -119,23 +122,25 @@ def find_active_set(
     if sum(c.mean() for c in changes.values()) > _MOST_CHANGED * len(cameras):
         return full_active_set(gaussians, cameras, render)
     changed = {
-        v: ChangedView(camera, changes[v], boxes_around(gaussians, camera, render, _CORE))
+        v: ChangedView(ActiveView(camera, render), changes[v], boxes_around(gaussians, camera, render, _CORE))
         for v, camera in cameras.items()
     }
-    shares = responsibility(gaussians, changed.values(), render, config.min_weight)
+    shares = responsibility(gaussians, changed.values(), config.min_weight)
     active = shares > config.min_responsibility
     if gaussians.logit_confidence is not None:
         active |= np.asarray(gaussians.logit_confidence) > 0
-    for view in changed.values():
-        unexplained = _unexplained(view.change, view.boxes.union(active, view.change.shape))
+    for found in changed.values():
+        grid, boxes = found.view.grid, found.boxes
+        unexplained = _unexplained(found.counts, boxes.union(active, grid), grid.block)
         if unexplained.any():
-            active |= np.asarray(view.boxes.covered(unexplained) > 0.5 * view.boxes.area)
+            table = from_numpy(mi.UInt32, summed_area(unexplained))
+            active |= np.asarray(boxes.within(table, grid) > 0.5 * boxes.area)
     drawn = _drawn(active, shares > _QUIET, changed, config)
     static = with_zero_motion(gaussians.select(~active))
     views = {
-        view: make_active_view(cameras[view], mask, static, channels[view], render)
-        for view, mask in drawn.items()
-        if mask.any()
+        v: make_active_view(cameras[v], Region.of(changed[v].view.grid, blocks), static, channels[v], render)
+        for v, blocks in drawn.items()
+        if blocks.any()
     }
     return ActiveSet(np.flatnonzero(active), len(gaussians), views, len(cameras))
 
@@ -149,22 +154,27 @@ def with_zero_motion(gaussians: Gaussians) -> Gaussians:
 def _drawn(
     active: np.ndarray, changing: np.ndarray, views: Mapping[int, ChangedView], config: ActiveSetConfig
 ) -> dict[int, np.ndarray]:
-    """Return the masks [H, W] of rendered pixels, by view index: changes, and boxes of active Gaussians [N]."""
+    """Return the drawn blocks [rows, columns], by view index: changes, and boxes of active Gaussians [N]."""
     indices = list(views)
-    some = {indices[k] for k in choose_key_views([view.camera for view in views.values()], config.quiet_views)}
+    some = {indices[k] for k in choose_key_views([found.view.camera for found in views.values()], config.quiet_views)}
     chosen = {v: active if v in some else active & changing for v in views}
-    return {v: view.boxes.union(chosen[v], view.change.shape) | view.change for v, view in views.items()}
+    return {v: found.boxes.union(chosen[v], found.view.grid) | (found.counts > 0) for v, found in views.items()}
 
 
-def _unexplained(change: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """Return the pixels [H, W] of the connected changes that a mask covers by less than half."""
-    square = np.ones((_CLUSTER, _CLUSTER), np.uint8)
-    if not cv2.morphologyEx((change & ~covered).astype(np.uint8), cv2.MORPH_OPEN, square).any():
-        return np.zeros_like(change)
-    clusters = cv2.morphologyEx(change.astype(np.uint8), cv2.MORPH_OPEN, square)
-    count, components, stats, _ = cv2.connectedComponentsWithStats(clusters)
+def _unexplained(counts: np.ndarray, covered: np.ndarray, block: tuple[int, int]) -> np.ndarray:
+    """Return the blocks of the connected changes that others cover by less than half, bool [rows, columns].
+
+    Args:
+        counts: changed pixels of each block.
+        covered: blocks that active Gaussians cover.
+        block: width and height of a block in pixels.
+    """
+    changed = counts > _CHANGED * block[0] * block[1]
+    if not (changed & ~covered).any():
+        return np.zeros_like(changed)
+    count, components = cv2.connectedComponents(changed.astype(np.uint8))
     labels = np.asarray(components, np.int32)
-    inside = np.bincount(labels[covered], minlength=count)
-    missing = inside < _EXPLAINED * stats[:, cv2.CC_STAT_AREA]
+    area, inside = (np.bincount(labels[blocks], counts[blocks], count) for blocks in (changed, changed & covered))
+    missing = inside < _EXPLAINED * area
     missing[0] = False
     return missing[labels]

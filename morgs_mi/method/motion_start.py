@@ -89,10 +89,9 @@ class MotionProblem:
         """
         some = self.gaussians.select(np.flatnonzero(chosen))
         places = [some, *(displaced(some, d[chosen]) for d in displacements if d.any())]
-        narrowed = {}
+        narrowed, everyone = {}, np.ones(len(some), bool)
         for index, view in self.views.items():
             boxes = [boxes_around(place, view.camera, view.config, 1.0) for place in places]
-            shape, everyone = (view.camera.height, view.camera.width), np.ones(len(some), bool)
-            narrowed[index] = view.narrowed(np.any([box.union(everyone, shape) for box in boxes], axis=0))
+            narrowed[index] = view.narrowed(np.any([box.union(everyone, view.grid) for box in boxes], axis=0))
         seen = {index: view for index, view in narrowed.items() if view is not None}
         return KeyImages(seen, self.targets) if seen else None

@@ -17,19 +17,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.method.boxes import Boxes
 from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.region import Region
-from morgs_mi.render.render_config import RenderConfig
 from morgs_mi.render.view_group import ViewGroup
 
 __all__ = ["ChangedView", "responsibility"]
@@ -40,39 +39,44 @@ class ChangedView:
     """A view, its changed pixels and the Gaussians in it.
 
     Attributes:
-        camera: the camera.
+        view: the whole view.
         change: mask of the changed pixels, bool [H, W].
         boxes: boxes of the N Gaussians.
     """
 
-    camera: Camera
+    view: ActiveView
     change: np.ndarray
     boxes: Boxes
 
+    @cached_property
+    def counts(self) -> np.ndarray:
+        """Number of changed pixels of each block, int32 [rows, columns]."""
+        return self.view.grid.counts(self.change)
+
 
 def responsibility(
-    gaussians: Gaussians, views: Iterable[ChangedView], render: RenderConfig, min_weight: float, width: int = 640
+    gaussians: Gaussians, views: Iterable[ChangedView], min_weight: float, width: int = 640
 ) -> np.ndarray:
     """Return the responsibility r [N] of each Gaussian for the changes, from 0 to 1; 0 for hidden ones.
 
     Args:
         gaussians: N Gaussians of the previous frame, detached.
         views: V views with the boxes of these Gaussians.
-        render: cut-offs.
         min_weight: blend weight summed over all changed blocks, in px, below which a Gaussian counts as hidden.
         width: views are reduced by the largest whole factor that leaves this width, in px.
     """
     near, area = dr.zeros(mi.Float, len(gaussians)), dr.zeros(mi.Float, len(gaussians))
     drawn, shares, factors = list[ActiveView](), list[np.ndarray](), list[int]()
-    for view in views:
-        area += view.boxes.area
-        if not view.change.any():
+    for changed_view in views:
+        view, boxes = changed_view.view, changed_view.boxes
+        area += boxes.area
+        if not changed_view.change.any():
             continue
         factors.append(max(view.camera.width // width, 1))
-        shares.append(_reduced(view.change, factors[-1]))
-        region = Region(shares[-1] > 0, render)
-        drawn.append(ActiveView(view.camera.resized(*shares[-1].shape[::-1]), render, region))
-        near += view.boxes.within(region, factors[-1])
+        shares.append(_reduced(changed_view.change, factors[-1]))
+        region = Region(shares[-1] > 0, view.config)
+        drawn.append(ActiveView(view.camera.resized(*shares[-1].shape[::-1]), view.config, region))
+        near += boxes.within(region.block_table, region.grid, factors[-1])
     if not drawn:
         return np.zeros(len(gaussians), np.float32)
     group = ViewGroup(drawn)

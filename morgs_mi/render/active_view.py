@@ -14,7 +14,7 @@ from morgs_mi.core.types import Tensor
 from morgs_mi.render.blocks import touches
 from morgs_mi.render.projection import Splats, project
 from morgs_mi.render.rasterize import Image, rasterize
-from morgs_mi.render.region import Region
+from morgs_mi.render.region import BlockGrid, Region
 from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["ActiveView", "make_active_view"]
@@ -59,10 +59,15 @@ class ActiveView:
         """Return the drawn pixels of an image [H, W, ...] of the view."""
         return image if self.region is None else self.region.crop(image)
 
-    def narrowed(self, mask: np.ndarray) -> ActiveView | None:
-        """Return the view restricted to drawn blocks with a pixel of `mask` [H, W]; None if there are none."""
-        mask = mask if self.region is None else mask & self.region.mask
-        return replace(self, region=Region(mask, self.config)) if mask.any() else None
+    @property
+    def grid(self) -> BlockGrid:
+        """All blocks of the view."""
+        return BlockGrid.of(self.camera.width, self.camera.height, self.config)
+
+    def narrowed(self, blocks: np.ndarray) -> ActiveView | None:
+        """Return the view restricted to some of its drawn blocks, bool [rows, columns]; None if there are none."""
+        blocks = blocks if self.region is None else blocks & self.region.drawn
+        return replace(self, region=Region.of(self.grid, blocks)) if blocks.any() else None
 
     @property
     def pixel_fraction(self) -> float:
@@ -74,20 +79,20 @@ class ActiveView:
 
 
 def make_active_view(
-    camera: Camera, mask: np.ndarray, static: ActivatedGaussians, channels: Sequence[str], config: RenderConfig
+    camera: Camera, region: Region, static: ActivatedGaussians, channels: Sequence[str], config: RenderConfig
 ) -> ActiveView:
-    """Return the active view of the blocks that contain a pixel of `mask` [H, W].
+    """Return the active view of a region.
 
     The static Gaussians are projected here, once, and not again when active Gaussians are rendered with them.
 
     Args:
         camera: the view.
-        mask: bool [H, W], the pixels to draw, at least one.
+        region: the blocks to draw.
         static: N >= 0 Gaussians, detached.
         channels: all channels that will be rendered.
         config: cut-offs and block shape.
     """
-    region, blended = Region(mask, config), tuple(name for name in channels if name != "alpha")
+    blended = tuple(name for name in channels if name != "alpha")
     if not int(static.means.shape[0]):
         return ActiveView(camera, config, region)
     with dr.suspend_grad():

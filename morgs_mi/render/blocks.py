@@ -161,8 +161,8 @@ def _cells_within(
         splats: N splats.
         cell: width and height of a cell in blocks.
     """
-    across = dr.gather(mi.UInt32, region.grid, mi.UInt32(0)) * (ACROSS // cell[0])
-    down = dr.gather(mi.UInt32, region.grid, mi.UInt32(1)) * (DOWN // cell[1])
+    across = dr.gather(mi.UInt32, region.tile_grid, mi.UInt32(0)) * (ACROSS // cell[0])
+    down = dr.gather(mi.UInt32, region.tile_grid, mi.UInt32(1)) * (DOWN // cell[1])
 
     def span(axis: int, cells: UInt32) -> tuple[UInt32, UInt32]:
         center, half, top = dr.detach(splats.shape[axis]), splats.extent[axis], mi.Float(cells)
@@ -203,7 +203,7 @@ def _tile_lists(rectangles: list[UInt32], region: Region) -> _Tiles:
     if total == 0:
         return _Tiles(*(dr.zeros(mi.UInt32, size) for size in (1, 1, slots, slots)))
     slot_at, rank_at = dr.empty(mi.UInt32, total), dr.empty(mi.UInt32, total)
-    across = dr.gather(mi.UInt32, region.grid, mi.UInt32(0))
+    across = dr.gather(mi.UInt32, region.tile_grid, mi.UInt32(0))
 
     def enter(place, end, column, tile, columns, rank, across, slot_of, slot_at, rank_at):
         slot = tile if region.whole else dr.gather(mi.UInt32, slot_of, tile)
@@ -330,7 +330,7 @@ def _farthest_limits(limits: Float, region: Region) -> Float:
     lane = dr.arange(mi.UInt32, region.width * region.height)
     row = quotient(lane, region.width)
     column = lane - row * dr.opaque(mi.UInt32, region.width)
-    across = dr.gather(mi.UInt32, region.grid, mi.UInt32(0))
+    across = dr.gather(mi.UInt32, region.tile_grid, mi.UInt32(0))
     x, y = column // region.block[0], row // region.block[1]
     tile = y // DOWN * across + x // ACROSS
     slot = tile if region.whole else dr.gather(mi.UInt32, region.slot_of, tile)

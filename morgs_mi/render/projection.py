@@ -23,6 +23,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import log2, sqrt
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -80,19 +81,15 @@ class Splats:
 
     def concatenated_with(self, other: Splats) -> Splats:
         """Return these splats followed by the others, which are 0 in the channels that they lack."""
-        return Splats(
-            concatenated(self.shape, other.shape),
-            {
-                name: concatenated(value, other.channels.get(name) or _zeros(value, len(other)))
-                for name, value in self.channels.items()
-            },
-            concatenated(self.depths, other.depths),
-            concatenated(self.extent, other.extent),
-            concatenated(self.valid, other.valid),
-            concatenated(self.finite, other.finite),
-            concatenated(self.profile, other.profile),
-            None if self.view is None else concatenated(self.view, other.view),
-        )
+
+        def columns_of(splats: Splats) -> tuple[Any, ...]:
+            blended = tuple(splats.channels.get(n) or _zeros(v, len(splats)) for n, v in self.channels.items())
+            culled = splats.depths, splats.extent, splats.valid, splats.finite
+            return splats.shape, blended, *culled, splats.profile, () if splats.view is None else splats.view
+
+        shape, blended, *culled, profile, view = concatenated(columns_of(self), columns_of(other))
+        channels = dict(zip(self.channels, blended, strict=True))
+        return Splats(shape, channels, *culled, profile, None if self.view is None else view)
 
 
 def _zeros(columns: tuple[Float, ...], count: int) -> tuple[Float, ...]:
@@ -114,13 +111,17 @@ class Views:
 
 def concatenated(a: Jit, b: Jit) -> Jit:
     """Return two arrays, or tuples of arrays, end to end; `dr.concat` would compile a kernel for every length."""
-    if isinstance(a, tuple):
-        return tuple(concatenated(v, w) for v, w in zip(a, b, strict=True))
     n, mode = dr.opaque(mi.UInt32, dr.width(a)), dr.ReduceMode.NoConflicts
     lane = dr.arange(mi.UInt32, dr.width(a) + dr.width(b))
     first = lane < n
-    front = dr.gather(type(a), a, lane, active=first, mode=mode)
-    return dr.select(first, front, dr.gather(type(b), b, lane - n, active=~first, mode=mode))
+
+    def joined(a: Jit, b: Jit) -> Jit:
+        if isinstance(a, tuple):
+            return tuple(joined(v, w) for v, w in zip(a, b, strict=True))
+        front = dr.gather(type(a), a, lane, active=first, mode=mode)
+        return dr.select(first, front, dr.gather(type(b), b, lane - n, active=~first, mode=mode))
+
+    return joined(a, b)
 
 
 def project(

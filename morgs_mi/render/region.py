@@ -7,9 +7,11 @@ whole view is stored row by row, padded to whole blocks on the right; an image o
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from math import gcd
 
+import cv2
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -21,12 +23,76 @@ from morgs_mi.core.types import Float, UInt32
 from morgs_mi.render.backend import block_shape
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["ACROSS", "DOWN", "NO_SLOT", "Region", "full_view", "joined", "on_region", "quotient"]
+__all__ = [
+    "ACROSS",
+    "DOWN",
+    "NO_SLOT",
+    "BlockGrid",
+    "Region",
+    "full_view",
+    "joined",
+    "on_region",
+    "quotient",
+    "summed_area",
+]
 
 # Blocks of a tile, across and down: one for each bit of a word.
 ACROSS, DOWN = 4, 8
 # In `Region.slot_of`: no block of the tile is drawn.
 NO_SLOT = 0xFFFFFFFF
+
+
+@dataclass(frozen=True)
+class BlockGrid:
+    """All blocks of a view, in rows and columns that are padded to whole tiles.
+
+    Attributes:
+        width: width of the view in pixels.
+        height: height of the view in pixels.
+        block: (width, height) of a block in pixels.
+    """
+
+    width: int
+    height: int
+    block: tuple[int, int]
+
+    @classmethod
+    def of(cls, width: int, height: int, config: RenderConfig) -> BlockGrid:
+        """Return the blocks of a view of that size, in pixels, with the block shape of a configuration."""
+        return cls(width, height, block_shape(config))
+
+    @property
+    def tiles(self) -> tuple[int, int]:
+        """Number of tiles across and down."""
+        return -(-self.width // (ACROSS * self.block[0])), -(-self.height // (DOWN * self.block[1]))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Number of rows and columns of blocks."""
+        across, down = self.tiles
+        return down * DOWN, across * ACROSS
+
+    def covering(self, mask: np.ndarray) -> np.ndarray:
+        """Return the blocks with a pixel of a mask [H, W], bool [rows, columns]."""
+        # Several pixels of a row as one integer: NumPy reduces a few small groups of booleans 50 times more slowly.
+        word = gcd(self.block[0], 8)
+        padded = self._padded(mask).reshape(self.shape[0], self.block[1], -1)
+        rows = np.bitwise_or.reduce(padded.view(f"u{word}"), axis=1)
+        return rows.reshape(*self.shape, self.block[0] // word).any(axis=2)
+
+    def counts(self, mask: np.ndarray) -> np.ndarray:
+        """Return the number of pixels of a mask [H, W] in each block, int32 [rows, columns]."""
+        (rows, columns), (width, height) = self.shape, self.block
+        pixels = self._padded(mask).view(np.uint8)
+        shares = cv2.resize(pixels.astype(np.float32), (columns, rows), interpolation=cv2.INTER_AREA)
+        return np.rint(shares * (width * height)).astype(np.int32)
+
+    def _padded(self, mask: np.ndarray) -> np.ndarray:
+        """Return a mask [H, W] with rows and columns of False up to whole tiles."""
+        (rows, columns), (width, height) = self.shape, self.block
+        padded = np.zeros((rows * height, columns * width), bool)
+        padded[: self.height, : self.width] = mask
+        return padded
 
 
 class Region:
@@ -39,6 +105,8 @@ class Region:
         config: block shape.
 
     Attributes:
+        grid: all blocks of the view.
+        drawn: which of them the region has, bool [rows, columns].
         width: width of the view in pixels.
         height: height of the view in pixels.
         block: (width, height) of a block in pixels.
@@ -57,7 +125,21 @@ class Region:
                 f"Region(): `mask` must be bool [H, W] with at least one pixel set, got {found}; "
                 "skip a view in which nothing is drawn."
             )
-        self._build(mask, config or RenderConfig(), whole=False)
+        grid = BlockGrid.of(mask.shape[1], mask.shape[0], config or RenderConfig())
+        self._build(grid, grid.covering(mask))
+
+    @classmethod
+    def of(cls, grid: BlockGrid, blocks: np.ndarray, whole: bool = False) -> Region:
+        """Return the region of some blocks of a view, at least one.
+
+        Args:
+            grid: all blocks of the view.
+            blocks: the requested ones, bool [rows, columns].
+            whole: whether images are [H, W, C]; all blocks must be requested.
+        """
+        region = cls.__new__(cls)
+        region._build(grid, blocks, whole)
+        return region
 
     # Per block: slot of its tile, its bit there, its first pixel (x, y), that pixel's packet in memory, its rows.
     tile: UInt32
@@ -67,7 +149,7 @@ class Region:
     place: UInt32
     rows: UInt32
     pitch: UInt32  # packets from a row of a block to the next, [1]
-    grid: UInt32  # tiles of the view across and down, [2]
+    tile_grid: UInt32  # tiles of the view across and down, [2]
     slot_of: UInt32  # slot of every tile of the view, or NO_SLOT
     block_table: UInt32  # summed areas of the drawn blocks and of the tiles that have one
     tile_table: UInt32
@@ -75,20 +157,12 @@ class Region:
     corner_x: Float
     corner_y: Float
     weights: Float | None  # per pixel: 1 in the view, 0 outside; None: all pixels are in the view
-    _grid: np.ndarray  # drawn blocks of the view, bool [rows, columns], padded to whole tiles
-    _blocks: tuple[np.ndarray, np.ndarray]  # per block: row and column in that grid
+    _blocks: tuple[np.ndarray, np.ndarray]  # per block: its row and column in the grid
 
-    def _build(self, mask: np.ndarray, config: RenderConfig, whole: bool) -> None:
-        H, W = mask.shape
-        bw, bh = block_shape(config)
-        self.width, self.height, self.block, self.whole = W, H, (bw, bh), whole
-        self.across, self.down = -(-W // (ACROSS * bw)), -(-H // (DOWN * bh))
-        padded = np.zeros((self.down * DOWN * bh, self.across * ACROSS * bw), bool)
-        padded[:H, :W] = mask
-        # Several pixels of a row as one integer: NumPy reduces a few small groups of booleans 50 times more slowly.
-        word = gcd(bw, 8)
-        rows = np.bitwise_or.reduce(padded.reshape(self.down * DOWN, bh, -1).view(f"u{word}"), axis=1)
-        self._lay_out(rows.reshape(self.down * DOWN, self.across * ACROSS, bw // word).any(axis=2))
+    def _build(self, grid: BlockGrid, blocks: np.ndarray, whole: bool = False) -> None:
+        self.grid, self.width, self.height, self.block, self.whole = grid, grid.width, grid.height, grid.block, whole
+        self.across, self.down = grid.tiles
+        self._lay_out(blocks)
         inside = None if whole else self.inside()
         self.weights = None if inside is None or inside.all() else from_numpy(mi.Float, inside)
 
@@ -104,7 +178,7 @@ class Region:
             tiles[tile] // self.across * DOWN + bit // ACROSS,
         )
         x, y = column * bw, row % (self.down * DOWN) * bh
-        self._grid, self._blocks = blocks, (row, column)
+        self.drawn, self._blocks = blocks, (row, column)
         slot_of = np.full(len(active), NO_SLOT, np.uint32)
         slot_of[tiles] = np.arange(len(tiles))
         pitch = -(-W // bw) * bw if whole else bw
@@ -121,10 +195,10 @@ class Region:
             "place": place // 4,
             "pitch": [pitch // 4],
             "rows": np.minimum(H - y, bh) if whole else np.full(len(y), bh),
-            "grid": [self.across, self.down],
+            "tile_grid": [self.across, self.down],
             "slot_of": slot_of,
-            "block_table": _summed_area(blocks),
-            "tile_table": _summed_area(active.any(1).reshape(-1, self.across)),
+            "block_table": summed_area(blocks),
+            "tile_table": summed_area(active.any(1).reshape(-1, self.across)),
         }
         for name, values in arrays.items():
             setattr(self, name, from_numpy(mi.UInt32, values))
@@ -138,15 +212,10 @@ class Region:
         return self.num_blocks, self.block[1], self.block[0], channels
 
     @property
-    def grid_shape(self) -> tuple[int, int]:
-        """Rows and columns of the blocks of the view, padded to whole tiles."""
-        return self._grid.shape[0], self._grid.shape[1]
-
-    @property
     def mask(self) -> np.ndarray:
         """The drawn pixels, bool [H, W]."""
         width, height = self.block
-        return self._grid.repeat(height, axis=0).repeat(width, axis=1)[: self.height, : self.width]
+        return self.drawn.repeat(height, axis=0).repeat(width, axis=1)[: self.height, : self.width]
 
     def inside(self) -> np.ndarray:
         """Return the mask of the pixels that lie in the view, bool [A, block_height, block_width].
@@ -185,7 +254,7 @@ class Region:
     def uncropped(self, values: np.ndarray) -> np.ndarray:
         """Return an image in whole blocks from this region's values [A, height, width, ...], 0 in all other blocks."""
         (row, column), (_, height, width, *rest) = self._blocks, values.shape
-        (rows, columns), dtype = self._grid.shape, values.dtype
+        (rows, columns), dtype = self.drawn.shape, values.dtype
         blocks = np.zeros((rows, height, columns, width, *rest), dtype)
         blocks[row, :, column] = values
         return blocks.reshape(rows * height, columns * width, *rest)
@@ -200,7 +269,7 @@ class Region:
 
     def _in_blocks(self, image: np.ndarray) -> np.ndarray:
         """Return an image [H, W, ...] as [rows, block_height, columns, block_width, ...], padded by zeros."""
-        (rows, columns), (width, height) = self._grid.shape, self.block
+        (rows, columns), (width, height) = self.drawn.shape, self.block
         missing = [(0, rows * height - image.shape[0]), (0, columns * width - image.shape[1])]
         if any(after for _, after in missing):
             image = np.pad(image, missing + [(0, 0)] * (image.ndim - 2))
@@ -213,7 +282,7 @@ def joined(regions: Sequence[Region]) -> Region:
     Its images are the regions' images, one after the other. Blocks keep the pixel coordinates of their view.
     """
     region = Region.__new__(Region)
-    region.block, region.whole, grids = regions[0].block, False, [part._grid for part in regions]
+    region.block, region.whole, grids = regions[0].block, False, [part.drawn for part in regions]
     region.across, region.down = max(part.across for part in regions), max(part.down for part in regions)
     rows, columns = region.down * DOWN, region.across * ACROSS
     region.width, region.height = columns * region.block[0], len(regions) * rows * region.block[1]
@@ -224,7 +293,7 @@ def joined(regions: Sequence[Region]) -> Region:
     return region
 
 
-def _summed_area(grid: np.ndarray) -> np.ndarray:
+def summed_area(grid: np.ndarray) -> np.ndarray:
     """Return the number of set cells left of and above every corner of a grid [R, C], flat [(R + 1) (C + 1)]."""
     return np.pad(grid, ((1, 0), (1, 0))).cumsum(0).cumsum(1).ravel()
 
@@ -261,7 +330,5 @@ def full_view(width: int, height: int, config: RenderConfig) -> Region:
 
 @lru_cache(maxsize=8)
 def _whole_view(width: int, height: int, block: tuple[int, int], variant: str) -> Region:
-    region = Region.__new__(Region)
-    config = RenderConfig(block_width=block[0], block_height=block[1])
-    region._build(np.ones((height, width), bool), config, whole=True)
-    return region
+    grid = BlockGrid(width, height, block)
+    return Region.of(grid, grid.covering(np.ones((height, width), bool)), whole=True)

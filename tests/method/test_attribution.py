@@ -12,6 +12,7 @@ from morgs_mi.fit.fit_config import DensityConfig
 from morgs_mi.method.attribution import Attribution, densification_scores
 from morgs_mi.method.ssim import Target
 from morgs_mi.render.active_view import ActiveView, make_active_view
+from morgs_mi.render.region import Region
 from tests.assertions import assert_close
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.gaussians import isotropic, random_sheet
@@ -28,7 +29,7 @@ def scene():
     part = np.zeros((60, 80), bool)
     part[20:50, 10:60] = True
     static = isotropic(random_sheet(rng, 40, 1.2, 0.3), 0.06, 0.8, rng.uniform(-1.5, 1.5, (40, 1, 3)))
-    views = [ActiveView(cameras[0]), make_active_view(cameras[1], part, static, ("color",), RenderConfig())]
+    views = [ActiveView(cameras[0]), make_active_view(cameras[1], Region(part), static, ("color",), RenderConfig())]
     images = [cv2.GaussianBlur(rng.random((60, 80, 3), np.float32), (0, 0), 2) for _ in views]
     return wall, views, [Target(images[0]), Target(images[1], rng.random((60, 80)) > 0.3)]
 

@@ -7,7 +7,7 @@ import pytest
 
 from morgs_mi import RenderConfig
 from morgs_mi.method.boxes import Boxes, boxes_around
-from morgs_mi.render.region import Region
+from morgs_mi.render.region import BlockGrid, Region
 from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic
 
@@ -27,22 +27,18 @@ def slices(boxes: Boxes) -> list[tuple[slice, slice]]:
     return [(slice(y0, y1), slice(x0, x1)) for x0, y0, x1, y1 in zip(*corners, strict=True)]
 
 
-def test_boxes__area_and_cover_count_pixels(boxes):
-    mask = np.random.default_rng(1).random((48, 64)) < 0.3
+def test_boxes__area_counts_pixels(boxes):
     np.testing.assert_array_equal(boxes.area, [np.ones((48, 64))[box].sum() for box in slices(boxes)])
-    np.testing.assert_array_equal(boxes.covered(mask), [mask[box].sum() for box in slices(boxes)])
     assert np.asarray(boxes.area)[7] == 0
 
 
-def test_union__covers_the_chosen_boxes_and_little_more(boxes):
+def test_union__is_the_blocks_that_the_chosen_boxes_touch(boxes):
     chosen = np.arange(50) % 3 == 0
     expected = np.zeros((48, 64), bool)
     for box in np.array(slices(boxes), object)[chosen]:
         expected[tuple(box)] = True
-    found = boxes.union(chosen, (48, 64))
-    assert found[expected].all()
-    cells = expected.reshape(12, 4, 16, 4).any(axis=(1, 3))
-    np.testing.assert_array_equal(found, cells.repeat(4, 0).repeat(4, 1))
+    grid = BlockGrid.of(64, 48, RenderConfig())
+    np.testing.assert_array_equal(boxes.union(chosen, grid), grid.covering(expected))
 
 
 @pytest.mark.parametrize("factor", [1, 2])
@@ -52,4 +48,4 @@ def test_within__counts_pixels_in_the_blocks_of_a_reduced_view(boxes, factor):
     blocks = region.mask.repeat(factor, 0).repeat(factor, 1)
     expected = [blocks[box].sum() for box in slices(boxes)]
     assert 0 < np.mean(expected) < np.asarray(boxes.area).mean()
-    np.testing.assert_allclose(boxes.within(region, factor), expected, atol=0.05)
+    np.testing.assert_allclose(boxes.within(region.block_table, region.grid, factor), expected, atol=0.05)

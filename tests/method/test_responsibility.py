@@ -27,8 +27,10 @@ def gaussians():
 
 
 def responsibility_for(gaussians, changes, width=640):
-    views = (ChangedView(c, changes[v], boxes_around(gaussians, c, RENDER, CORE)) for v, c in CAMERAS.items())
-    return responsibility(gaussians, views, RENDER, 0.2, width)
+    views = (
+        ChangedView(ActiveView(c), changes[v], boxes_around(gaussians, c, RENDER, CORE)) for v, c in CAMERAS.items()
+    )
+    return responsibility(gaussians, views, 0.2, width)
 
 
 def exact_ratio(gaussians, changes):

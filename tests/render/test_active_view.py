@@ -9,6 +9,7 @@ import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.render.active_view import ActiveView, make_active_view
+from morgs_mi.render.region import Region
 from morgs_mi.render.view_group import backproject
 from tests import tolerances as tol
 from tests.assertions import assert_close
@@ -37,7 +38,7 @@ def mask(camera: Camera) -> np.ndarray:
 def split(camera, gaussians, mask) -> tuple[ActiveView, Gaussians]:
     """Return the view of the static Gaussians, and the active Gaussians."""
     active = np.isin(np.arange(N), ACTIVE)
-    view = make_active_view(camera, mask, gaussians.select(~active), CHANNELS, RenderConfig())
+    view = make_active_view(camera, Region(mask), gaussians.select(~active), CHANNELS, RenderConfig())
     return view, gaussians.select(active)
 
 
@@ -75,6 +76,6 @@ def test_active_view__backproject_accounts_for_static_splats(camera, gaussians, 
 
 def test_make_active_view__accepts_no_static_gaussians(camera, gaussians, mask):
     none = gaussians.select(np.zeros(0, int))
-    view = make_active_view(camera, mask, none, CHANNELS, RenderConfig())
+    view = make_active_view(camera, Region(mask), none, CHANNELS, RenderConfig())
     full = rasterize(gaussians, camera, ("color",)).color
     assert np.array_equal(view.render(gaussians).color, view.crop(np.asarray(full)))

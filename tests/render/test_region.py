@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
-from morgs_mi.render.region import Region
+from morgs_mi.render.region import BlockGrid, Region
 from tests import tolerances as tol
 from tests.assertions import assert_close
 from tests.scenes.cameras import make_wide_camera
@@ -201,3 +201,18 @@ def test_region__refuses_to_crop_an_image_of_another_size():
     region = Region(np.ones((18, 21), bool))
     with pytest.raises(ValueError, match=r"`image` must be \[18, 21, ...\], got \[18, 22, 3\]; resize it"):
         region.crop(np.zeros((18, 22, 3)))
+
+
+@pytest.mark.parametrize("size", [(37, 45), (64, 96)])
+def test_BlockGrid__counts_the_pixels_of_its_blocks(size):
+    mask = np.random.default_rng(0).random(size) < 0.04
+    grid = BlockGrid(size[1], size[0], (8, 4))
+    rows, columns = grid.shape
+    padded = np.zeros((rows * 4, columns * 8), int)
+    padded[: size[0], : size[1]] = mask
+    expected = padded.reshape(rows, 4, columns, 8).sum(axis=(1, 3))
+    np.testing.assert_array_equal(grid.counts(mask), expected)
+    np.testing.assert_array_equal(grid.covering(mask), expected > 0)
+    np.testing.assert_array_equal(
+        Region.of(grid, expected > 0).mask, Region(mask, RenderConfig(block_width=8, block_height=4)).mask
+    )

@@ -11,6 +11,7 @@ import pytest
 from morgs_mi import Camera, Gaussians, RenderConfig, rasterize
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.render.active_view import ActiveView, make_active_view
+from morgs_mi.render.region import Region
 from morgs_mi.render.view_group import ViewGroup, backproject
 from tests import tolerances as tol
 from tests.assertions import assert_close
@@ -40,8 +41,9 @@ def views_of(gaussians: Gaussians) -> list[ActiveView]:
     for k, camera in enumerate(cameras):
         y, x = np.mgrid[: camera.height, : camera.width]
         mask = (x - 30) ** 2 + (y - 20) ** 2 < (10 + 5 * k) ** 2
-        views.append(make_active_view(camera, mask, static, ("color", "motion"), RenderConfig()))
-    return [*views, ActiveView(wide), make_active_view(cameras[1], mask, static.select(slice(0)), (), RenderConfig())]
+        views.append(make_active_view(camera, Region(mask), static, ("color", "motion"), RenderConfig()))
+    none = make_active_view(cameras[1], views[1].region, static.select(slice(0)), (), RenderConfig())
+    return [*views, ActiveView(wide), none]
 
 
 def test_view_group__draws_what_each_view_draws(gaussians):
