@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -32,7 +32,7 @@ class Ply:
     """Write a PLY file per frame, in the layout of 3D Gaussian Splatting or compressed, in the capture's axes."""
 
     out: Positional[Path]
-    """Folder of a fit, or a stream file."""
+    """Folder of a fit, a stream file, or a file of Gaussians."""
     output: Annotated[Positional[Path | None], DisallowNone, place("FOLDER")] = None
     """New folder for 0000.ply, ..., or FILE.ply for one frame; by default OUT/ply or OUT/compressed-ply."""
     format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(_names(PLY))] = None
@@ -67,7 +67,7 @@ class Gltf:
     """Write a .glb file per frame: glTF 2.0 with KHR_gaussian_splatting, rotated to y up."""
 
     out: Positional[Path]
-    """Folder of a fit, or a stream file."""
+    """Folder of a fit, a stream file, or a file of Gaussians."""
     output: Annotated[Positional[Path | None], DisallowNone, place("FOLDER")] = None
     """New folder for 0000.glb, ..., or FILE.glb for one frame; by default OUT/gltf."""
     frames: Annotated[str | None, DisallowNone, optional("FRAMES")] = None
@@ -97,7 +97,7 @@ class Usd:
     """Write an OpenUSD stage with a time sample per frame: ParticleField3DGaussianSplat, rotated to y up."""
 
     out: Positional[Path]
-    """Folder of a fit, or a stream file."""
+    """Folder of a fit, a stream file, or a file of Gaussians."""
     output: Annotated[Positional[Path | None], DisallowNone, place("FILE")] = None
     """FILE.usd, .usdc (binary), .usda (text) or .usdz (package); by default OUT/stream.usdc."""
     format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(_names(USD))] = None
@@ -127,7 +127,7 @@ class Flight:
     """Render a stream along a moving camera into an mp4."""
 
     out: Positional[Path]
-    """Folder of a fit, or a stream file."""
+    """Folder of a fit, a stream file, or a file of Gaussians."""
     output: Annotated[Positional[Path | None], DisallowNone, place("FILE.mp4")] = None
     """File for the video; by default OUT/PATH.mp4, e.g. OUT/orbit.mp4."""
     path: Annotated[str, arg(help=_PATH)] = "between"
@@ -149,33 +149,22 @@ class Flight:
     arguments: ClassVar[Mapping[str, str]] = {"least": "--least-seconds"}
 
     def run(self) -> None:
-        from morgs_mi.codec.packets import play
-        from morgs_mi.playback.export.clips import frame_numbers, repeated_frames, repeated_seconds, write_flight
-        from morgs_mi.playback.export.paths import focus, load_path, orbit, through_cameras
+        from morgs_mi.playback.export.clips import flight, frame_numbers, named_path, num_images, repeated_frames
+        from morgs_mi.playback.export.frames import write_images
         from morgs_mi.playback.streams import open_stream
 
         stream = open_stream(self.out)
         frames = frame_numbers(stream)
         if self.freeze is not None and self.freeze not in frames:
             raise ValueError(f"--freeze must be in {frames[0]} to {frames[-1]}, got {self.freeze}.")
-        if self.width is not None and self.width < 1:
-            raise ValueError(f"--width must be at least 1, got {self.width}.")
-        clip = repeated_seconds(len(frames) / stream.fps, self.least_seconds)
-        if self.path == "between":
-            path = through_cameras(stream.cameras, clip)
-        elif self.path == "orbit":
-            means = next(gaussians for _, gaussians in play(stream)).numpy()["means"]
-            path = orbit(stream.cameras, focus(stream.cameras, means), self.degrees, clip)
-        else:
-            path = load_path(self.path, stream.cameras)
+        path = named_path(stream, self.path, self.degrees, self.least_seconds).with_width(self.width)
         path = path if self.seconds is None else path.with_duration(self.seconds)
-        if self.width is not None:
-            height = max(1, round(self.width * path.keys[0].height / path.keys[0].width))
-            path = replace(path, keys=tuple(key.resized(self.width, height) for key in path.keys))
         output, _ = destination(stream.path, self.output, VIDEO, stem=Path(self.path).stem)
+        count = num_images(stream, path)
         with progress() as report:
             clip = repeated_frames(stream, self.freeze, self.back_and_forth)
-            write_flight(stream, path, output, self.channels, clip, lambda done, of: report("Rendering", done, of))
+            images = flight(stream, path, self.channels, clip)
+            write_images(images, stream.fps, output, lambda done: report("Rendering", done, count))
         print_result(f"{output}: {path.seconds:.1f} s, {path.keys[0].width}x{path.keys[0].height}.")
 
 
@@ -184,7 +173,7 @@ class Tracks:
     """Write the track of every Gaussian as NumPy arrays: ids, frames, positions, confidence."""
 
     out: Positional[Path]
-    """Folder of a fit, or a stream file."""
+    """Folder of a fit, a stream file, or a file of Gaussians."""
     output: Annotated[Positional[Path | None], DisallowNone, place("FILE.npz")] = None
     """File for the tracks; by default OUT/tracks.npz."""
 
@@ -208,7 +197,7 @@ class Web:
     """Write a web page that plays the stream without a server, or a folder for a server."""
 
     out: Positional[Path]
-    """Folder of a fit, or a stream file."""
+    """Folder of a fit, a stream file, or a file of Gaussians."""
     output: Annotated[Positional[Path | None], DisallowNone, place("FILE.html")] = None
     """FILE.html, or a new folder with the page and the stream, for hosting; by default OUT/player.html or OUT/web."""
     format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(_names(WEB))] = None
@@ -226,7 +215,7 @@ class Web:
         total, write = len(frame_numbers(stream)), write_web_folder if chosen.folder else write_web_page
         with progress() as report:
             size = write(stream, output, self.title, lambda done: report("Checking", done, total))
-        print_result(f"{output}: {total} frames, {size / 1e6:.2f} MB.")
+        print_result(f"{output}: {total} {'frame' if total == 1 else 'frames'}, {size / 1e6:.2f} MB.")
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.settings import setting
 from morgs_mi.codec.codec_config import CodecConfig
-from morgs_mi.runs.import_frames import Axes
+from morgs_mi.playback.default_rig import Axes
 
 __all__ = ["Import"]
 

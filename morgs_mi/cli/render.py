@@ -1,16 +1,22 @@
-"""`morgs-mi render`: a stream as seen by one camera."""
+"""`morgs-mi render`: a stream, or a file of Gaussians, as seen by one camera or along a path."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
 from morgs_mi.cli.settings import ChannelName, one_of, optional
+from morgs_mi.core.documentation import page
 from morgs_mi.playback.export.formats import IMAGES, destination
+
+if TYPE_CHECKING:
+    from morgs_mi.codec.reader import StreamReader
+    from morgs_mi.core.camera import Camera
 
 __all__ = ["Render"]
 
@@ -19,9 +25,17 @@ _CHANNELS = (
     "all that the stream stores."
 )
 _OUTPUT = (
-    "FILE.mp4; a new folder whose name ends in png, for PNG files; or another new folder, for multichannel EXR files "
-    "(R, G, B in linear light, motion.X and motion.Y in pixels, confidence.Y, depth.Y). By default OUT/CAMERA.mp4, "
-    "OUT/CAMERA-png or OUT/CAMERA-exr."
+    "FILE.mp4; a new folder whose name ends in png, for PNG files; another new folder, for multichannel EXR files "
+    "(R, G, B in linear light, motion.X and motion.Y in pixels, confidence.Y, depth.Y); FILE.png or FILE.exr for one "
+    "image. By default OUT/CAMERA.mp4, OUT/CAMERA-png or OUT/CAMERA-exr, with the name of the camera or the path."
+)
+_CAMERA = (
+    "Camera of the stream, by index or name; `morgs-mi info` lists those of a capture. A file of Gaussians has front, "
+    "front-right, right, back-right, back, back-left, left and front-left. One image is by default the first one's."
+)
+_PATH = (
+    "Camera path, instead of a camera: orbit (around the scene, the default), between (through the cameras), or a JSON "
+    f"file ({page('exports')}). `morgs-mi export video` has more options."
 )
 _INSERT = (
     "Mitsuba scene whose objects stand among the Gaussians: FILE.xml, or FILE.py with a function build(frame, time) "
@@ -31,15 +45,19 @@ _INSERT = (
 
 @dataclass(frozen=True)
 class Render:
-    """Render a stream for one camera into a video, EXR files or PNG files."""
+    """Render a stream or a file of Gaussians into a video, EXR files or PNG files, for one camera or along a path."""
 
     out: Positional[Path]
-    """Folder of a fit, or a stream file."""
-    camera: Annotated[str, arg(metavar="CAMERA")]
-    """Camera of the stream, by index or name; `morgs-mi info` lists those of a capture."""
+    """Folder of a fit, a stream file, or a file of Gaussians: .ply, .compressed.ply or .splat."""
     output: Annotated[
         Positional[Path | None], DisallowNone, arg(metavar="[FILE_OR_FOLDER]", help=_OUTPUT, help_behavior_hint="")
     ] = None
+    camera: Annotated[str | None, DisallowNone, optional("CAMERA", text=_CAMERA)] = None
+    path: Annotated[str | None, DisallowNone, optional("PATH", text=_PATH)] = None
+    degrees: Annotated[float | None, DisallowNone, optional("FLOAT")] = None
+    """Angle of an orbit, 1 to 360; by default the extent of the rig, and 60 for a file of Gaussians."""
+    width: Annotated[int | None, DisallowNone, optional("INT")] = None
+    """Width of the images, at the same aspect ratio; by default that of the camera."""
     format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(("mp4", "png", "exr"))] = None
     """Format: mp4, png or exr; by default by the name of the output."""
     channels: Annotated[tuple[ChannelName, ...] | None, DisallowNone, optional("NAME ...", text=_CHANNELS)] = None
@@ -56,8 +74,40 @@ class Render:
     shadows and reflections."""
 
     def run(self) -> None:
+        from morgs_mi.playback.export.clips import flight, frame_numbers, named_path, num_images
+        from morgs_mi.playback.export.frames import write_images
+        from morgs_mi.playback.player import find_camera, render_stream
+        from morgs_mi.playback.streams import open_stream
+
+        if self.camera is not None and self.path is not None:
+            raise ValueError(f"expected --camera or --path, got both, {self.camera} and {self.path}; leave out one.")
+        if self.insert is None and self.at is not None:
+            raise ValueError("--at selects frames of an inserted scene, got no scene; add --insert FILE.")
+        stream = open_stream(self.out)
+        view = find_camera(stream, 0 if self.camera is None else self.camera)
+        view = view if self.width is None else view.with_width(self.width)
+        stem = Path(self.path or "orbit").stem if self.camera is None and self.insert is None else view.name
+        output, chosen = destination(stream.path, self.output, IMAGES, self.format, stem)
+        count, single = len(frame_numbers(stream)), chosen.folder and chosen.is_file(output)
+        channels = self.channels or (None if chosen.name == "exr" else ("color",))
+        if self.insert is not None:
+            images, count = self._inserted(stream, view, chosen.name)
+        elif self.camera is not None or (self.path is None and single):
+            images = render_stream(stream, view, channels)
+        else:
+            path = named_path(stream, self.path or "orbit", self.degrees).with_width(self.width)
+            images, count = flight(stream, path, channels), num_images(stream, path)
+        if single and count > 1:
+            raise ValueError(f"{output}: expected one image for one file, got {count}; name a folder.")
+        with progress() as report:
+            write_images(images, stream.fps, output, lambda done: report("Rendering", done, count), chosen.name)
+        print_result(f"{output}: {count} {'image' if count == 1 else 'images'}, {view.width}x{view.height}.")
+
+    def _inserted(
+        self, stream: StreamReader, view: Camera, format: str
+    ) -> tuple[Iterator[tuple[int, dict[str, Any]]], int]:
+        """Return the rendered frames with the inserted scene, and their number."""
         from morgs_mi.playback.export.clips import frame_numbers
-        from morgs_mi.playback.export.frames import write_frames, write_images
         from morgs_mi.playback.export.insert import (
             InsertConfig,
             inserted_channels,
@@ -65,26 +115,10 @@ class Render:
             render_inserted,
             selected,
         )
-        from morgs_mi.playback.player import find_camera
-        from morgs_mi.playback.streams import open_stream
 
-        stream = open_stream(self.out)
-        camera = find_camera(stream, self.camera)
-        output, chosen = destination(stream.path, self.output, IMAGES, self.format, camera.name)
-        if self.insert is None and self.at is not None:
-            raise ValueError("--at selects frames of an inserted scene, got no scene; add --insert FILE.")
+        if self.insert is None or self.camera is None:
+            raise ValueError("--insert renders for one camera, got none; add --camera CAMERA.")
         frames = frame_numbers(stream) if self.at is None else selected(stream, self.at)
-        with progress() as report:
-
-            def done(count: int) -> None:
-                report("Rendering", count, len(frames))
-
-            if self.insert is None:
-                write_frames(stream, camera, output, self.channels, done, chosen.name)
-            else:
-                layers = inserted_channels(stream) if chosen.name == "exr" else ("color",)
-                channels, build = self.channels or layers, load_insert(self.insert)
-                config = InsertConfig(self.samples, self.shadows, self.light)
-                images = render_inserted(stream, camera, build, frames, channels, config)
-                write_images(images, stream.fps, output, done, chosen.name)
-        print_result(f"{output}: {len(frames)} frames of camera {camera.name}, {camera.width}x{camera.height}.")
+        channels = self.channels or (inserted_channels(stream) if format == "exr" else ("color",))
+        config = InsertConfig(self.samples, self.shadows, self.light)
+        return render_inserted(stream, view, load_insert(self.insert), frames, channels, config), len(frames)

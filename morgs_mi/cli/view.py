@@ -20,10 +20,10 @@ __all__ = ["View"]
 
 @dataclass(frozen=True)
 class View:
-    """View a stream in the browser, even while it is being fitted."""
+    """View a stream or a file of Gaussians in the browser; a stream even while it is being fitted."""
 
     out: Positional[Path]
-    """Folder of a fit, or a stream file."""
+    """Folder of a fit, a stream file, or a file of Gaussians: .ply, .compressed.ply or .splat."""
     open_browser: bool = True
     """Open the page in the browser of this machine."""
     config: Annotated[ViewerConfig, arg(name="")] = field(default_factory=ViewerConfig)

@@ -44,6 +44,7 @@ from morgs_mi.core.gaussians import Gaussians
 
 __all__ = [
     "CodedFrame",
+    "WholeFrame",
     "coded_frames",
     "decode",
     "frames_near",
@@ -85,7 +86,7 @@ class CodedFrame:
     gaussians: Gaussians
 
     def __len__(self) -> int:
-        return len(self.grid)
+        return len(self.ids)
 
     @cached_property
     def digest(self) -> np.ndarray:
@@ -102,6 +103,40 @@ class CodedFrame:
         mask = [grid.optional] if grid.optional > 1 else []
         hashed.update(np.array([self.next_id, grid.degree, *mask], "<u4").data)
         return np.frombuffer(hashed.digest(), np.uint8)
+
+
+class WholeFrame(Packet):
+    """Keyframe of Gaussians in memory: it decodes without loss, and is coded where its integers or bytes are needed.
+
+    Args:
+        gaussians: N Gaussians; a missing `motion` is zero.
+        cameras: cameras in which the error of its integers is measured.
+    """
+
+    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
+        for name, value in (("kind", PacketKind.KEYFRAME), ("frame", 0), ("place", "")):
+            object.__setattr__(self, name, value)
+        self.coded = _WholeState(gaussians, cameras)
+
+    @cached_property
+    def arrays(self) -> Mapping[str, np.ndarray]:
+        return reemitted_keyframe(self.coded).arrays
+
+
+class _WholeState(CodedFrame):
+    """State after a `WholeFrame`: its Gaussians are not rounded, and its integers follow when they are needed."""
+
+    def __init__(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> None:
+        N = len(gaussians)
+        motion = np.zeros((N, 3), np.float32) if gaussians.motion is None else gaussians.motion
+        fields = {"frame": 0, "ids": np.arange(N, dtype=np.uint32), "next_id": N}
+        for name, value in (*fields.items(), ("gaussians", replace(gaussians, motion=motion))):
+            object.__setattr__(self, name, value)
+        self.cameras = cameras
+
+    @cached_property
+    def grid(self) -> Grid:
+        return new_grid(split_groups(finite_fields(self.gaussians)), self.cameras, CodecConfig())
 
 
 def keyframe_packet(
@@ -186,6 +221,8 @@ def decode(previous: CodedFrame | None, packet: Packet) -> CodedFrame:
         ValueError: a residual without the state that it continues, a packet that contradicts itself, or a packet
             of a frame that is not after the frame of `previous`.
     """
+    if isinstance(packet, WholeFrame):
+        return packet.coded
     where = packet.place or f"packet of frame {packet.frame}"
     names = {"head", "code"} | ({"parent"} if packet.kind == PacketKind.RESIDUAL else set())
     optional = {"offset"} if packet.kind == PacketKind.RESIDUAL else set()

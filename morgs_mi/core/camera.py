@@ -176,6 +176,15 @@ class Camera:
         K = np.diag([width / self.width, height / self.height, 1.0]) @ self.K
         return replace(self, K=K, width=width, height=height)
 
+    def with_width(self, width: int) -> Camera:
+        """Return the same view with images of another width and the same aspect ratio.
+
+        Raises:
+            ValueError: `width` is below 1.
+        """
+        check_number("Camera.with_width()", "width", width, "[1, inf)")
+        return self.resized(width, max(1, round(width * self.height / self.width)))
+
     def sensor(self, **film: Any) -> dict[str, Any]:
         """Return a Mitsuba `perspective` sensor dictionary of this view.
 

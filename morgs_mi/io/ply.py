@@ -38,6 +38,8 @@ _TYPES = {
     for name in names
 }
 _BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+# Beyond these, an opacity is 0 or 1 and a size is 0, which other tools store as infinite numbers.
+_BOUNDS = {"opacity": (-99, 99), **dict.fromkeys(_SCALE, (-69, None))}
 _NORMAL, _DC = ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
 
 
@@ -71,7 +73,8 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
 def read_ply(path: str | Path) -> Gaussians:
     """Return the Gaussians in a PLY file of this package or of another tool: binary or text, SH of degree 0 to 3.
 
-    Normals and properties outside the layout are ignored; without ``f_rest_*`` the degree is 0.
+    Normals and properties outside the layout are ignored; without ``f_rest_*`` the degree is 0. Infinite logits of the
+    opacities 0 and 1 and infinite logarithms of sizes of 0 are replaced by finite ones, as in `from_activated`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -86,8 +89,8 @@ def read_ply(path: str | Path) -> Gaussians:
     missing = [name for name in (*_MEAN, *_DC, "opacity", *_SCALE, *_ROTATION) if name not in names]
     if missing:
         raise ValueError(
-            f"{path}: expected the vertices of a Gaussian splat, got a PLY without {', '.join(missing)}; "
-            "a point cloud can initialise a fit but is not its result."
+            f"{path}: expected Gaussians in the layout of 3D Gaussian Splatting, got vertices without "
+            f"{', '.join(missing)}, as of a mesh or a point cloud; export the Gaussians."
         )
     found = sum(name.startswith("f_rest_") for name in names)
     degree = {0: 0, 9: 1, 24: 2, 45: 3}.get(found)
@@ -100,7 +103,7 @@ def read_ply(path: str | Path) -> Gaussians:
     def columns(wanted: tuple[str, ...]) -> np.ndarray:
         values = np.empty((N, len(wanted)), np.float32)
         for i, name in enumerate(wanted):
-            values[:, i] = vertices[name]
+            values[:, i] = np.clip(vertices[name], *_BOUNDS.get(name, (None, None)))
         if bad := [name for i, name in enumerate(wanted) if not np.isfinite(values[:, i]).all()]:
             raise ValueError(f"{path}: expected finite numbers, got others in {', '.join(bad)}; clean the Gaussians.")
         return values

@@ -7,7 +7,7 @@ before, and the longest sequence of matches in the order of both frames survives
 frame becomes a residual, and the survivors keep their ids; otherwise it becomes a keyframe with a new set of Gaussians.
 
 The header of a stream has at least one camera, on whose screen the codec measures its errors and with which players
-begin. An imported stream has one that sees the Gaussians of several frames.
+begin. An imported stream has a ring of them, which sees the Gaussians of several frames.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from scipy.spatial import KDTree
@@ -25,28 +24,15 @@ from scipy.spatial import KDTree
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.codec.container import PacketKind, StreamWriter
 from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, reemitted_keyframe, residual_packet
-from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.splats import SUFFIXES, read_splats, suffix_of
+from morgs_mi.playback.default_rig import DEFAULT_RIG, Axes, default_rig
 
-__all__ = ["Axes", "Imported", "default_camera", "find_frames", "import_frames", "matched_rows", "same_gaussians"]
+__all__ = ["Imported", "find_frames", "import_frames", "matched_rows", "same_gaussians"]
 
-Axes = Literal["y-down", "y-up", "z-up"]
-"""Direction that is up in the files, by axis. The layout of 3D Gaussian Splatting mostly has y down."""
-
-# Directions up and forward of the camera.
-_DIRECTIONS: dict[Axes, tuple[np.ndarray, np.ndarray]] = {
-    "y-down": (np.array([0.0, -1, 0]), np.array([0.0, 0, 1])),
-    "y-up": (np.array([0.0, 1, 0]), np.array([0.0, 0, -1])),
-    "z-up": (np.array([0.0, 0, 1]), np.array([0.0, 1, 0])),
-}
-_WIDTH, _HEIGHT, _FOV_X = 1280, 720, 50.0
 _FRAMES_IN_VIEW = 3  # first, middle and last
-_MARGIN = 1.1
-_LEAST_EXTENT = 1e-6  # of the distance from the origin
-_PERCENT_OUTSIDE = 2.0  # of the centres, on each side: floaters far from the scene
 # With rows of other Gaussians the share is about a half; with the same ones, only near-duplicates reduce it.
 _LEAST_SHARE = 0.95
 # Share of the smaller frame that survives at least. Of n matches in random order, about 2 sqrt(n) are a sequence.
@@ -98,21 +84,20 @@ def import_frames(
         OSError: the stream cannot be written.
     """
     check_number("import_frames()", "fps", fps, "[1e-6, 1e6]")
-    _directions(axes)
     config, paths = config or CodecConfig(), find_frames(sources)
     path = Path(out) if Path(out).suffix.lower() == ".morgs" else Path(out) / "stream.morgs"
     if path.exists():
         raise FileExistsError(f"{path}: expected a new stream, got a file that exists; remove it, or name another.")
     in_view = np.unique(np.linspace(0, len(paths) - 1, _FRAMES_IN_VIEW).astype(int))
     try:
-        cameras = [default_camera([read_splats(paths[t]) for t in in_view], axes)]
+        cameras = default_rig([read_splats(paths[t]) for t in in_view], axes)
     except ValueError as error:
         if any(str(error).startswith(f"{path}: ") for path in paths):
             raise
         raise ValueError(f"{paths[0].parent}: {error}") from None
     path.parent.mkdir(parents=True, exist_ok=True)
     coded, order, keyframes = None, np.zeros(0, np.int64), 0
-    metadata = {"num_frames": len(paths), "config": {"codec": asdict(config)}}
+    metadata = {"num_frames": len(paths), DEFAULT_RIG: True, "config": {"codec": asdict(config)}}
     with atomic_path(path, "import_frames()") as partial, StreamWriter(partial, cameras, fps, metadata) as writer:
         for frame, source in enumerate(paths):
             gaussians = read_splats(source)
@@ -215,39 +200,6 @@ def matched_rows(before: Gaussians, now: Gaussians) -> np.ndarray | None:
         row, row_before = ends[k] + 1
         rows[row : row + gap[k] - 1] = np.arange(row_before, row_before + gap[k] - 1)
     return rows
-
-
-def default_camera(frames: Sequence[Gaussians], axes: Axes = "y-down") -> Camera:
-    """Return a camera in front of the scene that sees the box around nearly all centres in these frames.
-
-    Raises:
-        ValueError: there is no Gaussian in any of the frames, or `axes` is unknown.
-    """
-    means = np.concatenate([gaussians.numpy()["means"] for gaussians in frames]).astype(np.float64)
-    sizes = np.concatenate([gaussians.numpy()["log_scales"].max(axis=1, initial=-69) for gaussians in frames])
-    if not len(means):
-        raise ValueError(
-            "default_camera(): expected at least one Gaussian in the first, middle or last frame, got none; leave out "
-            "frames that are empty."
-        )
-    low, high = np.percentile(means, (_PERCENT_OUTSIDE, 100 - _PERCENT_OUTSIDE), axis=0)
-    # A single Gaussian has no extent but its own, and one without extent is at least larger than rounding errors.
-    least = _LEAST_EXTENT * (1 + np.abs((low, high)).max())
-    half = np.maximum(_MARGIN * 0.5 * (high - low) + 3 * np.exp(np.median(sizes)), least)
-    up, forward = _directions(axes)
-    width, height, depth = (np.abs(direction) @ half for direction in (np.cross(forward, up), up, forward))
-    tangent = np.tan(np.deg2rad(_FOV_X / 2))
-    distance = depth + max(width, height * _WIDTH / _HEIGHT) / tangent
-    center = (low + high) / 2
-    origin = center - distance * forward
-    return Camera.look_at(origin, center, up, _FOV_X, _WIDTH, _HEIGHT, "front", near=min(0.01, float(distance) / 1000))
-
-
-def _directions(axes: Axes) -> tuple[np.ndarray, np.ndarray]:
-    """Return the directions [3] up and forward of the camera."""
-    if axes not in _DIRECTIONS:
-        raise ValueError(f"import_frames(): `axes` must be one of {', '.join(_DIRECTIONS)}, got {axes!r}; choose one.")
-    return _DIRECTIONS[axes]
 
 
 def _scaled_features(before: Gaussians, now: Gaussians) -> tuple[np.ndarray, np.ndarray]:

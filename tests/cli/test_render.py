@@ -27,11 +27,12 @@ from tests.scenes.noise_capture import rig
         ),
         (
             ["a.gif", "--camera", "0"],
-            ("must be FILE.mp4, a folder ending in exr or a folder ending in png, got '.gif'.",),
+            ("must be FILE.mp4, a folder ending in exr, FILE.exr for one frame, a folder ending in png or FILE.png",),
         ),
         (["a.mp4", "--camera", "0", "--format", "png", "--at", "1"], ("--at selects frames",)),
         (["png", "--camera", "0", "--format", "mp4"], ("the output must be FILE.mp4, got 'png'",)),
         (["--camera", "0", "--insert", "no.xml"], ("no.xml", "expected a scene to insert")),
+        (["a.png", "--camera", "0"], ("a.png: expected one image for one file, got 2; name a folder.",)),
         (["--camera", "0", "--at", "1"], ("--at selects frames of an inserted scene", "add --insert FILE")),
     ],
 )

@@ -11,6 +11,7 @@ from plyfile import PlyData, PlyElement
 
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.ply import read_ply, write_ply
+from tests.assertions import assert_close
 from tests.scenes.gaussians import RAW, make_unit_scene, to_gaussians
 
 LAYOUT = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
@@ -89,6 +90,17 @@ def test_read_ply__accepts_files_of_other_tools(tmp_path, degree, form):
     assert_same(gaussians, read_ply(tmp_path / "g.ply"), rtol=1e-6 if "text" in form else 0)  # 9 digits may be fewer
 
 
+def test_read_ply__bounds_the_infinite_numbers_of_opaque_and_flat_gaussians(tmp_path):
+    records = table(random_gaussians(3))
+    records["opacity"][:2] = np.inf, -np.inf
+    records["scale_2"][0] = -np.inf
+    PlyData([PlyElement.describe(records, "vertex")]).write(str(tmp_path / "g.ply"))
+    gaussians = read_ply(tmp_path / "g.ply")
+    assert_close(np.array(gaussians.opacities)[:2], [1, 0], atol=1e-6)
+    assert 0 < np.array(gaussians.scales)[0, 2] < 1e-29
+    assert gaussians.numpy()["logit_opacities"][2] == records["opacity"][2]
+
+
 def test_write_ply__writes_no_rotation_for_a_zero_quaternion(tmp_path):
     write_ply(
         tmp_path / "g.ply", Gaussians(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 4)), [0], np.zeros((1, 1, 3)))
@@ -108,7 +120,7 @@ def with_nan(records):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (without("rot_3", "opacity"), "without opacity, rot_3; a point cloud"),
+        (without("rot_3", "opacity"), "without opacity, rot_3, as of a mesh or a point cloud; export the Gaussians"),
         (without("f_rest_4"), "expected f_rest_0 to f_rest_8, 23 or 44 .* got 44 of them"),
         (with_nan, "expected finite numbers, got others in scale_1"),
         (lambda _: np.zeros(4, [("packed_position", "u4")]), "PlayCanvas' compressed one; read it with `read_splats`"),

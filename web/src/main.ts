@@ -96,12 +96,16 @@ class Player {
     ({ cameras: this.cameras, frames: this.frames } = stream);
     if (stream.damage !== null) say(`This stream is damaged: ${stream.damage}. The frames before that play.`);
     const unit = unitOf(this.cameras);
-    const metadata = stream.metadata as { config?: { render?: object }; motion_scale?: number } | undefined;
+    const metadata = stream.metadata as
+      | { config?: { render?: object }; motion_scale?: number; default_rig?: boolean }
+      | undefined;
     this.motionScale = metadata?.motion_scale ?? 0.03;
     this.splats = new Splats(canvas, { eps2d: 0.3, alpha_min: 1 / 255, ...metadata?.config?.render }, unit);
     this.view = new View(this.cameras, unit, canvas, () => this.followView());
+    if (metadata?.default_rig === true) this.bound(); // no recorded views to stay near
     cameraList.replaceChildren(...this.cameras.map(({ name }, i) => new Option(name, String(i))));
     slider.max = String(this.frames.length - 1);
+    element("player").classList.toggle("still", this.frames.length === 1);
     this.playback.seek(0);
   }
 

@@ -12,16 +12,24 @@ from morgs_mi.codec.packets import CodedFrame, frames_near, play, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.io.video_writer import playable_format, write_video
-from morgs_mi.playback.export.formats import VIDEO, choose_format
-from morgs_mi.playback.export.frames import pad_to_even
-from morgs_mi.playback.export.paths import CameraPath
-from morgs_mi.playback.player import channel_image, render, render_config
-from morgs_mi.playback.visualise import side_by_side
+from morgs_mi.playback.default_rig import DEFAULT_RIG
+from morgs_mi.playback.export.paths import CameraPath, focus, load_path, orbit, through_cameras
+from morgs_mi.playback.player import available_channels, render, render_config
 
-__all__ = ["frame_numbers", "repeated_frames", "repeated_seconds", "select_frames", "write_each", "write_flight"]
+__all__ = [
+    "flight",
+    "frame_numbers",
+    "named_path",
+    "num_images",
+    "repeated_frames",
+    "repeated_seconds",
+    "select_frames",
+    "write_each",
+]
 
 Progress = Callable[[int, int], None] | None
+# Angle of an orbit around Gaussians without a recording. Scenes fall apart from behind, and may be tilted.
+_SWING = 60.0
 
 
 def frame_numbers(stream: StreamReader) -> list[int]:
@@ -101,40 +109,60 @@ def write_each(
                 break
 
 
-def write_flight(
+def flight(
     stream: StreamReader,
     path: CameraPath,
-    output: str | Path,
-    channels: Sequence[str] = ("color",),
+    channels: Sequence[str] | None = ("color",),
     clip: Iterator[Gaussians] | None = None,
-    progress: Progress = None,
-) -> None:
-    """Render a stream along a camera path into a video at the stream's frame rate; the file is written atomically.
+) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    """Render a stream along a camera path, at the stream's frame rate.
 
     Args:
         stream: the file.
-        path: the moving camera; it determines the duration of the video.
-        output: ``FILE.mp4``.
-        channels: out of `CHANNELS`, drawn side by side.
-        clip: Gaussians of each image of the video; None: `repeated_frames`.
-        progress: called with (images done, total number of images).
+        path: the moving camera; it determines the number of images, see `num_images`.
+        channels: out of `CHANNELS`; None for `available_channels`.
+        clip: Gaussians of each image; None: `repeated_frames`.
+
+    Yields:
+        (i, images): per channel an array [H, W, C], as `render_stream`.
 
     Raises:
-        ValueError: another type of file, an unknown channel, or a broken packet.
-        OSError: the file cannot be written.
+        ValueError: an unknown channel, or a broken packet.
     """
-    choose_format(VIDEO, output)
     frame_numbers(stream)
-    count, config = max(1, round(path.seconds * stream.fps)), render_config(stream)
+    config, clip = render_config(stream), clip or repeated_frames(stream)
+    for i, gaussians in zip(range(num_images(stream, path)), clip, strict=False):
+        yield i, render(gaussians, path.at(i / stream.fps), channels or available_channels(gaussians), config)
 
-    def images() -> Iterator[np.ndarray]:
-        for i, gaussians in zip(range(count), clip or repeated_frames(stream), strict=False):
-            rendered = render(gaussians, path.at(i / stream.fps), channels, config)
-            yield pad_to_even(side_by_side([channel_image(name, values) for name, values in rendered.items()]))
-            if progress is not None:
-                progress(i + 1, count)
 
-    write_video(output, images(), stream.fps, playable_format()[1])
+def num_images(stream: StreamReader, path: CameraPath) -> int:
+    """Return the number of images of `flight`."""
+    return max(1, round(path.seconds * stream.fps))
+
+
+def named_path(
+    stream: StreamReader, name: str = "orbit", degrees: float | None = None, least_seconds: float = 5.0
+) -> CameraPath:
+    """Return the camera path `between` or `orbit`, as long as the clip, or the path in a JSON file.
+
+    Args:
+        stream: the file.
+        name: of the path or the file.
+        degrees: angle of an orbit, see `orbit`; by default 60 for Gaussians without a recording.
+        least_seconds: shorter clips are repeated, see `repeated_seconds`.
+
+    Raises:
+        FileNotFoundError, ValueError: as `through_cameras`, `orbit` and `load_path`.
+    """
+    clip = repeated_seconds(len(frame_numbers(stream)) / stream.fps, least_seconds)
+    if name == "between":
+        return through_cameras(stream.cameras, clip)
+    if name == "orbit":
+        if degrees is None and stream.metadata.get(DEFAULT_RIG) is True:
+            degrees = _SWING
+        means = next(gaussians for _, gaussians in play(stream)).numpy()["means"]
+        return orbit(stream.cameras, focus(stream.cameras, means), degrees, clip)
+    return load_path(name, stream.cameras)
 
 
 def repeated_seconds(clip: float, least: float) -> float:

@@ -20,8 +20,8 @@ class Format:
         name: of the format.
         ending: end of the names of its outputs; empty: of names without a suffix.
         default: name of the output beside a stream; ``{}`` stands for the name of a camera or a path.
-        folder: whether it is a folder with a file per frame, or for a web server. With an `ending` that begins with a
-            dot, the file of a single frame is one, too.
+        folder: whether it is a folder with a file per frame, or for a web server. With an `ending`, the file of a
+            single frame is one, too.
     """
 
     name: str
@@ -34,9 +34,18 @@ class Format:
         """Outputs of this format in words."""
         if not self.folder:
             return (f"FILE{self.ending}",)
-        if self.ending.startswith("."):
-            return ("a folder", f"FILE{self.ending} for one frame")
-        return (f"a folder ending in {self.ending}" if self.ending else "a folder",)
+        if not self.ending:
+            return ("a folder",)
+        named = "" if self.ending.startswith(".") else f" ending in {self.ending}"
+        return (f"a folder{named}", f"FILE{self._suffix} for one frame")
+
+    @property
+    def _suffix(self) -> str:
+        return f".{self.ending.removeprefix('.')}"
+
+    def is_file(self, output: str | Path) -> bool:
+        """Return whether an output of this format is a file."""
+        return not self.folder or (bool(self.ending) and Path(output).name.lower().endswith(self._suffix))
 
 
 PLY = (Format("ply", ".ply", "ply", True), Format("compressed.ply", ".compressed.ply", "compressed-ply", True))
@@ -88,7 +97,7 @@ def destination(
     """
     chosen = choose_format(formats, output, name)
     path = check_output(output or stream.with_name(chosen.default.format(stem)))
-    if not chosen.folder and path.is_dir():
+    if chosen.is_file(path) and path.is_dir():
         raise ValueError(f"{path}: expected a file to write, got a folder; choose another name.")
     return path, chosen
 

@@ -10,7 +10,7 @@ import numpy as np
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import srgb_to_linear
-from morgs_mi.core.files import atomic_folder
+from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.io.cryptomatte import cryptomatte
 from morgs_mi.io.exr import write_exr
 from morgs_mi.io.video_writer import playable_format, write_video
@@ -38,7 +38,8 @@ def write_frames(
         stream: the file.
         camera: any view.
         output: ``FILE.mp4`` for a video of the channels side by side, a folder ending in ``png`` for the same images as
-            ``0000.png`` ..., any other folder for multichannel ``0000.exr`` ... (see `exr_channels`).
+            ``0000.png`` ..., any other folder for multichannel ``0000.exr`` ... (see `exr_channels`), or ``FILE.png``
+            or ``FILE.exr`` for a single frame.
         channels: out of `CHANNELS`; default: the colour, for EXR files all channels that the stream stores.
         progress: called with the number of frames done.
         format: mp4, png or exr; None: by the output's name.
@@ -80,12 +81,25 @@ def write_images(
         padded = (pad_to_even(_combined_image(images)) for _, images in frames())
         write_video(output, padded, fps, playable_format()[1])
         return
+    write = _write_png if chosen == "png" else _write_exr
+    if Path(output).name.lower().endswith(f".{chosen}"):
+        with atomic_path(output, "write_frames()") as partial:
+            for count, (_, images) in enumerate(frames()):
+                if count:
+                    raise ValueError(f"{output}: expected one frame for one file, got several; name a folder.")
+                write(partial, images)
+        return
     with atomic_folder(output, "write_frames()") as folder:
         for frame, images in frames():
-            if chosen == "png":
-                write_png(folder / f"{frame:04d}.png", _combined_image(images))
-            else:
-                write_exr(folder / f"{frame:04d}.exr", *exr_layers(images))
+            write(folder / f"{frame:04d}.{chosen}", images)
+
+
+def _write_png(path: Path, images: Mapping[str, np.ndarray]) -> None:
+    write_png(path, _combined_image(images))
+
+
+def _write_exr(path: Path, images: Mapping[str, np.ndarray]) -> None:
+    write_exr(path, *exr_layers(images))
 
 
 def exr_layers(images: Mapping[str, np.ndarray]) -> tuple[dict[str, np.ndarray], dict[str, str]]:

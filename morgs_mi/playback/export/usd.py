@@ -149,7 +149,7 @@ def _sets(clip: Iterator[tuple[int, CodedFrame]], axes: np.ndarray) -> dict[int,
     starts: dict[int, tuple[int, int]] = {}
     for first_id, coded in clip:
         parts = found.setdefault(first_id, [])
-        starts.setdefault(first_id, (coded.frame, coded.grid.degree))
+        starts.setdefault(first_id, (coded.frame, coded.gaussians.sh_degree))
         known = parts[-1][0][-1] if parts else -1
         born = coded.ids.astype(np.int64) > known
         if born.any():

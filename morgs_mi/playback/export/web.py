@@ -23,6 +23,7 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.playback.default_rig import DEFAULT_RIG
 from morgs_mi.playback.player import MOTION_SCALE, metadata_entry, stream_name
 
 __all__ = ["text_of_bytes", "web_page", "write_web_folder", "write_web_page"]
@@ -117,6 +118,8 @@ def _published(stream: StreamReader, progress: Progress | None) -> bytes:
     if not speeds:
         raise ValueError(f"{stream.path}: expected at least one frame to show, got none.")
     sink, metadata = io.BytesIO(), {"config": {"render": render}, "motion_scale": _motion_scale(*np.hstack(speeds))}
+    if stream.metadata.get(DEFAULT_RIG) is True:
+        metadata[DEFAULT_RIG] = True
     with StreamWriter(sink, stream.cameras, stream.fps, metadata) as writer:
         for packet in packets:
             writer.write(packet)

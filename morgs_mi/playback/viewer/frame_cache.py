@@ -13,7 +13,7 @@ from morgs_mi.codec.container import PacketKind, TruncatedStreamError
 from morgs_mi.codec.packets import CodedFrame, frames_near
 from morgs_mi.core.files import is_same_file
 from morgs_mi.playback.player import PROVISIONAL
-from morgs_mi.playback.streams import open_stream
+from morgs_mi.playback.streams import open_stream, stream_path
 
 __all__ = ["NO_TRAILS", "FrameCache", "Trails"]
 
@@ -46,7 +46,7 @@ class FrameCache:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self._path = open_stream(path).path
+        self._path = stream_path(path)
         self._centres: OrderedDict[int, tuple[np.ndarray, np.ndarray]] = OrderedDict()
         self._reopen()
         self.frames: list[int] = []

@@ -14,10 +14,9 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.color_space import srgb_to_linear
 from morgs_mi.io.ply import read_ply
 from morgs_mi.io.splats import read_splats
-from morgs_mi.playback.export.clips import _frames_backwards, repeated_seconds, select_frames, write_flight
+from morgs_mi.playback.export.clips import _frames_backwards, repeated_seconds, select_frames
 from morgs_mi.playback.export.formats import IMAGES, PLY, USD, WEB, choose_format
 from morgs_mi.playback.export.frames import exr_channels, pad_to_even, write_frames
-from morgs_mi.playback.export.paths import through_cameras
 from morgs_mi.render.rasterize import rasterize
 from tests.assertions import assert_close
 from tests.codec.forge import forged_streams
@@ -118,7 +117,7 @@ def test_export_tracks__writes_all_ids(stream, tmp_path):
     assert np.load(tmp_path / "tracks.npz")["positions"].shape == (4, 42, 3)
 
 
-def test_write_flight__shows_rendered_images_and_restarts_the_clip(stream, tmp_path):
+def test_flight__shows_rendered_images_and_restarts_the_clip(stream, tmp_path):
     keys = [{"time": 0, "camera": "middle"}, {"time": 0.6, "camera": "middle"}]
     (tmp_path / "still.json").write_text(json.dumps({"keys": keys}))
     assert run("export", "video", tmp_path, "--path", tmp_path / "still.json") == 0
@@ -131,7 +130,7 @@ def test_write_flight__shows_rendered_images_and_restarts_the_clip(stream, tmp_p
         assert errors[t % 4] < 0.03  # the error of the lossy codec on such a small image
 
 
-def test_write_flight__plays_back_and_forth(stream, tmp_path):
+def test_flight__plays_back_and_forth(stream, tmp_path):
     keys = [{"time": 0, "camera": "middle"}, {"time": 0.9, "camera": "middle"}]
     (tmp_path / "still.json").write_text(json.dumps({"keys": keys}))
     assert run("export", "video", tmp_path, "--path", tmp_path / "still.json", "--back-and-forth") == 0
@@ -159,12 +158,10 @@ def test_frames_backwards__are_those_of_the_clip_if_a_keyframe_is_forged(tmp_pat
         np.testing.assert_array_equal(gaussians.means, clip.states[frame].gaussians.means)
 
 
-@pytest.mark.parametrize("write", [write_frames, write_flight])
-def test_export__writes_videos_in_the_playable_format(stream, tmp_path, monkeypatch, write):
-    monkeypatch.setattr(f"{write.__module__}.playable_format", lambda: (".mp4", "mp4v"))
+def test_write_frames__writes_videos_in_the_playable_format(stream, tmp_path, monkeypatch):
+    monkeypatch.setattr(f"{write_frames.__module__}.playable_format", lambda: (".mp4", "mp4v"))
     reader = StreamReader(tmp_path / "stream.morgs")
-    view = reader.cameras[0] if write is write_frames else through_cameras(reader.cameras, 0.2)
-    write(reader, view, tmp_path / "a.mp4")
+    write_frames(reader, reader.cameras[0], tmp_path / "a.mp4")
     code = int(cv2.VideoCapture(str(tmp_path / "a.mp4")).get(cv2.CAP_PROP_FOURCC))
     assert code.to_bytes(4, "little") in (b"mp4v", b"FMP4")
 
@@ -181,7 +178,7 @@ def test_export_video__repeats_a_short_clip(stream, tmp_path):
     assert len(video(tmp_path / "between.mp4")) == 4
 
 
-def test_write_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
+def test_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
     more = ("--freeze", 2, "--seconds", 0.5, "--width", 32, "--channels", "color", "depth")
     assert run("export", "video", tmp_path, "--path", "orbit", *more) == 0
     assert [frame.shape for frame in video(tmp_path / "orbit.mp4")] == [(24, 68, 3)] * 5
@@ -204,7 +201,7 @@ def test_write_flight__freezes_a_frame_while_the_camera_moves(stream, tmp_path):
         (("web", "a.htm"), "a.htm: the output must be FILE.html or a folder, got '.htm'."),
         (("usd", "a.usdz", "--format", "usda"), "a.usdz: the output must be FILE.usda, got '.usdz'."),
         (("video", "--freeze", "7"), "--freeze must be in 0 to 3, got 7"),
-        (("video", "--width", "0"), "--width must be at least 1, got 0"),
+        (("video", "--width", "0"), "--width must be a number in [1, inf), got 0"),
         (("video", "--seconds", "-1"), "--seconds must be positive"),
         (("video", "--least-seconds", "-1"), "--least-seconds must be finite and not negative, got -1"),
         (("video", "--path", "none.json"), "expected a camera path, found none"),

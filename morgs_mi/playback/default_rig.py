@@ -1,0 +1,78 @@
+"""Cameras for Gaussians without a recording: a ring around them, from their extent.
+
+Gaussians of other tools have no cameras, and do not state which direction is up. Half of their extent along each axis
+is that of the middle 90 % of the centres, weighted by opacity: floaters and a far background do not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
+
+__all__ = ["DEFAULT_RIG", "Axes", "default_rig"]
+
+Axes = Literal["y-down", "y-up", "z-up"]
+"""Direction that is up, by axis. Files in the layout of 3D Gaussian Splatting mostly have COLMAP's axes, y down."""
+DEFAULT_RIG = "default_rig"
+"""Entry of a stream's metadata that is true where its cameras are not those of a recording."""
+
+# Directions up and forward of the first camera.
+_DIRECTIONS: dict[Axes, tuple[np.ndarray, np.ndarray]] = {
+    "y-down": (np.array([0.0, -1, 0]), np.array([0.0, 0, 1])),
+    "y-up": (np.array([0.0, 1, 0]), np.array([0.0, 0, -1])),
+    "z-up": (np.array([0.0, 0, 1]), np.array([0.0, 1, 0])),
+}
+# Every 45 degrees: orbits treat cameras without a gap of 90 degrees as a full circle.
+_NAMES = ("front", "front-right", "right", "back-right", "back", "back-left", "left", "front-left")
+_WIDTH, _HEIGHT, _FOV_X = 1280, 720, 50.0
+_PERCENT_OUTSIDE = 5.0  # of the weight, on each side
+_MARGIN = 1.1
+_LEAST_EXTENT = 1e-6  # of the distance from the origin
+
+
+def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Camera, ...]:
+    """Return eight cameras on a circle around nearly all Gaussians in these frames, which look at their middle.
+
+    The first one, `front`, looks along the forward axis of the convention.
+
+    Raises:
+        ValueError: there is no Gaussian in any of the frames, or `axes` is unknown.
+    """
+    if axes not in _DIRECTIONS:
+        raise ValueError(f"default_rig(): `axes` must be one of {', '.join(_DIRECTIONS)}, got {axes!r}; choose one.")
+    up, forward = _DIRECTIONS[axes]
+    low, high, size = _extent(frames)
+    # A single Gaussian has no extent but its own, and one without extent is at least larger than rounding errors.
+    least = _LEAST_EXTENT * (1 + np.abs((low, high)).max())
+    half = np.maximum(_MARGIN * 0.5 * (high - low) + 3 * size, least)
+    tall = np.abs(up) @ half
+    wide, deep = np.abs(np.cross(forward, up)) @ half, np.abs(forward) @ half
+    tangent = np.tan(np.deg2rad(_FOV_X / 2))
+    # The first camera sees the box; the others keep its distance from the middle.
+    distance = deep + max(wide, tall * _WIDTH / _HEIGHT) / tangent
+    center, near = (low + high) / 2, min(0.01, float(distance) / 1000)
+    arms = Rotation.from_rotvec(np.linspace(0, 2 * np.pi, len(_NAMES), endpoint=False)[:, None] * up).apply(-forward)
+    return tuple(
+        Camera.look_at(center + distance * arm, center, up, _FOV_X, _WIDTH, _HEIGHT, name, near)
+        for name, arm in zip(_NAMES, arms, strict=True)
+    )
+
+
+def _extent(frames: Sequence[Gaussians]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the corners [3] of the box around most of the opacity in all frames, and the median size of a Gaussian."""
+    raw = [gaussians.numpy() for gaussians in frames]
+    means = np.concatenate([values["means"] for values in raw]).astype(np.float64)
+    sizes = np.concatenate([values["log_scales"].max(axis=1, initial=-69) for values in raw])
+    opacities = 0.5 + 0.5 * np.tanh(0.5 * np.concatenate([values["logit_opacities"] for values in raw], dtype=float))
+    if not len(means):
+        raise ValueError("expected at least one Gaussian, got none; leave out files that are empty.")
+    percents, weights = (_PERCENT_OUTSIDE, 100 - _PERCENT_OUTSIDE), opacities + 1e-9
+    corners = [np.percentile(axis, percents, weights=weights, method="inverted_cdf") for axis in means.T]
+    low, high = np.array(corners).T
+    return low, high, float(np.exp(np.median(sizes)))

@@ -1,0 +1,50 @@
+"""Cameras for Gaussians without a recording: they see the scene upright, whatever lies far outside of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morgs_mi.playback.default_rig import default_rig
+from tests.assertions import assert_close
+from tests.scenes.changing_splats import splats
+
+
+@pytest.mark.parametrize(("axes", "up"), [("y-down", (0, -1, 0)), ("y-up", (0, 1, 0)), ("z-up", (0, 0, 1))])
+def test_default_rig__sees_the_gaussians_upright_from_all_sides(axes, up):
+    cameras, means = default_rig([splats(300)], axes), splats(300).numpy()["means"]
+    for camera in cameras:
+        pixels, depths = camera.project(means)
+        assert depths.min() > 10 * camera.near
+        assert np.mean(((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=1)) > 0.98
+        assert_close(-camera.viewmat[1, :3], up, atol=1e-12)
+        # The scene fills a good part of the image.
+        assert max(np.ptp(pixels, axis=0) / [camera.width, camera.height]) > 0.45
+    arms = np.stack([camera.position - cameras[0].position for camera in cameras])
+    assert_close(arms @ up, np.zeros(8), atol=1e-12)
+    right = cameras[[camera.name for camera in cameras].index("right")]
+    assert (right.position - cameras[4].position) @ cameras[0].viewmat[0, :3] > 1  # on the right of the front view
+
+
+def test_default_rig__ignores_far_floaters_and_what_is_nearly_transparent():
+    scene = splats(300)
+    raw = scene.numpy()
+    means, logits = raw["means"].copy(), raw["logit_opacities"].copy()
+    means[:3] *= 1e4
+    means[100:150], logits[100:150] = 50, -8
+    shown = replace(scene, means=means, logit_opacities=logits)
+    assert_close(default_rig([shown])[0].position, default_rig([scene])[0].position, atol=0.5)
+
+
+def test_default_rig__sees_a_single_gaussian():
+    for camera in default_rig([splats(1)]):
+        assert_close(camera.project(splats(1).numpy()["means"])[0], [[640, 360]], atol=1e-6)
+
+
+def test_default_rig__names_what_it_cannot_use():
+    with pytest.raises(ValueError, match="`axes` must be one of y-down, y-up, z-up, got 'up'"):
+        default_rig([splats(1)], "up")
+    with pytest.raises(ValueError, match="expected at least one Gaussian, got none"):
+        default_rig([splats(0)])

@@ -1,0 +1,149 @@
+"""Files of Gaussians as streams of one frame: exact Gaussians, every output, and messages for other files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from plyfile import PlyData
+
+from morgs_mi import cli
+from morgs_mi.codec.packets import decode, play, seek
+from morgs_mi.codec.reader import StreamReader
+from morgs_mi.io.exr import read_exr
+from morgs_mi.io.ply import write_ply
+from morgs_mi.io.splats import read_splats
+from morgs_mi.playback.export.web import write_web_folder
+from morgs_mi.playback.streams import open_stream
+from morgs_mi.playback.viewer.frame_cache import FrameCache
+from morgs_mi.render.rasterize import rasterize
+from tests.assertions import assert_close
+from tests.scenes.changing_splats import splats
+
+MESH = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+element face 1
+property list uchar int vertex_indices
+end_header
+0 0 0
+1 0 0
+0 1 0
+3 0 1 2
+"""
+
+
+@pytest.fixture(params=range(4), ids=lambda degree: f"degree {degree}")
+def file(tmp_path, request) -> Path:
+    write_ply(tmp_path / "scene.ply", splats(degree=request.param))
+    return tmp_path / "scene.ply"
+
+
+@pytest.fixture
+def run(capsys):
+    def call(*args: object) -> tuple[int, str, str]:
+        status = cli.main([str(arg) for arg in args])
+        return status, *capsys.readouterr()
+
+    return call
+
+
+def test_splat_file__has_the_gaussians_of_the_file_in_one_frame(file):
+    stream, expected = open_stream(file), read_splats(file).numpy()
+    for gaussians in (
+        next(gaussians for _, gaussians in play(stream)),
+        seek(stream, 0).gaussians,
+        FrameCache(file).at(0).gaussians,
+    ):
+        found = gaussians.numpy()
+        for name, values in expected.items():
+            np.testing.assert_array_equal(found[name], values)
+    assert (len(list(stream)), len(stream.index()), stream.closed()) == (1, 1, True)
+
+
+def test_splat_file__is_coded_like_any_keyframe(file, tmp_path):
+    stream = open_stream(file)
+    write_web_folder(stream, tmp_path / "page")
+    written = StreamReader(tmp_path / "page" / "stream.morgs")
+    assert written.metadata["default_rig"] is True
+    assert [camera.name for camera in written.cameras] == [camera.name for camera in stream.cameras]
+    packet, state = next(iter(written)), next(iter(stream)).coded
+    np.testing.assert_array_equal(decode(None, packet).grid.values, state.grid.values)
+    np.testing.assert_array_equal(decode(None, packet).digest, state.digest)
+
+
+@pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
+def test_render__draws_a_file_of_gaussians(tmp_path, run, text):
+    write_ply(tmp_path / "written.ply", splats(degree=2))
+    data = PlyData.read(str(tmp_path / "written.ply"))
+    data.text = text
+    data.write(str(tmp_path / "scene.ply"))
+    stream = open_stream(tmp_path / "scene.ply")
+    status, output, _ = run("render", stream.path, tmp_path / "a.png", "--width", 64)
+    assert (status, output) == (0, f"{tmp_path}/a.png: 1 image, 64x36.\n")
+    image = np.array(rasterize(read_splats(stream.path), stream.cameras[0].with_width(64)).color)
+    assert_close(cv2.imread(str(tmp_path / "a.png"))[..., ::-1] / 255, image.clip(0, 1), atol=0.5 / 255 + 1e-4)
+    assert run("render", stream.path, tmp_path / "a.exr", "--width", 64, "--camera", "right")[0] == 0
+    assert read_exr(tmp_path / "a.exr")["depth.Y"].shape == (36, 64)
+
+
+def test_render__orbits_a_file_of_gaussians(tmp_path, run):
+    write_ply(tmp_path / "scene.ply", splats())
+    assert run("render", tmp_path / "scene.ply", "--width", 32)[:2] == (
+        0,
+        f"{tmp_path}/orbit.mp4: 150 images, 32x18.\n",
+    )
+    path = tmp_path / "still.json"
+    path.write_text('{"keys": [{"time": 0, "camera": "left"}, {"time": 0.1, "camera": "back-left"}]}')
+    assert run("render", tmp_path / "scene.ply", tmp_path / "png", "--path", path, "--width", 32)[0] == 0
+    assert [image.name for image in sorted((tmp_path / "png").iterdir())] == ["0000.png", "0001.png", "0002.png"]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (MESH, "got vertices without f_dc_0, f_dc_1, f_dc_2, opacity, scale_0"),
+        (MESH.replace("vertex 3", "vertex 0"), "got vertices without f_dc_0"),
+        ("", "expected a complete PLY file, got one that cannot be read: it does not begin with `ply`"),
+        ("solid stl", "it does not begin with `ply`"),
+        (MESH[:60], "its header does not end"),
+    ],
+    ids=["mesh", "no vertices", "empty", "other", "truncated header"],
+)
+@pytest.mark.parametrize("command", [("render",), ("view", "--no-open-browser"), ("export", "web")], ids=" ".join)
+def test_commands__name_what_is_no_file_of_gaussians(tmp_path, run, content, message, command):
+    (tmp_path / "scene.ply").write_text(content)
+    status, _, error = run(*command, tmp_path / "scene.ply")
+    assert (status, "Traceback" in error) == (1, False)
+    assert f"{tmp_path}/scene.ply: " in error
+    assert message in error
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (("a.png", "--path", "orbit"), "a.png: expected one image for one file, got 150; name a folder"),
+        (("--camera", "top"), "one of front, front-right, right,"),
+        (("--camera", "0", "--path", "orbit"), "expected --camera or --path, got both"),
+        (("--degrees", "0"), "--degrees must be 1 to 360, got 0"),
+        (("--width", "0"), "--width must be a number in [1, inf), got 0"),
+        (("--insert", "no.py"), "--insert renders for one camera, got none; add --camera CAMERA"),
+    ],
+)
+def test_render__names_arguments_that_do_not_fit(tmp_path, run, args, message):
+    write_ply(tmp_path / "scene.ply", splats())
+    status, _, error = run("render", tmp_path / "scene.ply", *args)
+    assert (status, message in error) == (1, True), error
+    assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
+
+
+def test_splat_file__without_gaussians_is_named(tmp_path):
+    write_ply(tmp_path / "scene.ply", splats(0))
+    with pytest.raises(ValueError, match=r"scene\.ply: expected at least one Gaussian, got none"):
+        open_stream(tmp_path / "scene.ply")
