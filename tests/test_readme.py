@@ -41,6 +41,13 @@ def test_readme__quotes_the_committed_demo():
         assert f"| {title} | {figures} |" in README
 
 
+def test_readme__quotes_the_committed_time_of_an_image():
+    rows = json.loads((ROOT / "benchmarks/results/splat_files.json").read_text(encoding="utf-8"))["rows"]
+    seconds = {row["gaussians"]: f"{row['image_seconds']:.1f} s" for row in rows}
+    sentence = f"takes {seconds[100_000]} with 100,000 Gaussians and {seconds[1_000_000]} with a million, on two cores"
+    assert sentence in " ".join(README.split())
+
+
 def test_readme__names_commands_that_exist():
     known = {get_args(command)[0].__name__.lower() for command in get_args(Command)}
     named = set(re.findall(r"^ {4}morgs-mi (\w+)", README, re.MULTILINE))

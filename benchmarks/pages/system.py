@@ -19,6 +19,7 @@ __all__ = [
     "masks",
     "modelled",
     "seams",
+    "splat_files",
     "stages",
     "steps",
     "surfaces",
@@ -90,6 +91,21 @@ def codec_speed() -> str:
         for row in committed("codec_speed")["rows"]
     )
     return markdown(("Gaussians", "moving", "kB", "encode ms", "decode ms", "error, px RMS", "largest"), rows, left=0)
+
+
+def splat_files() -> str:
+    """Return the times of the commands for files of Gaussians by number of Gaussians."""
+    rows = (
+        (
+            f"{row['gaussians']:,}",
+            f"{row['file_megabytes']:.0f}",
+            *(f"{row[name]:.1f}" for name in ("open_seconds", "first_image_seconds", "image_seconds", "page_seconds")),
+            f"{row['page_megabytes']:.0f}",
+        )
+        for row in committed("splat_files")["rows"]
+    )
+    titles = "Gaussians", "file, MB", "open, s", "first image, s", "image, s", "web page, s", "page, MB"
+    return markdown(titles, rows, left=0)
 
 
 def fuzz() -> str:

@@ -1,7 +1,8 @@
 """Cameras for Gaussians without a recording: a ring around them, from their extent.
 
-Gaussians of other tools have no cameras, and do not state which direction is up. Half of their extent along each axis
-is that of the middle 90 % of the centres, weighted by opacity: floaters and a far background do not count.
+Gaussians of other tools have no cameras, and do not state which direction is up. Their extent along each axis is that
+of the middle 90 % of the centres, weighted by opacity: floaters and a far background do not count. Captured scenes have
+a side from which they were seen: there the images have the most detail.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.render.rasterize import rasterize
 
 __all__ = ["DEFAULT_RIG", "Axes", "default_rig"]
 
@@ -31,6 +33,7 @@ _DIRECTIONS: dict[Axes, tuple[np.ndarray, np.ndarray]] = {
 # Every 45 degrees: orbits treat cameras without a gap of 90 degrees as a full circle.
 _NAMES = ("front", "front-right", "right", "back-right", "back", "back-left", "left", "front-left")
 _WIDTH, _HEIGHT, _FOV_X = 1280, 720, 50.0
+_THUMBNAIL = 240  # width of the images that are compared
 _PERCENT_OUTSIDE = 5.0  # of the weight, on each side
 _MARGIN = 1.1
 _LEAST_EXTENT = 1e-6  # of the distance from the origin
@@ -39,7 +42,8 @@ _LEAST_EXTENT = 1e-6  # of the distance from the origin
 def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Camera, ...]:
     """Return eight cameras on a circle around nearly all Gaussians in these frames, which look at their middle.
 
-    The first one, `front`, looks along the forward axis of the convention.
+    `front` looks along the forward axis of the convention. The first one is where the first frame has the most detail;
+    the others follow counterclockwise, seen from above.
 
     Raises:
         ValueError: there is no Gaussian in any of the frames, or `axes` is unknown.
@@ -58,10 +62,18 @@ def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Cam
     distance = deep + max(wide, tall * _WIDTH / _HEIGHT) / tangent
     center, near = (low + high) / 2, min(0.01, float(distance) / 1000)
     arms = Rotation.from_rotvec(np.linspace(0, 2 * np.pi, len(_NAMES), endpoint=False)[:, None] * up).apply(-forward)
-    return tuple(
+    ring = tuple(
         Camera.look_at(center + distance * arm, center, up, _FOV_X, _WIDTH, _HEIGHT, name, near)
         for name, arm in zip(_NAMES, arms, strict=True)
     )
+    best = int(np.argmax([_detail(frames[0], camera.with_width(_THUMBNAIL)) for camera in ring]))
+    return ring[best:] + ring[:best]
+
+
+def _detail(gaussians: Gaussians, camera: Camera) -> float:
+    """Return the mean difference between neighbouring pixels of a view."""
+    image = np.array(rasterize(gaussians, camera, ("color",)).color).clip(0, 1)
+    return sum(float(np.abs(np.diff(image, axis=axis)).mean()) for axis in (0, 1))
 
 
 def _extent(frames: Sequence[Gaussians]) -> tuple[np.ndarray, np.ndarray, float]:

@@ -10,9 +10,11 @@ from pathlib import Path
 import pytest
 
 from morgs_mi.capture.capture import load_capture
+from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.visualise import write_png
 from morgs_mi.synth.synth_config import SynthConfig
 from morgs_mi.synth.synthesize import synthesize
+from tests.scenes.changing_splats import splats
 
 ROOT = Path(__file__).parents[2]
 # Appended to a command, which then takes seconds.
@@ -22,7 +24,8 @@ SMALLER = {
     "live": "--calibration CAPTURE --frames 2 --loop --first-frame-steps 30 --epochs 1",
     "demo": "--frames 3 --cameras 7",
 }
-PAGES = ("README.md", *(f"docs/{name}.md" for name in ("quickstart", "captures", "cameras", "colours", "checks")))
+GUIDES = ("quickstart", "splat-files", "captures", "cameras", "colours", "checks")
+PAGES = ("README.md", *(f"docs/{name}.md" for name in GUIDES))
 # Commands that never end, or write outside of the folder.
 LEFT_OUT = ("morgs-mi view", "morgs-mi --completion")
 
@@ -44,6 +47,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
         shutil.copy(folder / "CAPTURE" / f"{name}.mp4", folder / "FOLDER")
         write_png(folder / "PHOTOS" / f"{name}.png", image)
     shutil.copytree(folder / "CAPTURE", folder / "my_capture")
+    write_ply(folder / "scene.ply", splats(degree=3))
     return folder
 
 

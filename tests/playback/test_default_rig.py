@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.playback.default_rig import default_rig
 from tests.assertions import assert_close
 from tests.scenes.changing_splats import splats
@@ -24,8 +25,26 @@ def test_default_rig__sees_the_gaussians_upright_from_all_sides(axes, up):
         assert max(np.ptp(pixels, axis=0) / [camera.width, camera.height]) > 0.45
     arms = np.stack([camera.position - cameras[0].position for camera in cameras])
     assert_close(arms @ up, np.zeros(8), atol=1e-12)
-    right = cameras[[camera.name for camera in cameras].index("right")]
-    assert (right.position - cameras[4].position) @ cameras[0].viewmat[0, :3] > 1  # on the right of the front view
+    named = {camera.name: camera for camera in cameras}
+    across = (named["right"].position - named["left"].position) @ named["front"].viewmat[0, :3]
+    assert across > 1
+
+
+@pytest.mark.parametrize("side", ["front", "right", "back-left"])
+def test_default_rig__begins_where_the_scene_has_detail(side):
+    toward = next(camera for camera in default_rig([splats(1)]) if camera.name == side).viewmat[2, :3]
+    steps = np.stack(np.meshgrid(np.linspace(-1, 1, 21), np.linspace(-1, 1, 21)), axis=-1).reshape(-1, 2)
+    sheet = steps[:, :1] * np.cross(toward, (0, 1, 0)) + steps[:, 1:] * (0, 1, 0)
+    colors = np.random.default_rng(0).uniform(-1.5, 1.5, (len(sheet), 1, 3))
+    # A picture with a grey wall behind it.
+    scene = Gaussians.from_activated(
+        means=np.concatenate([sheet, sheet + 0.4 * toward]),
+        scales=np.repeat([0.04, 0.15], len(sheet))[:, None] * np.ones(3),
+        quats=np.tile([1.0, 0, 0, 0], (2 * len(sheet), 1)),
+        opacities=np.full(2 * len(sheet), 0.99),
+        sh_coeffs=np.concatenate([colors, 0 * colors]),
+    )
+    assert default_rig([scene])[0].name == side
 
 
 def test_default_rig__ignores_far_floaters_and_what_is_nearly_transparent():
@@ -35,7 +54,8 @@ def test_default_rig__ignores_far_floaters_and_what_is_nearly_transparent():
     means[:3] *= 1e4
     means[100:150], logits[100:150] = 50, -8
     shown = replace(scene, means=means, logit_opacities=logits)
-    assert_close(default_rig([shown])[0].position, default_rig([scene])[0].position, atol=0.5)
+    positions = ({camera.name: camera.position for camera in default_rig([found])} for found in (shown, scene))
+    assert_close(*(np.stack([found[name] for name in sorted(found)]) for found in positions), atol=0.5)
 
 
 def test_default_rig__sees_a_single_gaussian():

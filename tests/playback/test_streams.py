@@ -129,7 +129,7 @@ def test_commands__name_what_is_no_file_of_gaussians(tmp_path, run, content, mes
     ("args", "message"),
     [
         (("a.png", "--path", "orbit"), "a.png: expected one image for one file, got 150; name a folder"),
-        (("--camera", "top"), "one of front, front-right, right,"),
+        (("--camera", "top"), "the camera must be an index in 0..7 or one of"),
         (("--camera", "0", "--path", "orbit"), "expected --camera or --path, got both"),
         (("--degrees", "0"), "--degrees must be 1 to 360, got 0"),
         (("--width", "0"), "--width must be a number in [1, inf), got 0"),
