@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from math import log2, sqrt
 from typing import Any
 
@@ -88,8 +89,9 @@ class Splats:
             return splats.shape, blended, *culled, splats.profile, () if splats.view is None else splats.view
 
         shape, blended, *culled, profile, view = concatenated(columns_of(self), columns_of(other))
-        channels = dict(zip(self.channels, blended, strict=True))
-        return Splats(shape, channels, *culled, profile, None if self.view is None else view)
+        channels, (depths, extent, valid, finite) = dict(zip(self.channels, blended, strict=True)), culled
+        view = None if self.view is None else view
+        return Splats(shape, channels, depths, extent, valid, finite, profile, view)
 
 
 def _zeros(columns: tuple[Float, ...], count: int) -> tuple[Float, ...]:
@@ -227,15 +229,16 @@ def _pose(camera: Camera | Views) -> tuple[list[list[Float]], list[list[Float]],
     All are Dr.Jit floats, of width 1 for one camera, and attached to the gradient of a Dr.Jit `viewmat`.
     """
     if isinstance(camera, Views):
-        flat, first = (
-            from_numpy(mi.Float64, np.stack([np.asarray(c.viewmat) for c in camera.cameras])),
-            camera.view * 16,
-        )
+        memory = from_numpy(mi.Float64, np.stack([np.asarray(c.viewmat) for c in camera.cameras]))
+        numbers = [dr.gather(mi.Float64, memory, camera.view * 16 + k) for k in range(12)]
     else:
         viewmat: Tensor = camera.viewmat
-        first = mi.UInt32(0)
-        flat = mi.Float64(viewmat.array) if dr.is_tensor_v(viewmat) else from_numpy(mi.Float64, viewmat)
-    rows = [[dr.gather(mi.Float64, flat, first + (4 * i + k)) for k in range(4)] for i in range(3)]
+        if dr.is_tensor_v(viewmat):
+            memory = mi.Float64(viewmat.array)
+            numbers = [dr.gather(mi.Float64, memory, mi.UInt32(k)) for k in range(12)]
+        else:
+            numbers = _numbers(mi.Float64, tuple(np.asarray(viewmat, float).flat[:12]))
+    rows = [list(numbers[4 * i : 4 * i + 4]) for i in range(3)]
     eye = [-sum(row[k] * row[3] for row in rows) for k in range(3)]
     return [[mi.Float(v) for v in row[:3]] for row in rows], rows, eye
 
@@ -249,9 +252,16 @@ def _intrinsics(camera: Camera | Views) -> list[Float]:
         values = [_numbers_of(c) for c in camera.cameras]
         memory, first = from_numpy(mi.Float, values), camera.view * len(values[0])
         return [dr.gather(mi.Float, memory, first + i) for i in range(len(values[0]))]
-    values = _numbers_of(camera)
-    memory = from_numpy(mi.Float, values)
-    return [dr.gather(mi.Float, memory, mi.UInt32(i)) for i in range(len(values))]
+    return list(_numbers(mi.Float, tuple(_numbers_of(camera))))
+
+
+@lru_cache(maxsize=1024)  # the views of a rig are projected to again and again
+def _numbers(kind: type[Jit], values: tuple[float, ...]) -> tuple[Jit, ...]:
+    """Return numbers in memory, each an array of width 1."""
+    memory = from_numpy(kind, values)
+    found = tuple(dr.gather(kind, memory, mi.UInt32(i)) for i in range(len(values)))
+    dr.eval(found)
+    return found
 
 
 def _numbers_of(camera: Camera) -> list[float]:
