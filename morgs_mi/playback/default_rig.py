@@ -8,6 +8,7 @@ a side from which they were seen: there the images have the most detail.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -33,7 +34,7 @@ _DIRECTIONS: dict[Axes, tuple[np.ndarray, np.ndarray]] = {
 # Every 45 degrees: orbits treat cameras without a gap of 90 degrees as a full circle.
 _NAMES = ("front", "front-right", "right", "back-right", "back", "back-left", "left", "front-left")
 _WIDTH, _HEIGHT, _FOV_X = 1280, 720, 50.0
-_THUMBNAIL = 240  # width of the images that are compared
+_THUMBNAIL, _MOST = 240, 30_000  # width of the images that are compared, and Gaussians in them
 _PERCENT_OUTSIDE = 5.0  # of the weight, on each side
 _MARGIN = 1.1
 _LEAST_EXTENT = 1e-6  # of the distance from the origin
@@ -66,8 +67,16 @@ def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Cam
         Camera.look_at(center + distance * arm, center, up, _FOV_X, _WIDTH, _HEIGHT, name, near)
         for name, arm in zip(_NAMES, arms, strict=True)
     )
-    best = int(np.argmax([_detail(frames[0], camera.with_width(_THUMBNAIL)) for camera in ring]))
+    some = _thinned(frames[0])
+    best = int(np.argmax([_detail(some, camera.with_width(_THUMBNAIL)) for camera in ring]))
     return ring[best:] + ring[:best]
+
+
+def _thinned(gaussians: Gaussians) -> Gaussians:
+    """Return every k-th Gaussian, at most 30,000, enlarged to cover the same area."""
+    k = len(gaussians) // _MOST + 1
+    some = gaussians.select(np.arange(0, len(gaussians), k))
+    return replace(some, log_scales=some.log_scales + 0.5 * np.log(k))
 
 
 def _detail(gaussians: Gaussians, camera: Camera) -> float:
