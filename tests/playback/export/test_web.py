@@ -24,6 +24,7 @@ from morgs_mi.codec.packets import CodedFrame, coded_frames, reemitted_keyframe,
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.io.ply import write_ply
 from morgs_mi.playback.export.notebook import stream_html
 from morgs_mi.playback.export.web import text_of_bytes, write_web_folder, write_web_page
 from morgs_mi.playback.player import channel_image, render, render_config
@@ -464,6 +465,24 @@ def test_page__draws_orbits_back_farther_to_cameras_without_neighbours(browser, 
     write_web_page(open_stream(tmp_path), tmp_path / "page.html")
     with Page(browser, (tmp_path / "page.html").as_uri() + "#pause") as page:
         assert drag(page, -20, cameras) == pytest.approx(4, abs=0.2)
+
+
+def test_page__shows_a_file_of_gaussians_and_orbits_freely(browser, tmp_path):
+    write_ply(tmp_path / "scene.ply", splats(degree=3))
+    stream = open_stream(tmp_path / "scene.ply")
+    write_web_page(stream, tmp_path / "page.html")
+    (state,) = coded_frames(stream)
+    camera = stream.cameras[0].with_width(WIDTH)  # the page shows more of the scene above and below
+    K = camera.K.copy()
+    K[1, 2] = HEIGHT / 2
+    camera = replace(camera, K=K, height=HEIGHT)
+    with Page(browser, (tmp_path / "page.html").as_uri()) as opened:
+        image = render(state.gaussians, camera, ("color",), render_config(stream))["color"]
+        assert psnr(opened.image() / 255, channel_image("color", image) / 255) > 40
+        assert opened.page.evaluate("player.view.bounded") is False
+        shown = [opened.page.locator(f"#{name}").is_visible() for name in ("slider", "speed", "loop", "camera", "full")]
+        assert shown == [False, False, False, True, True]
+        assert opened.errors == []
 
 
 def test_page__is_operated_by_keyboard(page):
