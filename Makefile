@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 WEB_PLAYER ?= morgs_mi/playback/export/web_player
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-slow test-long lint docs web setup clean
+.PHONY: demo test test-slow test-long lint docs web wheel setup clean
 
 demo: setup
 	$(BIN)/morgs-mi demo out/demo
@@ -31,6 +31,10 @@ docs: setup
 # Needs Node.js 20 or newer. The result is part of the repository, so nothing else does.
 web:
 	cd web && npm ci --no-audit --no-fund && npm run build -- "$(abspath $(WEB_PLAYER))"
+
+# sdist and wheel in dist/; the wheel is installed and checked in a new environment outside of the checkout.
+wheel: setup
+	tools/check_wheel.sh $(BIN)/python
 
 # LLVM is checked every time: it is outside the environment, and finding it takes 50 ms.
 setup: $(STAMP)

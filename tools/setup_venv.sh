@@ -12,7 +12,7 @@ fi
 recent() { "$1" -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null; }
 if ! recent "$python"; then
     # Ubuntu 22.04 has 3.10 as python3 and 3.11 beside it.
-    for candidate in python3.13 python3.12 python3.11; do
+    for candidate in python3.14 python3.13 python3.12 python3.11; do
         recent "$candidate" && break
     done
     if ! recent "$candidate"; then

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import math
 import os
@@ -12,6 +11,11 @@ from collections.abc import Generator, Iterable, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
+
+try:
+    import fcntl
+except ImportError:  # Windows, where folders are not locked
+    fcntl = None
 
 __all__ = ["atomic_folder", "atomic_path", "is_same_file", "json_finite", "locked_folder", "write_error", "write_json"]
 
@@ -141,7 +145,8 @@ def write_error(start: str, error: Exception, own: Path) -> OSError:
 def _locked(file: int) -> bool:
     """Lock an open file and return whether that succeeded; it fails if another process holds the lock."""
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if fcntl is not None:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         return False
     except OSError:  # a file system without locks
@@ -169,6 +174,8 @@ def _left_behind(final: Path) -> list[Path]:
 
 
 def _alive(process: int) -> bool:
+    if os.name == "nt":  # signal 0 would interrupt this process there
+        return True
     try:
         os.kill(process, 0)
     except (ProcessLookupError, OverflowError):
