@@ -1,0 +1,121 @@
+"""The page for users of other tools: its commands run on a small recording in the folder of each of them."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
+from morgs_mi.core.camera import Camera
+from morgs_mi.io.ply import write_ply
+from morgs_mi.playback.visualise import write_png
+from morgs_mi.synth.synth_config import SynthConfig
+from morgs_mi.synth.synthesize import synthesize
+from tests.scenes.changing_splats import splats
+
+PAGE = (Path(__file__).parents[2] / "docs/coming-from.md").read_text(encoding="utf-8")
+COMMANDS = re.findall(r"^    ((?:morgs-mi|ln) .*)$", PAGE, re.MULTILINE)
+QUICK = "--num-gaussians 400 --first-frame-steps 20 --epochs 1"
+CAMERAS, FRAMES = 7, 2
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory) -> Capture:
+    folder = tmp_path_factory.mktemp("recording") / "spheres"
+    synthesize("spheres", folder, SynthConfig(cameras=CAMERAS, frames=FRAMES, width=320, height=240, spp=8))
+    return load_capture(folder)
+
+
+def write_images(recording: Capture, name: str) -> None:
+    """Write the images under names with {camera}, {frame} and {number}, which counts from 1."""
+    for frame in recording.frames():
+        for camera, image in zip(recording.names, frame.images, strict=True):
+            write_png(Path(name.format(camera=camera, frame=frame.index, number=frame.index + 1)), image)
+
+
+def dynerf(recording: Capture) -> None:
+    write_images(recording, "dynerf/SCENE/{camera}/images/{frame:04d}.png")
+    bounds = np.tile([1.0, 9.0], (CAMERAS, 1))
+    write_poses_bounds("dynerf/SCENE/poses_bounds.npy", recording.cameras, bounds)
+
+
+def multipleview(recording: Capture) -> None:
+    write_images(recording, "multipleview/SCENE/{camera}/frame_{number:05d}.png")
+    # As 4DGaussians' script names them: in no particular order.
+    other = [Camera(c.K, c.viewmat, c.width, c.height, f"image{i + 1}") for i, c in enumerate(recording.cameras[::-1])]
+    write_colmap("multipleview/SCENE/sparse_", other, recording.points)
+
+
+def dynamic3dgs(recording: Capture) -> None:
+    write_images(recording, "dynamic3dgs/SCENE/ims/{camera}/{frame:06d}.png")
+
+    def meta(cameras: list[Camera]) -> str:
+        names = [[f"{camera.name}/{t:06d}.png" for camera in cameras] for t in range(FRAMES)]
+        entries = {
+            "k": [[camera.K.tolist() for camera in cameras]] * FRAMES,
+            "w2c": [[np.asarray(camera.viewmat).tolist() for camera in cameras]] * FRAMES,
+            "cam_id": [[camera.name for camera in cameras]] * FRAMES,
+        }
+        return json.dumps({"w": cameras[0].width, "h": cameras[0].height, "fn": names, **entries})
+
+    Path("dynamic3dgs/SCENE/train_meta.json").write_text(meta(list(recording.cameras[1:])))
+    Path("dynamic3dgs/SCENE/test_meta.json").write_text(meta(list(recording.cameras[:1])))
+    points = np.concatenate([recording.points, recording.point_colors, np.ones((len(recording.points), 1))], axis=1)
+    np.savez("dynamic3dgs/SCENE/init_pt_cld.npz", data=points)
+
+
+def stream3dgs(recording: Capture) -> None:
+    write_images(recording, "3dgstream/SCENE/frame{frame:06d}/images/{camera}.png")
+    for frame in range(FRAMES):
+        write_colmap(f"3dgstream/SCENE/frame{frame:06d}/sparse/0", recording.cameras, recording.points)
+
+
+def nerfstudio(recording: Capture) -> None:
+    first = next(iter(recording.frames()))
+    entries = []
+    for i, (camera, image) in enumerate(zip(recording.cameras, first.images, strict=True), start=1):
+        for folder in ("images", "images_2"):
+            write_png(Path(f"nerfstudio/SCENE/{folder}/frame_{i:05d}.png"), image)
+        pose = np.linalg.inv(np.asarray(camera.viewmat)) @ np.diag([1, -1, -1, 1])
+        entries.append({"file_path": f"images/frame_{i:05d}.png", "transform_matrix": pose.tolist()})
+    (fx, _, cx), (_, fy, cy), _ = recording.cameras[0].K.tolist()
+    intrinsics = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": 320, "h": 240}
+    meta = {"camera_model": "OPENCV", **intrinsics, "frames": entries}
+    Path("nerfstudio/SCENE/transforms.json").write_text(json.dumps(meta))
+
+
+@pytest.mark.slow
+def test_coming_from__commands_run_on_the_folders_of_the_tools(recording, tmp_path, run, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for write in (dynerf, multipleview, dynamic3dgs, stream3dgs, nerfstudio):
+        write(recording)
+    write_ply("splat.ply", splats())
+    os.mkdir("out")
+    frames, outputs = {}, {}
+    for command in COMMANDS:
+        name, *rest = shlex.split(command)
+        if name == "ln":
+            subprocess.run([name, *rest], check=True)
+            continue
+        status, output, error = run(*rest, *(shlex.split(QUICK) if rest[0] == "fit" else ()))
+        assert status == 0, f"{command}\n{error}"
+        outputs[rest[0]] = output
+        if rest[0] == "fit":
+            frames[rest[2]] = len(json.loads(Path(rest[2], "report.json").read_text())["frames"])
+    assert frames.pop("out/nerfstudio") == 1
+    assert frames == {f"out/{name}": FRAMES for name in ("dynerf", "multipleview", "dynamic3dgs", "3dgstream")}
+    assert "Views between the cameras" in outputs["info"]
+
+
+def test_coming_from__names_a_command_for_each_tool():
+    assert len([command for command in COMMANDS if command.startswith("morgs-mi fit")]) == 5
+    assert "Views between the cameras will be poor: 4 cameras" in PAGE
