@@ -157,7 +157,8 @@ class Flight:
         frames = frame_numbers(stream)
         if self.freeze is not None and self.freeze not in frames:
             raise ValueError(f"--freeze must be in {frames[0]} to {frames[-1]}, got {self.freeze}.")
-        path = named_path(stream, self.path, self.degrees, self.least_seconds).with_width(self.width)
+        path = named_path(stream, self.path, self.degrees, self.least_seconds)
+        path = path if self.width is None else path.with_width(self.width)
         path = path if self.seconds is None else path.with_duration(self.seconds)
         output, _ = destination(stream.path, self.output, VIDEO, stem=Path(self.path).stem)
         count = num_images(stream, path)

@@ -17,6 +17,7 @@ from morgs_mi.playback.export.formats import IMAGES, destination
 if TYPE_CHECKING:
     from morgs_mi.codec.reader import StreamReader
     from morgs_mi.core.camera import Camera
+    from morgs_mi.playback.export.paths import CameraPath
 
 __all__ = ["Render"]
 
@@ -58,7 +59,11 @@ class Render:
     degrees: Annotated[float | None, DisallowNone, optional("FLOAT")] = None
     """Angle of an orbit, 1 to 360; by default the extent of the rig, and 60 for a file of Gaussians."""
     width: Annotated[int | None, DisallowNone, optional("INT")] = None
-    """Width of the images, at the same aspect ratio; by default that of the camera."""
+    """Width of the images; by default that of the camera, and 2048 for equirectangular ones."""
+    projection: Literal["perspective", "equirectangular"] = "perspective"
+    """Projection: perspective, or equirectangular, all around the camera with a level horizon."""
+    stereo: float = 0.0
+    """Distance of two eyes in world units, for equirectangular images, the left one above the right; 0: one eye."""
     format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(("mp4", "png", "exr"))] = None
     """Format: mp4, png or exr; by default by the name of the output."""
     channels: Annotated[tuple[ChannelName, ...] | None, DisallowNone, optional("NAME ...", text=_CHANNELS)] = None
@@ -75,34 +80,60 @@ class Render:
     shadows and reflections."""
 
     def run(self) -> None:
-        from morgs_mi.playback.export.clips import flight, frame_numbers, named_path, num_images
+        from morgs_mi.playback.export.clips import frame_numbers, named_path, num_images
         from morgs_mi.playback.export.frames import write_images
-        from morgs_mi.playback.player import find_camera, render_stream
+        from morgs_mi.playback.player import find_camera
         from morgs_mi.playback.streams import open_stream
 
-        if self.camera is not None and self.path is not None:
-            raise ValueError(f"expected --camera or --path, got both, {self.camera} and {self.path}; leave out one.")
-        if self.insert is None and self.at is not None:
-            raise ValueError("--at selects frames of an inserted scene, got no scene; add --insert FILE.")
+        self._check()
         stream = open_stream(self.out)
         view = find_camera(stream, 0 if self.camera is None else self.camera)
-        view = view if self.width is None else view.with_width(self.width)
         stem = Path(self.path or "orbit").stem if self.camera is None and self.insert is None else view.name
         output, chosen = destination(stream.path, self.output, IMAGES, self.format, stem)
-        count, single = len(frame_numbers(stream)), chosen.folder and chosen.is_file(output)
-        channels = self.channels or (None if chosen.name == "exr" else ("color",))
+        single = chosen.folder and chosen.is_file(output)
         if self.insert is not None:
             images, count = self._inserted(stream, view, chosen.name)
         elif self.camera is not None or (self.path is None and single):
-            images = render_stream(stream, view, channels)
+            images, count = self._seen(stream, view, chosen.name), len(frame_numbers(stream))
         else:
-            path = named_path(stream, self.path or "orbit", self.degrees).with_width(self.width)
-            images, count = flight(stream, path, channels), num_images(stream, path)
+            path = named_path(stream, self.path or "orbit", self.degrees)
+            images, count = self._seen(stream, path, chosen.name), num_images(stream, path)
         if single and count > 1:
             raise ValueError(f"{output}: expected one image for one file, got {count}; name a folder.")
         with progress() as report:
             write_images(images, stream.fps, output, lambda done: report("Rendering", done, count), chosen.name)
-        print_result(f"{output}: {count} {'image' if count == 1 else 'images'}, {view.width}x{view.height}.")
+        print_result(f"{output}: {count} {'image' if count == 1 else 'images'}.")
+
+    def _check(self) -> None:
+        """Refuse options that exclude each other."""
+        if self.camera is not None and self.path is not None:
+            raise ValueError(f"expected --camera or --path, got both, {self.camera} and {self.path}; leave out one.")
+        if self.insert is None and self.at is not None:
+            raise ValueError("--at selects frames of an inserted scene, got no scene; add --insert FILE.")
+        if self.insert is not None and self.camera is None:
+            raise ValueError("--insert renders for one camera, got none; add --camera CAMERA.")
+        if self.projection == "perspective":
+            if self.stereo:
+                raise ValueError("--stereo is for equirectangular images; add --projection equirectangular.")
+        elif self.insert is not None or self.channels not in (None, ("color",)):
+            raise ValueError("--projection equirectangular renders the colour of a stream alone; leave out the others.")
+
+    def _seen(
+        self, stream: StreamReader, view: Camera | CameraPath, format: str
+    ) -> Iterator[tuple[int, dict[str, Any]]]:
+        """Return the rendered images of a camera or along a path."""
+        from morgs_mi.core.camera import Camera
+        from morgs_mi.playback.export.clips import flight
+        from morgs_mi.playback.export.panorama import panoramas
+        from morgs_mi.playback.player import render_stream
+
+        if self.projection == "equirectangular":
+            return panoramas(stream, view, 2048 if self.width is None else self.width, self.stereo)
+        view = view if self.width is None else view.with_width(self.width)
+        channels = self.channels or (None if format == "exr" else ("color",))
+        if isinstance(view, Camera):
+            return render_stream(stream, view, channels)
+        return flight(stream, view, channels)
 
     def _inserted(
         self, stream: StreamReader, view: Camera, format: str
@@ -117,8 +148,8 @@ class Render:
             selected,
         )
 
-        if self.insert is None or self.camera is None:
-            raise ValueError("--insert renders for one camera, got none; add --camera CAMERA.")
+        assert self.insert is not None
+        view = view if self.width is None else view.with_width(self.width)
         frames = frame_numbers(stream) if self.at is None else selected(stream, self.at)
         channels = self.channels or (inserted_channels(stream) if format == "exr" else ("color",))
         config = InsertConfig(self.samples, self.shadows, self.light)

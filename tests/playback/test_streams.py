@@ -85,7 +85,7 @@ def test_render__draws_a_file_of_gaussians(tmp_path, run, text):
     data.write(str(tmp_path / "scene.ply"))
     stream = open_stream(tmp_path / "scene.ply")
     status, output, _ = run("render", stream.path, tmp_path / "a.png", "--width", 64)
-    assert (status, output) == (0, f"{tmp_path}/a.png: 1 image, 64x36.\n")
+    assert (status, output) == (0, f"{tmp_path}/a.png: 1 image.\n")
     image = np.array(rasterize(read_splats(stream.path), stream.cameras[0].with_width(64)).color)
     assert_close(cv2.imread(str(tmp_path / "a.png"))[..., ::-1] / 255, image.clip(0, 1), atol=0.5 / 255 + 1e-4)
     assert run("render", stream.path, tmp_path / "a.exr", "--width", 64, "--camera", "right")[0] == 0
@@ -96,7 +96,7 @@ def test_render__orbits_a_file_of_gaussians(tmp_path, run):
     write_ply(tmp_path / "scene.ply", splats())
     assert run("render", tmp_path / "scene.ply", "--width", 32)[:2] == (
         0,
-        f"{tmp_path}/orbit.mp4: 150 images, 32x18.\n",
+        f"{tmp_path}/orbit.mp4: 150 images.\n",
     )
     path = tmp_path / "still.json"
     path.write_text('{"keys": [{"time": 0, "camera": "left"}, {"time": 0.1, "camera": "back-left"}]}')
@@ -133,6 +133,10 @@ def test_commands__name_what_is_no_file_of_gaussians(tmp_path, run, content, mes
         (("--camera", "0", "--path", "orbit"), "expected --camera or --path, got both"),
         (("--degrees", "0"), "--degrees must be 1 to 360, got 0"),
         (("--width", "0"), "--width must be a number in [1, inf), got 0"),
+        (("--stereo", "0.1"), "--stereo is for equirectangular images; add --projection equirectangular"),
+        (("--projection", "equirectangular", "--width", "63"), "--width must be even and at least 2, got 63"),
+        (("--projection", "equirectangular", "--channels", "depth"), "renders the colour of a stream alone"),
+        (("--projection", "equirectangular", "--stereo", "-1"), "--stereo must be a number in [0, inf), got -1"),
         (("--insert", "no.py"), "--insert renders for one camera, got none; add --camera CAMERA"),
     ],
 )

@@ -10,6 +10,7 @@ import numpy as np
 
 from morgs_mi.codec.packets import CodedFrame, frames_near, play, seek
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_folder, atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.playback.default_rig import DEFAULT_RIG
@@ -18,6 +19,7 @@ from morgs_mi.playback.player import available_channels, render, render_config
 
 __all__ = [
     "flight",
+    "flight_views",
     "frame_numbers",
     "named_path",
     "num_images",
@@ -129,10 +131,22 @@ def flight(
     Raises:
         ValueError: an unknown channel, or a broken packet.
     """
+    config = render_config(stream)
+    for i, gaussians, camera in flight_views(stream, path, clip):
+        yield i, render(gaussians, camera, channels or available_channels(gaussians), config)
+
+
+def flight_views(
+    stream: StreamReader, path: CameraPath, clip: Iterator[Gaussians] | None = None
+) -> Iterator[tuple[int, Gaussians, Camera]]:
+    """Yield the number, the Gaussians and the camera of each image of `flight`.
+
+    Raises:
+        ValueError: the stream has no frame, or a packet is broken.
+    """
     frame_numbers(stream)
-    config, clip = render_config(stream), clip or repeated_frames(stream)
-    for i, gaussians in zip(range(num_images(stream, path)), clip, strict=False):
-        yield i, render(gaussians, path.at(i / stream.fps), channels or available_channels(gaussians), config)
+    frames = zip(range(num_images(stream, path)), clip or repeated_frames(stream), strict=False)
+    return ((i, gaussians, path.at(i / stream.fps)) for i, gaussians in frames)
 
 
 def num_images(stream: StreamReader, path: CameraPath) -> int:

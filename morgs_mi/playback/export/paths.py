@@ -62,13 +62,13 @@ class CameraPath:
         """Duration of the path."""
         return float(self.times[-1])
 
-    def with_width(self, width: int | None) -> CameraPath:
-        """Return the same path with images of another width and the same aspect ratio; None changes nothing.
+    def with_width(self, width: int) -> CameraPath:
+        """Return the same path with images of another width and the same aspect ratio.
 
         Raises:
             ValueError: `width` is below 1.
         """
-        return self if width is None else replace(self, keys=tuple(key.with_width(width) for key in self.keys))
+        return replace(self, keys=tuple(key.with_width(width) for key in self.keys))
 
     def at(self, time: float) -> Camera:
         """Return the view at a time in seconds; before the first and after the last key, that key."""
