@@ -18,6 +18,8 @@ __all__ = [
     "mask_fits",
     "masks",
     "modelled",
+    "peer_photos",
+    "peers",
     "seams",
     "splat_files",
     "stages",
@@ -225,3 +227,24 @@ def surfaces() -> str:
         for row in committed("surfaces_speed")["scenes"]
     )
     return markdown(("Gaussians, view", "splats", "surfaces", "both", "ratio to the sum", "shadow"), rows)
+
+
+def peers() -> str:
+    """Return the time of a step of this package and of peers, and the difference of their gradients."""
+    found = committed("peers_steps")
+    programs = ("ours", "ydah kernels", "volprim_rf_basic", "gsplat, PyTorch")
+    rows = []
+    for name, scene in {**found["scenes"], "300 Gaussians, 96x72": found["small"]}.items():
+        times = [f"{scene['ms'][p]:.1f} ms" if p in scene["ms"] else "not run" for p in programs]
+        rows.append((name, *times, f"{max(scene['gradients'].values()):.0e}"))
+    titles = "ours", "kernels of ydah/gsplat", "`volprim_rf_basic`", "gsplat, PyTorch", "gradients differ by"
+    return markdown(("", *titles), rows)
+
+
+def peer_photos() -> str:
+    """Return the held-out PSNR of OpenSplat and of this package over the seconds."""
+    rows = [
+        (f"`{fit['capture']}`", fit["program"], str(fit["seconds"]), f"{fit['gaussians']:,}", f"{fit['psnr']:.1f}")
+        for fit in committed("peers_photos")["fits"]
+    ]
+    return markdown(("photos", "program", "s", "Gaussians", "held out, dB"), rows)

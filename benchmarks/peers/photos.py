@@ -22,6 +22,7 @@ from typing import Annotated, Any
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+import pycolmap
 import tyro
 
 from benchmarks.speed.output import Output
@@ -62,15 +63,19 @@ def opensplat(path: Path, capture: Capture, options: Options) -> Iterator[dict[s
     """Yield a row of seconds, step, Gaussians and PSNR at each budget."""
     (test,) = set(range(len(capture.cameras))) - set(capture.train_views)
     with tempfile.TemporaryDirectory() as name:
-        out = Path(name) / "splat.ply"
-        command = [options.folder / "OpenSplat" / "build" / "opensplat", path, "-o", out, "-n", "30000", "--cpu"]
+        project, out = as_binary_project(path, Path(name) / "project"), Path(name) / "splat.ply"
+        command = [options.folder / "OpenSplat" / "build" / "opensplat", project, "-o", out, "-n", "30000", "--cpu"]
         command += ["-s", str(_SAVE_EVERY), "-d", str(options.downscale), "--val"]
         command += ["--val-image", next(p.name for p in sorted(path.glob(f"{capture.cameras[test].name}.*")))]
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
             try:
                 for seconds in options.seconds:
                     while (spent := processor_seconds(process.pid)) < seconds:
                         time.sleep(0.5)
+                        if process.poll() is not None:
+                            raise SystemExit(
+                                f"{command[0]}: expected a fit of {seconds} s, got exit {process.returncode}."
+                            )
                     stored = sorted(Path(name).glob("splat_*.ply"), key=lambda p: int(p.stem.split("_")[1]))
                     if stored:
                         gaussians, step = read_ply(stored[-1]), int(stored[-1].stem.split("_")[1])
@@ -78,6 +83,14 @@ def opensplat(path: Path, capture: Capture, options: Options) -> Iterator[dict[s
                         yield {"seconds": round(spent), "steps": step, "gaussians": len(gaussians), "psnr": psnr}
             finally:
                 process.kill()
+
+
+def as_binary_project(path: Path, folder: Path) -> Path:
+    """Write the poses of a capture as binary files, with its photos in `images`, and return the folder."""
+    (folder / "sparse" / "0").mkdir(parents=True)
+    (folder / "images").symlink_to(path.resolve())
+    pycolmap.Reconstruction(path / "sparse" / "0").write_binary(folder / "sparse" / "0")
+    return folder
 
 
 def processor_seconds(pid: int) -> float:
