@@ -7,7 +7,19 @@ import numpy as np
 from benchmarks.pages.results import Scores, committed
 from benchmarks.reports.plots import Column, grouped, markdown, means_over, scores_table
 
-__all__ = ["demo", "drift", "early_stop", "field", "frame_stages", "frame_times", "gains", "parts", "search", "unseen"]
+__all__ = [
+    "demo",
+    "drift",
+    "early_stop",
+    "field",
+    "frame_stages",
+    "frame_times",
+    "gains",
+    "momentum",
+    "parts",
+    "search",
+    "unseen",
+]
 
 
 def demo() -> str:
@@ -136,6 +148,16 @@ def early_stop() -> str:
         means = (f"{factor * np.mean([fit[name] for fit in own]):.{digits}f}" for name, factor, digits in columns)
         rows.append(("never" if not tolerance else f"falls by less than {tolerance:.0%}", *means))
     return markdown(("ends early if the objective", "PSNR, dB", "moving", "kB", "epochs, %", "processor time, s"), rows)
+
+
+def momentum() -> str:
+    """Return the scores of later frames by the momentum of Adam, means over the scenes."""
+    fits = [fit for fit in committed("steps")["fits"] if fit["fit_seed"] > 0]
+    columns, rows = (("psnr", 1, 2), ("psnr_moving", 1, 2), ("bytes", 1e-3, 1), ("cpu_s", 1, 2)), []
+    for (epochs, value), own in sorted(grouped(fits, "epochs", "momentum").items(), key=lambda item: item[0]):
+        means = (f"{factor * np.mean([fit[name] for fit in own]):.{digits}f}" for name, factor, digits in columns)
+        rows.append((f"{epochs}", f"{value:.2f}", *means))
+    return markdown(("epochs", "momentum", "PSNR, dB", "moving", "kB", "processor time, s"), rows)
 
 
 _STAGES = {

@@ -153,7 +153,7 @@ class _Fit:
             shared = MotionProblem(self._base, problem.active.views, problem.targets, self._rng)
             weight = self._config.objective.dssim_weight
             start, self.losses = fit_motion(shared, model, start, self._next_steps(epochs), weight)
-        self._optimizer = adam(residual_parameters(self._base, motion, start))
+        self._optimizer = adam(residual_parameters(self._base, motion, start), self._config.momentum)
         return epochs
 
     def run_epoch(self, epoch: int) -> None:

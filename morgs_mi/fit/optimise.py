@@ -20,10 +20,15 @@ __all__ = ["Losses", "Steps", "adam", "optimise", "replace_parameter", "values_o
 Losses = dict[str, Tensor]
 
 
-def adam(parameters: Mapping[str, Tensor]) -> Adam:
-    """Return Adam with these tensors, by name, at their start values."""
+def adam(parameters: Mapping[str, Tensor], momentum: float = 0.9) -> Adam:
+    """Return Adam with these tensors, by name, at their start values.
+
+    Args:
+        parameters: the tensors.
+        momentum: decay of the mean of the gradients from step to step (beta_1).
+    """
     # Gradients of means over a million pixels are tiny: Adam's usual epsilon of 1e-8 would dominate them.
-    return Adam(lr=1.0, params=dict(parameters), epsilon=1e-15)
+    return Adam(lr=1.0, params=dict(parameters), beta_1=momentum, epsilon=1e-15)
 
 
 def values_of(optimizer: Mapping[str, Tensor]) -> dict[str, Tensor]:

@@ -40,6 +40,20 @@ def test_optimise__steps_are_as_long_as_the_rate():
     assert_close(np.diff(path), np.full(11, -0.5), rtol=1e-3)
 
 
+@pytest.mark.parametrize(("momentum", "needed"), [(0.9, 3), (0.5, 1)])
+def test_adam__momentum_delays_a_reversal(momentum, needed):
+    """With less momentum, fewer opposite gradients reverse the steps."""
+    optimizer, path = adam({"x": mi.TensorXf(np.zeros(1, np.float32))}, momentum), [0.0]
+
+    def slope(values, view):
+        return {"slope": (1 if view else -1) * dr.sum(values["x"], axis=None)}
+
+    for view in [0] * 4 + [1] * 6:
+        optimise(optimizer, {"x": 1.0}, slope, Steps([view]))
+        path.append(np.asarray(values_of(optimizer)["x"]).item())
+    assert int(np.argmax(np.diff(path) < 0)) - 3 == needed
+
+
 def test_optimise__names_losses_that_are_not_finite():
     start = {"x": mi.TensorXf(np.zeros(1, np.float32))}
     with pytest.raises(FloatingPointError, match="recon are not finite after 3 steps"):

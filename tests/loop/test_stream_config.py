@@ -112,6 +112,11 @@ def test_apply_preset__rejects_an_unknown_name() -> None:
         apply_preset(StreamConfig(), "xl")  # type: ignore[arg-type]
 
 
+def test_momentum__fades_in_the_same_share_of_fewer_epochs() -> None:
+    assert FitConfig(epochs=8).momentum == 0.9
+    assert FitConfig(epochs=2).momentum == pytest.approx(0.9**4)
+
+
 def test_rates_at__decays_the_rate_of_the_means_and_raises_the_others_for_fewer_epochs() -> None:
     means = [FitConfig(epochs=8).rates_at(k).means / LearningRates().means for k in range(8)]
     assert means == pytest.approx([1, 1, 2 / 3, 1 / 2, 2 / 5, 1 / 3, 2 / 7, 1 / 4])
