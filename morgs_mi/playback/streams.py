@@ -8,6 +8,7 @@ from pathlib import Path
 from morgs_mi.codec.container import Packet, PacketKind
 from morgs_mi.codec.packets import WholeFrame
 from morgs_mi.codec.reader import StreamReader
+from morgs_mi.io.model_cameras import model_cameras
 from morgs_mi.io.splats import read_splats, suffix_of
 from morgs_mi.playback.default_rig import DEFAULT_RIG, default_rig
 from morgs_mi.playback.export.notebook import stream_html
@@ -24,7 +25,9 @@ class PlayableStream(StreamReader):
 
 
 class SplatFile(PlayableStream):
-    """File with the Gaussians of one frame, of any tool, as a stream with the cameras of `default_rig`.
+    """File with the Gaussians of one frame, of any tool, as a stream.
+
+    Its cameras are those of its training, if a `cameras.json` belongs to it (`model_cameras`), or a `default_rig`.
 
     Args:
         path: ``.ply``, ``.compressed.ply`` or ``.splat``.
@@ -35,10 +38,10 @@ class SplatFile(PlayableStream):
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.fps, self.metadata = path, 30.0, {"num_frames": 1, DEFAULT_RIG: True}
-        gaussians = read_splats(path)
+        gaussians, trained = read_splats(path), model_cameras(path)
+        self.path, self.fps, self.metadata = path, 30.0, {"num_frames": 1, DEFAULT_RIG: not trained}
         try:
-            self.cameras = default_rig([gaussians])
+            self.cameras = trained or default_rig([gaussians])
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
         self._frame = WholeFrame(gaussians, self.cameras)

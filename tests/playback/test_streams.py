@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -20,7 +21,7 @@ from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.viewer.frame_cache import FrameCache
 from morgs_mi.render.rasterize import rasterize
 from tests.assertions import assert_close
-from tests.scenes.changing_splats import splats
+from tests.scenes.changing_splats import rig, splats
 
 MESH = """ply
 format ascii 1.0
@@ -75,6 +76,60 @@ def test_splat_file__is_coded_like_any_keyframe(file, tmp_path):
     packet, state = next(iter(written)), next(iter(stream)).coded
     np.testing.assert_array_equal(decode(None, packet).grid.values, state.grid.values)
     np.testing.assert_array_equal(decode(None, packet).digest, state.digest)
+
+
+def write_model(folder: Path, cameras, **change) -> Path:
+    """Write a model as a training run does, and return its Gaussians."""
+    path = folder / "point_cloud" / "iteration_7" / "point_cloud.ply"
+    path.parent.mkdir(parents=True)
+    write_ply(path, splats())
+    rows = [
+        {
+            "id": i,
+            "img_name": camera.name,
+            "width": camera.width,
+            "height": camera.height,
+            "position": camera.position.tolist(),
+            "rotation": camera.viewmat[:3, :3].T.tolist(),
+            "fx": camera.K[0, 0],
+            "fy": camera.K[1, 1],
+            **change,
+        }
+        for i, camera in enumerate(cameras)
+    ]
+    (folder / "cameras.json").write_text(json.dumps(rows))
+    return path
+
+
+def test_splat_file__of_a_model_has_the_cameras_of_its_training(tmp_path, run):
+    path = write_model(tmp_path, rig())
+    stream = open_stream(path)
+    assert [camera.name for camera in stream.cameras] == ["left", "middle", "right"]
+    assert stream.metadata["default_rig"] is False
+    for found, camera in zip(stream.cameras, rig(), strict=True):
+        assert_close(found.viewmat, camera.viewmat, atol=1e-12)
+        assert_close(found.K, camera.K, atol=1e-12)
+    assert run("render", path, tmp_path / "a.png", "--camera", "middle")[0] == 0
+    assert cv2.imread(str(tmp_path / "a.png")).shape == (48, 64, 3)
+
+
+def test_splat_file__of_a_model_keeps_some_of_many_cameras(tmp_path):
+    names = [camera.name for camera in open_stream(write_model(tmp_path, 50 * rig())).cameras]
+    assert len(names) == 38
+    assert names[:3] == ["left", "middle", "right"]
+
+
+def test_splat_file__ignores_other_files_of_that_name(tmp_path):
+    write_ply(tmp_path / "scene.ply", splats())
+    for content in ('{"cameras": 3}', "[]", '[{"name": "cam00"}]'):
+        (tmp_path / "cameras.json").write_text(content)
+        assert open_stream(tmp_path / "scene.ply").metadata["default_rig"] is True
+
+
+@pytest.mark.parametrize("change", [{"rotation": [[1, 0], [0, 1]]}, {"width": "wide"}, {"fx": -1}, {"position": None}])
+def test_splat_file__of_a_model_names_a_broken_camera(tmp_path, change):
+    with pytest.raises(ValueError, match=r"cameras\.json: entry 0: expected a camera, got a broken one"):
+        open_stream(write_model(tmp_path, rig(), **change))
 
 
 @pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])

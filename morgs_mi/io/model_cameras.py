@@ -1,0 +1,52 @@
+"""Cameras of a training run of 3D Gaussian Splatting, from the `cameras.json` in the folder of its model.
+
+A model has `cameras.json` and `point_cloud/iteration_30000/point_cloud.ply`. The file is a list of objects with
+`img_name`, `width`, `height`, `position` [3], `rotation` [3][3] (camera to world, x right, y down, z forward), `fx` and
+`fy` in pixels; the principal point is the middle of the image.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.io.bounded import read_json
+
+__all__ = ["model_cameras"]
+
+_FILE = "cameras.json"
+_KEYS = {"width", "height", "position", "rotation", "fx", "fy"}
+# Cameras that are kept, evenly spaced in the file: more are of no use to a viewer.
+_MOST = 48
+
+
+def model_cameras(path: Path) -> tuple[Camera, ...]:
+    """Return cameras with which a file of Gaussians was trained; none if no `cameras.json` belongs to it.
+
+    The file is beside the Gaussians or in one of the two folders above. At most 48 cameras are returned.
+
+    Raises:
+        ValueError: an entry is broken.
+    """
+    folders = path.resolve().parents[:3]
+    for file in (folder / _FILE for folder in folders):
+        if file.is_file():
+            rows = read_json(file)
+            if isinstance(rows, list) and rows and all(isinstance(row, dict) and row.keys() >= _KEYS for row in rows):
+                return tuple(_camera(file, i, rows[i]) for i in range(0, len(rows), -(-len(rows) // _MOST)))
+    return ()
+
+
+def _camera(file: Path, index: int, row: dict[str, Any]) -> Camera:
+    try:
+        R, position = np.asarray(row["rotation"], np.float64), np.asarray(row["position"], np.float64)
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = R.T, -R.T @ position
+        width, height, fx, fy = (float(row[key]) for key in ("width", "height", "fx", "fy"))
+        K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]])
+        return Camera(K, viewmat, round(width), round(height), str(row.get("img_name", index)))
+    except (TypeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{file}: entry {index}: expected a camera, got a broken one: {error}") from None
