@@ -32,8 +32,8 @@ _OUTPUT = (
 )
 _CAMERA = (
     "Camera of the stream, by index or name; `morgs-mi info` lists those of a capture. A file of Gaussians has front, "
-    "front-right, right, back-right, back, back-left, left and front-left. By default, one image is that of the first "
-    "camera, or of the one that sees most detail of a file."
+    "front-right, right, back-right, back, back-left, left and front-left, or the cameras of its training. By default, "
+    "one image is that of the first camera, or of the one that sees most detail of a file."
 )
 _PATH = (
     "Camera path, instead of a camera: orbit (around the scene, the default), between (through the cameras), or a JSON "
