@@ -231,7 +231,7 @@ class FitConfig:
     @property
     def momentum(self) -> float:
         """Adam's momentum in a later frame: 0.9 in 8 epochs, and gradients fade in the same share of fewer steps."""
-        return 0.9 ** (_USUAL_EPOCHS / self.epochs)
+        return 0.9 ** max(_USUAL_EPOCHS / self.epochs, 1)
 
     @property
     def planned_steps(self) -> int:
