@@ -25,7 +25,7 @@ from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.threads import in_background
 from morgs_mi.fit.balance import Balance, balance_cameras, balance_config
-from morgs_mi.fit.detail import with_num_gaussians
+from morgs_mi.fit.budget import plan_first_frame
 from morgs_mi.fit.first_frame import fit_confidence, fit_first_frame
 from morgs_mi.fit.first_settings import Expected, first_settings
 from morgs_mi.fit.fit_config import FitConfig
@@ -180,18 +180,18 @@ def _fit_first_frame(
     found = _balance(setup, images, progress)
     balance = _exposures_of(setup, images, found)
     views, rng = _views(setup, _balanced(images, balance)), rng_of(config.seed, Stream.FIRST_FRAME)
-    fit = with_num_gaussians(config.fit, views, setup.points)
-    problem = FirstFrameProblem.of(views, setup.cloud, fit, config.render, rng)
-    chosen = first_settings(problem, fit, config.seed, progress)
+    plan = plan_first_frame(views, setup.cloud, config.fit, config.render, config.seed)
+    problem = FirstFrameProblem.of(views, setup.cloud, plan.config, config.render, rng)
+    chosen = first_settings(problem, plan.config, config.seed, progress)
 
     def packed(gaussians: Gaussians) -> Packet:
         return keyframe_packet(gaussians, 0, setup.cameras, config.codec)
 
     on_round = None if on_provisional is None else lambda gaussians: on_provisional(packed(gaussians))
-    fitted = fit_first_frame(problem, chosen.config, rng, progress.of("First frame"), on_round)
+    fitted = fit_first_frame(problem, chosen.config, rng, progress.of(plan.stage), on_round)
     return packed(fitted.gaussians), {
         "losses": fitted.losses,
-        "status": _start_status(setup, fit),
+        "status": _start_status(setup, plan.config),
         "validation": _about_expected(chosen.expected, problem.psnr(fitted.gaussians)) | _about_balance(found),
         "steps": fitted.steps,
         "balance": balance,

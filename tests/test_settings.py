@@ -41,7 +41,6 @@ VALUES: dict[str, Any] = {
     "fit.objective.isometry_weight": 1.0,
     "fit.early_stopping_tolerance": 0.5,
     "fit.dropping": 0.3,
-    "fit.first_frame_seconds": 0.01,
     "fit.density.max_gaussians": 1000,
     "fit.density.split_scale": 1.0,
     "fit.density.min_opacity": 0.4,
@@ -57,7 +56,7 @@ VALUES: dict[str, Any] = {
 ELSEWHERE: dict[str, str] = {
     "render.reproducible": "changes the order of sums only: tests/render",
     "fit.detail": "the number of Gaussians is given here: tests/fit/test_detail.py",
-    "fit.convergence": "the number of steps is given here: tests/fit/test_first_frame.py",
+    "fit.first_frame_seconds": "Gaussians and steps are given here: tests/fit/test_budget.py",
     "fit.validate": "fewer views here: tests/fit/test_cross_validation.py",
     "fit.camera_priors": "cameras are refined by the recorder: tests/calibration/test_bundle.py",
     "fit.short_fits": "no cameras are refined here: tests/calibration/test_refine.py, tests/fit/test_balance.py",

@@ -7,7 +7,7 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -26,10 +26,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Live"]
 
-# Dropped frames cost more than the last epochs of a frame gain.
-_DEFAULT = StreamConfig(fit=FitConfig(epochs=2))
+# Dropped frames cost more than the last epochs of a frame gain, and nothing should move during the first frame.
+_DEFAULT = StreamConfig(fit=FitConfig(epochs=2, first_frame_seconds=30.0))
 _PERIOD = 1.0  # least time between two lines about frames, s
-_FIRST_SECONDS = 30.0  # of the first frame, during which nothing should move, unless its steps or its time are given
 
 
 @dataclass(frozen=True)
@@ -56,7 +55,7 @@ class Live:
         from morgs_mi.runs.live.fit_live import fit_live
 
         out = self.out or Path(time.strftime("live-%Y%m%d-%H%M%S"))
-        config = _with_first_seconds(self.settings.stream_config(_DEFAULT))
+        config = self.settings.stream_config(_DEFAULT)
         self.settings.check_methods(config)
         sources = [int(source) if source.isdecimal() else source for source in self.camera]
         with ExitStack() as viewer, progress() as report:
@@ -79,13 +78,6 @@ class Live:
 
             rows = fit_live(sources, out, self.live, config, on_frame, on_stage)
         print_result(_summary(out, rows))
-
-
-def _with_first_seconds(config: StreamConfig) -> StreamConfig:
-    """Return a config in which the time of the first frame is limited."""
-    if config.fit.first_frame_seconds is not None or config.fit.first_frame_steps is not None:
-        return config
-    return replace(config, fit=replace(config.fit, first_frame_seconds=_FIRST_SECONDS))
 
 
 class _Lines:

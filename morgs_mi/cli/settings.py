@@ -160,12 +160,12 @@ class Settings:
     """File with any settings, as --print-config writes it."""
     seed: Annotated[int | None, setting("seed")] = None
     """Seed of every random choice."""
-    num_gaussians: Annotated[int | None, optional("INT", "(default: by the images' detail)")] = None
+    num_gaussians: Annotated[int | None, optional("INT", "(default: by detail and time)")] = None
     """Gaussians of the first frame."""
-    first_frame_steps: Annotated[int | None, optional("INT", "(default: until it converges)")] = None
+    first_frame_steps: Annotated[int | None, optional("INT", "(default: by Gaussians and time)")] = None
     """Optimisation steps of the first frame."""
-    first_frame_seconds: Annotated[float | None, optional("FLOAT")] = None
-    """Time of the first frame, which determines its steps."""
+    first_frame_seconds: Annotated[float | None, setting("first_frame_seconds")] = None
+    """Time of the first frame, which limits its Gaussians and steps."""
     epochs: Annotated[int | None, setting("epochs")] = None
     """Passes over the views for every later frame."""
     sh_degree: Annotated[int | None, setting("sh_degree")] = None

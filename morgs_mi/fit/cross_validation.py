@@ -33,15 +33,17 @@ from morgs_mi.fit.view import decibels
 __all__ = [
     "CrossValidation",
     "Trial",
-    "candidates_of",
     "cross_validate",
     "excess_share",
-    "trial_share",
+    "has_trials",
+    "trial_steps",
     "withheld_views",
 ]
 
 # Probabilities of dropping that are tried, in rising order.
 _CANDIDATES = (0.0, 0.2, 0.4)
+# Number of views from which one can be withheld.
+_VALIDATED = 3
 # Number of views per withheld view; at least one view is withheld.
 _WITHHELD = 6
 # Steps of a trial as a fraction of the steps of the first frame, and width in px to which its images are reduced: by
@@ -154,9 +156,9 @@ def cross_validate(
     kept = [view for view in range(len(cameras)) if view not in withheld]
     small = problem.reduced(_trial_width(cameras, config))
     trained, unseen = small.only(kept), small.only(withheld)
-    candidates, trials = candidates_of(problem, config), []
+    candidates, trials = _candidates_of(problem, config), []
     for number, dropping in enumerate(candidates, 1):
-        steps = max(1, round(trial_share(config) * config.planned_steps))
+        steps = max(1, round(_SHARES[config.validate] * config.planned_steps))
         trial = replace(config, dropping=dropping, first_frame_steps=steps)
         stage = progress.of(f"Trial {number} of {len(candidates)}" if len(candidates) > 1 else "Trial")
         fitted = fit_first_frame(trained, trial, rng_of(seed, Stream.TRIALS), stage).gaussians
@@ -170,15 +172,20 @@ def cross_validate(
     return CrossValidation(names, len(cameras), forecast(cameras, points).spacing, angle, tuple(trials))
 
 
-def candidates_of(problem: FirstFrameProblem, config: FitConfig) -> tuple[float, ...]:
+def _candidates_of(problem: FirstFrameProblem, config: FitConfig) -> tuple[float, ...]:
     """Return the probabilities of dropping that are tried."""
     is_chosen = config.validate and len(problem.views) >= MANY_VIEWS
     return _CANDIDATES if is_chosen else (dropping_by_noise(problem.images),)
 
 
-def trial_share(config: FitConfig) -> float:
-    """Return the steps of a trial as a fraction of the steps of the first frame."""
-    return _SHARES[config.validate]
+def has_trials(problem: FirstFrameProblem, config: FitConfig) -> bool:
+    """Return whether views are withheld: from three views and more, where no probability of dropping is given."""
+    return config.dropping is None and len(problem.views) >= _VALIDATED
+
+
+def trial_steps(problem: FirstFrameProblem, config: FitConfig) -> float:
+    """Return the steps of all trials, at most, relative to the steps of the first frame."""
+    return len(_candidates_of(problem, config)) * _SHARES[config.validate] if has_trials(problem, config) else 0.0
 
 
 def _trial_width(cameras: Sequence[Camera], config: FitConfig) -> int:

@@ -1,10 +1,5 @@
 """The first frame: all attributes from its images, then the confidence from its masks.
 
-Where the number of steps is not given, it follows from the images. A capture with much detail still improves when
-others have converged. If L_recon falls by more than 25 % in the last third of the steps, the number of steps is
-doubled, and the learning rates continue on the longer schedule. Noisy captures end early, because no step removes the
-noise from the loss.
-
 Up to the last round of density control, the images have half the size.
 """
 
@@ -36,17 +31,15 @@ from morgs_mi.render.active_view import ActiveView
 from morgs_mi.render.rasterize import rasterize
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["FirstFrame", "fit_confidence", "fit_first_frame"]
+__all__ = ["LAST_ROUND", "FirstFrame", "fit_confidence", "fit_first_frame"]
 
 # Passes over all views of which the loss is averaged, and the least number of steps.
 _PASSES, _LEAST = 4, 8
-# Relative decrease of L_recon over the last third of the steps from which they are doubled. Captures that are fitted,
-# with noise or without it, decrease by 0.02 to 0.24 then; one with much more detail by 0.3.
-_LEAST_DECREASE = 0.25
 # Fraction of the steps after which another SH band is added, as in 3DGS.
 _BAND = 1 / 30
-# First and last round of density control, as fractions of the steps: the remaining steps fit the births.
-_FIRST_ROUND, _LAST_ROUND = 0.1, 0.5
+_FIRST_ROUND = 0.1
+LAST_ROUND = 0.5
+"""Last round of density control, as a fraction of the steps: the remaining steps fit the births."""
 # Learning rates at the end, as a fraction of those at the start.
 _FINAL_RATE = 0.1
 
@@ -86,17 +79,13 @@ def fit_first_frame(
         progress: of the steps.
         on_round: called with the Gaussians before each round of density control.
     """
-    fit, steps, done, losses = _Fit(problem, config, rng, progress), config.planned_steps, 0, {}
-    while done < steps:
-        order = iter(view_order(len(problem.views), steps - done, rng))
-        for start, stop in fit.stretches(done, steps):
-            if on_round is not None and fit.has_round(start):
-                on_round(fit.gaussians)
-            fit.prepare(start)
-            before, losses = losses, fit.run(islice(order, stop - start), start, steps)
-        done = steps
-        if config.first_frame_steps is None and _still_falls(before, losses):
-            steps = min(2 * steps, config.convergence.most_steps)
+    fit, steps, losses = _Fit(problem, config, rng, progress), config.planned_steps, {}
+    order = iter(view_order(len(problem.views), steps, rng))
+    for start, stop in fit.stretches(steps):
+        if on_round is not None and fit.has_round(start):
+            on_round(fit.gaussians)
+        fit.prepare(start)
+        losses = fit.run(islice(order, stop - start), start, steps)
     return FirstFrame(fit.gaussians, losses, steps)
 
 
@@ -120,10 +109,9 @@ class _Fit:
         """The Gaussians with the current parameters."""
         return self._base.with_parameters(values_of(self._optimizer))
 
-    def stretches(self, done: int, steps: int) -> list[tuple[int, int]]:
-        """Return (first step, end) of the stretches of steps without an event, and of the last third."""
-        stops = {*self._bands, *self._rounds, 2 * steps // 3, steps}
-        return list(pairwise([done, *sorted(stop for stop in stops if stop > done)]))
+    def stretches(self, steps: int) -> list[tuple[int, int]]:
+        """Return (first step, end) of the stretches of steps without an event."""
+        return list(pairwise(sorted({0, *self._bands, *self._rounds, steps})))
 
     def has_round(self, step: int) -> bool:
         """Return whether a round of density control is due before a step."""
@@ -170,14 +158,9 @@ class _Fit:
         self._base = self._base.select(plan.parent)
 
 
-def _still_falls(before: Mapping[str, float], losses: Mapping[str, float]) -> bool:
-    """Return whether the losses before and after the last third of the steps show that they are too few."""
-    return "recon" in before and losses["recon"] < (1 - _LEAST_DECREASE) * before["recon"]
-
-
 def density_rounds(config: FitConfig) -> list[int]:
     """Return the steps of the first frame before which density control acts."""
-    steps = np.linspace(_FIRST_ROUND, _LAST_ROUND, config.density.rounds) * config.planned_steps
+    steps = np.linspace(_FIRST_ROUND, LAST_ROUND, config.density.rounds) * config.planned_steps
     return sorted(set(steps.astype(int).tolist()))
 
 

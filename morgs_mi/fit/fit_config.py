@@ -11,7 +11,6 @@ from morgs_mi.method.objective import ObjectiveConfig
 
 __all__ = [
     "CameraPriors",
-    "ConvergenceConfig",
     "DensityConfig",
     "DetailConfig",
     "FitConfig",
@@ -23,6 +22,8 @@ __all__ = [
 _CONSTANT_EPOCHS = 2
 # Epochs of a later frame that its learning rates were chosen for: they are larger in fewer epochs.
 _USUAL_EPOCHS = 8
+# Least number of steps of a first frame, and Gaussians per step: many see each pixel less often.
+_LEAST_STEPS, _GAUSSIANS_PER_STEP = 1200, 25
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,8 @@ class DetailConfig:
     """Gaussians per detail that the views do not share."""
     least_gaussians: Annotated[int, AtLeast(1)] = 4_000
     """Least number of Gaussians."""
-    most_gaussians: Annotated[int, AtLeast(1)] = 40_000
-    """Largest number of Gaussians, for the time of all frames and the size of the stream."""
+    most_gaussians: Annotated[int, AtLeast(1)] = 250_000
+    """Largest number of Gaussians, for memory, the time of later frames and the size of the stream."""
 
     def __post_init__(self) -> None:
         check_ranges(self)
@@ -102,23 +103,6 @@ class DetailConfig:
             raise ValueError(
                 f"DetailConfig(): `least_gaussians` must be 1 to `most_gaussians` = {self.most_gaussians}, got "
                 f"{self.least_gaussians}."
-            )
-
-
-@dataclass(frozen=True)
-class ConvergenceConfig:
-    """Settings of the number of steps of the first frame where none is given (see `first_frame`)."""
-
-    steps: Annotated[int, AtLeast(1)] = 1200
-    """Steps that every first frame gets."""
-    most_steps: Annotated[int, AtLeast(1)] = 6000
-    """Largest number of steps."""
-
-    def __post_init__(self) -> None:
-        check_ranges(self)
-        if self.steps > self.most_steps:
-            raise ValueError(
-                f"ConvergenceConfig(): `steps` must be 1 to `most_steps` = {self.most_steps}, got {self.steps}."
             )
 
 
@@ -166,16 +150,15 @@ class FitConfig:
     sh_degree: Annotated[int, AtLeast(0), AtMost(3)] = 1
     """Degree of the spherical harmonics, 0 to 3; 0 is enough where no surface is glossy."""
     num_gaussians: Annotated[int, AtLeast(1)] | None = None
-    """Number of Gaussians of the first frame; None: from the detail of its images (see `detail`). It starts from
-    `first_count`."""
+    """Number of Gaussians of the first frame; None: from the detail of its images and its time (see `budget`). It
+    starts from `first_count`."""
     detail: DetailConfig = field(default_factory=DetailConfig)
     """Number of Gaussians where none is given."""
     first_frame_steps: Annotated[int, AtLeast(1)] | None = None
-    """Steps of the first frame, one view each; None: until it has converged."""
-    first_frame_seconds: Annotated[float, Above(0)] | None = None
-    """Time of the first frame, from which the number of its steps follows; None: `first_frame_steps`."""
-    convergence: ConvergenceConfig = field(default_factory=ConvergenceConfig)
-    """Convergence of the first frame."""
+    """Steps of the first frame, one view each; None: from its Gaussians and its time (see `budget`)."""
+    first_frame_seconds: Annotated[float, Above(0)] = 120.0
+    """Time that the first frame may take with its trials: it limits those numbers of Gaussians and of steps that are
+    not given."""
     dropping: Annotated[float, AtLeast(0), Below(1)] | None = None
     """Probability with which each step of the first frame leaves a Gaussian out (see `dropping`); None: from the noise
     of the images, or with `validate` chosen by cross-validation."""
@@ -235,8 +218,10 @@ class FitConfig:
 
     @property
     def planned_steps(self) -> int:
-        """Number of steps that the first frame is planned with."""
-        return self.convergence.steps if self.first_frame_steps is None else self.first_frame_steps
+        """Number of steps of the first frame: where none is given, one per 25 Gaussians, at least 1200."""
+        if self.first_frame_steps is not None:
+            return self.first_frame_steps
+        return max(_LEAST_STEPS, round(self.planned_gaussians / _GAUSSIANS_PER_STEP))
 
     @property
     def planned_gaussians(self) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
-from morgs_mi.core.rig import scene_extent
+from morgs_mi.core.rig import scene_depths, scene_extent
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.initialise import Points, from_points, initial_points
 from morgs_mi.fit.view import View, mean_psnr
@@ -19,6 +19,8 @@ __all__ = ["FirstFrameProblem"]
 
 # Least width of the images that `halved` returns, px.
 _COARSE_WIDTH = 160
+# Least scene extent, relative to the median depth: of means that move by fractions of the extent.
+_DEPTH = 1 / 6
 # Opacity of the Gaussians at the start: most can become opaque or vanish within the steps of a first frame.
 _OPACITY = 0.3
 
@@ -31,7 +33,7 @@ class FirstFrameProblem:
         start: initial Gaussians.
         views: V views of one instant.
         points: [P, 3] of the scene, world units, or none.
-        extent: of the scene in world units.
+        extent: of the scene in world units, at least a sixth of its depth: cameras close together see far.
         render: cut-offs.
     """
 
@@ -60,8 +62,9 @@ class FirstFrameProblem:
             rng: draws points.
         """
         chosen = initial_points(views, points, config.first_count, rng)
-        start = from_points(*chosen, config.sh_degree, _OPACITY)
-        return cls(start, tuple(views), points[0], scene_extent([view.camera for view in views]), render)
+        start, cameras = from_points(*chosen, config.sh_degree, _OPACITY), [view.camera for view in views]
+        extent = max(scene_extent(cameras), _DEPTH * float(np.median(scene_depths(cameras, chosen[0]))))
+        return cls(start, tuple(views), points[0], extent, render)
 
     @property
     def cameras(self) -> list[Camera]:

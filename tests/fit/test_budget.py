@@ -1,37 +1,88 @@
-"""The number of steps of the first frame within a time budget, on a clock that the test advances."""
+"""The plan of the first frame, on a clock that the test advances."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
+from morgs_mi import RenderConfig
 from morgs_mi.fit import budget
-from morgs_mi.fit.budget import steps_within
-from morgs_mi.fit.fit_config import FitConfig
-from tests.scenes.ball import problem
+from morgs_mi.fit.budget import Plan, plan_first_frame
+from morgs_mi.fit.fit_config import DensityConfig, DetailConfig, FitConfig
+from morgs_mi.fit.view import View
+from tests.scenes.ball import bytes_of, images_of, opaque_ball, views
+
+NO_POINTS = np.zeros((0, 3)), np.zeros((0, 3))
+PIXELS = 64 * 48
+# Images of the ball ask for more Gaussians than the most.
+DETAIL = DetailConfig(per_detail=100.0, least_gaussians=5_000, most_gaussians=50_000)
+CONFIG = FitConfig(sh_degree=0, detail=DETAIL, dropping=0.0, density=DensityConfig(rounds=0))
 
 
 @pytest.fixture
-def steps(monkeypatch):
-    """A function that returns the steps within a time, if the first ones take 0.01 s each and later ones 0.015 s."""
+def plan(monkeypatch: pytest.MonkeyPatch):
+    """A function that plans for a time, if a step takes 1e-6 s per Gaussian and 0.45e-6 s per pixel."""
     now = [0.0]
 
     def fit(problem, config, *_):
-        now[0] += 0.01 * config.first_frame_steps
+        now[0] += config.first_frame_steps * 1e-6 * (len(problem.start) + 0.45 * PIXELS)
 
-    monkeypatch.setattr(budget.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(budget, "perf_counter", lambda: now[0])
     monkeypatch.setattr(budget, "fit_first_frame", fit)
-    return lambda seconds, trials=0: steps_within(seconds, problem([]), FitConfig(), trials, 0)
+    given = [View(*view) for view in zip(views(), bytes_of(images_of(opaque_ball())), strict=True)]
+
+    def planned(seconds: float, config: FitConfig = CONFIG, render: RenderConfig | None = None) -> Plan:
+        config = replace(config, first_frame_seconds=seconds)
+        return plan_first_frame(given, NO_POINTS, config, render or RenderConfig(), 0)
+
+    return planned
 
 
-def test_steps_within__fill_the_time_that_the_measurement_leaves(steps):
-    assert steps(15.4) == pytest.approx(1000, abs=1)  # 0.4 s were measured
-    assert steps(30.4) == pytest.approx(2000, abs=1)
+def numbers(plan: Plan) -> tuple[int, int]:
+    return plan.config.planned_gaussians, plan.config.planned_steps
 
 
-def test_steps_within__leave_time_for_the_trials(steps):
-    assert steps(45.4, trials=2.0) == pytest.approx(1000, abs=1)
-    assert steps(27.4, trials=0.8) == pytest.approx(1000, abs=1)
+def test_plan_first_frame__follows_the_images_where_the_time_does_not_limit_it(plan):
+    assert numbers(plan(1000)) == numbers(plan(2000)) == (50_000, 2000)
+    assert plan(1000).seconds == pytest.approx(2000e-6 * (50_000 + 0.45 * PIXELS))
 
 
-def test_steps_within__are_a_hundred_at_least(steps):
-    assert steps(0.1) == 100
+def test_plan_first_frame__has_fewer_gaussians_and_steps_in_less_time(plan):
+    found = plan(60)
+    gaussians, steps = numbers(found)
+    assert steps == round(gaussians / 25) > 1200
+    assert 0.9 * 60 < found.seconds <= 60
+
+
+def test_plan_first_frame__has_fewer_steps_where_the_fewest_gaussians_take_too_long(plan):
+    assert numbers(plan(5.0)) == (5_000, pytest.approx(397, abs=5))
+    assert numbers(plan(1e-3)) == (5_000, 100)
+
+
+def test_plan_first_frame__leaves_time_for_the_trials(plan):
+    with_trial = plan(60, replace(CONFIG, dropping=None))
+    assert numbers(with_trial) < numbers(plan(60))
+    assert with_trial.seconds <= 60
+
+
+def test_plan_first_frame__changes_no_number_that_is_given(plan):
+    gaussians, steps = numbers(plan(10, replace(CONFIG, num_gaussians=20_000)))
+    assert gaussians == 20_000
+    assert steps < 1200
+    gaussians, steps = numbers(plan(10, replace(CONFIG, first_frame_steps=400)))
+    assert gaussians < 50_000
+    assert steps == 400
+    both = replace(CONFIG, num_gaussians=20_000, first_frame_steps=400)
+    assert plan(1e-3, both) == Plan(replace(both, first_frame_seconds=1e-3))
+
+
+def test_plan_first_frame__takes_a_reference_machine_for_reproducible_fits(plan, monkeypatch):
+    monkeypatch.setattr(budget, "_measured_unit", lambda *_: pytest.fail("the machine was timed"))
+    assert plan(1.0, render=RenderConfig(reproducible=True)) == plan(1.0, render=RenderConfig(reproducible=True))
+
+
+def test_Plan__announces_its_time():
+    assert Plan(CONFIG).stage == "First frame"
+    assert Plan(CONFIG, 118.4).stage == "First frame, about 118 s"

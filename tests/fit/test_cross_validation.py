@@ -14,7 +14,7 @@ from morgs_mi.fit.cross_validation import (
     Trial,
     cross_validate,
     excess_share,
-    trial_share,
+    trial_steps,
     withheld_views,
 )
 from morgs_mi.fit.fit_config import FitConfig
@@ -54,9 +54,18 @@ def test_cross_validate__tries_candidates_until_one_is_no_better(monkeypatch):
     assert len(values) == 3 or values[-1] <= values[-2]
     assert found.best.withheld_psnr == max(values)
     assert all(trial.training_psnr > trial.withheld_psnr > 15 for trial in found.trials)
-    steps = round(trial_share(VALIDATED) * CONFIG.planned_steps)
+    steps = 40
     stages = [f"Trial {number} of 3" for number in range(1, len(found.trials) + 1)]
     assert done == [(stage, step, steps) for stage in stages for step in range(1, steps + 1)]
+
+
+@pytest.mark.parametrize(
+    ("count", "dropping", "validate", "steps"),
+    [(4, None, False, 0.15), (4, None, True, 0.4), (2, None, False, 0), (4, 0.1, True, 0)],
+)
+def test_trial_steps__are_relative_to_the_first_frame(count: int, dropping: float | None, validate: bool, steps: float):
+    config = dataclasses.replace(CONFIG, dropping=dropping, validate=validate)
+    assert trial_steps(problem(bytes_of(images_of(opaque_ball()))[:count]), config) == steps
 
 
 @pytest.mark.parametrize(("noise", "dropping"), [(0.0, 0.0), (0.05, 0.2)])

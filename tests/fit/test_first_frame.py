@@ -12,7 +12,7 @@ import pytest
 from morgs_mi import Gaussians, RenderConfig
 from morgs_mi.core.progress import Progress
 from morgs_mi.fit.first_frame import FirstFrame, density_rounds, fit_confidence, fit_first_frame
-from morgs_mi.fit.fit_config import ConvergenceConfig, DensityConfig, FitConfig, LearningRates
+from morgs_mi.fit.fit_config import DensityConfig, FitConfig, LearningRates
 from morgs_mi.fit.view import View, rendered
 from morgs_mi.method.objective import ObjectiveConfig
 from morgs_mi.render.active_view import ActiveView
@@ -22,7 +22,6 @@ from tests.scenes.ball import ball, images_of, mean_psnr, opaque_ball, problem, 
 REPRODUCIBLE = RenderConfig(reproducible=True)
 NO_GROWTH = DensityConfig(rounds=0)
 CONFIG = FitConfig(sh_degree=0, num_gaussians=80, first_frame_steps=8, density=NO_GROWTH)
-UNTIL_CONVERGED = FitConfig(sh_degree=0, num_gaussians=300, convergence=ConvergenceConfig(steps=60, most_steps=150))
 
 
 def fit(images, start, config, seed=0, progress=None, **given) -> FirstFrame:
@@ -53,31 +52,6 @@ def values_of(gaussians: Gaussians) -> dict[str, bytes]:
     return {name: value.tobytes() for name, value in gaussians.numpy().items()}
 
 
-# ---- number of steps -------------------------------------------------------------------------------------
-
-
-def test_fit_first_frame__doubles_its_steps_while_the_loss_falls(images, monkeypatch):
-    monkeypatch.setattr("morgs_mi.fit.first_frame._LEAST_DECREASE", 0.15)
-    done = []
-    found = fit(images, ball(150), UNTIL_CONVERGED, progress=Progress(lambda *now: done.append(now), "First frame"))
-    assert found.steps == 150
-    totals = [60] * 60 + [120] * 60 + [150] * 30
-    assert done == [("First frame", *steps) for steps in enumerate(totals, 1)]
-    few = fit(images, ball(150), dataclasses.replace(UNTIL_CONVERGED, first_frame_steps=60))
-    assert mean_psnr(found.gaussians, images) > mean_psnr(few.gaussians, images) + 3
-
-
-def test_fit_first_frame__ends_where_only_noise_is_left(images):
-    rng = np.random.default_rng(0)
-    noisy = [np.clip(image + rng.normal(0, 0.3, image.shape), 0, 1) for image in images]
-    assert fit(noisy, ball(150), UNTIL_CONVERGED).steps == 60
-
-
-def test_fit_first_frame__has_the_steps_that_are_given(images):
-    config = dataclasses.replace(UNTIL_CONVERGED, first_frame_steps=20)
-    assert fit(images, ball(150), config).steps == 20
-
-
 # ---- learning rates --------------------------------------------------------------------------------------
 
 # L1 of white images and of colours that stay dark: their gradient is constant, so Adam's steps are as long as the rate.
@@ -93,17 +67,15 @@ def lengths(drawn: list[Gaussians], found: FirstFrame) -> np.ndarray:
     return np.median(np.diff(colors, axis=0), axis=(1, 2, 3))
 
 
+def test_fit_first_frame__reports_its_steps(images):
+    done = []
+    assert fit(images, ball(80), CONFIG, progress=Progress(lambda *now: done.append(now), "First frame")).steps == 8
+    assert done == [("First frame", step, 8) for step in range(1, 9)]
+
+
 def test_fit_first_frame__lets_the_rates_fall_to_the_final_one(drawn):
     found = fit(WHITE, DARK, SCHEDULED)
     assert_close(lengths(drawn, found), 0.05 * 0.1 ** (np.arange(8) / 8), rtol=1e-4)
-
-
-def test_fit_first_frame__continues_the_rates_on_the_schedule_of_all_steps(drawn, monkeypatch):
-    monkeypatch.setattr("morgs_mi.fit.first_frame._LEAST_DECREASE", 1e-3)
-    convergence = ConvergenceConfig(steps=12, most_steps=30)
-    found = fit(WHITE, DARK, dataclasses.replace(SCHEDULED, first_frame_steps=None, convergence=convergence))
-    totals = np.repeat([12, 24, 30], [12, 12, 6])
-    assert_close(lengths(drawn, found), 0.05 * 0.1 ** (np.arange(30) / totals), rtol=1e-4)
 
 
 def test_fit_first_frame__moves_means_by_fractions_of_the_extent(images, drawn):

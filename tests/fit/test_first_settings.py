@@ -7,7 +7,6 @@ from dataclasses import replace
 import pytest
 
 from morgs_mi.core.progress import Progress
-from morgs_mi.fit import first_settings as module
 from morgs_mi.fit.cross_validation import CrossValidation
 from morgs_mi.fit.first_settings import first_settings
 from morgs_mi.fit.fit_config import FitConfig
@@ -74,23 +73,6 @@ def test_first_settings__keep_a_given_dropping_without_trials():
     assert found.config.dropping == 0.1
     assert isinstance(found.expected, Forecast)
     assert not stages
-
-
-@pytest.mark.parametrize(
-    ("views", "dropping", "validate", "trials"),
-    [(4, None, False, 0.15), (4, None, True, 0.4), (2, None, False, 0), (4, 0.1, True, 0)],
-)
-def test_first_settings__plan_the_steps_within_a_time_with_the_trials(monkeypatch, views, dropping, validate, trials):
-    planned = []
-
-    def steps_within(seconds, given, config, count, seed):
-        planned.append((seconds, count))
-        return 7
-
-    monkeypatch.setattr(module, "steps_within", steps_within)
-    config = replace(CONFIG, first_frame_steps=None, first_frame_seconds=20.0, dropping=dropping, validate=validate)
-    assert settings(config, views).config.first_frame_steps == 7
-    assert planned == [(20.0, trials)]
 
 
 def test_forecast__bounds_the_quality_by_the_training_views():

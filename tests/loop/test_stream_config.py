@@ -260,11 +260,6 @@ def test_apply_values__builds_and_removes_an_optional_config() -> None:
         (Root(), "[branch.leaf]\ncount = -1", "`branch.leaf.count` must not be negative, got -1; take 0."),
         (
             StreamConfig(),
-            "[fit.convergence]\nsteps = 9000",
-            "`fit.convergence.steps` must be 1 to `fit.convergence.most_",
-        ),
-        (
-            StreamConfig(),
             "[fit.detail]\nmost_gaussians = 10",
             "`fit.detail.least_gaussians` must be 1 to `fit.detail.most_gaussians` = 10, got 4000.",
         ),
