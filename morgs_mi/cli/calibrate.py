@@ -43,7 +43,8 @@ class Calibrate:
         print_table(table)
         for line in advice_lines(found.checks):
             print_warning(line)
+        how = f"{found.mapper} mapping" + (", with a principal point for each" if found.principal_points else "")
         print_result(
             f"{found.model}: {len(found.cameras)} cameras, {found.points} points, mean reprojection error "
-            f"{found.error:.2f} px, by {found.mapper} mapping; scale and up direction of its world are arbitrary."
+            f"{found.error:.2f} px, by {how}; scale and up direction of its world are arbitrary."
         )

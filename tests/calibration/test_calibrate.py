@@ -72,6 +72,18 @@ def test_calibrate__shares_intrinsics_among_clips_of_a_size(tmp_path: Path) -> N
         np.testing.assert_allclose(camera.K[0, 0], expected.K[0, 0], rtol=5e-3)
 
 
+def test_calibrate__moves_principal_points_that_differ(tmp_path: Path, capsys) -> None:
+    cameras = [camera.resized(240, 180) for camera in textured.rig()]
+    for camera, shift in zip(cameras, np.random.default_rng(0).uniform(-6, 6, (6, 2)), strict=True):
+        camera.K[:2, 2] += shift
+    film(tmp_path, cameras)
+    assert cli.main(["calibrate", str(tmp_path), "--shared-intrinsics"]) == 0
+    assert "with a principal point for each" in " ".join(capsys.readouterr().out.split())
+    found, true = (np.array([c.position for c in views]) for views in (load_capture(tmp_path).cameras, cameras))
+    # With principal points in the middle of the images, positions are off by 0.022.
+    assert_close(aligned(found, true)[0], true, atol=0.012)
+
+
 def test_calibrate__takes_global_mapping_where_incremental_mapping_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
