@@ -22,6 +22,7 @@ from benchmarks.reports import (
     live,
     masks,
     random_scenes,
+    real,
     seams,
     study,
     timing,
@@ -56,6 +57,7 @@ STUDIES = {
     generalise: ({"scenes": ("random-1",), "views": (3,), "steps": 3, "gaussians": 60}, 4),
     cameras: ({**FIRST, "degrees": (0.0, 0.5), "disturbances": (0,), "lens": 0.1}, 3),
     masks: ({"frames": 1, "loops": ("none",)}, 1),
+    real: ({"width": 64, "gaussians": 60, "steps": 3}, 1),
     drift: ({**SMALL, "scenes": ("spheres",)}, 2),
     live: ({**SMALL, "scenes": ("spheres",), "strides": (1,), "gap": 1, "gap_epochs": (2,)}, 6),
     exposure: ({**SMALL, "seeds": (3,)}, 8),
@@ -96,7 +98,7 @@ def test_study_options__of_workers_write_the_rows_of_one_process(report, clip: P
     for name in ("random-1", "random-2", "random-1-lens-0.1", "spheres-3x64"):
         (tmp_path / name).symlink_to(clip)
     given, num_rows = STUDIES[report]
-    place = {"captures": (clip,)} if report is masks else {"clips": tmp_path}
+    place = {"captures": (clip,)} if report in (masks, real) else {"clips": tmp_path}
     if report is disturbances:
         place["model"] = write_glb(tmp_path / "model.glb")
     workers, found = Here(), {}

@@ -1,0 +1,105 @@
+"""Photos of real scenes: held-out views from their calibrated cameras, and from the cameras that fit their images best.
+
+    python -m benchmarks.reports.real --captures sets/fern sets/flower --json out.json
+
+Each capture is a folder of photos with the model of `morgs-mi calibrate`. Photos 5, 13, 21 and so on are held out.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+
+from benchmarks.reports.fits import new_loop
+from benchmarks.reports.plots import Column, scores_table
+from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
+from morgs_mi.calibration.refine import register_camera
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.core.camera import Camera
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.fit.view import View, mean_psnr
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.runs.cluster.tasks import Source
+
+COLUMNS = (
+    Column("training views", "training", unit=" dB"),
+    Column("held out, as calibrated", "held_out", unit=" dB"),
+    Column("registered", "registered", unit=" dB"),
+    Column("processor time", "cpu_s", 0, unit=" s"),
+)
+_FIRST, _EVERY = 4, 8
+
+
+@dataclass(frozen=True)
+class Options(StudyOptions):
+    """Captures, work and output."""
+
+    captures: tuple[Path, ...] = ()
+    """Folders of photos."""
+    width: int = 360
+    """Width to which the photos are reduced, px."""
+    gaussians: int = 20_000
+    """Number of Gaussians."""
+    steps: int = 1200
+    """Steps of the first frame."""
+
+    def study(self) -> Study:
+        """Return the study of the captures."""
+        scenes = []
+        for path in self.captures:
+            full = load_capture(path, test_view=None)
+            capture = load_capture(path, max(1.0, full.cameras[0].width / self.width), None)
+            keys = {"set": path.name.partition("-")[0], "principal_points": principal_points(capture.cameras)}
+            scenes.append(Scene(keys, (Source.of(capture),)))
+        fit = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps, dropping=0.0)
+        return Study(measure, scenes, [Variant({}, StreamConfig(fit))], self.fit_seeds)
+
+    def table(self, rows: Sequence[Row]) -> str:
+        """Return the scores by set and calibration."""
+        return scores_table(rows, {"set": "set", "principal points": "principal_points"}, COLUMNS)
+
+
+def principal_points(cameras: Sequence[Camera]) -> str:
+    """Return whether cameras have equal principal points, in image sizes: ``"shared"`` or ``"own"``."""
+    points = {(round(c.K[0, 2] / c.width, 6), round(c.K[1, 2] / c.height, 6)) for c in cameras}
+    return "own" if len(points) > 1 else "shared"
+
+
+def measure(source: Source, config: StreamConfig) -> dict[str, Any]:
+    """Fit the photos that are not held out; return the mean PSNR of both, of the held-out ones in both ways."""
+    capture = source.open()
+    test = range(_FIRST, len(capture.cameras), _EVERY)
+    train = [v for v in range(len(capture.cameras)) if v not in test]
+    views = _views(capture)
+    loop, start = new_loop(capture, config, train), time.process_time()
+    loop.push([views[v].image for v in train])
+    seconds, gaussians = time.process_time() - start, loop.gaussians
+    assert gaussians is not None
+
+    def registered(view: View) -> View:
+        found = register_camera(gaussians, view, loop.setup.extent, config.fit, config.render)
+        return view._replace(camera=found)
+
+    held_out = [views[v] for v in test]
+    compared = {
+        "training": [views[v] for v in train],
+        "held_out": held_out,
+        "registered": [registered(view) for view in held_out],
+    }
+    scores = {name: mean_psnr(gaussians, given, config.render) for name, given in compared.items()}
+    return scores | {"views": len(train), "held_out_views": len(test), "cpu_s": seconds}
+
+
+def _views(capture: Capture) -> list[View]:
+    """Return the views of the first frame."""
+    images = next(capture.frames(0, 1)).images
+    return [View(*view) for view in zip(capture.cameras, images, capture.masks, strict=True)]
+
+
+if __name__ == "__main__":
+    tyro.cli(Options).run()
