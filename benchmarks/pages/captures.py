@@ -17,6 +17,8 @@ __all__ = [
     "dropping",
     "estimates",
     "exposure",
+    "first_frame_captures",
+    "first_frame_time",
     "first_frames",
     "live",
     "noise_aware",
@@ -61,6 +63,35 @@ def first_frames() -> str:
         )
     titles = "held out, dB", "estimate, dB", "processor time, s", "ratio"
     return markdown(("clip", "views", "noise", *titles), rows)
+
+
+def first_frame_captures() -> str:
+    """Return the held-out PSNR, the steps and the processor time of first frames, before and now."""
+    rows = []
+    for (case,), own in grouped(committed("first_frame_captures")["fits"], "case").items():
+        fits = [next(fit for fit in own if fit["variant"] == variant) for variant in ("before", "default")]
+        digits = {"held_out": 2, "steps": 0, "cpu_s": 0}
+        pairs = (" / ".join(f"{fit[key]:.{count}f}" for fit in fits) for key, count in digits.items())
+        rows.append((case, *pairs, f"{fits[1]['cpu_s'] / fits[0]['cpu_s']:.2f}"))
+    return markdown(("capture", "held out, dB", "steps", "processor time, s", "ratio"), rows)
+
+
+def first_frame_time() -> str:
+    """Return the quality and the work of first frames by the time that they may take."""
+    rows = (
+        (
+            fit["capture"],
+            f"{fit['seconds']:.0f}",
+            f"{fit['announced_s']:.0f}",
+            f"{fit['cpu_s'] / 2:.0f}",
+            f"{fit['gaussians']:,}",
+            f"{fit['steps']:,}",
+            f"{fit['held_out']:.2f}",
+        )
+        for fit in committed("first_frame_time")["fits"]
+    )
+    titles = ("may take, s", "announced, s", "processor time of two cores, s", "Gaussians", "steps", "held out, dB")
+    return markdown(("photos", *titles), rows)
 
 
 def noise_aware() -> str:

@@ -51,5 +51,24 @@ def estimates() -> Figure:
     return figure
 
 
+def first_frame_time() -> Figure:
+    """Return the held-out PSNR of first frames over the time that they may take."""
+    figure = blank_figure(5, 2.8)
+    axis = figure.subplots()
+    for (capture,), fits in grouped(committed("first_frame_time")["fits"], "capture").items():
+        axis.plot([fit["seconds"] for fit in fits], [fit["held_out"] for fit in fits], "o-", label=capture)
+    seconds = sorted({fit["seconds"] for fit in committed("first_frame_time")["fits"]})
+    axis.set(xscale="log", xlabel="time of the first frame, s", ylabel="held-out PSNR, dB")
+    axis.set_xticks(seconds, [f"{value:g}" for value in seconds])
+    axis.minorticks_off()
+    axis.grid(alpha=0.3)
+    axis.legend(fontsize=8)
+    return figure
+
+
 # Every plot by the name of its file.
-PLOTS: Mapping[str, Callable[[], Figure]] = {"drift": drift, "estimates": estimates}
+PLOTS: Mapping[str, Callable[[], Figure]] = {
+    "drift": drift,
+    "estimates": estimates,
+    "first_frame_time": first_frame_time,
+}

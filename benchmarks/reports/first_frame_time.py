@@ -9,6 +9,7 @@ do not slow it down.
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -86,7 +87,7 @@ def measure(source: Source, config: StreamConfig) -> dict[str, Any]:
         "held_out": mean_psnr(loop.gaussians, held_out, config.render),
         "training": mean_psnr(loop.gaussians, [views[v] for v in train], config.render),
         "estimate": report.validation.get("expected_psnr"),
-        "announced_s": float(stages[-1].split()[-2]),
+        "announced_s": float(found[1]) if (found := re.search(r"about (\d+) s", stages[-1])) else None,
         "gaussians": report.num_gaussians,
         "steps": report.steps,
         "cpu_s": seconds,

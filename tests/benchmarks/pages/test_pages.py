@@ -40,7 +40,7 @@ def test_plots__are_drawn_and_shown(tmp_path: Path):
 
 
 def test_claims__have_a_table_or_figure_a_command_and_committed_results():
-    assert len(CLAIMS) == 11
+    assert len(CLAIMS) == 12
     result = r"\]\(\.\./\.\./benchmarks/results/\w+\.json\)"
     parts = r"<!-- table: |!\[", r"`(?:make demo|python\s+-m\s+(?:benchmarks|tests)\.[^`]+)`", SETUP, result
     assert [(claim.partition("\n")[0], part) for claim in CLAIMS for part in parts if not re.search(part, claim)] == []
@@ -152,12 +152,10 @@ def test_method_page__quotes_the_unseen_scenes_without_seed_4():
 def test_first_frame_page__quotes_the_gaussians_and_the_forecast():
     fits = [fit for fit in committed("generalise")["fits"] if fit["variant"] == "default"]
     counts = {fit["clip"]: fit["gaussians"] for fit in fits if fit["views"] == 9 and not fit["noise"]}
-    walk4 = committed("first_frame_walk4")["fits"]["walk4"]["chosen"]
     assert not missing(
         "first-frame.md",
         [
             "get {:,}, {:,} and {:,}".format(*(counts[f"random-{seed}"] for seed in (201, 202, 203))),
-            f"got {walk4['gaussians']:,} Gaussians and {walk4['steps']} steps, and had {walk4['training']:.2f} dB",
         ],
     )
 
