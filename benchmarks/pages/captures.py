@@ -23,6 +23,7 @@ __all__ = [
     "live",
     "noise_aware",
     "points",
+    "principal_points",
 ]
 
 
@@ -141,6 +142,18 @@ def cameras() -> str:
         rows.append((name, *psnrs, f"{span((100 * fit['recovered'] for fit in own), 0)} %", rotations))
     titles = "true cameras, dB", "disturbed", "refined", "recovered", "rotation after, degrees"
     return markdown(("error", *titles), rows)
+
+
+def principal_points() -> str:
+    """Return the PSNR of photos by their calibration."""
+    columns = (
+        Column("training views, dB", "training", spread=True),
+        Column("held out, as calibrated", "held_out", spread=True),
+        Column("registered", "registered", spread=True),
+        Column("difference", lambda fit: fit["registered"] - fit["held_out"], spread=False),
+    )
+    keys = {"photos": "set", "principal points": "principal_points", "held out": "held_out_views"}
+    return scores_table(committed("real")["fits"], keys, columns, left=2)
 
 
 def clocks() -> str:
