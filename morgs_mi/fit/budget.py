@@ -1,15 +1,16 @@
 """The plan of the first frame: as many Gaussians and steps as its images ask for and its time allows.
 
 The images ask for a number of Gaussians (see `detail`), and these for a number of steps (`FitConfig.planned_steps`).
-Where that would take longer than `FitConfig.first_frame_seconds`, there are fewer Gaussians and with them fewer steps,
-and where the fewest Gaussians still take too long, fewer steps. Numbers that are given stay as they are.
+Where that would take longer than `FitConfig.first_frame_seconds`, both are reduced: the Gaussians by the square root of
+the share that the time allows, and the steps by the rest. Numbers that are given stay as they are.
 
 The time of a step is proportional to
 
     number of Gaussians + 0.45 number of pixels,
 
 as measured on two cores with 20,000 to 240,000 Gaussians and images of 160x120 to 706x529. A few steps on this machine
-give the factor, in reproducible fits a reference machine. Where the time does not limit the plan, the clock has no
+give the factor, in reproducible fits a reference machine. On a CPU they are timed by its processor time over all
+threads: other programs delay a fit, and do not make it worse. Where the time does not limit the plan, the clock has no
 influence on the result.
 """
 
@@ -17,8 +18,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from time import perf_counter
+from math import sqrt
+from time import perf_counter, process_time
 
+import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from morgs_mi.core.random_streams import Stream, rng_of
@@ -41,8 +45,6 @@ _REFERENCE = 2.5e-7
 _TIMED, _VIEWS, _LEAST = 12, 4, 100
 # Mean number of Gaussians while it grows from a half to all, relative to all.
 _GROWING = 0.75
-# Numbers of Gaussians that are considered, relative to the one that the images ask for.
-_SHARES = np.geomspace(1, 0.01, 200)
 
 
 @dataclass(frozen=True)
@@ -75,25 +77,28 @@ def plan_first_frame(views: Sequence[View], points: Points, config: FitConfig, r
     """
     if None not in (config.num_gaussians, config.first_frame_steps):
         return Plan(config)
-    begin, wanted = perf_counter(), with_num_gaussians(config, views, points[0])
+    begin, wanted = _clock(), with_num_gaussians(config, views, points[0])
     problem = FirstFrameProblem.of(views, points, wanted, render, rng_of(seed, Stream.BUDGET))
     unit, left = _REFERENCE, config.first_frame_seconds
     if not render.reproducible:
         unit = _measured_unit(problem, wanted, seed)
-        left -= perf_counter() - begin
+        left -= _clock() - begin
     unit *= 1 + trial_steps(problem, wanted)
-    plans = [wanted] if config.num_gaussians is not None else [_reduced(wanted, share) for share in _SHARES]
-    plan = next((plan for plan in plans if unit * _work(problem, plan) <= left), plans[-1])
+    plan, share = wanted, max(left, 0) / (unit * _work(problem, wanted))
+    if share < 1 and config.num_gaussians is None:
+        count = wanted.planned_gaussians
+        least = min(config.detail.least_gaussians, count)
+        plan = replace(wanted, num_gaussians=max(round(sqrt(share) * count), least))
     if config.first_frame_steps is None:
         allowed = int(plan.planned_steps * left / (unit * _work(problem, plan)))
         plan = replace(plan, first_frame_steps=max(_LEAST, min(plan.planned_steps, allowed)))
     return Plan(plan, unit * _work(problem, plan))
 
 
-def _reduced(config: FitConfig, share: float) -> FitConfig:
-    """Return the settings with a share of the Gaussians, at least the fewest that images ask for."""
-    wanted = config.planned_gaussians
-    return replace(config, num_gaussians=max(round(share * wanted), min(config.detail.least_gaussians, wanted)))
+def _clock() -> float:
+    """Return seconds of processor time over all threads, or of a clock where a GPU computes."""
+    is_cpu = dr.backend_v(mi.Float) == dr.JitBackend.LLVM
+    return process_time() / dr.thread_count() if is_cpu else perf_counter()
 
 
 def _work(problem: FirstFrameProblem, config: FitConfig) -> float:
@@ -114,10 +119,10 @@ def _pixels(problem: FirstFrameProblem) -> float:
 def _measured_unit(problem: FirstFrameProblem, config: FitConfig, seed: int) -> float:
     """Return the seconds of a step on this machine relative to its work."""
     timed = replace(config, dropping=0.0, density=replace(config.density, rounds=0))
-    some, ends = problem.only(range(min(_VIEWS, len(problem.views)))), [perf_counter()]
+    some, ends = problem.only(range(min(_VIEWS, len(problem.views)))), [_clock()]
     for steps in (_TIMED, _TIMED, 2 * _TIMED):  # the first time, kernels are compiled
         fit_first_frame(some, replace(timed, first_frame_steps=steps), rng_of(seed, Stream.BUDGET))
-        ends.append(perf_counter())
+        ends.append(_clock())
     _, less, more = np.diff(ends)
     work = _work(some, replace(timed, first_frame_steps=_TIMED, num_gaussians=len(problem.start)))
     return float(max(more - less, 0.1 * less)) / work
