@@ -93,3 +93,17 @@ def test_withheld_blocks__divide_the_valid_pixels():
         np.testing.assert_array_equal(a.mask ^ b.mask, allowed)
         assert not (a.mask & b.mask).any()
         assert b.mask.sum() / allowed.sum() == pytest.approx(1 / 8, abs=0.06)
+
+
+def test_first_frame_problem__has_an_extent_of_a_sixth_of_the_depth_at_least():
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (50, 3))
+
+    def extent(spread: float) -> float:
+        cameras = look_at_cameras([(x, 0, -12) for x in (-spread, spread)], 40)
+        given = [View(camera, np.zeros((camera.height, camera.width, 3), np.uint8)) for camera in cameras]
+        config = FitConfig(num_gaussians=50)
+        cloud = points, np.full_like(points, 0.5)
+        return FirstFrameProblem.of(given, cloud, config, RenderConfig(), np.random.default_rng(0)).extent
+
+    assert extent(0.1) == pytest.approx(12 / 6, rel=0.1)
+    assert extent(5.0) == pytest.approx(1.1 * 5.0)
