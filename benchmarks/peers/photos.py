@@ -105,6 +105,7 @@ def ours(capture: Capture) -> dict[str, Any]:
     loop = StreamLoop.of(capture, StreamConfig())
     loop.push([next(capture.frames()).images[v] for v in capture.train_views])
     spent = processor_seconds(os.getpid()) - start
+    assert loop.gaussians is not None
     return {
         "seconds": round(spent),
         "gaussians": len(loop.gaussians),

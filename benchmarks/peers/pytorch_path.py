@@ -10,8 +10,11 @@ import sys
 import time
 
 import numpy as np
-import torch
-from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
+import torch  # pyright: ignore[reportMissingImports]
+from gsplat.cuda._torch_impl import (  # pyright: ignore[reportMissingImports]
+    _fully_fused_projection,
+    _quat_scale_to_covar_preci,
+)
 
 
 def main(scene: str, out: str) -> None:

@@ -80,7 +80,9 @@ class Kernels:
             "grad_alphas": np.zeros(pixels),
             **{f"grad_{name}": np.zeros((N, *size)) for name, size in _GRADIENTS.items()},
         }
-        found = {name: np.ascontiguousarray(value, np.float32) for name, value in arrays.items()}
+        found: dict[str, np.ndarray] = {}
+        for name, value in arrays.items():
+            found[name] = np.ascontiguousarray(value, np.float32)
         found["offsets"] = np.searchsorted(tile[order], np.arange(across * down)).astype(np.int32)
         found["ids"], found["last"] = ids[order].astype(np.int32), np.zeros(pixels, np.int32)
         return cls(ctypes.CDLL(str(path.resolve())), found, (camera.width, camera.height))
