@@ -5,7 +5,7 @@ is a single trial of half the size, which takes about a tenth of the time of the
 
 With `FitConfig.validate`, longer trials of six views and more choose the probability of dropping (see `dropping`).
 Candidates are tried in rising order until one is no better than the last. With fewer views, and by default, it follows
-from the noise of the images: a rig without one of few views is too different.
+from the views alone: a rig without one of few views is too different.
 
 A withheld view has more error than the others. This excess grows with its angle to them, until the view shows nothing
 that they show. Views halfway between neighbouring cameras are nearer, and have less of it (see `excess_share`).
@@ -23,7 +23,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.progress import Progress
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.core.rig import angles_to, scene_depths
-from morgs_mi.fit.dropping import MANY_VIEWS, dropping_by_noise
+from morgs_mi.fit.dropping import MANY_VIEWS, default_dropping
 from morgs_mi.fit.first_frame import fit_first_frame
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.forecast import forecast, verdict
@@ -175,7 +175,7 @@ def cross_validate(
 def _candidates_of(problem: FirstFrameProblem, config: FitConfig) -> tuple[float, ...]:
     """Return the probabilities of dropping that are tried."""
     is_chosen = config.validate and len(problem.views) >= MANY_VIEWS
-    return _CANDIDATES if is_chosen else (dropping_by_noise(problem.images),)
+    return _CANDIDATES if is_chosen else (default_dropping(problem),)
 
 
 def has_trials(problem: FirstFrameProblem, config: FitConfig) -> bool:

@@ -2,13 +2,12 @@
 
 Where training views are few or noisy, Gaussians overfit them together: one compensates for another in a single view. In
 every step of the first frame, each Gaussian is left out with probability p, and the opacities of the others are scaled
-by 1 / (1 - p). p follows from the number of views and their noise, or is chosen by cross-validation (see
-`cross_validation`).
+by 1 / (1 - p). p follows from the number of views, their noise and the angles between them, or is chosen by
+cross-validation (see `cross_validation`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import drjit as dr
@@ -18,17 +17,20 @@ import numpy as np
 from morgs_mi.core.attributes import sigmoid
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
+from morgs_mi.fit.forecast import forecast
 from morgs_mi.fit.noise import is_noisy
+from morgs_mi.fit.problem import FirstFrameProblem
 
-__all__ = ["MANY_VIEWS", "dropped", "dropping_by_noise"]
+__all__ = ["MANY_VIEWS", "default_dropping", "dropped"]
 
 MANY_VIEWS = 6
-"""Number of views of which one is hardly missed, and from which noisy ones are fitted without dropping."""
+"""Number of views of which one is hardly missed, and that are fitted without dropping."""
 
 # Logit of an opacity that no cut-off of the renderer lets pass, and the largest opacity.
 _INVISIBLE, _MOST = -30.0, 0.999
-# Probability with which few noisy views are fitted.
-_NOISY_DROPPING = 0.2
+# Probability with which few views are fitted that are noisy or far apart, and the least `Forecast.reach` of the latter,
+# degrees.
+_DROPPING, _FAR = 0.2, 20.0
 
 
 def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) -> Gaussians:
@@ -47,10 +49,9 @@ def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) 
     return replace(gaussians, logit_opacities=mi.TensorXf(logits))
 
 
-def dropping_by_noise(images: Sequence[np.ndarray]) -> float:
-    """Return the probability of dropping that follows from the number of images and their noise.
-
-    Args:
-        images: [H, W, 3], uint8, one per view.
-    """
-    return _NOISY_DROPPING if len(images) < MANY_VIEWS and is_noisy(images) else 0.0
+def default_dropping(problem: FirstFrameProblem) -> float:
+    """Return the probability of dropping of a first frame: above 0 for few views that are noisy or far apart."""
+    if len(problem.views) >= MANY_VIEWS:
+        return 0.0
+    far = len(problem.views) > 1 and forecast(problem.cameras, problem.points).reach >= _FAR
+    return _DROPPING if far or is_noisy(problem.images) else 0.0

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from morgs_mi.core.progress import Progress
 from morgs_mi.fit.cross_validation import CrossValidation, cross_validate, has_trials
-from morgs_mi.fit.dropping import dropping_by_noise
+from morgs_mi.fit.dropping import default_dropping
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.forecast import Forecast, forecast
 from morgs_mi.fit.noise import is_noisy
@@ -50,5 +50,5 @@ def first_settings(
         found = cross_validate(problem, config, seed, progress)
         return FirstSettings(replace(config, dropping=found.best.dropping), found)
     if config.dropping is None:
-        config = replace(config, dropping=dropping_by_noise(problem.images))
+        config = replace(config, dropping=default_dropping(problem))
     return FirstSettings(config, forecast(problem.cameras, problem.points) if len(problem.views) > 1 else None)

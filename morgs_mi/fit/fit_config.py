@@ -161,7 +161,7 @@ class FitConfig:
     not given."""
     dropping: Annotated[float, AtLeast(0), Below(1)] | None = None
     """Probability with which each step of the first frame leaves a Gaussian out (see `dropping`); None: from the noise
-    of the images, or with `validate` chosen by cross-validation."""
+    of the images and the angles between the views, or with `validate` chosen by cross-validation."""
     validate: bool = False
     """Choose the dropping among six views and more by cross-validation, in long trials (see `cross_validation`)."""
     noise_aware: bool = True

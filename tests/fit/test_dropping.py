@@ -7,8 +7,12 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi.fit.dropping import dropped, dropping_by_noise
+from morgs_mi import RenderConfig
+from morgs_mi.fit.dropping import default_dropping, dropped
+from morgs_mi.fit.problem import FirstFrameProblem
+from morgs_mi.fit.view import View
 from tests.scenes.ball import images_of, opaque_ball
+from tests.scenes.cameras import arc, look_at_cameras
 from tests.scenes.gaussians import isotropic
 
 COUNT = 4000
@@ -46,12 +50,16 @@ def test_dropped__returns_the_same_without_probability():
     assert dropped(GAUSSIANS, 0.0, np.random.default_rng(0)) is GAUSSIANS
 
 
-def test_dropping_by_noise__drops_only_where_images_are_noisy_and_few():
+def test_default_dropping__is_for_few_views_that_are_noisy_or_far_apart():
     clean, rng = [0.2 + 0.6 * image for image in images_of(opaque_ball())], np.random.default_rng(0)
 
-    def dropping(noise: float, times: int = 1) -> float:
+    def dropping(noise: float, degrees: float, times: int = 1) -> float:
         noisy = [255 * (image + rng.normal(0, noise, image.shape)) for image in times * clean]
-        return dropping_by_noise([np.uint8(np.clip(image + 0.5, 0, 255)) for image in noisy])
+        cameras = look_at_cameras(arc(np.deg2rad(degrees) * np.arange(len(noisy)), 3.5), 40)
+        images = [np.uint8(np.clip(image + 0.5, 0, 255)) for image in noisy]
+        views = tuple(map(View, cameras, images))
+        return default_dropping(FirstFrameProblem(GAUSSIANS, views, np.zeros((0, 3)), 3.0, RenderConfig()))
 
-    assert [dropping(noise) for noise in (0.0, 0.008, 0.02)] == [0, 0, 0.2]
-    assert dropping(0.02, times=2) == 0
+    assert [dropping(noise, 8) for noise in (0.0, 0.008, 0.02)] == [0, 0, 0.2]
+    assert [dropping(0.0, degrees) for degrees in (8, 40)] == [0, 0.2]
+    assert dropping(0.02, 40, times=2) == 0

@@ -8,6 +8,7 @@ import pytest
 
 from morgs_mi.core.progress import Progress
 from morgs_mi.fit.cross_validation import CrossValidation
+from morgs_mi.fit.dropping import default_dropping
 from morgs_mi.fit.first_settings import first_settings
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.forecast import Forecast
@@ -47,7 +48,7 @@ def test_first_settings__withhold_a_view_of_three_and_more(views: int, expected,
     reported = set()
     found = settings(CHOOSING, views, report=lambda stage, *_: reported.add(stage))
     assert type(found.expected) is (expected or type(None))
-    assert found.config == replace(CHOOSING, dropping=0.0)
+    assert found.config == replace(CHOOSING, dropping=default_dropping(problem(GREY[:views])))
     assert reported == stages
 
 
