@@ -1,4 +1,5 @@
-// Build the player into a folder of the Python package: the page, its script, and the licences of its libraries.
+// Build the player into a folder of the Python package: the page, its script, the licences of its libraries, and
+// morgs-spark.js, the module for other pages.
 //
 //     node build.mjs FOLDER
 import { mkdir, readFile, writeFile } from "node:fs/promises";
@@ -28,8 +29,7 @@ const generated = {
       return { contents: await compiled(path.slice("wasm:".length)), loader: "binary" };
     });
     build.onLoad({ filter: /^worker:/, namespace: "generated" }, async () => {
-      const { outputFiles } = await esbuild.build({ ...settings, entryPoints: ["src/worker.ts"], plugins: [generated] });
-      return { contents: outputFiles[0].text, loader: "text" };
+      return { contents: await bundle("src/worker.ts"), loader: "text" };
     });
   },
 };
@@ -58,10 +58,19 @@ async function notice() {
   return `The web player contains these libraries; of assemblyscript, it contains the runtime.\n\n${parts.join("\n" + "-".repeat(80) + "\n\n")}`;
 }
 
+async function bundle(entry, options) {
+  const { outputFiles } = await esbuild.build({ ...settings, entryPoints: [entry], plugins: [generated], ...options });
+  return outputFiles[0].text;
+}
+
+const BANNER = `/* Streams of morgs-mi in scenes of three.js with Spark: docs/web-player.md. BSD-3-Clause, Copyright (c) 2026, The
+morgs_mi authors. It contains the runtime of AssemblyScript, under the Apache License 2.0. */`;
+
 const folder = resolve(process.argv[2]);
 process.chdir(import.meta.dirname);
-const { outputFiles } = await esbuild.build({ ...settings, entryPoints: ["src/main.ts"], plugins: [generated] });
 await mkdir(folder, { recursive: true });
-await writeFile(`${folder}/player.js`, outputFiles[0].text);
+await writeFile(`${folder}/player.js`, await bundle("src/main.ts"));
+const external = { format: "esm", external: ["three", "@sparkjsdev/spark"], banner: { js: BANNER } };
+await writeFile(`${folder}/morgs-spark.js`, await bundle("src/morgs_spark.ts", external));
 await writeFile(`${folder}/player.html`, await readFile("src/player.html", "utf8"));
 await writeFile(`${folder}/NOTICE`, await notice());

@@ -1,8 +1,9 @@
 /** Frames of a stream, in any order: forward by residuals, elsewhere from a keyframe or a state in memory. */
 
-import { difference, everything, type Update } from "./rows";
+import { difference, everything } from "./rows";
 import { applyResidual, bytesOf, type Change, copyOf, keyframe, ordered, type State } from "./state";
 import { KEYFRAME, openArrays, openPacket, type PacketPlace, type Stream } from "./stream";
+import type { Update } from "./update";
 
 /** Memory for states to start from. */
 const BUDGET = 256 * 2 ** 20;

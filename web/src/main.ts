@@ -1,10 +1,11 @@
 /** The page: its controls, and what connects playback, view and drawing. */
 
+import { positionOf } from "./cameras";
 import { CONFIDENCE_GRADIENT } from "./colors";
 import { Playback } from "./playback";
 import { type Mode, MODES, Splats } from "./splats";
-import type { CameraFields } from "./stream";
-import { positionOf, View } from "./view";
+import { type CameraFields, download } from "./stream";
+import { View } from "./view";
 import type { Opened } from "./worker";
 
 declare function embedded(id: string): Uint8Array<ArrayBuffer>;
@@ -32,11 +33,7 @@ function sayFailure(error: unknown): void {
 
 async function streamBytes(): Promise<Uint8Array<ArrayBuffer>> {
   const address = element("stream").dataset.address;
-  if (address === undefined) return embedded("stream");
-  const response = await fetch(address).catch(() => null);
-  if (response === null) throw new Error(`${address} cannot be read; a web server must serve this folder`);
-  if (!response.ok) throw new Error(`${address} cannot be read: ${response.status} ${response.statusText}`);
-  return new Uint8Array(await response.arrayBuffer());
+  return address === undefined ? embedded("stream") : download(address);
 }
 
 /** Scale of the page's units: the rig spans four, as Spark's thresholds are absolute. */
@@ -63,13 +60,7 @@ class Player {
 
   constructor(bytes: Uint8Array<ArrayBuffer>) {
     this.playback = new Playback(bytes, {
-      opened: (stream) => {
-        try {
-          this.open(stream);
-        } catch (error) {
-          sayFailure(error);
-        }
-      },
+      opened: (stream) => this.open(stream),
       show: (update, position) => {
         this.splats.apply(update);
         slider.value = String(position);
@@ -96,13 +87,11 @@ class Player {
     ({ cameras: this.cameras, frames: this.frames } = stream);
     if (stream.damage !== null) say(`This stream is damaged: ${stream.damage}. The frames before that play.`);
     const unit = unitOf(this.cameras);
-    const metadata = stream.metadata as
-      | { config?: { render?: object }; motion_scale?: number; default_rig?: boolean }
-      | undefined;
-    this.motionScale = metadata?.motion_scale ?? 0.03;
-    this.splats = new Splats(canvas, { eps2d: 0.3, alpha_min: 1 / 255, ...metadata?.config?.render }, unit);
+    const metadata = stream.metadata as { motion_scale?: number; default_rig?: boolean };
+    this.motionScale = metadata.motion_scale ?? 0.03;
+    this.splats = new Splats(canvas, stream.metadata, unit);
     this.view = new View(this.cameras, unit, canvas, () => this.followView());
-    if (metadata?.default_rig === true) this.bound(); // no recorded views to stay near
+    if (metadata.default_rig === true) this.bound(); // no recorded views to stay near
     cameraList.replaceChildren(...this.cameras.map(({ name }, i) => new Option(name, String(i))));
     slider.max = String(this.frames.length - 1);
     element("player").classList.toggle("still", this.frames.length === 1);

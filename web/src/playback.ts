@@ -1,7 +1,7 @@
 /** Frames in time: requests to the worker, frames that are ready ahead, and the clock. */
 
-import type { Update } from "./rows";
 import type { State } from "./state";
+import type { Update } from "./update";
 import source from "worker:decoder";
 import type { Opened, Reply, Request } from "./worker";
 
@@ -26,7 +26,7 @@ export class Playback {
   private readonly worker: Worker;
   private loops = true;
   private length = 0;
-  private fps = 30;
+  fps = 30;
   private ready: Shown[] = [];
   private due = 0;
   /** The ticket of the last jump; frames with an older one are dropped. */
@@ -68,9 +68,9 @@ export class Playback {
   /** Show a position as soon as it is decoded. */
   seek(position: number): void {
     const target = Math.max(0, Math.min(this.last, position));
-    const repeats = this.requested < this.position;
-    const requested = this.position < target && (target <= this.requested || repeats);
-    const underWay = requested && !this.jumping && !this.broken;
+    const ahead = (this.requested - this.position + this.length) % this.length;
+    const steps = (target - this.position + this.length) % this.length;
+    const underWay = steps > 0 && steps <= ahead && !this.jumping && !this.broken;
     this.target = target;
     this.jumping = true;
     if (underWay) {
@@ -109,6 +109,10 @@ export class Playback {
     return new Promise((resolve) => this.answers.push(resolve));
   }
 
+  dispose(): void {
+    this.worker.terminate();
+  }
+
   private get atEnd(): boolean {
     return this.position === this.last && !this.loops;
   }
@@ -137,7 +141,11 @@ export class Playback {
     if (reply.kind === "opened") {
       this.length = reply.frames.length;
       this.fps = reply.fps > 0 ? reply.fps : 30;
-      this.events.opened(reply);
+      try {
+        this.events.opened(reply);
+      } catch (error) {
+        this.events.failed(error instanceof Error ? error.message : String(error));
+      }
     } else if (reply.kind === "state") {
       this.answers.shift()?.(reply.state);
     } else if (reply.kind === "failed" && reply.ticket === -1) {

@@ -35,6 +35,13 @@ export interface Stream {
   damage: string | null;
 }
 
+export async function download(address: string | URL): Promise<Uint8Array<ArrayBuffer>> {
+  const response = await fetch(address).catch(() => null);
+  if (response === null) throw new Error(`${address} cannot be read; a web server must serve it`);
+  if (!response.ok) throw new Error(`${address} cannot be read: ${response.status} ${response.statusText}`);
+  return new Uint8Array(await response.arrayBuffer());
+}
+
 /** Parse the header and find the packets; checksums are checked when a packet is opened. */
 export function openStream(bytes: Uint8Array): Stream {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
@@ -56,7 +63,8 @@ export function openStream(bytes: Uint8Array): Stream {
   }
   if (packets.length === 0 || packets[0].kind !== HEADER) throw new Error("the header of the stream is missing");
   const fields = JSON.parse(new TextDecoder().decode(openPacket(bytes, packets[0])));
-  return { ...fields, bytes, damage, packets: packets.filter((p) => p.kind === KEYFRAME || p.kind === RESIDUAL) };
+  const metadata = fields.metadata ?? {};
+  return { ...fields, metadata, bytes, damage, packets: packets.filter((p) => p.kind === KEYFRAME || p.kind === RESIDUAL) };
 }
 
 /** Return the payload of a packet after checking its CRC. */

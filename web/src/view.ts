@@ -2,6 +2,7 @@
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { axisOf, fovOf, positionOf, turntableUp } from "./cameras";
 import type { CameraFields } from "./stream";
 
 /**
@@ -12,23 +13,6 @@ import type { CameraFields } from "./stream";
 const REACH = THREE.MathUtils.degToRad(8);
 /** Share of the angle beyond it by which a frame turns the view back. */
 const PULL = 0.5;
-
-/** Mean up direction of the cameras; that of the first one where they cancel out. */
-function upDirection(cameras: CameraFields[]): THREE.Vector3 {
-  const up = new THREE.Vector3();
-  for (const { viewmat } of cameras) up.sub(row(viewmat, 1));
-  return (up.length() > 0.1 * cameras.length ? up : row(cameras[0].viewmat, 1).negate()).normalize();
-}
-
-function row(viewmat: number[][], i: number): THREE.Vector3 {
-  return new THREE.Vector3(viewmat[i][0], viewmat[i][1], viewmat[i][2]);
-}
-
-export function positionOf({ viewmat }: CameraFields): THREE.Vector3 {
-  const position = new THREE.Vector3();
-  for (let i = 0; i < 3; i++) position.addScaledVector(row(viewmat, i), -viewmat[i][3]);
-  return position;
-}
 
 export class View {
   readonly camera = new THREE.PerspectiveCamera();
@@ -53,15 +37,12 @@ export class View {
   /** Show what a camera of the rig sees; orbits turn around the point on its axis at a distance. */
   select(index: number, distance: (camera: THREE.PerspectiveCamera) => number): void {
     this.current = this.cameras[index];
-    const { viewmat, near } = this.current;
     const { camera, unit } = this;
-    const [right, down, ahead] = [0, 1, 2].map((i) => row(viewmat, i));
+    const ahead = axisOf(this.current, 2);
     camera.position.copy(positionOf(this.current)).multiplyScalar(unit);
-    camera.near = near * unit;
+    camera.near = this.current.near * unit;
     camera.far = 1e5;
-    // Turntable around the rig's up, tilted sideways as far as this camera is, so that selecting it shows its pose.
-    camera.up.copy(upDirection(this.cameras)).addScaledVector(right, -upDirection(this.cameras).dot(right)).normalize();
-    if (camera.up.dot(down) > -0.1) camera.up.copy(down).negate();
+    camera.up.copy(turntableUp(this.current, this.cameras));
     camera.lookAt(ahead.clone().add(camera.position));
     this.project();
     this.controls?.dispose();
@@ -144,6 +125,6 @@ export class View {
       0, 0, -1, 0,
     );
     camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
-    camera.fov = THREE.MathUtils.radToDeg(2 * Math.atan(height / (2 * K[1][1] * scale))); // for the speed of panning
+    camera.fov = fovOf(this.current, width / height); // for the speed of panning
   }
 }

@@ -1,9 +1,9 @@
 /** Decoding outside the page's thread. */
 
 import { Decoder } from "./decoder";
-import type { Update } from "./rows";
 import type { State } from "./state";
 import { type CameraFields, openStream, type Stream } from "./stream";
+import type { Update } from "./update";
 
 export interface Opened {
   kind: "opened";

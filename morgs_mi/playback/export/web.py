@@ -1,7 +1,8 @@
-"""A stream as a web page that plays it: one file, or a folder for a web server.
+"""A stream as a web page that plays it: one file, or a folder for a web server with a module for other pages.
 
-The page is built from `web/` and part of the package. It contains its script, compressed, and in a single file the
-stream as well. Both are stored as text with 7 bits per character, see "In a web page" in docs/stream-format.md.
+The page and the module are built from `web/` and part of the package. The page contains its script, compressed, and in
+a single file the stream as well. Both are stored as text with 7 bits per character, see "In a web page" in
+docs/stream-format.md.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import re
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +35,7 @@ Progress = Callable[[int], None]
 # What an HTML parser replaces (NUL, carriage return) or could take for the end of a script (<).
 _UNSAFE = (0x00, 0x0D, 0x3C)
 _STREAM = "stream.morgs"
+_MODULE = "morgs-spark.js"
 # Gaussians per frame and camera from which the scale of the motion is estimated.
 _SAMPLES = 500
 # Smallest scale, as a fraction of the width per frame; with a smaller one, a still scene would show the fit's noise.
@@ -72,7 +75,9 @@ def web_page(stream: StreamReader, title: str | None = None, progress: Progress 
 def write_web_folder(
     stream: StreamReader, path: str | Path, title: str | None = None, progress: Progress | None = None
 ) -> int:
-    """Write a folder for a web server, with the page `index.html` and the stream as a file, and return their bytes.
+    """Write a folder for a web server and return its number of bytes.
+
+    It contains the page `index.html`, the stream as a file, and `morgs-spark.js`, which plays it in other pages.
 
     Args:
         stream: the file.
@@ -88,10 +93,11 @@ def write_web_folder(
     data = _published(stream, progress)
     place = f'<i id="stream" data-address="{_STREAM}" hidden></i>'
     page = _page(title or stream_name(stream), place, "'self' data: blob:")
+    contents = {"index.html": page, _STREAM: data, _MODULE: (_player() / _MODULE).read_bytes()}
     with atomic_folder(path, "write_web_folder()") as partial:
-        (partial / "index.html").write_bytes(page)
-        (partial / _STREAM).write_bytes(data)
-    return len(page) + len(data)
+        for name, content in contents.items():
+            (partial / name).write_bytes(content)
+    return sum(map(len, contents.values()))
 
 
 def text_of_bytes(data: bytes) -> str:
@@ -159,8 +165,12 @@ def _speeds(gaussians: Gaussians, cameras: Sequence[Camera]) -> np.ndarray:
     return np.hstack(found)
 
 
+def _player() -> Traversable:
+    return files("morgs_mi.playback.export") / "web_player"
+
+
 def _page(title: str, data: str, connect: str) -> bytes:
-    player = files("morgs_mi.playback.export") / "web_player"
+    player = _player()
     code = gzip.compress((player / "player.js").read_bytes(), 9, mtime=0)
     page = (player / "player.html").read_text(encoding="utf-8")
     values = {

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-import functools
-import http.server
 import itertools
 import os
 import re
-import shutil
-import threading
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib.resources import files
-from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -29,16 +23,11 @@ from morgs_mi.playback.export.notebook import stream_html
 from morgs_mi.playback.export.web import text_of_bytes, write_web_folder, write_web_page
 from morgs_mi.playback.player import channel_image, render, render_config
 from morgs_mi.playback.streams import open_stream
+from tests.playback.export.pages import HEIGHT, WIDTH, Page, served
 from tests.scenes.cameras import look_at_cameras
 from tests.scenes.changing_splats import rig, splats, write_stream
 
-NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
-WIDTH, HEIGHT = 480, 360
-# A software rasteriser on a busy machine starts slowly.
-TIMEOUT_MS = 60_000
 FRAMES = 4
-HIDDEN = "#bar, #legend, #message {visibility: hidden}"
 
 
 # --------------------------------------------------------------------------------------------------
@@ -191,79 +180,24 @@ def test_export_web__writes_a_page_or_a_folder(tmp_path, capsys):
 # --------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module", params=[pytest.param("chromium", marks=pytest.mark.slow)])
-def browser():
-    playwright = pytest.importorskip(
-        "playwright.sync_api", reason="install it with pip install 'morgs-mi[viewer-test]'"
-    )
-    if CHROMIUM is None:
-        pytest.skip("no Chromium found; install it with tools/setup_browser.sh (apt-get install chromium)")
-    with playwright.sync_playwright() as driver:
-        options = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-        browser = driver.chromium.launch(executable_path=CHROMIUM, args=options)
-        yield browser
-        browser.close()
-
-
-class Page:
-    """A page of the player, with what it requested and what it reported."""
+class Player(Page):
+    """A page of the player."""
 
     def __init__(self, browser, address: str, expected: str | None = None, **context):
-        options = {"viewport": {"width": WIDTH, "height": HEIGHT}, **context}
-        self.page = browser.new_context(**options).new_page()
-        self.page.set_default_timeout(TIMEOUT_MS)
-        self.errors: list[str] = []
-        self.requests: list[str] = []
-        self.page.on("console", lambda m: self.errors.append(m.text) if m.type in ("error", "warning") else None)
-        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on("request", lambda request: self.requests.append(request.url))
-        self.page.goto(address)
+        super().__init__(browser, address, **context)
         if expected is None:
             self.wait("!!window.player && player.settled")
         else:
             self.page.get_by_text(expected).wait_for()
 
-    def __enter__(self) -> Page:
-        return self
-
-    def __exit__(self, *error) -> None:
-        self.page.context.close()
-
-    def wait(self, condition: str) -> None:
-        """Wait for a condition; wait_for_function() needs `eval`, which the page forbids."""
-        for _ in range(TIMEOUT_MS // 50):
-            if self.page.evaluate(condition):
-                return
-            self.page.wait_for_timeout(50)
-        raise AssertionError(f"{condition} does not become true; {self.text('#message')} {self.errors}")
-
     def show(self, frame: int) -> None:
         self.page.evaluate(f"player.playback.seek({frame})")
         self.wait(f"player.playback.position === {frame} && player.settled")
 
-    def text(self, selector: str) -> str:
-        return self.page.locator(selector).inner_text()
-
-    def image(self) -> np.ndarray:
-        """Return the image behind the controls."""
-        style = self.page.add_style_tag(content=HIDDEN)
-        image = cv2.cvtColor(cv2.imdecode(np.frombuffer(self.page.screenshot(), np.uint8), 1), cv2.COLOR_BGR2RGB)
-        style.evaluate("node => node.remove()")
-        return image
-
-
-@pytest.fixture(scope="module")
-def clip(tmp_path_factory) -> tuple[Path, list[CodedFrame]]:
-    """Return the folder of a stream with SH of degree 3, births and a death, and its states."""
-    folder = tmp_path_factory.mktemp("web")
-    states = write_stream(folder / "stream.morgs", FRAMES, splats(degree=3), rig(WIDTH, HEIGHT))
-    write_web_page(open_stream(folder), folder / "page.html")
-    return folder, states
-
 
 @pytest.fixture(scope="module")
 def opened(browser, clip):
-    with Page(browser, (clip[0] / "page.html").as_uri() + "#pause") as page:
+    with Player(browser, (clip[0] / "page.html").as_uri() + "#pause") as page:
         yield page
 
 
@@ -280,7 +214,7 @@ def page(opened):
     assert elsewhere == [opened.page.url.split("#")[0]]
 
 
-def decodes(page: Page, position: int, coded: CodedFrame) -> bool:
+def decodes(page: Player, position: int, coded: CodedFrame) -> bool:
     """Return whether the page decodes a position to the integers of a state."""
     found = page.page.evaluate(
         """async (position) => {
@@ -305,7 +239,7 @@ def test_page__plays_a_salvaged_stream(browser, clip, tmp_path):
         for packet in kept:
             writer.write(packet)
     write_web_page(open_stream(tmp_path), tmp_path / "page.html")
-    with Page(browser, (tmp_path / "page.html").as_uri() + "#pause&frame=3") as page:
+    with Player(browser, (tmp_path / "page.html").as_uri() + "#pause&frame=3") as page:
         assert page.text("#count") == "3 / 3"
         assert all(decodes(page, position, states[frame]) for position, frame in enumerate((0, 2, 3)))
 
@@ -351,9 +285,9 @@ def test_page__steps_to_frames_that_are_being_decoded(page):
 
 
 def test_page__opens_on_the_first_frame_with_motion(browser, clip):
-    with Page(browser, (clip[0] / "page.html").as_uri() + "#pause") as page:
+    with Player(browser, (clip[0] / "page.html").as_uri() + "#pause") as page:
         assert page.text("#count") == f"1 / {FRAMES - 1}"
-    with Page(browser, (clip[0] / "page.html").as_uri() + "#pause&frame=0&mode=motion") as page:
+    with Player(browser, (clip[0] / "page.html").as_uri() + "#pause&frame=0&mode=motion") as page:
         assert page.text("#count") == f"0 / {FRAMES - 1}"
         assert "The first frame has no motion." in page.text("#legend")
 
@@ -375,7 +309,7 @@ HOLD_SORTING = """() => {
 
 
 def test_page__draws_a_new_mode_when_its_values_arrive(browser, clip):
-    with Page(browser, (clip[0] / "page.html").as_uri() + "#pause") as page:
+    with Player(browser, (clip[0] / "page.html").as_uri() + "#pause") as page:
         page.show(3)
         colors = page.image()
         page.page.evaluate(HOLD_SORTING)
@@ -434,7 +368,7 @@ AT_REST = """new Promise((resolve) => {
 })"""
 
 
-def drag(page: Page, pixels: int, cameras: Sequence[Camera]) -> float:
+def drag(page: Player, pixels: int, cameras: Sequence[Camera]) -> float:
     """Return the angle in degrees from the view at rest after a drag to the nearest camera."""
     page.page.mouse.move(WIDTH / 2, HEIGHT / 2)
     page.page.mouse.down()
@@ -463,7 +397,7 @@ def test_page__draws_orbits_back_farther_to_cameras_without_neighbours(browser, 
     cameras = tuple(look_at_cameras([(0, -4, 1), (4, 0, 1)], 45, WIDTH, HEIGHT, ("front", "side"), up=(0, 0, 1)))
     write_stream(tmp_path / "stream.morgs", 2, cameras=cameras)
     write_web_page(open_stream(tmp_path), tmp_path / "page.html")
-    with Page(browser, (tmp_path / "page.html").as_uri() + "#pause") as page:
+    with Player(browser, (tmp_path / "page.html").as_uri() + "#pause") as page:
         assert drag(page, -20, cameras) == pytest.approx(4, abs=0.2)
 
 
@@ -508,7 +442,7 @@ def test_page__is_operated_by_keyboard(page):
 
 def test_page__fits_a_phone_and_is_operated_by_touch(browser, clip):
     phone = {"viewport": {"width": 390, "height": 780}, "has_touch": True, "is_mobile": True}
-    with Page(browser, (clip[0] / "page.html").as_uri() + "#pause&frame=1&mode=motion", **phone) as page:
+    with Player(browser, (clip[0] / "page.html").as_uri() + "#pause&frame=1&mode=motion", **phone) as page:
         assert page.text("#count") == f"1 / {FRAMES - 1}"
         page.page.get_by_text("Confidence", exact=True).first.tap()
         page.wait("player.settled")
@@ -532,7 +466,7 @@ def test_page__names_a_damaged_packet(browser, hosted):
     data = bytearray(stream.path.read_bytes())
     data[stream.index()[2][2] + 100] ^= 1
     stream.path.write_bytes(data)
-    with Page(browser, address) as page:
+    with Player(browser, address) as page:
         page.page.keyboard.press("End")
         page.page.get_by_text("This stream is damaged: frame 2: the packet at byte").wait_for()
         page.show(1)
@@ -543,7 +477,7 @@ def test_page__names_a_truncated_stream(browser, hosted):
     address, stream = hosted
     data = stream.path.read_bytes()
     stream.path.write_bytes(data[: stream.index()[2][2] + 100])
-    with Page(browser, address) as page:
+    with Player(browser, address) as page:
         assert "truncated or damaged at byte" in page.text("#message")
         assert page.text("#count") == "1 / 1"
 
@@ -553,7 +487,7 @@ def test_page__shows_the_frames_before_a_damaged_one_that_the_address_asks_for(b
     data = bytearray(stream.path.read_bytes())
     data[stream.index()[2][2] + 100] ^= 1
     stream.path.write_bytes(data)
-    with Page(browser, f"{address}&frame=3") as page:
+    with Player(browser, f"{address}&frame=3") as page:
         page.page.get_by_text("The frames before that play.").wait_for()
         page.show(1)
 
@@ -564,29 +498,8 @@ def test_page__names_what_is_no_stream(browser, hosted):
     data[stream.index()[0][2] + 100] ^= 1
     for content, reason in ((b"something else", "this is not a .morgs stream"), (data, "frame 0: the packet at byte")):
         stream.path.write_bytes(content)
-        with Page(browser, address, f"This page could not start: {reason}") as page:
+        with Player(browser, address, f"This page could not start: {reason}") as page:
             assert "frames before" not in page.text("#message")
     stream.path.unlink()
-    with Page(browser, address, "stream.morgs cannot be read: 404"):
-        pass
-
-
-class served:
-    """Serve a folder on this machine, as a context that returns its address."""
-
-    def __init__(self, folder: Path):
-        handler = functools.partial(_Quiet, directory=str(folder))
-        self.server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
-
-    def __enter__(self) -> str:
-        threading.Thread(target=self.server.serve_forever, daemon=True).start()
-        return f"http://127.0.0.1:{self.server.server_port}"
-
-    def __exit__(self, *error) -> None:
-        self.server.shutdown()
-        self.server.server_close()
-
-
-class _Quiet(http.server.SimpleHTTPRequestHandler):
-    def log_message(self, format: str, *args: object) -> None:
+    with Player(browser, address, "stream.morgs cannot be read: 404"):
         pass

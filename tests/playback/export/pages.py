@@ -1,0 +1,79 @@
+"""Pages in headless Chromium, and a web server for them."""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import shutil
+import threading
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
+WIDTH, HEIGHT = 480, 360
+# A software rasteriser on a busy machine starts slowly.
+TIMEOUT_MS = 60_000
+HIDDEN = "#bar, #legend, #message {visibility: hidden}"
+
+
+class Page:
+    """A page with what it requested and what it reported."""
+
+    def __init__(self, browser, address: str, **context):
+        options = {"viewport": {"width": WIDTH, "height": HEIGHT}, **context}
+        self.page = browser.new_context(**options).new_page()
+        self.page.set_default_timeout(TIMEOUT_MS)
+        self.errors: list[str] = []
+        self.requests: list[str] = []
+        self.page.on("console", lambda m: self.errors.append(m.text) if m.type in ("error", "warning") else None)
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        self.page.goto(address)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error) -> None:
+        self.page.context.close()
+
+    def wait(self, condition: str) -> None:
+        """Wait for a condition; wait_for_function() needs `eval`, which the player forbids."""
+        for _ in range(TIMEOUT_MS // 50):
+            if self.page.evaluate(condition):
+                return
+            self.page.wait_for_timeout(50)
+        raise AssertionError(f"{condition} does not become true; {self.text('body')} {self.errors}")
+
+    def text(self, selector: str) -> str:
+        return self.page.locator(selector).inner_text()
+
+    def image(self) -> np.ndarray:
+        """Return the image behind the controls."""
+        style = self.page.add_style_tag(content=HIDDEN)
+        image = cv2.cvtColor(cv2.imdecode(np.frombuffer(self.page.screenshot(), np.uint8), 1), cv2.COLOR_BGR2RGB)
+        style.evaluate("node => node.remove()")
+        return image
+
+
+class served:
+    """Serve a folder on this machine, as a context that returns its address."""
+
+    def __init__(self, folder: Path):
+        handler = functools.partial(_Quiet, directory=str(folder))
+        self.server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+
+    def __enter__(self) -> str:
+        threading.Thread(target=self.server.serve_forever, daemon=True).start()
+        return f"http://127.0.0.1:{self.server.server_port}"
+
+    def __exit__(self, *error) -> None:
+        self.server.shutdown()
+        self.server.server_close()
+
+
+class _Quiet(http.server.SimpleHTTPRequestHandler):
+    def log_message(self, format: str, *args: object) -> None:
+        pass

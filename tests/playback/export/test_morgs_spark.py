@@ -1,0 +1,190 @@
+"""The module for pages with three.js and Spark, in the example of the documentation, in headless Chromium."""
+
+from __future__ import annotations
+
+import json
+import re
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi.evaluate.metrics import psnr
+from morgs_mi.playback.export.web import write_web_folder
+from morgs_mi.playback.player import render, render_config
+from morgs_mi.playback.streams import open_stream
+from tests.playback.export.pages import Page, served
+from tests.scenes.changing_splats import write_stream
+
+ROOT = Path(__file__).parents[3]
+MODULE = "morgs-spark.js"
+FRAMES = 4
+
+# Spark displays the values of the mesh's present version, in their order, and two images were drawn since.
+DISPLAYED = "spark.current === spark.display && spark.current.mapping[0]?.version === splats.mesh.version"
+DRAWN = f"""new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(() =>
+  resolve(!spark.sorting && !spark.sortDirty && {DISPLAYED}))))"""
+FAILURE = "import('./morgs-spark.js').then((m) => m.MorgsSplats.load('{}')).then(() => null, (error) => error.message)"
+
+
+def test_write_web_folder__contains_the_module(tmp_path):
+    write_stream(tmp_path / "stream.morgs")
+    size = write_web_folder(open_stream(tmp_path), tmp_path / "web")
+    assert size == sum(path.stat().st_size for path in (tmp_path / "web").iterdir())
+    packaged = files("morgs_mi.playback.export") / "web_player" / MODULE
+    assert (tmp_path / "web" / MODULE).read_bytes() == packaged.read_bytes()
+
+
+def test_module__imports_only_three_and_spark_and_is_small():
+    code = (files("morgs_mi.playback.export") / "web_player" / MODULE).read_text(encoding="utf-8")
+    assert set(re.findall(r'import[^;"]*from"([^"]*)"', code)) == {"three", "@sparkjsdev/spark"}
+    assert len(code) < 30_000
+
+
+def example() -> str:
+    """Return the page of the documentation with the installed packages, at a time that a test sets."""
+    page = re.search(r"```html\n(.*?)```", (ROOT / "docs/web-player.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert page is not None
+    lock = json.loads((ROOT / "web/package-lock.json").read_text(encoding="utf-8"))["packages"]
+
+    def local(address: re.Match) -> str:
+        folder = f"node_modules/{address[1]}"
+        assert lock[folder]["version"] == address[2]
+        return f"./{folder}"
+
+    text = re.sub(r"https://cdn\.jsdelivr\.net/npm/(@?[\w/-]+)@([\d.]+)", local, page[1])
+    variables = "Object.assign(window, { THREE, splats, spark, scene, camera, controls, time: 0 });"
+    loop = "renderer.setAnimationLoop"
+    assert text.count(loop) == text.count("milliseconds / 1000") == 1
+    text = f'<link rel="icon" href="data:,">{text}'  # a missing one is an error in the log
+    return text.replace("milliseconds / 1000", "window.time").replace(loop, f"{variables}\n  {loop}")
+
+
+@pytest.fixture(scope="module")
+def site(clip, tmp_path_factory):
+    """Return the folder of an exported clip, with the example, the packages and broken streams, and its address."""
+    packages = ROOT / "web/node_modules"
+    if not (packages / "three").exists():
+        pytest.skip("three.js and Spark are not installed; run npm ci in web/")
+    folder = tmp_path_factory.mktemp("spark") / "web"
+    write_web_folder(open_stream(clip[0]), folder)
+    (folder / "node_modules").symlink_to(packages)
+    (folder / "scene.html").write_text(example(), encoding="utf-8")
+    data, index = (folder / "stream.morgs").read_bytes(), open_stream(folder).index()
+    version, first, later = bytearray(data), bytearray(data), bytearray(data)
+    version[8] += 1
+    first[index[0][2] + 100] ^= 1
+    later[index[2][2] + 100] ^= 1
+    broken = {"page": b"something else", "version": version, "first": first, "later": later, "cut": data[:-10]}
+    for name, content in broken.items():
+        (folder / f"{name}.morgs").write_bytes(content)
+    with served(folder) as address:
+        yield folder, address
+
+
+class Scene(Page):
+    """The example, paused."""
+
+    def show(self, frame: int, camera: int = 0) -> np.ndarray:
+        """Return the image of a frame from a camera."""
+        self.page.evaluate(f"time = {frame} / splats.fps; controls.target.copy(splats.place(camera, {camera}))")
+        self.wait(f"splats.position === {frame}")
+        self.wait(DRAWN)
+        return self.image()
+
+
+@pytest.fixture(scope="module")
+def opened(browser, site):
+    with Scene(browser, f"{site[1]}/scene.html") as scene:
+        scene.wait("!!window.splats")
+        yield scene
+
+
+@pytest.fixture
+def scene(opened):
+    """Return the page of the example, and check afterwards what it reported and requested."""
+    yield opened
+    assert not opened.errors
+    origin = opened.page.url.removesuffix("scene.html")
+    assert all(url.startswith((origin, "blob:", "data:")) for url in opened.requests)
+
+
+def test_module__shows_the_images_of_the_renderer(scene, site, clip):
+    stream = open_stream(site[0])
+    for camera, frame in ((0, 0), (0, 3), (2, 2), (2, 1)):
+        expected = render(clip[1][frame].gaussians, stream.cameras[camera], ("color",), render_config(stream))["color"]
+        assert psnr(scene.show(frame, camera) / 255, np.clip(expected, 0, 1)) > 40
+
+
+def test_module__follows_the_mesh(scene):
+    before = scene.show(1)
+    scene.page.evaluate("splats.mesh.position.set(3, 1, -2); splats.mesh.rotateY(1); splats.mesh.scale.setScalar(0.5)")
+    moved = scene.show(1)
+    scene.page.evaluate("splats.mesh.position.set(0, 0, 0); splats.mesh.rotateY(-1); splats.mesh.scale.setScalar(1)")
+    assert psnr(moved / 255, before / 255) > 40
+
+
+def test_module__is_hidden_by_other_meshes(scene):
+    before = scene.show(1)
+    scene.page.evaluate("""{
+      const wall = new THREE.Mesh(new THREE.PlaneGeometry(4, 4), new THREE.MeshBasicMaterial({ color: 0x00ff00 }));
+      wall.quaternion.copy(camera.quaternion);
+      wall.position.copy(splats.place(camera)).add(new THREE.Vector3(2, 0, -1.5).applyQuaternion(camera.quaternion));
+      scene.add(wall);
+      window.wall = wall;
+    }""")
+    behind = scene.show(1)
+    scene.page.evaluate("wall.position.add(new THREE.Vector3(0, 0, 3).applyQuaternion(camera.quaternion))")
+    ahead = scene.show(1)
+    scene.page.evaluate("scene.remove(wall)")
+    green = np.array([0, 255, 0])
+    assert (ahead[:, -100:] == green).all()
+    assert not (behind[:, -100:] == green).all()
+    assert psnr(behind[:, :100] / 255, before[:, :100] / 255) > 40
+
+
+@pytest.mark.parametrize(("seconds", "frame"), [(0.15, 1), (0.2, 2), (0.7, 3), (-0.1, 3), (1.25, 0)])
+def test_module__repeats(scene, seconds, frame):
+    scene.page.evaluate(f"time = {seconds}")
+    scene.wait(f"splats.position === {frame}")
+
+
+def test_module__knows_the_size_of_a_frame(scene, clip):
+    scene.show(0)
+    means = clip[1][0].gaussians.numpy()["means"]
+    box = scene.page.evaluate("(({min, max}) => [min.toArray(), max.toArray()])(splats.mesh.getBoundingBox())")
+    assert np.allclose(box, [means.min(axis=0), means.max(axis=0)], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("page", "this is not a .morgs stream"),
+        ("version", "expected format version 2, found 3"),
+        ("first", "frame 0: the packet at byte"),
+        ("missing", "cannot be read: 404"),
+    ],
+)
+def test_module__refuses_what_it_cannot_play(browser, site, name, reason):
+    with Scene(browser, f"{site[1]}/scene.html") as scene:
+        message = scene.page.evaluate(FAILURE.format(f"{name}.morgs"))
+    assert message.startswith(f"{name}.morgs")
+    assert reason in message
+
+
+@pytest.mark.parametrize(
+    ("name", "last", "reason"), [("later", 1, "frame 2: the packet at byte"), ("cut", 2, "truncated or damaged")]
+)
+def test_module__plays_the_frames_before_the_damage(scene, name, last, reason):
+    scene.page.evaluate(
+        f"import('./morgs-spark.js').then((m) => m.MorgsSplats.load('{name}.morgs')).then((s) => (window.damaged = s))"
+    )
+    scene.page.evaluate(f"damaged.update({last} / damaged.fps)")
+    scene.wait(f"damaged.position === {last}")
+    scene.page.evaluate(f"damaged.update({last + 1} / damaged.fps)")
+    scene.wait("damaged.damage !== null")
+    assert reason in scene.page.evaluate("damaged.damage")
+    scene.page.evaluate("damaged.update(0)")
+    scene.wait("damaged.position === 0")
+    scene.page.evaluate("damaged.dispose()")
