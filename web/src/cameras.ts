@@ -25,6 +25,18 @@ export function fovOf({ K, width, height }: CameraFields, aspect: number): numbe
   return THREE.MathUtils.radToDeg(2 * Math.atan(Math.max(height, width / aspect) / (2 * K[1][1])));
 }
 
+/** Give a camera of three.js the field of view and the principal point of a recorded one, around its whole image. */
+export function focus(camera: THREE.PerspectiveCamera, recorded: CameraFields): void {
+  const { K, width, height } = recorded;
+  const { aspect } = camera;
+  const x = (width / 2 - K[0][2]) / Math.max(width, height * aspect);
+  const y = (height / 2 - K[1][2]) / Math.max(height, width / aspect);
+  camera.fov = fovOf(recorded, aspect);
+  camera.setViewOffset(1, 1, x, y, 1, 1); // which changes the aspect ratio
+  camera.aspect = aspect;
+  camera.updateProjectionMatrix();
+}
+
 /** Mean up direction of the cameras; that of the first one where they cancel out. */
 function upDirection(cameras: CameraFields[]): THREE.Vector3 {
   const up = new THREE.Vector3();

@@ -5,6 +5,7 @@ import * as THREE from "three";
 import { COEFFICIENT, FREE, GEOMETRY, OPACITY, type Update } from "./update";
 
 type SplatSource = NonNullable<SplatMesh["splats"]>;
+type FrameUpdate = Parameters<SplatMesh["update"]>[0];
 
 /** Texels of a line of the textures. */
 const WIDTH = 2048;
@@ -153,12 +154,21 @@ class Textures implements SplatSource {
 
 export class StreamMesh extends SplatMesh {
   readonly textures: Textures;
+  private readonly view = new THREE.Matrix4();
 
   constructor() {
     const textures = new Textures();
     super({ splats: textures });
     if (this.splats !== textures) throw new Error("Spark 2.0 or newer is needed");
     this.textures = textures;
+  }
+
+  /** Spark calls this before an image. Rounding of the camera's pose, as by OrbitControls, must not cause new sorting. */
+  override update(context: FrameUpdate): void {
+    const before = this.view.elements;
+    const moved = context.viewToWorld.elements.some((value, i) => Math.abs(value - before[i]) > 1e-7);
+    if (moved) this.view.copy(context.viewToWorld);
+    super.update({ ...context, viewToWorld: this.view });
   }
 
   /** Write an update into the textures. */

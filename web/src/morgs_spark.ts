@@ -1,7 +1,7 @@
 /** A stream in a scene of three.js that Spark draws: the module morgs-spark.js (docs/web-player.md). */
 
 import * as THREE from "three";
-import { fovOf, poseOf, turntableUp, upright } from "./cameras";
+import { focus, poseOf, turntableUp, upright } from "./cameras";
 import { rendererOptions, StreamMesh } from "./mesh";
 import { Playback } from "./playback";
 import { type CameraFields, download } from "./stream";
@@ -77,7 +77,7 @@ export class MorgsSplats {
   }
 
   /**
-   * Give a camera the pose of a recorded one, its up direction and a field of view with its whole image. Return the
+   * Give a camera the pose of a recorded one, its up direction, and a projection with its whole image. Return the
    * point on its axis at the median depth of the Gaussians, to orbit around.
    */
   place(camera: THREE.PerspectiveCamera, index = 0): THREE.Vector3 {
@@ -87,8 +87,7 @@ export class MorgsSplats {
     poseOf(recorded).premultiply(this.mesh.matrixWorld).decompose(camera.position, camera.quaternion, scale);
     camera.up.copy(turntableUp(recorded, this.cameras)).transformDirection(this.mesh.matrixWorld);
     camera.near = recorded.near * scale.x;
-    camera.fov = fovOf(recorded, camera.aspect);
-    camera.updateProjectionMatrix();
+    focus(camera, recorded);
     camera.updateMatrixWorld();
     return new THREE.Vector3(0, 0, -this.mesh.medianDepth(camera)).applyMatrix4(camera.matrixWorld);
   }
