@@ -200,7 +200,8 @@ class Web:
     out: Positional[Path]
     """Folder of a fit, a stream file, or a file of Gaussians."""
     output: Annotated[Positional[Path | None], DisallowNone, place("FILE.html")] = None
-    """FILE.html, or a new folder with the page and the stream, for hosting; by default OUT/player.html or OUT/web."""
+    """FILE.html, or a new folder with the page, the stream and a module for three.js, for hosting; by default
+    OUT/player.html or OUT/web."""
     format: Annotated[str | None, DisallowNone, optional("NAME"), one_of(_names(WEB))] = None
     """Format: html or folder; by default by the name."""
     title: Annotated[str | None, DisallowNone, optional("TEXT")] = None
