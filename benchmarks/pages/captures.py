@@ -17,6 +17,7 @@ __all__ = [
     "dropping",
     "estimates",
     "exposure",
+    "far_views",
     "first_frame_captures",
     "first_frame_time",
     "first_frames",
@@ -49,6 +50,16 @@ def dropping() -> str:
         row.append(plus_minus([_held_out(fit) for fit in own]))
     ordered = sorted(rows.items(), key=lambda item: (float(item[1][0]) < 0.015, int(item[0].partition("-")[2])))
     return markdown(("clip", "noise", "p = 0", "p = 0.2"), ((f"`{name}`", *row) for name, row in ordered))
+
+
+def far_views() -> str:
+    """Return the held-out PSNR of three clean views without and with dropping, by the angle to the next camera."""
+    fits = [fit for fit in committed("far_views")["fits"] if fit["steps"] == 1200 and fit["dropping"] in (0, 0.2)]
+    rows = []
+    for (seed, reach), own in sorted(grouped(fits, "seed", "reach").items(), key=lambda item: -item[0][1]):
+        without, dropped = (next(fit["held_out"] for fit in own if fit["dropping"] == p) for p in (0, 0.2))
+        rows.append((f"`random-{seed}`", f"{reach:.1f}", *(f"{x:.2f}" for x in (without, dropped, dropped - without))))
+    return markdown(("clip", "reach, degrees", "p = 0", "p = 0.2", "gain"), rows)
 
 
 def first_frames() -> str:

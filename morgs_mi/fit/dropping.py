@@ -30,7 +30,7 @@ MANY_VIEWS = 6
 _INVISIBLE, _MOST = -30.0, 0.999
 # Probability with which few views are fitted that are noisy or far apart, and the least `Forecast.reach` of the latter,
 # degrees.
-_DROPPING, _FAR = 0.2, 20.0
+_DROPPING, _FAR = 0.2, 24.0
 
 
 def dropped(gaussians: Gaussians, probability: float, rng: np.random.Generator) -> Gaussians:
