@@ -157,7 +157,7 @@ def test_module__is_hidden_by_other_meshes(scene):
 
 @pytest.mark.parametrize(("seconds", "frame"), [(0.15, 1), (0.2, 2), (0.7, 3), (-0.1, 3), (1.25, 0)])
 def test_module__repeats(scene, seconds, frame):
-    scene.page.evaluate(f"time = {seconds}")
+    scene.page.evaluate(f"time = {seconds}; splats.update(time)")
     scene.wait(f"splats.position === {frame}")
 
 
