@@ -188,9 +188,8 @@ def test_module__refuses_what_it_cannot_play(browser, site, name, reason):
     ("name", "last", "reason"), [("later", 1, "frame 2: the packet at byte"), ("cut", 2, "truncated or damaged")]
 )
 def test_module__plays_the_frames_before_the_damage(scene, name, last, reason):
-    scene.page.evaluate(
-        f"import('./morgs-spark.js').then((m) => m.MorgsSplats.load('{name}.morgs')).then((s) => (window.damaged = s))"
-    )
+    load = f"import('./morgs-spark.js').then((module) => module.MorgsSplats.load('{name}.morgs'))"
+    scene.page.evaluate(f"{load}.then((splats) => void (window.damaged = splats))")
     scene.page.evaluate(f"damaged.update({last} / damaged.fps)")
     scene.wait(f"damaged.position === {last}")
     scene.page.evaluate(f"damaged.update({last + 1} / damaged.fps)")
