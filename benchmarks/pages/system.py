@@ -244,7 +244,12 @@ def peers() -> str:
 def peer_photos() -> str:
     """Return the held-out PSNR of OpenSplat and of this package over the seconds."""
     rows = [
-        (f"`{fit['capture']}`", fit["program"], str(fit["seconds"]), f"{fit['gaussians']:,}", f"{fit['psnr']:.1f}")
+        (
+            f"`{fit['capture']}`",
+            fit["program"],
+            *(f"{fit[name]:,}" for name in ("seconds", "gaussians", "mb")),
+            f"{fit['psnr']:.1f}",
+        )
         for fit in committed("peers_photos")["fits"]
     ]
-    return markdown(("photos", "program", "s", "Gaussians", "held out, dB"), rows)
+    return markdown(("photos", "program", "s", "Gaussians", "memory, MB", "held out, dB"), rows)

@@ -80,9 +80,22 @@ def opensplat(path: Path, capture: Capture, options: Options) -> Iterator[dict[s
                     if stored:
                         gaussians, step = read_ply(stored[-1]), int(stored[-1].stem.split("_")[1])
                         psnr = held_out_psnr(capture, gaussians)
-                        yield {"seconds": round(spent), "steps": step, "gaussians": len(gaussians), "psnr": psnr}
+                        memory = peak_megabytes(process.pid)
+                        yield {
+                            "seconds": round(spent),
+                            "steps": step,
+                            "gaussians": len(gaussians),
+                            "psnr": psnr,
+                            "mb": memory,
+                        }
             finally:
                 process.kill()
+
+
+def peak_megabytes(pid: int) -> int:
+    """Return the largest resident memory that a process has had, MB (Linux)."""
+    (line,) = (line for line in Path(f"/proc/{pid}/status").read_text().splitlines() if line.startswith("VmHWM"))
+    return round(int(line.split()[1]) / 1e3)
 
 
 def as_binary_project(path: Path, folder: Path) -> Path:
@@ -110,6 +123,7 @@ def ours(capture: Capture) -> dict[str, Any]:
         "seconds": round(spent),
         "gaussians": len(loop.gaussians),
         "psnr": held_out_psnr(capture, loop.gaussians),
+        "mb": peak_megabytes(os.getpid()),
     }
 
 
