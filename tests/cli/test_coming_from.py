@@ -10,6 +10,7 @@ import subprocess
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
 from morgs_mi.capture.capture import Capture, load_capture
@@ -93,10 +94,20 @@ def nerfstudio(recording: Capture) -> None:
     Path("nerfstudio/SCENE/transforms.json").write_text(json.dumps(meta))
 
 
+def vggt(recording: Capture) -> None:
+    """Photos, and a binary model in `sparse` itself."""
+    first = next(iter(recording.frames()))
+    for camera, image in zip(recording.cameras, first.images, strict=True):
+        write_png(Path(f"vggt/SCENE/images/{camera.name}.png"), image)
+    write_colmap("vggt/text", recording.cameras, recording.points)
+    Path("vggt/SCENE/sparse").mkdir()
+    pycolmap.Reconstruction("vggt/text").write_binary("vggt/SCENE/sparse")
+
+
 @pytest.mark.slow
 def test_coming_from__commands_run_on_the_folders_of_the_tools(recording, tmp_path, run, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    for write in (dynerf, multipleview, dynamic3dgs, stream3dgs, nerfstudio):
+    for write in (dynerf, multipleview, dynamic3dgs, stream3dgs, nerfstudio, vggt):
         write(recording)
     write_ply("splat.ply", splats())
     os.mkdir("out")
@@ -111,11 +122,11 @@ def test_coming_from__commands_run_on_the_folders_of_the_tools(recording, tmp_pa
         outputs[rest[0]] = output
         if rest[0] == "fit":
             frames[rest[2]] = len(json.loads(Path(rest[2], "report.json").read_text())["frames"])
-    assert frames.pop("out/nerfstudio") == 1
+    assert [frames.pop(f"out/{name}") for name in ("nerfstudio", "vggt")] == [1, 1]
     assert frames == {f"out/{name}": FRAMES for name in ("dynerf", "multipleview", "dynamic3dgs", "3dgstream")}
     assert "Views between the cameras" in outputs["info"]
 
 
 def test_coming_from__names_a_command_for_each_tool():
-    assert len([command for command in COMMANDS if command.startswith("morgs-mi fit")]) == 5
+    assert len([command for command in COMMANDS if command.startswith("morgs-mi fit")]) == 6
     assert "Views between the cameras will be poor: 4 cameras" in PAGE
