@@ -410,7 +410,7 @@ def test_page__shows_a_file_of_gaussians_and_orbits_freely(browser, tmp_path):
     K = camera.K.copy()
     K[1, 2] = HEIGHT / 2
     camera = replace(camera, K=K, height=HEIGHT)
-    with Page(browser, (tmp_path / "page.html").as_uri()) as opened:
+    with Player(browser, (tmp_path / "page.html").as_uri()) as opened:
         image = render(state.gaussians, camera, ("color",), render_config(stream))["color"]
         assert psnr(opened.image() / 255, channel_image("color", image) / 255) > 40
         assert opened.page.evaluate("player.view.bounded") is False
