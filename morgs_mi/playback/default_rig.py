@@ -23,7 +23,7 @@ __all__ = ["DEFAULT_RIG", "Axes", "default_rig"]
 Axes = Literal["y-down", "y-up", "z-up"]
 """Direction that is up, by axis. Files in the layout of 3D Gaussian Splatting mostly have COLMAP's axes, y down."""
 DEFAULT_RIG = "default_rig"
-"""Entry of a stream's metadata that is true where its cameras are not those of a recording."""
+"""Entry of a stream's metadata that is true where its cameras are made up, not recorded."""
 
 # Directions up and forward of the first camera.
 _DIRECTIONS: dict[Axes, tuple[np.ndarray, np.ndarray]] = {
