@@ -31,9 +31,9 @@ _OUTPUT = (
     "image. By default OUT/CAMERA.mp4, OUT/CAMERA-png or OUT/CAMERA-exr, with the name of the camera or the path."
 )
 _CAMERA = (
-    "Camera of the stream, by index or name; `morgs-mi info` lists the cameras of a capture. A file of Gaussians has front, "
-    "front-right, right, back-right, back, back-left, left and front-left, or the cameras of its training. By default, "
-    "one image is that of the first camera, or of the one that sees most detail of a file."
+    "Camera of the stream, by index or name; `morgs-mi info` lists the cameras of a capture. A file of Gaussians has "
+    "front, front-right, right, back-right, back, back-left, left and front-left, or the cameras of its training. By "
+    "default, a single image is seen by the first camera; for a file, by the one with most detail in view."
 )
 _PATH = (
     "Camera path, instead of a camera: orbit (around the scene, the default), between (through the cameras), or a JSON "
