@@ -1,6 +1,7 @@
 """Photos of real scenes: held-out views from their calibrated cameras, and from the cameras that fit their images best.
 
     python -m benchmarks.reports.real --captures sets/fern sets/flower --json out.json
+    python -m benchmarks.reports.real --captures sets/fern sets/flower --seconds 60 120 300 --width 720 --json out.json
 
 Each capture is a folder of photos with the model of `morgs-mi calibrate`. Photos 5, 13, 21 and so on are held out.
 """
@@ -47,6 +48,8 @@ class Options(StudyOptions):
     """Number of Gaussians."""
     steps: int = 1200
     """Steps of the first frame."""
+    seconds: tuple[int, ...] = ()
+    """Times of the first frame, which plan its Gaussians and steps instead."""
 
     def study(self) -> Study:
         """Return the study of the captures."""
@@ -56,12 +59,15 @@ class Options(StudyOptions):
             capture = load_capture(path, max(1.0, full.cameras[0].width / self.width), None)
             keys = {"set": path.name.partition("-")[0], "principal_points": principal_points(capture.cameras)}
             scenes.append(Scene(keys, (Source.of(capture),)))
-        fit = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps, dropping=0.0)
-        return Study(measure, scenes, [Variant({}, StreamConfig(fit))], self.fit_seeds)
+        given = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps, dropping=0.0)
+        fits = {seconds: FitConfig(first_frame_seconds=seconds) for seconds in self.seconds} or {None: given}
+        variants = [Variant({"budget": seconds}, StreamConfig(fit)) for seconds, fit in fits.items()]
+        return Study(measure, scenes, variants, self.fit_seeds)
 
     def table(self, rows: Sequence[Row]) -> str:
         """Return the scores by set and calibration."""
-        return scores_table(rows, {"set": "set", "principal points": "principal_points"}, COLUMNS)
+        key = {"seconds": "budget"} if self.seconds else {"principal points": "principal_points"}
+        return scores_table(rows, {"set": "set"} | key, COLUMNS)
 
 
 def principal_points(cameras: Sequence[Camera]) -> str:
@@ -92,7 +98,8 @@ def measure(source: Source, config: StreamConfig) -> dict[str, Any]:
         "registered": [registered(view) for view in held_out],
     }
     scores = {name: mean_psnr(gaussians, given, config.render) for name, given in compared.items()}
-    return scores | {"views": len(train), "held_out_views": len(test), "cpu_s": seconds}
+    counts = {"views": len(train), "held_out_views": len(test), "gaussians": len(gaussians)}
+    return scores | counts | {"cpu_s": seconds}
 
 
 def _views(capture: Capture) -> list[View]:

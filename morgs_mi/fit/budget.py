@@ -4,14 +4,14 @@ The images ask for a number of Gaussians (see `detail`), and these for a number 
 Where that would take longer than `FitConfig.first_frame_seconds`, both are reduced: the Gaussians by the square root of
 the share that the time allows, and the steps by the rest. Numbers that are given stay as they are.
 
-The time of a step is proportional to
+The time of a step is modelled as
 
-    number of Gaussians + 0.45 number of pixels,
+    a number of Gaussians + b number of pixels.
 
-as measured on two cores with 20,000 to 240,000 Gaussians and images of 160x120 to 706x529. A few steps on this machine
-give the factor, in reproducible fits a reference machine. On a CPU they are timed by its processor time over all
-threads: other programs delay a fit, and do not make it worse. Where the time does not limit the plan, the clock has no
-influence on the result.
+Steps with the Gaussians that the images ask for, at full and at half the resolution, give both factors; reproducible
+fits have the factors of a reference machine. On a CPU, steps are timed by its processor time over all threads: other
+programs delay a fit, and do not make it worse. Where the time does not limit the plan, the clock has no influence on
+the result.
 """
 
 from __future__ import annotations
@@ -37,14 +37,36 @@ from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["Plan", "plan_first_frame"]
 
-# Time of a pixel relative to the time of a Gaussian.
-_PIXEL = 0.45
-# Seconds per Gaussian and step of the reference machine, two cores of a server.
-_REFERENCE = 2.5e-7
 # Steps that are timed, without as many before them, in as many views; and the least number that a time leaves.
-_TIMED, _VIEWS, _LEAST = 12, 4, 100
+_TIMED, _VIEWS, _LEAST = 8, 4, 100
 # Mean number of Gaussians while it grows from a half to all, relative to all.
 _GROWING = 0.75
+
+
+@dataclass(frozen=True)
+class _StepTime:
+    """Time of a step, s: per Gaussian and per pixel of its view."""
+
+    gaussian: float
+    pixel: float
+
+    def of(self, problem: FirstFrameProblem, count: float) -> float:
+        """Return the mean time of a step with `count` Gaussians."""
+        return self.gaussian * count + self.pixel * _pixels(problem)
+
+    def of_all(self, problem: FirstFrameProblem, config: FitConfig) -> float:
+        """Return the time of a first frame with its trials; a round of density control is a step in every view."""
+        count, steps, rounds = config.planned_gaussians, config.planned_steps, config.density.rounds
+        late = self.of(problem, count)
+        if not rounds:
+            return (1 + trial_steps(problem, config)) * steps * late
+        early = self.of(problem.halved(), _GROWING * count)
+        fit = LAST_ROUND * steps * early + (1 - LAST_ROUND) * steps * late + rounds * len(problem.views) * early
+        return (1 + trial_steps(problem, config)) * fit
+
+
+# Of the reference machine, two cores of a server.
+_REFERENCE = _StepTime(2.2e-7, 0.5e-7)
 
 
 @dataclass(frozen=True)
@@ -79,20 +101,19 @@ def plan_first_frame(views: Sequence[View], points: Points, config: FitConfig, r
         return Plan(config)
     begin, wanted = _clock(), with_num_gaussians(config, views, points[0])
     problem = FirstFrameProblem.of(views, points, wanted, render, rng_of(seed, Stream.BUDGET))
-    unit, left = _REFERENCE, config.first_frame_seconds
+    time, left = _REFERENCE, config.first_frame_seconds
     if not render.reproducible:
-        unit = _measured_unit(problem, wanted, seed)
+        time = _measured(views, points, wanted, render, seed)
         left -= _clock() - begin
-    unit *= 1 + trial_steps(problem, wanted)
-    plan, share = wanted, max(left, 0) / (unit * _work(problem, wanted))
+    plan, share = wanted, max(left, 0) / time.of_all(problem, wanted)
     if share < 1 and config.num_gaussians is None:
         count = wanted.planned_gaussians
         least = min(config.detail.least_gaussians, count)
         plan = replace(wanted, num_gaussians=max(round(sqrt(share) * count), least))
     if config.first_frame_steps is None:
-        allowed = int(plan.planned_steps * left / (unit * _work(problem, plan)))
+        allowed = int(plan.planned_steps * left / time.of_all(problem, plan))
         plan = replace(plan, first_frame_steps=max(_LEAST, min(plan.planned_steps, allowed)))
-    return Plan(plan, unit * _work(problem, plan))
+    return Plan(plan, time.of_all(problem, plan))
 
 
 def _clock() -> float:
@@ -101,28 +122,29 @@ def _clock() -> float:
     return process_time() / dr.thread_count() if is_cpu else perf_counter()
 
 
-def _work(problem: FirstFrameProblem, config: FitConfig) -> float:
-    """Return the time of a first frame relative to the time of a step of a Gaussian."""
-    count, steps = config.planned_gaussians, config.planned_steps
-    all_pixels = count + _PIXEL * _pixels(problem)
-    if not config.density.rounds:
-        return steps * all_pixels
-    growing = _GROWING * count + _PIXEL * _pixels(problem.halved())
-    return steps * (LAST_ROUND * growing + (1 - LAST_ROUND) * all_pixels)
+def _measured(views: Sequence[View], points: Points, config: FitConfig, render: RenderConfig, seed: int) -> _StepTime:
+    """Return the time of a step on this machine, from some with all Gaussians at full and at half the resolution."""
+    config = replace(config, dropping=0.0, density=replace(config.density, rounds=0))
+    full = FirstFrameProblem.of(views[:_VIEWS], points, config, render, rng_of(seed, Stream.BUDGET))
+    half = full.reduced(max(camera.width for camera in full.cameras) // 2)
+    _timed(full, config, _TIMED, seed)  # compiles the kernels
+    times, pixels = [], []
+    for problem in (full, half):
+        less, more = (_timed(problem, config, steps, seed) for steps in (_TIMED, 2 * _TIMED))
+        times.append(max(more - less, 0.1 * less) / _TIMED)
+        pixels.append(_pixels(problem))
+    fewer = pixels[0] - pixels[1]  # none of images that are too small to be reduced
+    pixel = max(times[0] - times[1], 0) / fewer if fewer else 0.0
+    return _StepTime(max(times[0] - pixel * pixels[0], 0.1 * times[0]) / len(full.start), pixel)
+
+
+def _timed(problem: FirstFrameProblem, config: FitConfig, steps: int, seed: int) -> float:
+    """Return the seconds of a fit of some steps."""
+    begin = _clock()
+    fit_first_frame(problem, replace(config, first_frame_steps=steps), rng_of(seed, Stream.BUDGET))
+    return _clock() - begin
 
 
 def _pixels(problem: FirstFrameProblem) -> float:
     """Return the mean number of pixels of a view."""
     return float(np.mean([camera.width * camera.height for camera in problem.cameras]))
-
-
-def _measured_unit(problem: FirstFrameProblem, config: FitConfig, seed: int) -> float:
-    """Return the seconds of a step on this machine relative to its work."""
-    timed = replace(config, dropping=0.0, density=replace(config.density, rounds=0))
-    some, ends = problem.only(range(min(_VIEWS, len(problem.views)))), [_clock()]
-    for steps in (_TIMED, _TIMED, 2 * _TIMED):  # the first time, kernels are compiled
-        fit_first_frame(some, replace(timed, first_frame_steps=steps), rng_of(seed, Stream.BUDGET))
-        ends.append(_clock())
-    _, less, more = np.diff(ends)
-    work = _work(some, replace(timed, first_frame_steps=_TIMED, num_gaussians=len(problem.start)))
-    return float(max(more - less, 0.1 * less)) / work

@@ -23,11 +23,11 @@ CONFIG = FitConfig(sh_degree=0, detail=DETAIL, dropping=0.0, density=DensityConf
 
 @pytest.fixture
 def plan(monkeypatch: pytest.MonkeyPatch):
-    """A function that plans for a time, if a step takes 1e-6 s per Gaussian and 0.45e-6 s per pixel."""
+    """A function that plans for a time, if a step takes 1e-6 s per Gaussian and 0.3e-6 s per pixel."""
     now = [0.0]
 
     def fit(problem, config, *_):
-        now[0] += config.first_frame_steps * 1e-6 * (len(problem.start) + 0.45 * PIXELS)
+        now[0] += config.first_frame_steps * 1e-6 * (len(problem.start) + 0.3 * budget._pixels(problem))
 
     monkeypatch.setattr(budget, "_clock", lambda: now[0])
     monkeypatch.setattr(budget, "fit_first_frame", fit)
@@ -46,7 +46,7 @@ def numbers(plan: Plan) -> tuple[int, int]:
 
 def test_plan_first_frame__follows_the_images_where_the_time_does_not_limit_it(plan):
     assert numbers(plan(1000)) == numbers(plan(2000)) == (50_000, 2000)
-    assert plan(1000).seconds == pytest.approx(2000e-6 * (50_000 + 0.45 * PIXELS))
+    assert plan(1000).seconds == pytest.approx(2000e-6 * (50_000 + 0.3 * PIXELS))
 
 
 def test_plan_first_frame__has_fewer_gaussians_and_steps_in_less_time(plan):
@@ -78,7 +78,7 @@ def test_plan_first_frame__changes_no_number_that_is_given(plan):
 
 
 def test_plan_first_frame__takes_a_reference_machine_for_reproducible_fits(plan, monkeypatch):
-    monkeypatch.setattr(budget, "_measured_unit", lambda *_: pytest.fail("the machine was timed"))
+    monkeypatch.setattr(budget, "_measured", lambda *_: pytest.fail("the machine was timed"))
     assert plan(1.0, render=RenderConfig(reproducible=True)) == plan(1.0, render=RenderConfig(reproducible=True))
 
 
