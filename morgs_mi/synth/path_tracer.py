@@ -15,7 +15,8 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.color_space import linear_to_srgb
 from morgs_mi.synth.disturbances import undistorted
 from morgs_mi.synth.ground_truth import SurfacePoints
-from morgs_mi.synth.scene import Deformed, DeformingObject, Mesh, Object, Scene
+from morgs_mi.synth.mitsuba_mesh import move_mesh, new_mesh
+from morgs_mi.synth.scene import Deformed, DeformingObject, Object, Scene
 
 __all__ = ["PathTracer", "developed", "srgb_bytes"]
 
@@ -52,20 +53,6 @@ def _load(name: str, content: dict[str, Any]) -> Any:
         # Mitsuba's message begins with a line of its own source.
         reason = re.sub(r"^\[\w+\.cpp:\d+\] ", "", str(error)).rstrip(".! ")
         raise ValueError(f"scene {name!r}: Mitsuba cannot load it: {reason}; correct the dictionary.") from error
-
-
-def _mesh(place: str, name: str, mesh: Mesh, used: np.ndarray, faces: np.ndarray) -> Any:
-    """Return a Mitsuba mesh of the vertices `used` of an object; `faces` [F, 3] are indices into these."""
-    props = mi.Properties()
-    props["bsdf"] = _load(place, mesh.bsdf)
-    props["face_normals"] = not mesh.smooth
-    loaded: Any = mi.Mesh(name, len(used), len(faces), props, mesh.smooth, mesh.uvs is not None)
-    params: Any = mi.traverse(loaded)
-    params["faces"] = mi.UInt32(faces.ravel())
-    if mesh.uvs is not None:
-        params["vertex_texcoords"] = mi.Float(mesh.uvs[used].ravel())
-    params.update()
-    return loaded
 
 
 def _pose_of(item: Object | DeformingObject, time: float) -> np.ndarray | Deformed:
@@ -106,11 +93,11 @@ class PathTracer:
             if isinstance(item, DeformingObject):
                 shapes = {}
                 for part, mesh in item.meshes.items():
-                    used, own = np.unique(mesh.faces, return_inverse=True)
-                    known = f"{name}_{part}"
+                    used, known = np.unique(mesh.faces), f"{name}_{part}"
                     self._parts.append(_Part(known, name, used, mesh.smooth))
                     faces[known] = mesh.faces
-                    shapes[known] = _mesh(scene.name, known, mesh, used, own.reshape(-1, 3))
+                    bsdf = _load(scene.name, mesh.bsdf)
+                    shapes[known] = new_mesh(known, bsdf, mesh, used, item.shape(0.0).vertices)
             elif item.pose is None:
                 shapes = {f"{name}_{part}": shape for part, shape in item.shapes.items()}
             else:
@@ -163,9 +150,7 @@ class PathTracer:
     def _set_shape(self, name: str, shape: Deformed) -> None:
         for part in self._parts:
             if part.owner == name:
-                self._params[f"{part.name}.vertex_positions"] = mi.Float(shape.vertices[part.used].ravel())
-                if part.smooth and shape.normals is not None:
-                    self._params[f"{part.name}.vertex_normals"] = mi.Float(shape.normals[part.used].ravel())
+                move_mesh(self._params, part.name, part.used, part.smooth, shape)
 
     def render(self, camera: Camera, spp: int, seed: int, noise: float = 0.0) -> np.ndarray:
         """Return the path-traced view, sRGB-encoded [H, W, 3], uint8.
