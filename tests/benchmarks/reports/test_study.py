@@ -17,7 +17,6 @@ from benchmarks.reports import (
     drift,
     estimates,
     exposure,
-    first_frame_time,
     fits,
     generalise,
     live,
@@ -48,14 +47,13 @@ TINY = StreamConfig(
     render=RenderConfig(reproducible=True),
 )
 # Figures that are times, which no two fits share.
-TIMES = {"seconds", "cpu_s", "processor_ms"}
+TIMES = {"cpu_s", "processor_ms", "seconds"}
 FIRST = {"seeds": (1,), "downscale": 1, "steps": 3, "gaussians": 60}
 SMALL = {"frames": 3, "width": 64, "gaussians": 60, "steps": 3, "epochs": 1, "fit_seeds": (0, 1)}
 # Options of a tiny run, and the number of its rows.
 STUDIES = {
     random_scenes: ({"seeds": (1,), "frames": 2}, 1),
     estimates: ({**FIRST, "views": (3,)}, 1),
-    first_frame_time: ({"captures": ("random-1",), "seconds": (60.0, 120.0)}, 2),
     generalise: ({"scenes": ("random-1",), "views": (3,), "steps": 3, "gaussians": 60}, 4),
     cameras: ({**FIRST, "degrees": (0.0, 0.5), "disturbances": (0,), "lens": 0.1}, 3),
     masks: ({"frames": 1, "loops": ("none",)}, 1),
