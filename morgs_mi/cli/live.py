@@ -16,27 +16,32 @@ import numpy as np
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, print_warning, progress
-from morgs_mi.cli.settings import Flag, GivenSettings, Settings
-from morgs_mi.fit.fit_config import FitConfig
-from morgs_mi.loop.stream_config import StreamConfig
-from morgs_mi.runs.live.live_config import LiveConfig
+from morgs_mi.cli.settings import Flag, Settings, setting
+from morgs_mi.runs.live.live_config import LIVE_STREAM, LiveConfig
 
 if TYPE_CHECKING:
     from morgs_mi.runs.live.fit_live import LiveFrame
 
-__all__ = ["Live"]
+__all__ = ["Live", "LiveSettings"]
 
-# Dropped frames cost more than the last epochs of a frame gain, and nothing should move during the first frame.
-_DEFAULT = StreamConfig(fit=FitConfig(epochs=2, first_frame_seconds=30.0))
 _PERIOD = 1.0  # least time between two lines about frames, s
+
+
+@dataclass(frozen=True)
+class LiveSettings(Settings):
+    """Settings of a live fit, with its own defaults."""
+
+    first_frame_seconds: Annotated[float | None, setting("first_frame_seconds", LIVE_STREAM)] = None
+    """Time of the first frame, which limits its Gaussians and steps."""
+    epochs: Annotated[int | None, setting("epochs", LIVE_STREAM)] = None
+    """Passes over the views for every later frame."""
 
 
 @dataclass(frozen=True)
 class Live:
     """Reconstruct what cameras see, while they see it, into OUT/stream.morgs; Ctrl-C ends it.
 
-    Whenever a frame is fitted, the newest images follow, and those between are dropped. Frames have two epochs unless
-    --epochs, a preset or a file sets more.
+    Whenever a frame is fitted, the newest images follow, and those between are dropped.
     """
 
     out: Annotated[Positional[Path | None], arg(help_behavior_hint="(default: live-DATE-TIME)", metavar="[OUT]")] = None
@@ -48,14 +53,14 @@ class Live:
     """Show the stream in the viewer, which follows it."""
     open_browser: bool = True
     """Open the viewer in the browser of this machine."""
-    settings: GivenSettings = field(default_factory=Settings)
+    settings: Annotated[LiveSettings, arg(name=""), DisallowNone] = field(default_factory=LiveSettings)
 
     def run(self) -> None:
         from morgs_mi.playback.player import PROVISIONAL
         from morgs_mi.runs.live.fit_live import fit_live
 
         out = self.out or Path(time.strftime("live-%Y%m%d-%H%M%S"))
-        config = self.settings.stream_config(_DEFAULT)
+        config = self.settings.stream_config(LIVE_STREAM)
         self.settings.check_methods(config)
         sources = [int(source) if source.isdecimal() else source for source in self.camera]
         with ExitStack() as viewer, progress() as report:

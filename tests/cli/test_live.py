@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 
 from morgs_mi.cli import live as module
-from morgs_mi.cli.live import Live, _Lines, _summary
-from morgs_mi.cli.settings import Settings
+from morgs_mi.cli.live import Live, LiveSettings, _Lines, _summary
 from morgs_mi.io.video_writer import write_video
 from morgs_mi.playback.player import PROVISIONAL
 from morgs_mi.playback.streams import open_stream
@@ -120,9 +119,9 @@ def test_Live__names_the_output_after_the_time(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr("morgs_mi.runs.live.fit_live.fit_live", fit)
     cases = (
-        (Settings(), 30, 2),
-        (Settings(first_frame_seconds=5, epochs=8), 5, 8),
-        (Settings(preset="s"), 30, 5),
+        (LiveSettings(), 30, 2),
+        (LiveSettings(first_frame_seconds=5, epochs=8), 5, 8),
+        (LiveSettings(preset="s"), 30, 5),
     )
     for settings, seconds, epochs in cases:
         with pytest.raises(KeyboardInterrupt):

@@ -15,6 +15,7 @@ from morgs_mi import cli
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.cli.settings import SETTINGS, Reading
 from morgs_mi.loop.stream_config import StreamConfig, apply_values, config_toml
+from morgs_mi.runs.live.live_config import LIVE_STREAM
 
 
 def printed_config(run, *args: object) -> StreamConfig:
@@ -91,12 +92,13 @@ def flattened(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return {key: value for part in pairs for key, value in part.items()}
 
 
-def test_fit__shows_the_defaults_of_its_options(capsys) -> None:
+@pytest.mark.parametrize(("command", "config"), [("fit", StreamConfig()), ("live", LIVE_STREAM)])
+def test_help__shows_the_defaults_of_the_options(command: str, config: StreamConfig, capsys) -> None:
     with pytest.raises(SystemExit):
-        cli.main(["fit", "--help"])
+        cli.main([command, "--help"])
     text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     for option, key in SETTINGS.items():
-        default = reduce(getattr, key.split("."), StreamConfig())
+        default = reduce(getattr, key.split("."), config)
         shown = "" if default is None or default is False else rf" (?:(?!--).)*\(default: {default}\)"
         assert re.search(rf"--{option.replace('_', '-')}{shown}", text), option
     assert "None)" not in text

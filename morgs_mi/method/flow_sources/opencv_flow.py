@@ -87,7 +87,7 @@ def optical_flow(
 ) -> np.ndarray:
     """Return the flow [H, W, 2] in pixels, float32, from I_t to I_{t-1} on frame t's grid (eq. 4).
 
-    Images with a side under `FlowConfig.min_side` have too little to match: their flow is zero.
+    Images with a side under 16 px have too little to match: their flow is zero.
 
     Args:
         image: I_t [H, W, 3], RGB, uint8 or float in [0, 1].

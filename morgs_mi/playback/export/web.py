@@ -47,8 +47,8 @@ def write_web_page(
 ) -> int:
     """Write a self-contained page that plays a stream, and return its number of bytes.
 
-    It is one HTML file that runs from a disk and requests nothing. The stream's metadata is left out, except for the
-    renderer's settings, because it contains paths of the machine that made the fit; the scale of the motion is added.
+    It is one HTML file that runs from a disk and requests nothing. Of the stream's metadata it has the renderer's
+    settings alone; the scale of the motion is added.
 
     Args:
         stream: the file.

@@ -23,7 +23,7 @@ from morgs_mi.core.threads import in_background, map_in_threads
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.runs.live.feed import Bundle, Feed
 from morgs_mi.runs.live.live_capture import begin_capture, read_calibration, write_images
-from morgs_mi.runs.live.live_config import LiveConfig
+from morgs_mi.runs.live.live_config import LIVE_STREAM, LiveConfig
 from morgs_mi.runs.live.sources import Source, open_feed
 from morgs_mi.runs.recorder import Prepared, push_frame
 from morgs_mi.runs.recording import FitFiles, Recording, check_outputs, described_capture, stream_metadata
@@ -71,7 +71,7 @@ def fit_live(
         sources: the cameras, see `open_feed`.
         out: folder, made if missing.
         live: settings of the cameras.
-        config: settings of the loop.
+        config: settings of the loop; None: `LIVE_STREAM`.
         on_frame: called when a frame is in the stream.
         on_stage: called with (name, done, total) of the work up to the first frame.
 
@@ -103,7 +103,7 @@ def fit_live(
             raise ValueError("fit_live(): expected images of the cameras, got none.")
         report("Waiting for the cameras", 1, 1)
         capture = begin_capture(out / "capture", feed.names, first.images, live, calibration, on_stage)
-        return _fit(_LiveFrames(feed, capture, first, live), out, config or StreamConfig(), on_frame, report)
+        return _fit(_LiveFrames(feed, capture, first, live), out, config or LIVE_STREAM, on_frame, report)
 
 
 def _check_outside(out: Path, sources: Sequence[Source]) -> None:

@@ -1,0 +1,50 @@
+"""Real images: which views are held out, and photos from their folder to the committed figures.
+
+The photos are not in the repository (docs/experiments/real.md says where they are); a variable names their folder, with
+a folder for each set:
+
+MORGS_MI_PHOTOS=FOLDER pytest -m slow tests/benchmarks/reports/test_real.py
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks.pages.results import committed
+from benchmarks.reports import real
+from morgs_mi import cli
+
+FOLDER = os.environ.get("MORGS_MI_PHOTOS")
+# Number of photos, and whether each has a principal point of its own.
+SETS = {"fern": (20, "own"), "flower": (25, "own"), "kitchen": (25, "shared"), "sceaux": (11, "shared")}
+
+
+def test_held_out__is_every_eighth_view_or_each_of_a_few_in_turn():
+    assert real.held_out(20) == [[4, 12]]
+    assert real.held_out(7) == [[4]]
+    assert real.held_out(3) == [[0], [1], [2]]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not FOLDER, reason="needs photos: set MORGS_MI_PHOTOS to the folder of their sets")
+@pytest.mark.parametrize("name", SETS)
+def test_photos__are_calibrated_and_reach_the_committed_quality(name: str, tmp_path: Path) -> None:
+    photos, (count, points) = tmp_path / name, SETS[name]
+    photos.mkdir()
+    for path in sorted((Path(FOLDER or ".") / name).iterdir()):
+        if path.suffix.lower() in (".jpg", ".png"):
+            shutil.copy(path, photos)
+    assert cli.main(["calibrate", str(photos), "--shared-intrinsics"]) == 0
+    real.Options(json=tmp_path / "out.json", captures=(photos,)).run()
+    (found,) = json.loads((tmp_path / "out.json").read_text())["fits"]
+    assert found["views"] + found["held_out_views"] == count, "every photo is registered"
+    assert found["principal_points"] == points
+    fits = [f for f in committed("real")["fits"] if (f["set"], f["principal_points"]) == (name, points)]
+    # Two fits of Sceaux, with one held-out photo, differ by 1 dB, the others by 0.4 dB at most.
+    assert found["held_out"] > np.mean([fit["held_out"] for fit in fits]) - 1
