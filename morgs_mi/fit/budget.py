@@ -1,8 +1,8 @@
 """The plan of the first frame: as many Gaussians and steps as its images ask for and its time allows.
 
 The images ask for a number of Gaussians (see `detail`), and these for a number of steps (`FitConfig.planned_steps`).
-Where that would take longer than `FitConfig.first_frame_seconds`, both are reduced: the Gaussians by the square root of
-the share that the time allows, and the steps by the rest. Numbers that are given stay as they are.
+Where that would take longer than `FitConfig.first_frame_seconds`, the most Gaussians are chosen whose own number of
+steps fits the time; if not even the least do, the steps are reduced. Numbers that are given stay as they are.
 
 The time of a step is modelled as
 
@@ -16,9 +16,9 @@ the result.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import sqrt
 from time import perf_counter, process_time
 
 import drjit as dr
@@ -105,11 +105,15 @@ def plan_first_frame(views: Sequence[View], points: Points, config: FitConfig, r
     if not render.reproducible:
         time = _measured(views, points, wanted, render, seed)
         left -= _clock() - begin
-    plan, share = wanted, max(left, 0) / time.of_all(problem, wanted)
-    if share < 1 and config.num_gaussians is None:
-        count = wanted.planned_gaussians
-        least = min(config.detail.least_gaussians, count)
-        plan = replace(wanted, num_gaussians=max(round(sqrt(share) * count), least))
+    plan = wanted
+    if config.num_gaussians is None:
+        most = wanted.planned_gaussians
+        least = min(config.detail.least_gaussians, most)
+
+        def is_too_long(count: int) -> bool:
+            return time.of_all(problem, replace(wanted, num_gaussians=count)) > left
+
+        plan = replace(wanted, num_gaussians=least + bisect_left(range(least + 1, most + 1), True, key=is_too_long))
     if config.first_frame_steps is None:
         allowed = int(plan.planned_steps * left / time.of_all(problem, plan))
         plan = replace(plan, first_frame_steps=max(_LEAST, min(plan.planned_steps, allowed)))
