@@ -37,8 +37,8 @@ from morgs_mi.render.render_config import RenderConfig
 
 __all__ = ["Plan", "plan_first_frame"]
 
-# Steps that are timed, without as many before them, in as many views; and the least number that a time leaves.
-_TIMED, _VIEWS, _LEAST = 8, 4, 100
+# Steps that compile kernels, steps that are timed, and their views; the least number of steps that a time leaves.
+_WARM, _TIMED, _VIEWS, _LEAST = 6, 12, 4, 100
 # Mean number of Gaussians while it grows from a half to all, relative to all.
 _GROWING = 0.75
 
@@ -131,22 +131,23 @@ def _measured(views: Sequence[View], points: Points, config: FitConfig, render: 
     config = replace(config, dropping=0.0, density=replace(config.density, rounds=0))
     full = FirstFrameProblem.of(views[:_VIEWS], points, config, render, rng_of(seed, Stream.BUDGET))
     half = full.reduced(max(camera.width for camera in full.cameras) // 2)
-    _timed(full, config, _TIMED, seed)  # compiles the kernels
-    times, pixels = [], []
-    for problem in (full, half):
-        less, more = (_timed(problem, config, steps, seed) for steps in (_TIMED, 2 * _TIMED))
-        times.append(max(more - less, 0.1 * less) / _TIMED)
-        pixels.append(_pixels(problem))
+    pixels = [_pixels(problem) for problem in (full, half)]
+    times = [_timed(problem, config, seed) for problem in (full, half)]
     fewer = pixels[0] - pixels[1]  # none of images that are too small to be reduced
     pixel = max(times[0] - times[1], 0) / fewer if fewer else 0.0
     return _StepTime(max(times[0] - pixel * pixels[0], 0.1 * times[0]) / len(full.start), pixel)
 
 
-def _timed(problem: FirstFrameProblem, config: FitConfig, steps: int, seed: int) -> float:
-    """Return the seconds of a fit of some steps."""
-    begin = _clock()
-    fit_first_frame(problem, replace(config, first_frame_steps=steps), rng_of(seed, Stream.BUDGET))
-    return _clock() - begin
+def _timed(problem: FirstFrameProblem, config: FitConfig, seed: int) -> float:
+    """Return the median time of a step, s."""
+    config, ends = replace(config, first_frame_steps=_WARM + _TIMED), []
+
+    def on_step(done: int, total: int) -> None:
+        dr.sync_thread()
+        ends.append(_clock())
+
+    fit_first_frame(problem, config, rng_of(seed, Stream.BUDGET), on_step)
+    return float(np.median(np.diff(ends)[-_TIMED:]))
 
 
 def _pixels(problem: FirstFrameProblem) -> float:
