@@ -19,12 +19,13 @@ __all__ = [
     "exposure",
     "far_views",
     "first_frame_captures",
-    "first_frame_time",
     "first_frames",
     "live",
     "noise_aware",
+    "photos_over_time",
     "points",
     "principal_points",
+    "rig_estimates",
 ]
 
 
@@ -88,24 +89,6 @@ def first_frame_captures() -> str:
     return markdown(("capture", "held out, dB", "steps", "processor time, s", "ratio"), rows)
 
 
-def first_frame_time() -> str:
-    """Return the quality and the work of first frames by the time that they may take."""
-    rows = (
-        (
-            fit["capture"],
-            f"{fit['seconds']:.0f}",
-            f"{fit['announced_s']:.0f}",
-            f"{fit['cpu_s'] / 2:.0f}",
-            f"{fit['gaussians']:,}",
-            f"{fit['steps']:,}",
-            f"{fit['held_out']:.2f}",
-        )
-        for fit in committed("first_frame_time")["fits"]
-    )
-    titles = ("may take, s", "announced, s", "processor time of two cores, s", "Gaussians", "steps", "held out, dB")
-    return markdown(("photos", *titles), rows)
-
-
 def noise_aware() -> str:
     """Return the held-out PSNR of the first frame by its loss."""
     found = grouped(committed("priors_noisy")["fits"], "case", "prior")
@@ -165,6 +148,36 @@ def principal_points() -> str:
     )
     keys = {"photos": "set", "principal points": "principal_points", "held out": "held_out_views"}
     return scores_table(committed("real")["fits"], keys, columns, left=2)
+
+
+def photos_over_time() -> str:
+    """Return the quality and the work of first frames of photos by the time that they may take."""
+    rows = (
+        (
+            fit["set"],
+            f"{fit['seconds']:.0f}",
+            f"{fit['cpu_s'] / 2:.0f}",
+            f"{fit['gaussians']:,}",
+            f"{fit['steps']:,}",
+            *(f"{fit[score]:.2f}" for score in ("training", "held_out", "registered")),
+            f"{fit['estimate']:.1f}",
+        )
+        for fit in committed("real_seconds")["fits"]
+    )
+    titles = "may take, s", "processor time of two cores, s", "Gaussians", "steps", "training views, dB"
+    return markdown(("photos", *titles, "held out", "registered", "estimate"), rows)
+
+
+def rig_estimates() -> str:
+    """Return the estimates of the quality between the cameras of real images, and how far off they are."""
+    rows = []
+    for (name,), own in grouped(committed("real_rigs")["fits"], "set").items():
+        errors = np.array([fit["estimate"] - fit["held_out"] for fit in own])
+        views = f"{own[0]['views']} + {own[0]['held_out_views']}"
+        scores = (span(fit[score] for fit in own) for score in ("training", "held_out", "estimate"))
+        rows.append((name, views, f"{len(own)}", *scores, span(errors), f"{(abs(errors) <= 1.5).sum()} of {len(own)}"))
+    titles = "training views, dB", "held out", "estimate", "error", "within 1.5 dB"
+    return markdown(("images", "views", "fits", *titles), rows)
 
 
 def clocks() -> str:

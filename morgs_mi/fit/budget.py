@@ -25,6 +25,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from morgs_mi.core.progress import Progress
 from morgs_mi.core.random_streams import Stream, rng_of
 from morgs_mi.fit.cross_validation import trial_steps
 from morgs_mi.fit.detail import with_num_gaussians
@@ -142,11 +143,11 @@ def _timed(problem: FirstFrameProblem, config: FitConfig, seed: int) -> float:
     """Return the median time of a step, s."""
     config, ends = replace(config, first_frame_steps=_WARM + _TIMED), []
 
-    def on_step(done: int, total: int) -> None:
+    def on_step(stage: str, done: float, total: float) -> None:
         dr.sync_thread()
         ends.append(_clock())
 
-    fit_first_frame(problem, config, rng_of(seed, Stream.BUDGET), on_step)
+    fit_first_frame(problem, config, rng_of(seed, Stream.BUDGET), Progress(on_step))
     return float(np.median(np.diff(ends)[-_TIMED:]))
 
 
