@@ -16,17 +16,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import tyro
 
 from benchmarks.reports.fits import new_loop
 from benchmarks.reports.plots import Column, scores_table
 from benchmarks.reports.study import Row, Scene, Study, StudyOptions, Variant
+from morgs_mi import Gaussians, rasterize
 from morgs_mi.calibration.refine import register_camera
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.core.camera import Camera
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.playback.visualise import label, side_by_side
 from morgs_mi.runs.cluster.tasks import Source
 
 COLUMNS = (
@@ -53,6 +57,8 @@ class Options(StudyOptions):
     """Steps of the first frame."""
     seconds: tuple[int, ...] = ()
     """Times of the first frame, which plan its Gaussians and steps instead."""
+    pictures: Path | None = None
+    """Folder for a picture of each set, SET.jpg: the first held-out image, recorded and rendered."""
 
     def study(self) -> Study:
         """Return the study of the captures."""
@@ -61,7 +67,10 @@ class Options(StudyOptions):
             full = load_capture(path, test_view=None)
             capture = load_capture(path, max(1.0, full.cameras[0].width / self.width), None)
             keys = {"set": path.name.partition("-")[0], "principal_points": principal_points(capture.cameras)}
-            scenes += [Scene(keys | {"test": test}, (Source.of(capture), test)) for test in held_out(len(full.cameras))]
+            scenes += [
+                Scene(keys | {"test": test}, (Source.of(capture), test, self.pictures))
+                for test in held_out(len(full.cameras))
+            ]
         given = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps, dropping=0.0)
         fits = {seconds: FitConfig(first_frame_seconds=seconds) for seconds in self.seconds} or {None: given}
         variants = [Variant({"seconds": seconds}, StreamConfig(fit)) for seconds, fit in fits.items()]
@@ -84,7 +93,7 @@ def held_out(count: int) -> list[list[int]]:
     return [[v] for v in range(count)] if count <= _FEW else [[*range(_FIRST, count, _EVERY)]]
 
 
-def measure(source: Source, test: Sequence[int], config: StreamConfig) -> dict[str, Any]:
+def measure(source: Source, test: Sequence[int], pictures: Path | None, config: StreamConfig) -> dict[str, Any]:
     """Fit the views that are not held out; return the mean PSNR of both, of the held-out ones in both ways."""
     capture, stages = source.open(), []
     train = [v for v in range(len(capture.cameras)) if v not in test]
@@ -103,6 +112,8 @@ def measure(source: Source, test: Sequence[int], config: StreamConfig) -> dict[s
         "held_out": [views[v] for v in test],
         "registered": [registered(views[v]) for v in test],
     }
+    if pictures is not None:
+        _write_picture(pictures / f"{capture.path.name}.jpg", gaussians, views[test[0]])
     scores = {name: mean_psnr(gaussians, given, config.render) for name, given in compared.items()}
     announced = float(found[1]) if (found := re.search(r"about (\d+) s", stages[-1])) else None
     return scores | {
@@ -114,6 +125,14 @@ def measure(source: Source, test: Sequence[int], config: StreamConfig) -> dict[s
         "announced_s": announced,
         "cpu_s": seconds,
     }
+
+
+def _write_picture(path: Path, gaussians: Gaussians, view: View) -> None:
+    """Write a recorded image and its rendering side by side."""
+    rendered = np.asarray(rasterize(gaussians, view.camera, ("color",)).color)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    picture = side_by_side([label(view.image, "held-out image"), label(rendered, "rendered")])
+    cv2.imwrite(str(path), picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 85])
 
 
 def _views(capture: Capture) -> list[View]:

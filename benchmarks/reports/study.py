@@ -36,7 +36,7 @@ __all__ = ["Row", "Scene", "Study", "StudyOptions", "Variant", "method_version",
 Row = Mapping[str, Any]
 _SHOWN = 300  # characters of a cell's scores that are printed
 # Options for the paths of files and for the processes that fit.
-_WORK = ("json", "workers", "scheduler", "store", "plot", "clips", "captures", "model")
+_WORK = ("json", "workers", "scheduler", "store", "plot", "clips", "captures", "model", "pictures")
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ STUDIES = {
     generalise: ({"scenes": ("random-1",), "views": (3,), "steps": 3, "gaussians": 60}, 4),
     cameras: ({**FIRST, "degrees": (0.0, 0.5), "disturbances": (0,), "lens": 0.1}, 3),
     masks: ({"frames": 1, "loops": ("none",)}, 1),
-    real: ({"width": 64, "gaussians": 60, "steps": 3}, 1),
+    real: ({"width": 64, "gaussians": 60, "steps": 3}, 5),
     drift: ({**SMALL, "scenes": ("spheres",)}, 2),
     live: ({**SMALL, "scenes": ("spheres",), "strides": (1,), "gap": 1, "gap_epochs": (2,)}, 6),
     exposure: ({**SMALL, "seeds": (3,)}, 8),
