@@ -2,7 +2,8 @@
 
 The images ask for a number of Gaussians (see `detail`), and these for a number of steps (`FitConfig.planned_steps`).
 Where that would take longer than `FitConfig.first_frame_seconds`, the most Gaussians are chosen whose own number of
-steps fits the time; if not even the least do, the steps are reduced. Numbers that are given stay as they are.
+steps fits the time. An eighth of those that the images ask for is the least, because pixels take time as well: from
+there on, the steps are reduced. Numbers that are given stay as they are.
 
 The time of a step is modelled as
 
@@ -40,6 +41,8 @@ __all__ = ["Plan", "plan_first_frame"]
 
 # Steps that compile kernels, steps that are timed, and their views; the least number of steps that a time leaves.
 _WARM, _TIMED, _VIEWS, _LEAST = 6, 12, 4, 100
+# The Gaussians that the images ask for, relative to the least that a time leaves.
+_LEAST_SHARE = 8
 # Mean number of Gaussians while it grows from a half to all, relative to all.
 _GROWING = 0.75
 
@@ -109,7 +112,7 @@ def plan_first_frame(views: Sequence[View], points: Points, config: FitConfig, r
     plan = wanted
     if config.num_gaussians is None:
         most = wanted.planned_gaussians
-        least = min(config.detail.least_gaussians, most)
+        least = min(max(config.detail.least_gaussians, most // _LEAST_SHARE), most)
 
         def is_too_long(count: int) -> bool:
             return time.of_all(problem, replace(wanted, num_gaussians=count)) > left
