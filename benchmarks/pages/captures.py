@@ -25,6 +25,7 @@ __all__ = [
     "photos_over_time",
     "points",
     "principal_points",
+    "real_motion",
     "rig_estimates",
 ]
 
@@ -166,6 +167,19 @@ def photos_over_time() -> str:
     )
     titles = "may take, s", "processor time of two cores, s", "Gaussians", "steps", "training views, dB"
     return markdown(("photos", *titles, "held out", "registered", "estimate"), rows)
+
+
+def real_motion() -> str:
+    """Return the PSNR of recordings over their frames: where things move, and in the whole image."""
+    rows = []
+    for fit in committed("real_motion")["fits"]:
+        moving = [value for value in fit["psnr_moving"] if value is not None]
+        name = fit["recording"] + ("" if len(fit["keyframes"]) == 1 else f", also a keyframe at {fit['keyframes'][1]}")
+        views = "training" if fit["held_out"] is None else fit["held_out"]
+        figures = (moving[0], min(moving), moving[-1], fit["psnr"][0], fit["psnr"][-1])
+        rows.append((name, views, f"{len(fit['psnr'])}", *(f"{value:.1f}" for value in figures)))
+    titles = "moving, dB: first", "lowest", "last", "whole image: first", "last"
+    return markdown(("recording", "views", "frames", *titles), rows, left=2)
 
 
 def rig_estimates() -> str:

@@ -71,7 +71,7 @@ class Options(StudyOptions):
                 Scene(keys | {"test": test}, (Source.of(capture), test, self.pictures))
                 for test in held_out(len(full.cameras))
             ]
-        given = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps, dropping=0.0)
+        given = FitConfig(num_gaussians=self.gaussians, first_frame_steps=self.steps)
         fits = {seconds: FitConfig(first_frame_seconds=seconds) for seconds in self.seconds} or {None: given}
         variants = [Variant({"seconds": seconds}, StreamConfig(fit)) for seconds, fit in fits.items()]
         return Study(measure, scenes, variants, self.fit_seeds)
