@@ -25,8 +25,8 @@ __all__ = [
     "photos_over_time",
     "points",
     "principal_points",
+    "real_estimates",
     "real_motion",
-    "rig_estimates",
 ]
 
 
@@ -169,6 +169,18 @@ def photos_over_time() -> str:
     return markdown(("photos", *titles, "held out", "registered", "estimate"), rows)
 
 
+def real_estimates() -> str:
+    """Return the estimates of the quality between the cameras of real images, and how far off they are."""
+    rows = []
+    for (name,), own in grouped(committed("real_estimates")["fits"], "set").items():
+        errors = np.array([fit["estimate"] - fit["held_out"] for fit in own])
+        views = f"{own[0]['views']} + {own[0]['held_out_views']}"
+        scores = (span(fit[score] for fit in own) for score in ("training", "held_out", "estimate"))
+        rows.append((name, views, f"{len(own)}", *scores, span(errors), f"{(abs(errors) <= 1.5).sum()} of {len(own)}"))
+    titles = "training views, dB", "held out", "estimate", "error", "within 1.5 dB"
+    return markdown(("images", "views", "fits", *titles), rows)
+
+
 def real_motion() -> str:
     """Return the PSNR of recordings over their frames: where things move, and in the whole image."""
     rows = []
@@ -180,18 +192,6 @@ def real_motion() -> str:
         rows.append((name, views, f"{len(fit['psnr'])}", *(f"{value:.1f}" for value in figures)))
     titles = "moving, dB: first", "lowest", "last", "whole image: first", "last"
     return markdown(("recording", "views", "frames", *titles), rows, left=2)
-
-
-def rig_estimates() -> str:
-    """Return the estimates of the quality between the cameras of real images, and how far off they are."""
-    rows = []
-    for (name,), own in grouped(committed("real_rigs")["fits"], "set").items():
-        errors = np.array([fit["estimate"] - fit["held_out"] for fit in own])
-        views = f"{own[0]['views']} + {own[0]['held_out_views']}"
-        scores = (span(fit[score] for fit in own) for score in ("training", "held_out", "estimate"))
-        rows.append((name, views, f"{len(own)}", *scores, span(errors), f"{(abs(errors) <= 1.5).sum()} of {len(own)}"))
-    titles = "training views, dB", "held out", "estimate", "error", "within 1.5 dB"
-    return markdown(("images", "views", "fits", *titles), rows)
 
 
 def clocks() -> str:

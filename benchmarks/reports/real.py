@@ -79,7 +79,7 @@ class Options(StudyOptions):
     def table(self, rows: Sequence[Row]) -> str:
         """Return the scores by set and calibration."""
         key = {"seconds": "seconds"} if self.seconds else {"principal points": "principal_points"}
-        return scores_table(rows, {"set": "set"} | key, COLUMNS)
+        return scores_table(rows, {"set": "set"} | key, [column for column in COLUMNS if column.score in rows[0]])
 
 
 def principal_points(cameras: Sequence[Camera]) -> str:
