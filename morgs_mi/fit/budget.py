@@ -48,25 +48,49 @@ _GROWING = 0.75
 
 
 @dataclass(frozen=True)
+class _Work:
+    """What a first frame works on.
+
+    Attributes:
+        pixels: mean number of pixels of a view.
+        half_pixels: the same at half the size, up to the last round of density control.
+        views: number of views.
+        trials: steps of the trials, relative to the steps of the first frame.
+    """
+
+    pixels: float
+    half_pixels: float
+    views: int
+    trials: float
+
+    @classmethod
+    def of(cls, problem: FirstFrameProblem, config: FitConfig) -> _Work:
+        """Return the work of a problem."""
+        trials = trial_steps(problem, config)
+        return cls(_pixels(problem), _pixels(problem.halved()), len(problem.views), trials)
+
+
+@dataclass(frozen=True)
 class _StepTime:
     """Time of a step, s: per Gaussian and per pixel of its view."""
 
     gaussian: float
     pixel: float
 
-    def of(self, problem: FirstFrameProblem, count: float) -> float:
-        """Return the mean time of a step with `count` Gaussians."""
-        return self.gaussian * count + self.pixel * _pixels(problem)
+    def of(self, count: float, pixels: float) -> float:
+        """Return the time of a step with `count` Gaussians."""
+        return self.gaussian * count + self.pixel * pixels
 
-    def of_all(self, problem: FirstFrameProblem, config: FitConfig) -> float:
+    def of_all(self, work: _Work, config: FitConfig) -> float:
         """Return the time of a first frame with its trials; a round of density control is a step in every view."""
         count, steps, rounds = config.planned_gaussians, config.planned_steps, config.density.rounds
-        late = self.of(problem, count)
+        late = self.of(count, work.pixels)
         if not rounds:
-            return (1 + trial_steps(problem, config)) * steps * late
-        early = self.of(problem.halved(), _GROWING * count)
-        fit = LAST_ROUND * steps * early + (1 - LAST_ROUND) * steps * late + rounds * len(problem.views) * early
-        return (1 + trial_steps(problem, config)) * fit
+            return (1 + work.trials) * steps * late
+        early = self.of(_GROWING * count, work.half_pixels)
+        return (1 + work.trials) * (
+            steps * (LAST_ROUND * early + (1 - LAST_ROUND) * late) + rounds * work.views * early
+        )
 
 
 # Of the reference machine, two cores of a server.
@@ -104,7 +128,7 @@ def plan_first_frame(views: Sequence[View], points: Points, config: FitConfig, r
     if None not in (config.num_gaussians, config.first_frame_steps):
         return Plan(config)
     begin, wanted = _clock(), with_num_gaussians(config, views, points[0])
-    problem = FirstFrameProblem.of(views, points, wanted, render, rng_of(seed, Stream.BUDGET))
+    work = _Work.of(FirstFrameProblem.of(views, points, wanted, render, rng_of(seed, Stream.BUDGET)), wanted)
     time, left = _REFERENCE, config.first_frame_seconds
     if not render.reproducible:
         time = _measured(views, points, wanted, render, seed)
@@ -115,13 +139,13 @@ def plan_first_frame(views: Sequence[View], points: Points, config: FitConfig, r
         least = min(max(config.detail.least_gaussians, most // _LEAST_SHARE), most)
 
         def is_too_long(count: int) -> bool:
-            return time.of_all(problem, replace(wanted, num_gaussians=count)) > left
+            return time.of_all(work, replace(wanted, num_gaussians=count)) > left
 
         plan = replace(wanted, num_gaussians=least + bisect_left(range(least + 1, most + 1), True, key=is_too_long))
     if config.first_frame_steps is None:
-        allowed = int(plan.planned_steps * left / time.of_all(problem, plan))
+        allowed = int(plan.planned_steps * left / time.of_all(work, plan))
         plan = replace(plan, first_frame_steps=max(_LEAST, min(plan.planned_steps, allowed)))
-    return Plan(plan, time.of_all(problem, plan))
+    return Plan(plan, time.of_all(work, plan))
 
 
 def _clock() -> float:
