@@ -26,17 +26,17 @@ def new_mesh(name: str, bsdf: Any, mesh: Mesh, used: np.ndarray, vertices: np.nd
         used: sorted indices of the vertices in these triangles [U].
         vertices: positions of all vertices of the object [V, 3].
     """
-    made: Any
+    kind: Any = mi.Mesh
     faces, uvs = np.searchsorted(used, mesh.faces), None if mesh.uvs is None else mesh.uvs[used]
-    if hasattr(mi.Mesh, "from_fields"):  # Mitsuba 3.10
+    if hasattr(kind, "from_fields"):  # Mitsuba 3.10
         given = {"faces": mi.TensorXu(faces), "positions": mi.TensorXf(vertices[used])}
         given |= {} if uvs is None else {"texcoords": mi.TensorXf(uvs)}
-        made = mi.Mesh(name, **given, face_normals=not mesh.smooth)
+        made = kind(name, **given, face_normals=not mesh.smooth)
         made.set_bsdf(bsdf)
         return made
     props = mi.Properties()
     props["bsdf"], props["face_normals"] = bsdf, not mesh.smooth
-    made = mi.Mesh(name, len(used), len(faces), props, mesh.smooth, uvs is not None)
+    made = kind(name, len(used), len(faces), props, mesh.smooth, uvs is not None)
     params: Any = mi.traverse(made)
     params["faces"] = mi.UInt32(faces.ravel())
     params["vertex_positions"] = mi.Float(vertices[used].ravel())
