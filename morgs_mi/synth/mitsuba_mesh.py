@@ -6,7 +6,7 @@ place of `vertex_positions` [3V]. Both versions are served.
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import mitsuba as mi
 import numpy as np
@@ -26,10 +26,11 @@ def new_mesh(name: str, bsdf: Any, mesh: Mesh, used: np.ndarray, vertices: np.nd
         used: sorted indices of the vertices in these triangles [U].
         vertices: positions of all vertices of the object [V, 3].
     """
-    kind = cast("Any", mi.Mesh)
+    kind: Any = mi.Mesh
     faces, uvs = np.searchsorted(used, mesh.faces), None if mesh.uvs is None else mesh.uvs[used]
-    if "from_fields" in dir(kind):  # Mitsuba 3.10
-        given = {"faces": mi.TensorXu(faces), "positions": mi.TensorXf(vertices[used])}
+    if hasattr(mi.Mesh, "from_fields"):  # Mitsuba 3.10
+        tensor: Any = mi.TensorXu
+        given = {"faces": tensor(faces), "positions": mi.TensorXf(vertices[used])}
         given |= {} if uvs is None else {"texcoords": mi.TensorXf(uvs)}
         made = kind(name, **given, face_normals=not mesh.smooth)
         made.set_bsdf(bsdf)
