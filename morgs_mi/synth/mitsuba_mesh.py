@@ -53,7 +53,7 @@ def move_mesh(params: Any, name: str, used: np.ndarray, smooth: bool, shape: Def
     Args:
         params: parameters of the scene; their `update` is left to the caller.
         name: name of the mesh.
-        used: indices of its vertices among those of the object [U].
+        used: indices of its vertices in the object [U].
         smooth: whether it is shaded with normals of the vertices.
         shape: vertices of the object.
     """

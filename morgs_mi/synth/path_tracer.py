@@ -91,13 +91,13 @@ class PathTracer:
         self._parts: list[_Part] = []
         for index, (name, item) in enumerate(scene.objects.items()):
             if isinstance(item, DeformingObject):
-                shapes = {}
+                shapes, vertices = {}, item.shape(0.0).vertices
                 for part, mesh in item.meshes.items():
                     used, known = np.unique(mesh.faces), f"{name}_{part}"
                     self._parts.append(_Part(known, name, used, mesh.smooth))
                     faces[known] = mesh.faces
                     bsdf = _load(scene.name, mesh.bsdf)
-                    shapes[known] = new_mesh(known, bsdf, mesh, used, item.shape(0.0).vertices)
+                    shapes[known] = new_mesh(known, bsdf, mesh, used, vertices)
             elif item.pose is None:
                 shapes = {f"{name}_{part}": shape for part, shape in item.shapes.items()}
             else:

@@ -101,7 +101,12 @@ def test_help__shows_the_defaults_of_the_options(command: str, config: StreamCon
         default = reduce(getattr, key.split("."), config)
         shown = "" if default is None or default is False else rf" (?:(?!--).)*\(default: {default}\)"
         assert re.search(rf"--{option.replace('_', '-')}{shown}", text), option
-    assert command == "live" or "None)" not in text
+
+
+def test_fit__shows_no_default_none(capsys) -> None:
+    with pytest.raises(SystemExit):
+        cli.main(["fit", "--help"])
+    assert "None)" not in capsys.readouterr().out
 
 
 def test_Reading__has_the_fields_of_the_config() -> None:

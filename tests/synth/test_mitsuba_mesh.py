@@ -41,7 +41,10 @@ def test_new_mesh__gives_mitsuba_3_10_all_data_at_once(monkeypatch: pytest.Monke
     monkeypatch.setattr(mi, "Mesh", _Mesh310)
     made = mitsuba_mesh.new_mesh("part", "material", TRIANGLES, USED, VERTICES)
     assert (made.name, made.face_normals, made.bsdf) == ("part", False, "material")
-    assert [made.arrays[name].shape for name in ("faces", "positions", "texcoords")] == [(2, 3), (4, 3), (4, 2)]
+    np.testing.assert_array_equal(made.arrays["faces"], [[3, 1, 2], [1, 2, 0]])
+    np.testing.assert_array_equal(made.arrays["positions"], VERTICES[USED])
+    assert TRIANGLES.uvs is not None
+    np.testing.assert_array_equal(made.arrays["texcoords"], np.float32(TRIANGLES.uvs[USED]))
 
 
 @pytest.mark.parametrize("smooth", [False, True])
