@@ -255,16 +255,21 @@ def _match(
     reader = pycolmap.ImageReaderOptions(camera_model=config.camera_model)
     if masks:
         reader.mask_path = masked
+    pycolmap.Database.open(database).close()
     for done, (size, names) in enumerate(by_size.items()):  # each call makes a camera of its own
         report("Finding features", done, len(by_size))
         extraction = pycolmap.FeatureExtractionOptions(max_image_size=max(size))
         extraction.sift.peak_threshold = _PEAK
+        pycolmap.import_images(database, folder, mode, names, reader)  # else threads number them in any order
         pycolmap.extract_features(database, folder, names, mode, reader, extraction, pycolmap.Device.cpu)
     report("Finding features", len(by_size), len(by_size))
     _check_features(path, database)
     report("Matching views", 0, 1)
+    # Without a seed of its own, the verification keeps other matches on each run, and may lose a view with few of them.
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = config.seed
     # Guided matching takes several times as long, and its poses are no better by matches of other features.
-    pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
+    pycolmap.match_exhaustive(database, verification_options=verification, device=pycolmap.Device.cpu)
     report("Matching views", 1, 1)
     _check_pairs(path, database)
 
