@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from benchmarks.pages.results import CHOSEN_ON, Scores, committed, span
+from benchmarks.reports.cameras import recovered
 from benchmarks.reports.plots import Column, grouped, markdown, plus_minus, scores_table
 
 __all__ = [
@@ -134,7 +135,7 @@ def cameras() -> str:
     for name, own in (groups | {"lenses ignored": [fit for fit in fits if fit["lens"]]}).items():
         psnrs = (f"{np.mean([fit[how]['registered'] for fit in own]):.1f}" for how in ("true", "disturbed", "refined"))
         rotations = span((fit["refined"]["rotation"] for fit in own), 2)
-        rows.append((name, *psnrs, f"{span((100 * fit['recovered'] for fit in own), 0)} %", rotations))
+        rows.append((name, *psnrs, f"{span((100 * recovered(fit) for fit in own), 0)} %", rotations))
     titles = "true cameras, dB", "disturbed", "refined", "recovered", "rotation after, degrees"
     return markdown(("error", *titles), rows)
 

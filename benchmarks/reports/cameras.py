@@ -45,7 +45,7 @@ _FOCAL_ERROR = 0.01
 COLUMNS = (
     *(Column(f"{name} cameras", lambda fit, name=name: fit[name]["registered"]) for name in ("true", "disturbed")),
     Column("refined", lambda fit: fit["refined"]["registered"]),
-    Column("recovered", "recovered", 0, 100, " %"),
+    Column("recovered", lambda fit: recovered(fit), 0, 100, " %"),
     Column("rotation, degrees", lambda fit: fit["disturbed"]["rotation"], 3),
     Column("refined", lambda fit: fit["refined"]["rotation"], 3),
 )
@@ -150,14 +150,12 @@ def measure(
     if degrees:
         wrong = replace(wrong, cameras=disturbed(wrong.cameras, degrees, disturbance))
     better, found = refine_cameras(wrong, config.fit, config.render, config.seed)
-    row = {
+    return {
         "true": scores(capture, config),
         "disturbed": scores(wrong, config) | camera_errors(wrong, capture),
         "refined": scores(better, config) | camera_errors(better, capture),
         "refinement": asdict(found),
     }
-    is_wrong = degrees or calibrated != source
-    return {"recovered": recovered(row) if is_wrong else None, **row}
 
 
 def camera_errors(given: Capture, capture: Capture) -> dict[str, float]:
@@ -192,12 +190,11 @@ def _at_corner(camera: Camera, terms: Sequence[float]) -> np.ndarray:
 
 
 def recovered(row: Mapping[str, Any]) -> float:
-    """Return the share of the lost PSNR of the registered view that refinement brings back; NaN if none is lost.
-
-    Its digits end at 1e-4: below, two registrations of the same camera differ.
-    """
+    """Return the share of the lost PSNR of the registered view that refinement brings back; NaN of true cameras."""
+    if not row["degrees"] and not row["lens"]:
+        return float("nan")
     true, before, after = (row[name]["registered"] for name in ("true", "disturbed", "refined"))
-    return round((after - before) / (true - before), 4) if true != before else float("nan")
+    return (after - before) / (true - before) if true != before else float("nan")
 
 
 if __name__ == "__main__":
