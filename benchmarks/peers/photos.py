@@ -4,8 +4,11 @@
     python -m benchmarks.peers.photos fern --folder FOLDER --seconds 60 120 300 --json photos.json
 
 CAPTURE is a folder of photos with COLMAP's `sparse/0`. Both programs get the same poses and points; the test view of
-the capture is held out. OpenSplat stores its Gaussians again and again, and this package renders all of them. Seconds
-are processor time divided by the number of threads, because other programs may run on the machine.
+the capture is held out. OpenSplat takes principal points for the centres of the images. Therefore a bundle adjustment
+moves them there first, for both programs.
+
+OpenSplat stores its Gaussians again and again, and this package renders all of them. Seconds are processor time divided
+by the number of threads, because other programs may run on the machine.
 """
 
 from __future__ import annotations
@@ -59,14 +62,14 @@ def held_out_psnr(capture: Capture, gaussians: Gaussians) -> float:
     return round(psnr_of(((image - truth) ** 2).mean()), 2)
 
 
-def opensplat(path: Path, capture: Capture, options: Options) -> Iterator[dict[str, Any]]:
+def opensplat(project: Path, capture: Capture, options: Options) -> Iterator[dict[str, Any]]:
     """Yield a row of seconds, step, Gaussians and PSNR at each budget."""
     (test,) = set(range(len(capture.cameras))) - set(capture.train_views)
     with tempfile.TemporaryDirectory() as name:
-        project, out = as_binary_project(path, Path(name) / "project"), Path(name) / "splat.ply"
+        out = Path(name) / "splat.ply"
         command = [options.folder / "OpenSplat" / "build" / "opensplat", project, "-o", out, "-n", "30000", "--cpu"]
         command += ["-s", str(_SAVE_EVERY), "-d", str(options.downscale), "--val"]
-        command += ["--val-image", next(p.name for p in sorted(path.glob(f"{capture.cameras[test].name}.*")))]
+        command += ["--val-image", next(p.name for p in (project / "images").glob(f"{capture.cameras[test].name}.*"))]
         with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
             try:
                 for seconds in options.seconds:
@@ -98,11 +101,16 @@ def peak_megabytes(pid: int) -> int:
     return round(int(line.split()[1]) / 1e3)
 
 
-def as_binary_project(path: Path, folder: Path) -> Path:
-    """Write the poses of a capture as binary files, with its photos in `images`, and return the folder."""
+def centred_project(path: Path, folder: Path) -> Path:
+    """Write the photos of a capture and their poses with centred principal points, and return the folder."""
+    model, options = pycolmap.Reconstruction(path / "sparse" / "0"), pycolmap.BundleAdjustmentOptions()
+    for camera in model.cameras.values():
+        camera.principal_point_x, camera.principal_point_y = camera.width / 2, camera.height / 2
+    options.print_summary = False
+    pycolmap.bundle_adjustment(model, options)
     (folder / "sparse" / "0").mkdir(parents=True)
     (folder / "images").symlink_to(path.resolve())
-    pycolmap.Reconstruction(path / "sparse" / "0").write_binary(folder / "sparse" / "0")
+    model.write_binary(folder / "sparse" / "0")
     return folder
 
 
@@ -132,12 +140,14 @@ def main(options: Options) -> None:
     mi.set_variant("llvm_ad_rgb")
     rows = []
     for path in options.captures:
-        capture = load_capture(path, downscale=options.downscale)
-        rows.append({"capture": path.name, "program": "ours", **ours(capture)})
-        print(rows[-1], flush=True)
-        for row in opensplat(path, capture, options):
-            rows.append({"capture": path.name, "program": "OpenSplat 1.2.0", **row})
+        with tempfile.TemporaryDirectory() as name:
+            project = centred_project(path, Path(name) / "project")
+            capture = load_capture(project, downscale=options.downscale)
+            rows.append({"capture": path.name, "program": "ours", **ours(capture)})
             print(rows[-1], flush=True)
+            for row in opensplat(project, capture, options):
+                rows.append({"capture": path.name, "program": "OpenSplat 1.2.0", **row})
+                print(rows[-1], flush=True)
     options.write({"threads": dr.thread_count(), "fits": rows})
 
 
