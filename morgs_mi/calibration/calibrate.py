@@ -170,6 +170,7 @@ def calibrate(
                 f"{', '.join(left_out)}: move these so that neighbours see the same objects, {_MORE_TEXTURE}, "
                 "calibrate on another frame (--frame), or accept the partial model (--partial)."
             )
+        _name_photos(best.model, path)
         with atomic_path(path / "sparse", "calibrate()") as folder:
             write_reconstruction(best.model, folder / "0")
     found = best.model.num_points3D(), best.error, best.checks, best.mapper, best.principal_points
@@ -187,6 +188,14 @@ def _checks(model: Any, names: Sequence[str]) -> tuple[CameraCheck, ...]:
             advice = f"it has the same pose as {other}: one clip seems to be a copy of the other; replace it"
             checks[own] = replace(checks[own], fits=False, advice=advice)
     return tuple(checks.values())
+
+
+def _name_photos(model: Any, path: Path) -> None:
+    """Name the images of a folder of photos after their files, which other programs open by these names."""
+    files = {} if clips_by_camera(path) else photos(path)
+    for image in map(model.image, model.reg_image_ids()):
+        if (name := Path(image.name).stem) in files:
+            image.name = files[name][0].name
 
 
 def _check(name: str, image: Any | None, model: Any) -> CameraCheck:

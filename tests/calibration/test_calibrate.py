@@ -70,6 +70,17 @@ def test_calibrate__finds_the_same_poses_on_every_run(tmp_path: Path) -> None:
     assert np.ptp(found, axis=0).max() < 1e-9, "threads add up in another order; other image numbers change it by 0.1"
 
 
+def test_calibrate__names_images_after_photos(tmp_path: Path) -> None:
+    planes = textured.textures()
+    for camera in (camera.resized(240, 180) for camera in textured.rig(4)):
+        image = textured.render(camera, planes)[..., ::-1]
+        cv2.imwrite(str(tmp_path / f"{camera.name}.JPG"), image, [cv2.IMWRITE_JPEG_QUALITY, 98])
+    found = calibrate(tmp_path, CalibrateConfig(shared_intrinsics=True))
+    model = pycolmap.Reconstruction(str(found.model))
+    assert {image.name for image in model.images.values()} == {f.name for f in tmp_path.glob("*.JPG")}
+    assert load_capture(tmp_path).names == found.cameras
+
+
 def test_calibrate__shares_intrinsics_among_clips_of_a_size(tmp_path: Path) -> None:
     sizes = [(240, 180), (320, 240)] * 3
     cameras = [camera.resized(*size) for camera, size in zip(textured.rig(), sizes, strict=True)]
