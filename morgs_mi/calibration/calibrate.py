@@ -304,14 +304,17 @@ def _map(path: Path, names: Sequence[str], scratch: Path, seed: int) -> _Candida
 
 
 def _mapped(names: Sequence[str], scratch: Path, seed: int) -> list[_Candidate]:
-    """Return the models of both mappers."""
+    """Return the models of both mappers.
+
+    Threads of a mapper share its random samples, which makes other models on some runs; one thread takes as long.
+    """
     import pycolmap
 
     inputs = scratch / _DATABASE, scratch / _IMAGES, scratch
-    incremental = pycolmap.IncrementalPipelineOptions(min_model_size=2, random_seed=seed)
+    incremental = pycolmap.IncrementalPipelineOptions(min_model_size=2, random_seed=seed, num_threads=1)
     found: dict[Mapper, dict[int, Any]] = {
         "incremental": pycolmap.incremental_mapping(*inputs, incremental),
-        "global": pycolmap.global_mapping(*inputs, pycolmap.GlobalPipelineOptions(random_seed=seed)),
+        "global": pycolmap.global_mapping(*inputs, pycolmap.GlobalPipelineOptions(random_seed=seed, num_threads=1)),
     }
     return [
         _Candidate(mapper, model, _checks(model, names))
