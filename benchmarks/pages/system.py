@@ -246,10 +246,11 @@ def peer_photos() -> str:
     rows = [
         (
             f"`{fit['capture']}`",
+            fit["photo"],
             fit["program"],
             *(f"{fit[name]:,}" for name in ("seconds", "gaussians", "mb")),
             f"{fit['psnr']:.1f}",
         )
         for fit in committed("peers_photos")["fits"]
     ]
-    return markdown(("photos", "program", "s", "Gaussians", "memory, MB", "held out, dB"), rows)
+    return markdown(("photos", "held out", "program", "s", "Gaussians", "memory, MB", "PSNR, dB"), rows)

@@ -52,11 +52,19 @@ class Options(Output):
     """Seconds after which the photo is compared, in ascending order."""
     downscale: float = 1
     """Factor by which the photos are reduced."""
+    test_view: str = "auto"
+    """Index or name of the held-out photo; "auto" is the first one."""
+
+
+def held_out(capture: Capture) -> int:
+    """Return the index of the test view."""
+    (test,) = set(range(len(capture.cameras))) - set(capture.train_views)
+    return test
 
 
 def held_out_psnr(capture: Capture, gaussians: Gaussians) -> float:
     """Return PSNR, dB, of the test view."""
-    (test,) = set(range(len(capture.cameras))) - set(capture.train_views)
+    test = held_out(capture)
     truth = np.asarray(next(capture.frames()).images[test], np.float32) / 255
     image = np.clip(np.asarray(rasterize(gaussians, capture.cameras[test], ("color",)).color), 0, 1)
     return round(psnr_of(((image - truth) ** 2).mean()), 2)
@@ -64,12 +72,12 @@ def held_out_psnr(capture: Capture, gaussians: Gaussians) -> float:
 
 def opensplat(project: Path, capture: Capture, options: Options) -> Iterator[dict[str, Any]]:
     """Yield a row of seconds, step, Gaussians and PSNR at each budget."""
-    (test,) = set(range(len(capture.cameras))) - set(capture.train_views)
+    photo = capture.cameras[held_out(capture)].name
     with tempfile.TemporaryDirectory() as name:
         out = Path(name) / "splat.ply"
         command = [options.folder / "OpenSplat" / "build" / "opensplat", project, "-o", out, "-n", "30000", "--cpu"]
         command += ["-s", str(_SAVE_EVERY), "-d", str(options.downscale), "--val"]
-        command += ["--val-image", next(p.name for p in (project / "images").glob(f"{capture.cameras[test].name}.*"))]
+        command += ["--val-image", next(p.name for p in (project / "images").glob(f"{photo}.*"))]
         with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
             try:
                 for seconds in options.seconds:
@@ -142,11 +150,12 @@ def main(options: Options) -> None:
     for path in options.captures:
         with tempfile.TemporaryDirectory() as name:
             project = centred_project(path, Path(name) / "project")
-            capture = load_capture(project, downscale=options.downscale)
-            rows.append({"capture": path.name, "program": "ours", **ours(capture)})
+            capture = load_capture(project, options.downscale, options.test_view)
+            names = {"capture": path.name, "photo": capture.cameras[held_out(capture)].name}
+            rows.append({**names, "program": "ours", **ours(capture)})
             print(rows[-1], flush=True)
             for row in opensplat(project, capture, options):
-                rows.append({"capture": path.name, "program": "OpenSplat 1.2.0", **row})
+                rows.append({**names, "program": "OpenSplat 1.2.0", **row})
                 print(rows[-1], flush=True)
     options.write({"threads": dr.thread_count(), "fits": rows})
 
