@@ -53,26 +53,19 @@ class Options(Output):
     downscale: float = 1
     """Factor by which the photos are reduced."""
     test_view: str = "auto"
-    """Index or name of the held-out photo; "auto" is the first one."""
-
-
-def held_out(capture: Capture) -> int:
-    """Return the index of the test view."""
-    (test,) = set(range(len(capture.cameras))) - set(capture.train_views)
-    return test
+    """Index or name of the held-out photo; "auto" is the first one of at least six."""
 
 
 def held_out_psnr(capture: Capture, gaussians: Gaussians) -> float:
     """Return PSNR, dB, of the test view."""
-    test = held_out(capture)
-    truth = np.asarray(next(capture.frames()).images[test], np.float32) / 255
-    image = np.clip(np.asarray(rasterize(gaussians, capture.cameras[test], ("color",)).color), 0, 1)
+    assert capture.test_view is not None
+    truth = np.asarray(next(capture.frames()).images[capture.test_view], np.float32) / 255
+    image = np.clip(np.asarray(rasterize(gaussians, capture.cameras[capture.test_view], ("color",)).color), 0, 1)
     return round(psnr_of(((image - truth) ** 2).mean()), 2)
 
 
-def opensplat(project: Path, capture: Capture, options: Options) -> Iterator[dict[str, Any]]:
-    """Yield a row of seconds, step, Gaussians and PSNR at each budget."""
-    photo = capture.cameras[held_out(capture)].name
+def opensplat(project: Path, capture: Capture, photo: str, options: Options) -> Iterator[dict[str, Any]]:
+    """Yield a row of seconds, step, Gaussians and PSNR at each budget; `photo` is the name of the test view."""
     with tempfile.TemporaryDirectory() as name:
         out = Path(name) / "splat.ply"
         command = [options.folder / "OpenSplat" / "build" / "opensplat", project, "-o", out, "-n", "30000", "--cpu"]
@@ -151,10 +144,13 @@ def main(options: Options) -> None:
         with tempfile.TemporaryDirectory() as name:
             project = centred_project(path, Path(name) / "project")
             capture = load_capture(project, options.downscale, options.test_view)
-            names = {"capture": path.name, "photo": capture.cameras[held_out(capture)].name}
+            if capture.test_view is None:
+                raise SystemExit(f"{path}: expected a held-out photo, found none; give one with --test-view.")
+            photo = capture.names[capture.test_view]
+            names = {"capture": path.name, "photo": photo}
             rows.append({**names, "program": "ours", **ours(capture)})
             print(rows[-1], flush=True)
-            for row in opensplat(project, capture, options):
+            for row in opensplat(project, capture, photo, options):
                 rows.append({**names, "program": "OpenSplat 1.2.0", **row})
                 print(rows[-1], flush=True)
     options.write({"threads": dr.thread_count(), "fits": rows})
