@@ -23,6 +23,7 @@ from morgs_mi.capture.lens import Lens, undistortion
 from morgs_mi.capture.timeline import ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points
+from morgs_mi.core.rig import with_near_planes
 from morgs_mi.io.prefetch import prefetched
 from morgs_mi.io.remote import is_url, mirrored
 from morgs_mi.io.video import Clip, FolderReader, FrameReader, ImageOrError, open_clips
@@ -318,6 +319,7 @@ def load_capture(
         for camera, (delay, rate, readout) in zip(recorded, times, strict=True)
     )
     _check_downscale(downscale, cameras, recorded)
+    cameras = with_near_planes(cameras, calibration.points, reading.near)
     capture = Capture(
         path=path,
         cameras=cameras,

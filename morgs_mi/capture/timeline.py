@@ -36,7 +36,7 @@ _NEAR = 0.5
 
 @dataclass(frozen=True)
 class ReadConfig:
-    """Handling of clips that do not match; by default they are refused."""
+    """How a capture is read: clips that do not match, which are refused by default, and near planes."""
 
     trim: bool = False
     """Whether to use only the instants that all clips cover, at the lowest of their frame rates."""
@@ -52,6 +52,9 @@ class ReadConfig:
     most points with the others."""
     without: tuple[str, ...] = ()
     """Names of the cameras that are left out."""
+    near: float | None = None
+    """Depth of the cameras' near planes, world units; None: a fifth of the smallest reliable depth (see
+    `with_near_planes`)."""
 
     @property
     def aligns_clips(self) -> bool:

@@ -145,6 +145,8 @@ class Reading:
     """Colour correction: none, linear, or with a reference camera linear:CAMERA."""
     without: Without = ()
     """Cameras that are left out, by name."""
+    near: Annotated[float | None, optional("UNITS", f"(default: from the scene, {page('captures')})")] = None
+    """Depth of the cameras' near planes."""
 
     def read_config(self) -> ReadConfig:
         """Return the options as `load_capture` takes them."""

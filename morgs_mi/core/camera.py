@@ -33,7 +33,8 @@ class Camera:
         width: image width in pixels.
         height: image height in pixels.
         name: in the capture, e.g. ``cam00``.
-        near: depth in world units below which Gaussians are not rendered.
+        near: depth in world units below which Gaussians are not rendered. The cameras of a capture have a depth that
+            follows the scene (see `with_near_planes`).
         delay: frames by which its images are later than the instants of the recording, at the middle row. Gaussians
             with motion are rendered where they are then.
         readout: frames between the exposures of the first and the last row; 0 for a global shutter.

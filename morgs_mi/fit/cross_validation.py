@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import exp
+from math import expm1
 
 import numpy as np
 
@@ -135,7 +135,7 @@ def excess_share(angle: float, withheld_angle: float, trained: int) -> float:
         trained: number of views that were not withheld.
     """
     power = max(1.0, _POWER / trained)
-    near, far = (1 - exp(-((max(x, 1e-6) / _FAR) ** power)) for x in (min(angle, withheld_angle), withheld_angle))
+    near, far = (-expm1(-((max(x, 1e-6) / _FAR) ** power)) for x in (min(angle, withheld_angle), withheld_angle))
     return near / far
 
 

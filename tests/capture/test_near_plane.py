@@ -1,0 +1,108 @@
+"""A held-out camera that stands in a dark ball, as cameras on the wall of a dome do in the views of the others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from morgs_mi.capture.capture import load_capture
+from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.evaluate.evaluate import evaluate_stream
+from morgs_mi.fit.fit_config import FitConfig
+from morgs_mi.fit.initialise import from_points
+from morgs_mi.loop.stream_config import StreamConfig
+from morgs_mi.playback.streams import open_stream
+from morgs_mi.playback.visualise import to_uint8, write_png
+from morgs_mi.render.rasterize import rasterize
+from morgs_mi.render.render_config import RenderConfig
+from morgs_mi.runs.recorder import stream_capture
+from tests.scenes.cameras import circle, look_at_cameras
+
+RADIUS = 0.08  # of the dark ball around camera 0
+CONFIG = StreamConfig(
+    fit=FitConfig(sh_degree=0, num_gaussians=600, first_frame_steps=150, validate=False, dropping=0.0),
+    render=RenderConfig(reproducible=True),
+)
+SHORT = replace(CONFIG, fit=replace(CONFIG.fit, num_gaussians=60, first_frame_steps=2))
+
+
+def dome() -> list[Camera]:
+    """Return eight cameras on a circle, of which the opposite ones see camera 0 above the scene."""
+    return look_at_cameras(circle(np.arange(8) * np.pi / 4, 3.0, z=0.9), 60, 96, 72, up=(0, 0, 1))
+
+
+def scene() -> tuple[np.ndarray, np.ndarray]:
+    """Return points and colours of a bright cube in the middle and of a dark ball around camera 0."""
+    rng = np.random.default_rng(0)
+    cube = rng.uniform(-0.8, 0.8, (400, 3))
+    ball = rng.normal(size=(60, 3))
+    ball *= RADIUS / np.linalg.norm(ball, axis=1, keepdims=True)
+    colors = np.concatenate([0.6 + 0.3 * np.sin(5 * cube), np.full((60, 3), 0.02)])
+    return np.concatenate([cube, dome()[0].position + ball]), colors
+
+
+def splats() -> Gaussians:
+    points, colors = scene()
+    gaussians = from_points(points, colors, 0, opacity=0.9)
+    dark = np.arange(len(points)) >= 400
+    log_scales = np.where(dark[:, None], np.log(RADIUS / 2), np.asarray(gaussians.log_scales))
+    return replace(gaussians, log_scales=log_scales)
+
+
+def image(camera: Camera, gaussians: Gaussians) -> np.ndarray:
+    return to_uint8(np.asarray(rasterize(gaussians, camera, ("color",), background=(0.5, 0.5, 0.5)).color))
+
+
+@pytest.fixture
+def capture(tmp_path: Path) -> Path:
+    """A capture whose camera 0, held out, has photographed the scene without the ball around itself."""
+    path = tmp_path / "capture"
+    write_colmap(path / "sparse" / "0", dome(), *scene())
+    for index, camera in enumerate(dome()):
+        gaussians = splats() if index else splats().select(np.arange(400))
+        write_png(path / camera.name / "0000.png", image(camera, gaussians))
+    return path
+
+
+def held_out_psnr(capture: Path, out: Path, reading: ReadConfig) -> float:
+    stream_capture(load_capture(capture, reading=reading), out, CONFIG)
+    return evaluate_stream(out, capture).scores.psnr
+
+
+def test_load_capture__near_plane_is_behind_a_splat_around_a_held_out_camera(capture: Path) -> None:
+    camera = load_capture(capture).cameras[0]
+    shown, true = (image(camera, s) for s in (splats(), splats().select(np.arange(400))))
+    assert np.array_equal(shown, true)
+    assert image(replace(camera, near=0.01), splats()).max() < 60, "the test has no splat around the camera"
+
+
+@pytest.mark.slow
+def test_load_capture__near_plane_shows_a_held_out_camera_past_a_splat_around_it(capture: Path, tmp_path: Path) -> None:
+    with_rule = held_out_psnr(capture, tmp_path / "rule", ReadConfig())
+    without = held_out_psnr(capture, tmp_path / "constant", ReadConfig(near=0.01))
+    assert without < 12
+    assert with_rule > without + 6
+
+
+def test_load_capture__takes_a_given_near_plane_and_the_stream_stores_it(capture: Path, tmp_path: Path) -> None:
+    stream_capture(load_capture(capture, reading=ReadConfig(near=0.3)), tmp_path / "out", SHORT)
+    assert {camera.near for camera in open_stream(tmp_path / "out").cameras} == {0.3}
+
+
+def test_capture__keeps_near_planes_at_the_recorded_size(capture: Path) -> None:
+    reading = ReadConfig(near=0.3)
+    recording = load_capture(capture, downscale=2, reading=reading)
+    assert {camera.near for camera in recording.cameras} == {0.3}
+    assert {camera.near for camera in recording.at_recorded_size().cameras} == {0.3}
+
+
+@pytest.mark.parametrize("near", [0.0, -1.0, float("nan"), float("inf")])
+def test_load_capture__refuses_a_near_plane_that_is_not_positive(capture: Path, near: float) -> None:
+    with pytest.raises(ValueError, match="`near` must"):
+        load_capture(capture, reading=ReadConfig(near=near))

@@ -1,0 +1,78 @@
+"""Near planes that follow the scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.rig import scene_extent, with_near_planes
+from tests.assertions import assert_close
+from tests.scenes.cameras import arc, circle, look_at_cameras
+
+NO_POINTS = np.zeros((0, 3))
+
+
+def slab(count: int = 500) -> np.ndarray:
+    """Return points [count, 3] at depths 2 to 3 of a camera at z = -3 that looks along +z."""
+    rng = np.random.default_rng(0)
+    return rng.uniform((-0.5, -0.4, -1), (0.5, 0.4, 0), (count, 3))
+
+
+def nears(cameras: list[Camera], points: np.ndarray = NO_POINTS) -> np.ndarray:
+    return np.array([camera.near for camera in with_near_planes(cameras, points)])
+
+
+def at_scale(camera: Camera, scale: float) -> Camera:
+    """Return the camera in a world whose unit is 1 / scale as long."""
+    V = np.array(camera.viewmat)
+    V[:3, 3] *= scale
+    return replace(camera, viewmat=V)
+
+
+def test_with_near_planes__are_a_fifth_of_the_smallest_depth_of_the_points() -> None:
+    (near,) = nears(look_at_cameras([(0, 0, -3)]), slab())
+    assert 0.2 * 2.0 <= near <= 0.2 * 2.05
+
+
+def test_with_near_planes__ignores_a_few_wrong_points_before_the_camera() -> None:
+    camera = look_at_cameras([(0, 0, -3)])
+    wrong = np.tile([0, 0, -2.99], (4, 1))
+    assert nears(camera, np.concatenate([slab(), wrong]))[0] > 0.2 * 1.99
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e5])
+@pytest.mark.parametrize("points", [NO_POINTS, slab()], ids=["rig", "points"])
+def test_with_near_planes__scale_with_the_world(scale: float, points: np.ndarray) -> None:
+    cameras = look_at_cameras(arc((-0.3, 0, 0.3), 3.0))
+    scaled = nears([at_scale(camera, scale) for camera in cameras], scale * points)
+    assert_close(scaled, scale * nears(cameras, points), rtol=1e-6)
+
+
+def test_with_near_planes__without_points_follow_the_focus_of_a_dome() -> None:
+    cameras = look_at_cameras(circle(np.arange(8) * np.pi / 4, 2.7), up=(0, 0, 1))
+    assert_close(nears(cameras), 0.2 * np.hypot(2.7, 0.5), rtol=1e-3)
+
+
+def test_with_near_planes__without_points_stay_within_the_rig_of_a_far_scene() -> None:
+    cameras = look_at_cameras([(x, 0, -50.0) for x in (-0.5, 0, 0.5)])
+    assert_close(nears(cameras), 0.2 * scene_extent(cameras), rtol=1e-6)
+
+
+def test_with_near_planes__of_parallel_cameras_follow_the_distance_to_the_next_one() -> None:
+    origins = [(x, 0.0, -3.0) for x in (0.0, 0.1, 0.3)]
+    cameras = [look_at_cameras([(x, y, z)], target=(x, y, 0))[0] for x, y, z in origins]
+    assert_close(nears(cameras), 0.2 * np.array([0.1, 0.1, 0.2]), rtol=1e-6)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_with_near_planes__are_unchanged_if_all_cameras_are_at_one_place(count: int) -> None:
+    cameras = [look_at_cameras([(0, 0, -3)], target=(x, 0, 0))[0] for x in range(count)]
+    assert nears(cameras).tolist() == [0.01] * count
+
+
+def test_with_near_planes__have_a_given_depth() -> None:
+    cameras = with_near_planes(look_at_cameras([(0, 0, -3), (1, 0, -3)]), slab(), 0.7)
+    assert [camera.near for camera in cameras] == [0.7, 0.7]
