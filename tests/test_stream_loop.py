@@ -333,7 +333,7 @@ def test_stream_capture__writes_a_file(clip, tmp_path):
         points=points["means"],
         point_colors=np.full((len(points["means"]), 3), 0.5, np.float32),
         masks=(None,) * 5,
-        test_view=4,
+        test_views=(4,),
         truth=None,
         _sources=(),
         downscale=2,

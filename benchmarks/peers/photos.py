@@ -58,9 +58,9 @@ class Options(Output):
 
 def held_out_psnr(capture: Capture, gaussians: Gaussians) -> float:
     """Return PSNR, dB, of the test view."""
-    assert capture.test_view is not None
-    truth = np.asarray(next(capture.frames()).images[capture.test_view], np.float32) / 255
-    image = np.clip(np.asarray(rasterize(gaussians, capture.cameras[capture.test_view], ("color",)).color), 0, 1)
+    assert capture.test_views
+    truth = np.asarray(next(capture.frames()).images[capture.reference_view], np.float32) / 255
+    image = np.clip(np.asarray(rasterize(gaussians, capture.cameras[capture.reference_view], ("color",)).color), 0, 1)
     return round(psnr_of(((image - truth) ** 2).mean()), 2)
 
 
@@ -144,9 +144,9 @@ def main(options: Options) -> None:
         with tempfile.TemporaryDirectory() as name:
             project = centred_project(path, Path(name) / "project")
             capture = load_capture(project, options.downscale, options.test_view)
-            if capture.test_view is None:
+            if not capture.test_views:
                 raise SystemExit(f"{path}: expected a held-out photo, found none; give one with --test-view.")
-            photo = capture.names[capture.test_view]
+            photo = capture.names[capture.reference_view]
             names = {"capture": path.name, "photo": photo}
             rows.append({**names, "program": "ours", **ours(capture)})
             print(rows[-1], flush=True)

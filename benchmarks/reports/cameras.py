@@ -121,9 +121,8 @@ def scores(capture: Capture, config: StreamConfig) -> dict[str, float]:
     """Fit the first frame; return the PSNR of the training views, and of the held-out one in both ways."""
     loop, images, train = new_loop(capture, config), next(capture.frames(0, 1)).images, capture.train_views
     loop.push([images[v] for v in train])
-    gaussians, test = loop.gaussians, capture.test_view
+    gaussians, test = loop.gaussians, capture.reference_view
     assert gaussians is not None
-    assert test is not None
     view = View(capture.cameras[test], images[test], capture.masks[test])
     registered = register_camera(gaussians, view, loop.setup.extent, config.fit, config.render)
     views = {
@@ -177,7 +176,7 @@ def lens_clips(options: Options, seed: int) -> tuple[Path, Path]:
     capture = synthetic("random", true, SynthConfig(frames=1, seed=seed, disturbances=own))
     if not denied.exists():
         truth = load_disturbances(true / "truth")
-        lenses = [truth[n].lens if v == capture.test_view else Lens() for v, n in enumerate(capture.names)]
+        lenses = [truth[n].lens if v in capture.test_views else Lens() for v, n in enumerate(capture.names)]
         shutil.copytree(true, denied)
         write_colmap(denied / "sparse" / "0", capture.cameras, capture.points, capture.point_colors, lenses)
     return true, denied

@@ -147,5 +147,5 @@ class Clip:
     def writer(self, path: Path, config: StreamConfig) -> StreamWriter:
         """Return a writer of a new stream of this clip."""
         about = {"capture": str(self.capture.path.resolve()), "downscale": self.capture.downscale}
-        about |= {"test_view": self.capture.test_view, "config": asdict(config)}
+        about |= {"test_view": list(self.capture.test_views), "config": asdict(config)}
         return StreamWriter(path, self.capture.cameras, self.capture.fps, about)

@@ -121,11 +121,11 @@ class Clip:
         self.capture, self.config = source.open(), config
         self.views = self.capture.train_views
         self.cameras = [self.capture.cameras[v] for v in self.views]
-        if self.capture.test_view is None or self.capture.truth is None:
+        if not self.capture.test_views or self.capture.truth is None:
             raise ValueError(
                 f"{source.path}: expected a capture with a held-out view and ground truth; make one with synth."
             )
-        self.test_view, self.truth = self.capture.test_view, self.capture.truth
+        self.test_view, self.truth = self.capture.reference_view, self.capture.truth
         self.held_out = self.capture.cameras[self.test_view]
         self.frames = list(self.capture.frames())
         loop = self._loop(MotionConfig())

@@ -87,8 +87,7 @@ def measure(source: Source, num_frames: int, config: StreamConfig) -> dict[str, 
 
 def fitted_frames(loop: StreamLoop, capture: Capture, frames: Iterable[PartialFrame]) -> Iterator[dict[str, float]]:
     """Fit frames after the first one, and yield the scores of those that the held-out view has recorded."""
-    test = capture.test_view
-    assert test is not None
+    test = capture.reference_view
     for frame in frames:
         start = time.process_time()
         _, report = loop.push([frame.images[v] for v in capture.train_views])

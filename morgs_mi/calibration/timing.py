@@ -120,7 +120,7 @@ def estimate_time_offsets(
     instants = np.linspace(largest, clips.num_frames - 2 - largest, _INSTANTS).round().astype(int)
     rounds = _Rounds(clips, instants, seed, progress)
     offsets, step, equations = _aligned(rounds, largest)
-    reference = capture.test_view or 0
+    reference = capture.reference_view
     part = _found_back(rounds, offsets - step, equations, reference)
     errors = np.minimum(equations.errors(reference) / part, UNKNOWN)
     return _relative(capture, offsets, errors, float(np.abs(step).max()))
@@ -283,7 +283,7 @@ def _fitted(clips: _Clips, images: Sequence[np.ndarray], divisor: int, seed: int
 
 def _relative(capture: Capture, offsets: np.ndarray, errors: np.ndarray, change: float) -> TimeOffsets:
     """Return the result with the offsets relative to the reference, in addition to the capture's offsets."""
-    reference = capture.test_view or 0
+    reference = capture.reference_view
     known = capture.reading.offset
     apart = offsets - [camera.delay for camera in capture.cameras]
     own = {n: known.get(n, 0.0) - (o - apart[reference]) for n, o in zip(capture.names, apart, strict=True)}

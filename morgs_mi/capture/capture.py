@@ -28,7 +28,10 @@ from morgs_mi.io.prefetch import prefetched
 from morgs_mi.io.remote import is_url, mirrored
 from morgs_mi.io.video import Clip, FolderReader, FrameReader, ImageOrError, open_clips
 
-__all__ = ["Capture", "Frame", "PartialFrame", "load_capture", "opaque_pixels"]
+__all__ = ["Capture", "Frame", "PartialFrame", "TestViews", "load_capture", "opaque_pixels"]
+
+TestViews = int | str | Sequence[int | str] | None
+"""Held-out cameras: an index, a name, several of these, None for none, or "auto"."""
 
 _LOG = logging.getLogger(__name__)
 # Pixels of the shorter side that a downscaled image needs.
@@ -82,7 +85,7 @@ class Capture:
         points: [P, 3] float32, world units; P = 0 if the layout has none.
         point_colors: [P, 3] float32 in [0, 1].
         masks: per camera [H, W] bool, true where the undistorted pixel was recorded; None if all were.
-        test_view: index of the camera held out from training, or None.
+        test_views: indices of the cameras held out from training, in ascending order.
         truth: folder of ground truth, or None.
         downscale: the downscaling factor.
         layout: name of the folder's layout, e.g. ``COLMAP``.
@@ -100,7 +103,7 @@ class Capture:
     points: np.ndarray
     point_colors: np.ndarray
     masks: tuple[np.ndarray | None, ...]
-    test_view: int | None
+    test_views: tuple[int, ...]
     truth: Path | None
     _sources: tuple[CameraSource, ...] = field(repr=False)
     downscale: float = 1
@@ -121,7 +124,12 @@ class Capture:
     @property
     def train_views(self) -> tuple[int, ...]:
         """Indices of the cameras that are not held out."""
-        return tuple(i for i in range(len(self.cameras)) if i != self.test_view)
+        return tuple(i for i in range(len(self.cameras)) if i not in self.test_views)
+
+    @property
+    def reference_view(self) -> int:
+        """Index of the first held-out camera, otherwise of the first camera: the one that figures show."""
+        return self.test_views[0] if self.test_views else 0
 
     @property
     def recorded_sizes(self) -> tuple[tuple[int, int], ...]:
@@ -155,6 +163,14 @@ class Capture:
         masks = tuple(source.mask(camera) for source, camera in zip(sources, rig.cameras, strict=True))
         return replace(rig, masks=masks, _sources=tuple(sources), distortions=left)
 
+    def holding_out(self, views: int | str | Sequence[int | str] | None) -> Capture:
+        """Return the capture with other held-out cameras, by indices or names; None for none.
+
+        Raises:
+            ValueError: there is no such camera, or none is left for training.
+        """
+        return replace(self, test_views=_held_out(self.path, _views_called(self.path, views, self.names), self.names))
+
     def process(self, view: int, image: np.ndarray) -> np.ndarray:
         """Return a recorded image of a camera undistorted, downscaled and colour-corrected, like its frames."""
         return self._sources[view].process(image, self.cameras[view])
@@ -171,7 +187,7 @@ class Capture:
             "fps": self.fps,
             "downscale": self.downscale,
             "filter": "none" if self.downscale == 1 else "area",
-            "test_view": self.test_view,
+            "test_view": list(self.test_views),
             "points": len(self.points),
             "reading": {**asdict(self.reading), "without": list(self.reading.without)},
             "colors": colors,
@@ -255,7 +271,7 @@ class Capture:
 def load_capture(
     path: str | Path,
     downscale: float = 1,
-    test_view: int | str | None = "auto",
+    test_view: TestViews = "auto",
     max_frames: int | None = None,
     reading: ReadConfig | None = None,
 ) -> Capture:
@@ -264,8 +280,8 @@ def load_capture(
     Args:
         path: the folder, or its URL (see `io.remote`); `layouts/layout_registry.py` lists the supported layouts.
         downscale: factor by which images are downscaled (area averages, rounded to the nearest whole size).
-        test_view: index or name of the held-out camera, None for none; "auto" uses the value in `capture.json`, then
-            the layout's own, then 0 as N3DV does, or none with fewer than six cameras.
+        test_view: index or name of the held-out camera, several of them, or None for none; "auto" uses the value in
+            `capture.json`, then the layout's own, then 0 as N3DV does, or none with fewer than six cameras.
         max_frames: number of frames to use at most, from the start.
         reading: how clips that do not match are read.
 
@@ -328,7 +344,7 @@ def load_capture(
         points=calibration.points,
         point_colors=calibration.point_colors,
         masks=tuple(s.mask(c) for s, c in zip(sources, cameras, strict=True)),
-        test_view=_test_view(path, test_view, settings, every, calibration),
+        test_views=_test_views(path, test_view, settings, every, calibration),
         # The frames of the ground truth are numbered like the frames of the clips.
         truth=path / "truth" if common.unchanged and (path / "truth").is_dir() else None,
         _sources=sources,
@@ -412,30 +428,56 @@ def _resized(camera: Camera, downscale: float) -> Camera:
     return camera.resized(max(1, round(camera.width / downscale)), max(1, round(camera.height / downscale)))
 
 
-def _test_view(
-    path: Path, requested: int | str | None, settings: dict[str, Any], every: Calibration, used: Calibration
-) -> int | None:
-    """Return the index of the held-out camera among the used ones; a setting of the capture counts all cameras."""
-    if requested != "auto":
-        return _view_called(path, requested, used.names)
-    own = every.test_view
-    if "test_view" in settings:
-        own = _view_called(path / "capture.json", settings["test_view"], every.names)
-        if own is None:
-            return None
-    if own is not None and every.names[own] in used.names:
-        return used.names.index(every.names[own])
-    return 0 if len(used.names) >= 6 else None
-
-
-def _view_called(place: Path, view: int | str | None, names: Sequence[str]) -> int | None:
-    """Return the index of a camera given by index or name, or None.
+def _test_views(
+    path: Path, requested: TestViews, settings: dict[str, Any], every: Calibration, used: Calibration
+) -> tuple[int, ...]:
+    """Return the indices of the held-out cameras among the used ones; a setting of the capture counts all cameras.
 
     Raises:
-        ValueError: there is none; `place` is where it was requested.
+        ValueError: a camera is unknown, or none is left for training.
     """
-    if view is None:
-        return None
+    if requested != "auto":
+        return _held_out(path, _views_called(path, requested, used.names), used.names)
+    return _held_out(path, _default_test_views(path, settings, every, used), used.names)
+
+
+def _held_out(path: Path, views: tuple[int, ...], names: Sequence[str]) -> tuple[int, ...]:
+    """Return the held-out views if a camera is left for training."""
+    if len(views) == len(names):
+        raise ValueError(
+            f"{path}: `test_view` must leave a camera for training, got all {len(views)} cameras; name fewer of them."
+        )
+    return views
+
+
+def _default_test_views(path: Path, settings: dict[str, Any], every: Calibration, used: Calibration) -> tuple[int, ...]:
+    """Return the held-out cameras by the capture's settings, by its layout, or by the number of cameras."""
+    if "test_view" in settings:
+        views = _views_called(path / "capture.json", settings["test_view"], every.names)
+        if not views:
+            return ()
+    else:
+        views = every.test_views or ()
+    names = [every.names[view] for view in views if every.names[view] in used.names]
+    if names or every.test_views == ():
+        return tuple(used.names.index(name) for name in names)
+    return (0,) if len(used.names) >= 6 else ()
+
+
+def _views_called(place: Path, views: int | str | Sequence[int | str] | None, names: Sequence[str]) -> tuple[int, ...]:
+    """Return the ascending indices of cameras given by indices or names.
+
+    Raises:
+        ValueError: there is no such camera; `place` is where it was requested.
+    """
+    if views is None:
+        return ()
+    requested = [views] if isinstance(views, int | str) else list(views)
+    return tuple(sorted({_view_called(place, view, names) for view in requested}))
+
+
+def _view_called(place: Path, view: int | str, names: Sequence[str]) -> int:
+    """Return the index of a camera given by index or name."""
     index = names.index(view) if view in names else view
     if str(index).isdecimal() and int(index) < len(names):
         return int(index)

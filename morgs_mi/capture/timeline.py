@@ -319,6 +319,9 @@ def read_settings(path: Path) -> dict[str, Any]:
     readout = settings.get("readout", 0.0)
     for value in readout.values() if isinstance(readout, dict) else [readout]:
         check_number(str(path), "readout", value, "[-1, 1]")
-    if view is not None and type(view) is not int:
-        raise ValueError(f"{path}: `test_view` must be a camera's index or null, got {view!r}; correct it.")
+    indices = view if isinstance(view, list) else [view]
+    if view is not None and any(type(index) is not int for index in indices):
+        raise ValueError(
+            f"{path}: `test_view` must be a camera's index, a list of them, or null, got {view!r}; correct it."
+        )
     return settings

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, print_warning, progress
-from morgs_mi.cli.settings import Flag, GivenReading, GivenSettings, Reading, Settings, optional
+from morgs_mi.cli.settings import Flag, GivenReading, GivenSettings, HeldOut, Reading, Settings, held_out, optional
 from morgs_mi.core.documentation import page
 from morgs_mi.loop.stream_config import StreamConfig, config_toml
 
@@ -43,8 +43,8 @@ class Fit:
     """Number of frames to fit, from the first one."""
     downscale: float = 1
     """Factor by which the images are reduced; 2 halves width and height."""
-    test_view: Annotated[str, arg(metavar="CAMERA")] = "auto"
-    """Held-out camera, by index or name; none: all are fitted; auto: the capture's own, or camera 0 of six or more."""
+    test_view: HeldOut = ("auto",)
+    """Held-out cameras, by indices or names; none: all are fitted; auto: the capture's, or camera 0 of six or more."""
     reading: GivenReading = field(default_factory=Reading)
     settings: GivenSettings = field(default_factory=Settings)
     resume: Flag = False
@@ -69,8 +69,9 @@ class Fit:
         if self.capture is None or self.out is None:
             raise ValueError("morgs-mi fit: expected the folders CAPTURE and OUT, got fewer; see morgs-mi fit --help.")
         self.settings.check_methods(config)
-        view = None if self.test_view.lower() == "none" else self.test_view
-        capture = load_capture(self.capture, self.downscale, view, self.frames, self.reading.read_config())
+        capture = load_capture(
+            self.capture, self.downscale, held_out(self.test_view), self.frames, self.reading.read_config()
+        )
         if config.fit.exposure == "off" and not self.resume:
             for finding in check_exposures(capture):
                 print_warning(f"Warning: {finding.sentence}")
@@ -119,7 +120,7 @@ def first_frame_sentences(validation: Mapping[str, Any]) -> Iterator[str]:
     if "held_out" in refined:
         psnr = refined["held_out"]
         yield (
-            f"The held-out view has {psnr['calibrated_psnr']:.1f} dB as calibrated, {psnr['registered_psnr']:.1f} dB "
+            f"Held-out views have {psnr['calibrated_psnr']:.1f} dB as calibrated, {psnr['registered_psnr']:.1f} dB "
             "registered."
         )
     if "exposure" in validation:

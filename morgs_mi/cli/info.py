@@ -138,7 +138,7 @@ def _camera_table(capture: Capture, found: RigCheck | None) -> Table:
             f"{K[0, 0]:.1f}" if f"{K[0, 0]:.1f}" == f"{K[1, 1]:.1f}" else f"{K[0, 0]:.1f} {K[1, 1]:.1f}",
             f"{K[0, 2]:.1f} {K[1, 2]:.1f}",
             "100 %" if mask is None else f"{100 * mask.mean():.0f} %",
-            "test" if index == capture.test_view else "train",
+            "test" if index in capture.test_views else "train",
             *check_cells(found.cameras[index] if found else None),
         )
     return table

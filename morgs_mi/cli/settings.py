@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import reduce
 from pathlib import Path
@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, get_args
 from tyro.conf import DisallowNone, FlagCreatePairsOff, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
+from morgs_mi.capture.capture import TestViews
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.core.documentation import page
 from morgs_mi.loop.stream_config import PresetName, StreamConfig, apply_preset, apply_values, read_config, relocated
@@ -21,9 +22,11 @@ __all__ = [
     "Flag",
     "GivenReading",
     "GivenSettings",
+    "HeldOut",
     "Reading",
     "Settings",
     "Without",
+    "held_out",
     "one_of",
     "optional",
     "place",
@@ -62,6 +65,15 @@ Estimation = Literal["off", "auto", "on"]
 Flag = Annotated[bool, FlagCreatePairsOff, arg(help_behavior_hint="")]
 # Names of cameras, none by default.
 Without = Annotated[tuple[str, ...], arg(metavar="CAMERA ...", help_behavior_hint="")]
+# Names or indices of held-out cameras.
+HeldOut = Annotated[tuple[str, ...], arg(metavar="CAMERA ...")]
+
+
+def held_out(names: Sequence[str]) -> TestViews:
+    """Return held-out cameras, given by name or index, or as `none` or `auto`, as `load_capture` takes them."""
+    if len(names) == 1 and names[0].lower() in ("none", "auto"):
+        return None if names[0].lower() == "none" else "auto"
+    return tuple(names)
 
 
 def optional(metavar: str, hint: str = "", text: str | None = None) -> Any:

@@ -32,7 +32,7 @@ class ComparedClip:
         recording: its capture.
         packets: kind and size of each frame's packet.
         num_packets: number of packets, re-emitted keyframes included.
-        views: the evaluated views: the held-out one, or otherwise all training views.
+        views: the evaluated views: the held-out ones, or otherwise all training views.
         cameras: of all views, with the delays of the recording.
         channels: rendered channels.
         render: settings of the renderer, as in the fit.
@@ -65,7 +65,7 @@ class ComparedClip:
         if not packets:
             raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
         recording = open_stream_capture(stream, capture, list(packets))
-        views = recording.train_views if recording.test_view is None else [recording.test_view]
+        views = recording.test_views or recording.train_views
         channels = ("color", "motion", *(("confidence",) if has_confidence(stream) else ()))
         cameras = recording.with_delays(stream.cameras)
         return cls(stream, recording, packets, count, views, cameras, channels, render_config(stream))

@@ -58,7 +58,7 @@ def evaluate_stream(
     return Evaluation(
         stream=str(stream.path.resolve()),
         capture=str(recording.path.resolve()),
-        held_out=recording.test_view is not None,
+        held_out=bool(recording.test_views),
         complete=len(rows) == stream.metadata.get("num_frames", len(rows)),
         regions="recorded change" if recording.truth is None else "true masks",
         sizes=_sizes(stream.path.stat().st_size, rows),

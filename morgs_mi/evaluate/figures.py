@@ -70,7 +70,7 @@ def draw_stream(
     if not frames:
         raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
     recording = open_stream_capture(stream, capture, frames)
-    view = recording.train_views[0] if recording.test_view is None else recording.test_view
+    view = recording.reference_view
     camera = recording.with_delays(stream.cameras)[view]
     # Nothing moves up to the first frame.
     later = frames[1:] or frames

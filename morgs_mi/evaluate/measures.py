@@ -142,28 +142,28 @@ class Motion3D(Measure):
 
 
 class Registration(Measure):
-    """PSNR of the held-out view in the first frame, from the camera that fits its image best."""
+    """PSNR of the held-out views in the first frame, from the cameras that fit their images best."""
 
     def __init__(self) -> None:
-        self._psnr = float("nan")
+        self._psnr: dict[str, float] = {}
         self._begun = False
 
     def add_view(self, view: ComparedView) -> None:
         clip = view.frame.clip
-        if self._begun or view.index != clip.recording.test_view:
+        if self._begun or view.index not in clip.recording.test_views:
             return
         given = View(clip.stream.cameras[view.index], view.recorded, view.valid)
         extent = scene_extent([clip.stream.cameras[v] for v in clip.recording.train_views])
         gaussians = view.frame.coded.gaussians
-        found = given._replace(camera=register_camera(gaussians, given, extent, FitConfig(), clip.render))
-        self._psnr = mean_psnr(gaussians, [found], clip.render)
+        registered = given._replace(camera=register_camera(gaussians, given, extent, FitConfig(), clip.render))
+        self._psnr[view.camera.name] = mean_psnr(gaussians, [registered], clip.render)
 
     def add_frame(self, frame: ComparedFrame) -> dict[str, Any]:
         self._begun = True
         return {}
 
     def result(self) -> dict[str, Any]:
-        return {"registered_psnr": self._psnr}
+        return {"registered": self._psnr}
 
 
 class Tracking(Measure):

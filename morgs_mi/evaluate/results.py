@@ -6,7 +6,7 @@ NaN stands for an unknown score. A name with ``_moving`` or ``_still`` is the sc
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Self
 
 import numpy as np
@@ -234,7 +234,7 @@ class Evaluation:
     capture: str
     """Path of the capture."""
     held_out: bool
-    """Whether the held-out view is scored; otherwise all training views."""
+    """Whether held-out views are scored; otherwise all training views."""
     complete: bool
     """Whether the stream holds all frames that were to be fitted."""
     regions: str
@@ -248,9 +248,9 @@ class Evaluation:
     frames: tuple[FrameScores, ...]
     tracking: tuple[TrackingScores, ...] = ()
     """3D point tracks against the true ones, a row per protocol; empty without true tracks."""
-    registered_psnr: float = float("nan")
-    """PSNR of the held-out view in the first frame, seen from the camera that fits its image best, dB; NaN without a
-    held-out view. The scores of the frames are those as calibrated."""
+    registered: Mapping[str, float] = field(default_factory=dict)
+    """PSNR of each held-out view in the first frame, seen from the camera that fits its image best, dB, by camera name.
+    The scores of the frames are those as calibrated."""
     expected: str = ""
     """Expected quality of views between the cameras, a sentence from the report of the fit; without one, a forecast
     from the rig; empty with a single training view."""
@@ -272,6 +272,11 @@ class Evaluation:
         """Means over the frames by camera name."""
         names = self.frames[0].views
         return {name: ViewScores.mean([frame.views[name] for frame in self.frames]) for name in names}
+
+    @property
+    def registered_psnr(self) -> float:
+        """Mean of the PSNR of the registered held-out views, dB; NaN without a held-out view."""
+        return known_mean(list(self.registered.values()))
 
     @property
     def motion_3d(self) -> Motion3DScores | None:
@@ -309,7 +314,10 @@ class Evaluation:
             "bytes": asdict(self.sizes),
             "mtv": asdict(self.variation),
             "playback": asdict(self.playback),
-            "views": {name: asdict(scores) for name, scores in self.views.items()},
+            "views": {
+                name: {**asdict(scores), "registered_psnr": self.registered.get(name, float("nan"))}
+                for name, scores in self.views.items()
+            },
             "frames": [frame.as_dict() for frame in self.frames],
         }
 

@@ -16,6 +16,8 @@ _METRICS = (("PSNR, dB", "psnr", 2), ("SSIM", "ssim", 4), ("FLIP", "flip", 4), (
 _METRICS += (("LPIPS", "lpips", 4), ("flow error, px", "motion_error", 2))
 _FRAME = (("PSNR, dB", "psnr", 2), ("moving", "psnr_moving", 2), ("SSIM", "ssim", 4), ("FLIP", "flip", 4))
 _FRAME += (("flow error", "motion_error", 2), ("moving", "motion_error_moving", 2))
+_VIEW = (("PSNR, dB", "psnr", 2), ("colours matched", "psnr_matched", 2), ("SSIM", "ssim", 4))
+_VIEW += (("flow error", "motion_error", 2), ("registered", "registered_psnr", 2))
 
 
 def figure(value: float | None, digits: int) -> str:
@@ -24,14 +26,17 @@ def figure(value: float | None, digits: int) -> str:
 
 
 def evaluation_tables(result: Evaluation) -> Iterator[Table]:
-    """Yield a table of the frames, one of the regions and, with true tracks, one of the point tracks."""
+    """Yield tables of the frames, of several views, of the regions and, with true tracks, of the point tracks."""
     frames = _table("frame by frame", "frame", *(title for title, *_ in _FRAME), "kB", "s")
     for row in result.frames:
         scores = (figure(getattr(row.scores, name), digits) for _, name, digits in _FRAME)
         frames.add_row(str(row.frame), *scores, figure(row.num_bytes / 1e3, 1), figure(row.seconds, 1))
     yield frames
-    views = ("held-out view " if result.held_out else "training views ") + ", ".join(result.views)
-    regions = _table(f"{views}: means, regions from {result.regions}", "", "whole", "moving", "still")
+    if len(result.views) > 1:
+        yield _view_table(result)
+    views = ("held-out " if result.held_out else "training ") + ("views" if len(result.views) > 1 else "view")
+    names = "" if len(result.views) > 1 else " " + ", ".join(result.views)
+    regions = _table(f"{views}{names}: means, regions from {result.regions}", "", "whole", "moving", "still")
     mean = result.scores
     for title, name, digits in _METRICS:
         values = [getattr(mean, name + region) for region in REGIONS]
@@ -43,6 +48,18 @@ def evaluation_tables(result: Evaluation) -> Iterator[Table]:
     yield regions
     if result.tracking:
         yield _tracking_table(result)
+
+
+def _view_table(result: Evaluation) -> Table:
+    """Return the scores of each view, and their means."""
+    title = "held-out views" if result.held_out else "training views"
+    table = _table(f"{title}, means over the frames", "", *(title for title, *_ in _VIEW))
+    rows = {**result.views, "mean": result.scores}
+    registered = {**result.registered, "mean": result.registered_psnr}
+    for name, scores in rows.items():
+        values = [figure(getattr(scores, key), digits) for _, key, digits in _VIEW[:-1]]
+        table.add_row(name, *values, figure(registered.get(name), 2))
+    return table
 
 
 def _tracking_table(result: Evaluation) -> Table:
@@ -61,21 +78,19 @@ def _tracking_table(result: Evaluation) -> Table:
 def evaluation_summary(result: Evaluation) -> Iterator[str]:
     """Yield sentences on other views, time, size, drift and 3D motion."""
     sizes, seconds, play, mean = result.sizes, result.seconds, result.playback, result.scores
-    if not result.held_out:
-        scores = (f"{name} {figure(score.psnr, 2)}" for name, score in result.views.items())
-        yield f"PSNR by view, dB: {', '.join(scores)}"
     first, last = (result.frames[k].scores.psnr for k in (0, -1))
     yield (
         f"Drift: PSNR {figure(first, 2)} dB in the first frame, {figure(last, 2)} dB in the last, "
         f"{figure(result.psnr_slope, 4)} dB per frame."
     )
     if result.held_out:  # a measurement, beside which an estimate would only confuse
+        held_out = "Held-out views" if len(result.views) > 1 else "Held-out view"
         yield (
-            f"Held-out view in the first frame: {figure(first, 2)} dB as calibrated, "
-            f"{figure(result.registered_psnr, 2)} dB registered, from the camera that fits its image best."
+            f"{held_out} in the first frame: {figure(first, 2)} dB as calibrated, "
+            f"{figure(result.registered_psnr, 2)} dB registered, from the camera that fits each image best."
         )
         yield (
-            f"Held-out view in all frames: {figure(mean.psnr, 2)} dB as recorded, {figure(mean.psnr_matched, 2)} dB "
+            f"{held_out} in all frames: {figure(mean.psnr, 2)} dB as recorded, {figure(mean.psnr_matched, 2)} dB "
             "after the gain and bias per channel that fit best."
         )
     elif result.expected:

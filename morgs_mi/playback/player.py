@@ -74,6 +74,7 @@ PROVISIONAL = "provisional.morgs"
 _MOST_TIMED_FRAMES = 30
 _JSON_TYPES = {
     dict: "an object",
+    list: "a list",
     bool: "true or false",
     int: "an integer",
     float: "a number",
@@ -292,16 +293,18 @@ def open_stream_capture(stream: StreamReader, capture: str | Path | None, frames
     path = capture or fitted_capture(stream)
     reading = apply_values(ReadConfig(), metadata_entry(stream, "reading", {}, dict), _place(stream, "reading"))
     downscale = metadata_entry(stream, "downscale", 1, int, float)
-    test_view = metadata_entry(stream, "test_view", "auto", int, str, NoneType)
+    test_view = metadata_entry(stream, "test_view", "auto", list, int, str, NoneType)
     if not frames:
         raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
-    recording = load_capture(path, downscale, test_view, frames[-1] + 1, reading)
+    recording = load_capture(path, downscale, "auto" if test_view == "auto" else None, frames[-1] + 1, reading)
     expected, found = _sizes(stream.cameras), _sizes(recording.cameras)
     if found != expected:
         raise ValueError(
             f"{path}: expected the cameras that {stream.path} was fitted to, {expected}, got {found}; "
             "pass that capture (--capture)."
         )
+    if test_view != "auto":
+        recording = recording.holding_out(test_view)
     if frames != list(range(frames[0], frames[-1] + 1)) or recording.num_frames <= frames[-1]:
         raise ValueError(
             f"{stream.path}: expected consecutive frames out of the {recording.num_frames} of {path}, got {frames}; "

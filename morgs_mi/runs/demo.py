@@ -205,7 +205,7 @@ def _compare(results: Mapping[str, Evaluation]) -> tuple[list[int], dict[str, di
 
 def _draw(out: Path, capture: Capture, report: Callable[[float, float], None]) -> None:
     """Write the video and the contact sheet."""
-    scale = motion_scale(capture, capture.cameras[capture.test_view or 0])
+    scale = motion_scale(capture, capture.cameras[capture.reference_view])
     full = _panels(capture, out / "stream", scale)
     plain = _panels(capture, out / "stream_plain", scale, ", no ML, MO, MC")
     shown = ("truth", "render", "motion", "confidence")
@@ -225,7 +225,7 @@ def _draw(out: Path, capture: Capture, report: Callable[[float, float], None]) -
 
 def _panels(capture: Capture, stream: Path, scale: float, note: str = "") -> list[dict[str, np.ndarray]]:
     """Return the labelled images of every frame of the held-out view by name; `note` is appended to the labels."""
-    reader, view = open_stream(stream), capture.test_view or 0
+    reader, view = open_stream(stream), capture.reference_view
     camera = reader.cameras[view]
     frames = []
     for recorded, (index, images) in zip(capture.frames(), render_stream(reader, camera), strict=False):

@@ -150,15 +150,18 @@ class Prepared:
         return replace(report, validation=report.validation | {"refinement": about | held_out})
 
     def _held_out(self, gaussians: Gaussians, frame: PartialFrame, config: StreamConfig) -> dict[str, Any]:
-        """Return the PSNR of the held-out view by its calibrated and by its registered camera, if there is one."""
-        capture, test = self.capture, self.capture.test_view
-        image = None if test is None else frame.images[test]
-        if test is None or image is None:
+        """Return the mean PSNR of the held-out views by their calibrated and registered cameras, if there are any."""
+        capture = self.capture
+        images = [(v, image) for v in capture.test_views if (image := frame.images[v]) is not None]
+        if not images:
             return {}
-        view = View(capture.cameras[test], image, capture.masks[test])
+        views = [View(capture.cameras[v], image, capture.masks[v]) for v, image in images]
         extent = scene_extent([capture.cameras[v] for v in capture.train_views])
-        registered = view._replace(camera=register_camera(gaussians, view, extent, config.fit, config.render))
-        calibrated_psnr, registered_psnr = (mean_psnr(gaussians, [v], config.render) for v in (view, registered))
+        registered = [
+            view._replace(camera=register_camera(gaussians, view, extent, config.fit, config.render)) for view in views
+        ]
+        calibrated_psnr = mean_psnr(gaussians, views, config.render)
+        registered_psnr = mean_psnr(gaussians, registered, config.render)
         return {"held_out": {"calibrated_psnr": calibrated_psnr, "registered_psnr": registered_psnr}}
 
 

@@ -276,7 +276,7 @@ def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig)
     metadata = {
         "fingerprint": _fingerprint([*first.images, capture.points, capture.point_colors, *calibrated]),
         "downscale": capture.downscale,
-        "test_view": capture.test_view,
+        "test_view": list(capture.test_views),
         "reading": asdict(capture.reading),
         "train_views": list(train),
         "num_frames": capture.num_frames,

@@ -100,7 +100,7 @@ def test_refine_cameras__stays_in_the_frame_of_what_takes_no_part(far_capture, s
     """Noise alone moves correct cameras by 0.2 to 0.3 px; disturbed ones show the splats 0.6 to 0.8 px off."""
     deviations = scale * np.array([0.005] * 3 + [0.006] * 3 + [0.008, 0, 0, 0, 0])
     errors = deviations * np.random.default_rng(seed).normal(size=(9, 11))
-    errors[far_capture.test_view] = 0
+    errors[list(far_capture.test_views)] = 0
     cameras = [changed_camera(*pair) for pair in zip(far_capture.cameras, errors, strict=True)]
     capture = replace(far_capture, cameras=tuple(cameras))
     config = FitConfig(refine_cameras="on", short_fits=replace(SHORT, steps=100))
@@ -216,7 +216,7 @@ def test_matched__finds_the_distortion_that_is_left(textured_capture, monkeypatc
 def test_refine_cameras__needs_two_images(splat_capture):
     fields = {name: getattr(splat_capture, name)[:1] for name in ("cameras", "masks", "_sources")}
     with pytest.raises(ValueError, match="at least two training views, got 1"):
-        refine_cameras(replace(splat_capture, **fields, test_view=None), LEAST)
+        refine_cameras(replace(splat_capture, **fields, test_views=()), LEAST)
 
 
 def test_Refinement__reports_the_changes_and_the_gain():

@@ -40,7 +40,7 @@ def colmap(path: Path, names: tuple[str, ...] = ("cam01", "cam02"), **kwargs) ->
 def test_load_capture__reads_n3dv(tmp_path: Path) -> None:
     capture = load_capture(n3dv(tmp_path))
     assert capture.names == ("cam00", "cam01", "cam02")
-    assert (capture.num_frames, capture.fps, capture.test_view, capture.truth) == (COUNT, FPS, None, None)
+    assert (capture.num_frames, capture.fps, capture.test_views, capture.truth) == (COUNT, FPS, (), None)
     assert capture.points.shape == capture.point_colors.shape == (0, 3)
     assert capture.masks == (None,) * 3
     assert_close(capture.cameras[1].viewmat, make_camera(1, "cam01").viewmat, atol=1e-12)
@@ -127,14 +127,18 @@ def test_load_capture__reads_frame_folders_named_in_the_model(tmp_path: Path) ->
 def test_load_capture__selects_the_held_out_view(tmp_path: Path) -> None:
     n3dv(tmp_path, tuple(f"cam{i:02}" for i in range(6)))
     capture = load_capture(tmp_path)
-    assert capture.test_view == 0
+    assert capture.test_views == (0,)
     assert capture.train_views == (1, 2, 3, 4, 5)
-    assert load_capture(tmp_path, test_view=None).test_view is None
+    assert load_capture(tmp_path, test_view=None).test_views == ()
     (tmp_path / "capture.json").write_text('{"test_view": 4}')
-    assert load_capture(tmp_path).test_view == 4
-    assert load_capture(tmp_path, test_view=2).test_view == 2
+    assert load_capture(tmp_path).test_views == (4,)
+    assert load_capture(tmp_path, test_view=2).test_views == (2,)
+    assert load_capture(tmp_path, test_view=[5, "cam00", 0]).test_views == (0, 5)
+    (tmp_path / "capture.json").write_text('{"test_view": [4, 1]}')
+    assert load_capture(tmp_path).test_views == (1, 4)
+    assert load_capture(tmp_path).train_views == (0, 2, 3, 5)
     (tmp_path / "capture.json").write_text('{"test_view": null}')
-    assert load_capture(tmp_path).test_view is None
+    assert load_capture(tmp_path).test_views == ()
 
 
 def test_load_capture__finds_truth_and_limits_frames(tmp_path: Path) -> None:
@@ -162,18 +166,18 @@ def test_load_capture__leaves_cameras_out(tmp_path: Path, without: list[str]) ->
     capture = load_capture(path, reading=ReadConfig(without=tuple(without)))
     kept = [name for name in names if name not in without]
     assert capture.names == tuple(kept)
-    assert capture.test_view is not None
-    assert capture.names[capture.test_view] == "cam04", "the setting counts all cameras"
+    (test_view,) = capture.test_views
+    assert capture.names[test_view] == "cam04", "the setting counts all cameras"
     assert {c.name: c.readout for c in capture.cameras if c.readout} == {"cam05": 0.2}
     assert [image[0, 0, 0] for image in next(capture.frames()).images] == [names.index(name) for name in kept]
-    assert load_capture(path, test_view=2, reading=ReadConfig(without=tuple(without))).test_view == 2
+    assert load_capture(path, test_view=2, reading=ReadConfig(without=tuple(without))).test_views == (2,)
 
 
 def test_load_capture__holds_out_another_view_without_the_one_of_the_settings(tmp_path: Path) -> None:
     path = n3dv(tmp_path, tuple(f"cam{i:02}" for i in range(8)))
     (path / "capture.json").write_text('{"test_view": 4}')
-    assert load_capture(path, reading=ReadConfig(without=("cam04",))).test_view == 0
-    assert load_capture(path, reading=ReadConfig(without=("cam04", "cam06", "cam07"))).test_view is None
+    assert load_capture(path, reading=ReadConfig(without=("cam04",))).test_views == (0,)
+    assert load_capture(path, reading=ReadConfig(without=("cam04", "cam06", "cam07"))).test_views == ()
 
 
 @pytest.mark.parametrize(
@@ -295,7 +299,11 @@ def square(camera: Camera) -> Camera:
             "cameras must not move, but 'cam01.png' and 'cam01/0001.png', both of cam01, have",
         ),
         (missing_video_of_a_row, ValueError, r"got 3 rows for 2 videos \(cam01, cam02\)"),
-        (bad_settings, ValueError, "capture.json: `test_view` must be a camera's index or null, got 'cam01'"),
+        (
+            bad_settings,
+            ValueError,
+            "capture.json: `test_view` must be a camera's index, a list of them, or null, got 'cam01'",
+        ),
         (bad_readout, ValueError, r"capture.json: `readout` must be a number in \[-1, 1\], got 2"),
         (readout_of_another, ValueError, "capture.json: `readout` must name cameras of cam01, cam02, .*got cam07"),
         (broken_settings, ValueError, "capture.json: expected JSON"),
@@ -320,6 +328,8 @@ def test_load_capture__refuses_broken_captures(tmp_path: Path, damage, error: ty
         ({"downscale": float("nan")}, "`downscale` must be at least 1, got nan"),
         ({"max_frames": 0}, "`max_frames` must be at least 1, got 0"),
         ({"test_view": 2}, r"`test_view` must be an index in 0..1, one of .*, or none .* got 2"),
+        ({"test_view": ["cam01", 7]}, r"`test_view` must be an index in 0..1, one of .*, or none .* got 7"),
+        ({"test_view": [0, "cam02"]}, "`test_view` must leave a camera for training, got all 2 cameras"),
         ({"test_view": -1}, r"`test_view` must be an index in 0..1, one of .*, or none .* got -1"),
     ],
 )

@@ -183,11 +183,19 @@ def test_fit__rejects_arguments_that_cannot_be_parsed(capture: Path, tmp_path: P
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("view", "test_view"), [("cam1", 1), ("2", 2), ("none", None), ("None", None), ("auto", None)])
+@pytest.mark.parametrize(
+    ("view", "test_views"),
+    [(("cam1",), (1,)), (("2",), (2,)), (("cam2", "0"), (0, 2)), (("none",), ()), (("None",), ()), (("auto",), ())],
+)
 def test_fit__takes_the_held_out_camera_by_index_or_name(
-    capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, view: str, test_view: int | None
+    capture: Path,
+    tmp_path: Path,
+    run,
+    monkeypatch: pytest.MonkeyPatch,
+    view: tuple[str, ...],
+    test_views: tuple[int, ...],
 ) -> None:
-    assert fitted_capture(monkeypatch, run, capture, tmp_path, "--test-view", view).test_view == test_view
+    assert fitted_capture(monkeypatch, run, capture, tmp_path, "--test-view", *view).test_views == test_views
 
 
 def fitted_capture(monkeypatch: pytest.MonkeyPatch, run, capture: Path, out: Path, *args: object) -> Capture:

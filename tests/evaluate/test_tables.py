@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -20,11 +21,16 @@ def result(fitted_clip: Path, tmp_path_factory: pytest.TempPathFactory) -> Evalu
     return evaluate_stream(path, fitted_clip / "capture")
 
 
-def test_evaluation_tables__fit_eighty_columns(result: Evaluation) -> None:
+def text_of(result: Evaluation) -> str:
+    """Return the tables of an evaluation as printed."""
     console = Console(width=200, record=True)
     for table in evaluation_tables(result):
         console.print(table)
-    lines = [line.rstrip() for line in console.export_text().splitlines()]
+    return "\n".join(line.rstrip() for line in console.export_text().splitlines())
+
+
+def test_evaluation_tables__fit_eighty_columns(result: Evaluation) -> None:
+    lines = text_of(result).splitlines()
     assert max(map(len, lines)) <= 80
     rows = {line.split("  ")[0].strip(): line.split()[-3:] for line in lines}
     assert rows["PSNR, dB"] == [
@@ -33,6 +39,21 @@ def test_evaluation_tables__fit_eighty_columns(result: Evaluation) -> None:
     assert rows["FLIP"] == [figure(getattr(result.scores, "flip" + region), 4) for region in ("", "_moving", "_still")]
     assert "LPIPS" not in rows, "no network was given"
     assert any(line.endswith(figure(result.variation.input, 3)) for line in lines)
+
+
+def test_evaluation_tables__have_a_row_for_each_of_several_views(fitted_clip: Path, tmp_path: Path) -> None:
+    write_stream(tmp_path / "s.morgs", {"test_view": None}, shift=1)
+    several = evaluate_stream(tmp_path / "s.morgs", fitted_clip / "capture")
+    registered = dict.fromkeys(several.views, 30.0) | {"cam1": 32.0}
+    lines = text_of(replace(several, held_out=True, registered=registered)).splitlines()
+    assert max(map(len, lines)) <= 80
+    rows = {line.split()[0]: line.split()[1:] for line in lines if line.strip()}
+    for name, scores, psnr in (
+        *((n, s, registered[n]) for n, s in several.views.items()),
+        ("mean", several.scores, 31),
+    ):
+        expected = (scores.psnr, 2), (scores.psnr_matched, 2), (scores.ssim, 4), (scores.motion_error, 2), (psnr, 2)
+        assert rows[name] == [figure(*value) for value in expected]
 
 
 def test_evaluation_summary__holds_the_figures_that_no_table_has(result: Evaluation) -> None:

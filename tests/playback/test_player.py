@@ -80,7 +80,11 @@ def test_render_stream__renders_the_available_channels(fitted_clip: Path, tmp_pa
         ({"config": {"motion": 1}}, has_confidence, r"`config.motion.learn_confidence` of .* must be true or false"),
         ({"num_frames": "many"}, num_frames, r"`num_frames` of the header's metadata must be an integer, got 'many'"),
         ({"downscale": None}, capture_of, r"`downscale` of .* must be an integer or a number, got None"),
-        ({"test_view": [1]}, capture_of, r"`test_view` of .* must be an integer or a string or null, got \[1\]"),
+        (
+            {"test_view": 1.5},
+            capture_of,
+            r"`test_view` of .* must be a list or an integer or a string or null, got 1.5",
+        ),
         ({"reading": {"offset": {"cam0": "0.5"}}}, capture_of, r"`reading` of the header's metadata: `offset` must be"),
         ({"reading": {"offset": {"cam0": 2}, "trim": 1}}, capture_of, r"metadata: `trim` must be true or false, got 1"),
     ],

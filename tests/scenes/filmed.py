@@ -31,7 +31,7 @@ def filmed(clips: Clips, fps: float = FPS) -> Filmed:
     capture = Filmed(
         *(Path("filmed"), tuple(rig()[: len(clips)]), len(clips[0]), fps, none, none),
         masks=(None,) * len(clips),
-        test_view=None,
+        test_views=(),
         truth=None,
         _sources=(),
     )

@@ -69,7 +69,7 @@ def recording(**changes) -> Recording:
         "points": rng.uniform(-1, 1, (150, 3)).astype(np.float32),
         "point_colors": rng.uniform(0, 1, (150, 3)).astype(np.float32),
         "masks": (None,) * 3,
-        "test_view": None,
+        "test_views": (),
         "truth": None,
         "_sources": (),
     }

@@ -171,10 +171,10 @@ def triangulate_points(capture: Capture, shared: SharedFeatures) -> Capture:
     """Return the capture with points triangulated from its training views instead of its own.
 
     Views with few matches are also matched by their poses. Views that share few features give few points or none, which
-    the fit reports. The held-out view is not used.
+    the fit reports. Held-out views are not used.
     """
     cameras = capture.at_recorded_size().cameras
-    matches = [match for match in shared.matches if capture.test_view not in match.views]
+    matches = [match for match in shared.matches if not set(capture.test_views) & set(match.views)]
     matches += match_guided(shared.features, cameras, _unmatched(capture.train_views, matches))
     points, colors = triangulate(matches, shared.features, cameras, MAX_ERROR)
     return replace(capture, points=points, point_colors=colors)

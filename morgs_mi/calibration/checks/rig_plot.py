@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -64,7 +64,7 @@ def write_rig(path: Path, capture: Capture, deep: DeepCheck | None = None) -> No
         warnings.filterwarnings("ignore", "Glyph .* missing from font")
         figure = Figure(figsize=(_WIDTH, sum(heights)), layout="constrained")
         rows = figure.subfigures(len(heights), height_ratios=heights, squeeze=False)[:, 0]
-        draw_rig(rows[0], capture.cameras, (capture.points, capture.point_colors), capture.test_view)
+        draw_rig(rows[0], capture.cameras, (capture.points, capture.point_colors), capture.test_views)
         if deep:
             draw_deep(rows[1], deep)
         figure.savefig(data, format=path.suffix[1:].lower(), dpi=_DPI)
@@ -74,7 +74,7 @@ def write_rig(path: Path, capture: Capture, deep: DeepCheck | None = None) -> No
 
 
 def draw_rig(
-    figure: Any, cameras: Sequence[Camera], points: tuple[np.ndarray, np.ndarray], test_view: int | None = None
+    figure: Any, cameras: Sequence[Camera], points: tuple[np.ndarray, np.ndarray], test_views: Collection[int] = ()
 ) -> None:
     """Plot the cameras' frusta and names, the points and the world axes, in world units.
 
@@ -85,7 +85,7 @@ def draw_rig(
         figure: an empty figure or subfigure of matplotlib.
         cameras: the rig.
         points: positions [P, 3] in world units and colours [P, 3] in [0, 1]; distant ones are cut off.
-        test_view: index of the held-out camera, drawn in red.
+        test_views: indices of the held-out cameras, drawn in red.
     """
     right, forward, up = _directions(cameras)
     positions = np.array([camera.position for camera in cameras])
@@ -105,7 +105,7 @@ def draw_rig(
         axes.set(title=title, xlabel=f"{across}, world units", ylabel=f"{upwards}, world units")
         axes.scatter(*(plane @ places.T), s=1, c=colors, rasterized=True)
         for index, (camera, frustum) in enumerate(zip(cameras, frusta @ plane.T, strict=True)):
-            color = _HELD_OUT if index == test_view else _TRAINING
+            color = _HELD_OUT if index in test_views else _TRAINING
             axes.plot(*frustum[_EDGES].T, color=color, linewidth=1)
             axes.plot(*frustum[0], "o", color=color, markersize=4)
             name = camera.name or str(index)

@@ -56,7 +56,7 @@ class Calibration:
         clips: one per camera: its video, folder of images or list of images.
         points: [P, 3] float32, world units; P = 0 if the layout has none.
         point_colors: [P, 3] float32 in [0, 1].
-        test_view: index of the camera that the layout holds out, or None.
+        test_views: indices of the cameras that the layout holds out; None if it does not specify them.
     """
 
     cameras: tuple[Camera, ...]
@@ -64,7 +64,7 @@ class Calibration:
     clips: tuple[Clip, ...]
     points: np.ndarray = field(default_factory=lambda: NO_POINTS)
     point_colors: np.ndarray = field(default_factory=lambda: NO_POINTS)
-    test_view: int | None = None
+    test_views: tuple[int, ...] | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -83,7 +83,7 @@ class Calibration:
             cameras=tuple(self.cameras[index] for index in kept),
             lenses=tuple(self.lenses[index] for index in kept),
             clips=tuple(self.clips[index] for index in kept),
-            test_view=kept.index(self.test_view) if self.test_view in kept else None,
+            test_views=self.test_views and tuple(kept.index(view) for view in self.test_views if view in kept),
         )
 
 

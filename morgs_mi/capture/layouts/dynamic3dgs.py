@@ -118,25 +118,24 @@ def read_point_cloud(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _read_calibration(path: Path) -> Calibration:
-    """Return the training cameras and the first test camera, which is held out; cameras without images are left out."""
-    rig, held_out = read_meta(path / "train_meta.json"), ""
+    """Return the training cameras and the test cameras, which are held out; cameras without images are left out."""
+    rig = read_meta(path / "train_meta.json")
+    held_out: set[str] = set()
     if (path / "test_meta.json").is_file():
-        test, *others = read_meta(path / "test_meta.json")
-        if others:
-            names = ", ".join(view.camera.name for view in others)
-            _LOG.info("%s: %s is held out, %s not used.", path / "test_meta.json", test.camera.name, names)
-        held_out = test.camera.name
-        others = [view for view in rig if view.camera.name != held_out]
-        rig = sorted([*others, test], key=lambda view: natural_key(view.camera.name))
+        test = read_meta(path / "test_meta.json")
+        held_out = {view.camera.name for view in test}
+        train = [view for view in rig if view.camera.name not in held_out]
+        rig = sorted([*train, *test], key=lambda view: natural_key(view.camera.name))
     empty = [view.camera.name for view in rig if not any(file.exists() for file in view.files)]
     if empty and len(empty) < len(rig):
         _LOG.warning("%s: no image of %s was found: left out.", path / "train_meta.json", ", ".join(empty))
         rig = [view for view in rig if view.camera.name not in empty]
     cloud = path / "init_pt_cld.npz"
     points, colors = read_point_cloud(cloud) if cloud.is_file() else (NO_POINTS, NO_POINTS)
-    cameras, clips = tuple(view.camera for view in rig), tuple(view.files for view in rig)
-    test_view = next((index for index, camera in enumerate(cameras) if camera.name == held_out), None)
-    return Calibration(cameras, (Lens(),) * len(rig), clips, points, colors, test_view)
+    cameras = tuple(view.camera for view in rig)
+    clips = tuple(view.files for view in rig)
+    test_views = tuple(index for index, camera in enumerate(cameras) if camera.name in held_out)
+    return Calibration(cameras, (Lens(),) * len(rig), clips, points, colors, test_views or None)
 
 
 LAYOUT = Layout(

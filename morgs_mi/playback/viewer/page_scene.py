@@ -68,8 +68,9 @@ class PageScene:
         colors = np.broadcast_to(colors, lines.shape)
         self._scene.add_line_segments("/trails", self._scale * lines, colors, thickness=1.5, thickness_units="screen")
 
-    def add_cameras(self, cameras: Sequence[Camera], held_out: int | None, go_to: Callable[[Any, int], None]) -> None:
+    def add_cameras(self, cameras: Sequence[Camera], test_view: Any, go_to: Callable[[Any, int], None]) -> None:
         """Add the cameras with their names, hidden; `go_to` is called with (client, index) when one is clicked."""
+        held_out = test_view if isinstance(test_view, list) else [test_view]  # streams before 0.3 have one index
         for index, camera in enumerate(cameras):
             position = self._scale * camera.position
             frustum = self._scene.add_camera_frustum(
@@ -79,7 +80,7 @@ class PageScene:
                 scale=_FRUSTUM,
                 thickness=2,
                 thickness_units="screen",
-                color=_HELD_OUT if index == held_out else _CAMERA,
+                color=_HELD_OUT if index in held_out else _CAMERA,
                 wxyz=orientation(camera),
                 position=position,
                 visible=False,
@@ -87,7 +88,7 @@ class PageScene:
                 receive_shadow=False,
             )
             frustum.on_click(lambda event, index=index: go_to(event.client, index))
-            name = f"{camera.name} (held out)" if index == held_out else camera.name
+            name = f"{camera.name} (held out)" if index in held_out else camera.name
             label = self._scene.add_label(f"/names/{index}", name, position=position, visible=False)
             self._cameras.append((frustum, label))
 

@@ -257,7 +257,7 @@ def score_seam(stream: StreamReader, capture: Capture, frame: int) -> SeamScores
     Pixels are static if they are so in all frames around the seam, eight on either side.
     """
     first, last = max(frame - _AROUND, 0), min(frame + _AROUND, capture.num_frames)
-    views = capture.train_views if capture.test_view is None else (capture.test_view,)
+    views = capture.test_views or capture.train_views
     config = render_config(stream)
     rendered: dict[int, dict[int, np.ndarray]] = {}
     cameras = capture.with_delays(stream.cameras)

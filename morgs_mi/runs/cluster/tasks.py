@@ -57,12 +57,12 @@ class Source:
 
     Attributes:
         path: its folder, absolute, or its URL.
-        downscale, test_view, num_frames, reading: as `load_capture` takes them.
+        downscale, test_views, num_frames, reading: as `load_capture` takes them.
     """
 
     path: str
     downscale: float
-    test_view: int | None
+    test_views: tuple[int, ...]
     num_frames: int
     reading: ReadConfig
 
@@ -70,11 +70,11 @@ class Source:
     def of(cls, capture: Capture) -> Source:
         """Return the source of an open capture."""
         path = url_of(capture.path) or str(capture.path.resolve())
-        return cls(path, capture.downscale, capture.test_view, capture.num_frames, capture.reading)
+        return cls(path, capture.downscale, capture.test_views, capture.num_frames, capture.reading)
 
     def open(self) -> Capture:
         """Return the capture."""
-        return load_capture(self.path, self.downscale, self.test_view, self.num_frames, self.reading)
+        return load_capture(self.path, self.downscale, self.test_views, self.num_frames, self.reading)
 
 
 Points = tuple[np.ndarray, np.ndarray]

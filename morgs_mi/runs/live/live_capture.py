@@ -106,4 +106,4 @@ def _calibrate(folder: Path, on_stage: Report | None) -> None:
 
 def _opened(folder: Path, config: LiveConfig) -> Capture:
     # A camera may stop: later frames are read without its images.
-    return load_capture(folder, config.downscale, config.test_view, reading=ReadConfig(gaps=True))
+    return load_capture(folder, config.downscale, config.test_view or None, reading=ReadConfig(gaps=True))

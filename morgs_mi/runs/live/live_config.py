@@ -27,8 +27,8 @@ class LiveConfig:
     """Calibrated cameras that are left out, by name."""
     downscale: Annotated[float, AtLeast(1)] = 1
     """Factor by which the images are reduced."""
-    test_view: str | None = None
-    """Held-out camera, by index or name; by default all are fitted."""
+    test_view: tuple[str, ...] = ()
+    """Held-out cameras, by indices or names; by default all are fitted."""
     frames: Annotated[int, AtLeast(1)] | None = None
     """Number of frames to fit; by default as many as come."""
     seconds: Annotated[float, Above(0)] | None = None

@@ -83,7 +83,7 @@ def test_check_rig__hardly_detects_a_common_shift_of_principal_points(capture: C
 def test_triangulate_points__ignores_the_held_out_view(capture: Capture, shared: SharedFeatures) -> None:
     found = triangulate_points(capture, shared)
     assert len(found.points) == len(found.point_colors) > 1000
-    held_out = replace(capture, test_view=3)
+    held_out = replace(capture, test_views=(3,))
     fewer = triangulate_points(held_out, shared)
     blind = SharedFeatures(
         tuple(detect(np.zeros((48, 64, 3), np.uint8)) if i == 3 else f for i, f in enumerate(shared.features)),
@@ -106,7 +106,7 @@ def test_match_capture__finds_features_at_the_recorded_size(capture: Capture, sh
 
 
 def test_triangulate_points__matches_distant_views_with_their_poses(capture: Capture, shared: SharedFeatures) -> None:
-    ends = replace(capture, cameras=(capture.cameras[0], capture.cameras[5]), masks=(None, None), test_view=None)
+    ends = replace(capture, cameras=(capture.cameras[0], capture.cameras[5]), masks=(None, None), test_views=())
     unmatched = SharedFeatures((shared.features[0], shared.features[5]), ())
     found = triangulate_points(ends, unmatched)
     assert len(found.points) > 50

@@ -23,7 +23,7 @@ def test_draw_rig__draws_cameras_at_their_positions() -> None:
     cameras = [Camera.look_at((x, 0, 0), (x, 0, 5), (0, -1, 0), 60, 64, 48, "") for x in (-1.0, 0.0, 1.0)]
     points, green = np.array([[0.0, 0, 3], [1e6, 0, 0]]), np.array([[0, 1.0, 0], [0, 1, 0]])
     figure = Figure()
-    draw_rig(figure, cameras, (points, green), test_view=1)
+    draw_rig(figure, cameras, (points, green), test_views=(1,))
     above = figure.axes[0]
     assert_close(np.array([name.xy for name in above.texts[:3]]), [(-1, 0), (0, 0), (1, 0)], atol=1e-6)
     assert [name.get_text() for name in above.texts[:3]] == ["0", "1", "2"]

@@ -17,6 +17,7 @@ from morgs_mi.capture.layouts import layout_registry
 from morgs_mi.capture.layouts.calibration import Calibration, Layout, required_clips
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import MODELS, Lens
+from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.io.video_writer import write_video
 from tests.assertions import assert_close
 from tests.scenes import captures as layouts
@@ -234,7 +235,7 @@ def test_find_layout__finds_a_layout_that_is_added(tmp_path: Path, monkeypatch: 
         load_capture(path)
     (path / "toy.txt").touch()
     capture = load_capture(path)
-    assert (capture.layout, len(capture.points), capture.test_view) == ("toy", 0, None)
+    assert (capture.layout, len(capture.points), capture.test_views) == ("toy", 0, ())
     assert_holds(capture, names, (0, 1, 2))
     write_poses_bounds(path / "poses_bounds.npy", rig(names), [[1, 9]] * 3)
     assert load_capture(path).layout == "poses_bounds"
@@ -345,13 +346,13 @@ def test_nerfstudio__reads_a_folder_per_frame(tmp_path: Path) -> None:
 
 def test_dynamic3dgs__reads_cameras(tmp_path: Path) -> None:
     capture = load_capture(layouts.dynamic3dgs(tmp_path / "a"))
-    assert (capture.layout, capture.test_view, capture.fps) == ("Dynamic 3D Gaussians", None, 30)
+    assert (capture.layout, capture.test_views, capture.fps) == ("Dynamic 3D Gaussians", (), 30)
     assert_holds(capture, ("2", "1", "10"), (1, 0, 2), shift=3)
     np.testing.assert_array_equal(capture.points, [[1, 2, 3]])
     np.testing.assert_allclose(capture.point_colors, [[0.1, 0.2, 0.3]], rtol=1e-6)
 
 
-def test_dynamic3dgs__holds_out_the_first_test_camera(tmp_path: Path) -> None:
+def test_dynamic3dgs__holds_out_all_test_cameras(tmp_path: Path) -> None:
     path = layouts.dynamic3dgs(tmp_path / "a")
     meta = json.loads((path / "train_meta.json").read_text())
     for name, kept in (("train_meta", (1,)), ("test_meta", (10, 2))):
@@ -362,8 +363,9 @@ def test_dynamic3dgs__holds_out_the_first_test_camera(tmp_path: Path) -> None:
         }
         (path / f"{name}.json").write_text(json.dumps(meta | lists))
     capture = load_capture(path)
-    assert (capture.names, capture.test_view) == (("1", "2"), 1)
-    assert load_capture(path, test_view=None).test_view is None
+    assert (capture.names, capture.test_views) == (("1", "2", "10"), (1, 2))
+    assert load_capture(path, test_view=None).test_views == ()
+    assert load_capture(path, reading=ReadConfig(without=("2",))).test_views == (1,)
 
 
 def test_at_clip_size__scales_the_intrinsics_of_smaller_clips(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -382,7 +384,7 @@ def test_metadata__describes_how_frames_were_read(tmp_path: Path) -> None:
     path = layouts.nerfstudio(tmp_path / "a")
     metadata = load_capture(path, downscale=2, test_view=1, max_frames=3).metadata()
     assert json.loads(json.dumps(metadata)) == metadata
-    assert (metadata["filter"], metadata["downscale"], metadata["test_view"], metadata["frames"]) == ("area", 2, 1, 3)
+    assert (metadata["filter"], metadata["downscale"], metadata["test_view"], metadata["frames"]) == ("area", 2, [1], 3)
     assert (metadata["layout"], metadata["fps"], metadata["points"]) == ("Nerfstudio", FPS, 0)
     view = metadata["cameras"][2]
     assert (view["name"], view["recorded_size"], view["size"]) == ("cam10", [WIDTH, HEIGHT], [WIDTH // 2, HEIGHT // 2])

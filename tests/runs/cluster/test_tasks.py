@@ -50,7 +50,7 @@ def test_fit_frames__ends_where_its_memory_ends(fit: Fit, monkeypatch: pytest.Mo
 def test_source__opens_the_capture_as_it_is(tmp_path: Path) -> None:
     capture = load_capture(write_recording(tmp_path, 5), 1.0, "cam1", 4)
     again = Source.of(capture).open()
-    assert (again.num_frames, again.test_view, again.names) == (4, 1, capture.names)
+    assert (again.num_frames, again.test_views, again.names) == (4, (1,), capture.names)
 
 
 def test_source__of_a_url_is_opened_by_its_url(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
