@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import asdict
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
@@ -17,7 +18,7 @@ _METRICS += (("LPIPS", "lpips", 4), ("flow error, px", "motion_error", 2))
 _FRAME = (("PSNR, dB", "psnr", 2), ("moving", "psnr_moving", 2), ("SSIM", "ssim", 4), ("FLIP", "flip", 4))
 _FRAME += (("flow error", "motion_error", 2), ("moving", "motion_error_moving", 2))
 _VIEW = (("PSNR, dB", "psnr", 2), ("colours matched", "psnr_matched", 2), ("SSIM", "ssim", 4))
-_VIEW += (("flow error", "motion_error", 2), ("registered", "registered_psnr", 2))
+_VIEW += (("flow error", "motion_error", 2), ("registered", "registered", 2))
 
 
 def figure(value: float | None, digits: int) -> str:
@@ -51,14 +52,16 @@ def evaluation_tables(result: Evaluation) -> Iterator[Table]:
 
 
 def _view_table(result: Evaluation) -> Table:
-    """Return the scores of each view, and their means."""
+    """Return the scores of each view, and their means, without columns that have none."""
+    rows = {name: {**asdict(scores), "registered": None} for name, scores in result.views.items()}
+    rows["mean"] = {**asdict(result.scores), "registered": None}
+    for name, psnr in (*result.registered.items(), ("mean", result.registered_psnr)):
+        rows[name]["registered"] = psnr
+    columns = [column for column in _VIEW if any(figure(row[column[1]], 0) != "-" for row in rows.values())]
     title = "held-out views" if result.held_out else "training views"
-    table = _table(f"{title}, means over the frames", "", *(title for title, *_ in _VIEW))
-    rows = {**result.views, "mean": result.scores}
-    registered = {**result.registered, "mean": result.registered_psnr}
-    for name, scores in rows.items():
-        values = [figure(getattr(scores, key), digits) for _, key, digits in _VIEW[:-1]]
-        table.add_row(name, *values, figure(registered.get(name), 2))
+    table = _table(f"{title}, means over the frames", "", *(title for title, *_ in columns))
+    for name, row in rows.items():
+        table.add_row(name, *(figure(row[key], digits) for _, key, digits in columns))
     return table
 
 
