@@ -109,6 +109,8 @@ def timeline(
     for name, offset in config.offset.items():
         check_number(str(path), f"offset of {name}", offset, "(-inf, inf)")
     numbers = align_numbers(path, names, readers, config.trim, config.offset)
+    for note in numbers.notes:
+        _LOG.warning("%s: %s", path, note)
     exact = _clocks(names, readers, config, fps, numbers)
     if config.aligns_clips:
         clocks = _without_drift(exact, readers, max_frames)
