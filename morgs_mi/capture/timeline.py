@@ -14,12 +14,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from morgs_mi.capture.image_numbers import ImageNumbers, align_numbers
 from morgs_mi.core.checks import check_number
 from morgs_mi.io.bounded import read_json
 from morgs_mi.io.video import FrameReader
@@ -28,8 +29,6 @@ __all__ = ["ReadConfig", "Timeline", "nearest_frames", "read_settings", "timelin
 
 _LOG = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0
-# 29.97 and 30 fps count as the same rate: programs write either for the same camera.
-_SAME_RATE = 1.01
 # Distance in frames up to which a frame shows an instant.
 _NEAR = 0.5
 
@@ -74,7 +73,7 @@ class Timeline:
         rates: per camera the frames of its clip per instant.
         fps: instants per second.
         unchanged: whether instant t is frame t of every clip.
-        notes: a sentence for each clip of variable frame rate.
+        notes: a sentence for each clip of variable frame rate, and on the numbers of images.
     """
 
     frame_indices: tuple[np.ndarray, ...]
@@ -112,37 +111,54 @@ def timeline(
         raise ValueError(f"{path}: `offset` must name cameras of {', '.join(names)}, got {', '.join(unknown)}.")
     for name, offset in config.offset.items():
         check_number(str(path), f"offset of {name}", offset, "(-inf, inf)")
+    numbers = align_numbers(path, names, readers, config.trim, config.offset)
+    for note in numbers.notes:
+        _LOG.warning("%s: %s", path, note)
+    exact = _clocks(names, readers, config, fps, numbers)
     if config.aligns_clips:
-        clocks = _aligned_clocks(names, readers, config, fps)
+        clocks = _without_drift(exact, readers, max_frames)
         instants = _common_instants(path, names, readers, config, clocks)[:max_frames]
     else:
         instants = np.arange(_num_frames(path, readers, max_frames, config.gaps), dtype=float)
-        clocks = _Clocks(np.zeros(len(readers)), np.ones(len(readers)), _fps(path, readers, fps))
+        clocks = replace(exact, rates=np.ones(len(readers)))
+        _check_rates(path, readers, exact, instants)
     positions = clocks.offsets[:, None] + clocks.rates[:, None] * instants
-    nearest = (nearest_frames(reader, own) for reader, own in zip(readers, positions, strict=True))
-    indices, apart = map(list, zip(*nearest, strict=True))
+    indices = [nearest_frames(reader, own)[0] for reader, own in zip(readers, positions, strict=True)]
     shares: list[np.ndarray | None] = [None] * len(readers)
     delays = [0.0] * len(readers)
     for c, (name, reader) in enumerate(zip(names, readers, strict=True)):
         if not _is_fractional(reader, config.offset.get(name, 0)):
             continue
         if clocks.rates[c] == round(clocks.rates[c]):
-            later = float(np.floor(positions[c][0] + 0.5) - positions[c][0])  # the same for all of its frames
-            indices[c] = np.rint(positions[c] + later).astype(int)
-            delays[c], apart[c] = later, np.zeros_like(positions[c])
+            delays[c] = float(np.floor(positions[c][0] + 0.5) - positions[c][0])  # the same for all of its frames
+            indices[c] = np.rint(positions[c] + delays[c]).astype(int)
         else:
             indices[c] = np.clip(np.floor(positions[c]).astype(int), 0, reader.num_frames - 2)
-            shares[c], apart[c] = positions[c] - indices[c], np.zeros_like(positions[c])
+            shares[c] = positions[c] - indices[c]
+    frames = zip(readers, indices, delays, shares, strict=True)
+    shown = np.array([_positions(r, k) - delay + (0 if share is None else share) for r, k, delay, share in frames])
     if config.gaps:
-        indices = [np.where(distance > _NEAR, -1, index) for index, distance in zip(indices, apart, strict=True)]
-    used = [distance[index >= 0].max(initial=0) for index, distance in zip(indices, apart, strict=True)]
-    if (largest := float(np.max(used / (clocks.rates * clocks.fps)))) > 1e-3:
-        _LOG.warning("%s: images of one instant are up to %.1f ms apart.", path, 1e3 * largest)
+        far = np.abs(shown - positions) > _NEAR
+        indices = [np.where(own, -1, index) for own, index in zip(far, indices, strict=True)]
+    _warn_apart(path, (shown - exact.offsets[:, None]) / exact.rates[:, None], indices, exact.fps)
     unchanged = all(np.array_equal(index, np.arange(len(instants))) for index in indices)
     unchanged = unchanged and not any(config.offset.values())
     notes = tuple(_note(r, k) for r, k in zip(readers, indices, strict=True) if r.positions is not None)
     rates = tuple(clocks.rates.tolist())
-    return Timeline(tuple(indices), tuple(shares), tuple(delays), rates, clocks.fps, unchanged, notes)
+    return Timeline(
+        tuple(indices), tuple(shares), tuple(delays), rates, clocks.fps, unchanged, (*numbers.notes, *notes)
+    )
+
+
+def _warn_apart(path: Path, times: np.ndarray, indices: Sequence[np.ndarray], fps: float) -> None:
+    """Warn if images of one instant are apart; `times` [C, T] are theirs in instants, where `indices` are not -1."""
+    times = np.where(np.stack(indices) < 0, np.nan, times)
+    images = times[:, np.isfinite(times).any(0)]
+    if not images.size:
+        return
+    apart = float((np.nanmax(images, axis=0) - np.nanmin(images, axis=0)).max()) / fps
+    if apart > 1e-3:
+        _LOG.warning("%s: images of one instant are up to %.1f ms apart.", path, 1e3 * apart)
 
 
 @dataclass(frozen=True)
@@ -154,15 +170,30 @@ class _Clocks:
     fps: float
 
 
-def _aligned_clocks(
-    names: Sequence[str], readers: Sequence[FrameReader], config: ReadConfig, fps: float | None
+def _clocks(
+    names: Sequence[str],
+    readers: Sequence[FrameReader],
+    config: ReadConfig,
+    fps: float | None,
+    numbers: ImageNumbers,
 ) -> _Clocks:
-    """Return the clocks of clips that are aligned by their offsets and their frame rates."""
+    """Return the clocks of the clips by their offsets, their frame rates and the numbers of their images."""
     clip_fps = [fps or reader.fps for reader in readers]
-    lowest = min((rate for rate in clip_fps if rate), default=_DEFAULT_FPS)
-    rates = [1.0 if not rate or rate < _SAME_RATE * lowest else rate / lowest for rate in clip_fps]
+    lowest = min((rate for rate in clip_fps if rate), default=fps or _DEFAULT_FPS)
+    rates = np.array([(rate or lowest) / lowest for rate in clip_fps])
     offsets = [_position(r, config.offset.get(name, 0)) for name, r in zip(names, readers, strict=True)]
-    return _Clocks(np.array(offsets, float), np.array(rates), lowest)
+    return _Clocks(np.array(offsets, float) + numbers.offsets * rates, rates * numbers.rates, lowest / numbers.interval)
+
+
+def _without_drift(clocks: _Clocks, readers: Sequence[FrameReader], max_frames: int | None) -> _Clocks:
+    """Return the clocks with a whole rate r for each clip that differs from it by less than half a frame in the end.
+
+    Programs write 29.97 or 30 fps for the same camera. The distance of the frames from an instant is then constant.
+    """
+    periods = min(_periods(reader) / rate for reader, rate in zip(readers, clocks.rates, strict=True))
+    whole = np.maximum(1, np.rint(clocks.rates))
+    drift = np.abs(whole - clocks.rates) * (min(periods, max_frames or periods) - 1)
+    return replace(clocks, rates=np.where(drift < _NEAR, whole, clocks.rates))
 
 
 def _common_instants(
@@ -206,6 +237,11 @@ def nearest_frames(reader: FrameReader, positions: np.ndarray) -> tuple[np.ndarr
     between = (reader.positions[1:] + reader.positions[:-1]) / 2
     indices = np.searchsorted(between, positions)
     return indices, np.abs(reader.positions[indices] - positions)
+
+
+def _positions(reader: FrameReader, indices: np.ndarray) -> np.ndarray:
+    """Return the positions of frames [T]."""
+    return indices.astype(float) if reader.positions is None else reader.positions[indices]
 
 
 def _note(reader: FrameReader, indices: np.ndarray) -> str:
@@ -284,17 +320,15 @@ def _num_frames(path: Path, readers: Sequence[FrameReader], max_frames: int | No
     return shortest
 
 
-def _fps(path: Path, readers: Sequence[FrameReader], given: float | None) -> float:
-    if given is not None:
-        return given
-    rates = [reader.fps for reader in readers if reader.fps]
-    if rates and max(rates) > _SAME_RATE * min(rates):
-        table = ", ".join(f"{r.path.name} {r.fps:g}" for r in readers if r.fps)
+def _check_rates(path: Path, readers: Sequence[FrameReader], clocks: _Clocks, instants: np.ndarray) -> None:
+    """Check that frames with the same index are simultaneous, for `instants` of clips with equal offsets."""
+    drift = (clocks.rates.max() - clocks.rates.min()) * (len(instants) - 1)
+    if drift > _NEAR:
+        table = ", ".join(f"{r.path.name} {r.fps:.6g}" for r in readers if r.fps)
         raise ValueError(
-            f"{path}: all cameras must have the same frame rate, got {table}; use the lowest with --trim, or set the "
-            "true one as `fps` in capture.json."
+            f"{path}: all cameras must have the same frame rate, got {table}: images of one index are up to "
+            f"{drift:.1f} frames apart; use the lowest rate with --trim, or set the true one as `fps` in capture.json."
         )
-    return rates[0] if rates else _DEFAULT_FPS
 
 
 def read_settings(path: Path) -> dict[str, Any]:

@@ -10,14 +10,16 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Generator, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from morgs_mi.io.bounded import check_claim
+from morgs_mi.io.frame_times import SAME_TIME, clock, read_header, seconds, true_rate
+from morgs_mi.io.numbering import counting_together
 from morgs_mi.io.remote import fetched
 
 __all__ = [
@@ -36,17 +38,11 @@ __all__ = [
 
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-_WITHOUT_TIMES = (".avi",)
-# Deviation from a constant rate that does not count: the exposure's, in frames, and the rounding of Matroska's times.
-_JITTER, _ROUNDING_SECONDS = 0.1, 1e-3
-# Difference up to which the header's frame rate, which may be a mean over pauses, is the rate of the clip's clock.
-_SAME_RATE = 0.01
 # Bytes of an image file in which its size is searched, and of memory that a pixel takes, in BGR and RGB.
 _MAX_HEADER, _BYTES_PER_PIXEL = 1_000_000, 6
 # First frame that is worth a search, and the frames before it at which the search aims: those shown right after a
 # keyframe may refer to frames before it, and a file may be indexed by the times of decoding.
 _FAR, _BEFORE = 100, 32
-_SAME_TIME = 1e-6
 # Frames that a clip may pause; the instants of the pause are listed.
 _MAX_PAUSE = 1_000_000
 
@@ -102,27 +98,28 @@ class VideoReader:
             ValueError: it is empty, OpenCV cannot decode it, or its time stamps are broken.
         """
         path = Path(path)
-        (height, width), num_frames, fps = _video_header(path)
-        times = _frame_times(path)
-        held = len(times)
-        stored = None if path.suffix.lower() in _WITHOUT_TIMES or not (np.diff(times) > 0).all() else times
-        clock = None if stored is None else _clock(stored)
+        header = read_header(path)
+        held = header.num_held
+        fps = header.fps
+        times = header.times
         # Some containers do not store the number, and a frame takes more than a byte.
-        declared = num_frames if 0 < num_frames <= path.stat().st_size else held
-        if clock is None:
-            return cls(path, declared, fps if fps > 0 else None, width, height, held, times=stored)
-        positions, rate = clock
+        declared = header.num_frames if 0 < header.num_frames <= path.stat().st_size else held
+        if times is not None and len(times) > 1:
+            fps = true_rate(fps, len(times) - 1, float(times[-1] - times[0]))
+        regular = None if times is None else clock(times)
+        if times is None or regular is None:
+            return cls(path, declared, fps if fps > 0 else None, header.width, header.height, held, times=times)
+        positions, rate = regular
         if positions[-1] > 10 * held + _MAX_PAUSE:
             raise ValueError(
                 f"{path}: expected {held} frames at about {rate:.3g} per second, got time stamps that span "
                 f"{times[-1]:.3g} s; they are broken, convert the clip."
             )
         # Where the number is not stored, it is the duration times the mean rate; a clip that lasts so long is complete.
-        if fps > 0 and declared / fps <= times[-1] + 1.5 / rate:
+        if header.fps > 0 and declared / header.fps <= times[-1] + 1.5 / rate:
             declared = held
-        if abs(fps / rate - 1) < _SAME_RATE:
-            rate = fps
-        return cls(path, declared, rate, width, height, held, positions, times)
+        rate = true_rate(header.fps, float(positions[-1] - positions[0]), float(times[-1] - times[0]))
+        return cls(path, declared, rate, header.width, header.height, held, positions, times)
 
     def frames(self, start: int = 0, stop: int | None = None) -> Iterator[np.ndarray]:
         """Yield frames start..stop-1, by default up to `num_frames`.
@@ -161,8 +158,8 @@ class VideoReader:
         stream = self._opened()
         stream.set(cv2.CAP_PROP_POS_MSEC, 1000 * self.times[index - _BEFORE])
         if stream.grab():
-            at = int(np.argmin(np.abs(self.times - _seconds(stream))))
-            while at <= index and abs(self.times[at] - _seconds(stream)) < _SAME_TIME:
+            at = int(np.argmin(np.abs(self.times - seconds(stream))))
+            while at <= index and abs(self.times[at] - seconds(stream)) < SAME_TIME:
                 if at == index:
                     return stream, index + 1
                 at += 1
@@ -186,6 +183,9 @@ class FolderReader:
     `positions` being None.
 
     The images may also be a list of files in any folders; `path` is then the folder of the first.
+
+    Attributes:
+        numbers: numbers of the images, None of a list of files and of a single image without a number.
     """
 
     path: Path
@@ -194,6 +194,7 @@ class FolderReader:
     height: int
     fps: float | None = None
     positions: np.ndarray | None = None
+    numbers: range | None = None
 
     @classmethod
     def open(cls, path: str | Path) -> FolderReader:
@@ -209,7 +210,7 @@ class FolderReader:
                 f"{path}: the images must be numbered without gaps, got {files[gap - 1].name} followed by "
                 f"{files[gap].name}; extract the frames again, or go on without the missing ones (--gaps)."
             )
-        return cls.of_files(files)
+        return replace(cls.of_files(files), numbers=_numbers(files))
 
     @classmethod
     def of_files(cls, files: Sequence[Path], gaps: bool = False) -> FolderReader:
@@ -283,7 +284,8 @@ ImageOrError = np.ndarray | ValueError | FileNotFoundError
 def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
     """Return one reader per camera; with `gaps`, images may be missing or broken.
 
-    Folders are then aligned by the numbers of their images: a number that only other cameras have is a missing image.
+    Folders that count together (see `counting_together`) are then aligned by the numbers of their images: a number
+    that only others have is a missing image.
 
     Raises:
         FileNotFoundError: a clip is missing, or one of its images.
@@ -293,22 +295,38 @@ def open_clips(clips: Sequence[Clip], gaps: bool = False) -> list[FrameReader]:
     if not gaps or not folders:
         return [FolderReader.of_files(c, gaps) if isinstance(c, tuple) else open_frames(c) for c in clips]
     numbered = {folder: {image_number(file): file for file in _images(folder)} for folder in folders}
-    numbers = sorted(set().union(*numbered.values()))
-    step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
-    if (numbers[-1] - numbers[0]) // step > 10 * len(numbers) + 1000:
-        after = int(np.argmax(np.diff(numbers)))
-        file = next(files[numbers[after + 1]] for files in numbered.values() if numbers[after + 1] in files)
-        raise ValueError(
-            f"{file}: expected images numbered without large gaps, got this after "
-            f"number {numbers[after]} among {len(numbers)} images; rename or remove it."
-        )
-    instants = range(numbers[0], numbers[-1] + 1, step)
+    groups = counting_together({folder: sorted(files) for folder, files in numbered.items()})
+    instants = {folder: _instants([numbered[key] for key in group]) for group in groups for folder in group}
     return [
-        FolderReader.of_files([numbered[clip].get(n, _missing_name(clip, numbered[clip], n)) for n in instants], gaps)
+        _open_with_gaps(clip, numbered[clip], instants[clip])
         if isinstance(clip, Path) and clip in numbered
         else open_clips([clip], gaps)[0]
         for clip in clips
     ]
+
+
+def _instants(group: Sequence[Mapping[int, Path]]) -> range:
+    """Return the numbers of the instants of folders that count together, given by their images by number.
+
+    Raises:
+        ValueError: there are far more than images.
+    """
+    numbers = sorted(set().union(*group))
+    step = int(np.gcd.reduce(np.diff(numbers))) if len(numbers) > 1 else 1
+    if (numbers[-1] - numbers[0]) // step > 10 * len(numbers) + 1000:
+        after = int(np.argmax(np.diff(numbers)))
+        file = next(files[numbers[after + 1]] for files in group if numbers[after + 1] in files)
+        raise ValueError(
+            f"{file}: expected images numbered without large gaps, got this after "
+            f"number {numbers[after]} among {len(numbers)} images; rename or remove it."
+        )
+    return range(numbers[0], numbers[-1] + 1, step)
+
+
+def _open_with_gaps(folder: Path, files: Mapping[int, Path], numbers: range) -> FolderReader:
+    """Return the reader of the images with `numbers`, which may be missing."""
+    images = [files.get(number, _missing_name(folder, files, number)) for number in numbers]
+    return replace(FolderReader.of_files(images, gaps=True), numbers=numbers)
 
 
 def open_frames(path: str | Path | tuple[Path, ...]) -> FrameReader:
@@ -316,64 +334,6 @@ def open_frames(path: str | Path | tuple[Path, ...]) -> FrameReader:
     if isinstance(path, tuple):
         return FolderReader.of_files(path)
     return FolderReader.open(path) if Path(path).is_dir() else VideoReader.open(path)
-
-
-def _video_header(path: Path) -> tuple[tuple[int, int], int, float]:
-    """Return the height and width of a video's first frame, and the number and rate of frames in the file's header.
-
-    Raises:
-        FileNotFoundError, ValueError: as for `VideoReader.open`.
-    """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: expected a video file, found none; check the path.")
-    if fetched(path).stat().st_size == 0:
-        raise ValueError(f"{path}: expected a video, got an empty file; copy or record it again.")
-    stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
-    try:
-        ok, first = stream.read()
-        num_frames, fps = int(stream.get(cv2.CAP_PROP_FRAME_COUNT)), stream.get(cv2.CAP_PROP_FPS)
-    finally:
-        stream.release()
-    if not ok:
-        raise ValueError(
-            f"{path}: expected a video, got {path.stat().st_size} bytes of which OpenCV cannot decode one frame: the "
-            "file is truncated or no video; copy or convert it again."
-        )
-    height, width = first.shape[:2]
-    return (height, width), num_frames, fps
-
-
-def _frame_times(path: Path) -> np.ndarray:
-    """Return the times of the frames in a video file in seconds, from the first, ascending.
-
-    The packets are read but not decoded, 0.2 ms each at 1080x1920. They are in the order of decoding, which differs
-    from the order of presentation where frames are predicted from later ones.
-    """
-    stream = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_FORMAT, -1])
-    times = []
-    while stream.grab():
-        times.append(_seconds(stream))
-    stream.release()
-    return np.sort(times)
-
-
-def _seconds(stream: cv2.VideoCapture) -> float:
-    """Return the time of the frame or packet that a decoder has just passed."""
-    return stream.get(cv2.CAP_PROP_POS_MSEC) / 1000
-
-
-def _clock(times: np.ndarray) -> tuple[np.ndarray, float] | None:
-    """Return the `positions` of frames and their rate, or None if the rate is constant or the times are not known."""
-    steps = np.diff(times)
-    if len(steps) < 2 or steps.min() <= 0:
-        return None
-    # Most frames are one period apart, and in step with the clock.
-    period = float(steps[steps < 1.5 * np.median(steps)].mean())
-    ticks = np.append(0, np.cumsum(np.maximum(1, np.rint(steps / period))))
-    positions = (times - np.median(times - period * ticks)) / period
-    if np.abs(positions - np.arange(len(times))).max() <= _JITTER + _ROUNDING_SECONDS / period:
-        return None
-    return positions, 1 / period
 
 
 def _raising(images: Iterator[ImageOrError]) -> Iterator[np.ndarray]:
@@ -396,6 +356,15 @@ def _images(path: Path) -> list[Path]:
     return files
 
 
+def _numbers(files: Sequence[Path]) -> range | None:
+    """Return the numbers of images without gaps, None of a single image without a number."""
+    if len(files) == 1 and not re.search(r"[0-9]", files[0].stem):
+        return None
+    first = image_number(files[0])
+    step = image_number(files[1]) - first if len(files) > 1 else 1
+    return range(first, first + step * len(files), step)
+
+
 def image_number(file: Path) -> int:
     """Return the last number in the name of an image.
 
@@ -408,7 +377,7 @@ def image_number(file: Path) -> int:
     return int(numbers[-1])
 
 
-def _missing_name(folder: Path, files: dict[int, Path], number: int) -> Path:
+def _missing_name(folder: Path, files: Mapping[int, Path], number: int) -> Path:
     """Return the path that a missing image would have."""
     other = next(iter(files.values()))
     return folder / re.sub(r"[0-9]+(?=[^0-9]*\.)", lambda old: str(number).zfill(len(old[0])), other.name, count=1)

@@ -7,7 +7,8 @@ import os
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from math import inf
 from pathlib import Path
 
 import cv2
@@ -27,8 +28,31 @@ _MAX_RATE = 1000
 # What the last bytes of a complete file contain, and how many of them; cameras may add a few bytes behind an image.
 _ENDS, _TAIL = (b"IEND\xaeB`\x82", b"\xff\xd9"), 64
 
-_Numbered = Mapping[int, Path]
-_Found = Mapping[str, _Numbered]
+
+@dataclass(frozen=True)
+class _Images:
+    """Images of a camera.
+
+    Attributes:
+        files: by number.
+        ahead: time by which `time.monotonic` is ahead of the times of the files, s: the program that writes them may
+            run on a machine with another clock.
+    """
+
+    files: Mapping[int, Path]
+    ahead: float = 0.0
+
+    def arrival(self, number: int) -> float:
+        """Return when an image was written, s of `time.monotonic`."""
+        return _written(self.files[number]) + self.ahead
+
+    def since(self, begin: float) -> _Images:
+        """Return the images that did not arrive before `begin`, s of `time.monotonic`."""
+        return replace(self, files={n: file for n, file in self.files.items() if self.arrival(n) >= begin})
+
+
+_Found = Mapping[str, _Images]
+_NONE = _Images({})
 
 
 class FolderFeed:
@@ -51,14 +75,22 @@ class FolderFeed:
         if not folder.is_dir():
             raise FileNotFoundError(f"{folder}: expected a folder with the images of the cameras, found none.")
         self.names = tuple(names or ())
-        self._folder, self._timeout = folder, timeout
-        # When the last bundle was written, and when the images began that are counted together with it, s of files.
-        self._written = self._begin = 0.0
+        self._folder = folder
+        self._timeout = timeout
+        # By camera, see `_Images.ahead`.
+        self._ahead: dict[str, float] = {}
+        # When the last bundle was returned, s of `time.monotonic`.
+        self._returned = time.monotonic()
+        # By camera, when the images of the last bundle were written, and those before the ones that are counted
+        # together with it, s of their files.
+        self._written: dict[str, float] = {}
+        self._before: dict[str, float] = {}
 
     def newest(self, after: Bundle | None = None) -> Bundle | None:
         """Wait for the newest bundle and return it; None if no camera delivers images any more."""
         start = time.monotonic()
         pause_end = start + _PAUSE
+        searched = self._returned
         while True:
             now = time.monotonic()
             late = now - start >= self._timeout
@@ -67,10 +99,12 @@ class FolderFeed:
                 bundle = self._first(found, late) if after is None else self._next(found, after, late)
                 if bundle is not None:
                     self._take(found, max(bundle.numbers), after)
-                    return bundle
+                    # Images that are not waited for may have been there for longer.
+                    return self._arrived(bundle, self._returned if paused else searched)
             if late:
                 return self._end(after)
             pause_end = now + _PAUSE if paused else pause_end
+            searched = now
             time.sleep(_POLL)
 
     def problem(self, camera: int) -> str:
@@ -86,9 +120,9 @@ class FolderFeed:
 
     def _newer(self, after: Bundle | None, paused: bool) -> Iterator[_Found]:
         """Yield the images with larger numbers than a bundle; after a pause also all that were written since."""
-        yield self._found(-1 if after is None else max(after.numbers), self._begin)
+        yield self._found(-1 if after is None else max(after.numbers), self._before)
         if paused and after is not None:
-            yield self._found(-1, self._written + _PAUSE)
+            yield self._found(-1, self._written)
 
     def _first(self, found: _Found, late: bool) -> Bundle | None:
         """Return the newest bundle of all cameras."""
@@ -96,8 +130,8 @@ class FolderFeed:
         common = _common(found, names)
         if not self.names and not late:
             # Which cameras there are is known when the next number begins.
-            common -= {max(number for files in found.values() for number in files)} if found else set()
-        bundle = _bundle([found.get(name, {}) for name in names], common)
+            common -= {max(number for images in found.values() for number in images.files)} if found else set()
+        bundle = _bundle([found.get(name, _NONE) for name in names], common)
         if bundle is not None:
             if silent := [name for name in self._cameras() if name not in names and not self.names]:
                 _LOG.warning("%s is left out: no image in %s", ", ".join(silent), self._folder)
@@ -106,22 +140,29 @@ class FolderFeed:
 
     def _next(self, found: _Found, after: Bundle, late: bool) -> Bundle | None:
         """Return the newest bundle of the cameras that are expected; if it is late, of those that have an image."""
-        files = [found.get(name, {}) for name in self.names]
-        numbers = [set(own) for own, image in zip(files, after.images, strict=True) if own or image is not None]
+        cameras = [found.get(name, _NONE) for name in self.names]
+        pairs = zip(cameras, after.images, strict=True)
+        numbers = [set(camera.files) for camera, image in pairs if camera.files or image is not None]
         if late:
-            return _bundle(files, set.union(*numbers), after, partial=True)
-        bundle = _bundle(files, set.intersection(*numbers), after)
+            return _bundle(cameras, set.union(*numbers), after, partial=True)
+        bundle = _bundle(cameras, set.intersection(*numbers), after)
         # A camera that has stopped during a fit has images that the others had, too, but long ago.
-        newest = max((_arrival(own[max(own)]) for own in files if own), default=0.0)
+        newest = max((camera.arrival(max(camera.files)) for camera in cameras if camera.files), default=0.0)
         return bundle if bundle is not None and newest - bundle.time <= self._timeout else None
 
     def _take(self, found: _Found, number: int, after: Bundle | None) -> None:
-        """Remember when the images of a number were written, and whether the count has begun again."""
+        """Store when the images of a number were written, and whether the count has begun again."""
         if after is not None and number <= (last := max(after.numbers)):
-            if not self._begin:
+            if not self._before:
                 _LOG.warning("%s: the numbers go on with %d after %d", self._folder, number, last)
-            self._begin = self._written + _PAUSE
-        self._written = max(_written(files[number]) for files in found.values() if number in files)
+            self._before = self._written
+        images = {name: images.files[number] for name, images in found.items() if number in images.files}
+        self._written = {name: _written(file) for name, file in images.items()}
+
+    def _arrived(self, bundle: Bundle, begin: float) -> Bundle:
+        """Return a bundle that was not there at the time `begin`, whatever the clock of its files."""
+        self._returned = time.monotonic()
+        return replace(bundle, time=min(max(bundle.time, begin), self._returned))
 
     def _end(self, after: Bundle | None) -> None:
         """End the images.
@@ -141,20 +182,43 @@ class FolderFeed:
 
     def _lack(self) -> str:
         """Return a description of the images that are missing for a first bundle."""
-        found = self._found(-1, 0.0)
+        found = self._found(-1, {})
         names = self.names or tuple(found)
         if silent := [name for name in names if name not in found]:
             return f", but no image of {', '.join(silent)}"
         if common := _common(found, names):
-            broken = [name for name in names if _shot(found[name][max(common)], 0) is None]
+            broken = [name for name in names if _shot(found[name], max(common)) is None]
             return f", but no complete image {max(common)} of {', '.join(broken)}"
-        numbers = ", ".join(f"{min(own)} to {max(own)} of {name}" for name, own in found.items())
+        numbers = ", ".join(f"{min(own.files)} to {max(own.files)} of {name}" for name, own in found.items())
         return f", with {numbers}" if numbers else ""
 
-    def _found(self, after: int, begin: float) -> dict[str, _Numbered]:
-        """Return the images of each camera with numbers larger than `after` that were not written before `begin`."""
-        found = {name: _images(self._folder / name, after, begin) for name in self.names or self._cameras()}
-        return {name: files for name, files in found.items() if files}
+    def _found(self, after: int, before: Mapping[str, float]) -> dict[str, _Images]:
+        """Return the images of each camera with numbers larger than `after`, without those of the time of `before`.
+
+        Args:
+            after: number.
+            before: by camera, when its image was written, s of the file; images written up to `_PAUSE` later are of
+                the same time. Empty: no image is left out.
+        """
+        found = {}
+        for name in self.names or self._cameras():
+            if files := _files(self._folder / name, after):
+                self._compare_clocks(name, files[max(files)])
+                found[name] = _Images(files, self._ahead.get(name, 0.0))
+        if not before:
+            return found
+        begin = _PAUSE + max(written + self._ahead.get(name, 0.0) for name, written in before.items())
+        found = {name: images.since(begin) for name, images in found.items()}
+        return {name: images for name, images in found.items() if images.files}
+
+    def _compare_clocks(self, name: str, file: Path) -> None:
+        """Compare the clock of a camera's files with this machine's by one of its images.
+
+        An image is found after it was written, so the smallest difference is the most accurate one.
+        """
+        with suppress(FileNotFoundError):
+            ahead = time.monotonic() - file.stat().st_mtime
+            self._ahead[name] = min(ahead, self._ahead.get(name, inf))
 
     def _cameras(self) -> list[str]:
         """Return the names of the folders, in numerical order."""
@@ -166,60 +230,57 @@ class FolderFeed:
 
 def _common(found: _Found, names: Sequence[str]) -> set[int]:
     """Return the numbers that all cameras have."""
-    return set.intersection(*(set(found.get(name, ())) for name in names)) if names else set()
+    return set.intersection(*(set(found.get(name, _NONE).files) for name in names)) if names else set()
 
 
 def _bundle(
-    files: Sequence[_Numbered], numbers: Collection[int], after: Bundle | None = None, partial: bool = False
+    cameras: Sequence[_Images], numbers: Collection[int], after: Bundle | None = None, partial: bool = False
 ) -> Bundle | None:
     """Return the bundle of the largest of `numbers` of which every file is complete; `partial`: or at least one."""
     for number in sorted(numbers, reverse=True):
-        there = [own.get(number) for own in files]
-        shots = [None if file is None else _shot(file, number) for file in there]
-        complete = all(shot is not None or file is None for shot, file in zip(shots, there, strict=True))
+        shots = [_shot(images, number) for images in cameras]
+        complete = all(shot or number not in images.files for shot, images in zip(shots, cameras, strict=True))
         if complete or (partial and any(shots)):
             bundle = bundled(shots, [number] * len(shots), 0.0)
-            return bundle if after is None else replace(bundle, dropped=_dropped(files, bundle, after))
+            return bundle if after is None else replace(bundle, dropped=_dropped(cameras, bundle, after))
     return None
 
 
-def _dropped(files: Sequence[_Numbered], bundle: Bundle, after: Bundle) -> int:
+def _dropped(cameras: Sequence[_Images], bundle: Bundle, after: Bundle) -> int:
     """Return the number of images that each camera delivered between two bundles."""
     number = max(bundle.numbers)
     between = number - max(after.numbers) - 1
     if 0 <= between <= _MAX_RATE * (1 + bundle.time - after.time):
         return between
-    return min(
-        sum(n < number for n in own) for own, image in zip(files, bundle.images, strict=True) if image is not None
-    )
+    pairs = zip(cameras, bundle.images, strict=True)
+    return min(sum(n < number for n in images.files) for images, image in pairs if image is not None)
 
 
-def _images(folder: Path, after: int, begin: float) -> dict[int, Path]:
-    """Return the images in a folder, by their numbers, that are larger than `after`, not written before `begin`."""
-    found = {}
+def _files(folder: Path, after: int) -> dict[int, Path]:
+    """Return the images in a folder, by their numbers, that are larger than `after`."""
+    files = {}
     with suppress(FileNotFoundError, NotADirectoryError):
         for name in os.listdir(folder):
             if name.lower().endswith(IMAGE_SUFFIXES) and not name.startswith("."):
                 with suppress(ValueError):
-                    found[image_number(Path(name))] = folder / name
-    return {n: file for n, file in found.items() if n > after and (not begin or _written(file) >= begin)}
+                    files[image_number(Path(name))] = folder / name
+    return {number: file for number, file in files.items() if number > after}
 
 
-def _shot(file: Path, number: int) -> Shot | None:
-    """Return the image in a file, None if it is not complete yet or not there any more."""
+def _shot(images: _Images, number: int) -> Shot | None:
+    """Return an image, None if it is not complete yet or not there any more."""
+    if number not in images.files:
+        return None
+    file = images.files[number]
     try:
-        data, arrival = np.fromfile(file, np.uint8), _arrival(file)
+        data = np.fromfile(file, np.uint8)
+        arrival = images.arrival(number)
         if not any(end in data[-_TAIL:].tobytes() for end in _ENDS):
             return None
         image = decode_image(file, data, cv2.IMREAD_COLOR)
     except (ValueError, FileNotFoundError):
         return None
     return Shot(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), arrival, number)
-
-
-def _arrival(file: Path) -> float:
-    """Return when a file was written, s of `time.monotonic`; now if it is not there any more."""
-    return time.monotonic() - max(time.time() - _written(file), 0.0)
 
 
 def _written(file: Path) -> float:

@@ -222,3 +222,79 @@ def test_FolderFeed__names_what_it_lacks(tmp_path: Path) -> None:
         FolderFeed(tmp_path / "nowhere", 1)
     with pytest.raises(ValueError, match=r"images of the cameras that have .* found folders called nothing; check"):
         FolderFeed(tmp_path, 0.1).newest()
+
+
+def stamp(folder: Path, **clocks: float) -> None:
+    """Write camera CAM's new images as a machine whose clock is ahead by `clocks[CAM]` seconds."""
+    for name, ahead in clocks.items():
+        for file in (folder / name).iterdir():
+            if abs(file.stat().st_mtime - time.time()) < 60:
+                now = file.stat().st_mtime + ahead
+                os.utime(file, times=(now, now))
+
+
+CLOCKS = [{"a": -300, "b": -300}, {"a": 300, "b": 300}, {"a": -300, "b": 0}, {"a": 300, "b": -4000}]
+
+
+@pytest.mark.parametrize("clocks", CLOCKS)
+def test_FolderFeed__has_times_of_this_machine_whatever_the_clocks_of_the_files(tmp_path: Path, clocks) -> None:
+    start = time.monotonic()
+    feed = FolderFeed(fill(tmp_path, range(2), "a", "b"), 2, ["a", "b"])
+    stamp(tmp_path, **clocks)
+    bundle = feed.newest()
+    for number in (2, 3):
+        time.sleep(0.2)
+        fill(tmp_path, range(number, number + 1), "a", "b")
+        stamp(tmp_path, **clocks)
+        written = time.monotonic()
+        time.sleep(0.2)  # a fit
+        bundle = feed.newest(bundle)
+        assert bundle is not None
+        assert bundle.numbers == (number, number)
+        assert start < bundle.time <= time.monotonic()
+    # The time by which the first images were found late is known from the later ones.
+    assert bundle is not None
+    assert bundle.time == pytest.approx(written, abs=0.25)
+
+
+def test_FolderFeed__has_no_times_before_the_last_bundle_if_a_clock_is_set_back(tmp_path: Path) -> None:
+    feed = FolderFeed(fill(tmp_path, range(2), "a", "b"), 2, ["a", "b"])
+    first = feed.newest()
+    assert first is not None
+    fill(tmp_path, range(2, 3), "a", "b")
+    stamp(tmp_path, a=-500, b=-500)
+    second = feed.newest(first)
+    assert second is not None
+    assert first.time <= second.time <= time.monotonic()
+
+
+def test_FolderFeed__has_the_time_at_which_it_finds_images_that_were_copied_with_old_times(tmp_path: Path) -> None:
+    feed = FolderFeed(fill(tmp_path, range(1), "a", "b"), 2, ["a", "b"])
+
+    def copy(number: int) -> None:
+        fill(tmp_path / "other", range(number, number + 1), "a", "b")
+        for name in ("a", "b"):
+            os.utime(tmp_path / "other" / name / f"{number:04d}.png", times=(1e9, 1e9))
+            (tmp_path / "other" / name / f"{number:04d}.png").rename(tmp_path / name / f"{number:04d}.png")
+
+    copy(0)
+    first = feed.newest()
+    timer = Timer(0.4, copy, (1,))
+    timer.start()
+    second = feed.newest(first)
+    assert second is not None
+    assert second.time == pytest.approx(time.monotonic(), abs=0.15)
+
+
+@pytest.mark.parametrize("clocks", CLOCKS)
+def test_FolderFeed__goes_on_when_numbers_begin_again_whatever_the_clocks(tmp_path: Path, short_pause, clocks) -> None:
+    feed = FolderFeed(fill(tmp_path, range(9), "a", "b"), 2, ["a", "b"])
+    stamp(tmp_path, **clocks)
+    first = feed.newest()
+    time.sleep(0.3)
+    fill(tmp_path, range(3), "a", "b")
+    stamp(tmp_path, **clocks)
+    second = feed.newest(first)
+    assert second is not None
+    assert second.numbers == (2, 2)
+    assert all(image is not None for image in second.images)

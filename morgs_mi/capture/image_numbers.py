@@ -1,0 +1,106 @@
+"""Alignment of folders of images by the numbers of their images.
+
+The numbers are times: images with the same number are simultaneous. Cameras whose numbers do not overlap, such as 1000
+to 1010 and 2340 to 2350, count separately. The first images of such cameras are simultaneous.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from math import lcm
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.io.numbering import counting_together
+from morgs_mi.io.video import FolderReader, FrameReader
+
+__all__ = ["ImageNumbers", "align_numbers"]
+
+_Numbers = Mapping[int, range]
+
+
+@dataclass(frozen=True)
+class ImageNumbers:
+    """Alignment of clips by the numbers of their images: the image o + r t of a clip shows instant t.
+
+    Attributes:
+        offsets: o of each clip [C].
+        rates: r of each clip [C].
+        interval: time between two instants, in frames of the clip with the most frames per time.
+        notes: a sentence for each assumption.
+    """
+
+    offsets: np.ndarray
+    rates: np.ndarray
+    interval: float = 1.0
+    notes: tuple[str, ...] = ()
+
+
+def align_numbers(
+    path: Path, names: Sequence[str], readers: Sequence[FrameReader], trim: bool, offset: Mapping[str, float]
+) -> ImageNumbers:
+    """Return the alignment of the clips of the capture `path` by the numbers of their images.
+
+    Args:
+        path: the capture folder, for messages.
+        names: names of the cameras.
+        readers: one clip per camera.
+        trim: whether to use only the numbers that all cameras have which count together.
+        offset: as in `ReadConfig`; without `trim`, the images are aligned by their positions and `offset`.
+
+    Raises:
+        ValueError: numbers of cameras that count together differ and no option resolves it, or none are common.
+    """
+    numbers = {c: r.numbers for c, r in enumerate(readers) if isinstance(r, FolderReader) and r.numbers is not None}
+    groups = counting_together(numbers)
+    notes = _separate(names, numbers, groups)
+    by_position = ImageNumbers(np.zeros(len(readers)), np.ones(len(readers)), notes=notes)
+    different = [group for group in groups if len({(numbers[c][0], numbers[c].step) for c in group}) > 1]
+    if not different:
+        return by_position
+    table = "; ".join(_table(names, numbers, group) for group in different)
+    if offset and not trim:
+        note = f"Images are aligned by their positions and --offset, not by their numbers: {table}."
+        return ImageNumbers(by_position.offsets, by_position.rates, notes=(*notes, note))
+    common = sorted(set.intersection(*(set(numbers[c]) for c in different[0])))
+    if not trim or not common or len(different) > 1:
+        remedy = f"the {len(common)} common ones with --trim, " if common and len(different) == 1 else ""
+        raise ValueError(
+            f"{path}: images with the same number must be simultaneous and all cameras must have the same numbers, got "
+            f"{table}; use {remedy}all numbers with --gaps, which leaves out the cameras that lack an image, or the "
+            f"positions of the images in place of their numbers with --offset {names[different[0][0]]} 0."
+        )
+    note = f"Images with the same number are simultaneous: {table}. Used are {_range(common)}, which all cameras have."
+    return _aligned(readers, {c: numbers[c] for c in different[0]}, common[0], (*notes, note))
+
+
+def _aligned(readers: Sequence[FrameReader], numbers: _Numbers, begin: int, notes: tuple[str, ...]) -> ImageNumbers:
+    """Return the alignment to common numbers that start with `begin`; other clips start with the first of `numbers`."""
+    step = lcm(*(own.step for own in numbers.values()))
+    finest = min(own.step for own in numbers.values())
+    first = min(own[0] for own in numbers.values())
+    clips = [numbers.get(c, range(first, first + 1, finest)) for c in range(len(readers))]
+    offsets = np.array([(begin - clip[0]) / clip.step for clip in clips])
+    rates = np.array([step / clip.step for clip in clips])
+    return ImageNumbers(offsets, rates, step / finest, notes)
+
+
+def _separate(names: Sequence[str], numbers: _Numbers, groups: Sequence[Sequence[int]]) -> tuple[str, ...]:
+    """Return a note on cameras that count separately, none if there are none or single images."""
+    if len(groups) < 2 or all(len(own) == 1 for own in numbers.values()):
+        return ()
+    table = "; ".join(_table(names, numbers, group[:1]) for group in groups)
+    return (f"The numbers of the images do not overlap: {table}. Cameras with such numbers begin at the same time.",)
+
+
+def _table(names: Sequence[str], numbers: _Numbers, group: Sequence[int]) -> str:
+    """Return the numbers of the cameras in a group."""
+    return ", ".join(f"{names[c]} {_range(numbers[c])}" for c in group)
+
+
+def _range(numbers: Sequence[int]) -> str:
+    step = numbers[1] - numbers[0] if len(numbers) > 1 else 1
+    text = f"{numbers[0]} to {numbers[-1]}" if len(numbers) > 1 else f"{numbers[0]}"
+    return text if step == 1 else f"{text} by {step}"
