@@ -128,9 +128,9 @@ def rasterize(
         the full computation's.
 
     Raises:
-        ValueError: an unknown channel, a channel with a missing attribute, NaN or infinite attributes or poses, a
-            region of another view or block shape, `static_splats` together with a depth limit, a depth limit with
-            gradients enabled, or a call inside a function under `dr.freeze`.
+        ValueError: an unknown channel, a channel with a missing attribute, NaN or infinite attributes or poses, values
+            above 1e18 to blend, a region of another view or block shape, `static_splats` together with a depth limit, a
+            depth limit with gradients enabled, or a call inside a function under `dr.freeze`.
 
     Equal depths are blended in the order of the input. A quaternion of length 0 is the identity. Gaussians nearer than
     the camera's near plane or beyond 1e18 units, and those that overflow float32 once projected, are not drawn.
@@ -305,10 +305,11 @@ def _check(
                 "the channel."
             )
     if background is not None and not (
-        np.shape(background) == (3,) and np.isfinite(numbers("rasterize()", "background", background)).all()
+        np.shape(background) == (3,) and (np.abs(numbers("rasterize()", "background", background)) <= FARTHEST).all()
     ):
         raise ValueError(
-            f"rasterize(): `background` must be three finite numbers, got {background!r}; pass a colour or None."
+            f"rasterize(): `background` must be three finite numbers of at most 1e18, got {background!r}; "
+            "pass a colour or None."
         )
     if camera.width * camera.height > 2**28:
         raise ValueError(
@@ -353,18 +354,23 @@ def _checked_limits(depth_limit: Tensor | np.ndarray, camera: Camera, static_spl
 
 
 def _check_finite(finite: Bool, gaussians: ActivatedGaussians, camera: Camera, features: Tensor | None) -> None:
-    """Raise an error if a projected Gaussian is not finite because its attributes, or the pose, are not."""
+    """Raise an error if a projected Gaussian is not finite because its attributes, or the pose, are not.
+
+    Values that are blended must also be at most 1e18, beyond which their squares and gradients overflow.
+    """
     if dr.all(finite):
         return
-    names = ["means", "scales", "quats", "opacities", "sh_coeffs", "motion"]
-    names += [attribute.activated_name for attribute in attribute_channels().values()]
+    blended = ["sh_coeffs", "motion", *(attribute.activated_name for attribute in attribute_channels().values())]
+    names = ["means", "scales", "quats", "opacities", *blended]
     values = {"camera.viewmat": camera.viewmat, **{name: getattr(gaussians, name, None) for name in names}}
     for name, value in {**values, "features": features}.items():
         if value is None:
             continue
         array = np.asarray(dr.detach(value))
-        bad = np.argwhere(~np.isfinite(array))
+        bounded = name in (*blended, "features")
+        bad = np.argwhere(~(np.abs(array) <= FARTHEST) if bounded else ~np.isfinite(array))
         if len(bad):
+            worst = array[tuple(bad[0])]
             index = ", ".join(map(str, bad[0]))
             remedy = (
                 "lower the learning rate"
@@ -372,6 +378,6 @@ def _check_finite(finite: Bool, gaussians: ActivatedGaussians, camera: Camera, f
                 else "remove these Gaussians or lower the learning rate"
             )
             raise ValueError(
-                f"rasterize(): `{name}` must be finite, got {array[tuple(bad[0])]} at "
+                f"rasterize(): `{name}` must be {'at most 1e18' if np.isfinite(worst) else 'finite'}, got {worst:g} at "
                 f"[{index}] ({len(bad)} such values); {remedy}."
             )
