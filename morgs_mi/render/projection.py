@@ -37,7 +37,7 @@ from morgs_mi.core.types import Bool, Float, Jit, Tensor, UInt32
 from morgs_mi.render.channels import attribute_channels
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["FARTHEST", "Splats", "Views", "concatenated", "project"]
+__all__ = ["FARTHEST", "AttachedCamera", "Splats", "Views", "concatenated", "project"]
 
 _HALF_LOG2E = 0.5 * log2(2.718281828459045)
 
@@ -96,6 +96,17 @@ class Splats:
 
 def _zeros(columns: tuple[Float, ...], count: int) -> tuple[Float, ...]:
     return tuple(dr.zeros(mi.Float, count) for _ in columns)
+
+
+@dataclass(frozen=True)
+class AttachedCamera(Camera):
+    """Camera with intrinsics that get gradients.
+
+    Attributes:
+        intrinsics: fx, fy, cx and cy in pixels, equal to those of `K`.
+    """
+
+    intrinsics: tuple[Float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -263,7 +274,9 @@ def _intrinsics(camera: Camera | Views) -> list[Float]:
         values = [_numbers_of(c) for c in camera.cameras]
         memory, first = from_numpy(mi.Float, values), camera.view * len(values[0])
         return [dr.gather(mi.Float, memory, first + i) for i in range(len(values[0]))]
-    return list(_numbers(mi.Float, tuple(_numbers_of(camera))))
+    values = list(_numbers(mi.Float, tuple(_numbers_of(camera))))
+    attached = camera.intrinsics if isinstance(camera, AttachedCamera) else ()
+    return [*map(dr.replace_grad, values, attached), *values[len(attached) :]]
 
 
 @lru_cache(maxsize=1024)  # the views of a rig are projected to again and again
