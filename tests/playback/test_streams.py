@@ -293,3 +293,16 @@ def test_commands__refuse_a_file_that_is_broken_as_a_whole(tmp_path, run):
     path = with_nan(tmp_path / "b.ply", 40)
     status, _, error = run("render", path, tmp_path / "b.png", "--drop-invalid")
     assert (status, "expected at least one Gaussian, got none" in error) == (1, True)
+
+
+@pytest.mark.parametrize("link", [None, Path.symlink_to, Path.hardlink_to])
+def test_export__does_not_replace_its_source(tmp_path, run, link):
+    write_ply(tmp_path / "a.ply", splats())
+    content = (tmp_path / "a.ply").read_bytes()
+    output = tmp_path / "a.ply" if link is None else tmp_path / "b.ply"
+    if link is not None:
+        link(output, tmp_path / "a.ply")
+    status, _, error = run("export", "ply", tmp_path / "a.ply", output)
+    assert (status, f"{output}: expected an output beside its source" in error) == (1, True)
+    assert (tmp_path / "a.ply").read_bytes() == content
+    assert run("export", "ply", tmp_path / "a.ply", tmp_path / "c.ply")[0] == 0
