@@ -18,8 +18,8 @@ With an integrator for `surfaces`, the other shapes of the scene are drawn among
 
     "integrator": {"type": "gaussian_splat", "surfaces": {"type": "path"}}
 
-`mi.render(scene, params)` is differentiable, in both modes, in these attributes and in the sensor's `to_world`; with
-surfaces rendered by `prb` or similar also in their materials and lights.
+`mi.render(scene, params)` is differentiable, in both modes, in these attributes and in the sensor's `to_world`, `x_fov`
+and `principal_point_offset_x`, `_y`; with surfaces rendered by `prb` or similar also in their materials and lights.
 
 Importing this module registers the plugin with the active variant and with every variant set later.
 """
@@ -42,6 +42,7 @@ from morgs_mi.plugins.composite import composite, cropped
 from morgs_mi.plugins.surface_view import SampledPixels, SurfaceView
 from morgs_mi.render.channels import attribute_channels, exr_names
 from morgs_mi.render.kernel_recording import render_lock
+from morgs_mi.render.projection import AttachedCamera
 from morgs_mi.render.rasterize import rasterize
 
 __all__ = ["ellipsoids"]
@@ -167,15 +168,18 @@ def _sensor_camera(sensor: Any, border: int) -> Camera:
     params: Any = mi.traverse(sensor)
     W, H = (int(size) for size in sensor.film().size())
     names = ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
-    fov, offset_x, offset_y = (float(params[name][0]) for name in names)
-    f = 0.5 * W / np.tan(np.deg2rad(0.5 * fov))
+    fov, offset_x, offset_y = (params[name] for name in names)
+    f = 0.5 * W / dr.tan(dr.deg2rad(0.5 * fov))
     # Mitsuba adds its offset to the pixel's position: the principal point moves the other way.
     cx, cy = W * (0.5 - offset_x) + border, H * (0.5 - offset_y) + border
-    K = np.array([[f, 0, cx], [0, f, cy], [0, 0, 1]])
+    K = np.diag([float(f[0]), float(f[0]), 1.0])
+    K[:2, 2] = cx[0], cy[0]
     world_to_sensor = mi.TensorXf(dr.rcp(params["to_world"].matrix))[..., 0]
     # Mitsuba's camera has x to the left and y up.
     viewmat = world_to_sensor * mi.TensorXf([-1, -1, 1, 1], (4, 1))
-    return Camera(K, viewmat, W + 2 * border, H + 2 * border, sensor.id(), float(params["near_clip"]))
+    size = (W + 2 * border, H + 2 * border)
+    near = float(params["near_clip"])
+    return AttachedCamera(K, viewmat, *size, sensor.id(), near, intrinsics=(f, f, cx, cy))
 
 
 def _plugin() -> type:
@@ -213,6 +217,9 @@ def _plugin() -> type:
         With `surfaces`, that integrator renders the other shapes with `spp` samples; their mean is the pixel's sample.
         A pixel's splats end at the mean depth of the surfaces in it, and are blended twice if they cover it in part.
         Surfaces get no light or shadow from splats, and splats get none from surfaces; see docs/surfaces.md for both.
+        The surfaces have no derivatives with respect to the sensor.
+
+        Integrators around it, such as `aov` and `moment`, are refused: they need the colour of single rays.
         """
 
         def __init__(self, props: Any) -> None:
@@ -233,6 +240,11 @@ def _plugin() -> type:
                     f"gaussian_splat: `surfaces` must be an integrator, got {self.surfaces!r}; pass one such as "
                     "{'type': 'path'}."
                 )
+            if self.surfaces is not None and not mi.is_rgb:
+                raise ValueError(
+                    f"gaussian_splat: with `surfaces`, expected a variant such as 'llvm_ad_rgb', got {mi.variant()!r}; "
+                    "call mi.set_variant() before the scene is loaded, because Gaussians have RGB colours."
+                )
             self.warned = False
             known = _aov_attributes()
             for name in self.aovs:
@@ -241,6 +253,17 @@ def _plugin() -> type:
                         f"gaussian_splat: `aovs` must be out of {', '.join(known)}, got {name!r}; separate them by "
                         "commas."
                     )
+
+        def sample(self, *_: Any, **__: Any) -> Any:
+            """Refuse to render single rays, as an integrator around this one requests.
+
+            Raises:
+                ValueError: always.
+            """
+            raise ValueError(
+                "gaussian_splat: expected to be the scene's integrator, got an integrator around it, such as `aov` or "
+                "`moment`, which needs the colour of single rays; list further channels in `aovs`, such as 'depth'."
+            )
 
         def aov_names(self) -> list[str]:
             return [channel for name in self.aovs for channel in exr_names(name)]

@@ -78,7 +78,7 @@ def rasterize(
     means, quats = raw["means"], raw["quats"]
     scales, opacities = np.exp(raw["log_scales"]), 1 / (1 + np.exp(-raw["logit_opacities"]))
     degree = int(np.sqrt(raw["sh_coeffs"].shape[1])) - 1
-    dtype = np.result_type(np.float64, *(np.asarray(v).dtype for v in raw.values()), viewmat.dtype)
+    dtype = np.result_type(np.float64, *(np.asarray(v).dtype for v in raw.values()), viewmat.dtype, K.dtype)
     R, t = viewmat[:3, :3], viewmat[:3, 3]
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     eye = -R.T @ t

@@ -55,6 +55,13 @@ class ReadConfig:
     """Depth of the cameras' near planes, world units; None: a fifth of the smallest reliable depth (see
     `with_near_planes`)."""
 
+    def __post_init__(self) -> None:
+        if isinstance(self.color, str) and self.color.partition(":")[0] not in ("none", "linear"):
+            raise ValueError(
+                f"ReadConfig(): `color` must be none, linear, or linear with a camera, such as linear:cam00, got "
+                f"{self.color!r}."
+            )
+
     @property
     def aligns_clips(self) -> bool:
         """Whether clips of different lengths and frame rates are aligned."""

@@ -6,15 +6,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import tyro
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
+from morgs_mi.cli.opening import DropInvalid, opened
 from morgs_mi.cli.settings import ChannelName, Flag, one_of, optional, place
 from morgs_mi.core.documentation import page
 from morgs_mi.playback.export.formats import GLTF, PLY, TRACKS, USD, VIDEO, WEB, Format, destination
+
+if TYPE_CHECKING:
+    from morgs_mi.playback.streams import PlayableStream
 
 __all__ = ["Export"]
 
@@ -42,15 +46,13 @@ class Ply:
 
     arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
 
-    def run(self) -> None:
+    def run(self, stream: PlayableStream) -> None:
         from morgs_mi.codec.packets import play
         from morgs_mi.io.compressed_ply import write_compressed_ply
         from morgs_mi.io.ply import write_ply
         from morgs_mi.playback.export.clips import select_frames, write_each
         from morgs_mi.playback.export.order import by_place
-        from morgs_mi.playback.streams import open_stream
 
-        stream = open_stream(self.out)
         frames = select_frames(stream, self.frames)
         output, chosen = destination(stream.path, self.output, PLY, self.format)
         with progress() as report:
@@ -75,14 +77,12 @@ class Gltf:
 
     arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
 
-    def run(self) -> None:
+    def run(self, stream: PlayableStream) -> None:
         from morgs_mi.codec.packets import play
         from morgs_mi.playback.export.axes import gltf_axes
         from morgs_mi.playback.export.clips import select_frames, write_each
         from morgs_mi.playback.export.gltf_export import write_gltf
-        from morgs_mi.playback.streams import open_stream
 
-        stream = open_stream(self.out)
         frames = select_frames(stream, self.frames)
         output, chosen = destination(stream.path, self.output, GLTF)
         axes = gltf_axes(stream.cameras)
@@ -109,12 +109,10 @@ class Usd:
 
     arguments: ClassVar[Mapping[str, str]] = {"span": "--frames"}
 
-    def run(self) -> None:
+    def run(self, stream: PlayableStream) -> None:
         from morgs_mi.playback.export.clips import select_frames
         from morgs_mi.playback.export.usd import write_usd
-        from morgs_mi.playback.streams import open_stream
 
-        stream = open_stream(self.out)
         frames = select_frames(stream, self.frames)
         output, _ = destination(stream.path, self.output, USD, self.format)
         with progress() as report:
@@ -148,12 +146,10 @@ class Flight:
 
     arguments: ClassVar[Mapping[str, str]] = {"least": "--least-seconds"}
 
-    def run(self) -> None:
+    def run(self, stream: PlayableStream) -> None:
         from morgs_mi.playback.export.clips import flight, frame_numbers, named_path, num_images, repeated_frames
         from morgs_mi.playback.export.frames import write_images
-        from morgs_mi.playback.streams import open_stream
 
-        stream = open_stream(self.out)
         frames = frame_numbers(stream)
         if self.freeze is not None and self.freeze not in frames:
             raise ValueError(f"--freeze must be in {frames[0]} to {frames[-1]}, got {self.freeze}.")
@@ -178,12 +174,10 @@ class Tracks:
     output: Annotated[Positional[Path | None], DisallowNone, place("FILE.npz")] = None
     """File for the tracks; by default OUT/tracks.npz."""
 
-    def run(self) -> None:
+    def run(self, stream: PlayableStream) -> None:
         from morgs_mi.playback.export.clips import frame_numbers
         from morgs_mi.playback.export.tracks import extract_tracks, write_tracks
-        from morgs_mi.playback.streams import open_stream
 
-        stream = open_stream(self.out)
         output, _ = destination(stream.path, self.output, TRACKS)
         total = len(frame_numbers(stream))
         with progress() as report:
@@ -207,12 +201,10 @@ class Web:
     title: Annotated[str | None, DisallowNone, optional("TEXT")] = None
     """Title of the page; by default the name of the stream's folder or file."""
 
-    def run(self) -> None:
+    def run(self, stream: PlayableStream) -> None:
         from morgs_mi.playback.export.clips import frame_numbers
         from morgs_mi.playback.export.web import write_web_folder, write_web_page
-        from morgs_mi.playback.streams import open_stream
 
-        stream = open_stream(self.out)
         output, chosen = destination(stream.path, self.output, WEB, self.format)
         total, write = len(frame_numbers(stream)), write_web_folder if chosen.folder else write_web_page
         with progress() as report:
@@ -234,5 +226,8 @@ class Export:
         arg(name=""),
     ]
 
+    drop_invalid: DropInvalid = False
+
     def run(self) -> None:
-        self.kind.run()
+        drawn = isinstance(self.kind, Flight | Web)
+        self.kind.run(opened(self.kind.out, self.drop_invalid, drawn))

@@ -10,6 +10,7 @@ from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, progress
+from morgs_mi.cli.opening import DropInvalid
 from morgs_mi.cli.settings import setting
 from morgs_mi.codec.codec_config import CodecConfig
 from morgs_mi.playback.default_rig import Axes
@@ -40,6 +41,7 @@ class Import:
     """Most bytes of a frame that continues the one before; 0: no limit."""
     keyframe_interval: Annotated[int, arg(metavar="INT")] = CodecConfig().keyframe_interval
     """Frames between two keyframes; 0: only where they are needed."""
+    drop_invalid: DropInvalid = False
 
     def run(self) -> None:
         from morgs_mi.runs.import_frames import import_frames
@@ -57,6 +59,7 @@ class Import:
                 config,
                 self.axes,
                 lambda done, of: report("Importing", done, of),
+                most_invalid=1.0 if self.drop_invalid else 0.0,
             )
         sets = "one set" if result.num_keyframes == 1 else f"{result.num_keyframes} sets"
         print_result(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import DisallowNone, Positional, arg
 
 from morgs_mi.cli.console import print_result, progress
+from morgs_mi.cli.opening import DropInvalid, opened
 from morgs_mi.cli.settings import ChannelName, one_of, optional
 from morgs_mi.core.documentation import page
 from morgs_mi.playback.export.formats import IMAGES, destination
@@ -78,15 +79,15 @@ class Render:
     light: Literal["probe", "traced"] = "probe"
     """Light of an inserted scene: an environment map at its middle, or rays traced through the Gaussians, for their
     shadows and reflections."""
+    drop_invalid: DropInvalid = False
 
     def run(self) -> None:
         from morgs_mi.playback.export.clips import frame_numbers, named_path, num_images
         from morgs_mi.playback.export.frames import write_images
         from morgs_mi.playback.player import find_camera
-        from morgs_mi.playback.streams import open_stream
 
         self._check()
-        stream = open_stream(self.out)
+        stream = opened(self.out, self.drop_invalid)
         view = find_camera(stream, 0 if self.camera is None else self.camera)
         stem = Path(self.path or "orbit").stem if self.camera is None and self.insert is None else view.name
         output, chosen = destination(stream.path, self.output, IMAGES, self.format, stem)

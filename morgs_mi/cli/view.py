@@ -13,6 +13,7 @@ from typing import Annotated
 from tyro.conf import Positional, arg
 
 from morgs_mi.cli.console import print_result
+from morgs_mi.cli.opening import DropInvalid, most_invalid, print_cameras
 from morgs_mi.playback.viewer.viewer import Viewer, ViewerConfig
 
 __all__ = ["View"]
@@ -26,18 +27,20 @@ class View:
     """Folder of a fit, a stream file, or a file of Gaussians: .ply, .compressed.ply or .splat."""
     open_browser: bool = True
     """Open the page in the browser of this machine."""
+    drop_invalid: DropInvalid = False
     config: Annotated[ViewerConfig, arg(name="")] = field(default_factory=ViewerConfig)
 
     def run(self) -> None:
         try:
-            viewer = Viewer(self.out, self.config, self._announce)
+            viewer = Viewer(self.out, self.config, self._announce, most_invalid(self.drop_invalid))
         except ImportError as error:
             raise ValueError(str(error)) from error
         with _stopped_by_interrupt(viewer.stop):
             viewer.run()
 
     def _announce(self, viewer: Viewer) -> None:
-        """Report the address and open it."""
+        """Report the cameras and the address, and open it."""
+        print_cameras(viewer.stream)
         print_result(f"{viewer.url} (Ctrl-C to stop)")
         if viewer.is_public:
             print_result(

@@ -186,15 +186,28 @@ class Camera:
         check_number("Camera.with_width()", "width", width, "[1, inf)")
         return self.resized(width, max(1, round(width * self.height / self.width)))
 
+    def square(self) -> Camera:
+        """Return the same view with equal focal lengths, to half a pixel of its height, which may be another one."""
+        return self.resized(self.width, max(1, round(self.height * self.K[0, 0] / self.K[1, 1])))
+
     def sensor(self, **film: Any) -> dict[str, Any]:
         """Return a Mitsuba `perspective` sensor dictionary of this view.
 
         Keyword arguments override entries of the film (e.g. ``rfilter``, ``pixel_format``).
-        Mitsuba's sensor has one focal length: where fx and fy differ, fx is used.
+
+        Raises:
+            ValueError: fx and fy differ by more than a pixel in the height of the image: Mitsuba's sensor has one
+                focal length.
         """
         import mitsuba as mi
 
-        f, cx, cy = self.K[0, 0], self.K[0, 2], self.K[1, 2]
+        f, fy, cx, cy = self.K[0, 0], self.K[1, 1], self.K[0, 2], self.K[1, 2]
+        if abs(f / fy - 1) * self.height > 1:
+            raise ValueError(
+                f"Camera.sensor(): `K` must have equal focal lengths, because Mitsuba's sensor has one, got {f:g} and "
+                f"{fy:g}; render `camera.square()`, of {self.square().width}x{self.square().height} pixels, and resize "
+                "the image."
+            )
         # Mitsuba adds its offset to the pixel's position, so the principal point moves the other way.
         return {
             "type": "perspective",

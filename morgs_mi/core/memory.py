@@ -1,10 +1,12 @@
-"""Memory that NumPy and Dr.Jit exchange.
+"""Memory that NumPy and Dr.Jit exchange, and memory that is free.
 
 Dr.Jit borrows NumPy's memory where it can, and reads it when a kernel runs: after the call that passed it, when the
 caller may have written to it. The package therefore passes copies.
 """
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import drjit as dr
 import mitsuba as mi
@@ -14,7 +16,7 @@ from numpy.typing import ArrayLike
 from morgs_mi.core.checks import numbers
 from morgs_mi.core.types import Jit, Tensor
 
-__all__ = ["float_tensor", "from_numpy", "owned_copy", "refuse_freezing"]
+__all__ = ["check_memory", "float_tensor", "free_memory", "from_numpy", "owned_copy", "refuse_freezing"]
 
 # Bytes: Dr.Jit aligns its own memory to as many.
 _ALIGNMENT = 64
@@ -81,3 +83,63 @@ def owned_copy(values: Jit) -> Jit:
     copy = dr.gather(type(values), values, dr.arange(mi.UInt32, dr.width(values)) + dr.opaque(mi.UInt32, 0))
     dr.eval(copy)
     return copy
+
+
+def check_memory(place: str, needed: float, content: str, remedy: str) -> None:
+    """Raise an error unless there is memory for what is about to be computed: Dr.Jit ends the process without it.
+
+    Args:
+        place: where the error's sentence begins.
+        needed: bytes, a lower estimate.
+        content: what needs them, for the message, e.g. ``an image of 20000x20000 pixels``.
+        remedy: end of the sentence.
+
+    Raises:
+        ValueError: fewer bytes are free.
+    """
+    free = free_memory()
+    if needed > free:
+        raise ValueError(
+            f"{place}: expected what fits in the {max(free, 0) / 1e9:.1f} GB of free memory, got {content}, which "
+            f"takes about {needed / 1e9:.1f} GB; {remedy}."
+        )
+
+
+def free_memory() -> float:
+    """Return the bytes that this process may still use, by the machine, its control group and its own limit."""
+    return min(_free_in_machine(), _free_in_group(), _free_in_limit())
+
+
+def _free_in_machine() -> float:
+    for line in _lines("/proc/meminfo"):
+        if line.startswith("MemAvailable:"):
+            return 1024.0 * int(line.split()[1])
+    return float("inf")
+
+
+def _free_in_group() -> float:
+    """Return the free bytes of a container."""
+    limit = "".join(_lines("/sys/fs/cgroup/memory.max")).strip()
+    used = "".join(_lines("/sys/fs/cgroup/memory.current")).strip()
+    return float(limit) - float(used) if limit.isdigit() and used.isdigit() else float("inf")
+
+
+def _free_in_limit() -> float:
+    """Return the rest of the address space, which `ulimit -v` limits."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return float("inf")
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    sizes = "".join(_lines("/proc/self/statm")).split()
+    if limit == resource.RLIM_INFINITY or not sizes:
+        return float("inf")
+    return float(limit - int(sizes[0]) * resource.getpagesize())
+
+
+def _lines(path: str) -> list[str]:
+    """Return the lines of a system's file; none where it does not exist."""
+    try:
+        return Path(path).read_text(encoding="ascii").splitlines()
+    except (OSError, ValueError):
+        return []

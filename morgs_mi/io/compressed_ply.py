@@ -26,6 +26,7 @@ from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.geometry import unit_quats
+from morgs_mi.io.invalid import without_invalid
 from morgs_mi.io.ply import read_elements
 
 __all__ = ["read_compressed_ply", "write_compressed_ply"]
@@ -84,14 +85,18 @@ def write_compressed_ply(path: str | Path, gaussians: Gaussians) -> None:
         PlyData(elements, byte_order="<").write(str(partial))
 
 
-def read_compressed_ply(path: str | Path) -> Gaussians:
+def read_compressed_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
     """Return the Gaussians in a compressed PLY file of any tool, SH of degree 0 to 3.
 
     Opacities are clipped to [1e-6, 1 - 1e-6], as in `Gaussians.from_activated`.
 
+    Args:
+        path: the file.
+        most_invalid: share of Gaussians with invalid numbers that are left out with a warning; 0: none.
+
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not a PLY file, is truncated, lacks a property, or has a number that is not finite.
+        ValueError: it is not a PLY file, is truncated, lacks a property, or has more invalid Gaussians.
     """
     elements = read_elements(path, ("chunk", "vertex"), ("sh",))
     chunks, vertices, rest = elements["chunk"], elements["vertex"], elements.get("sh", {})
@@ -121,7 +126,9 @@ def read_compressed_ply(path: str | Path) -> Gaussians:
         steps = np.stack([rest[name] for name in names], axis=1).reshape(N, 3, len(names) // 3).transpose(0, 2, 1)
         coeffs[:, 1:] = (np.where(steps == 0, 0, np.where(steps == 255, 256, steps + 0.5)) / 128 - 1) * _SH_RANGE
     quats = _unpacked_rotations(vertices["packed_rotation"])
-    return Gaussians.from_activated(position, np.exp(scale), quats, color[:, 3], coeffs)
+    with np.errstate(over="ignore"):  # infinite, and therefore invalid
+        gaussians = Gaussians.from_activated(position, np.exp(scale), quats, color[:, 3], coeffs)
+    return without_invalid(path, gaussians, most_invalid)
 
 
 def _within_chunks(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -142,10 +149,9 @@ def _between(path: str | Path, chunks: dict[str, np.ndarray], key: str, fraction
         np.stack([np.asarray(chunks[name], np.float64) for name in ends], axis=1).repeat(_CHUNK, axis=0)
         for ends in _BOUNDS[key]
     )
-    if not (np.isfinite(low).all() and np.isfinite(high).all()):
-        raise ValueError(f"{path}: expected finite bounds, got others in {', '.join(names)}; clean the Gaussians.")
     N = len(fractions)
-    return low[:N] * (1 - fractions) + high[:N] * fractions
+    with np.errstate(invalid="ignore"):  # NaN where a bound is infinite: the Gaussians of the chunk are invalid
+        return low[:N] * (1 - fractions) + high[:N] * fractions
 
 
 def _check_columns(

@@ -23,10 +23,11 @@ _KEYS = {"width", "height", "position", "rotation", "fx", "fy"}
 _MOST = 48
 
 
-def model_cameras(path: Path) -> tuple[Camera, ...]:
-    """Return cameras with which a file of Gaussians was trained; none if no `cameras.json` belongs to it.
+def model_cameras(path: Path) -> tuple[Path | None, tuple[Camera, ...]]:
+    """Return the `cameras.json` that may belong to a file of Gaussians, and its cameras; None and none without one.
 
-    The file is beside the Gaussians or in one of the two folders above. At most 48 cameras are returned.
+    The file is beside the Gaussians or in one of the two folders above. At most 48 cameras are returned. Nothing in it
+    names the Gaussians: it may be of another scene.
 
     Raises:
         ValueError: an entry is broken.
@@ -36,8 +37,8 @@ def model_cameras(path: Path) -> tuple[Camera, ...]:
         if file.is_file():
             rows = read_json(file)
             if isinstance(rows, list) and rows and all(isinstance(row, dict) and row.keys() >= _KEYS for row in rows):
-                return tuple(_camera(file, i, rows[i]) for i in range(0, len(rows), -(-len(rows) // _MOST)))
-    return ()
+                return file, tuple(_camera(file, i, rows[i]) for i in range(0, len(rows), -(-len(rows) // _MOST)))
+    return None, ()
 
 
 def _camera(file: Path, index: int, row: dict[str, Any]) -> Camera:

@@ -18,6 +18,8 @@ from plyfile import PlyData, PlyElement
 
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.io.invalid import without_invalid
+from morgs_mi.io.ply_kinds import as_3dgs
 
 __all__ = ["read_elements", "read_ply", "read_vertices", "write_ply"]
 
@@ -70,48 +72,55 @@ def write_ply(path: str | Path, gaussians: Gaussians) -> None:
         PlyData([PlyElement.describe(vertices, "vertex")], byte_order="<").write(str(partial))
 
 
-def read_ply(path: str | Path) -> Gaussians:
+def read_ply(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
     """Return the Gaussians in a PLY file of this package or of another tool: binary or text, SH of degree 0 to 3.
 
-    Normals and properties outside the layout are ignored; without ``f_rest_*`` the degree is 0. Infinite logits of the
+    Normals and other harmless properties are ignored; without ``f_rest_*`` the degree is 0. Infinite logits of the
     opacities 0 and 1 and infinite logarithms of sizes of 0 are replaced by finite ones, as in `from_activated`.
+    `ply_kinds` lists the kinds of Gaussians of other methods that are read.
+
+    Args:
+        path: the file.
+        most_invalid: share of Gaussians with invalid numbers that are left out with a warning; 0: none.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it is not a PLY file, is truncated, lacks a property, or has a number that is not finite.
+        ValueError: it is not a PLY file, is truncated, lacks a property, holds another kind of Gaussians, or has more
+            invalid ones.
     """
     vertices = read_vertices(path)
-    names = set(vertices)
-    if "packed_position" in names:
+    if "packed_position" in vertices:
         raise ValueError(
             f"{path}: expected an uncompressed PLY, got PlayCanvas' compressed one; read it with `read_splats`."
         )
-    missing = [name for name in (*_MEAN, *_DC, "opacity", *_SCALE, *_ROTATION) if name not in names]
+    vertices = as_3dgs(path, vertices)
+    missing = [name for name in (*_MEAN, *_DC, "opacity", *_SCALE, *_ROTATION) if name not in vertices]
     if missing:
         raise ValueError(
             f"{path}: expected Gaussians in the layout of 3D Gaussian Splatting, got vertices without "
             f"{', '.join(missing)}, as of a mesh or a point cloud; export the Gaussians."
         )
-    found = sum(name.startswith("f_rest_") for name in names)
-    degree = {0: 0, 9: 1, 24: 2, 45: 3}.get(found)
-    if degree is None or not names.issuperset(_rest((degree + 1) ** 2)):
+    count = sum(name.startswith("f_rest_") for name in vertices)
+    degree = {0: 0, 9: 1, 24: 2, 45: 3}.get(count)
+    if degree is None or not vertices.keys() >= {*_rest((degree + 1) ** 2)}:
         raise ValueError(
-            f"{path}: expected f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) or none, got {found} of them."
+            f"{path}: expected f_rest_0 to f_rest_8, 23 or 44 (SH of degree 1 to 3) or none, got {count} of them; "
+            "export the Gaussians with SH of degree 3 or less."
         )
     N, K = len(vertices["x"]), (degree + 1) ** 2
 
-    def columns(wanted: tuple[str, ...]) -> np.ndarray:
-        values = np.empty((N, len(wanted)), np.float32)
-        for i, name in enumerate(wanted):
-            values[:, i] = np.clip(vertices[name], *_BOUNDS.get(name, (None, None)))
-        if bad := [name for i, name in enumerate(wanted) if not np.isfinite(values[:, i]).all()]:
-            raise ValueError(f"{path}: expected finite numbers, got others in {', '.join(bad)}; clean the Gaussians.")
+    def columns(names: tuple[str, ...]) -> np.ndarray:
+        values = np.empty((N, len(names)), np.float32)
+        with np.errstate(over="ignore"):  # infinite, and therefore invalid
+            for i, name in enumerate(names):
+                values[:, i] = np.clip(vertices[name], *_BOUNDS.get(name, (None, None)))
         return values
 
     coeffs = np.empty((N, K, 3), np.float32)
     coeffs[:, 0] = columns(_DC)
     coeffs[:, 1:] = columns(_rest(K)).reshape(N, 3, K - 1).transpose(0, 2, 1)
-    return Gaussians(columns(_MEAN), columns(_SCALE), columns(_ROTATION), columns(("opacity",))[:, 0], coeffs)
+    gaussians = Gaussians(columns(_MEAN), columns(_SCALE), columns(_ROTATION), columns(("opacity",))[:, 0], coeffs)
+    return without_invalid(path, gaussians, most_invalid)
 
 
 def read_vertices(path: str | Path) -> dict[str, np.ndarray]:

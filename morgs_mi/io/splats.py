@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.core.color_space import SH_C0
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.compressed_ply import read_compressed_ply
+from morgs_mi.io.foreign import refuse_foreign
+from morgs_mi.io.invalid import without_invalid
 from morgs_mi.io.ply import read_ply
 
 __all__ = ["SUFFIXES", "read_splats", "suffix_of"]
@@ -32,36 +33,30 @@ def suffix_of(path: str | Path) -> str | None:
     return next((suffix for suffix in SUFFIXES if name.endswith(suffix)), None)
 
 
-def read_splats(path: str | Path) -> Gaussians:
+def read_splats(path: str | Path, most_invalid: float = 0.0) -> Gaussians:
     """Return the Gaussians in a file. Its name determines its format; a `.ply` may also be compressed.
+
+    Args:
+        path: the file.
+        most_invalid: share of Gaussians that are left out with a warning because a number of theirs is not finite, or a
+            centre, size or coefficient is above 1e12; 0: none.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the name has another suffix, the file is broken or truncated, or it has a number that is not finite,
-            or a centre, size or coefficient above 1e12.
+        ValueError: the file has another format, is broken or truncated, or has more invalid Gaussians.
     """
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"{path}: expected a file with Gaussians, found none; check the path.")
+    refuse_foreign(path)
     suffix = suffix_of(path)
     if suffix is None:
         raise ValueError(
             f"{path}: expected a file whose name ends in {', '.join(SUFFIXES)}, got {Path(path).suffix!r}; convert it."
         )
-    if not Path(path).is_file():
-        raise FileNotFoundError(f"{path}: expected a file with Gaussians, found none; check the path.")
     if suffix == ".splat":
-        gaussians = _read_splat(Path(path))
-    elif suffix == ".compressed.ply" or _is_compressed(Path(path)):
-        gaussians = read_compressed_ply(path)
-    else:
-        gaussians = read_ply(path)
-    raw = gaussians.numpy()
-    for name, values in (
-        ("centres", raw["means"]),
-        ("sizes", np.exp(np.float64(raw["log_scales"]).clip(max=99))),
-        ("coefficients of colour", raw["sh_coeffs"]),
-    ):
-        if not bounded(values):
-            raise ValueError(f"{path}: expected {name} of at most {LARGEST:g}, got larger ones; clean the Gaussians.")
-    return gaussians
+        return _read_splat(Path(path), most_invalid)
+    compressed = suffix == ".compressed.ply" or _is_compressed(Path(path))
+    return (read_compressed_ply if compressed else read_ply)(path, most_invalid)
 
 
 def _is_compressed(path: Path) -> bool:
@@ -69,7 +64,7 @@ def _is_compressed(path: Path) -> bool:
         return b"packed_position" in file.read(4096).partition(b"end_header")[0]
 
 
-def _read_splat(path: Path) -> Gaussians:
+def _read_splat(path: Path, most_invalid: float) -> Gaussians:
     size = path.stat().st_size
     if size % _RECORD.itemsize:
         raise ValueError(
@@ -77,16 +72,8 @@ def _read_splat(path: Path) -> Gaussians:
             "file is truncated or no .splat, export it again."
         )
     records = np.fromfile(path, _RECORD)
-    for name, least in (("means", -np.inf), ("scales", 0)):
-        good = (np.isfinite(records[name]) & (records[name] >= least)).all(axis=1)
-        if not good.all():
-            row = np.flatnonzero(~good)[0]
-            raise ValueError(
-                f"{path}: expected finite {name}{' of at least 0' if least == 0 else ''}, got "
-                f"{records[name][row].tolist()} in Gaussian {row}; the file is damaged or no .splat, export it again."
-            )
+    scales = np.where(records["scales"] >= 0, records["scales"], np.nan)
     quats = (records["quats"] - 128.0) / 128
     colors = (records["color"] / 255 - 0.5) / SH_C0
-    return Gaussians.from_activated(
-        records["means"], records["scales"], quats, records["opacity"] / 255, colors[:, None]
-    )
+    gaussians = Gaussians.from_activated(records["means"], scales, quats, records["opacity"] / 255, colors[:, None])
+    return without_invalid(path, gaussians, most_invalid)

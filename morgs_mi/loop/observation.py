@@ -16,6 +16,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_mask, check_points, check_type
 from morgs_mi.core.rig import choose_key_views, scene_extent
 from morgs_mi.core.threads import map_in_threads
+from morgs_mi.fit.capacity import check_capacity
 from morgs_mi.fit.initialise import Points
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.method.change import box_around, change_mask, moving_region, update_reference
@@ -146,6 +147,7 @@ def prepare(
     for view, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
         if mask is not None:
             check_mask(f"StreamLoop(): view {camera.name or view!r}", mask, camera.height, camera.width)
+    check_capacity("StreamLoop()", cameras, config.fit)
     copies = tuple(None if mask is None else mask.copy() for mask in masks)
     key_views = choose_key_views(cameras, config.motion.key_views)
     extent = scene_extent(cameras)

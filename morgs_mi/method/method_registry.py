@@ -65,9 +65,22 @@ class Registry(Generic[Made, Config]):
         Raises:
             ValueError: `text` selects none, or as its factory.
         """
+        self.check(text)
+        name, _, argument = text.partition(":")
+        return self._factories[name](argument, config)
+
+    def check(self, text: str, place: str = "") -> None:
+        """Raise an error unless `text` selects an implementation, which is not made.
+
+        Args:
+            text: value of the setting.
+            place: where the error's sentence begins; by default the function that looks names up.
+
+        Raises:
+            ValueError: it selects none.
+        """
         name, colon, argument = text.partition(":")
         takes_argument = bool(self._arguments.get(name))
         if name not in self._factories or not (takes_argument == bool(colon) == bool(argument)):
-            known = ", ".join(self.usages)
-            raise ValueError(f"{self._place}: `{self._setting}` must be one of {known}, got {text!r}.")
-        return self._factories[name](argument, config)
+            usages = ", ".join(self.usages)
+            raise ValueError(f"{place or self._place}: `{self._setting}` must be one of {usages}, got {text!r}.")

@@ -9,8 +9,11 @@ from morgs_mi.core.ranges import AtLeast, AtMost, check_ranges
 from morgs_mi.method.active_set import ActiveSetConfig
 from morgs_mi.method.change import ChangeConfig
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
+from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES
 from morgs_mi.method.lift import LiftConfig
 from morgs_mi.method.mask_refiners.mask_config import MaskConfig
+from morgs_mi.method.mask_refiners.mask_registry import MASK_REFINERS
+from morgs_mi.method.motion_model import MOTION_MODELS
 from morgs_mi.method.search import SearchConfig
 
 __all__ = ["MotionConfig"]
@@ -23,7 +26,7 @@ class MotionConfig:
     With all three off, the residual-only baseline remains (eq. 3).
 
     Raises:
-        ValueError: a number is out of range.
+        ValueError: a number is out of range, or a method or model is not registered.
     """
 
     learn_motion: bool = True
@@ -78,3 +81,6 @@ class MotionConfig:
 
     def __post_init__(self) -> None:
         check_ranges(self)
+        FLOW_SOURCES.check(self.flow_method, "MotionConfig()")
+        MASK_REFINERS.check(self.mask_method, "MotionConfig()")
+        MOTION_MODELS.check(self.model, "MotionConfig()")

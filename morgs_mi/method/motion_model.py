@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import drjit as dr
 import mitsuba as mi
@@ -26,7 +27,9 @@ from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.memory import from_numpy
 from morgs_mi.core.types import Jit, Tensor
 from morgs_mi.method.method_registry import Registry
-from morgs_mi.method.motion_config import MotionConfig
+
+if TYPE_CHECKING:
+    from morgs_mi.method.motion_config import MotionConfig
 
 __all__ = [
     "MOTION_MODELS",

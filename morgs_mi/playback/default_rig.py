@@ -18,7 +18,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.render.rasterize import rasterize
 
-__all__ = ["DEFAULT_RIG", "Axes", "default_rig"]
+__all__ = ["DEFAULT_RIG", "Axes", "default_rig", "thinned"]
 
 Axes = Literal["y-down", "y-up", "z-up"]
 """Direction that is up, by axis. Files in the layout of 3D Gaussian Splatting mostly have COLMAP's axes, y down."""
@@ -43,8 +43,8 @@ _LEAST_EXTENT = 1e-6  # of the distance from the origin
 def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Camera, ...]:
     """Return eight cameras on a circle around nearly all Gaussians in these frames, which look at their middle.
 
-    `front` looks along the forward axis of the convention. The first one is where the first frame has the most detail;
-    the others follow counterclockwise, seen from above.
+    `front` looks along the forward axis of the convention. The first one is where the first frame with Gaussians has
+    the most detail; the others follow counterclockwise, seen from above.
 
     Raises:
         ValueError: there is no Gaussian in any of the frames, or `axes` is unknown.
@@ -67,12 +67,12 @@ def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Cam
         Camera.look_at(center + distance * arm, center, up, _FOV_X, _WIDTH, _HEIGHT, name, near)
         for name, arm in zip(_NAMES, arms, strict=True)
     )
-    some = _thinned(frames[0])
+    some = thinned(next(gaussians for gaussians in frames if len(gaussians)))
     best = int(np.argmax([_detail(some, camera.with_width(_THUMBNAIL)) for camera in ring]))
     return ring[best:] + ring[:best]
 
 
-def _thinned(gaussians: Gaussians) -> Gaussians:
+def thinned(gaussians: Gaussians) -> Gaussians:
     """Return every k-th Gaussian, at most 30,000, enlarged to cover the same area."""
     k = len(gaussians) // _MOST + 1
     some = gaussians.select(np.arange(0, len(gaussians), k))

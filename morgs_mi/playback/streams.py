@@ -5,16 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from morgs_mi.codec.container import Packet, PacketKind
+from morgs_mi.codec.container import MAGIC, Packet, PacketKind
 from morgs_mi.codec.packets import WholeFrame
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.io.model_cameras import model_cameras
+from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.splats import read_splats, suffix_of
 from morgs_mi.playback.default_rig import DEFAULT_RIG, default_rig
 from morgs_mi.playback.export.notebook import stream_html
 from morgs_mi.playback.player import STREAM
+from morgs_mi.playback.trained_cameras import trained_cameras
 
-__all__ = ["PlayableStream", "SplatFile", "open_stream", "stream_path"]
+__all__ = ["DRAWN", "PlayableStream", "SplatFile", "open_stream", "stream_path"]
+
+DRAWN = 0.5
+"""Share of invalid Gaussians up to which a file is drawn without them: beyond, the file as a whole is broken."""
 
 
 class PlayableStream(StreamReader):
@@ -27,18 +31,23 @@ class PlayableStream(StreamReader):
 class SplatFile(PlayableStream):
     """File with the Gaussians of one frame, of any tool, as a stream.
 
-    Its cameras are those of its training, if a `cameras.json` belongs to it (`model_cameras`), or a `default_rig`.
+    Its cameras are those of its training, if it has any (see `trained_cameras`), or a `default_rig`.
 
     Args:
         path: ``.ply``, ``.compressed.ply`` or ``.splat``.
+        most_invalid: share of Gaussians with invalid numbers that are left out with a warning.
+
+    Attributes:
+        cameras_file: the `cameras.json` with its cameras; None: they are a `default_rig`.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: it has no Gaussians, is broken or truncated.
+        ValueError: it has no Gaussians, is broken or truncated, or has more invalid Gaussians.
     """
 
-    def __init__(self, path: Path) -> None:
-        gaussians, trained = read_splats(path), model_cameras(path)
+    def __init__(self, path: Path, most_invalid: float = DRAWN) -> None:
+        gaussians = read_splats(path, most_invalid)
+        self.cameras_file, trained = trained_cameras(path, gaussians)
         self.path, self.fps, self.metadata = path, 30.0, {"num_frames": 1, DEFAULT_RIG: not trained}
         try:
             self.cameras = trained or default_rig([gaussians])
@@ -69,18 +78,36 @@ def stream_path(out: str | Path) -> Path:
 
     Raises:
         FileNotFoundError: there is no such file.
+        ValueError: there is a file of another format, or a folder with files of Gaussians instead.
     """
     path = Path(out)
+    if path.is_dir() and not (path / STREAM).exists():
+        if (path / "meta.json").is_file():
+            refuse_foreign(path / "meta.json")
+        if frames := sorted(file.name for file in path.iterdir() if suffix_of(file)):
+            raise ValueError(
+                f"{path}: got a folder with {len(frames)} files of Gaussians, not a stream; name one of them, such "
+                f"as {path / frames[0]}, or turn all into a stream with `morgs-mi import`."
+            )
     path = path / STREAM if path.is_dir() else path
     if not path.is_file():
         raise FileNotFoundError(f"{path}: expected a stream, found none; check the path or fit a capture first.")
+    with path.open("rb") as file:
+        content = file.read(len(MAGIC))
+    if content != MAGIC:
+        refuse_foreign(path)
     return path
 
 
-def open_stream(out: str | Path) -> PlayableStream:
+def open_stream(out: str | Path, most_invalid: float = DRAWN) -> PlayableStream:
     """Open a stream file, the ``stream.morgs`` in the folder of a fit, or a file with Gaussians as one frame.
 
     Files with Gaussians are ``.ply`` files in the layout of 3D Gaussian Splatting, ``.compressed.ply`` and ``.splat``.
+
+    Args:
+        out: the file or folder.
+        most_invalid: share of Gaussians of such a file that may have numbers that are not finite or above 1e12; they
+            are left out with a warning. 0: none.
 
     Example:
         >>> stream = morgs_mi.open_stream("out/arm_fit")
@@ -89,7 +116,8 @@ def open_stream(out: str | Path) -> PlayableStream:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is not a stream, or its header is broken or missing; or it has no Gaussians.
+        ValueError: the file is not a stream, or its header is broken or missing; or it has no Gaussians, or more
+            invalid ones.
     """
     path = stream_path(out)
-    return SplatFile(path) if suffix_of(path) else PlayableStream(path)
+    return SplatFile(path, most_invalid) if suffix_of(path) else PlayableStream(path)

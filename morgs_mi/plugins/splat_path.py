@@ -86,10 +86,7 @@ def _plugin() -> type:
         def __init__(self, props: Any) -> None:
             super().__init__(props)
             if not mi.is_rgb:
-                raise ValueError(
-                    f"splat_path: expected a variant such as 'llvm_ad_rgb', got {mi.variant()!r}; call "
-                    "mi.set_variant() before the scene is loaded, because Gaussians have RGB colours."
-                )
+                _refuse_variant(props)
             self.clipped = float(props.get("clipped", CLIPPED))
             if not 1 <= self.clipped < float("inf"):
                 raise ValueError(
@@ -233,11 +230,22 @@ def _plugin() -> type:
     return SplatPathIntegrator
 
 
+def _refuse_variant(props: Any) -> None:
+    """Raise an error where the active variant has no RGB colours or no derivatives.
+
+    Raises:
+        ValueError: always.
+    """
+    raise ValueError(
+        f"splat_path: expected a variant such as 'llvm_ad_rgb', got {mi.variant()!r}; call mi.set_variant() before the "
+        "scene is loaded, because Gaussians have RGB colours."
+    )
+
+
 def _register(*_: Any) -> None:
     """Register the plugin with the active variant."""
-    if dr.is_diff_v(mi.Float):
-        plugin = _plugin()
-        mi.register_integrator("splat_path", lambda props: plugin(props))
+    plugin = _plugin() if dr.is_diff_v(mi.Float) else _refuse_variant
+    mi.register_integrator("splat_path", lambda props: plugin(props))
 
 
 mi.detail.add_variant_callback(_register)

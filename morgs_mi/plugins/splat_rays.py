@@ -283,11 +283,13 @@ class SplatRays:
 def _finite(gaussians: ActivatedGaussians, name: str) -> np.ndarray:
     """Return an attribute in float64, detached."""
     values = np.array(dr.detach(getattr(gaussians, name)), np.float64)
-    bad = np.argwhere(~np.isfinite(values))
+    limit = FARTHEST if name == "sh_coeffs" else np.finfo(np.float32).max
+    bad = np.argwhere(~(np.abs(values) <= limit))
     if len(bad):
+        expected = "finite and at most 1e18" if name == "sh_coeffs" else "finite"
         raise ValueError(
-            f"SplatRays(): `{name}` must be finite, got {values[tuple(bad[0])]} at {bad[0].tolist()} ({len(bad)} such "
-            "values); remove these Gaussians."
+            f"SplatRays(): `{name}` must be {expected}, got {values[tuple(bad[0])]} at {bad[0].tolist()} ({len(bad)} "
+            "such values); remove these Gaussians."
         )
     return values
 

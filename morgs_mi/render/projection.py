@@ -37,11 +37,11 @@ from morgs_mi.core.types import Bool, Float, Jit, Tensor, UInt32
 from morgs_mi.render.channels import attribute_channels
 from morgs_mi.render.render_config import RenderConfig
 
-__all__ = ["FARTHEST", "Splats", "Views", "concatenated", "project"]
+__all__ = ["FARTHEST", "AttachedCamera", "Splats", "Views", "concatenated", "project"]
 
 _HALF_LOG2E = 0.5 * log2(2.718281828459045)
 
-# World units; squares of what is farther overflow.
+# World units, or units of a channel; squares of what is farther or larger overflow.
 FARTHEST = 1e18
 # A float32 rotation orients a needle to 1e-7 of its length at best: aspects below this are clamped.
 _THINNEST = 1e-6
@@ -57,7 +57,7 @@ class Splats:
         depths: camera-space z in world units, detached.
         extent: (half width, half height) in px of the region where alpha >= alpha_min, detached; 0 if culled.
         valid: False where culled: behind the near plane, too faint, or not finite.
-        finite: False where an attribute, or a value computed from it, is not finite.
+        finite: False where an attribute, or a value computed from it, is not finite, or a blended one is above 1e18.
         profile: (z, gx, gy, 1 / sigma), the Gaussian in depth along the ray of a pixel (see module docstring), world
             units, differentiable; empty if no depth limit cuts the splats.
         view: index of the view that each splat belongs to, in a region of several views; None: there is one view.
@@ -96,6 +96,17 @@ class Splats:
 
 def _zeros(columns: tuple[Float, ...], count: int) -> tuple[Float, ...]:
     return tuple(dr.zeros(mi.Float, count) for _ in columns)
+
+
+@dataclass(frozen=True)
+class AttachedCamera(Camera):
+    """Camera with intrinsics that get gradients.
+
+    Attributes:
+        intrinsics: fx, fy, cx and cy in pixels, equal to those of `K`.
+    """
+
+    intrinsics: tuple[Float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -182,11 +193,14 @@ def project(
     line = _depth_profile(z, (u0, u1, w), (xx, xy, yy), det, eps, r_focal, r_scale) if "profile" in channels else ()
 
     blended: dict[str, tuple[Float, ...]] = {}
+    largest = mi.Float(0)
     attributes = attribute_channels()
     for name in channels:
         if name == "color":
             direction = dr.select(front, mi.Vector3f(*(mi.Float(v - e) for v, e in zip(world, eye, strict=True))), 1)
-            blended[name] = _colors(direction, gaussians.rows("sh_coeffs", rows))
+            coeffs = gaussians.rows("sh_coeffs", rows)
+            largest = _largest(largest, coeffs)
+            blended[name] = _colors(direction, coeffs)
         elif name == "depth":
             blended[name] = (z,)
         elif name in ("motion", "guided_motion"):
@@ -202,11 +216,19 @@ def project(
     xx, yy = dr.detach(xx), dr.detach(yy)
     # Not finite where any of these values is not.
     probe += sum(dr.detach(v) for v in (*shape, *line, *(v for values in blended.values() for v in values)))
-    finite = dr.isfinite(probe)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    largest = _largest(largest, [v for name, values in blended.items() if name != "depth" for v in values])
+    finite = dr.isfinite(probe) & (largest <= FARTHEST)  # pyright: ignore
     valid = front & (reach > 0) & finite  # pyright: ignore[reportOperatorIssue]
     extent = (dr.sqrt(reach * xx) / s, dr.sqrt(reach * yy) / s)
     view = camera.view if isinstance(camera, Views) else None
     return Splats(shape, blended, dr.detach(z), extent, valid, finite, line, view)
+
+
+def _largest(bound: Float, values: Sequence[Float]) -> Float:
+    """Return the largest absolute value of numbers, at least `bound`, detached."""
+    for value in values:
+        bound = dr.maximum(bound, dr.abs(dr.detach(value)))
+    return bound
 
 
 def _transformed(world: list[Float], pose: list[list[Float]]) -> tuple[Float, Float, Float]:
@@ -252,7 +274,9 @@ def _intrinsics(camera: Camera | Views) -> list[Float]:
         values = [_numbers_of(c) for c in camera.cameras]
         memory, first = from_numpy(mi.Float, values), camera.view * len(values[0])
         return [dr.gather(mi.Float, memory, first + i) for i in range(len(values[0]))]
-    return list(_numbers(mi.Float, tuple(_numbers_of(camera))))
+    values = list(_numbers(mi.Float, tuple(_numbers_of(camera))))
+    attached = camera.intrinsics if isinstance(camera, AttachedCamera) else ()
+    return [*map(dr.replace_grad, values, attached), *values[len(attached) :]]
 
 
 @lru_cache(maxsize=1024)  # the views of a rig are projected to again and again

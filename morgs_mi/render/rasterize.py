@@ -13,7 +13,7 @@ from morgs_mi.core.attributes import BY_ACTIVATED_NAME
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_type, numbers
 from morgs_mi.core.gaussians import ActivatedGaussians, repeat_each
-from morgs_mi.core.memory import float_tensor, from_numpy, refuse_freezing
+from morgs_mi.core.memory import check_memory, float_tensor, from_numpy, refuse_freezing
 from morgs_mi.core.types import Bool, Float, Tensor
 from morgs_mi.io.png import png_bytes
 from morgs_mi.render.backend import block_shape
@@ -29,6 +29,9 @@ __all__ = ["Image", "rasterize"]
 
 # Beside the channels color, depth, motion and confidence, a record then takes seven packets of 4 floats.
 _MOST_FEATURES = 12
+# Pixels from which the free memory is compared with what an image takes, and bytes of a pixel.
+_LARGE = 2**22
+_PIXEL_BYTES = 60
 
 
 @dataclass(frozen=True)
@@ -128,9 +131,10 @@ def rasterize(
         the full computation's.
 
     Raises:
-        ValueError: an unknown channel, a channel with a missing attribute, NaN or infinite attributes or poses, a
-            region of another view or block shape, `static_splats` together with a depth limit, a depth limit with
-            gradients enabled, or a call inside a function under `dr.freeze`.
+        ValueError: an image that does not fit in memory, an unknown channel, a channel with a missing attribute, NaN or
+            infinite attributes or poses, values above 1e18 to blend, a region of another view or block shape,
+            `static_splats` together with a depth limit, a depth limit with gradients enabled, or a call inside a
+            function under `dr.freeze`.
 
     Equal depths are blended in the order of the input. A quaternion of length 0 is the identity. Gaussians nearer than
     the camera's near plane or beyond 1e18 units, and those that overflow float32 once projected, are not drawn.
@@ -305,16 +309,21 @@ def _check(
                 "the channel."
             )
     if background is not None and not (
-        np.shape(background) == (3,) and np.isfinite(numbers("rasterize()", "background", background)).all()
+        np.shape(background) == (3,) and (np.abs(numbers("rasterize()", "background", background)) <= FARTHEST).all()
     ):
         raise ValueError(
-            f"rasterize(): `background` must be three finite numbers, got {background!r}; pass a colour or None."
+            f"rasterize(): `background` must be three finite numbers of at most 1e18, got {background!r}; "
+            "pass a colour or None."
         )
     if camera.width * camera.height > 2**28:
         raise ValueError(
             f"rasterize(): the image must have at most 2^28 pixels, got {camera.width}x{camera.height}; "
             "render it in tiles, one camera each."
         )
+    pixels = camera.width * camera.height
+    if pixels >= _LARGE:
+        size = f"an image of {camera.width}x{camera.height} pixels"
+        check_memory("rasterize()", _PIXEL_BYTES * pixels, size, "render a smaller one, or tiles, one camera each")
 
 
 def _checked_features(features: Tensor | np.ndarray, gaussians: ActivatedGaussians) -> tuple[Tensor, int]:
@@ -353,18 +362,23 @@ def _checked_limits(depth_limit: Tensor | np.ndarray, camera: Camera, static_spl
 
 
 def _check_finite(finite: Bool, gaussians: ActivatedGaussians, camera: Camera, features: Tensor | None) -> None:
-    """Raise an error if a projected Gaussian is not finite because its attributes, or the pose, are not."""
+    """Raise an error if a projected Gaussian is not finite because its attributes, or the pose, are not.
+
+    Values that are blended must also be at most 1e18, beyond which their squares and gradients overflow.
+    """
     if dr.all(finite):
         return
-    names = ["means", "scales", "quats", "opacities", "sh_coeffs", "motion"]
-    names += [attribute.activated_name for attribute in attribute_channels().values()]
+    blended = ["sh_coeffs", "motion", *(attribute.activated_name for attribute in attribute_channels().values())]
+    names = ["means", "scales", "quats", "opacities", *blended]
     values = {"camera.viewmat": camera.viewmat, **{name: getattr(gaussians, name, None) for name in names}}
     for name, value in {**values, "features": features}.items():
         if value is None:
             continue
         array = np.asarray(dr.detach(value))
-        bad = np.argwhere(~np.isfinite(array))
+        bounded = name in (*blended, "features")
+        bad = np.argwhere(~(np.abs(array) <= FARTHEST) if bounded else ~np.isfinite(array))
         if len(bad):
+            worst = array[tuple(bad[0])]
             index = ", ".join(map(str, bad[0]))
             remedy = (
                 "lower the learning rate"
@@ -372,6 +386,6 @@ def _check_finite(finite: Bool, gaussians: ActivatedGaussians, camera: Camera, f
                 else "remove these Gaussians or lower the learning rate"
             )
             raise ValueError(
-                f"rasterize(): `{name}` must be finite, got {array[tuple(bad[0])]} at "
+                f"rasterize(): `{name}` must be {'at most 1e18' if np.isfinite(worst) else 'finite'}, got {worst:g} at "
                 f"[{index}] ({len(bad)} such values); {remedy}."
             )

@@ -27,6 +27,7 @@ from morgs_mi.codec.packets import CodedFrame, decode, keyframe_packet, reemitte
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.io.foreign import refuse_foreign
 from morgs_mi.io.splats import SUFFIXES, read_splats, suffix_of
 from morgs_mi.playback.default_rig import DEFAULT_RIG, Axes, default_rig
 
@@ -63,6 +64,7 @@ def import_frames(
     config: CodecConfig | None = None,
     axes: Axes = "y-down",
     progress: Callable[[int, int], None] | None = None,
+    most_invalid: float = 0.0,
 ) -> Imported:
     """Write files with Gaussians, one per frame, as a stream, and return a summary; the stream is written atomically.
 
@@ -76,6 +78,7 @@ def import_frames(
         config: precision of the stream.
         axes: direction that is up.
         progress: called with (frames done, number of frames).
+        most_invalid: share of a frame's Gaussians with invalid numbers that are left out with a warning; 0: none.
 
     Raises:
         FileNotFoundError: a file or the folder is missing.
@@ -90,7 +93,7 @@ def import_frames(
         raise FileExistsError(f"{path}: expected a new stream, got a file that exists; remove it, or name another.")
     in_view = np.unique(np.linspace(0, len(paths) - 1, _FRAMES_IN_VIEW).astype(int))
     try:
-        cameras = default_rig([read_splats(paths[t]) for t in in_view], axes)
+        cameras = default_rig([read_splats(paths[t], most_invalid) for t in in_view], axes)
     except ValueError as error:
         if any(str(error).startswith(f"{path}: ") for path in paths):
             raise
@@ -100,7 +103,7 @@ def import_frames(
     metadata = {"num_frames": len(paths), DEFAULT_RIG: True, "config": {"codec": asdict(config)}}
     with atomic_path(path, "import_frames()") as partial, StreamWriter(partial, cameras, fps, metadata) as writer:
         for frame, source in enumerate(paths):
-            gaussians = read_splats(source)
+            gaussians = read_splats(source, most_invalid)
             rows = None if coded is None else matched_rows(coded.gaussians.select(np.argsort(order)), gaussians)
             if coded is None or rows is None:
                 order = np.arange(len(gaussians))
@@ -138,6 +141,8 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
         folder = paths[0]
         paths = sorted((path for path in folder.iterdir() if path.is_file() and suffix_of(path)), key=_by_numbers)
         if not paths:
+            for file in sorted(folder.iterdir()):
+                refuse_foreign(file)
             raise ValueError(
                 f"{folder}: expected files whose names end in {', '.join(SUFFIXES)}, got none; convert the frames."
             )
@@ -145,6 +150,7 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
         raise ValueError("import_frames(): `sources` must be a folder or at least one file, got none.")
     first = {suffix_of(path): path for path in reversed(paths)}
     if None in first:
+        refuse_foreign(first[None])
         raise ValueError(
             f"{first[None]}: expected one folder, or files whose names end in {', '.join(SUFFIXES)}, got another; "
             "convert it, or leave it out."

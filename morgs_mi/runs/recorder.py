@@ -16,6 +16,7 @@ from morgs_mi.core.files import locked_folder, write_json
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.rig import scene_extent
+from morgs_mi.fit.capacity import check_capacity
 from morgs_mi.fit.view import View, mean_psnr
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.source import about_lenses, as_fitted
@@ -63,12 +64,14 @@ def stream_capture(
         OSError: the disk is full or not writable, another fit writes into OUT, or the stream was removed, moved or
         replaced meanwhile; the stream is complete up to the last frame.
         ValueError: as `StreamLoop`; OUT lies in a capture; or the stream to resume is damaged, or belongs to another
-        capture or other settings.
+        capture or other settings; or images, Gaussians or steps that do not fit in memory.
     """
     out = Path(out)
+    config = config or StreamConfig()
     check_outputs(out)
+    check_capacity("stream_capture()", [capture.cameras[view] for view in capture.train_views], config.fit)
     with locked_folder(out, "stream_capture()"):
-        return _stream(capture, out, config or StreamConfig(), resume, Progress(progress))
+        return _stream(capture, out, config, resume, Progress(progress))
 
 
 def _stream(capture: Capture, out: Path, config: StreamConfig, resume: bool, progress: Progress) -> list[FrameReport]:

@@ -23,6 +23,7 @@ from morgs_mi.capture.outputs import check_output
 from morgs_mi.capture.truth import Tracks, save_tracks, save_truth
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path, write_json
+from morgs_mi.core.memory import check_memory
 from morgs_mi.io.bounded import read_json
 from morgs_mi.io.video import open_frames
 from morgs_mi.io.video_writer import playable_format, write_video
@@ -42,6 +43,8 @@ from morgs_mi.synth.synth_config import SynthConfig
 __all__ = ["synthesize"]
 
 _LOG = logging.getLogger(__name__)
+# Bytes of a pixel of an image with its ground truth.
+_PIXEL_BYTES = 100
 _NUM_SFM_POINTS = 8000
 _NUM_TRACKS = 2000
 
@@ -87,6 +90,9 @@ def synthesize(
         )
     config = config or SynthConfig()
     config.check()
+    pixels = config.width * config.height
+    size = f"images of {config.width}x{config.height} pixels"
+    check_memory("synthesize()", _PIXEL_BYTES * pixels, size, "make them smaller (`width`, `height`)")
     scene = _loaded(scene, config)
     rig = _Rig.of(scene, config.completed(scene.recording))
     check_lenses(rig.cameras, rig.disturbed)

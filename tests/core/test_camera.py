@@ -43,6 +43,25 @@ def test_project__inverts_the_rays_of_the_mitsuba_sensor(camera):
     assert_close(camera.project(points)[0], np.stack([x, y], axis=1), atol=2e-3)
 
 
+@pytest.mark.parametrize("ratio", [0.8, 0.99, 1.3])
+def test_sensor__refuses_two_focal_lengths(camera, ratio):
+    K = np.diag([1, ratio, 1]) @ camera.K
+    K[1, 2] = camera.K[1, 2]
+    view = replace(camera, K=K, width=640, height=480)
+    with pytest.raises(ValueError, match=r"Camera\.sensor\(\): `K` must have equal focal lengths.*camera\.square\(\)"):
+        view.sensor()
+    square = view.square()
+    mi.load_dict(square.sensor())
+    point = np.array([0.2, -0.3, 0.1])
+    scale = [1, square.height / view.height]
+    assert_close(square.project(point)[0], view.project(point)[0] * scale, atol=1e-9)
+    assert abs(square.K[0, 0] / square.K[1, 1] - 1) * square.height <= 0.5
+
+
+def test_sensor__accepts_focal_lengths_that_differ_by_less_than_a_pixel(camera):
+    mi.load_dict(replace(camera, K=np.diag([1, 1 + 0.9 / 48, 1]) @ camera.K).sensor())
+
+
 def test_unproject__inverts_project(camera):
     points = np.random.default_rng(0).uniform(-1, 1, (4, 5, 3))
     pixels, depths = camera.project(points)

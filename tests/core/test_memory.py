@@ -1,13 +1,19 @@
-"""Copies of NumPy memory for Dr.Jit: types, alignment, and later writes."""
+"""Copies of NumPy memory for Dr.Jit: types, alignment, and later writes. Memory that is free."""
 
 from __future__ import annotations
+
+import subprocess
+import sys
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import pytest
 
-from morgs_mi.core.memory import from_numpy, owned_copy
+from morgs_mi import Camera, FitConfig, StreamConfig, StreamLoop, cli, rasterize
+from morgs_mi.core.memory import check_memory, from_numpy, owned_copy
+from morgs_mi.playback.export.panorama import panorama
+from tests.scenes.changing_splats import splats
 
 
 @pytest.mark.parametrize("kind", ["Float", "Float64", "Int32", "UInt32", "Bool", "TensorXf"])
@@ -49,3 +55,54 @@ def test_from_numpy__is_refused_under_freeze():
     with pytest.raises(RuntimeError) as error:
         frozen(dr.arange(mi.Float, 4))
     assert "expected a call outside dr.freeze" in str(error.value.__cause__)
+
+
+def test_free_memory__is_at_most_what_the_process_may_use():
+    script = """
+import resource
+from morgs_mi.core.memory import free_memory
+resource.setrlimit(resource.RLIMIT_AS, (4_000_000_000, resource.RLIM_INFINITY))
+print(free_memory())
+"""
+    output = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert 0 < float(output.splitlines()[-1]) < 4e9
+
+
+def test_check_memory__names_what_is_needed_and_free(monkeypatch):
+    monkeypatch.setattr("morgs_mi.core.memory.free_memory", lambda: 2e9)
+    check_memory("f()", 1.9e9, "an image", "make it smaller")
+    with pytest.raises(ValueError, match=r"^f\(\): expected what fits in the 2\.0 GB of free .*, got an image, which"):
+        check_memory("f()", 2.1e9, "an image", "make it smaller")
+
+
+def wide(width: int) -> Camera:
+    return Camera.look_at((0, 0, -5), (0, 0, 0), (0, -1, 0), 40, width, width)
+
+
+DOORS = {
+    "image": (lambda: rasterize(splats(), wide(16000)), "an image of 16000x16000 pixels"),
+    "panorama": (lambda: panorama(splats(), wide(8), 1_000_000_000), "`width=1000000000`"),
+    "gaussians": (
+        lambda: StreamLoop([wide(8)], (), (), StreamConfig(fit=FitConfig(num_gaussians=10**9))),
+        "`num_gaussians=1000000000`",
+    ),
+    "steps": (
+        lambda: StreamLoop([wide(8)], (), (), StreamConfig(fit=FitConfig(first_frame_steps=10**9))),
+        "`first_frame_steps=1000000000`",
+    ),
+    "views": (lambda: StreamLoop([wide(40_000)], (), ()), "1 views with 1600000000 pixels"),
+}
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_check_memory__is_called_before_work_begins(door, monkeypatch):
+    call, content = DOORS[door]
+    monkeypatch.setattr("morgs_mi.core.memory.free_memory", lambda: 8e9)
+    with pytest.raises(ValueError, match=rf"\(\): expected what fits in the 8\.0 GB of free .*, got {content}, "):
+        call()
+
+
+def test_synthesize__refuses_images_that_do_not_fit_in_memory(tmp_path, capsys):
+    assert cli.main(["synth", "spheres", str(tmp_path / "a"), "--width", "1000000000", "--height", "1000000"]) == 1
+    assert "got images of 1000000000x1000000 pixels" in capsys.readouterr().err
+    assert not (tmp_path / "a").exists()

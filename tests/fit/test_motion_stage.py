@@ -16,8 +16,6 @@ from morgs_mi.method.motion_start import MotionStart
 from tests.scenes.ball import opaque_ball
 from tests.scenes.shifted_ball import FIT, PLAIN, SHIFT, fit_shifted, motion_error, psnr_of
 
-MODEL = replace(PLAIN, model="test-shift")
-
 
 @MOTION_MODELS.register("test-shift")
 def _one_shift(argument: str, config: MotionConfig) -> MotionModelFactory:
@@ -33,6 +31,9 @@ def _one_shift(argument: str, config: MotionConfig) -> MotionModelFactory:
         )
 
     return make
+
+
+MODEL = replace(PLAIN, model="test-shift")
 
 
 def fit(config: FitConfig = FIT, start: MotionStart | None = None, share: float = MODEL.model_share):

@@ -10,7 +10,7 @@ import pytest
 from tests import reference
 from tests import tolerances as tol
 from tests.assertions import assert_close
-from tests.gaussian_integrator.expected import expected_image
+from tests.gaussian_integrator.expected import expected_image, to_linear
 from tests.reference import rasterize_view
 from tests.scenes.cameras import make_sensor_camera
 from tests.scenes.gaussians import to_gaussians
@@ -135,3 +135,35 @@ def test_gaussian_splat__differentiates_filter_and_crop(raw):
     dr.set_grad(data, 0)
     dr.backward(dr.sum(mi.render(scene, params) * mi.TensorXf(g), axis=None))
     assert np.vdot(np.asarray(dr.grad(data), np.float64), v) == pytest.approx(forward, rel=tol.DUALITY_REL)
+
+
+# Change of K by a parameter of the sensor, for a film of W x H pixels.
+INTRINSICS = {
+    "x_fov": lambda K, W, H: np.diag([1, 1, 0]) * -0.5 * np.deg2rad(1) * (K[0, 0] ** 2 / (W / 2) + W / 2),
+    "principal_point_offset_x": lambda K, W, H: np.array([[0, 0, -W], [0, 0, 0], [0, 0, 0]]),
+    "principal_point_offset_y": lambda K, W, H: np.array([[0, 0, 0], [0, 0, -H], [0, 0, 0]]),
+}
+
+
+@pytest.mark.parametrize("name", INTRINSICS)
+def test_gaussian_splat__gradient_of_the_sensors_intrinsics(raw, name):
+    camera, scene = make_sensor_camera(), make_mitsuba_scene(to_gaussians(raw))
+    viewmat, K = (np.float32(matrix).astype(np.float64) for matrix in (camera.viewmat, camera.K))
+
+    def loss(values):
+        image = reference.rasterize(raw, values["K"], viewmat, camera.width, camera.height)["color"]
+        return np.sum(to_linear(image) ** 2)
+
+    change = INTRINSICS[name](K, camera.width, camera.height)
+    expected = reference.directional(loss, {"K": K}, {"K": change})
+    params = mi.traverse(scene)
+    parameter = params[f"sensor.{name}"]
+    dr.enable_grad(parameter)
+    params.update()
+    dr.backward(dr.sum(dr.square(mi.render(scene, params)), axis=None))
+    assert dr.grad(parameter)[0] == pytest.approx(expected, rel=10 * tol.GRADIENT_REL)
+    dr.set_grad(parameter, 1)
+    image = mi.render(scene, params)
+    dr.forward_to(image)
+    slope = 2 * np.vdot(np.asarray(image, np.float64), np.asarray(dr.grad(image)))
+    assert slope == pytest.approx(expected, rel=10 * tol.GRADIENT_REL)

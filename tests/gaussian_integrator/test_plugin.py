@@ -155,6 +155,34 @@ def test_gaussian_splat__refuses_bad_props_when_the_scene_is_loaded(props, messa
         mi.load_dict({"type": "gaussian_splat", **props})
 
 
+@pytest.mark.parametrize(
+    "outer", [{"type": "aov", "aovs": "dd:depth"}, {"type": "moment"}], ids=lambda outer: outer["type"]
+)
+def test_gaussian_splat__refuses_an_integrator_around_it(outer):
+    scene = {"type": "scene", "sensor": make_sensor_camera().sensor(), **with_shape()}
+    scene = mi.load_dict({**scene, "integrator": {**outer, "inner": {"type": "gaussian_splat"}}})
+    with pytest.raises(RuntimeError) as error:
+        mi.render(scene)
+    assert "expected to be the scene's integrator, got an integrator around it" in str(error.value.__cause__)
+
+
+def test_gaussian_splat__names_variants_that_it_does_not_work_in():
+    """All of `splat_path` and `surfaces` have RGB colours."""
+    script = r"""
+import morgs_mi, mitsuba as mi
+for variant in ("scalar_rgb", "llvm_ad_mono", "llvm_ad_spectral"):
+    mi.set_variant(variant)
+    for plugin in ({"type": "splat_path"}, {"type": "gaussian_splat", "surfaces": {"type": "path"}}):
+        try:
+            mi.load_dict(plugin)
+            print("\n>", plugin)
+        except RuntimeError as error:
+            print("\n>", "expected a variant such as 'llvm_ad_rgb'" in str(error))
+"""
+    output = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True).stdout
+    assert [line for line in output.splitlines() if line.startswith(">")] == 6 * ["> True"]
+
+
 def test_ellipsoids__refuse_no_gaussians(raw):
     with pytest.raises(ValueError, match="at least one Gaussian"):
         ellipsoids(to_gaussians({name: value[:0] for name, value in raw.items()}))

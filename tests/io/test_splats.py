@@ -44,10 +44,14 @@ def test_read_splats__reads_an_uncompressed_ply(tmp_path):
     ("name", "content", "message"),
     [
         ("a.splat", bytes(33), "expected 32 bytes for each Gaussian, got 33 bytes"),
-        ("a.splat", RECORD.pack(*(0,) * 14) + RECORD.pack(np.nan, *(0,) * 13), "expected finite means, .* Gaussian 1"),
-        ("a.splat", RECORD.pack(*(0,) * 3, -1, *(0,) * 10), "expected finite scales of at least 0, got .* Gaussian 0"),
+        (
+            "a.splat",
+            RECORD.pack(*(0,) * 14) + RECORD.pack(np.nan, *(0,) * 13),
+            "others in 1 of 2 Gaussians .centre of 1.",
+        ),
+        ("a.splat", RECORD.pack(*(0,) * 3, -1, *(0,) * 10), "others in 1 of 1 Gaussians .size of 0."),
         ("a.ply", b"", "expected a complete PLY file"),
-        ("a.ksplat", b"", r"name ends in .compressed.ply, .ply, .splat, got '.ksplat'"),
+        ("a.xyz", b"", r"name ends in .compressed.ply, .ply, .splat, got '.xyz'"),
     ],
 )
 def test_read_splats__names_what_is_broken(tmp_path, name, content, message):

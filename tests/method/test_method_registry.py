@@ -49,6 +49,20 @@ def test_registry__rejects_bad_and_taken_names(registry, name, message):
         registry.register(name)
 
 
+@pytest.mark.parametrize(
+    ("setting", "value"),
+    [("flow_method", "diss"), ("flow_method", "files"), ("flow_method", ""), ("mask_method", "sam"), ("model", "mesh")],
+)
+def test_motion_config__refuses_names_that_are_not_registered(setting, value):
+    with pytest.raises(ValueError, match=rf"^MotionConfig\(\): `{setting}` must be one of .*, got '{value}'\.$"):
+        morgs_mi.MotionConfig(**{setting: value})
+
+
+def test_motion_config__accepts_arguments_whose_files_are_not_there_yet():
+    config = morgs_mi.MotionConfig(flow_method="files:none", mask_method="sam2:a.onnx,b.onnx")
+    assert config.flow_method == "files:none"
+
+
 # Both run in a copy of the package, in which the page's example is one more module.
 FLOW = """
 import numpy as np

@@ -25,7 +25,7 @@ def tensor(*shape: int) -> mi.TensorXf:
 
 def test_motion_model__is_the_one_that_the_setting_selects():
     assert motion_model(MotionConfig()) is None
-    with pytest.raises(ValueError, match=r"motion_model\(\): `model` must be one of none.*, got 'mesh'\."):
+    with pytest.raises(ValueError, match=r"MotionConfig\(\): `model` must be one of none.*, got 'mesh'\."):
         motion_model(MotionConfig(model="mesh"))
 
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -10,7 +12,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from morgs_mi import cli
+from morgs_mi import Camera, cli
 from morgs_mi.codec.packets import decode, play, seek
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.io.exr import read_exr
@@ -21,6 +23,7 @@ from morgs_mi.playback.streams import open_stream
 from morgs_mi.playback.viewer.frame_cache import FrameCache
 from morgs_mi.render.rasterize import rasterize
 from tests.assertions import assert_close
+from tests.scenes.cameras import look_at_cameras
 from tests.scenes.changing_splats import rig, splats
 
 MESH = """ply
@@ -206,3 +209,100 @@ def test_splat_file__without_gaussians_is_named(tmp_path):
     write_ply(tmp_path / "scene.ply", splats(0))
     with pytest.raises(ValueError, match=r"scene\.ply: expected at least one Gaussian, got none"):
         open_stream(tmp_path / "scene.ply")
+
+
+def ring(center, count: int = 6, distance: float = 5) -> list[Camera]:
+    """Return cameras on a circle that look at its centre."""
+    angles = 2 * np.pi * np.arange(count) / count
+    origins = [np.add(center, (distance * np.sin(a), 0, -distance * np.cos(a))) for a in angles]
+    return look_at_cameras(origins, 45, 64, 48, [f"{i:05d}" for i in range(count)], target=center, up=(0, -1, 0))
+
+
+OTHER_SCENES = {
+    "far away": ring((300, 0, 0)),
+    "a dot in one image": ring((300, 0, 0), 4),
+    "looking away": [Camera.look_at((0, 0, 3), (x, 0, 9), (0, -1, 0), 45, 64, 48, f"{x}") for x in (-1, 0, 1)],
+    "much larger": ring((0, 0, 0), 6, 1e5),
+}
+
+
+@pytest.mark.parametrize("kind", OTHER_SCENES)
+def test_splat_file__has_a_ring_where_the_cameras_are_of_another_scene(tmp_path, kind, caplog, run):
+    path = write_model(tmp_path, OTHER_SCENES[kind])
+    stream = open_stream(path)
+    assert (len(stream.cameras), stream.metadata["default_rig"], stream.cameras_file) == (8, True, None)
+    assert re.search(r"cameras\.json: its cameras see 0\.0 % of the Gaussians of point_cloud\.ply", caplog.text)
+    assert run("render", path, tmp_path / "a.png", "--width", 64)[0] == 0
+    assert cv2.imread(str(tmp_path / "a.png")).max() > 0
+
+
+def test_splat_file__leaves_out_single_cameras_of_another_scene(tmp_path, caplog):
+    foreign, *others = ring((300, 0, 0), 2)[:1] + list(rig())
+    stream = open_stream(write_model(tmp_path, [foreign, *others]))
+    assert [camera.name for camera in stream.cameras] == ["left", "middle", "right"]
+    assert "1 of 4 cameras are left out, because they see next to nothing of the Gaussians" in caplog.text
+
+
+def test_splat_file__keeps_cameras_that_see_a_single_gaussian(tmp_path):
+    path = write_model(tmp_path, rig())
+    write_ply(path, splats(1))
+    assert open_stream(path).cameras_file == tmp_path / "cameras.json"
+
+
+@pytest.mark.parametrize("command", [("render",), ("export", "video"), ("export", "web")], ids=" ".join)
+def test_commands__name_the_cameras_that_they_use(tmp_path, run, command):
+    path = write_model(tmp_path, rig())
+    status, _, error = run(*command, path, *(["--width", 32] if command != ("export", "web") else []))
+    assert (status, error) == (0, f"Cameras: {tmp_path}/cameras.json.\n")
+
+
+def with_nan(path: Path, rows: int) -> Path:
+    """Write 40 splats, the first of which have no finite centre."""
+    means = splats().numpy()["means"]
+    means[:rows] = np.nan
+    write_ply(path, replace(splats(), means=means))
+    return path
+
+
+DRAWING = [("render",), ("export", "video"), ("export", "web")]
+WRITING = [("export", kind) for kind in ("ply", "gltf", "usd", "tracks")]
+
+
+@pytest.mark.parametrize("command", DRAWING, ids=" ".join)
+def test_commands__draw_without_invalid_gaussians(tmp_path, run, caplog, command):
+    path = with_nan(tmp_path / "a.ply", 2)
+    options = [] if command == ("export", "web") else ["--width", 32]
+    assert run(*command, path, *options)[0] == 0
+    assert "a.ply: 2 of 40 Gaussians are left out" in caplog.text
+
+
+@pytest.mark.parametrize("command", WRITING, ids=" ".join)
+def test_commands__write_no_other_number_of_gaussians_unasked(tmp_path, run, command):
+    path = with_nan(tmp_path / "a.ply", 1)
+    status, _, error = run(*command, path)
+    assert (status, [file.name for file in tmp_path.iterdir()]) == (1, ["a.ply"])
+    assert "others in 1 of 40 Gaussians (centre of 0); leave them out with --drop-invalid" in error
+    assert run(*command, path, "--drop-invalid")[0] == 0
+
+
+def test_commands__refuse_a_file_that_is_broken_as_a_whole(tmp_path, run):
+    path = with_nan(tmp_path / "a.ply", 30)
+    status, _, error = run("render", path, tmp_path / "a.png")
+    assert (status, "others in 30 of 40 Gaussians" in error) == (1, True)
+    assert run("render", path, tmp_path / "a.png", "--width", 32, "--drop-invalid")[0] == 0
+    path = with_nan(tmp_path / "b.ply", 40)
+    status, _, error = run("render", path, tmp_path / "b.png", "--drop-invalid")
+    assert (status, "expected at least one Gaussian, got none" in error) == (1, True)
+
+
+@pytest.mark.parametrize("link", [None, Path.symlink_to, Path.hardlink_to])
+def test_export__does_not_replace_its_source(tmp_path, run, link):
+    write_ply(tmp_path / "a.ply", splats())
+    content = (tmp_path / "a.ply").read_bytes()
+    output = tmp_path / "a.ply" if link is None else tmp_path / "b.ply"
+    if link is not None:
+        link(output, tmp_path / "a.ply")
+    status, _, error = run("export", "ply", tmp_path / "a.ply", output)
+    assert (status, f"{output}: expected an output beside its source" in error) == (1, True)
+    assert (tmp_path / "a.ply").read_bytes() == content
+    assert run("export", "ply", tmp_path / "a.ply", tmp_path / "c.ply")[0] == 0

@@ -139,9 +139,11 @@ def raw_gaussians(**change: Any) -> Gaussians:
         {"logit_opacities": np.array([-1e38, -100, -17, 17, 100, 1e38])},
         {"logit_confidence": np.array([-1e38, -100, -17, 17, 100, 1e38])},
         {"means": np.array([1e30, -3e38, 1e19, 0, 1e-30, 3e38])[:, None] * np.ones(3)},
-        {"sh_coeffs": np.full((6, 4, 3), -3e37)},
+        {"sh_coeffs": np.full((6, 4, 3), -1e18)},
+        {"sh_coeffs": np.full((6, 4, 3), 1e18)},
+        {"motion": np.full((6, 3), 1e17)},
     ],
-    ids=["scales", "needles", "opacities", "confidence", "means", "colours"],
+    ids=["scales", "needles", "opacities", "confidence", "means", "colours below 0", "colours", "motion"],
 )
 def test_rasterize__raw_extremes_stay_finite(change):
     gaussians = raw_gaussians(**change)
@@ -160,8 +162,11 @@ def test_rasterize__raw_extremes_stay_finite(change):
         ({"means": np.full((6, 3), [0, 0, -np.inf])}, r"`means` must be finite, got -inf at \[0, 2\]"),
         ({"means": np.full((6, 3), [0, 0, -10.0]), "quats": np.full((6, 4), np.nan)}, "`quats` must be finite"),
         ({"quats": np.full((6, 4), [0, 0, 0, np.nan])}, r"`quats` must be finite, got nan at \[0, 3\]"),
+        ({"sh_coeffs": np.full((6, 4, 3), 3e38)}, r"`sh_coeffs` must be at most 1e18, got 3e\+38 at \[0, 0, 0\] \(72 "),
+        ({"sh_coeffs": np.full((6, 4, 3), -1e20)}, r"`sh_coeffs` must be at most 1e18, got -1e\+20"),
+        ({"motion": np.full((6, 3), 1e30)}, r"`motion` must be at most 1e18, got 1e\+30 at \[0, 0\]"),
     ],
-    ids=["overflow", "infinite mean", "behind the camera", "one component"],
+    ids=["overflow", "infinite mean", "behind", "one component", "colours", "negative colours", "motion"],
 )
 def test_rasterize__refuses_non_finite_attributes_anywhere(change, message):
     with pytest.raises(ValueError, match=message):
@@ -179,3 +184,10 @@ def test_rasterize__fuzz():
 @pytest.mark.long
 def test_rasterize__fuzz_with_many_seeds():
     assert not fuzz(range(10, 210))
+
+
+def test_rasterize__refuses_features_and_backgrounds_whose_squares_overflow():
+    with pytest.raises(ValueError, match=r"`features` must be at most 1e18, got 1e\+20 at \[0, 0\]"):
+        rasterize(raw_gaussians(), eye(), features=np.full((6, 2), 1e20))
+    with pytest.raises(ValueError, match=r"`background` must be three finite numbers of at most 1e18, got"):
+        rasterize(raw_gaussians(), eye(), background=(0, 0, 1e30))

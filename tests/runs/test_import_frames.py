@@ -205,9 +205,9 @@ def test_import_frames__reads_gaussians_without_extent(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"means": np.full((2, 3), 1e30)}, r"0\.ply: expected centres of at most 1e\+12, got larger ones"),
-        ({"log_scales": np.full((2, 3), 1000.0)}, r"0\.ply: expected sizes of at most 1e\+12"),
-        ({"sh_coeffs": np.full((2, 1, 3), -1e20)}, r"0\.ply: expected coefficients of colour of at most 1e\+12"),
+        ({"means": np.full((2, 3), 1e30)}, r"0\.ply: .* in 2 of 2 Gaussians \(centre of 0, 1\)"),
+        ({"log_scales": np.full((2, 3), 1000.0)}, r"0\.ply: .* in 2 of 2 Gaussians \(size of 0, 1\)"),
+        ({"sh_coeffs": np.full((2, 1, 3), -1e20)}, r"0\.ply: .* in 2 of 2 Gaussians \(colour of 0, 1\)"),
         ({"means": np.array([[-9e11] * 3, [9e11] * 3])}, r"Camera\('front'\).*the pose must be finite, with numbers"),
     ],
 )
@@ -215,6 +215,27 @@ def test_import_frames__names_the_file_of_huge_numbers(tmp_path, change, message
     write_ply(tmp_path / "0.ply", replace(splats(2, 0), **change))
     with pytest.raises(ValueError, match=f"^{tmp_path}.*{message}"):
         import_frames([tmp_path], tmp_path / "out")
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+def test_import_frames__accepts_an_empty_frame(tmp_path, place):
+    frames = [moving(t) for t in range(3)]
+    frames[place] = splats(0)
+    import_frames([write_frames(tmp_path / "clip", frames)], tmp_path / "s.morgs")
+    counts = [len(gaussians) for _, gaussians in play(StreamReader(tmp_path / "s.morgs"))]
+    assert counts == [0 if t == place else N for t in range(3)]
+
+
+def test_import_frames__leaves_out_invalid_gaussians_if_asked_to(tmp_path, caplog):
+    frames = [moving(t) for t in range(3)]
+    means = frames[1].numpy()["means"]
+    means[[4, 7], 1] = np.nan, np.inf
+    clip = write_frames(tmp_path / "clip", [frames[0], replace(frames[1], means=means), frames[2]])
+    with pytest.raises(ValueError, match=r"frame1\.ply: .* in 2 of 300 Gaussians .*--drop-invalid"):
+        import_frames([clip], tmp_path / "s.morgs")
+    assert cli.main(["import", str(clip), str(tmp_path / "s.morgs"), "--drop-invalid"]) == 0
+    assert [len(gaussians) for _, gaussians in play(StreamReader(tmp_path / "s.morgs"))] == [N, N - 2, N]
+    assert "frame1.ply: 2 of 300 Gaussians are left out" in caplog.text
 
 
 def test_import_frames__refuses_frames_without_gaussians(tmp_path):

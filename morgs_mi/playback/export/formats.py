@@ -93,12 +93,15 @@ def destination(
         stem: name of a camera or a path, for the name of the output.
 
     Raises:
-        ValueError: as `choose_format` and `check_output`, or a folder stands where a file is to be written.
+        ValueError: as `choose_format` and `check_output`, a folder stands where a file is to be written, or the output
+            is the stream itself, by any of its names.
     """
     chosen = choose_format(formats, output, name)
     path = check_output(output or stream.with_name(chosen.default.format(stem)))
     if chosen.is_file(path) and path.is_dir():
         raise ValueError(f"{path}: expected a file to write, got a folder; choose another name.")
+    if path.exists() and stream.exists() and path.samefile(stream):
+        raise ValueError(f"{path}: expected an output beside its source, got the source itself; choose another name.")
     return path, chosen
 
 

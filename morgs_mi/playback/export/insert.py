@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
 
+import cv2
 import mitsuba as mi
 import numpy as np
 
@@ -27,6 +28,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded, check_number
 from morgs_mi.core.color_space import linear_to_srgb, srgb_to_linear
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.ranges import check_ranges
 from morgs_mi.gaussian_integrator import ellipsoids
 from morgs_mi.playback.export.clips import frame_numbers
 from morgs_mi.playback.export.frames import MATTE
@@ -74,6 +76,7 @@ class InsertConfig:
 
     def __post_init__(self) -> None:
         check_number("render_inserted()", "samples", self.samples, "[1, inf)")
+        check_ranges(self, "render_inserted()")
 
 
 def load_insert(path: str | Path) -> Build:
@@ -169,7 +172,17 @@ def render_inserted(
     for frame, gaussians in play(stream):
         if frames is None or frame in frames:
             entries = build(frame, frame / stream.fps)
-            yield frame, _render(gaussians, camera, entries, channels, config)
+            images = _render(gaussians, camera.square(), entries, channels, config)
+            yield frame, {name: _resized(name, image, camera) for name, image in images.items()}
+
+
+def _resized(name: str, image: np.ndarray, camera: Camera) -> np.ndarray:
+    """Return an image [H', W, C] of a camera's `square` view with the camera's height H."""
+    scale = camera.height / image.shape[0]
+    if scale == 1:
+        return image
+    resized = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
+    return resized.reshape(camera.height, camera.width, -1) * (np.float32([1, scale]) if name == "motion" else 1)
 
 
 def captured_light(gaussians: Gaussians, camera: Camera, position: np.ndarray) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from morgs_mi.codec.reader import StreamReader
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_number
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.memory import check_memory
 from morgs_mi.playback.export.axes import up_direction
 from morgs_mi.playback.export.clips import flight_views
 from morgs_mi.playback.export.paths import CameraPath
@@ -36,6 +37,9 @@ __all__ = ["levelled", "panorama", "panoramas"]
 
 # Rays that are traced at a time.
 _MOST_RAYS = 2**20
+# Bytes of a pixel of the result with a copy, and of a ray.
+_PIXEL_BYTES = 24
+_RAY_BYTES = 200
 
 
 def panorama(
@@ -63,6 +67,13 @@ def panorama(
     if width < 2 or width % 2:
         raise ValueError(f"panorama(): `width` must be even and at least 2, got {width}; it is twice the height.")
     height, eyes = width // 2, (-0.5, 0.5) if stereo else (0.0,)
+    strip = max(_MOST_RAYS, width * samples**2)
+    check_memory(
+        "panorama()",
+        _PIXEL_BYTES * len(eyes) * height * width + _RAY_BYTES * strip,
+        f"`width={width}`",
+        "make it smaller",
+    )
     if not len(gaussians):
         return np.zeros((len(eyes) * height, width, 3), np.float32)
     rays, to_world = SplatRays(gaussians, config), np.linalg.inv(np.asarray(camera.viewmat, np.float64))[:3]

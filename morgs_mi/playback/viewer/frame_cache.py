@@ -13,7 +13,7 @@ from morgs_mi.codec.container import PacketKind, TruncatedStreamError
 from morgs_mi.codec.packets import CodedFrame, frames_near
 from morgs_mi.core.files import is_same_file
 from morgs_mi.playback.player import PROVISIONAL
-from morgs_mi.playback.streams import open_stream, stream_path
+from morgs_mi.playback.streams import DRAWN, open_stream, stream_path
 
 __all__ = ["NO_TRAILS", "FrameCache", "Trails"]
 
@@ -36,6 +36,7 @@ class FrameCache:
 
     Args:
         path: stream file, or the folder of a fit.
+        most_invalid: as for `open_stream`.
 
     Attributes:
         stream: the file.
@@ -45,8 +46,8 @@ class FrameCache:
         FileNotFoundError, ValueError: as for `open_stream`.
     """
 
-    def __init__(self, path: str | Path) -> None:
-        self._path = stream_path(path)
+    def __init__(self, path: str | Path, most_invalid: float = DRAWN) -> None:
+        self._path, self._most_invalid = stream_path(path), most_invalid
         self._centres: OrderedDict[int, tuple[np.ndarray, np.ndarray]] = OrderedDict()
         self._reopen()
         self.frames: list[int] = []
@@ -139,7 +140,7 @@ class FrameCache:
         return provisional if provisional.is_file() and not open_stream(self._path).index() else self._path
 
     def _reopen(self) -> None:
-        self.stream = open_stream(self._newest())
+        self.stream = open_stream(self._newest(), self._most_invalid)
         self._opened = self.stream.path.stat()
         self._current: CodedFrame | None = None
         self._upcoming: Iterator[CodedFrame] = iter(())

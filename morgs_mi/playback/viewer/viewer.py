@@ -23,6 +23,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.png import png_bytes
 from morgs_mi.playback.player import MOTION_SCALE, channel_image, render, render_config, stream_name
+from morgs_mi.playback.streams import DRAWN
 from morgs_mi.playback.viewer.access import checked_connections
 from morgs_mi.playback.viewer.controls import FREE, Controls, control_table
 from morgs_mi.playback.viewer.frame_cache import NO_TRAILS, FrameCache
@@ -82,8 +83,10 @@ class Viewer:
         path: stream file, or the folder of a fit; it may still be written.
         config: address and initial settings.
         on_served: called as soon as a browser can open the page, which then loads while the first frame is decoded.
+        most_invalid: as for `open_stream`.
 
     Attributes:
+        stream: the file, as it was opened.
         url: address of the page on this machine.
         is_public: whether other machines can reach it.
 
@@ -97,6 +100,7 @@ class Viewer:
         path: str | Path,
         config: ViewerConfig | None = None,
         on_served: Callable[[Viewer], None] = lambda viewer: None,
+        most_invalid: float = DRAWN,
     ) -> None:
         try:
             import viser
@@ -105,13 +109,14 @@ class Viewer:
                 "Viewer(): expected viser, found none; install it with pip install 'morgs-mi[viewer]'."
             ) from error
         config = config or ViewerConfig()
-        self._cache, self._trail, self._stopped = FrameCache(path), config.trail, Event()
+        self._cache, self._trail, self._stopped = FrameCache(path, most_invalid), config.trail, Event()
         self._follow = config.follow
         if not self._cache.frames:
             raise ValueError(
                 f"{self._cache.stream.path}: at least one frame was expected, got none; wait for the first."
             )
-        self._cameras = self._cache.stream.cameras
+        self.stream = self._cache.stream
+        self._cameras = self.stream.cameras
         self._config = render_config(self._cache.stream)
         self._recording = RecordedClip(self._cache, config.capture)
         self._shown: tuple[Any, ...] | None = None

@@ -52,6 +52,21 @@ def test_render_inserted__shows_the_scene_of_each_frame(stream, tmp_path):
     np.testing.assert_allclose(images[0]["color"][:4], alone[:4], atol=2e-4)
 
 
+def test_render_inserted__honours_two_focal_lengths(stream, tmp_path):
+    """The image of a camera with pixels of another height is that of square pixels, resized."""
+    (tmp_path / "card.py").write_text(CARD)
+    view = camera().resized(camera().width, 2 * camera().height)
+    build = load_insert(tmp_path / "card.py")
+    tall, square = (
+        dict(render_inserted(stream, each, build, [2], ("color", "alpha")))[2]["color"] for each in (view, camera())
+    )
+    assert tall.shape == (view.height, view.width, 3)
+    np.testing.assert_allclose(0.5 * (tall[::2] + tall[1::2]), square, atol=0.2)
+    assert np.abs(0.5 * (tall[::2] + tall[1::2]) - square).mean() < 0.01
+    with pytest.raises(ValueError, match="`light` must be probe or traced, got 'lamp'"):
+        InsertConfig(light="lamp")  # type: ignore[arg-type]
+
+
 def test_render_inserted__takes_shapes_lights_and_integrator_of_an_xml_file(stream, tmp_path):
     (tmp_path / "ball.xml").write_text(XML)
     build = load_insert(tmp_path / "ball.xml")

@@ -1,0 +1,44 @@
+"""Memory that a fit takes at least, compared with the free memory before it begins."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from morgs_mi.core.attributes import ATTRIBUTES
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.memory import check_memory
+from morgs_mi.fit.fit_config import FitConfig
+
+__all__ = ["check_capacity"]
+
+# Arrays of each parameter: value, gradient and Adam's two moments; floats of a projected Gaussian; bytes of a float.
+_ARRAYS, _PROJECTED, _FLOAT = 4, 40, 4
+# Bytes of a pixel of a view: its image as bytes and as floats, and its reference.
+_PIXEL = 30
+# Bytes of a step in the order of the views.
+_STEP = 16
+
+
+def check_capacity(place: str, cameras: Sequence[Camera], config: FitConfig) -> None:
+    """Raise an error unless there is memory for the numbers of Gaussians and of steps that a config gives.
+
+    Args:
+        place: where the error's sentence begins.
+        cameras: the views.
+        config: settings.
+
+    Raises:
+        ValueError: there is not.
+    """
+    K = (config.sh_degree + 1) ** 2
+    floats = sum(3 * (K - 1) if attribute.width < 0 else attribute.width for attribute in ATTRIBUTES)
+    given = {
+        "num_gaussians": _FLOAT * (_ARRAYS * floats + _PROJECTED),
+        "first_frame_steps": _STEP,
+    }
+    for name, size in given.items():
+        count = getattr(config, name) or 0
+        check_memory(place, size * count, f"`{name}={count}`", "set a smaller number")
+    pixels = sum(camera.width * camera.height for camera in cameras)
+    views = f"{len(cameras)} views with {pixels} pixels"
+    check_memory(place, _PIXEL * pixels, views, "fit smaller images (`downscale`), or fewer cameras")

@@ -1,0 +1,106 @@
+"""Files of Gaussians in other formats than those that are read, recognised by their names and their first bytes.
+
+The first bytes of a file decide before its name, because files are renamed.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+__all__ = ["refuse_foreign"]
+
+_CONVERTERS = "convert it to .ply with SuperSplat (superspl.at/editor) or splat-transform (@playcanvas/splat-transform)"
+_EXPORT = "export it as .ply in the layout of 3D Gaussian Splatting from the program that wrote it"
+_HEAD = 4096
+
+
+@dataclass(frozen=True)
+class _Format:
+    """A format that is not read.
+
+    Attributes:
+        name: in words.
+        endings: of the names of its files.
+        remedy: how to get a file that is read.
+    """
+
+    name: str
+    endings: tuple[str, ...]
+    remedy: str = _CONVERTERS
+
+
+_SPZ = _Format("SPZ (Niantic's compressed format)", (".spz",))
+_SOG = _Format("SOG (PlayCanvas' compressed format)", (".sog", ".sogs", "meta.json"))
+_GLTF = _Format("glTF (KHR_gaussian_splatting)", (".glb", ".gltf"), _EXPORT)
+_USD = _Format("OpenUSD", (".usd", ".usda", ".usdc", ".usdz"), _EXPORT)
+_ARCHIVE = _Format("an archive", (".zip", ".7z", ".tar", ".gz", ".tgz"), "unpack it, and name the .ply in it")
+_NUMPY = _Format("an archive of NumPy", (".npz", ".npy"), _EXPORT)
+_CHECKPOINT = _Format("a checkpoint of a training", (".pt", ".pth", ".ckpt"), _EXPORT)
+_PLY = _Format("PLY", (), "rename it to .ply")
+_FORMATS = (
+    _SPZ,
+    _Format("KSPLAT (of GaussianSplats3D)", (".ksplat",)),
+    _SOG,
+    _Format("LCC (of XGRIDS)", (".lcc",)),
+    _Format("SPLATV (a moving scene in several instants)", (".splatv",), _EXPORT),
+    _Format("a compressed format of Gaussians", (".gsz", ".rad", ".splatz", ".cply"), _EXPORT),
+    _GLTF,
+    _USD,
+    _NUMPY,
+    _CHECKPOINT,
+    _ARCHIVE,
+)
+
+
+def refuse_foreign(path: str | Path) -> None:
+    """Raise an error if a file has Gaussians in a format that is not read.
+
+    Raises:
+        ValueError: it does; the sentence names the format and what converts it.
+    """
+    kind = _format(Path(path))
+    if kind is not None:
+        raise ValueError(
+            f"{path}: expected Gaussians as .ply, .compressed.ply or .splat, got {kind.name}, which is not read; "
+            f"{kind.remedy}."
+        )
+
+
+def _format(path: Path) -> _Format | None:
+    """Return the format of a file that is not read, by its first bytes or else by its name; None: no such format."""
+    head = b""
+    if path.is_file():
+        with path.open("rb") as file:
+            head = file.read(_HEAD)
+    name = path.name.lower()
+    named = next((kind for kind in _FORMATS if name.endswith(kind.endings)), None)
+    return _by_content(head, named, name) or named
+
+
+def _by_content(head: bytes, named: _Format | None, name: str) -> _Format | None:
+    """Return the format that begins with these bytes."""
+    if head[:4] == b"NGSP" or (head[:2] == b"\x1f\x8b" and _unzipped(head)[:4] == b"NGSP"):
+        return _SPZ
+    if head[:2] == b"\x1f\x8b":
+        return named or _ARCHIVE
+    if head[:4] == b"PK\x03\x04":
+        return _SOG if b"meta.json" in head else named or _ARCHIVE
+    if head[:4] == b"glTF" or b"KHR_gaussian_splatting" in head:
+        return _GLTF
+    if head[:8] == b"PXR-USDC" or head[:5] == b"#usda":
+        return _USD
+    if head[:6] == b"\x93NUMPY":
+        return _NUMPY
+    if head[:4] in (b"ply\n", b"ply\r") and not name.endswith(".ply"):
+        return _PLY
+    return None
+
+
+def _unzipped(head: bytes) -> bytes:
+    """Return the first bytes of a gzip stream."""
+    try:
+        return zlib.decompressobj(wbits=31).decompress(head, 16)
+    except zlib.error:
+        return b""

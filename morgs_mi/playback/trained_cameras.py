@@ -1,0 +1,88 @@
+"""The cameras of a file of Gaussians: those of its training, if they see it.
+
+Nothing in a `cameras.json` names its Gaussians. It may be of another scene in the same folder, or of the same scene
+before it was moved or scaled.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.core.camera import Camera
+from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.io.model_cameras import model_cameras
+from morgs_mi.playback.default_rig import thinned
+
+__all__ = ["trained_cameras"]
+
+_log = logging.getLogger(__name__)
+
+# Share of the Gaussians, weighted by opacity, that all cameras together see at least.
+_LEAST_SEEN = 0.03
+# Share that each camera sees at least, of the share of the camera that sees most.
+_LEAST_RELATIVE = 0.02
+# Extent of what a camera sees, in widths of its image: below, the scene is a dot.
+_LEAST_EXTENT = 0.03
+
+
+def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tuple[Camera, ...]]:
+    """Return the cameras with which a file of Gaussians was trained, and the file that has them.
+
+    Cameras that do not see the Gaussians are left out with a warning.
+
+    Args:
+        path: the file.
+        gaussians: its Gaussians.
+
+    Returns:
+        None and no cameras where no `cameras.json` belongs to the Gaussians.
+
+    Raises:
+        ValueError: an entry of the `cameras.json` is broken.
+    """
+    file, cameras = model_cameras(path)
+    if not cameras or not len(gaussians):
+        return None, ()
+    some = thinned(gaussians)
+    seen = np.stack([_seen(some, camera) for camera in cameras])
+    opacities = np.asarray(some.opacities, np.float64)
+    weights = opacities / opacities.sum()
+    shares = seen @ weights
+    share = seen.any(axis=0) @ weights
+    if share < _LEAST_SEEN:
+        _log.warning(
+            "%s: its cameras see %.1f %% of the Gaussians of %s and are not used, as they seem to be of another scene; "
+            "the cameras are a ring around the Gaussians instead.",
+            file,
+            100 * share,
+            path.name,
+        )
+        return None, ()
+    sees = shares >= _LEAST_RELATIVE * shares.max()
+    if not sees.all():
+        names = [camera.name for camera, good in zip(cameras, sees, strict=True) if not good]
+        _log.warning(
+            "%s: %d of %d cameras are left out, because they see next to nothing of the Gaussians of %s: %s.",
+            file,
+            len(names),
+            len(cameras),
+            path.name,
+            ", ".join(names[:3]) + (" and others" if len(names) > 3 else ""),
+        )
+    return file, tuple(camera for camera, good in zip(cameras, sees, strict=True) if good)
+
+
+def _seen(gaussians: Gaussians, camera: Camera) -> np.ndarray:
+    """Return which of N Gaussians a camera sees, bool [N]: none where they are a dot in its image."""
+    raw = gaussians.numpy()
+    with np.errstate(all="ignore"):
+        pixels, depths = camera.project(raw["means"].astype(np.float64))
+        visible = (depths > camera.near) & ((pixels > 0) & (pixels < [camera.width, camera.height])).all(axis=1)
+        radii = camera.K[0, 0] * np.exp(raw["log_scales"].max(axis=1, initial=-69)) / depths
+    if not visible.any():
+        return visible
+    extent = np.ptp(pixels[visible], axis=0).max() + 2 * np.median(radii[visible])
+    return visible & (extent >= _LEAST_EXTENT * camera.width)

@@ -1,0 +1,119 @@
+"""PLY files of other methods: drawn as what they are, or named."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from plyfile import PlyData, PlyElement
+
+from morgs_mi.io.ply import read_ply
+from tests.assertions import assert_close
+from tests.io.test_ply import random_gaussians, table
+
+N = 20
+RNG = np.random.default_rng(0)
+
+
+def write(path, without=(), **more):
+    """Write Gaussians without some properties and with others, and return the path."""
+    records = table(random_gaussians(N, degree=1))
+    columns = {name: records[name] for name in records.dtype.names if name not in without} | more
+    rows = np.empty(N, [(name, np.asarray(values).dtype.str) for name, values in columns.items()])
+    for name, values in columns.items():
+        rows[name] = values
+    PlyData([PlyElement.describe(rows, "vertex")]).write(str(path))
+    return path
+
+
+def varying() -> np.ndarray:
+    return RNG.uniform(0, 1, N).astype("f4")
+
+
+def same(value: float = 0) -> np.ndarray:
+    return np.full(N, value, "f4")
+
+
+def columns(*names: str) -> dict[str, np.ndarray]:
+    return {name: varying() for name in names}
+
+
+def test_read_ply__draws_discs_with_a_thin_third_axis(tmp_path, caplog):
+    gaussians = read_ply(write(tmp_path / "a.ply", without=("scale_2",)))
+    expected = random_gaussians(N, degree=1)
+    np.testing.assert_array_equal(gaussians.numpy()["log_scales"][:, :2], expected.numpy()["log_scales"][:, :2])
+    assert np.exp(gaussians.numpy()["log_scales"][:, 2]).max() < 1e-20
+    assert "a.ply: it has discs of 2D Gaussian Splatting" in caplog.text
+
+
+SPACETIME = {"trbf_center", "trbf_scale", *(f"motion_{i}" for i in range(9)), *(f"omega_{i}" for i in range(4))}
+INSTANTS = {
+    "spacetime gaussians": columns(*SPACETIME),
+    "4dgs": columns("t", "scale_t", "rot_r_0", "rot_r_1", "rot_r_2", "rot_r_3"),
+    "four axes": columns("t", "scale_3", "rot_4", "rot_5", "rot_6", "rot_7"),
+    "time": columns("time"),
+    "frame": {"frame": np.arange(N, dtype="i4")},
+    "timestamp": columns("timestamp"),
+    "motion alone": columns(*(f"motion_{i}" for i in range(9))),
+    "velocity": columns("velocity_0", "velocity_1", "velocity_2"),
+    "one instant that moves": {"trbf_center": same(0.5), **columns("omega_0")},
+    "not a number": {"t": same(np.nan)},
+}
+
+
+@pytest.mark.parametrize("kind", INSTANTS)
+def test_read_ply__refuses_several_instants(tmp_path, kind):
+    path = write(tmp_path / "a.ply", **INSTANTS[kind])
+    with pytest.raises(
+        ValueError, match=r"a\.ply: expected the Gaussians of one instant, got those of several.*import"
+    ):
+        read_ply(path)
+
+
+@pytest.mark.parametrize("more", [{"time": same(3)}, {"frame": np.full(N, 7, "i4")}, {"motion_0": same()}])
+def test_read_ply__reads_gaussians_of_one_instant(tmp_path, more):
+    assert len(read_ply(write(tmp_path / "a.ply", **more))) == N
+
+
+@pytest.mark.parametrize(
+    ("without", "more", "message"),
+    [
+        (("f_dc_0",), columns("f_offset_0", "f_anchor_feat_0"), "got anchors of Scaffold-GS .f_anchor_feat_0, f_off"),
+        (("scale_1", "scale_2"), {}, "expected Gaussians with three axes, .* got scale_0 alone"),
+        (("scale_0",), {}, "with two, got scale_1, scale_2 alone"),
+        (
+            ("scale_0",),
+            {"scale_0": np.zeros(N, "u1")},
+            "got integers in scale_0, which stand for entries of a codebook",
+        ),
+        ((), columns(*(f"f_rest_{i}" for i in range(72))), "got 72 of them; export the Gaussians with SH of degree 3"),
+        (("f_rest_8",), {}, "got 8 of them"),
+    ],
+)
+def test_read_ply__names_other_kinds(tmp_path, without, more, message):
+    with pytest.raises(ValueError, match=message):
+        read_ply(write(tmp_path / "a.ply", without=without, **more))
+
+
+def test_read_ply__puts_the_filter_of_mip_splatting_into_sizes_and_opacities(tmp_path, caplog):
+    widths = np.where(np.arange(N) % 2, RNG.uniform(0.01, 1, N), 0).astype("f4")
+    plain = read_ply(write(tmp_path / "a.ply"))
+    filtered = read_ply(write(tmp_path / "b.ply", filter_3D=widths))
+    scales = np.asarray(plain.scales, np.float64)
+    wider = np.sqrt(scales**2 + widths[:, None] ** 2)
+    assert_close(filtered.scales, wider, rtol=1e-5)
+    share = np.sqrt(np.prod(scales**2, axis=1) / np.prod(wider**2, axis=1))
+    assert_close(filtered.opacities, np.asarray(plain.opacities) * share, rtol=1e-4)
+    assert not caplog.records
+
+
+def test_read_ply__names_what_may_change_the_image_once_in_a_folder(tmp_path, caplog):
+    for name in ("a.ply", "b.ply"):
+        read_ply(write(tmp_path / name, **columns("nx", "label", "object_id", "red", "beta", "sg_axis_0")))
+    (message,) = [record.getMessage() for record in caplog.records]
+    assert message.endswith("a.ply: it is drawn without beta, sg_axis_0, which may change the image.")
+
+
+def test_read_ply__names_a_deformation_network_beside_the_gaussians(tmp_path, caplog):
+    (tmp_path / "deformation.pth").touch()
+    read_ply(write(tmp_path / "point_cloud.ply"))
+    assert "point_cloud.ply: it is drawn without deformation.pth" in caplog.text
