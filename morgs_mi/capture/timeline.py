@@ -323,7 +323,7 @@ def _check_rates(path: Path, readers: Sequence[FrameReader], clocks: _Clocks, in
     if drift > _NEAR:
         table = ", ".join(f"{r.path.name} {r.fps:.6g}" for r in readers if r.fps)
         raise ValueError(
-            f"{path}: all cameras must have the same frame rate, got {table}: images of one index are up to "
+            f"{path}: all cameras must have the same frame rate, got {table}; images of one index are up to "
             f"{drift:.1f} frames apart; use the lowest rate with --trim, or set the true one as `fps` in capture.json."
         )
 
