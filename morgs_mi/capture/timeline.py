@@ -4,6 +4,8 @@ An instant t = 0, 1, ... is a frame of the recording. It is shown by frame k of 
 
     k = o + r t,    with o the clip's offset and r its frame rate divided by the lowest frame rate.
 
+Folders of images have an o and r by the numbers of their images, too (see `image_numbers`).
+
 In a clip of variable frame rate, k is a position on its regular clock, and the nearest frame shows the instant. If o is
 not whole, the clip has no frame of the instant. With a whole r, the nearest frame is used unchanged: it is always later
 by the same time, the camera's delay (see `Camera`). Otherwise an image is interpolated between two frames (see
