@@ -4,6 +4,8 @@ An instant t = 0, 1, ... is a frame of the recording. It is shown by frame k of 
 
     k = o + r t,    with o the clip's offset and r its frame rate divided by the lowest frame rate.
 
+Folders of images have an o and r by the numbers of their images, too (see `image_numbers`).
+
 In a clip of variable frame rate, k is a position on its regular clock, and the nearest frame shows the instant. If o is
 not whole, the clip has no frame of the instant. With a whole r, the nearest frame is used unchanged: it is always later
 by the same time, the camera's delay (see `Camera`). Otherwise an image is interpolated between two frames (see
@@ -333,7 +335,7 @@ def _check_rates(path: Path, readers: Sequence[FrameReader], clocks: _Clocks, in
     if drift > _NEAR:
         table = ", ".join(f"{r.path.name} {r.fps:.6g}" for r in readers if r.fps)
         raise ValueError(
-            f"{path}: all cameras must have the same frame rate, got {table}: images of one index are up to "
+            f"{path}: all cameras must have the same frame rate, got {table}; images of one index are up to "
             f"{drift:.1f} frames apart; use the lowest rate with --trim, or set the true one as `fps` in capture.json."
         )
 

@@ -16,6 +16,8 @@ __all__ = ["Movie", "read_movie"]
 
 # The boxes with which a file of this kind begins.
 _FIRST = {b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip"}
+# Bytes of an edit list that are read; it has a few entries.
+_MAX_EDITS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ def _parts(file: BinaryIO, movie: _Box) -> tuple[float, ...]:
 
 def _durations(file: BinaryIO, edits: _Box, per_second: int) -> tuple[float, ...]:
     """Return the lengths of the parts in an edit list, s."""
-    data = _bytes(file, edits, edits.stop - edits.start)
+    data = _bytes(file, edits, _MAX_EDITS)
     # An entry has the length of the part, its start in the track, -1 for a pause, and its speed.
     width = 8 if data[:1] == b"\1" else 4
     entries = [data[at : at + 2 * width] for at in range(8, len(data) - 2 * width - 3, 2 * width + 4)]

@@ -122,6 +122,50 @@ def test_timeline__warns_about_images_of_different_times(tmp_path: Path, caplog)
     assert "images of one instant are up to 6.7 ms apart" in caplog.text
 
 
+RATES = {"a": (300, 30.0), "b": (300, 29.7), "c": (300, 29.97)}
+
+
+def moments(capture: Capture, clips: dict[str, tuple[int, float]]) -> np.ndarray:
+    """Return the times of the images of each instant [T, C] in s; the clips of `capture_of` begin together."""
+    numbers = np.array([[int(image[0, 0, 1]) for image in frame.images] for frame in capture.frames()])
+    # The colour of a frame is its number modulo 256.
+    numbers += 256 * np.cumsum(np.diff(numbers, axis=0, prepend=0) < 0, axis=0)
+    return numbers / [fps for _, fps in clips.values()]
+
+
+@pytest.mark.parametrize(
+    "config", [ReadConfig(trim=True), ReadConfig(offset={"b": 0}), ReadConfig(trim=True, gaps=True)]
+)
+def test_timeline__uses_rates_that_are_less_than_a_percent_apart(tmp_path: Path, caplog, config: ReadConfig) -> None:
+    path = capture_of(tmp_path / "c", RATES)
+    with caplog.at_level(logging.WARNING):
+        capture = load_capture(path, reading=config)
+    assert capture.fps == pytest.approx(29.7, abs=0.01)
+    times = moments(capture, RATES)
+    np.testing.assert_allclose(times[:, 1], np.arange(len(times)) / 29.7, atol=1e-3)
+    apart = np.ptp(times, axis=1).max()
+    assert apart < 1 / 29.7
+    assert f"images of one instant are up to {1e3 * apart:.0f}"[:-1] in caplog.text
+
+
+def test_timeline__refuses_rates_that_drift_more_than_half_a_frame(tmp_path: Path, caplog) -> None:
+    path = capture_of(tmp_path / "c", RATES)
+    with pytest.raises(ValueError, match=r"same frame rate, got a.mkv 30, .* up to 3.0 frames apart; .*--trim"):
+        load_capture(path)
+    with caplog.at_level(logging.WARNING):
+        capture = load_capture(path, max_frames=30)
+    assert moments(capture, RATES).shape == (30, 3)
+    assert "images of one instant are up to 9.8 ms apart" in caplog.text
+    (path / "capture.json").write_text('{"fps": 30}')
+    assert load_capture(path).num_frames == 300
+
+
+def test_timeline__keeps_a_constant_delay_where_rates_hardly_differ(tmp_path: Path) -> None:
+    path = capture_of(tmp_path / "c", {"a": (20, 30), "b": (20, 29.97)})
+    capture = load_capture(path, reading=ReadConfig(offset={"a": 0.25}))
+    assert [camera.delay for camera in capture.cameras] == [-0.25, 0]
+
+
 def test_timeline__keeps_truth_only_for_unshifted_clips(tmp_path: Path) -> None:
     path = capture_of(tmp_path / "c", {"a": (4, 25), "b": (6, 25)})
     (path / "truth").mkdir()

@@ -36,7 +36,7 @@ def test_fit__continues_without_a_camera_whose_clip_is_cut_off_meanwhile(
     capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     truncate_clip(capture)
-    monkeypatch.setattr("morgs_mi.io.video._frame_times", lambda path: np.arange(FRAMES) / 25)
+    monkeypatch.setattr("morgs_mi.io.frame_times._packet_times", lambda path: np.arange(FRAMES) / 25)
     assert run("fit", capture, tmp_path / "out", *QUICK)[0] == 0
     frames = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
     assert [frame["missing_views"] for frame in frames] == [[], ["cam1"], ["cam1"]]

@@ -1,0 +1,125 @@
+"""Folders of images whose numbers differ among the cameras."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.timeline import ReadConfig
+from morgs_mi.io.numbering import counting_together
+from morgs_mi.io.video_writer import write_video
+from tests.scenes import captures as layouts
+
+TRIM, GAPS = ReadConfig(trim=True), ReadConfig(gaps=True)
+
+
+def capture_of(path: Path, **cameras: Iterable[int]) -> Path:
+    """Write folders of images with the numbers of each camera; an image has its number as colour."""
+    layouts.n3dv(path, tuple(cameras), lambda *_: None)
+    for name, numbers in cameras.items():
+        (path / name).mkdir()
+        for number in numbers:
+            image = np.full((layouts.HEIGHT, layouts.WIDTH, 3), number % 256, np.uint8)
+            cv2.imwrite(str(path / name / f"{number:04d}.png"), image)
+    return path
+
+
+def colors(capture: Capture) -> list[list[int | None]]:
+    frames = capture.partial_frames()
+    return [[None if image is None else int(image[0, 0, 0]) for image in frame.images] for frame in frames]
+
+
+DIFFERENT = [
+    # numbers of a and b, the common ones, and the interval of the instants in numbers
+    (range(4), range(2, 6), [2, 3], 1),
+    (range(10), range(1, 11), range(1, 10), 1),
+    ([0, 1], [0, 2], [0], 2),
+    (range(9), range(4, 9, 2), [4, 6, 8], 2),
+    (range(0, 13, 2), range(0, 13, 3), [0, 6, 12], 6),
+]
+
+
+@pytest.mark.parametrize(("a", "b", "common", "interval"), DIFFERENT)
+def test_align_numbers__are_times(tmp_path: Path, caplog, a, b, common, interval) -> None:
+    path = capture_of(tmp_path / "c", a=a, b=b, c=a)
+    with caplog.at_level(logging.WARNING):
+        capture = load_capture(path, reading=TRIM)
+    assert colors(capture) == [[number] * 3 for number in common]
+    (note,) = capture.notes
+    assert note in caplog.text
+    assert f"Images with the same number are simultaneous: a {a[0]} to {a[-1]}" in note
+    finest = min(a[1] - a[0], b[1] - b[0])
+    assert capture.fps == pytest.approx(30 * finest / interval)
+    instants = colors(load_capture(path, reading=GAPS))
+    assert all(len({number for number in row if number is not None}) <= 1 for row in instants)
+    for camera, numbers in enumerate((a, b, a)):
+        assert [row[camera] for row in instants if row[camera] is not None] == list(numbers)
+
+
+@pytest.mark.parametrize(("a", "b", "common", "interval"), DIFFERENT)
+def test_align_numbers__are_refused_without_an_option_and_replaced_by_offsets(
+    tmp_path: Path, a, b, common, interval
+) -> None:
+    path = capture_of(tmp_path / "c", a=a, b=b)
+    with pytest.raises(
+        ValueError,
+        match=rf"got a 0 to .*, b {b[0]} to .*; use the {len(common)} common .*--trim, .*--gaps.*--offset a 0",
+    ):
+        load_capture(path)
+    capture = load_capture(path, reading=ReadConfig(offset={"a": 0}))
+    assert colors(capture) == [list(pair) for pair in zip(a, b, strict=False)]
+    assert "aligned by their positions and --offset" in capture.notes[0]
+
+
+def test_align_numbers__without_a_common_one_are_refused(tmp_path: Path) -> None:
+    path = capture_of(tmp_path / "c", a=range(0, 6, 2), b=range(1, 7, 2))
+    for reading in (ReadConfig(), TRIM):
+        with pytest.raises(ValueError, match=r"got a 0 to 4 by 2, b 1 to 5 by 2; use all numbers with --gaps"):
+            load_capture(path, reading=reading)
+
+
+@pytest.mark.parametrize("reading", [ReadConfig(), TRIM, GAPS])
+def test_align_numbers__that_do_not_overlap_count_separately(tmp_path: Path, caplog, reading: ReadConfig) -> None:
+    path = capture_of(tmp_path / "c", a=range(100, 105), b=range(40, 45), c=range(40, 45))
+    with caplog.at_level(logging.WARNING):
+        capture = load_capture(path, reading=reading)
+    assert colors(capture) == [[100 + t, 40 + t, 40 + t] for t in range(5)]
+    assert "The numbers of the images do not overlap: b 40 to 44; a 100 to 104" in caplog.text
+    assert capture.notes[0] in caplog.text
+
+
+def test_align_numbers__says_nothing_on_equal_numbers_and_photos(tmp_path: Path) -> None:
+    for cameras in ({"a": range(3, 6), "b": range(3, 6)}, {"a": [1], "b": [2]}, {"a": [4], "b": [4]}):
+        capture = load_capture(capture_of(tmp_path / str(cameras["a"]), **cameras))
+        assert not any("numbers" in note for note in capture.notes)
+    (tmp_path / "d").mkdir()
+    path = capture_of(tmp_path / "d" / "c", a=[0], b=[0])
+    for name in ("a", "b"):
+        (path / name / "0000.png").rename(path / name / "photo.png")
+    assert load_capture(path).num_frames == 1
+
+
+def test_align_numbers__shifts_videos_beside_them(tmp_path: Path) -> None:
+    """A video begins with the first number."""
+    path = capture_of(tmp_path / "c", a=range(6), b=range(2, 8))
+    layouts.write_poses_bounds(path / "poses_bounds.npy", layouts.rig(("a", "b", "v")), np.array([[1, 9]] * 3))
+    images = [np.full((layouts.HEIGHT, layouts.WIDTH, 3), t, np.uint8) for t in range(8)]
+    write_video(path / "v.mkv", images, 30)
+    assert colors(load_capture(path, reading=TRIM)) == [[t, t, t] for t in range(2, 6)]
+
+
+def test_align_numbers__with_trim_are_the_base_of_offsets(tmp_path: Path) -> None:
+    path = capture_of(tmp_path / "c", a=range(6), b=range(2, 8))
+    capture = load_capture(path, reading=ReadConfig(trim=True, offset={"b": 1}))
+    assert colors(capture) == [[t, t + 1] for t in range(1, 6)]
+
+
+def test_counting_together__groups_overlapping_numbers() -> None:
+    numbers = {"a": [0, 9], "b": [5, 20], "c": [21, 30], "d": [15, 16], "e": [100]}
+    assert counting_together(numbers) == [["a", "b", "d"], ["c"], ["e"]]
