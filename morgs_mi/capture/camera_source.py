@@ -28,7 +28,7 @@ class CameraSource:
         frame_indices: the clip's frames that show the instants 0, 1, ... of the recording, -1 for none, int [T].
         shares: the share of the time to the clip's next frame that has passed at each instant [T]; None: none has.
         color_correction: the colour correction, or None.
-        opaque: the mask of the recorded pixels that are not transparent [H, W], or None if all are opaque.
+        used: the mask of the recorded pixels that are neither transparent nor masked out [H, W], or None if all are.
         delay: time from an instant to the frame that shows it, in frames of the clip.
     """
 
@@ -38,7 +38,7 @@ class CameraSource:
     frame_indices: np.ndarray
     shares: np.ndarray | None = None
     color_correction: ColorCorrection | None = None
-    opaque: np.ndarray | None = None
+    used: np.ndarray | None = None
     delay: float = 0.0
 
     def at_instants(self) -> CameraSource:
@@ -78,12 +78,12 @@ class CameraSource:
 
     def mask(self, camera: Camera) -> np.ndarray | None:
         """Return the mask of the valid pixels of `camera` [H, W] bool, or None if all are valid."""
-        valid = self.opaque
+        valid = self.used
         if self.undistortion is not None:
             valid = self.undistortion.mask
-            if self.opaque is not None:
-                # Transparent pixels must not contribute; cubic weights can also be negative.
-                valid = valid & (np.abs(self.undistortion(self.opaque.astype(np.float32)) - 1) < 1e-3)
+            if self.used is not None:
+                # Other pixels must not contribute; cubic weights can also be negative.
+                valid = valid & (np.abs(self.undistortion(self.used.astype(np.float32)) - 1) < 1e-3)
         if valid is None or valid.all():
             return None
         # A downscaled pixel is valid if all pixels that it averages are.

@@ -20,6 +20,7 @@ from morgs_mi.capture.layouts.calibration import Calibration
 from morgs_mi.capture.layouts.clips import EXAMPLE
 from morgs_mi.capture.layouts.layout_registry import find_layout
 from morgs_mi.capture.lens import Lens, undistortion
+from morgs_mi.capture.masks import used_pixels
 from morgs_mi.capture.timeline import ReadConfig, read_settings, timeline
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_points
@@ -84,7 +85,7 @@ class Capture:
         fps: frames per second.
         points: [P, 3] float32, world units; P = 0 if the layout has none.
         point_colors: [P, 3] float32 in [0, 1].
-        masks: per camera [H, W] bool, true where the undistorted pixel was recorded; None if all were.
+        masks: per camera [H, W] bool, true where the undistorted pixel was recorded and is used; None if all are.
         test_views: indices of the cameras held out from training, in ascending order.
         truth: folder of ground truth, or None.
         downscale: the downscaling factor.
@@ -316,7 +317,8 @@ def load_capture(
         )
     names = [camera.name for camera in recorded]
     common = timeline(path, names, readers, reading, max_frames, settings.get("fps"))
-    opaque = [opaque_pixels(reader, camera.name) for reader, camera in zip(readers, recorded, strict=True)]
+    masks = calibration.masks or ((),) * len(readers)
+    used = [_used(*each) for each in zip(readers, masks, names, strict=True)]
     sources = tuple(
         CameraSource(
             reader,
@@ -324,7 +326,7 @@ def load_capture(
             undistortion(camera, lens),
             common.frame_indices[c],
             common.shares[c],
-            opaque=opaque[c][0],
+            used=used[c][0],
             delay=common.delays[c],
         )
         for c, (reader, lens, camera) in enumerate(zip(readers, calibration.lenses, recorded, strict=True))
@@ -351,7 +353,7 @@ def load_capture(
         downscale=downscale,
         layout=layout.name,
         reading=reading,
-        notes=(*common.notes, *(note for _, note in opaque if note), *_photos(calibration.clips)),
+        notes=(*common.notes, *(note for _, notes in used for note in notes), *_photos(calibration.clips)),
     )
     return capture if reading.color == "none" else _color_corrected(capture, reading.color)
 
@@ -369,6 +371,21 @@ def _readouts(path: Path, every: Sequence[str], names: Sequence[str], settings: 
         where = path / "capture.json"
         raise ValueError(f"{where}: `readout` must name cameras of {', '.join(every)}, got {', '.join(unknown)}.")
     return [readout.get(name, 0.0) for name in names]
+
+
+def _used(reader: FrameReader, masks: Sequence[Path], name: str) -> tuple[np.ndarray | None, list[str]]:
+    """Return the mask of the pixels of a clip that are opaque and in no mask black, None if all are, and notes.
+
+    Raises:
+        FileNotFoundError: a mask is missing.
+        ValueError: a mask cannot be read, or no pixel is left.
+    """
+    opaque, *notes = opaque_pixels(reader, name)
+    used, note = used_pixels(masks, reader.width, reader.height, name)
+    both = opaque if used is None else used if opaque is None else used & opaque
+    if both is not None and not both.any():
+        raise ValueError(f"{masks[0]}: expected pixels that are used, got a mask of transparent ones; correct it.")
+    return both, [text for text in (*notes, note) if text]
 
 
 def opaque_pixels(reader: FrameReader, name: str) -> tuple[np.ndarray | None, str]:

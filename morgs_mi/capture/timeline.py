@@ -25,12 +25,14 @@ import numpy as np
 from morgs_mi.capture.image_numbers import ImageNumbers, align_numbers
 from morgs_mi.core.checks import check_number
 from morgs_mi.io.bounded import read_json
+from morgs_mi.io.unread import warn_unread
 from morgs_mi.io.video import FrameReader
 
 __all__ = ["ReadConfig", "Timeline", "nearest_frames", "read_settings", "timeline"]
 
 _LOG = logging.getLogger(__name__)
 _DEFAULT_FPS = 30.0
+_SETTINGS = {"fps", "test_view", "meters_per_unit", "readout"}
 # Distance in frames up to which a frame shows an instant.
 _NEAR = 0.5
 
@@ -355,6 +357,8 @@ def read_settings(path: Path) -> dict[str, Any]:
     settings = read_json(path)
     if not isinstance(settings, dict):
         raise ValueError(f"{path}: expected a JSON object, got {type(settings).__name__}; correct it.")
+    if "scene" not in settings:  # a synthetic capture describes itself
+        warn_unread(path, settings.keys() - _SETTINGS)
     view = settings.get("test_view")
     for name, interval in (("fps", "[1e-6, 1e6]"), ("meters_per_unit", "[1e-12, 1e12]")):
         if (value := settings.get(name)) is not None:

@@ -3,6 +3,8 @@
 A file may make its reader use 10 times its size plus 200 MB. The allowance is for small files that decode to large
 data without being broken, such as an image of one colour. Only regular files are read: a pipe in a folder would keep
 its reader waiting, and a device may have no end.
+
+Text is UTF-8, or UTF-16 or UTF-32 as shells of Windows write it, with or without a byte order mark.
 """
 
 from __future__ import annotations
@@ -15,12 +17,24 @@ import tomllib
 import zipfile
 import zlib
 from io import BytesIO
+from operator import mul
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-__all__ = ["MAX_TOML", "array_names", "check_claim", "read_array", "read_bytes", "read_json", "read_toml", "regular"]
+__all__ = [
+    "MAX_TOML",
+    "array_names",
+    "check_claim",
+    "encoding_of",
+    "read_array",
+    "read_bytes",
+    "read_json",
+    "read_text",
+    "read_toml",
+    "regular",
+]
 
 _FACTOR, _ALLOWANCE = 10, 200_000_000
 # Errors of NumPy and zipfile for broken files. NumPy parses headers as Python.
@@ -30,11 +44,22 @@ _BROKEN = (
 )
 # At most, in bytes: an empty dict or list as the value of a list, and a number or a short key with its reference.
 _DICT_BYTES, _LIST_BYTES, _VALUE_BYTES = 240, 64, 40
+# A text in JSON, which may lack its end.
+_TEXT = re.compile(r'"(?:[^"\\]|\\.)*+"?', re.DOTALL)
 # Size of a TOML file, bytes that its parser takes for a table, and parts of a key: memory and time grow with the square
 # of their number.
 MAX_TOML, _TABLE_BYTES, _MAX_PARTS = 1_000_000, 1000, 32
-# Separators of the keys and values of a TOML file, and the end of a part of a key; ornaments of dots are not keys.
-_BETWEEN, _PART = re.compile(rb"[=,\[\]{}#\n]"), re.compile(rb"[^.\s][ \t]*\.")
+# A comment or a string of a TOML file, which may lack its end. Every branch consumes what it has searched.
+_COMMENT = r"#[^\n]*+"
+_STRING = (
+    r'"""(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5})?'
+    r"|'''(?:[^']|'(?!''))*+(?:'{3,5})?"
+    r'|"(?:[^"\\\n]|\\[^\n])*+"?'
+    r"|'[^'\n]*+'?"
+)
+_TOKEN = re.compile(f"(?P<comment>{_COMMENT})|(?:{_STRING})", re.DOTALL)
+# A key or a number with its parts, and the character that shows that it is a key: of a value or of a table.
+_WORD = re.compile(r"([^\s.=,\[\]{}]++(?:[ \t]*+\.[ \t]*+[^\s.=,\[\]{}]++)*+)[ \t]*+([=\]]?)")
 
 
 def check_claim(path: str | Path, claimed: int, content: str, beside: int = 0) -> None:
@@ -84,6 +109,25 @@ def read_bytes(path: str | Path, most: int | None = None) -> bytes:
     return path.read_bytes()
 
 
+def encoding_of(start: bytes) -> str:
+    """Return the encoding of a text that begins with these bytes, of which the first two are of ASCII."""
+    return json.detect_encoding(start[:4])
+
+
+def read_text(path: str | Path, most: int | None = None) -> str:
+    """Return the text in a file, without a byte order mark; `most` as for `read_bytes`.
+
+    Raises:
+        OSError: there is no such file, or it cannot be read.
+        ValueError: as for `read_bytes`, or the file is no text.
+    """
+    data = read_bytes(path, most)
+    try:
+        return data.decode(encoding_of(data))
+    except UnicodeError as error:
+        raise ValueError(f"{path}: expected text in UTF-8, got other bytes ({error}); save it as UTF-8.") from None
+
+
 def read_toml(path: str | Path) -> dict[str, Any]:
     """Return the content of a TOML file.
 
@@ -91,13 +135,15 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         OSError: there is no such file, or it cannot be read.
         ValueError: the file is broken, too large, nested too deeply, or has too many tables.
     """
-    data = read_bytes(path, MAX_TOML)
-    tables = sum(map(data.count, (b".", b"[", b"{")))
+    text = read_text(path, MAX_TOML)
+    structure = _TOKEN.sub(lambda token: "" if token["comment"] else "s", text)
+    words = [(word.count("."), end) for word, end in _WORD.findall(structure)]
+    tables = sum(dots for dots, end in words if end) + sum(map(structure.count, "[{"))
     check_claim(path, _TABLE_BYTES * tables, f"{tables} tables")
     try:
-        if any(len(_PART.findall(piece)) >= _MAX_PARTS for piece in _BETWEEN.split(data)):
+        if max((dots for dots, _ in words), default=0) >= _MAX_PARTS:
             raise ValueError(f"a key has more than {_MAX_PARTS} parts")
-        return tomllib.loads(data.decode("utf-8"))
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: expected TOML, got a broken file ({error}); write it again.") from None
 
@@ -109,14 +155,21 @@ def read_json(path: str | Path) -> Any:
         OSError: there is no such file, or it cannot be read.
         ValueError: it is no regular file, is broken, nested too deeply, or has too many tiny values.
     """
-    data = read_bytes(path)
-    counts = data.count(b"{"), data.count(b"["), data.count(b",")
-    values = counts[0] * _DICT_BYTES + counts[1] * _LIST_BYTES + counts[2] * _VALUE_BYTES
-    check_claim(path, values, f"{sum(counts)} values")
+    text = read_text(path)
+    claimed, values = _json_claim(text)
+    if claimed > _ALLOWANCE:  # the punctuation of texts takes no memory
+        claimed, values = _json_claim(_TEXT.sub("", text))
+    check_claim(path, claimed, f"{values} values")
     try:
-        return json.loads(data.decode("utf-8"))
+        return json.loads(text)
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: expected JSON, got a broken file ({error}); write it again.") from None
+
+
+def _json_claim(text: str) -> tuple[int, int]:
+    """Return bytes that the values of a JSON text take at most, and their number."""
+    counts = [text.count(mark) for mark in "{[,"]
+    return sum(map(mul, counts, (_DICT_BYTES, _LIST_BYTES, _VALUE_BYTES))), sum(counts)
 
 
 def read_array(path: str | Path, name: str | None = None) -> np.ndarray:
@@ -135,7 +188,7 @@ def read_array(path: str | Path, name: str | None = None) -> np.ndarray:
         if dtype.hasobject:
             raise ValueError("it holds Python objects, not numbers")
         count, held = math.prod(shape), len(data) - stream.tell()
-        if min(shape, default=0) < 0 or count * dtype.itemsize > held:
+        if min(shape, default=0) < 0 or count * dtype.itemsize != held:
             raise ValueError(f"its header claims {dtype} {shape}, but {held} bytes follow")
         flat = np.frombuffer(data, dtype, count, stream.tell())
         return flat.reshape(shape, order="F" if in_columns else "C")

@@ -14,11 +14,13 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.bounded import read_json
+from morgs_mi.io.unread import warn_unread
 
 __all__ = ["model_cameras"]
 
 _FILE = "cameras.json"
 _KEYS = {"width", "height", "position", "rotation", "fx", "fy"}
+_HARMLESS = {"id", "img_name", "image_name", "name", "near", "far"}
 # Cameras that are kept, evenly spaced in the file: more are of no use to a viewer.
 _MOST = 48
 
@@ -37,6 +39,7 @@ def model_cameras(path: Path) -> tuple[Path | None, tuple[Camera, ...]]:
         if file.is_file():
             rows = read_json(file)
             if isinstance(rows, list) and rows and all(isinstance(row, dict) and row.keys() >= _KEYS for row in rows):
+                warn_unread(file, {key for row in rows for key in row} - _KEYS - _HARMLESS)
                 return file, tuple(_camera(file, i, rows[i]) for i in range(0, len(rows), -(-len(rows) // _MOST)))
     return None, ()
 

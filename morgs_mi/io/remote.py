@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from morgs_mi.core.files import write_json
+from morgs_mi.io.listing import is_listed
 
 __all__ = ["fetched", "is_url", "mirrored", "url_of"]
 
@@ -32,10 +33,11 @@ _VERSION = (
     *("modify", "modificationTime", "date_time", "sha"),  # ftp, webhdfs, archives, GitHub
 )
 # One of these is among the first bytes of an image, a video or another file of a suffix.
-_IMAGE, _VIDEO = (b"\x89PNG", b"\xff\xd8"), (b"ftyp", b"moov", b"mdat", b"free", b"wide", b"\x1aE\xdf\xa3", b"RIFF")
+_IMAGE = (b"\x89PNG", b"\xff\xd8", b"II*\0", b"MM\0*", b"II+\0", b"MM\0+", b"RIFF", b"BM")
+_VIDEO = (b"ftyp", b"moov", b"mdat", b"free", b"wide", b"\x1aE\xdf\xa3", b"RIFF")
 _FETCHED_LATER = {
     **dict.fromkeys((".mp4", ".mkv", ".avi", ".mov", ".webm"), _VIDEO),
-    **dict.fromkeys((".png", ".jpg", ".jpeg"), _IMAGE),
+    **dict.fromkeys((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp"), _IMAGE),
 }
 _MAGIC = {**_FETCHED_LATER, ".npy": (b"\x93NUMPY",), ".npz": (b"PK",), ".ply": (b"ply",)}
 _PAGE = (b"<!doctype html", b"<html")
@@ -115,6 +117,8 @@ def _listing(system: Any, base: str) -> dict[str, Mapping[str, Any]]:
     for folder in folders:  # which grows
         for about in system.ls(folder, detail=True):
             path = about["name"].rstrip("/")
+            if not is_listed(path.rpartition("/")[2]):
+                continue
             if about["type"] != "directory":
                 found[path] = about
             elif path not in (*folders, f"{base}/{_IGNORED}"):

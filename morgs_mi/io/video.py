@@ -9,7 +9,6 @@ stores the time of each frame, so the reader knows where on a regular clock the 
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -19,6 +18,8 @@ import numpy as np
 
 from morgs_mi.io.bounded import check_claim
 from morgs_mi.io.frame_times import SAME_TIME, clock, read_header, seconds, true_rate
+from morgs_mi.io.image_size import image_size
+from morgs_mi.io.listing import listed
 from morgs_mi.io.numbering import counting_together
 from morgs_mi.io.remote import fetched
 
@@ -37,9 +38,9 @@ __all__ = [
 ]
 
 VIDEO_SUFFIXES = (".mp4", ".mkv", ".avi", ".mov", ".webm")
-IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-# Bytes of an image file in which its size is searched, and of memory that a pixel takes, in BGR and RGB.
-_MAX_HEADER, _BYTES_PER_PIXEL = 1_000_000, 6
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".bmp")
+# Bytes of memory that a pixel takes, in BGR and RGB.
+_BYTES_PER_PIXEL = 6
 # First frame that is worth a search, and the frames before it at which the search aims: those shown right after a
 # keyframe may refer to frames before it, and a file may be indexed by the times of decoding.
 _FAR, _BEFORE = 100, 32
@@ -347,7 +348,7 @@ def _images(path: Path) -> list[Path]:
     """Return a folder's images in the order of their numbers."""
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: expected a folder of images, found none; check the path.")
-    found = (f for f in path.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES)
+    found = (f for f in listed(path) if f.suffix.lower() in IMAGE_SUFFIXES)
     files = sorted(found, key=lambda f: natural_key(f.stem))
     if not files:
         raise FileNotFoundError(
@@ -419,7 +420,7 @@ def decode_image(file: Path, data: np.ndarray, mode: int) -> np.ndarray:
     Raises:
         ValueError: the bytes are no image, or claim more pixels than the file may hold.
     """
-    width, height = _claimed_size(data[:_MAX_HEADER].tobytes())
+    width, height = image_size(data)
     check_claim(file, _BYTES_PER_PIXEL * width * height, f"{width}x{height} pixels")
     image = cv2.imdecode(data, mode | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
     if image is None:
@@ -434,8 +435,7 @@ def _opaque(file: Path) -> np.ndarray | None:
     try:
         with fetched(file).open("rb") as opened:
             header = opened.read(26)
-        # Its type of colours: with a palette, grey and alpha, or RGB and alpha.
-        if not header.startswith(b"\x89PNG") or header[25:] not in (b"\3", b"\4", b"\6"):
+        if not _may_be_transparent(header):
             return None
         image = _decoded(file, cv2.IMREAD_UNCHANGED)
     except (ValueError, OSError):
@@ -443,17 +443,8 @@ def _opaque(file: Path) -> np.ndarray | None:
     return image[..., 3] == np.iinfo(image.dtype).max if image.ndim == 3 and image.shape[2] == 4 else None
 
 
-def _claimed_size(data: bytes) -> tuple[int, int]:
-    """Return the width and height in the header of a PNG or JPEG file, 0 of another."""
-    if data.startswith(b"\x89PNG") and len(data) >= 24:
-        width, height = struct.unpack(">II", data[16:24])
-        return width, height
-    at = 2
-    while data.startswith(b"\xff\xd8") and at + 9 <= len(data):
-        marker, length = data[at + 1], int.from_bytes(data[at + 2 : at + 4], "big")
-        # Start of a frame, by its kind of compression; the other three numbers mark tables.
-        if 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):
-            height, width = struct.unpack(">HH", data[at + 5 : at + 9])
-            return width, height
-        at += 1 if marker == 0xFF else 2 + length
-    return 0, 0
+def _may_be_transparent(header: bytes) -> bool:
+    """Return whether an image may have an alpha channel, from the first 26 bytes of its file."""
+    if header.startswith(b"\x89PNG"):
+        return header[25:] in (b"\3", b"\4", b"\6")  # with a palette, grey and alpha, or RGB and alpha
+    return not header.startswith((b"\xff\xd8", b"BM"))  # JPEG has none, and BMP's has no meaning

@@ -9,6 +9,7 @@ from morgs_mi.codec.container import MAGIC, Packet, PacketKind
 from morgs_mi.codec.packets import WholeFrame
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.io.foreign import refuse_foreign
+from morgs_mi.io.listing import listed
 from morgs_mi.io.splats import read_splats, suffix_of
 from morgs_mi.playback.default_rig import DEFAULT_RIG, default_rig
 from morgs_mi.playback.export.notebook import stream_html
@@ -84,7 +85,7 @@ def stream_path(out: str | Path) -> Path:
     if path.is_dir() and not (path / STREAM).exists():
         if (path / "meta.json").is_file():
             refuse_foreign(path / "meta.json")
-        if frames := sorted(file.name for file in path.iterdir() if suffix_of(file)):
+        if frames := [file.name for file in listed(path) if suffix_of(file)]:
             raise ValueError(
                 f"{path}: got a folder with {len(frames)} files of Gaussians, not a stream; name one of them, such "
                 f"as {path / frames[0]}, or turn all into a stream with `morgs-mi import`."

@@ -13,6 +13,7 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.rig import with_near_planes
 from morgs_mi.io.model_cameras import model_cameras
 from morgs_mi.playback.default_rig import thinned
 
@@ -47,6 +48,7 @@ def trained_cameras(path: Path, gaussians: Gaussians) -> tuple[Path | None, tupl
     if not cameras or not len(gaussians):
         return None, ()
     some = thinned(gaussians)
+    cameras = with_near_planes(cameras, some.numpy()["means"])
     seen = np.stack([_seen(some, camera) for camera in cameras])
     opacities = np.asarray(some.opacities, np.float64)
     weights = opacities / opacities.sum()

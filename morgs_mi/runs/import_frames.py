@@ -28,6 +28,7 @@ from morgs_mi.core.checks import check_number
 from morgs_mi.core.files import atomic_path
 from morgs_mi.core.gaussians import Gaussians
 from morgs_mi.io.foreign import refuse_foreign
+from morgs_mi.io.listing import listed
 from morgs_mi.io.splats import SUFFIXES, read_splats, suffix_of
 from morgs_mi.playback.default_rig import DEFAULT_RIG, Axes, default_rig
 
@@ -139,9 +140,9 @@ def find_frames(sources: Sequence[str | Path]) -> list[Path]:
             raise FileNotFoundError(f"{path}: expected frames ({', '.join(SUFFIXES)}), found none; check the path.")
     if len(paths) == 1 and paths[0].is_dir():
         folder = paths[0]
-        paths = sorted((path for path in folder.iterdir() if path.is_file() and suffix_of(path)), key=_by_numbers)
+        paths = sorted((path for path in listed(folder) if path.is_file() and suffix_of(path)), key=_by_numbers)
         if not paths:
-            for file in sorted(folder.iterdir()):
+            for file in listed(folder):
                 refuse_foreign(file)
             raise ValueError(
                 f"{folder}: expected files whose names end in {', '.join(SUFFIXES)}, got none; convert the frames."

@@ -25,6 +25,7 @@ from morgs_mi.core.camera import Camera
 from morgs_mi.core.files import atomic_path, write_json
 from morgs_mi.core.memory import check_memory
 from morgs_mi.io.bounded import read_json
+from morgs_mi.io.listing import is_added
 from morgs_mi.io.video import open_frames
 from morgs_mi.io.video_writer import playable_format, write_video
 from morgs_mi.synth.disturbances import (
@@ -289,7 +290,7 @@ def _check_folder(out: Path, overwrite: bool) -> None:
     """Raise `FileExistsError` if `out` must not be replaced."""
     if out.exists() and not out.is_dir():
         raise FileExistsError(f"synthesize(): {out} is a file; choose another folder.")
-    occupied = out.is_dir() and any(out.iterdir())
+    occupied = out.is_dir() and not all(is_added(file.name) for file in out.iterdir())
     if occupied and not overwrite:
         raise FileExistsError(f"synthesize(): {out} is not empty; choose another folder, or set `overwrite`.")
     if occupied and not _is_synthetic(out):

@@ -26,7 +26,7 @@ from morgs_mi.calibration.calibrate import (
 )
 from morgs_mi.calibration.checks.rig_check import CameraCheck, check_rig, match_capture
 from morgs_mi.capture.capture import load_capture
-from morgs_mi.capture.layouts.colmap import write_colmap
+from morgs_mi.capture.layouts.colmap import read_colmap, write_colmap
 from morgs_mi.core.camera import Camera
 from morgs_mi.io.video_writer import write_video
 from tests.assertions import assert_close
@@ -87,15 +87,21 @@ def test_calibrate__finds_the_same_poses_on_every_run(tmp_path: Path) -> None:
     assert not np.ptp(found, axis=0).any(), "threads may find a pose from other samples"
 
 
-def test_calibrate__names_images_after_photos(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "names",
+    [("a.JPG", "b.JPG", "c.JPG", "d.JPG"), (" a.tif", "b .webp", " c d .BMP", "e.TIFF")],
+    ids=["JPEG", "spaces and other formats"],
+)
+def test_calibrate__names_images_after_photos(tmp_path: Path, names: tuple[str, ...]) -> None:
     planes = textured.textures()
-    for camera in (camera.resized(240, 180) for camera in textured.rig(4)):
-        image = textured.render(camera, planes)[..., ::-1]
-        cv2.imwrite(str(tmp_path / f"{camera.name}.JPG"), image, [cv2.IMWRITE_JPEG_QUALITY, 98])
-    found = calibrate(tmp_path, CalibrateConfig(shared_intrinsics=True))
-    model = pycolmap.Reconstruction(str(found.model))
-    assert {image.name for image in model.images.values()} == {f.name for f in tmp_path.glob("*.JPG")}
-    assert load_capture(tmp_path).names == found.cameras
+    for name, camera in zip(names, textured.rig(4), strict=True):
+        image = textured.render(camera.resized(240, 180), planes)[..., ::-1]
+        options = [cv2.IMWRITE_JPEG_QUALITY, 98] if name.endswith("JPG") else []
+        (tmp_path / name).write_bytes(cv2.imencode(Path(name).suffix.lower(), image, options)[1].tobytes())
+        (tmp_path / f"._{name}").write_bytes(b"\0\5\x16\7")
+    result = calibrate(tmp_path, CalibrateConfig(shared_intrinsics=True))
+    assert {camera.name for camera in read_colmap(result.model).cameras} == set(names)
+    assert load_capture(tmp_path).names == result.cameras
 
 
 def test_calibrate__shares_intrinsics_among_clips_of_a_size(tmp_path: Path) -> None:

@@ -223,7 +223,10 @@ NERFSTUDIO = {
         transforms(lambda m: m["frames"][1].pop("file_path")),
         "frame 1: `file_path` must name a file, got None",
     ),
-    "no size": (transforms(lambda m: m.pop("w")), "frame 0 .*: `w` must be a finite number .*, here or .* got none"),
+    "no size": (
+        transforms(lambda m: m.update(w="62")),
+        "frame 0 .*: `w` must be a finite number .*, here or .* got '62'",
+    ),
     "no focal length": (transforms(lambda m: m["frames"][2].pop("fl_x")), "frame 2 .*cam10.png.: `fl_x` must be a fin"),
     "word": (transforms(lambda m: m.update(k1="no")), "`k1` must be a finite number .* got 'no'"),
     "unknown model": (transforms(lambda m: m.update(camera_model="EQUIRECTANGULAR")), "got 'EQUIRECTANGULAR'; undist"),

@@ -107,6 +107,15 @@ CASES = {
     "JSON of long number": (read_json, b"9" * 5000, "expected JSON, got a broken file"),
     "TOML of a long key": (read_toml, b"x." + b"a." * 20_000 + b"b = 1", r"broken file \(a key has more than 32 parts"),
     "TOML of a long table": (read_toml, b"[a" + b" .\t'b'" * 99 + b"]", r"broken file \(a key has more than 32 parts"),
+    "TOML of signs": (read_toml, b'"#".' * 20_000 + b"b = 1", r"broken file \(a key has more than 32 parts"),
+    "TOML of equals signs": (read_toml, b"'='." * 20_000 + b"b = 1", r"broken file \(a key has more than 32 parts"),
+    "TOML of escapes": (read_toml, rb'"\"".' * 20_000 + b"b = 1", r"broken file \(a key has more than 32 parts"),
+    "TOML of a long inline key": (read_toml, b"x = {" + b"'{'." * 99 + b"b = 1}", "a key has more than 32 parts"),
+    "TOML of a key alone": (read_toml, b"a." * 400_000, "a key has more than 32 parts"),
+    "TOML of open strings": (read_toml, b'a = """' + b'\\"""' * 100_000, "expected TOML, got a broken file"),
+    "TOML in Latin-1": (read_toml, "a = 'é'".encode("latin-1"), "expected text in UTF-8, got other bytes"),
+    "JSON in Latin-1": (read_json, '"é"'.encode("latin-1"), "expected text in UTF-8, got other bytes"),
+    "npy of more numbers": (read_array, npy("(5,)"), r"its header claims float64 \(5,\), but 48 bytes follow"),
     "TOML of many tables": (read_toml, b"[a.b.c]\n" * 90_000, "got a claim of 270000 tables"),
     "TOML of many rows": (read_toml, b"x = [" + b"1," * MAX_TOML + b"]", "expected at most 1000000 bytes, got 2000006"),
     "deep TOML": (read_toml, b"x = " + b"[" * 5000, "expected TOML, got a broken file"),
@@ -162,10 +171,27 @@ def test_readers__refuse_pipes_and_folders(tmp_path: Path, read) -> None:
             read(path)
 
 
-def test_read_toml__reads_long_comments_and_many_numbers(tmp_path: Path) -> None:
-    text = "# " + "." * 200 + "\n# " + "A sentence. " * 20 + f"\nx = {[0.5] * 1000}\na.b.c.d = '...'\n"
+def test_read_toml__counts_keys_and_not_texts(tmp_path: Path) -> None:
+    """Dots and brackets in comments and texts, and the points of numbers, take nothing."""
+    dots = "a." * 100_000
+    text = f"# {dots} \"'\n# it's [[\nx = {[0.5] * 20_000}\na.b.c.d = '{dots}'\n\"{dots[:99]}\".'{dots[:99]}' = 1\n"
     (tmp_path / "a.toml").write_text(text)
-    assert read_toml(tmp_path / "a.toml") == {"x": [0.5] * 1000, "a": {"b": {"c": {"d": "..."}}}}
+    content = {"x": [0.5] * 20_000, "a": {"b": {"c": {"d": dots}}}, dots[:99]: {dots[:99]: 1}}
+    assert read_toml(tmp_path / "a.toml") == content
+
+
+def test_read_json__does_not_count_the_punctuation_of_texts(tmp_path: Path) -> None:
+    text = "[{,\\" * 400_000 + '"'
+    (tmp_path / "a.json").write_text(json.dumps([text]))
+    assert read_json(tmp_path / "a.json") == [text]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32"])
+def test_readers__read_every_encoding_of_unicode(tmp_path: Path, encoding: str) -> None:
+    (tmp_path / "a").write_bytes('a = "é"\r\n[b]\r\n'.encode(encoding))
+    assert read_toml(tmp_path / "a") == {"a": "é", "b": {}}
+    (tmp_path / "a").write_bytes('{"a":\r\n"é"}'.encode(encoding))
+    assert read_json(tmp_path / "a") == {"a": "é"}
 
 
 @pytest.mark.parametrize("order", "CF")

@@ -154,7 +154,7 @@ def test_same_gaussians__accepts_equal_rows():
 
 def test_find_frames__orders_by_number(tmp_path):
     names = ["f9.ply", "f10.ply", "f100.ply", "f1.ply"]
-    for name in [*names, "notes.txt", "cameras.json"]:
+    for name in [*names, "notes.txt", "cameras.json", "._f1.ply", ".DS_Store", "Thumbs.db"]:
         (tmp_path / name).touch()
     assert [path.name for path in find_frames([tmp_path])] == ["f1.ply", "f9.ply", "f10.ply", "f100.ply"]
     given = [tmp_path / name for name in names]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -118,17 +119,23 @@ def colmap(path: Path) -> Path:
     return path
 
 
-def nerfstudio(path: Path) -> Path:
-    path.mkdir(parents=True)
-    names = ("cam1", "cam2", "cam10")
+def transforms(path: Path, cameras: list[Camera], k1: float = 0.0) -> None:
+    """Write a `transforms.json` of cameras that are named as their images."""
     entries = []
-    for camera in rig(names, shift=3):
+    for camera in cameras:
         to_world = np.linalg.inv(camera.viewmat) @ np.diag([1, -1, -1, 1])
         K = camera.K
         focal = {"fl_x": K[0, 0], "fl_y": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-        entries.append({"file_path": f"./images/{camera.name}.png", "transform_matrix": to_world.tolist(), **focal})
-    meta = {"camera_model": "OPENCV", "w": WIDTH, "h": HEIGHT, "k1": 0.01, "frames": entries}
+        entries.append({"file_path": camera.name, "transform_matrix": to_world.tolist(), **focal})
+    meta = {"camera_model": "OPENCV", "w": WIDTH, "h": HEIGHT, "k1": k1, "frames": entries}
     (path / "transforms.json").write_text(json.dumps(meta))
+
+
+def nerfstudio(path: Path) -> Path:
+    path.mkdir(parents=True)
+    names = ("cam1", "cam2", "cam10")
+    cameras = [replace(camera, name=f"./images/{camera.name}.png") for camera in rig(names, shift=3)]
+    transforms(path, cameras, k1=0.01)
     videos(path, names)
     return path
 

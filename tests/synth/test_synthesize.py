@@ -72,6 +72,16 @@ def test_synthesize__colmap_points_lie_on_the_surface_within_their_noise(clip):
     assert np.percentile(best, 95) < 4
 
 
+def test_synthesize__replaces_a_folder_of_system_files_but_no_hidden_ones(tmp_path):
+    (tmp_path / "repository" / ".git").mkdir(parents=True)
+    with pytest.raises(FileExistsError, match="not empty; choose another folder"):
+        synthesize("spheres", tmp_path / "repository", TINY)
+    (tmp_path / "new" / "__MACOSX").mkdir(parents=True)
+    (tmp_path / "new" / ".DS_Store").touch()
+    synthesize("spheres", tmp_path / "new", TINY)
+    assert (tmp_path / "new" / "capture.json").is_file()
+
+
 def test_synthesize__rejects_a_non_empty_folder_and_replaces_a_capture_with_overwrite(tmp_path, clip):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(FileExistsError, match="not empty; choose another folder"):

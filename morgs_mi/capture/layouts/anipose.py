@@ -31,13 +31,21 @@ from morgs_mi.capture.layouts.calibration import (
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import LARGEST, bounded
-from morgs_mi.io.bounded import MAX_TOML, read_bytes, read_toml
+from morgs_mi.io.bounded import MAX_TOML, read_text, read_toml
+from morgs_mi.io.unread import warn_unread
 
 __all__ = ["LAYOUT", "read_anipose"]
 
 _KEYS = ("matrix", "distortions", "rotation", "translation")
+_CAMERA = {*_KEYS, "name", "size", "fisheye"}
+# Entries of caliscope, FreeMoCap and Pose2Sim that say nothing about the lenses and poses.
+_HARMLESS = {
+    *("cam_id", "port", "error", "exposure", "grid_count", "ignore", "rotation_count", "verified_resolutions"),
+    *("metadata", "capture_volume", "charuco", "aruco", "board", "point_estimates", "camera_count", "creation_date"),
+    *("save_tracked_points_video", "fps_recording", "fps_sync_stream_processing", "version"),
+}
 # Recognises a calibration without parsing it; a broken one is then reported as a broken calibration.
-_MARKS = [re.compile(rf"^[ \t]*{key}[ \t]*=".encode(), re.MULTILINE) for key in ("matrix", "rotation")]
+_MARKS = [re.compile(rf"^[ \t]*{key}[ \t]*=", re.MULTILINE) for key in ("matrix", "rotation")]
 
 
 def read_anipose(path: Path) -> tuple[list[Camera], list[Lens]]:
@@ -57,8 +65,10 @@ def read_anipose(path: Path) -> tuple[list[Camera], list[Lens]]:
             f"{path}: expected a table for each camera, such as [cam_0], with {', '.join(_KEYS)}, found none; export "
             "the calibration again."
         )
-    found = [_camera(path, key, entry) for key, entry in entries.items()]
-    return [camera for camera, _ in found], [lens for _, lens in found]
+    others = {key for table in (content, tables) for key in table if key not in entries and key != "cameras"}
+    warn_unread(path, {*others, *(key for entry in entries.values() for key in entry)} - _CAMERA - _HARMLESS)
+    pairs = [_camera(path, key, entry) for key, entry in entries.items()]
+    return [camera for camera, _ in pairs], [lens for _, lens in pairs]
 
 
 def _camera(path: Path, key: str, entry: Mapping[str, Any]) -> tuple[Camera, Lens]:
@@ -112,7 +122,7 @@ def _calibration_files(path: Path) -> list[Path]:
 
 def _is_calibration(file: Path) -> bool:
     try:
-        content = read_bytes(file, MAX_TOML)
+        content = read_text(file, MAX_TOML)
     except (OSError, ValueError):  # not readable, a folder or a pipe, or more than a calibration
         return False
     return all(mark.search(content) for mark in _MARKS)
@@ -121,7 +131,7 @@ def _is_calibration(file: Path) -> bool:
 def _read_calibration(path: Path) -> Calibration:
     source = only_calibration(path, _calibration_files(path), "one calibration in TOML")
     cameras, lenses = read_anipose(source)
-    return Calibration(*match_clips(path, source, required_clips(path), cameras, lenses))
+    return match_clips(path, source, required_clips(path), cameras, lenses).calibration
 
 
 LAYOUT = Layout("Anipose", ("calibration.toml",), lambda path: bool(_calibration_files(path)), _read_calibration)

@@ -8,7 +8,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from fnmatch import fnmatch
+from pathlib import Path, PurePosixPath
 from typing import Literal, cast
 
 import numpy as np
@@ -25,12 +26,14 @@ from morgs_mi.capture.layouts.clips import (
 )
 from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera
+from morgs_mi.io.listing import listed
 from morgs_mi.io.video import VIDEO_SUFFIXES, Clip, natural_key
 
 __all__ = [
     "NO_POINTS",
     "Calibration",
     "Layout",
+    "Match",
     "PoseConvention",
     "calibration_files",
     "match_clips",
@@ -56,7 +59,9 @@ class Calibration:
         clips: one per camera: its video, folder of images or list of images.
         points: [P, 3] float32, world units; P = 0 if the layout has none.
         point_colors: [P, 3] float32 in [0, 1].
-        test_views: indices of the cameras that the layout holds out; None if it does not specify them.
+        test_views: indices of the cameras that the layout holds out, in ascending order; None if it specifies none.
+        masks: per camera images of its clip's size or scaled versions, whose black pixels are not used; no images: all
+            pixels are used.
     """
 
     cameras: tuple[Camera, ...]
@@ -65,6 +70,7 @@ class Calibration:
     points: np.ndarray = field(default_factory=lambda: NO_POINTS)
     point_colors: np.ndarray = field(default_factory=lambda: NO_POINTS)
     test_views: tuple[int, ...] | None = None
+    masks: tuple[tuple[Path, ...], ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -78,12 +84,14 @@ class Calibration:
             ValueError: there is no such camera, or none is left.
         """
         kept = [self.names.index(name) for name in names_without(path, self.names, names)]
+        views = self.test_views
         return replace(
             self,
             cameras=tuple(self.cameras[index] for index in kept),
             lenses=tuple(self.lenses[index] for index in kept),
             clips=tuple(self.clips[index] for index in kept),
-            test_views=self.test_views and tuple(kept.index(view) for view in self.test_views if view in kept),
+            test_views=views and tuple(kept.index(view) for view in views if view in kept),
+            masks=tuple(self.masks[index] for index in kept if self.masks),
         )
 
 
@@ -122,8 +130,9 @@ class Layout:
 
 
 def calibration_files(path: Path, pattern: str) -> list[Path]:
-    """Return the files with a name that matches a pattern, in a capture or in its folder `calibration`."""
-    return [file for folder in (path, path / "calibration") for file in sorted(folder.glob(pattern))]
+    """Return the files with a name that matches a pattern in lower case, in a capture or in its `calibration`."""
+    folders = [folder for folder in (path, path / "calibration") if folder.is_dir()]
+    return [file for folder in folders for file in listed(folder) if fnmatch(file.name.lower(), pattern)]
 
 
 def only_calibration(path: Path, files: Sequence[Path], expected: str) -> Path:
@@ -152,15 +161,29 @@ def required_clips(path: Path) -> Mapping[str, Clip]:
     )
 
 
+@dataclass(frozen=True)
+class Match:
+    """Fixed cameras and their clips.
+
+    Attributes:
+        calibration: one camera, lens and clip per fixed camera.
+        images: per camera the indices of its images in the file of the calibration.
+    """
+
+    calibration: Calibration
+    images: tuple[tuple[int, ...], ...]
+
+
 def match_clips(
     path: Path, source: Path, clips: Mapping[str, Clip], cameras: Sequence[Camera], lenses: Sequence[Lens]
-) -> tuple[tuple[Camera, ...], tuple[Lens, ...], tuple[Clip, ...]]:
-    """Return one camera, lens and clip per fixed camera that has one, in numerical order of the clips' names.
+) -> Match:
+    """Return the fixed cameras that have a clip, in numerical order of the clips' names.
 
     Cameras without a clip, and clips without a camera, are left out with a warning.
 
     Args:
-        path: the capture folder; its photos and frame folders are used if they match more cameras than `clips`.
+        path: the capture folder; its photos, its frame folders or the photos in the folder that the cameras' names
+            state are used if they match more cameras than `clips`.
         source: file or folder of the calibration, for messages.
         clips: from `required_clips`.
         cameras: one or more per fixed camera, named as the calibration's images.
@@ -171,51 +194,60 @@ def match_clips(
         ValueError: two images of one clip have different poses or lenses, or a frame folder is missing.
     """
     match = _best_match(path, source, clips, cameras, lenses)
-    index, clips = match.index, match.clips
+    clips = match.clips
     if match.without:
         names, count = ", ".join(match.without[:_MAX_LISTED]), len(match.without) - _MAX_LISTED
         rest = f" and {count} others" if count > 0 else ""
         _LOG.warning("%s: no clip is named after %s%s: left out.", source, names, rest)
-    if unused := [name for name in clips if name not in index]:
+    if unused := [name for name in clips if name not in match.images]:
         _LOG.warning("%s does not calibrate %s: not used.", source, ", ".join(unused))
-    names = sorted(index, key=natural_key)
-    return (
-        tuple(replace(cameras[index[name]], name=name) for name in names),
-        tuple(lenses[index[name]] for name in names),
+    names = sorted(match.images, key=natural_key)
+    images = tuple(tuple(match.images[name]) for name in names)
+    calibration = Calibration(
+        tuple(replace(cameras[index[0]], name=name) for name, index in zip(names, images, strict=True)),
+        tuple(lenses[index[0]] for index in images),
         tuple(clips[name] for name in names),
     )
+    return Match(calibration, images)
 
 
 @dataclass(frozen=True)
-class _Match:
+class _NamedMatch:
     """Clips and the cameras that they belong to.
 
     Attributes:
         clips: clips by name.
-        index: index of the first camera of each clip that has one, by the clip's name.
+        images: indices of the cameras of each clip that has some, by the clip's name.
         without: names of the cameras that have no clip.
     """
 
     clips: Mapping[str, Clip]
-    index: dict[str, int]
+    images: dict[str, list[int]]
     without: list[str]
 
 
 def _best_match(
     path: Path, source: Path, clips: Mapping[str, Clip], cameras: Sequence[Camera], lenses: Sequence[Lens]
-) -> _Match:
+) -> _NamedMatch:
     """Return the match of `clips`, photos or frame folders with the most cameras; see `match_clips`."""
-    found, errors = [], []
-    for find in (lambda _: clips, photos, clips_by_frame):
+    matches, errors = [], []
+    attempts: Sequence[tuple[Callable[[Path], Mapping[str, Clip]], bool]] = (
+        (lambda _: clips, True),
+        (lambda _: {} if _in_folders(clips, cameras) else clips, False),
+        (photos, False),
+        (clips_by_frame, False),
+        (lambda path: _named_photos(path, cameras), False),
+    )
+    for find, by_folder in attempts:
         try:
-            found.append(_matched(source, find(path), cameras, lenses))
+            matches.append(_matched(source, find(path), cameras, lenses, by_folder))
         except ValueError as error:
             errors.append(error)
             continue
-        if not found[-1].without:
+        if not matches[-1].without:
             break
-    best = max(found, key=lambda match: len(match.index), default=None)
-    if best is None or not best.index:
+    best = max(matches, key=lambda match: len(match.images), default=None)
+    if best is None or not best.images:
         expected = ", ".join(camera.name for camera in cameras[:_MAX_LISTED])
         errors.append(
             FileNotFoundError(
@@ -229,19 +261,34 @@ def _best_match(
     return best
 
 
-def _matched(source: Path, clips: Mapping[str, Clip], cameras: Sequence[Camera], lenses: Sequence[Lens]) -> _Match:
-    """Return the match between clips and cameras.
+def _in_folders(clips: Mapping[str, Clip], cameras: Sequence[Camera]) -> bool:
+    """Return whether an image of the cameras is named as one in a folder of `clips`."""
+    names = {part for camera in cameras for part in PurePosixPath(camera.name.replace("\\", "/")).parts[:-1]}
+    return any(isinstance(clip, Path) and clip.is_dir() for clip in map(clips.get, names))
+
+
+def _named_photos(path: Path, cameras: Sequence[Camera]) -> Mapping[str, Clip]:
+    """Return the photos in the folder that the names of all cameras state, if there is one."""
+    folders = {path / PurePosixPath(camera.name.replace("\\", "/")).parent for camera in cameras}
+    return photos(folder) if len(folders) == 1 and (folder := folders.pop()).is_dir() else {}
+
+
+def _matched(
+    source: Path, clips: Mapping[str, Clip], cameras: Sequence[Camera], lenses: Sequence[Lens], by_folder: bool
+) -> _NamedMatch:
+    """Return the match between clips and cameras, `by_folder` as for `view_of_image`.
 
     Raises:
         ValueError: two images of one clip have different poses or lenses.
     """
-    match = _Match(clips, {}, [])
+    match = _NamedMatch(clips, {}, [])
     for index, camera in enumerate(cameras):
-        name = clip_of_camera(clips, camera.name) or view_of_image(clips, camera.name)
+        name = clip_of_camera(clips, camera.name) or view_of_image(clips, camera.name, by_folder)
         if name is None:
             match.without.append(camera.name)
             continue
-        first = match.index.setdefault(name, index)
+        match.images.setdefault(name, []).append(index)
+        first = match.images[name][0]
         same = np.allclose(cameras[first].viewmat, camera.viewmat, atol=1e-6) and lenses[first] == lenses[index]
         if not (same and np.allclose(cameras[first].K, camera.K)):
             raise ValueError(

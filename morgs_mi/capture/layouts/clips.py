@@ -5,21 +5,29 @@ camera or per frame; cameras are ordered numerically, cam_2 before cam_10:
 
 - per camera: ``cam01.mp4``, ``cam01/0000.png`` or ``cam01/images/0000.png``, in the capture or in a folder of it
   (``videos/cam01.mp4``, ``images/cam01/0000.png``). Of several clips of one name the lossless one in ``frames/``
-  takes precedence, then a video, then a folder; clips in the capture itself take precedence over those in a folder;
+  takes precedence, then a video, then a folder; clips in the capture itself take precedence over those in a folder, and
+  those in the folder ``images`` or ``videos`` over those in others. Files that differ in their suffixes are refused;
 - per frame: ``0000/cam01.png`` or ``0000/images/cam01.png``, with the same cameras in every folder;
 - photos: ``cam01.png`` or ``images/cam01.png``, one image per camera.
 """
 
 from __future__ import annotations
 
+import logging
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
-from morgs_mi.io.video import IMAGE_SUFFIXES, VIDEO_SUFFIXES, natural_key, numbering_gap
+import numpy as np
+
+from morgs_mi.io.image_size import image_size
+from morgs_mi.io.listing import listed
+from morgs_mi.io.remote import fetched
+from morgs_mi.io.video import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Clip, natural_key, numbering_gap, open_frames
 
 __all__ = [
     "EXAMPLE",
+    "ImageSizes",
     "check_frames",
     "clip_of_camera",
     "clips_by_camera",
@@ -29,32 +37,45 @@ __all__ = [
     "view_of_image",
 ]
 
+_LOG = logging.getLogger(__name__)
+
 EXAMPLE = "one folder per camera: cam01/0000.png, cam01/0001.png, ..., cam02/0000.png, cam02/0001.png, ..."
 """The layout of a recording in images, for messages."""
 
 # Folders without clips, and folders with images that do not belong to a camera.
 _NOT_CLIPS = {"sparse", "truth", "masks", "seg"}
 # Nerfstudio writes downscaled copies to `images_2`, `images_4`, ...
-_NOT_CAMERAS = re.compile(rf"{'|'.join(_NOT_CLIPS)}|frames|images(_[0-9]+)?|\..*")
+_COPIES = re.compile(r"images_[0-9]+")
+_NOT_CAMERAS = re.compile(rf"{'|'.join(_NOT_CLIPS)}|frames|images|{_COPIES.pattern}")
+_USUAL = {"images", "videos"}
 
 
 def clips_by_camera(path: Path) -> dict[str, Path]:
-    """Return each camera's video or folder of images by the camera's name, in numerical order."""
-    inner = [f for f in path.iterdir() if f.is_dir() and f.name not in _NOT_CLIPS and not f.name.startswith(".")]
-    found: dict[str, Path] = {}
+    """Return each camera's video or folder of images by the camera's name, in numerical order.
+
+    Raises:
+        ValueError: two videos in one folder differ only in their suffixes.
+    """
+    inner = [f for f in listed(path) if f.is_dir() and f.name not in {*_NOT_CLIPS, "frames"}]
+    if (path / "images").is_dir():
+        inner = [f for f in inner if not _COPIES.fullmatch(f.name)]
+    inner.sort(key=lambda f: f.name in _USUAL)
     # The last clip found for a camera takes precedence.
-    for folder in [*sorted(f for f in inner if f.name != "frames"), path]:
-        found |= _folders(folder) | {f.stem: f for f in folder.iterdir() if _is_video(f)}
+    found = _merged(path, map(_folders, inner)) | _merged(path, map(_videos, inner)) | _folders(path) | _videos(path)
     if (path / "frames").is_dir():
-        found |= {f.stem: f for f in (path / "frames").iterdir() if _is_video(f)} | _folders(path / "frames")
+        found |= _videos(path / "frames") | _folders(path / "frames")
     return {name: found[name] for name in sorted(found, key=natural_key)}
 
 
 def photos(path: Path) -> dict[str, tuple[Path]]:
-    """Return the images directly in a capture or its folder `images` as clips of one frame, by their names."""
+    """Return the images directly in a folder or its folder `images` as clips of one frame, by their names.
+
+    Raises:
+        ValueError: two images differ only in their suffixes.
+    """
     folder = _image_folder(path)
-    images = sorted(filter(_is_image, folder.iterdir()), key=lambda f: natural_key(f.stem)) if folder else ()
-    return {f.stem: (f,) for f in images}
+    images = _by_stem(filter(_is_image, listed(folder))) if folder else {}
+    return {name: (images[name],) for name in sorted(images, key=natural_key)}
 
 
 def clips_by_frame(path: Path) -> dict[str, tuple[Path, ...]]:
@@ -65,8 +86,8 @@ def clips_by_frame(path: Path) -> dict[str, tuple[Path, ...]]:
     frames = sorted(_folders(path).values(), key=lambda f: natural_key(str(f)))
     if not frames:
         return {}
-    images = sorted((f for f in frames[0].iterdir() if _is_image(f)), key=lambda f: natural_key(f.stem))
-    return {f.stem: tuple(folder / f.name for folder in frames) for f in images}
+    images = _by_stem(filter(_is_image, listed(frames[0])))
+    return {name: tuple(f / images[name].name for f in frames) for name in sorted(images, key=natural_key)}
 
 
 def check_frames(path: Path, clips: Mapping[str, Sequence[Path]]) -> None:
@@ -97,14 +118,17 @@ def names_without(path: Path, names: Collection[str], without: Collection[str]) 
     return kept
 
 
-def view_of_image(views: Collection[str], image: str) -> str | None:
+def view_of_image(views: Collection[str], image: str, by_folder: bool = False) -> str | None:
     """Return the camera in `views` to which an image of a calibration belongs, or None.
 
-    It is cam01 for ``cam01.png``, ``cam01.mp4``, ``cam01/0000.png`` and ``cam01/images/0000.png``.
+    It is cam01 for ``cam01.png``, ``cam01.mp4``, ``cam01``, ``cam01/0000.png`` and ``cam01/images/0000.png``. Of
+    ``1/2.png`` it is 2, or with `by_folder` 1, if there are both.
     """
     place = PurePosixPath(image.replace("\\", "/"))
-    names = (place.stem, *reversed(place.parts[:-1]))
-    return next((name for name in names if name in views), None)
+    folders = place.parts[-2::-1]
+    own = (place.stem, place.name)
+    names = (*folders, *own) if by_folder else (*own, *folders)
+    return next((name for text in names for name in (text, text.strip()) if name in views), None)
 
 
 def clip_of_camera(clips: Collection[str], camera: str) -> str | None:
@@ -116,15 +140,100 @@ def clip_of_camera(clips: Collection[str], camera: str) -> str | None:
     return found[0] if len(found) == 1 else None
 
 
+class ImageSizes:
+    """Sizes of the images that a calibration names, from their files or their clips.
+
+    Args:
+        folder: the folder of the calibration, from which the images are named, with or without their suffixes.
+        clips: clips by name, for images that are no files.
+    """
+
+    def __init__(self, folder: Path, clips: Mapping[str, Clip]) -> None:
+        self._folder = folder
+        self._clips = clips
+        self._files: dict[Path, dict[str, Path]] = {}
+        self._sizes: dict[Clip, tuple[int, int]] = {}
+
+    def of(self, image: str) -> tuple[int, int] | None:
+        """Return the width and height of an image, None if it has neither a file nor a clip.
+
+        Raises:
+            ValueError: the file or the clip cannot be read.
+        """
+        clip = self._file(self._folder / image.replace("\\", "/")) or self._clip(image)
+        if clip is None:
+            return None
+        if clip not in self._sizes:
+            self._sizes[clip] = _clip_size(clip)
+        return self._sizes[clip]
+
+    def _file(self, image: Path) -> Path | None:
+        if image.is_file():
+            return image
+        folder = image.parent
+        if folder not in self._files:
+            images = filter(_is_image, listed(folder)) if folder.is_dir() else ()
+            self._files[folder] = {file.stem: file for file in images}
+        return self._files[folder].get(image.name)
+
+    def _clip(self, image: str) -> Clip | None:
+        name = view_of_image(self._clips, image, by_folder=True)
+        return None if name is None else self._clips[name]
+
+
+def _clip_size(clip: Clip) -> tuple[int, int]:
+    """Return the width and height of a clip or an image."""
+    if isinstance(clip, Path) and _is_image(clip):
+        size = image_size(np.memmap(clip, np.uint8, "r")) if fetched(clip).stat().st_size else (0, 0)
+        if all(size):
+            return size
+        clip = (clip,)
+    reader = open_frames(clip)
+    return reader.width, reader.height
+
+
 def _folders(folder: Path) -> dict[str, Path]:
-    inner = [f for f in folder.iterdir() if f.is_dir() and not _NOT_CAMERAS.fullmatch(f.name)]
-    return {f.name: found for f in inner if (found := _image_folder(f))}
+    inner = [f for f in listed(folder) if f.is_dir() and not _NOT_CAMERAS.fullmatch(f.name)]
+    return {f.name: images for f in inner if (images := _image_folder(f))}
+
+
+def _videos(folder: Path) -> dict[str, Path]:
+    return _by_stem(filter(_is_video, listed(folder)))
+
+
+def _by_stem(files: Iterable[Path]) -> dict[str, Path]:
+    """Return files by their names without suffix.
+
+    Raises:
+        ValueError: two have the same.
+    """
+    named: dict[str, Path] = {}
+    for file in files:
+        if (other := named.setdefault(file.stem, file)) != file:
+            raise ValueError(
+                f"{file.parent}: expected one file per camera, got {other.name} and {file.name}; keep one of them, or "
+                "rename it."
+            )
+    return named
+
+
+def _merged(path: Path, places: Iterable[Mapping[str, Path]]) -> dict[str, Path]:
+    """Return the clips in folders of the capture `path`, the last one of each name, with a warning if it has others."""
+    merged: dict[str, Path] = {}
+    for clips in places:
+        if twice := [name for name in clips if name in merged]:
+            first, last = (found[twice[0]].relative_to(path) for found in (merged, clips))
+            _LOG.warning(
+                "%s: %s have two clips, such as %s and %s: the latter is used.", path, ", ".join(twice), first, last
+            )
+        merged |= clips
+    return merged
 
 
 def _image_folder(folder: Path) -> Path | None:
     """Return the folder that holds a camera's or a frame's images: its own or the `images` folder in it, or None."""
     for place in (folder, folder / "images"):
-        if place.is_dir() and any(_is_image(f) for f in place.iterdir()):
+        if place.is_dir() and any(map(_is_image, listed(place))):
             return place
     return None
 

@@ -9,10 +9,10 @@ and silently drops every second image of a text model without blank lines.
 
 from __future__ import annotations
 
+import logging
 import os
-import struct
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -21,20 +21,31 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from morgs_mi.capture.layouts.calibration import Calibration, Layout, match_clips, required_clips
-from morgs_mi.capture.lens import MODELS, Lens, lens_and_intrinsics
+from morgs_mi.capture.layouts.colmap_files import (
+    binary_cameras,
+    binary_images,
+    binary_points,
+    count_images,
+    text_cameras,
+    text_images,
+    text_points,
+)
+from morgs_mi.capture.lens import Lens, lens_and_intrinsics
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.core.files import write_error
-from morgs_mi.io.bounded import check_claim, read_bytes, regular
+from morgs_mi.io.bounded import check_claim
+from morgs_mi.io.listing import listed
+from morgs_mi.io.video import natural_key
 
 if TYPE_CHECKING:
     import pycolmap
 
 __all__ = ["LAYOUT", "ColmapModel", "find_colmap", "read_colmap", "write_colmap", "write_reconstruction"]
 
+_LOG = logging.getLogger(__name__)
+
 _FILES = ("cameras", "images", "points3D")
-# More values than a line of any camera model has in a text file.
-_MAX_CAMERA_FIELDS = 20
 # Memory of a `Camera`, which a line of a few characters may describe.
 _CAMERA_BYTES = 500
 
@@ -59,14 +70,35 @@ class ColmapModel:
 def find_colmap(folder: Path) -> Path | None:
     """Return the folder of the COLMAP model in a capture, or None.
 
-    It is the first of `sparse/0`, `sparse`, `colmap/sparse/0` and the folder itself that holds a model.
+    It is in a numbered folder of `sparse`, in `sparse`, in another folder of it, likewise in `colmap/sparse`, or in the
+    capture itself. COLMAP writes several models, in any order, if it cannot connect all images: the one of most images
+    is used.
     """
-    for place in (folder / "sparse" / "0", folder / "sparse", folder / "colmap" / "sparse" / "0"):
-        if any((place / f"cameras.{kind}").exists() for kind in ("bin", "txt")):
-            return place
+    return next(iter(_models(folder)), None)
+
+
+def _models(folder: Path) -> list[Path]:
+    """Return the folders of the models of a capture, of which the first is used."""
+    for place in (folder / "sparse", folder / "colmap" / "sparse"):
+        inner = [model for model in listed(place) if _holds_model(model)] if place.is_dir() else []
+        if numbered := [model for model in inner if model.name.isdecimal()]:
+            return _largest_first(numbered)
+        if _holds_model(place):
+            return [place]
+        if inner:
+            return _largest_first(inner)
     # In the capture folder itself all three files are required: a single name may have another meaning.
     here = any(all((folder / f"{name}.{kind}").exists() for name in _FILES) for kind in ("bin", "txt"))
-    return folder if here else None
+    return [folder] if here else []
+
+
+def _largest_first(models: Sequence[Path]) -> list[Path]:
+    models = sorted(models, key=lambda model: natural_key(model.name))
+    return sorted(models, key=count_images, reverse=True) if len(models) > 1 else models
+
+
+def _holds_model(folder: Path) -> bool:
+    return any((folder / f"cameras.{kind}").exists() for kind in ("bin", "txt"))
 
 
 def read_colmap(folder: str | Path) -> ColmapModel:
@@ -87,14 +119,14 @@ def read_colmap(folder: str | Path) -> ColmapModel:
     cameras_path, images_path, points_path = (folder / f"{name}.{kind}" for name in _FILES)
     text = kind == "txt"
     intrinsics = {}
-    for camera_id, model, width, height, params in (_text_cameras if text else _binary_cameras)(cameras_path):
+    for camera_id, model, width, height, params in (text_cameras if text else binary_cameras)(cameras_path):
         try:
             intrinsics[camera_id] = (*lens_and_intrinsics(model, params), width, height)
         except ValueError as error:
             raise ValueError(f"{cameras_path}: camera {camera_id}: {error}") from None
         check_claim(cameras_path, _CAMERA_BYTES * len(intrinsics), f"{len(intrinsics)} cameras")
     cameras, lenses = [], []
-    for name, camera_id, pose in (_text_images if text else _binary_images)(images_path):
+    for name, camera_id, pose in (text_images if text else binary_images)(images_path):
         if camera_id not in intrinsics:
             raise ValueError(
                 f"{images_path}: image {name!r} refers to camera {camera_id}, {cameras_path.name} has "
@@ -109,7 +141,7 @@ def read_colmap(folder: str | Path) -> ColmapModel:
         check_claim(images_path, _CAMERA_BYTES * len(cameras), f"{len(cameras)} images")
     if not cameras:
         raise ValueError(f"{images_path}: expected at least one image, got none; register the images.")
-    rows = (_text_points if text else _binary_points)(points_path)
+    rows = (text_points if text else binary_points)(points_path)
     points = np.asarray(np.fromiter(rows, np.dtype((np.float64, 6))), np.float64)
     if not bounded(points):
         raise ValueError(
@@ -218,127 +250,17 @@ def _viewmat(pose: Sequence[float]) -> np.ndarray:
 
 
 def _read_calibration(path: Path) -> Calibration:
-    clips, folder = required_clips(path), find_colmap(path)
-    assert folder is not None
+    clips = required_clips(path)
+    folder, *others = _models(path)
+    if others:
+        counts = ", ".join(f"{model.name} has {count_images(model)}" for model in others)
+        _LOG.warning(
+            "%s: the largest of %d models, %s with %d images, is used; %s.",
+            *(folder.parent, 1 + len(others), folder.name, count_images(folder), counts),
+        )
     model = read_colmap(folder)
-    return Calibration(*match_clips(path, folder, clips, model.cameras, model.lenses), model.points, model.point_colors)
+    match = match_clips(path, folder, clips, model.cameras, model.lenses)
+    return replace(match.calibration, points=model.points, point_colors=model.point_colors)
 
 
 LAYOUT = Layout("COLMAP", ("sparse/0", "sparse"), lambda path: find_colmap(path) is not None, _read_calibration)
-
-
-# ---- text ------------------------------------------------------------------------------------------------
-
-
-def _lines(path: Path) -> Iterator[tuple[int, str]]:
-    """Yield the number, from 1, and the text of all lines that are not comments, including blank ones."""
-    with regular(path).open(encoding="utf-8", errors="replace") as file:
-        for i, line in enumerate(file, start=1):
-            if not line.startswith("#"):
-                yield i, line.rstrip("\n")
-
-
-def _broken(path: Path, number: int, expected: str, line: str) -> ValueError:
-    return ValueError(f"{path}, line {number}: expected `{expected}`, got {line[:80]!r}; export the model again.")
-
-
-def _text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]:
-    for number, line in _lines(path):
-        if fields := line.split(maxsplit=_MAX_CAMERA_FIELDS):
-            try:
-                camera_id, width, height = int(fields[0]), int(fields[2]), int(fields[3])
-                yield camera_id, fields[1], width, height, [float(f) for f in fields[4:]]
-            except (ValueError, IndexError):
-                raise _broken(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line) from None
-
-
-def _text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
-    lines = _lines(path)
-    for number, line in lines:
-        if not line.strip():
-            continue
-        fields = line.split(maxsplit=9)
-        try:
-            name, camera_id, pose = fields[9].strip(), int(fields[8]), [float(f) for f in fields[1:8]]
-        except (ValueError, IndexError):
-            raise _broken(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line) from None
-        number, line = next(lines, (number, ""))
-        if _count_words(line) % 3:
-            raise _broken(path, number, "POINTS2D[] as (X, Y, POINT3D_ID), or a blank line", line)
-        yield name, camera_id, pose
-
-
-def _count_words(line: str) -> int:
-    """Return the length of `line.split()`, which would take many times the memory of a line of thousands of points."""
-    visible = np.frombuffer(f" {line}".encode(), np.uint8) > 32
-    return int(np.count_nonzero(visible[1:] & ~visible[:-1]))
-
-
-def _text_points(path: Path) -> Iterator[list[float]]:
-    for number, line in _lines(path):
-        if fields := line.split(maxsplit=8):
-            try:
-                xyz_rgb = [float(f) for f in fields[1:7]]
-                float(fields[7])
-            except (ValueError, IndexError):
-                raise _broken(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK[]", line) from None
-            yield xyz_rgb
-
-
-# ---- binary ----------------------------------------------------------------------------------------------
-
-
-class _Bytes:
-    """A binary file that is read sequentially; reads past its end raise ValueError."""
-
-    def __init__(self, path: Path) -> None:
-        self.path, self.data, self.at = path, read_bytes(path), 0
-
-    def take(self, layout: str) -> tuple:
-        """Return the fields of one little-endian record."""
-        layout = "<" + layout
-        self.skip(struct.calcsize(layout))
-        return struct.unpack_from(layout, self.data, self.at - struct.calcsize(layout))
-
-    def skip(self, count: int) -> None:
-        if count > len(self.data) - self.at:
-            raise ValueError(
-                f"{self.path}: expected {count} more bytes at byte {self.at}, got "
-                f"{len(self.data) - self.at}: the file is truncated or broken; export the model again."
-            )
-        self.at += count
-
-    def string(self) -> str:
-        start, end = self.at, self.data.find(b"\0", self.at)
-        self.skip((end if end >= 0 else len(self.data)) + 1 - start)
-        return self.data[start:end].decode("utf-8", errors="replace")
-
-
-def _binary_cameras(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
-    file, names = _Bytes(path), list(MODELS)
-    for _ in range(*file.take("Q")):
-        camera_id, model, width, height = file.take("IiQQ")
-        if not 0 <= model < len(names):
-            # lens_and_intrinsics rejects this name; the rest of the file cannot be read.
-            yield camera_id, f"number {model}", width, height, ()
-            return
-        focals, coefficients = MODELS[names[model]]
-        yield camera_id, names[model], width, height, file.take(f"{focals + 2 + coefficients}d")
-
-
-def _binary_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
-    file = _Bytes(path)
-    for _ in range(*file.take("Q")):
-        _, *pose, camera_id = file.take("I7dI")
-        name = file.string()
-        (count,) = file.take("Q")
-        file.skip(24 * count)
-        yield name, camera_id, tuple(pose)
-
-
-def _binary_points(path: Path) -> Iterator[list[float]]:
-    file = _Bytes(path)
-    for _ in range(*file.take("Q")):
-        _, *xyz_rgb, _, track = file.take("Q3d3BdQ")
-        file.skip(8 * track)
-        yield xyz_rgb

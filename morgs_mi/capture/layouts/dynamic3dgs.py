@@ -21,6 +21,7 @@ from morgs_mi.capture.lens import Lens
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import bounded
 from morgs_mi.io.bounded import read_array, read_json
+from morgs_mi.io.unread import warn_unread
 from morgs_mi.io.video import natural_key
 
 __all__ = ["LAYOUT", "MetaCamera", "read_meta", "read_point_cloud"]
@@ -48,6 +49,7 @@ def read_meta(path: Path) -> list[MetaCamera]:
     missing = [key for key in _KEYS if not isinstance(meta, dict) or key not in meta]
     if missing:
         raise ValueError(f"{path}: expected the keys {', '.join(_KEYS)}, {', '.join(missing)} missing; export again.")
+    warn_unread(path, meta.keys() - set(_KEYS))
     _check_counts(path, meta)
     columns = [{str(camera_id): column for column, camera_id in enumerate(row)} for row in meta["cam_id"]]
     names = sorted(map(str, meta["cam_id"][0]), key=natural_key)
@@ -119,16 +121,14 @@ def read_point_cloud(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _read_calibration(path: Path) -> Calibration:
     """Return the training cameras and the test cameras, which are held out; cameras without images are left out."""
-    rig = read_meta(path / "train_meta.json")
-    held_out: set[str] = set()
-    if (path / "test_meta.json").is_file():
-        test = read_meta(path / "test_meta.json")
-        held_out = {view.camera.name for view in test}
-        train = [view for view in rig if view.camera.name not in held_out]
-        rig = sorted([*train, *test], key=lambda view: natural_key(view.camera.name))
+    training = read_meta(path / "train_meta.json")
+    test = read_meta(path / "test_meta.json") if (path / "test_meta.json").is_file() else []
+    held_out = {view.camera.name for view in test}
+    rig = [*(view for view in training if view.camera.name not in held_out), *test]
+    rig.sort(key=lambda view: natural_key(view.camera.name))
     empty = [view.camera.name for view in rig if not any(file.exists() for file in view.files)]
     if empty and len(empty) < len(rig):
-        _LOG.warning("%s: no image of %s was found: left out.", path / "train_meta.json", ", ".join(empty))
+        _LOG.warning("%s: no image of %s was found: left out.", path / "ims", ", ".join(empty))
         rig = [view for view in rig if view.camera.name not in empty]
     cloud = path / "init_pt_cld.npz"
     points, colors = read_point_cloud(cloud) if cloud.is_file() else (NO_POINTS, NO_POINTS)

@@ -1,15 +1,18 @@
 """Nerfstudio's `transforms.json`: poses as camera -> world with OpenGL's axes.
 
 Each of its `frames` names a file and has a `transform_matrix` [4, 4]: camera -> world, x right, y up, z backward.
-Intrinsics (`fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`) and lens coefficients are keys of the file or of a frame; the frame's
-take precedence. Pixel centres lie at +0.5, as in `Camera`. World units are the units of the matrices:
-`applied_transform` and `applied_scale` are not undone.
+Intrinsics (`fl_x`, `fl_y`, `cx`, `cy`, `w`, `h`), lens coefficients and `mask_path` are keys of the file or of a frame;
+the frame's take precedence. `w` and `h` may be missing. Pixel centres lie at +0.5, as in `Camera`. World units are the
+units of the matrices: `applied_transform` and `applied_scale` are not undone. `train_filenames`, `val_filenames` and
+`test_filenames` split the images.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
+import logging
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -22,21 +25,66 @@ from morgs_mi.capture.layouts.calibration import (
     match_clips,
     required_clips,
 )
+from morgs_mi.capture.layouts.clips import ImageSizes
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import LARGEST, bounded
 from morgs_mi.io.bounded import read_json
 from morgs_mi.io.ply import read_vertices
+from morgs_mi.io.unread import warn_unread
+from morgs_mi.io.video import IMAGE_SUFFIXES, VIDEO_SUFFIXES, Clip
 
-__all__ = ["LAYOUT", "read_points_ply", "read_transforms"]
+__all__ = ["LAYOUT", "Transforms", "read_points_ply", "read_transforms"]
+
+_LOG = logging.getLogger(__name__)
 
 _OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 # Nerfstudio treats all of these as its single perspective model.
 _PERSPECTIVE = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "RADIAL", "SIMPLE_RADIAL")
+_INTRINSICS = {"w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y"}
+_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+_SPLITS = ("train_filenames", "val_filenames", "test_filenames")
+_KEYS = {
+    *_INTRINSICS,
+    *_DISTORTION,
+    *_SPLITS,
+    *("frames", "file_path", "transform_matrix", "ply_file_path", "mask_path", "camera_model", "is_fisheye"),
+}
+# Keys of exporters that say nothing about the cameras: instant-ngp's, Nerfstudio's, Blender's and Record3D's.
+_HARMLESS = {
+    *("aabb_scale", "aabb", "scale", "offset", "up", "render_aabb", "n_extra_learnable_dims", "from_na", "sharpness"),
+    *("enable_depth_loading", "enable_ray_loading", "integer_depth_scale", "depth_unit_scale_factor", "depth_path"),
+    *("applied_transform", "applied_scale", "orientation_override", "auto_scale_poses_override", "colmap_im_id"),
+    *("colmap_camera_id", "colmap_img_id", "depth_file_path", "normal_file_path", "timestamp", "time", "rotation"),
+    *("near", "far", "description", "version", "date"),
+}
 
 
-def read_transforms(path: Path) -> tuple[list[Camera], list[Lens], Path | None]:
-    """Return the cameras, named by their `file_path`, their lenses, and the path of the points' PLY file or None.
+@dataclass(frozen=True)
+class Transforms:
+    """Content of a `transforms.json`.
+
+    Attributes:
+        cameras: one per frame, named by its `file_path`.
+        lenses: one per frame.
+        masks: per frame the image whose black pixels are not used, or None.
+        points: the points' PLY file, or None.
+        splits: names of images by split; empty if the file does not split them.
+    """
+
+    cameras: list[Camera]
+    lenses: list[Lens]
+    masks: list[Path | None]
+    points: Path | None
+    splits: Mapping[str, list[str]]
+
+
+def read_transforms(path: Path, clips: Mapping[str, Clip] | None = None) -> Transforms:
+    """Return the content of a `transforms.json`.
+
+    Args:
+        path: the file.
+        clips: clips by name, whose sizes frames without `w` and `h` have if their images are no files.
 
     Raises:
         ValueError: the file is broken, a key is missing or not a number, a pose is not rigid, or the camera model is
@@ -46,7 +94,9 @@ def read_transforms(path: Path) -> tuple[list[Camera], list[Lens], Path | None]:
     frames = meta.get("frames") if isinstance(meta, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(f, dict) for f in frames):
         raise ValueError(f"{path}: expected an object with a list of `frames`, got none; export it again.")
-    cameras, lenses = [], []
+    unread = {key for values in (meta, *frames) for key in values} - _KEYS - _HARMLESS
+    sizes = ImageSizes(path.parent, clips or {})
+    cameras, lenses, masks = [], [], []
     for index, frame in enumerate(frames):
         where = f"{path}, frame {index}"
         name = frame.get("file_path")
@@ -54,21 +104,44 @@ def read_transforms(path: Path) -> tuple[list[Camera], list[Lens], Path | None]:
             raise ValueError(f"{where}: `file_path` must name a file, got {name!r}; export it again.")
         where += f" ({name})"
         values = meta | frame
+        if not {"w", "h"} <= values.keys():
+            values |= _size(sizes, name, frames)
         cameras.append(_camera(where, values, name))
         lenses.append(_lens(where, values))
-    points = meta.get("ply_file_path")
-    return cameras, lenses, path.parent / points if points else None
+        if lenses[-1].model == "OPENCV_FISHEYE":  # it has k1 to k4 alone
+            unread |= {f"{key} of a fisheye" for key in ("p1", "p2") if values.get(key)}
+        mask = _file_name(where, values, "mask_path")
+        masks.append(path.parent / mask if mask else None)
+    points = _file_name(str(path), meta, "ply_file_path")
+    warn_unread(path, unread)
+    splits = {split: meta[split] for split in _SPLITS if meta.get(split) is not None}
+    for split, names in splits.items():
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise ValueError(f"{path}: `{split}` must be a list of names of images, got another value; correct it.")
+    return Transforms(cameras, lenses, masks, path.parent / points if points else None, splits)
+
+
+def _size(sizes: ImageSizes, name: str, frames: Sequence[Mapping[str, Any]]) -> dict[str, int]:
+    """Return `w` and `h` of an image, or another image's if it is missing: its camera is left out later."""
+    names = [name, *(str(frame.get("file_path")) for frame in frames)]
+    size = next(filter(None, map(sizes.of, names)), ())
+    return dict(zip(("w", "h"), size, strict=False))
+
+
+def _file_name(where: str, values: Mapping[str, Any], key: str) -> str | None:
+    name = values.get(key)
+    if name is not None and not isinstance(name, str):
+        raise ValueError(f"{where}: `{key}` must name a file, got {repr(name)[:80]}; export it again.")
+    return name.replace("\\", "/") if name else None
 
 
 def _camera(where: str, values: Mapping[str, Any], name: str) -> Camera:
-    width, height = (_number(where, values, key) for key in ("w", "h"))
-    if "fl_x" not in values and "camera_angle_x" in values:
-        angle = _number(where, values, "camera_angle_x")
-        fx = 0.5 * width / np.tan(0.5 * angle)
-    else:
-        fx = _number(where, values, "fl_x")
-    fy = _number(where, values, "fl_y", fx)
-    cx, cy = _number(where, values, "cx", width / 2), _number(where, values, "cy", height / 2)
+    width = _number(where, values, "w")
+    height = _number(where, values, "h")
+    fx = _focal_length(where, values, "x", width)
+    fy = _focal_length(where, values, "y", height, fx)
+    cx = _number(where, values, "cx", width / 2)
+    cy = _number(where, values, "cy", height / 2)
     try:
         matrix = np.array(values.get("transform_matrix"), dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -81,11 +154,22 @@ def _camera(where: str, values: Mapping[str, Any], name: str) -> Camera:
         raise ValueError(f"{where}: {error}") from None
 
 
+def _focal_length(where: str, values: Mapping[str, Any], axis: str, size: float, default: float | None = None) -> float:
+    """Return the focal length from `fl_x` or `camera_angle_x`, px, of an axis along which the image has `size` px."""
+    key, angle = f"fl_{axis}", f"camera_angle_{axis}"
+    if key not in values and angle in values:
+        return float(0.5 * size / np.tan(0.5 * _number(where, values, angle)))
+    return _number(where, values, key, default)
+
+
 def _lens(where: str, values: Mapping[str, Any]) -> Lens:
     model = values.get("camera_model", "OPENCV")
-    k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    if model == "OPENCV_FISHEYE":
-        return Lens(model, (k1, k2, k3, k4))
+    k1, k2, k3, k4, p1, p2 = (_number(where, values, key, 0.0) for key in _DISTORTION)
+    fisheye = values.get("is_fisheye", False)
+    if fisheye not in (True, False):
+        raise ValueError(f"{where}: `is_fisheye` must be true or false, got {repr(fisheye)[:80]}; correct it.")
+    if fisheye or model == "OPENCV_FISHEYE":
+        return Lens("OPENCV_FISHEYE", (k1, k2, k3, k4))
     if model not in _PERSPECTIVE:
         raise ValueError(
             f"{where}: `camera_model` must be OPENCV_FISHEYE or one of {', '.join(_PERSPECTIVE)}, got {model!r}; "
@@ -135,9 +219,61 @@ def read_points_ply(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def _read_calibration(path: Path) -> Calibration:
     clips, source = required_clips(path), path / "transforms.json"
-    cameras, lenses, ply = read_transforms(source)
-    points, colors = read_points_ply(ply) if ply else (NO_POINTS, NO_POINTS)
-    return Calibration(*match_clips(path, source, clips, cameras, lenses), points, colors)
+    content = read_transforms(source, clips)
+    points, colors = read_points_ply(content.points) if content.points else (NO_POINTS, NO_POINTS)
+    match = match_clips(path, source, clips, content.cameras, content.lenses)
+    masks = tuple(_distinct(content.masks[index] for index in images) for images in match.images)
+    calibration = replace(match.calibration, points=points, point_colors=colors, masks=masks)
+    return _split(path, source, calibration, content, match.images) if content.splits else calibration
+
+
+def _distinct(files: Iterable[Path | None]) -> tuple[Path, ...]:
+    return tuple(dict.fromkeys(file for file in files if file))
+
+
+def _split(
+    path: Path, source: Path, calibration: Calibration, content: Transforms, images: Sequence[Sequence[int]]
+) -> Calibration:
+    """Return the calibration with the held-out cameras of `content`, and without those that are in no split.
+
+    A camera is trained on if one of its images is: is in `train_filenames` or, without these, in no other split.
+
+    Raises:
+        ValueError: no camera is left for training.
+    """
+    names = [camera.name for camera in content.cameras]
+    splits = {split: _images_named(source, split, given, names) for split, given in content.splits.items()}
+    held_out = splits.get("val_filenames", set()) | splits.get("test_filenames", set())
+    training = splits.get("train_filenames", set(range(len(names))) - held_out)
+    views = tuple(view for view, own in enumerate(images) if training.isdisjoint(own))
+    if len(views) == len(images):
+        raise ValueError(f"{source}: expected a camera to train on, got none in `train_filenames`; correct the splits.")
+    calibration = replace(calibration, test_views=views)
+    if unused := [calibration.names[view] for view in views if held_out.isdisjoint(images[view])]:
+        _LOG.warning("%s: %s in none of the splits: left out.", source, ", ".join(unused))
+    return calibration.without(path, unused)
+
+
+def _images_named(source: Path, split: str, given: Sequence[str], names: Sequence[str]) -> set[int]:
+    """Return the indices of the images `names` that a split names, in full or by the end of one path alone."""
+    places = [_parts(name) for name in names]
+    whole: dict[tuple[str, ...], set[int]] = {}
+    ends: dict[tuple[str, ...], set[int]] = {}
+    for index, parts in enumerate(places):
+        whole.setdefault(parts, set()).add(index)
+        for start in range(1, len(parts)):
+            ends.setdefault(parts[start:], set()).add(index)
+    ends = {parts: indices for parts, indices in ends.items() if len(indices) == 1} | whole
+    if unknown := [name for name in given if _parts(name) not in ends]:
+        _LOG.warning("%s: `%s` names %d images without a frame, such as %s.", source, split, len(unknown), unknown[0])
+    return set().union(*(ends.get(_parts(name), set()) for name in given))
+
+
+def _parts(name: str) -> tuple[str, ...]:
+    """Return the parts of an image's path without the suffix of its format."""
+    place = PurePosixPath(name.replace("\\", "/"))
+    known = place.suffix.lower() in (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
+    return (place.with_suffix("") if known else place).parts
 
 
 LAYOUT = Layout(

@@ -15,6 +15,7 @@ also divides the distortion coefficients by 64, which makes them negligible. Pos
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -33,7 +34,8 @@ from morgs_mi.capture.layouts.calibration import (
 from morgs_mi.capture.lens import Lens, opencv_lens
 from morgs_mi.core.camera import Camera, rigid
 from morgs_mi.core.checks import LARGEST, bounded
-from morgs_mi.io.bounded import check_claim, read_bytes
+from morgs_mi.io.bounded import check_claim, encoding_of, read_bytes
+from morgs_mi.io.unread import warn_unread
 
 __all__ = ["LAYOUT", "read_qualisys"]
 
@@ -45,6 +47,23 @@ _SUBPIXELS = 64
 _VALUE_BYTES = 200
 _METRES = 1e-3
 _OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
+# Attributes of a camera's elements that are read, and others that QTM writes and that say nothing about the images.
+_READ = {
+    "fov_video": {"left", "top", "right", "bottom"},
+    "transform": {*"xyz", *(f"r{row}{column}" for row in (1, 2, 3) for column in (1, 2, 3))},
+    "intrinsic": {
+        *("focalLengthU", "focalLengthV", "centerPointU", "centerPointV", "focallength"),
+        *(
+            "radialDistortion1",
+            "radialDistortion2",
+            "radialDistortion3",
+            "tangentalDistortion1",
+            "tangentalDistortion2",
+        ),
+        *("sensorMinU", "sensorMaxU", "sensorMinV", "sensorMaxV"),
+    },
+}
+_HARMLESS = {"fov_marker", "fov_marker_max", "fov_video_max"}
 _DISTORTION = ("radialDistortion1", "radialDistortion2", "tangentalDistortion1", "tangentalDistortion2")
 
 
@@ -59,7 +78,10 @@ def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
     values = data.count(b"<") + data.count(b"=")
     check_claim(path, _VALUE_BYTES * values, f"{values} elements and attributes")
     try:
-        root = ElementTree.fromstring(data, ElementTree.XMLParser(target=_Plain()))
+        encoding = encoding_of(data)  # of which a byte order mark knows better than a declaration
+        root = ElementTree.fromstring(
+            data if encoding == "utf-8" else data.decode(encoding), ElementTree.XMLParser(target=_Plain())
+        )
     except (ElementTree.ParseError, ValueError) as error:
         raise ValueError(f"{path}: expected XML, got a broken file ({error}); export it again.") from None
     active = [element for element in root.iter("camera") if element.get("active", "1") != "0"]
@@ -72,8 +94,21 @@ def read_qualisys(path: Path) -> tuple[list[Camera], list[Lens]]:
             "%s: QTM displays %s rotated (viewrotation); their clips must show the images as the sensor recorded them.",
             *(path, ", ".join(turned)),
         )
-    found = [_camera(path, element) for element in active]
-    return [camera for camera, _ in found], [lens for _, lens in found]
+    warn_unread(path, (name for element in active for name in _unread(element)))
+    pairs = [_camera(path, element) for element in active]
+    return [camera for camera, _ in pairs], [lens for _, lens in pairs]
+
+
+def _unread(camera: Element) -> Iterator[str]:
+    """Yield the elements of a camera and their attributes that are not read; a `skew` of 0 changes nothing."""
+    for element in camera:
+        if element.tag in _HARMLESS:
+            continue
+        if element.tag not in _READ:
+            yield element.tag
+            continue
+        others = set(element.keys()) - _READ[element.tag]
+        yield from (name for name in others if name != "skew" or element.get(name, "").strip("0."))
 
 
 class _Plain(ElementTree.TreeBuilder):
@@ -132,7 +167,7 @@ def _read_calibration(path: Path) -> Calibration:
     """Return the cameras that have a clip; marker cameras have none."""
     source = only_calibration(path, calibration_files(path, _PATTERN), "one file *.qca.txt")
     cameras, lenses = read_qualisys(source)
-    return Calibration(*match_clips(path, source, required_clips(path), cameras, lenses))
+    return match_clips(path, source, required_clips(path), cameras, lenses).calibration
 
 
 LAYOUT = Layout(

@@ -25,6 +25,7 @@ import numpy as np
 
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.exr import read_exr, write_exr
+from morgs_mi.io.listing import listed
 from morgs_mi.method.flow_sources.flow_config import FlowConfig
 from morgs_mi.method.flow_sources.flow_registry import FLOW_SOURCES, FlowSource, FramePair
 
@@ -101,7 +102,7 @@ class FlowFolder:
 
 def _files_by_frame(folder: Path) -> dict[int, list[Path]]:
     numbered: dict[int, list[Path]] = {}
-    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+    for path in listed(folder) if folder.is_dir() else ():
         if path.suffix.lower() in SUFFIXES and (digits := re.findall(r"\d+", path.stem)):
             numbered.setdefault(int(digits[-1]), []).append(path)
     return numbered

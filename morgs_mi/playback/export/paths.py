@@ -26,6 +26,13 @@ __all__ = ["CameraPath", "focus", "load_path", "orbit", "through_cameras"]
 
 # Weight of the Gaussians' median relative to an optical axis; it matters only where the axes do not meet.
 _MEDIAN_WEIGHT = 0.01
+# Keys of other files of cameras, and what these are.
+_OTHER_FILES = {
+    "camera_path": "a camera path of Nerfstudio",
+    "path": "a camera path of instant-ngp",
+    "frames": "the calibration of a capture",
+    "w2c": "the calibration of a capture",
+}
 
 
 @dataclass(frozen=True)
@@ -186,10 +193,12 @@ def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
     if not Path(file).is_file():
         raise FileNotFoundError(f"{file}: expected a camera path, found none; check the path.")
     document = read_json(file)
-    try:
-        keys = [dict(key) for key in document["keys"]]
-    except (ValueError, TypeError, KeyError) as error:
-        raise ValueError(f"{file}: expected a JSON object with a list `keys` of objects, got {error!r}.") from None
+    keys = document.get("keys") if isinstance(document, dict) else None
+    if not isinstance(keys, list) or not all(isinstance(key, dict) for key in keys):
+        raise ValueError(
+            f"{file}: expected a JSON object with a list `keys` of objects, got {_described(document)}; write the "
+            "views of the camera path as `keys`."
+        )
     common = {name: value for name, value in document.items() if name != "keys"}
     views, times = [], []
     for i, key in enumerate(keys):
@@ -204,6 +213,15 @@ def load_path(file: str | Path, cameras: Sequence[Camera]) -> CameraPath:
         return CameraPath(np.asarray(times), tuple(views))
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from None
+
+
+def _described(document: Any) -> str:
+    """Return what a JSON document that is no camera path contains."""
+    if not isinstance(document, dict):
+        return "a list" if isinstance(document, list) else repr(document)[:80]
+    program = next((program for key, program in _OTHER_FILES.items() if key in document), None)
+    names = ", ".join(f"`{name}`"[:40] for name in list(document)[:6]) or "nothing"
+    return f"an object with {names}" + (f", {program}" if program else "")
 
 
 def _key_view(key: Mapping[str, Any], cameras: Sequence[Camera]) -> Camera:

@@ -85,7 +85,7 @@ def noting_segments(out: Path) -> Iterator[None]:
     try:
         yield
     except (KeyboardInterrupt, OSError, MemoryError) as error:
-        streams = sorted((out / FOLDER).glob("*.morgs"))
+        streams = sorted((out / FOLDER).glob("[0-9]*.morgs"))
         with suppress(OSError, ValueError):
             count = sum(map(_num_finished, streams))
             if count:

@@ -14,7 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from morgs_mi.io.video import IMAGE_SUFFIXES, decode_image, image_number, natural_key
+from morgs_mi.io.listing import is_listed, listed
+from morgs_mi.io.video import decode_image, image_number, natural_key
 from morgs_mi.runs.live.feed import Bundle, Shot, bundled
 
 __all__ = ["FolderFeed"]
@@ -25,7 +26,9 @@ _POLL = 0.05  # s
 _PAUSE = 1.0
 # Numbers per second that grow faster than this do not count images; they are times, or one is far ahead.
 _MAX_RATE = 1000
-# What the last bytes of a complete file contain, and how many of them; cameras may add a few bytes behind an image.
+# Suffixes of the images, whose last bytes show that the file is complete; what these bytes contain, and how many they
+# are: cameras may add a few bytes behind an image.
+_SUFFIXES = (".png", ".jpg", ".jpeg")
 _ENDS, _TAIL = (b"IEND\xaeB`\x82", b"\xff\xd9"), 64
 
 
@@ -223,7 +226,7 @@ class FolderFeed:
     def _cameras(self) -> list[str]:
         """Return the names of the folders, in numerical order."""
         with suppress(FileNotFoundError):
-            names = [file.name for file in self._folder.iterdir() if file.is_dir() and not file.name.startswith(".")]
+            names = [file.name for file in listed(self._folder) if file.is_dir()]
             return sorted(names, key=natural_key)
         return []
 
@@ -261,7 +264,7 @@ def _files(folder: Path, after: int) -> dict[int, Path]:
     files = {}
     with suppress(FileNotFoundError, NotADirectoryError):
         for name in os.listdir(folder):
-            if name.lower().endswith(IMAGE_SUFFIXES) and not name.startswith("."):
+            if name.lower().endswith(_SUFFIXES) and is_listed(name):
                 with suppress(ValueError):
                     files[image_number(Path(name))] = folder / name
     return {number: file for number, file in files.items() if number > after}

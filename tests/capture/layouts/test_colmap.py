@@ -10,11 +10,12 @@ import numpy as np
 import pycolmap
 import pytest
 
+from morgs_mi.capture.capture import load_capture
 from morgs_mi.capture.layouts.colmap import find_colmap, read_colmap, write_colmap
 from morgs_mi.capture.lens import MODELS, Lens
 from morgs_mi.core.camera import Camera
 from tests.assertions import assert_close
-from tests.scenes.captures import HEIGHT, WIDTH, rig
+from tests.scenes.captures import HEIGHT, WIDTH, rig, videos
 from tests.scenes.full_disk import files_end_at
 
 RNG = np.random.default_rng(1)
@@ -173,3 +174,56 @@ def test_read_colmap__names_a_missing_file(tmp_path: Path) -> None:
     (write(tmp_path) / "points3D.txt").unlink()
     with pytest.raises(FileNotFoundError, match=r"points3D.txt is missing"):
         read_colmap(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_read_colmap__refuses_a_binary_file_that_holds_more_than_it_announces(tmp_path: Path, name: str) -> None:
+    file = write(tmp_path, "bin") / f"{name}.bin"
+    count = int.from_bytes(file.read_bytes()[:8], "little")
+    file.write_bytes((count - 1).to_bytes(8, "little") + file.read_bytes()[8:])
+    with pytest.raises(ValueError, match=rf"{name}.bin: expected the {count - 1} \w+ that it announces, got \d+"):
+        read_colmap(tmp_path)
+
+
+def test_read_colmap__keeps_the_spaces_of_names(tmp_path: Path) -> None:
+    names = (" cam1", "cam 2 ", "  cam3")
+    write_colmap(tmp_path, rig(names))
+    assert {camera.name for camera in read_colmap(tmp_path).cameras} == {f"{name}.png" for name in names}
+    videos(tmp_path, names)
+    assert set(load_capture(tmp_path).names) == set(names)
+
+
+def test_read_colmap__reads_aligned_columns(tmp_path: Path) -> None:
+    write_colmap(tmp_path, rig(("cam1", "cam2")))
+    text = (tmp_path / "images.txt").read_text()
+    (tmp_path / "images.txt").write_text(text.replace(" cam", "   cam").replace("\n1 ", "\n  1 "))
+    videos(tmp_path, ("cam1", "cam2"))
+    assert load_capture(tmp_path).names == ("cam1", "cam2")
+
+
+@pytest.mark.parametrize("kind", ["txt", "bin"])
+@pytest.mark.parametrize("place", ["sparse", "colmap/sparse"])
+def test_find_colmap__takes_the_model_of_most_images(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, kind: str, place: str
+) -> None:
+    names = ("cam1", "cam2", "cam3")
+    for number, count in (("0", 1), ("1", 3), ("10", 2), ("backup", 3)):
+        folder = tmp_path / place / number
+        write_colmap(folder, rig(names)[:count])
+        if kind == "bin":
+            pycolmap.Reconstruction(str(folder)).write_binary(str(folder))
+    (tmp_path / place / "._1").touch()
+    videos(tmp_path, names)
+    assert load_capture(tmp_path).names == names
+    assert f"{place}: the largest of 3 models, 1 with 3 images, is used; 10 has 2, 0 has 1." in caplog.text
+
+
+def test_find_colmap__takes_the_first_of_equal_models_and_the_only_one(tmp_path: Path) -> None:
+    for number in ("1", "2"):
+        write_colmap(tmp_path / "sparse" / number, rig(("cam1", "cam2")))
+    assert find_colmap(tmp_path) == tmp_path / "sparse" / "1"
+    (tmp_path / "sparse/1/images.txt").write_text("broken\n")
+    assert find_colmap(tmp_path) == tmp_path / "sparse" / "2"
+    write_colmap(tmp_path / "a/sparse", rig(("cam1",)))
+    write_colmap(tmp_path / "a/sparse/backup", rig(("cam1", "cam2")))
+    assert find_colmap(tmp_path / "a") == tmp_path / "a/sparse"

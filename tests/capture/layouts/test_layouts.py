@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import shutil
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +18,8 @@ from plyfile import PlyData, PlyElement
 from morgs_mi.capture.capture import Capture, load_capture
 from morgs_mi.capture.layouts import layout_registry
 from morgs_mi.capture.layouts.calibration import Calibration, Layout, required_clips
+from morgs_mi.capture.layouts.clips import clips_by_camera, photos
+from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.capture.layouts.poses_bounds import write_poses_bounds
 from morgs_mi.capture.lens import MODELS, Lens
 from morgs_mi.capture.timeline import ReadConfig
@@ -352,20 +357,164 @@ def test_dynamic3dgs__reads_cameras(tmp_path: Path) -> None:
     np.testing.assert_allclose(capture.point_colors, [[0.1, 0.2, 0.3]], rtol=1e-6)
 
 
-def test_dynamic3dgs__holds_out_all_test_cameras(tmp_path: Path) -> None:
-    path = layouts.dynamic3dgs(tmp_path / "a")
+def split_meta(path: Path, **cameras: tuple[int, ...]) -> Path:
+    """Keep the `cameras` of `train_meta.json` in the files of these names."""
     meta = json.loads((path / "train_meta.json").read_text())
-    for name, kept in (("train_meta", (1,)), ("test_meta", (10, 2))):
+    for name, kept in cameras.items():
         picks = [[row.index(i) for i in kept] for row in meta["cam_id"]]
         lists = {
             key: [[row[c] for c in pick] for row, pick in zip(meta[key], picks, strict=True)]
             for key in ("k", "w2c", "fn", "cam_id")
         }
         (path / f"{name}.json").write_text(json.dumps(meta | lists))
-    capture = load_capture(path)
-    assert (capture.names, capture.test_views) == (("1", "2", "10"), (1, 2))
+    return path
+
+
+def test_dynamic3dgs__holds_out_all_test_cameras(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = split_meta(layouts.dynamic3dgs(tmp_path / "a"), train_meta=(1,), test_meta=(10, 2))
+    calibration = layout_registry.find_layout(path).read(path)
+    assert (calibration.names, calibration.test_views) == (("1", "2", "10"), (1, 2))
+    assert load_capture(path).test_views == (1, 2)
     assert load_capture(path, test_view=None).test_views == ()
     assert load_capture(path, reading=ReadConfig(without=("2",))).test_views == (1,)
+    shutil.rmtree(path / "ims" / "2")
+    assert layout_registry.find_layout(path).read(path).test_views == (1,)
+    assert "no image of 2 was found: left out" in caplog.text
+    path = split_meta(layouts.dynamic3dgs(tmp_path / "b"), test_meta=(10,))  # which is trained on, too
+    assert layout_registry.find_layout(path).read(path).test_views == (2,)
+
+
+JUNK = ("._{}", ".DS_Store", "Thumbs.db", "__MACOSX/{}", "__MACOSX/._{}", "@eaDir/{}/SYNOPHOTO_THUMB_XL.jpg")
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        layouts.n3dv,
+        lambda path: layouts.n3dv(path, clips=folder_per_camera),
+        lambda path: layouts.n3dv(path, clips=folder_per_frame),
+        layouts.colmap,
+        layouts.nerfstudio,
+        layouts.dynamic3dgs,
+        layouts.anipose,
+        layouts.qualisys,
+    ],
+)
+def test_load_capture__ignores_what_systems_add(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, build: Callable[[Path], Path]
+) -> None:
+    path = build(tmp_path / "a")
+    names = load_capture(path).names
+    caplog.clear()
+    for file in [file for file in path.rglob("*") if file.is_file()]:
+        for junk in JUNK:
+            copy = file.parent / junk.format(file.name)
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(b"\0\5\x16\7" + bytes(99))
+    capture = load_capture(path)
+    assert capture.names == names
+    assert [len(frame.images) for frame in capture.frames()] == [3] * COUNT
+    assert "__MACOSX" not in caplog.text
+
+
+@pytest.mark.parametrize("mark", ["utf-8-sig", "utf-16"])
+@pytest.mark.parametrize(
+    "build", [layouts.colmap, layouts.nerfstudio, layouts.dynamic3dgs, layouts.anipose, layouts.qualisys]
+)
+def test_load_capture__reads_texts_of_windows(tmp_path: Path, mark: str, build: Callable[[Path], Path]) -> None:
+    path = build(tmp_path / "a")
+    (path / "capture.json").write_text('{"fps": 12}')
+    before = load_capture(path)
+    for file in [file for file in path.rglob("*") if file.suffix in (".txt", ".json", ".toml")]:
+        declared = "<?xml version='1.0' encoding='utf-8'?>\n" if file.name.endswith(".qca.txt") else ""
+        file.write_bytes((declared + file.read_text()).replace("\n", "\r\n").encode(mark))
+    after = load_capture(path)
+    assert (after.names, after.fps) == (before.names, 12)
+    for camera, expected in zip(after.cameras, before.cameras, strict=True):
+        np.testing.assert_array_equal(camera.K, expected.K)
+        np.testing.assert_array_equal(camera.viewmat, expected.viewmat)
+
+
+@pytest.mark.parametrize(
+    ("place", "image"),
+    [
+        ("images/{}", "{}/1.png"),
+        ("images/{}", "images/{}/1.png"),
+        ("{}", "{}/3.png"),
+        ("{}/images", "{}/images/2.png"),
+        ("frames/{}", "./{}/1.png"),
+    ],
+)
+@pytest.mark.parametrize("layout", ["COLMAP", "Nerfstudio"])
+def test_match_clips__reads_cameras_and_frames_numbered_alike(
+    tmp_path: Path, layout: str, place: str, image: str
+) -> None:
+    names = ("1", "2", "3")
+    for i, name in enumerate(names):
+        for t in range(COUNT):
+            layouts.write_image(tmp_path / place.format(name) / f"{t + 1}.png", i, t)
+    views = [replace(camera, name=image.format(camera.name)) for camera in rig(names)]
+    if layout == "COLMAP":
+        write_colmap(tmp_path / "sparse/0", views)
+    else:
+        layouts.transforms(tmp_path, views)
+    assert_holds(load_capture(tmp_path), names, (0, 1, 2))
+
+
+@pytest.mark.parametrize("image", ["0/{}.png", "0/images/{}.png"])
+def test_match_clips__reads_a_folder_per_frame_numbered_like_cameras(tmp_path: Path, image: str) -> None:
+    names = ("0", "1", "2")
+    for i, name in enumerate(names):
+        for t in range(COUNT):
+            layouts.write_image(tmp_path / image.format(name).replace("0/", f"{t}/", 1), i, t)
+    write_colmap(tmp_path / "sparse/0", [replace(camera, name=image.format(camera.name)) for camera in rig(names)])
+    assert_holds(load_capture(tmp_path), names, (0, 1, 2))
+
+
+def test_clips__refuse_files_that_differ_in_their_suffixes(tmp_path: Path) -> None:
+    path = layouts.colmap(tmp_path / "a")
+    shutil.copy(path / "cam2.mkv", path / "cam2.mov")
+    with pytest.raises(ValueError, match=r"expected one file per camera, got cam2.mkv and cam2.mov; keep one of them"):
+        load_capture(path)
+    for suffix in (".png", ".jpg"):
+        layouts.write_image(tmp_path / "b" / f"cam2{suffix}", 0, 0)
+    with pytest.raises(ValueError, match=r"expected one file per camera, got cam2.jpg and cam2.png"):
+        photos(tmp_path / "b")
+
+
+def test_clips_by_camera__names_clips_in_several_folders(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for folder in ("depth", "images", "images_2", "rgb"):
+        folder_per_camera(tmp_path / folder, ("cam1", "cam2"))
+    assert clips_by_camera(tmp_path) == {name: tmp_path / "images" / name for name in ("cam1", "cam2")}
+    assert "cam1, cam2 have two clips, such as rgb/cam1 and images/cam1: the latter is used" in caplog.text
+    assert "images_2" not in caplog.text
+
+
+UNREAD = {
+    "Dynamic 3D Gaussians": (layouts.dynamic3dgs, "train_meta.json", ('{"w": ', '{"lens": 1, "w": '), "lens"),
+    "Anipose": (layouts.anipose, "calibration.toml", ("[cam_1]", "[extra]\na = 1\n[cam_1]\nskew = 2"), "extra, skew"),
+    "Qualisys": (
+        layouts.qualisys,
+        "rig.qca.txt",
+        ('skew="0.0"', 'skew="0.1" radialDistortion4="1"'),
+        "radial.*, skew",
+    ),
+    "capture.json": (layouts.n3dv, "capture.json", ("", '{"FPS": 3}'), "FPS"),
+}
+
+
+@pytest.mark.parametrize(("build", "file", "change", "names"), UNREAD.values(), ids=UNREAD)
+def test_load_capture__names_what_it_does_not_understand_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, build, file: str, change: tuple[str, str], names: str
+) -> None:
+    path = build(tmp_path / "a")
+    old, new = change
+    text = (path / file).read_text() if old else ""
+    (path / file).write_text(text.replace(old, new) if old else new)
+    with caplog.at_level(logging.WARNING):
+        load_capture(path)
+    (message,) = [text for text in caplog.messages if "not understood" in text]
+    assert re.search(f"{file}: not understood and not used: {names}.$", message)
 
 
 def test_at_clip_size__scales_the_intrinsics_of_smaller_clips(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -56,6 +56,8 @@ def test_read_flow__accepts_exr_channels_of_other_programs(tmp_path, names):
 
 
 def test_flow_source__reads_both_directions_of_a_frame(folder):
+    for file in list(folder.rglob("*.flo")):
+        file.with_name(f"._{file.name}").touch()  # macOS adds these
     for frame in (1, 2):
         images = np.zeros((2, 6, 9, 3), np.uint8)
         pair = FramePair(*images, camera="cam00", frame=frame)

@@ -1,0 +1,180 @@
+"""The files of a COLMAP model, as text and binary.
+
+Readers yield a tuple per record: id, model, width, height and parameters of a camera; name, id of the camera and pose
+[7] of an image, a wxyz quaternion and a translation; x, y, z and the colour, 0 to 255, of a point.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from morgs_mi.capture.lens import MODELS
+from morgs_mi.io.bounded import encoding_of, read_bytes, regular
+
+__all__ = [
+    "binary_cameras",
+    "binary_images",
+    "binary_points",
+    "count_images",
+    "text_cameras",
+    "text_images",
+    "text_points",
+]
+
+# The least bytes of an image in a binary model.
+_IMAGE_BYTES = 73
+# What precedes the name of an image in a line of text: nine words, and one space. The name may begin with spaces.
+_BEFORE_NAME = re.compile(r"\s*(?:\S+\s+){8}\S+\s")
+# More values than a line of any camera model has in a text file.
+_MAX_CAMERA_FIELDS = 20
+
+
+def count_images(folder: Path) -> int:
+    """Return the number of images in the COLMAP model in `folder`; 0 if it cannot be read."""
+    with suppress(OSError, ValueError):
+        if (folder / "cameras.bin").exists():
+            file = _Bytes(folder / "images.bin")
+            (count,) = file.take("Q")
+            return min(count, len(file.data) // _IMAGE_BYTES)
+        return sum(1 for _ in text_images(folder / "images.txt"))
+    return 0
+
+
+# ---- text ------------------------------------------------------------------------------------------------
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield the number, from 1, and the text of all lines that are not comments, including blank ones."""
+    with regular(path).open("rb") as file:
+        encoding = encoding_of(file.read(4))
+    with path.open(encoding=encoding, errors="replace") as file:
+        for i, line in enumerate(file, start=1):
+            if not line.startswith("#"):
+                yield i, line.rstrip("\n")
+
+
+def _broken(path: Path, number: int, expected: str, line: str) -> ValueError:
+    return ValueError(f"{path}, line {number}: expected `{expected}`, got {line[:80]!r}; export the model again.")
+
+
+def text_cameras(path: Path) -> Iterator[tuple[int, str, int, int, list[float]]]:
+    for number, line in _lines(path):
+        if fields := line.split(maxsplit=_MAX_CAMERA_FIELDS):
+            try:
+                camera_id, width, height = int(fields[0]), int(fields[2]), int(fields[3])
+                yield camera_id, fields[1], width, height, [float(f) for f in fields[4:]]
+            except (ValueError, IndexError):
+                raise _broken(path, number, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", line) from None
+
+
+def text_images(path: Path) -> Iterator[tuple[str, int, list[float]]]:
+    lines = _lines(path)
+    for number, line in lines:
+        if not line.strip():
+            continue
+        fields = line.split(maxsplit=9)
+        try:
+            camera_id, pose = int(fields[8]), [float(f) for f in fields[1:8]]
+            name = _BEFORE_NAME.sub("", line, count=1).rstrip() if fields[9] else ""
+        except (ValueError, IndexError):
+            raise _broken(path, number, "IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME", line) from None
+        number, line = next(lines, (number, ""))
+        if _count_words(line) % 3:
+            raise _broken(path, number, "POINTS2D[] as (X, Y, POINT3D_ID), or a blank line", line)
+        yield name, camera_id, pose
+
+
+def _count_words(line: str) -> int:
+    """Return the length of `line.split()`, which would take many times the memory of a line of thousands of points."""
+    visible = np.frombuffer(f" {line}".encode(), np.uint8) > 32
+    return int(np.count_nonzero(visible[1:] & ~visible[:-1]))
+
+
+def text_points(path: Path) -> Iterator[list[float]]:
+    for number, line in _lines(path):
+        if fields := line.split(maxsplit=8):
+            try:
+                xyz_rgb = [float(f) for f in fields[1:7]]
+                float(fields[7])
+            except (ValueError, IndexError):
+                raise _broken(path, number, "POINT3D_ID X Y Z R G B ERROR TRACK[]", line) from None
+            yield xyz_rgb
+
+
+# ---- binary ----------------------------------------------------------------------------------------------
+
+
+class _Bytes:
+    """A binary file that is read sequentially; reads past its end raise ValueError."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.data, self.at = path, read_bytes(path), 0
+
+    def take(self, layout: str) -> tuple:
+        """Return the fields of one little-endian record."""
+        layout = "<" + layout
+        self.skip(struct.calcsize(layout))
+        return struct.unpack_from(layout, self.data, self.at - struct.calcsize(layout))
+
+    def skip(self, count: int) -> None:
+        if count > len(self.data) - self.at:
+            raise ValueError(
+                f"{self.path}: expected {count} more bytes at byte {self.at}, got "
+                f"{len(self.data) - self.at}: the file is truncated or broken; export the model again."
+            )
+        self.at += count
+
+    def end(self, count: int, what: str) -> None:
+        """Check that nothing follows the `count` records that the file announces."""
+        if rest := len(self.data) - self.at:
+            raise ValueError(
+                f"{self.path}: expected the {count} {what} that it announces, got {rest} more bytes: the number or the "
+                "file is broken; export the model again."
+            )
+
+    def string(self) -> str:
+        start, end = self.at, self.data.find(b"\0", self.at)
+        self.skip((end if end >= 0 else len(self.data)) + 1 - start)
+        return self.data[start:end].decode("utf-8", errors="replace")
+
+
+def binary_cameras(path: Path) -> Iterator[tuple[int, str, int, int, tuple[float, ...]]]:
+    file, names = _Bytes(path), list(MODELS)
+    (count,) = file.take("Q")
+    for _ in range(count):
+        camera_id, model, width, height = file.take("IiQQ")
+        if not 0 <= model < len(names):
+            # lens_and_intrinsics rejects this name; the rest of the file cannot be read.
+            yield camera_id, f"number {model}", width, height, ()
+            return
+        focals, coefficients = MODELS[names[model]]
+        yield camera_id, names[model], width, height, file.take(f"{focals + 2 + coefficients}d")
+    file.end(count, "cameras")
+
+
+def binary_images(path: Path) -> Iterator[tuple[str, int, tuple[float, ...]]]:
+    file = _Bytes(path)
+    (count,) = file.take("Q")
+    for _ in range(count):
+        _, *pose, camera_id = file.take("I7dI")
+        name = file.string()
+        (points,) = file.take("Q")
+        file.skip(24 * points)
+        yield name, camera_id, tuple(pose)
+    file.end(count, "images")
+
+
+def binary_points(path: Path) -> Iterator[list[float]]:
+    file = _Bytes(path)
+    (count,) = file.take("Q")
+    for _ in range(count):
+        _, *xyz_rgb, _, track = file.take("Q3d3BdQ")
+        file.skip(8 * track)
+        yield xyz_rgb
+    file.end(count, "points")

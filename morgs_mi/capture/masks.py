@@ -1,0 +1,64 @@
+"""Masks of the pixels of a camera's clip that are not used, from images whose black pixels mark them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from morgs_mi.io.remote import fetched
+from morgs_mi.io.video import decode_image
+
+__all__ = ["used_pixels"]
+
+
+def used_pixels(files: Sequence[Path], width: int, height: int, name: str) -> tuple[np.ndarray | None, str]:
+    """Return the mask [H, W] of the pixels that are black in no image, None if there are none, and a note.
+
+    Args:
+        files: images of one camera, of the size of its clip or scaled versions of it.
+        width: of the clip, px.
+        height: of the clip, px.
+        name: name of the camera.
+
+    Raises:
+        FileNotFoundError: an image is missing.
+        ValueError: an image cannot be read or has another aspect ratio, or all pixels are masked out.
+    """
+    used = np.ones((height, width), bool)
+    varies = False
+    for file in files:
+        mask = _at_size(file, _not_black(file), width, height)
+        varies = varies or (file != files[0] and not np.array_equal(used & mask, used))
+        used &= mask
+    if used.all():
+        return None, ""
+    if not used.any():
+        raise ValueError(f"{files[0]}: expected pixels that are used, got a black mask of {name}; correct it.")
+    several = f": all that any of {len(files)} different masks has black" if varies else f" by {files[0].name}"
+    return used, f"{name}: {100 * (1 - used.mean()):.1f} % of its pixels are masked out{several}."
+
+
+def _not_black(file: Path) -> np.ndarray:
+    """Return the mask [H, W] of the pixels of an image that are neither black nor transparent."""
+    if not file.is_file():
+        raise FileNotFoundError(f"{file}: expected a mask, found none; copy it, or drop `mask_path`.")
+    image = decode_image(file, np.fromfile(fetched(file), np.uint8), cv2.IMREAD_UNCHANGED)
+    if image.ndim == 2:
+        return image > 0
+    return np.any(image[..., :3] > 0, axis=2) & np.all(image[..., 3:] > 0, axis=2)
+
+
+def _at_size(file: Path, mask: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Return a mask at another size, where a pixel is used if all that it shows is."""
+    rows, columns = mask.shape
+    if (columns, rows) == (width, height):
+        return mask
+    if abs(columns * height - rows * width) > min(columns, rows, width, height):
+        raise ValueError(
+            f"{file}: expected a mask of {width}x{height} pixels as the clip has, or a scaled version of it, got "
+            f"{columns}x{rows}; make it again."
+        )
+    return np.greater(cv2.resize(mask.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA), 1 - 1e-4)

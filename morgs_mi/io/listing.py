@@ -1,0 +1,33 @@
+"""Content of folders, without the files that operating systems and file servers add."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+__all__ = ["is_added", "is_listed", "listed"]
+
+# In lower case: of macOS and its archives, Windows (thumbnails, settings, bins), Synology, and ext4.
+_ADDED = {
+    *(".ds_store", "__macosx", "icon\r", ".spotlight-v100", ".trashes", ".fseventsd"),
+    *("thumbs.db", "ehthumbs.db", "desktop.ini", "$recycle.bin", "system volume information"),
+    *("@eadir", "#recycle", "lost+found"),
+}
+
+
+def is_added(name: str) -> bool:
+    """Return whether a system adds files or folders of this name, such as macOS's `._cam01.mp4`."""
+    return name.startswith("._") or name.lower() in _ADDED
+
+
+def is_listed(name: str) -> bool:
+    """Return whether a file or folder of this name is neither hidden nor added by a system."""
+    return not (name.startswith(".") or is_added(name))
+
+
+def listed(folder: str | Path) -> list[Path]:
+    """Return the files and folders in a folder that are neither hidden nor added by a system, by name.
+
+    Raises:
+        OSError: there is no such folder, or it cannot be read.
+    """
+    return sorted(file for file in Path(folder).iterdir() if is_listed(file.name))

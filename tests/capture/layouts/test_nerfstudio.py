@@ -1,0 +1,207 @@
+"""Nerfstudio's `transforms.json`: lenses, masks, splits, sizes and keys of its exporters."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.layouts.nerfstudio import LAYOUT
+from tests.assertions import assert_close
+from tests.scenes import captures as layouts
+from tests.scenes.captures import HEIGHT, WIDTH
+
+NAMES = ("cam1", "cam2", "cam10")
+PIXEL_ABS = 1e-6  # the file stores float64
+
+
+def photos(path: Path, folder: str = "images", suffix: str = ".png", change: Callable = lambda meta: None) -> Path:
+    """Write three photos and their `transforms.json`, after `change`."""
+    layouts.nerfstudio(path)
+    for i, name in enumerate(NAMES):
+        (path / f"{name}.mkv").unlink()
+        layouts.write_image(path / folder / f"{name}{suffix}", i, 0)
+    meta = json.loads((path / "transforms.json").read_text())
+    for frame, name in zip(meta["frames"], NAMES, strict=True):
+        frame["file_path"] = f"{folder}/{name}{suffix}"
+    meta["k1"] = 0
+    change(meta)
+    (path / "transforms.json").write_text(json.dumps(meta))
+    return path
+
+
+def write_mask(file: Path, mask: np.ndarray) -> None:
+    file.parent.mkdir(exist_ok=True)
+    cv2.imwrite(str(file), mask.astype(np.uint8))
+
+
+def left_half(value: int = 255) -> np.ndarray:
+    """Return an image that is black in its left half."""
+    return np.where(np.arange(WIDTH) < WIDTH // 2, 0, value) + np.zeros((HEIGHT, 1), int)
+
+
+def lenses(capture: Capture) -> list[tuple[str, list[float]]]:
+    return [(view["lens"], view["distortion"]) for view in capture.metadata()["cameras"]]
+
+
+@pytest.mark.parametrize("camera_model", [None, "OPENCV", "OPENCV_FISHEYE"])
+def test_nerfstudio__reads_fisheyes_by_their_flag(tmp_path: Path, camera_model: str | None) -> None:
+    def change(meta: dict) -> None:
+        meta.pop("camera_model")
+        meta.update({"is_fisheye": True, "k1": 0.01} | ({"camera_model": camera_model} if camera_model else {}))
+        meta["frames"][1]["is_fisheye"] = False
+
+    first, second, _ = lenses(load_capture(photos(tmp_path / "a", change=change)))
+    assert first == ("OPENCV_FISHEYE", [0.01, 0, 0, 0])
+    assert second[0] == ("OPENCV_FISHEYE" if camera_model == "OPENCV_FISHEYE" else "OPENCV")
+
+
+def test_nerfstudio__refuses_a_flag_that_is_none(tmp_path: Path) -> None:
+    path = photos(tmp_path / "a", change=lambda meta: meta.update(is_fisheye="yes"))
+    with pytest.raises(ValueError, match=r"frame 0 .*: `is_fisheye` must be true or false, got 'yes'"):
+        load_capture(path)
+
+
+@pytest.mark.parametrize("value", [255, 1])
+def test_nerfstudio__does_not_use_pixels_that_a_mask_has_black(tmp_path: Path, value: int) -> None:
+    def change(meta: dict) -> None:
+        meta["frames"][0]["mask_path"] = "masks/cam1.png"
+
+    path = photos(tmp_path / "a", change=change)
+    write_mask(path / "masks/cam1.png", left_half(value))
+    capture = load_capture(path)
+    np.testing.assert_array_equal(capture.masks[0], left_half() > 0)
+    assert capture.masks[1:] == (None, None)
+    assert "cam1: 50.0 % of its pixels are masked out by cam1.png." in capture.notes
+
+
+@pytest.mark.usefixtures("small_images")
+def test_nerfstudio__combines_masks_with_alpha_lens_and_downscaling(tmp_path: Path) -> None:
+    def change(meta: dict) -> None:
+        meta.update(mask_path="masks/all.png", k1=0.3)
+
+    path = photos(tmp_path / "a", change=change)
+    write_mask(path / "masks/all.png", left_half())
+    rows = np.where(np.arange(HEIGHT) < 10, 0, 255)[:, None] + np.zeros((1, WIDTH), int)
+    cv2.imwrite(str(path / "images/cam1.png"), np.dstack([*[np.full((HEIGHT, WIDTH), 9)] * 3, rows]).astype(np.uint8))
+    full, small = load_capture(path), load_capture(path, 2)
+    alone = full.at_recorded_size()._sources[0].undistortion.mask
+    for mask in full.masks:
+        assert mask is not None
+        assert not mask[:, : WIDTH // 2 - 2].any()
+        assert not (mask & ~alone).any()
+    assert not full.masks[0][:8].any()
+    assert full.masks[1][1, WIDTH // 2 + 2 : WIDTH // 2 + 8].any()
+    blocks = full.masks[0].reshape(HEIGHT // 2, 2, WIDTH // 2, 2).all(axis=(1, 3))
+    np.testing.assert_array_equal(small.masks[0], blocks)
+
+
+def test_nerfstudio__masks_what_any_mask_of_a_camera_has_black(tmp_path: Path) -> None:
+    path = layouts.nerfstudio(tmp_path / "a")
+    meta = json.loads((path / "transforms.json").read_text())
+    first = meta["frames"][0] | {"file_path": "cam1/0000.png", "mask_path": "masks/a.png"}
+    meta["frames"][0] = first
+    meta["frames"].append(first | {"file_path": "cam1/0001.png", "mask_path": "masks/b.png"})
+    meta["k1"] = 0
+    (path / "transforms.json").write_text(json.dumps(meta))
+    write_mask(path / "masks/a.png", left_half())
+    write_mask(path / "masks/b.png", 255 - left_half())
+    with pytest.raises(ValueError, match="expected pixels that are used, got a black mask of cam1"):
+        load_capture(path)
+    write_mask(path / "masks/b.png", np.full((2 * HEIGHT, 2 * WIDTH), 255))
+    assert load_capture(path).masks[0].mean() == 0.5
+    write_mask(path / "masks/b.png", np.full((HEIGHT, HEIGHT), 255))
+    with pytest.raises(ValueError, match=r"b.png: expected a mask of 62x46 pixels .*, got 46x46"):
+        load_capture(path)
+    (path / "masks/b.png").unlink()
+    with pytest.raises(FileNotFoundError, match=r"b.png: expected a mask, found none"):
+        load_capture(path)
+
+
+SPLITS = {
+    "test": ({"test_filenames": ["images/cam2.png"]}, (1,)),
+    "validation and test": ({"val_filenames": ["images/cam1.png"], "test_filenames": ["./images/cam2.png"]}, (0, 1)),
+    "other than training": (
+        {"train_filenames": ["images/cam1.png"], "test_filenames": ["images/cam10.png", "cam2"]},
+        (1, 2),
+    ),
+    "trained and tested": (
+        {"train_filenames": [f"images/{n}.png" for n in NAMES], "val_filenames": ["images/cam2.png"]},
+        (),
+    ),
+    "none": ({"test_filenames": []}, ()),
+}
+
+
+@pytest.mark.parametrize(("lists", "views"), SPLITS.values(), ids=SPLITS)
+def test_nerfstudio__holds_out_the_views_of_its_splits(tmp_path: Path, lists: dict, views: tuple[int, ...]) -> None:
+    path = photos(tmp_path / "a", change=lambda meta: meta.update(lists))
+    assert LAYOUT.read(path).test_views == views
+    assert load_capture(path).test_views == views
+    assert load_capture(path, test_view=None).test_views == ()
+
+
+def test_nerfstudio__leaves_out_views_of_no_split(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    lists = {"train_filenames": ["images/cam1.png", "gone.png"], "test_filenames": ["images/cam10.png"]}
+    path = photos(tmp_path / "a", change=lambda meta: meta.update(lists))
+    capture = load_capture(path)
+    assert (capture.names, capture.test_views) == (("cam1", "cam10"), (1,))
+    assert "cam2 in none of the splits: left out" in caplog.text
+    assert "`train_filenames` names 1 images without a frame, such as gone.png" in caplog.text
+    path = photos(tmp_path / "b", change=lambda meta: meta.update(train_filenames=[]))
+    with pytest.raises(ValueError, match=r"transforms.json: expected a camera to train on, got none"):
+        load_capture(path)
+
+
+@pytest.mark.parametrize(
+    "kept", [("fl_x", "fl_y"), ("fl_x",), ("camera_angle_x",), ("camera_angle_x", "camera_angle_y")]
+)
+@pytest.mark.parametrize("suffix", [".png", ".JPG", ".tif"])
+@pytest.mark.parametrize("named", [True, False])
+def test_nerfstudio__takes_missing_sizes_from_the_images(tmp_path: Path, kept, suffix: str, named: bool) -> None:
+    angles = {"camera_angle_x": 2 * np.arctan(WIDTH / 100), "camera_angle_y": 2 * np.arctan(HEIGHT / 100)}
+
+    def change(meta: dict) -> None:
+        del meta["w"], meta["h"]
+        for frame in meta["frames"]:
+            for key in ("fl_x", "fl_y", "cx", "cy"):
+                del frame[key]
+            frame.update({key: value for key, value in {"fl_x": 50.0, "fl_y": 50.0, **angles}.items() if key in kept})
+            if not named:
+                frame["file_path"] = "./" + frame["file_path"].removesuffix(suffix)
+
+    capture = load_capture(photos(tmp_path / "a", "train", suffix, change))
+    assert capture.names == NAMES
+    for camera in capture.cameras:
+        assert (camera.width, camera.height) == (WIDTH, HEIGHT)
+        assert_close(camera.K, [[50, 0, WIDTH / 2], [0, 50, HEIGHT / 2], [0, 0, 1]], atol=PIXEL_ABS)
+
+
+def test_nerfstudio__takes_missing_sizes_from_clips_and_leaves_out_missing_ones(tmp_path: Path) -> None:
+    path = layouts.nerfstudio(tmp_path / "a")
+    meta = json.loads((path / "transforms.json").read_text())
+    del meta["w"], meta["h"]
+    (path / "transforms.json").write_text(json.dumps(meta))
+    (path / "cam1.mkv").unlink()
+    capture = load_capture(path)
+    assert [(camera.name, camera.width) for camera in capture.cameras] == [("cam2", WIDTH), ("cam10", WIDTH)]
+
+
+def test_nerfstudio__names_keys_that_it_does_not_understand_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    def change(meta: dict) -> None:
+        meta.update(aabb_scale=16, scale=1, applied_transform=[], applied_scale=1.0, rolling_shutter=[0, 0, 1])
+        for frame in meta["frames"]:
+            frame.update(sharpness=9.5, colmap_im_id=3, depth_file_path="d.png", k5=0.1)
+
+    path = photos(tmp_path / "a", change=change)
+    with caplog.at_level(logging.WARNING):
+        load_capture(path)
+    assert caplog.messages == [f"{path / 'transforms.json'}: not understood and not used: k5, rolling_shutter."]
