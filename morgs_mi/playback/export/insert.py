@@ -182,9 +182,8 @@ def _resized(name: str, image: np.ndarray, camera: Camera) -> np.ndarray:
     if scale == 1:
         return image
     resized = cv2.resize(image, (camera.width, camera.height), interpolation=cv2.INTER_LINEAR)
-    return resized.reshape(camera.height, camera.width, -1) * np.array(
-        [1, scale] if name == "motion" else 1, np.float32
-    )
+    unit = np.array([1, scale] if name == "motion" else 1, np.float32)  # motion is in pixels
+    return resized.reshape(camera.height, camera.width, -1) * unit
 
 
 def captured_light(gaussians: Gaussians, camera: Camera, position: np.ndarray) -> dict[str, Any]:
