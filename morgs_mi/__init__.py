@@ -12,6 +12,7 @@ from morgs_mi.core.camera import Camera  # noqa: E402
 from morgs_mi.core.color_space import SH_C0  # noqa: E402
 from morgs_mi.core.gaussians import Gaussians  # noqa: E402
 from morgs_mi.core.progress import ProgressBar  # noqa: E402
+from morgs_mi.core.rig import with_near_planes  # noqa: E402
 from morgs_mi.evaluate.evaluate import evaluate_stream  # noqa: E402
 from morgs_mi.evaluate.point_tracks import PointTracks, track_points  # noqa: E402
 from morgs_mi.fit.fit_config import FitConfig  # noqa: E402
@@ -72,4 +73,5 @@ __all__ = [
     "stream_capture",
     "synthesize",
     "track_points",
+    "with_near_planes",
 ]

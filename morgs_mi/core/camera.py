@@ -98,9 +98,11 @@ class Camera:
         width: int,
         height: int,
         name: str = "",
-        near: float = 0.01,
+        near: float | None = None,
     ) -> Camera:
         """Return the camera at `origin` [3] that looks at `target` [3]; `fov_x` in degrees across, below 180.
+
+        The default of `near` is 0.01, or a hundredth of the distance to `target` if that is less.
 
         Raises:
             ValueError: `target` is at `origin` or above or below it in the direction of `up`, and as for `Camera`.
@@ -118,14 +120,15 @@ class Camera:
         if not np.linalg.norm(right) > 1e-12 * np.linalg.norm(forward) * np.linalg.norm(vectors["up"]):
             found = ", ".join(f"{key} {value.tolist()}" for key, value in vectors.items())
             raise ValueError(f"{where}: `up` must not be parallel to the direction of view, got {found}; tilt it.")
-        forward /= np.linalg.norm(forward)
+        distance = float(np.linalg.norm(forward))
+        forward /= distance
         right /= np.linalg.norm(right)
         R = np.stack([right, np.cross(forward, right), forward])
         viewmat = np.eye(4)
         viewmat[:3, :3], viewmat[:3, 3] = R, -R @ vectors["origin"]
         f = 0.5 * width / np.tan(np.deg2rad(0.5 * fov_x))
         K = np.array([[f, 0, 0.5 * width], [0, f, 0.5 * height], [0, 0, 1.0]])
-        return cls(K, viewmat, width, height, name, near)
+        return cls(K, viewmat, width, height, name, min(0.01, distance / 100) if near is None else near)
 
     @property
     def position(self) -> np.ndarray:

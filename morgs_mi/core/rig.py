@@ -12,6 +12,7 @@ from morgs_mi.core.camera import Camera
 __all__ = [
     "angles_between",
     "angles_to",
+    "check_near_planes",
     "choose_key_views",
     "focus_depths",
     "focus_point",
@@ -99,6 +100,21 @@ def with_near_planes(cameras: Sequence[Camera], points: np.ndarray, near: float 
         replace(camera, near=float(depth)) if depth > 0 else camera
         for camera, depth in zip(cameras, nearest, strict=True)
     )
+
+
+def check_near_planes(where: str, cameras: Sequence[Camera], points: np.ndarray) -> None:
+    """Check that not all near planes are behind the scene, which then would not be rendered.
+
+    Raises:
+        ValueError: they are, in a sentence that begins with `where`.
+    """
+    depths = scene_depths([replace(camera, near=_IN_FRONT) for camera in cameras], points)
+    if all(camera.near > depth for camera, depth in zip(cameras, depths, strict=True)):
+        raise ValueError(
+            f"{where}: the near planes of `cameras` must be in front of the scene, got {cameras[0].near:g} world units "
+            f"where it is {depths[0]:.3g} away; pass with_near_planes(cameras, points), or cameras with a smaller "
+            "`near`."
+        )
 
 
 def _reliable_depths(cameras: Sequence[Camera], points: np.ndarray) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 
 from morgs_mi.core.camera import Camera
 from morgs_mi.core.checks import check_mask, check_points, check_type
-from morgs_mi.core.rig import choose_key_views, scene_extent
+from morgs_mi.core.rig import check_near_planes, choose_key_views, scene_extent
 from morgs_mi.core.threads import map_in_threads
 from morgs_mi.fit.capacity import check_capacity
 from morgs_mi.fit.initialise import Points
@@ -147,6 +147,7 @@ def prepare(
     for view, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
         if mask is not None:
             check_mask(f"StreamLoop(): view {camera.name or view!r}", mask, camera.height, camera.width)
+    check_near_planes("StreamLoop()", cameras, points)
     check_capacity("StreamLoop()", cameras, config.fit)
     copies = tuple(None if mask is None else mask.copy() for mask in masks)
     key_views = choose_key_views(cameras, config.motion.key_views)

@@ -61,10 +61,10 @@ def default_rig(frames: Sequence[Gaussians], axes: Axes = "y-down") -> tuple[Cam
     tangent = np.tan(np.deg2rad(_FOV_X / 2))
     # The first camera sees the box; the others keep its distance from the middle.
     distance = deep + max(wide, tall * _WIDTH / _HEIGHT) / tangent
-    center, near = (low + high) / 2, min(0.01, float(distance) / 1000)
+    center = (low + high) / 2
     arms = Rotation.from_rotvec(np.linspace(0, 2 * np.pi, len(_NAMES), endpoint=False)[:, None] * up).apply(-forward)
     ring = tuple(
-        Camera.look_at(center + distance * arm, center, up, _FOV_X, _WIDTH, _HEIGHT, name, near)
+        Camera.look_at(center + distance * arm, center, up, _FOV_X, _WIDTH, _HEIGHT, name)
         for name, arm in zip(_NAMES, arms, strict=True)
     )
     some = thinned(next(gaussians for gaussians in frames if len(gaussians)))

@@ -145,3 +145,10 @@ def test_look_at__refuses_bad_input(change, message):
     view = {"origin": (0, -3, 0), "target": (0, 0, 0), "up": (0, 0, 1), "fov_x": 40, "width": 8, "height": 8}
     with pytest.raises(ValueError, match=message):
         Camera.look_at(**{**view, **change})
+
+
+@pytest.mark.parametrize(("distance", "near"), [(5.0, 0.01), (0.02, 2e-4)])
+def test_look_at__has_a_near_plane_before_its_target(distance: float, near: float) -> None:
+    camera = Camera.look_at((0, 0, -distance), (0, 0, 0), (0, -1, 0), 40, 32, 24)
+    assert camera.near == pytest.approx(near)
+    assert Camera.look_at((0, 0, -distance), (0, 0, 0), (0, -1, 0), 40, 32, 24, near=0.5).near == 0.5

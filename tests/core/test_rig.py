@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.core.camera import Camera
-from morgs_mi.core.rig import scene_extent, with_near_planes
+from morgs_mi.core.rig import check_near_planes, scene_extent, with_near_planes
 from tests.assertions import assert_close
 from tests.scenes.cameras import arc, circle, look_at_cameras
 
@@ -76,3 +76,13 @@ def test_with_near_planes__are_unchanged_if_all_cameras_are_at_one_place(count: 
 def test_with_near_planes__have_a_given_depth() -> None:
     cameras = with_near_planes(look_at_cameras([(0, 0, -3), (1, 0, -3)]), slab(), 0.7)
     assert [camera.near for camera in cameras] == [0.7, 0.7]
+
+
+@pytest.mark.parametrize("points", [NO_POINTS, slab()], ids=["rig", "points"])
+def test_check_near_planes__refuses_planes_behind_the_scene(points: np.ndarray) -> None:
+    cameras = look_at_cameras(arc((-0.3, 0.3), 3.0))
+    check_near_planes("here", cameras, points)
+    hidden = [replace(camera, near=5.0) for camera in cameras]
+    with pytest.raises(ValueError, match=r"here: the near planes .* got 5 world units where it is .* away"):
+        check_near_planes("here", hidden, points)
+    check_near_planes("here", with_near_planes(hidden, points), points)

@@ -283,7 +283,7 @@ def test_apply_values__names_file_key_expected_and_given(config: Any, text: str,
         (None, FileNotFoundError, "expected a TOML file with settings, found none; write one with"),
         (b"fit = ", ValueError, r"expected TOML, got a broken file \(Invalid value"),
         (b"a = 1\na = 2", ValueError, r"expected TOML, got a broken file \(Cannot overwrite a value"),
-        (b"\xff", ValueError, r"expected TOML, got a broken file \('utf-8' codec"),
+        (b"\xff", ValueError, r"expected text in UTF-8, got other bytes \('utf-8' codec"),
     ],
 )
 def test_read_config__names_a_file_that_cannot_be_read(content, error, message, tmp_path: Path) -> None:
