@@ -67,7 +67,10 @@ class Fit:
             print_result(config_toml(config).rstrip())
             return
         if self.capture is None or self.out is None:
-            raise ValueError("morgs-mi fit: expected the folders CAPTURE and OUT, got fewer; see morgs-mi fit --help.")
+            raise ValueError(
+                "morgs-mi fit: expected the folders CAPTURE and OUT, got fewer; give them before options with several "
+                "values, such as --test-view, and see morgs-mi fit --help."
+            )
         self.settings.check_methods(config)
         capture = load_capture(
             self.capture, self.downscale, held_out(self.test_view), self.frames, self.reading.read_config()
