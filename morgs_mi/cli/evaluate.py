@@ -12,7 +12,7 @@ from tyro.conf import DisallowNone, Positional
 
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.cli.console import print_result, print_table, print_warning, progress
-from morgs_mi.cli.settings import optional
+from morgs_mi.cli.settings import Flag, optional
 from morgs_mi.evaluate.results import Evaluation
 from morgs_mi.evaluate.tables import evaluation_summary, evaluation_tables
 from morgs_mi.runs.recording import FILES
@@ -28,6 +28,8 @@ class Eval:
     """Folder of a fit, or a stream file."""
     capture: Annotated[Path | None, DisallowNone, optional("FOLDER")] = None
     """Capture that was fitted, if it has moved since the fit."""
+    any_recording: Flag = False
+    """Compare with CAPTURE even if it is another recording by the same cameras."""
     json: Annotated[Path | None, DisallowNone, optional("FILE.json")] = None
     """File for all results; - prints them instead of the tables."""
     figures: Annotated[Path | None, DisallowNone, optional("FOLDER")] = None
@@ -47,9 +49,11 @@ class Eval:
                 _check_not_of_fit(self.out, check_output(output))
         network = None if self.lpips is None else Lpips(self.lpips)
         with progress() as report:
-            result = evaluate_stream(self.out, self.capture, partial(report, "Evaluating frames"), network)
+            frames = partial(report, "Evaluating frames")
+            result = evaluate_stream(self.out, self.capture, frames, network, self.any_recording)
             if self.figures is not None:
-                draw_stream(self.out, self.figures, self.capture, partial(report, "Drawing frames"))
+                drawing = partial(report, "Drawing frames")
+                draw_stream(self.out, self.figures, self.capture, drawing, self.any_recording)
         scores = {**result.as_dict(), "machine": machine(), "versions": versions()}
         if self.json == Path("-"):
             print_result(json.dumps(json_finite(scores), indent=2))

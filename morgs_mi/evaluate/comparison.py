@@ -48,10 +48,11 @@ class ComparedClip:
     render: RenderConfig
 
     @classmethod
-    def of(cls, stream: StreamReader, capture: str | Path | None) -> ComparedClip:
+    def of(cls, stream: StreamReader, capture: str | Path | None, any_recording: bool = False) -> ComparedClip:
         """Return a stream beside `capture`; None: the capture that it was fitted to.
 
-        The sizes are read from the file and not from the fit's report, because a receiver has only the file.
+        The sizes are read from the file and not from the fit's report, because a receiver has only the file. The
+        capture must be the recording that was fitted, unless it may be any.
 
         Raises:
             FileNotFoundError: the capture is missing.
@@ -64,7 +65,7 @@ class ComparedClip:
             count += 1
         if not packets:
             raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
-        recording = open_stream_capture(stream, capture, list(packets))
+        recording = open_stream_capture(stream, capture, list(packets), any_recording)
         views = recording.test_views or recording.train_views
         channels = ("color", "motion", *(("confidence",) if has_confidence(stream) else ()))
         cameras = recording.with_delays(stream.cameras)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from morgs_mi.capture.capture import Capture
+from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.evaluate.comparison import ComparedClip
 from morgs_mi.evaluate.lpips import Lpips
 from morgs_mi.evaluate.measures import Motion3D, Quality, Registration, Tracking, Variation
@@ -19,11 +20,13 @@ from morgs_mi.playback.streams import open_stream
 __all__ = ["evaluate_stream"]
 
 
+@interrupts_raised()
 def evaluate_stream(
     out: str | Path,
     capture: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
     lpips: Lpips | None = None,
+    any_recording: bool = False,
 ) -> Evaluation:
     """Decode a stream and compare it with its recording: in the held-out view, or otherwise in all training views.
 
@@ -33,6 +36,7 @@ def evaluate_stream(
         capture: recording; default is the capture that the stream was fitted to.
         progress: called with (frames done, frames in all).
         lpips: network for LPIPS; without one there is no LPIPS.
+        any_recording: whether `capture` may be another recording by the same cameras than the one that was fitted.
 
     Returns:
         The scores of the clip, its frames and its views.
@@ -43,7 +47,7 @@ def evaluate_stream(
             network does not accept images of this size, or the true tracks are broken.
     """
     stream = open_stream(out)
-    clip = ComparedClip.of(stream, capture)
+    clip = ComparedClip.of(stream, capture, any_recording)
     recording, (seconds, estimate) = clip.recording, _of_fit(stream.path)
     measures = (Quality(lpips), Variation(clip), Motion3D(clip), Registration(), Tracking(clip))
     rows: list[FrameScores] = []

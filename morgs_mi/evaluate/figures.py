@@ -44,6 +44,7 @@ def draw_stream(
     folder: str | Path,
     capture: str | Path | None = None,
     progress: Callable[[int, int], None] | None = None,
+    any_recording: bool = False,
 ) -> list[Path]:
     """Draw a stream's held-out view, or without one its first training view, into PNG files.
 
@@ -56,6 +57,7 @@ def draw_stream(
         folder: output folder; created if missing.
         capture: recording; default is the capture that the stream was fitted to.
         progress: called with (frames done, frames in all).
+        any_recording: as for `evaluate_stream`.
 
     Returns:
         Paths of the files.
@@ -69,7 +71,7 @@ def draw_stream(
     frames = [packet.frame for packet in stream]
     if not frames:
         raise ValueError(f"{stream.path}: expected at least one frame, got a header alone; fit the capture again.")
-    recording = open_stream_capture(stream, capture, frames)
+    recording = open_stream_capture(stream, capture, frames, any_recording)
     view = recording.reference_view
     camera = recording.with_delays(stream.cameras)[view]
     # Nothing moves up to the first frame.

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.fingerprint import fingerprint
 from morgs_mi.capture.timeline import ReadConfig
 from morgs_mi.capture.truth import GroundTruth, load_truth
 from morgs_mi.codec.container import PacketKind
@@ -277,13 +278,16 @@ def _place(stream: StreamReader, key: str) -> str:
     return f"{stream.path}: packet 0: `{key}` of the header's metadata"
 
 
-def open_stream_capture(stream: StreamReader, capture: str | Path | None, frames: Sequence[int]) -> Capture:
+def open_stream_capture(
+    stream: StreamReader, capture: str | Path | None, frames: Sequence[int], any_recording: bool = False
+) -> Capture:
     """Open the capture to which a stream was fitted, with the settings of the fit.
 
     Args:
         stream: the file.
         capture: folder of the capture; default: the fit's, which the ``capture.json`` beside the stream names.
         frames: indices of the stream's frames.
+        any_recording: whether the capture may be another recording by the same cameras.
 
     Raises:
         FileNotFoundError: the capture is missing.
@@ -310,8 +314,23 @@ def open_stream_capture(stream: StreamReader, capture: str | Path | None, frames
             f"{stream.path}: expected consecutive frames out of the {recording.num_frames} of {path}, got {frames}; "
             "pass the capture that was fitted (--capture)."
         )
+    if not any_recording:
+        _check_recording(stream, recording)
     # Other refined cameras change no image, and ground truth refers to the recording's cameras.
     return as_fitted(recording, stream) if "distortions" in stream.metadata else recording
+
+
+def _check_recording(stream: StreamReader, recording: Capture) -> None:
+    """Raise `ValueError` if a recording has not the fingerprint in a stream's header; imported streams have none."""
+    expected = metadata_entry(stream, "fingerprint", None, str, NoneType)
+    if expected is None:
+        return
+    refines = metadata_entry(stream, "config.fit.refine_cameras", "off", str) != "off"
+    if fingerprint(recording, next(recording.partial_frames(0, 1)).images, refines) != expected:
+        raise ValueError(
+            f"{recording.path}: expected the recording that {stream.path} was fitted to, got other images in its first "
+            "frame, or other points; pass that capture (--capture), or compare with any recording (--any-recording)."
+        )
 
 
 def fitted_capture(stream: StreamReader) -> str:

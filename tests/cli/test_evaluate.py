@@ -5,9 +5,13 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import cv2
 import pytest
 
-from tests.cli.commands import assert_refused
+from morgs_mi.playback.player import PROVISIONAL
+from morgs_mi.playback.visualise import write_png
+from tests.cli.commands import QUICK, assert_refused
+from tests.scenes.recording import write_recording
 
 
 def test_eval__replaces_no_file_of_the_fit(stream: Path, tmp_path: Path, run) -> None:
@@ -16,6 +20,32 @@ def test_eval__replaces_no_file_of_the_fit(stream: Path, tmp_path: Path, run) ->
             run("eval", stream, "--json", tmp_path / name),
             f"{name}: expected a new file, got one that the fit has written",
         )
+
+
+def test_eval__refuses_another_recording_by_the_same_cameras(tmp_path: Path, run) -> None:
+    clip, out = write_recording(tmp_path / "clip", 2), tmp_path / "out"
+    assert run("fit", clip, out, *QUICK, "--color", "linear")[0] == 0
+    other = shutil.copytree(clip, tmp_path / "other")
+    for image in other.glob("cam*/*.png"):
+        write_png(image, 255 - cv2.imread(str(image))[..., ::-1])
+    for figures in ((), ("--figures", tmp_path / "figures")):
+        result = run("eval", out, "--capture", other, *figures)
+        assert_refused(result, f"{other}: expected the recording that {out}/stream.morgs was fitted to", "--any-recor")
+    assert not (tmp_path / "figures").exists()
+    assert run("eval", out, "--capture", other, "--any-recording")[0] == 0
+    shutil.rmtree(other)
+    assert run("eval", out, "--capture", clip.rename(tmp_path / "moved"))[0] == 0
+
+
+def test_eval__says_that_a_first_frame_is_provisional(tmp_path: Path, run, caplog: pytest.LogCaptureFixture) -> None:
+    clip, out = write_recording(tmp_path / "clip", 1), tmp_path / "out"
+    assert run("fit", clip, out, *QUICK)[0] == 0
+    assert not caplog.messages
+    provisional = (out / "stream.morgs").rename(out / PROVISIONAL)
+    assert run("eval", provisional)[0] == 0
+    assert run("render", provisional, tmp_path / "image.png")[0] == 0
+    sentence = "a provisional first frame of a fit that is still running or was killed"
+    assert [sentence in message for message in caplog.messages] == [True, True]
 
 
 @pytest.mark.parametrize(

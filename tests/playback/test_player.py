@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 from morgs_mi.capture.capture import Capture, load_capture
+from morgs_mi.capture.fingerprint import fingerprint
 from morgs_mi.codec.container import StreamWriter
 from morgs_mi.codec.packets import keyframe_packet
 from morgs_mi.codec.reader import StreamReader
@@ -191,6 +193,21 @@ def test_open_stream_capture__finds_the_capture_of_the_fit(fitted_clip: Path, tm
     beside = "capture" if stored == "header" else capture
     (tmp_path / "capture.json").write_text(json.dumps({"capture": beside}))
     assert str(open_stream_capture(open_stream(tmp_path), None, [0, 1, 2]).path) == capture
+
+
+@pytest.mark.parametrize("refine", ["off", "on"])
+def test_open_stream_capture__recognises_the_recording_by_its_fingerprint(
+    fitted_clip: Path, tmp_path: Path, refine: str
+) -> None:
+    capture = load_capture(fitted_clip / "capture", test_view=0)
+    mark = fingerprint(capture, next(capture.partial_frames()).images, refine == "on")
+    for found, refused in ((mark, False), ("0" * 16, True), (None, False)):
+        about = {"test_view": 0, "fingerprint": found, "config": {"fit": {"refine_cameras": refine}}}
+        write_stream(tmp_path / "stream.morgs", about)
+        stream = open_stream(tmp_path)
+        with pytest.raises(ValueError, match="expected the recording that") if refused else nullcontext():
+            open_stream_capture(stream, capture.path, [0, 1, 2])
+        assert open_stream_capture(stream, capture.path, [0, 1, 2], any_recording=True).path == capture.path
 
 
 def test_open_stream_capture__asks_for_a_capture_that_has_moved(fitted_clip: Path, tmp_path: Path) -> None:
