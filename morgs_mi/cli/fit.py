@@ -55,7 +55,7 @@ class Fit:
     print_config: Flag = False
     """Print all settings as TOML and exit."""
 
-    arguments: ClassVar[Mapping[str, str]] = {"max_frames": "--frames"}
+    arguments: ClassVar[Mapping[str, str]] = {"max_frames": "--frames", "count": "--segments"}
 
     def run(self) -> None:
         from morgs_mi.calibration.checks.deep import check_exposures
@@ -93,7 +93,7 @@ class Fit:
         from morgs_mi.runs.cluster.segments import SegmentedRun, noting_segments
 
         assert self.out is not None
-        segments = SegmentConfig(self.segments or 1)
+        segments = SegmentConfig(1 if self.segments is None else self.segments)
         workers = min(segments.count, cores())
         with noting_segments(self.out), progress() as report, open_workers(self.scheduler, workers) as opened:
             run = SegmentedRun(capture, self.out, opened, config, segments, report)
@@ -113,6 +113,12 @@ def _print_summary(stream: Path, reports: Sequence[FrameReport]) -> None:
     )
     for sentence in first_frame_sentences(first.validation):
         print_result(sentence)
+    if problems := [row for row in reports if row.status != "ok"]:
+        row = problems[0]
+        print_result(
+            f"{len(problems)} of {len(reports)} frames have a problem (status in report.json), frame {row.frame}: "
+            f"{row.status.rstrip('.')}."
+        )
 
 
 def first_frame_sentences(validation: Mapping[str, Any]) -> Iterator[str]:

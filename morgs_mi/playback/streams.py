@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,13 +14,15 @@ from morgs_mi.io.listing import listed
 from morgs_mi.io.splats import read_splats, suffix_of
 from morgs_mi.playback.default_rig import DEFAULT_RIG, default_rig
 from morgs_mi.playback.export.notebook import stream_html
-from morgs_mi.playback.player import STREAM
+from morgs_mi.playback.player import PROVISIONAL, STREAM
 from morgs_mi.playback.trained_cameras import trained_cameras
 
 __all__ = ["DRAWN", "PlayableStream", "SplatFile", "open_stream", "stream_path"]
 
 DRAWN = 0.5
 """Share of invalid Gaussians up to which a file is drawn without them: beyond, the file as a whole is broken."""
+
+_LOG = logging.getLogger(__name__)
 
 
 class PlayableStream(StreamReader):
@@ -104,6 +107,7 @@ def open_stream(out: str | Path, most_invalid: float = DRAWN) -> PlayableStream:
     """Open a stream file, the ``stream.morgs`` in the folder of a fit, or a file with Gaussians as one frame.
 
     Files with Gaussians are ``.ply`` files in the layout of 3D Gaussian Splatting, ``.compressed.ply`` and ``.splat``.
+    A warning is logged for a provisional first frame, which a fit that was killed leaves behind.
 
     Args:
         out: the file or folder.
@@ -121,4 +125,9 @@ def open_stream(out: str | Path, most_invalid: float = DRAWN) -> PlayableStream:
             invalid ones.
     """
     path = stream_path(out)
+    if path.name == PROVISIONAL:
+        _LOG.warning(
+            "%s: a provisional first frame of a fit that is still running or was killed; its Gaussians are not final.",
+            path,
+        )
     return SplatFile(path, most_invalid) if suffix_of(path) else PlayableStream(path)

@@ -183,10 +183,10 @@ def _begin_with_first_frame(out: Path, source: Path, capture: Capture, config: S
         config: settings of the fit.
     """
     stream = open_stream(source)
+    metadata = stream_metadata(capture, next(capture.partial_frames()), config)
     capture = as_fitted(capture, stream)
-    metadata = stream_metadata(capture, next(capture.partial_frames()), config) | about_lenses(capture)
+    metadata |= about_lenses(capture)
     out.mkdir(exist_ok=True)
-    (out / "capture.json").unlink(missing_ok=True)
     with Recording(FitFiles.of(out), capture, metadata) as recording:
         recording.extend([next(iter(stream))], read_reports(FitFiles.of(source).report, range(1)))
 

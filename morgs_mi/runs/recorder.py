@@ -12,8 +12,9 @@ from morgs_mi.calibration.checks.rig_check import dense_points, match_capture
 from morgs_mi.calibration.refine import Refinement, refine_cameras, register_camera
 from morgs_mi.capture.capture import Capture, PartialFrame
 from morgs_mi.codec.container import Packet
-from morgs_mi.core.files import locked_folder, write_json
+from morgs_mi.core.files import locked_folder
 from morgs_mi.core.gaussians import Gaussians
+from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.rig import scene_extent
 from morgs_mi.fit.capacity import check_capacity
@@ -25,7 +26,6 @@ from morgs_mi.runs.recording import (
     Interrupted,
     Recording,
     check_outputs,
-    described_capture,
     interrupted_fit,
     stream_metadata,
 )
@@ -37,6 +37,7 @@ __all__ = ["Prepared", "push_frame", "stream_capture", "with_next", "with_points
 _FEW_POINTS = 100
 
 
+@interrupts_raised()
 def stream_capture(
     capture: Capture,
     out: str | Path,
@@ -51,7 +52,7 @@ def stream_capture(
 
     Args:
         capture: cameras and frames; the test view is not trained on, but is part of the stream's header.
-        out: folder, made if missing.
+        out: folder, made if missing. The files of an earlier fit stay there until the first frame replaces them.
         config: settings.
         resume: continue after the last complete packet of the stream in `out`, if there is one. With
             `RenderConfig(reproducible=True)` the stream has the same bytes as without an interruption.
@@ -76,7 +77,8 @@ def stream_capture(
 
 def _stream(capture: Capture, out: Path, config: StreamConfig, resume: bool, progress: Progress) -> list[FrameReport]:
     """Fit a capture into a locked folder."""
-    frames, files, about = capture.partial_frames(), FitFiles.of(out), out / "capture.json"
+    frames = capture.partial_frames()
+    files = FitFiles.of(out)
     first = next(frames)
     metadata = stream_metadata(capture, first, config)
     earlier = interrupted_fit(files, capture, metadata) if resume else None
@@ -88,7 +90,6 @@ def _stream(capture: Capture, out: Path, config: StreamConfig, resume: bool, pro
         prepared = Prepared(as_fitted(capture, earlier.stream))
         loop = StreamLoop.of(prepared.capture, config)
         frames = _resumed(loop, prepared.capture, earlier, progress)
-    write_json(about, described_capture(prepared.capture, None if earlier is None else about))
     last, train = capture.num_frames - 1, capture.train_views
     with Recording(files, prepared.capture, metadata | prepared.metadata, earlier) as recording:
         for frame, upcoming in with_next(frames):

@@ -4,26 +4,29 @@ A fit may be killed at any instruction. The stream then holds complete packets a
 frame's row is written to the report before its packets are written to the stream, so every packet has a row. Nothing
 else is stored, because the state of the loop follows from the stream and the recording (see `StreamState`).
 
+A fit into a folder that has a stream writes hidden files beside it until its first frame is there. They then replace
+the earlier stream, its description and its report together.
+
 A stream is made to be shared, so its header has no paths. The path of the capture is in the `capture.json` beside it.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from hashlib import blake2b
 from itertools import takewhile
 from pathlib import Path
 from reprlib import repr as shortened
 from typing import Any, NamedTuple
 
 import mitsuba as mi
-import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
+from morgs_mi.capture.fingerprint import fingerprint
 from morgs_mi.capture.outputs import check_output
 from morgs_mi.codec.container import Packet, PacketKind, StreamWriter, TruncatedStreamError, header_json
 from morgs_mi.codec.packets import CodedFrame, decode, reemitted_keyframe
@@ -52,6 +55,8 @@ __all__ = [
     "stream_metadata",
 ]
 
+_LOG = logging.getLogger(__name__)
+
 FILES = ("stream.morgs", "capture.json", "report.json")
 """Names of the files that a fit writes into its folder."""
 
@@ -61,20 +66,51 @@ Finished = Callable[[Sequence[Entry], int], tuple[Sequence[Entry], int]]
 
 
 class FitFiles(NamedTuple):
-    """Stream and report of a fit."""
+    """Stream and report of a fit, and the description of its capture; None: there is none, as in a segment."""
 
     stream: Path
     report: Path
+    description: Path | None = None
 
     @property
     def provisional(self) -> Path:
         """Stream of a provisional first frame."""
         return self.stream.with_name(PROVISIONAL)
 
+    @property
+    def next(self) -> FitFiles:
+        """Hidden files that are to replace these."""
+        return FitFiles(*(path.with_name(f".next-{path.name}") for path in self if path is not None))
+
     @classmethod
     def of(cls, out: Path) -> FitFiles:
         """Return the files of a fit in the folder `out`."""
-        return cls(out / "stream.morgs", out / "report.json")
+        return cls(*(out / name for name in ("stream.morgs", "report.json", "capture.json")))
+
+    def replace_by_next(self) -> None:
+        """Replace these files by the `next` ones; `settle` finishes what a kill leaves undone.
+
+        Raises:
+            OSError: a file cannot be renamed.
+        """
+        self.next.stream.replace(self.stream)
+        self.settle()
+
+    def settle(self) -> None:
+        """Finish a replacement that was cut off, or remove the `next` files of one that had not begun.
+
+        The stream is the first that is replaced and the last that is removed, so it tells the two apart.
+
+        Raises:
+            OSError: a file cannot be renamed.
+        """
+        replaced = not self.next.stream.exists()
+        for path, successor in reversed([*zip(self, self.next, strict=True)]):
+            if path is None or successor is None:
+                continue
+            if replaced and successor.exists():
+                successor.replace(path)
+            successor.unlink(missing_ok=True)
 
 
 def check_outputs(out: Path) -> None:
@@ -86,8 +122,10 @@ def check_outputs(out: Path) -> None:
 class Recording:
     """Stream and report of a fit, to which frames are added; a context manager.
 
+    The files of an earlier fit stay until the first frame replaces them.
+
     Args:
-        files: the stream and the report.
+        files: the stream, the report and the description of the capture.
         capture: cameras and frame rate of the stream's header.
         metadata: other entries of the header, from `stream_metadata`.
         earlier: an interrupted fit to continue; None to begin.
@@ -104,17 +142,24 @@ class Recording:
     ) -> None:
         self._files, self._metadata, self._capture = files, metadata, capture
         self._interval: int = metadata["config"]["codec"]["keyframe_interval"]
+        self._shows_provisional = True
         self.reports: list[FrameReport] = []
         files.provisional.unlink(missing_ok=True)
+        files.settle()
+        begins_anew = earlier is None and files.stream.exists()
+        self._written_files = files.next if begins_anew else files
         if earlier is None:
-            self._writer = StreamWriter(files.stream, capture.cameras, capture.fps, metadata)
+            self._writer = StreamWriter(self._written_files.stream, capture.cameras, capture.fps, metadata)
         else:
             self.reports += earlier.reports
             self._writer = StreamWriter.continued(files.stream, earlier.index, earlier.end)
             if earlier.index[-1][0] == PacketKind.RESIDUAL:
                 for packet in due_keyframe(earlier.coded, self._interval):
                     self._writer.write(packet)
-        self._written = os.stat(files.stream)
+        self._written = os.stat(self._written_files.stream)
+        if self._written_files.description is not None:
+            described = described_capture(capture, files.description if earlier else None)
+            write_json(self._written_files.description, described)
 
     def __enter__(self) -> Recording:
         return self
@@ -122,20 +167,27 @@ class Recording:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._writer.close()
         self._files.provisional.unlink(missing_ok=True)
+        self._files.settle()
         if kind is None:
             self._check_in_place()
 
     def show(self, keyframe: Packet) -> None:
         """Write a provisional first frame beside the stream, which viewers show until the stream has its first frame.
 
-        Raises:
-            OSError: the file cannot be written.
+        If it cannot be written, e.g. because the disk has room for the result alone, a warning is logged, and it and
+        later ones are skipped.
         """
-        with (
-            atomic_path(self._files.provisional, "Recording.show()") as partial,
-            StreamWriter(partial, self._capture.cameras, self._capture.fps, self._metadata) as writer,
-        ):
-            writer.write(keyframe)
+        if not self._shows_provisional:
+            return
+        try:
+            with (
+                atomic_path(self._files.provisional, "Recording.show()") as partial,
+                StreamWriter(partial, self._capture.cameras, self._capture.fps, self._metadata) as writer,
+            ):
+                writer.write(keyframe)
+        except OSError as error:
+            self._shows_provisional = False
+            _LOG.warning("the fit goes on without a provisional first frame: %s", error)
 
     def push(self, packet: Packet, report: FrameReport, coded: CodedFrame | None, **entries: Any) -> None:
         """Add a frame, and the keyframe that is due after it.
@@ -157,15 +209,19 @@ class Recording:
         self._check_in_place()
         reports = [*self.reports, *reports]
         rows = [asdict(report) for report in reports]
-        write_json(self._files.report, {**self._metadata, "frames": rows, **entries})
+        # The disk may have room for only one of the two first frames.
+        self._files.provisional.unlink(missing_ok=True)
+        write_json(self._written_files.report, {**self._metadata, "frames": rows, **entries})
         for packet in packets:
             self._writer.write(packet)
-        self._files.provisional.unlink(missing_ok=True)
         self.reports = reports
+        if self._written_files is not self._files:
+            self._files.replace_by_next()
+            self._written_files = self._files
 
     def _check_in_place(self) -> None:
         """Raise `FileNotFoundError` if the stream has been removed, moved or replaced."""
-        path = self._files.stream
+        path = self._written_files.stream
         if not is_same_file(path, self._written):
             found = "another file" if path.exists() else "none"
             raise FileNotFoundError(
@@ -216,6 +272,7 @@ def interrupted_fit(
     Raises:
         ValueError: the stream or the report is damaged, or belongs to another capture or other settings.
     """
+    files.settle()
     try:
         stream = StreamReader(files.stream)
     except (FileNotFoundError, TruncatedStreamError):
@@ -272,9 +329,8 @@ def stream_metadata(capture: Capture, first: PartialFrame, config: StreamConfig)
     """Return the entries of the stream's header about the fit; they must agree for a fit to be resumed."""
     train = capture.train_views
     key_views = choose_key_views([capture.cameras[v] for v in train], config.motion.key_views)
-    calibrated = () if config.fit.refine_cameras == "off" else [m for c in capture.cameras for m in (c.K, c.viewmat)]
     metadata = {
-        "fingerprint": _fingerprint([*first.images, capture.points, capture.point_colors, *calibrated]),
+        "fingerprint": fingerprint(capture, first.images, config.fit.refine_cameras != "off"),
         "downscale": capture.downscale,
         "test_view": list(capture.test_views),
         "reading": asdict(capture.reading),
@@ -309,14 +365,6 @@ def described_capture(capture: Capture, earlier: Path | None) -> dict[str, Any]:
         with suppress(OSError, ValueError):
             about = read_json(earlier)
     return {**(about if isinstance(about, dict) else capture.metadata()), "capture": str(Path(capture.path).resolve())}
-
-
-def _fingerprint(arrays: Iterable[np.ndarray | None]) -> str:
-    """Return a digest of a recording's first images and its points, to recognise another recording in its place."""
-    digest = blake2b(digest_size=8)
-    for array in arrays:
-        digest.update(b"" if array is None else np.ascontiguousarray(array).data)
-    return digest.hexdigest()
 
 
 def _difference(old: Any, new: Any, name: str = "") -> tuple[str, Any, Any] | None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import os
 import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 from math import ceil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -111,6 +114,119 @@ def test_stream_capture__shows_a_provisional_first_frame(tmp_path: Path, monkeyp
     assert len(shown) == 3
     assert [first.encoded] not in shown
     assert not (tmp_path / PROVISIONAL).exists()
+
+
+def test_stream_capture__goes_on_without_a_provisional_first_frame_that_has_no_room(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    write = StreamWriter.write
+
+    def full(writer: StreamWriter, packet: Packet) -> int:
+        if "provisional" in writer.path.name:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        assert not (tmp_path / PROVISIONAL).exists(), "it would take the room of the result"
+        return write(writer, packet)
+
+    monkeypatch.setattr(StreamWriter, "write", full)
+    stream_capture(recording(), tmp_path, CONFIG)
+    assert_same(tmp_path, whole)
+    assert [m.split(":")[0] for m in caplog.messages] == ["the fit goes on without a provisional first frame"]
+
+
+def test_stream_capture__removes_the_provisional_first_frame_before_it_writes_the_result(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write, shown = StreamWriter.write, []
+
+    def spy(writer: StreamWriter, packet: Packet) -> int:
+        is_provisional = "provisional" in writer.path.name
+        assert is_provisional or not (tmp_path / PROVISIONAL).exists()
+        shown.append(is_provisional)
+        return write(writer, packet)
+
+    monkeypatch.setattr(StreamWriter, "write", spy)
+    stream_capture(recording(), tmp_path, CONFIG)
+    assert shown[0]
+    assert_same(tmp_path, whole)
+
+
+def other_fit(out: Path, push: Callable[..., Any] | None = None) -> None:
+    """Fit with another seed into a folder; `push` replaces the fit of a frame."""
+    with pytest.MonkeyPatch.context() as patch:
+        if push is not None:
+            patch.setattr(StreamLoop, "push", push)
+        stream_capture(recording(path=Path("other")), out, replace(CONFIG, seed=1))
+
+
+def files_of(out: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in out.iterdir()}
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, "full"), RuntimeError("crash")])
+def test_stream_capture__keeps_an_earlier_fit_until_its_first_frame(
+    whole: Path, tmp_path: Path, error: BaseException
+) -> None:
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
+
+    def fail(*_: Any) -> None:
+        assert {name: data for name, data in files_of(out).items() if name[0] != "."} == files_of(whole)
+        raise error
+
+    with pytest.raises(type(error)):
+        other_fit(out, fail)
+    assert files_of(out) == files_of(whole)
+    stream_capture(recording(), out, CONFIG, resume=True)
+    assert files_of(out) == files_of(whole)
+
+
+def test_stream_capture__replaces_an_earlier_fit_together(whole: Path, tmp_path: Path) -> None:
+    out, push, frames = tmp_path / "out", StreamLoop.push, []
+    shutil.copytree(whole, out)
+
+    def spy(loop: StreamLoop, *args: Any) -> Any:
+        if frame := loop.state.frame:
+            about = json.loads((out / "capture.json").read_text())
+            rows = report_of(out)["frames"]
+            held = {index for _, index, _ in StreamReader(out / "stream.morgs").index()}
+            frames.append((Path(about["capture"]).name, report_of(out)["config"]["seed"], len(rows), len(held)))
+            assert len(rows) == frame
+        return push(loop, *args)
+
+    other_fit(out, spy)
+    assert frames == [("other", 1, frame, frame) for frame in range(1, FRAMES)]
+    assert sorted(files_of(out)) == ["capture.json", "report.json", "stream.morgs"]
+
+
+@pytest.mark.parametrize("calls", range(1, 5))
+def test_stream_capture__resumes_after_a_kill_between_the_files_that_it_replaces(
+    whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, calls: int
+) -> None:
+    """Whatever has been replaced, the files that are there after the next start belong together."""
+    out, count, rename = tmp_path / "out", 0, Path.replace
+    shutil.copytree(whole, out)
+
+    class Killed(BaseException):
+        pass
+
+    def dying(path: Path, target: Path) -> Path:
+        nonlocal count
+        count += path.name.startswith(".next-") and path.suffix in (".morgs", ".json")
+        if count >= calls:
+            raise Killed
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, "replace", dying)
+    monkeypatch.setattr(Files, "__exit__", lambda *_: None)  # a killed process does not clean up
+    with contextlib.suppress(Killed):
+        other_fit(out)
+    monkeypatch.undo()
+    if calls == 1:  # nothing was replaced
+        stream_capture(recording(), out, CONFIG, resume=True)
+        assert files_of(out) == files_of(whole)
+    stream_capture(recording(path=Path("other")), out, replace(CONFIG, seed=1), resume=calls > 1)
+    other_fit(tmp_path / "new")
+    assert_same(out, tmp_path / "new")
 
 
 @pytest.mark.slow

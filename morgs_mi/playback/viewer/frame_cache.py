@@ -13,7 +13,7 @@ from morgs_mi.codec.container import PacketKind, TruncatedStreamError
 from morgs_mi.codec.packets import CodedFrame, frames_near
 from morgs_mi.core.files import is_same_file
 from morgs_mi.playback.player import PROVISIONAL
-from morgs_mi.playback.streams import DRAWN, open_stream, stream_path
+from morgs_mi.playback.streams import DRAWN, PlayableStream, open_stream, stream_path
 
 __all__ = ["NO_TRAILS", "FrameCache", "Trails"]
 
@@ -140,7 +140,9 @@ class FrameCache:
         return provisional if provisional.is_file() and not open_stream(self._path).index() else self._path
 
     def _reopen(self) -> None:
-        self.stream = open_stream(self._newest(), self._most_invalid)
+        path = self._newest()
+        # The viewer itself says that a frame is provisional.
+        self.stream = open_stream(path, self._most_invalid) if path == self._path else PlayableStream(path)
         self._opened = self.stream.path.stat()
         self._current: CodedFrame | None = None
         self._upcoming: Iterator[CodedFrame] = iter(())

@@ -19,6 +19,8 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any, TypeVar
 
+from morgs_mi.core.interrupts import interrupts_raised
+
 __all__ = ["Workers", "cores", "open_workers", "share_of_machine", "wait_for"]
 
 Item = TypeVar("Item")
@@ -154,6 +156,7 @@ class _DaskWorkers(Workers):
             raise
 
 
+@interrupts_raised()
 def wait_for(work: Coroutine[Any, Any, Result]) -> Result:
     """Run a coroutine that awaits tasks, and return its result; an interruption is raised without further messages."""
 

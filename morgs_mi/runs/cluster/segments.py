@@ -22,7 +22,7 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.codec.container import Packet, PacketKind, StreamWriter, TruncatedStreamError, decode_packet
 from morgs_mi.codec.packets import decode, reemitted_keyframe, seek
 from morgs_mi.codec.reader import StreamReader
-from morgs_mi.core.files import atomic_path, locked_folder, write_json
+from morgs_mi.core.files import locked_folder, write_json
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.loop.stream_config import StreamConfig
 from morgs_mi.playback.source import about_lenses, as_fitted
@@ -100,6 +100,15 @@ def _num_finished(path: Path) -> int:
     return len({frame for _, frame, _ in stream.index() if frame >= start})
 
 
+def _remove(folder: Path) -> None:
+    """Remove a folder, if there is one; after a kill it has all its files, or another name."""
+    removed = folder.with_name(f".removed-{folder.name}")
+    shutil.rmtree(removed, ignore_errors=True)
+    with suppress(FileNotFoundError):
+        folder.rename(removed)
+    shutil.rmtree(removed, ignore_errors=True)
+
+
 def _starts(num_frames: int, segments: int) -> list[int]:
     """Return the first frames of segments of about the same length, and the number of frames."""
     most = max(1, num_frames // _MIN_FRAMES)
@@ -174,7 +183,7 @@ class SegmentedRun:
             with ExitStack() as self.recordings:
                 if (reports := await self._fit_all(resume)) is not None:
                     return SegmentedFit(tuple(reports))
-            return self._joined(self.out / "stream.morgs")
+            return self._joined(FitFiles.of(self.out))
 
     async def _fit_all(self, resume: bool) -> list[FrameReport] | None:
         """Fit what is missing of the segments; return the reports of all frames if they had been joined before."""
@@ -182,10 +191,8 @@ class SegmentedRun:
         if resume and not folder.exists() and (reports := self._complete(path)):
             return reports
         if not resume:
-            shutil.rmtree(folder, ignore_errors=True)
+            _remove(folder)
         folder.mkdir(exist_ok=True)
-        about = self.out / "capture.json"
-        write_json(about, described_capture(self.capture, about if resume else None))
         self.segments = [_Segment(self, k) for k in range(len(self.starts) - 1)]
         points = None
         if not self.segments[0].num_fitted:
@@ -234,23 +241,30 @@ class SegmentedRun:
             return None
         return read_reports(self.out / "report.json", range(frames))
 
-    def _joined(self, path: Path) -> SegmentedFit:
+    def _joined(self, files: FitFiles) -> SegmentedFit:
         """Join the segments into one stream, with its report and the scores of the seams."""
         reports = [report for segment in self.segments for report in segment.reports]
-        with atomic_path(path, "SegmentedRun()") as partial:
-            with StreamWriter(partial, self.capture.cameras, self.capture.fps, self.metadata) as writer:
+        new = files.next
+        assert new.description is not None
+        files.settle()
+        try:
+            with StreamWriter(new.stream, self.capture.cameras, self.capture.fps, self.metadata) as writer:
                 for segment in self.segments:
                     for packet in segment.packets():
                         writer.write(packet)
             scores = []
             for done, frame in enumerate(self.starts[1:-1]):
                 self.on_stage("Evaluating seams", done, len(self.starts) - 2)
-                scores.append(score_seam(StreamReader(partial), self.capture, frame))
+                scores.append(score_seam(StreamReader(new.stream), self.capture, frame))
             report: dict[str, Any] = {**self.metadata, "frames": [asdict(r) for r in reports]}
             if scores:
                 report |= {"seams": [asdict(s) for s in scores], "workers": self.peaks}
-            write_json(self.out / "report.json", report)
-        shutil.rmtree(self.out / FOLDER)
+            write_json(new.report, report)
+            write_json(new.description, described_capture(self.capture, None))
+            files.replace_by_next()
+        finally:
+            files.settle()
+        _remove(self.out / FOLDER)
         return SegmentedFit(tuple(reports), tuple(scores), self.peaks)
 
 

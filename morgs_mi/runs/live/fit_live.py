@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from morgs_mi.capture.capture import Capture, PartialFrame
-from morgs_mi.core.files import locked_folder, write_json
+from morgs_mi.core.files import locked_folder
+from morgs_mi.core.interrupts import interrupts_raised
 from morgs_mi.core.progress import Progress, Report
 from morgs_mi.core.threads import in_background, map_in_threads
 from morgs_mi.loop.stream_config import StreamConfig
@@ -26,7 +27,7 @@ from morgs_mi.runs.live.live_capture import begin_capture, read_calibration, wri
 from morgs_mi.runs.live.live_config import LIVE_STREAM, LiveConfig
 from morgs_mi.runs.live.sources import Source, open_feed
 from morgs_mi.runs.recorder import Prepared, push_frame
-from morgs_mi.runs.recording import FitFiles, Recording, check_outputs, described_capture, stream_metadata
+from morgs_mi.runs.recording import FitFiles, Recording, check_outputs, stream_metadata
 from morgs_mi.stream_loop import FrameReport, StreamLoop
 
 __all__ = ["LiveFrame", "fit_live"]
@@ -55,6 +56,7 @@ class LiveFrame:
     problems: tuple[str, ...] = ()
 
 
+@interrupts_raised()
 def fit_live(
     sources: Sequence[Source],
     out: str | Path,
@@ -188,7 +190,6 @@ def _fit(
     prepared = Prepared.of(capture, config, Progress(on_stage))
     frames.capture = prepared.capture
     loop = StreamLoop.of(prepared.capture, config)
-    write_json(out / "capture.json", described_capture(prepared.capture, None))
     rows: list[LiveFrame] = []
     with Recording(FitFiles.of(out), prepared.capture, metadata | prepared.metadata) as recording:
         try:

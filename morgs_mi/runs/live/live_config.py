@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+from morgs_mi.core.checks import check_number
 from morgs_mi.core.ranges import Above, AtLeast, check_ranges
 from morgs_mi.fit.fit_config import FitConfig
 from morgs_mi.loop.stream_config import StreamConfig
@@ -15,6 +16,9 @@ __all__ = ["LIVE_STREAM", "LiveConfig"]
 # Default settings of the loop. Dropped frames cost more than the last epochs of a frame gain, and nothing should move
 # during the first frame.
 LIVE_STREAM = StreamConfig(fit=FitConfig(epochs=2, first_frame_seconds=30.0))
+# Frame rates of streams, and times for which a thread can wait.
+_FPS = "[1e-6, 1e6]"
+_SECONDS = "[0, 1e6]"
 
 
 @dataclass(frozen=True)
@@ -58,3 +62,6 @@ class LiveConfig:
                 "calibration; name the sources that are used (--camera)."
             )
         check_ranges(self, place)
+        check_number(place, "fps", self.fps, _FPS)
+        for name in ("timeout", "warm_up"):
+            check_number(place, name, getattr(self, name), _SECONDS)
