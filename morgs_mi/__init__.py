@@ -1,7 +1,9 @@
 """Dynamic Gaussian splatting for Mitsuba 3."""
 
+from morgs_mi.core.interrupts import begin_command
 from morgs_mi.core.llvm import ensure_llvm
 
+begin_command()
 # Before anything imports Dr.Jit, which looks for LLVM at that moment.
 ensure_llvm()
 

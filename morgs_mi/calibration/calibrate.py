@@ -26,6 +26,7 @@ from morgs_mi.capture.layouts.clips import EXAMPLE, clips_by_camera, names_witho
 from morgs_mi.capture.layouts.colmap import write_reconstruction
 from morgs_mi.capture.timeline import nearest_frames
 from morgs_mi.core.camera import Camera
+from morgs_mi.core.checks import check_number
 from morgs_mi.core.files import atomic_path
 from morgs_mi.io.video import FrameReader, open_frames
 
@@ -45,6 +46,8 @@ _LEAST_DECREASE = 0.15
 # Files in the folder that COLMAP works in.
 _IMAGES, _DATABASE = "images", "database.db"
 _MORE_TEXTURE = "light the scene evenly, add textured objects, or record a frame with such objects before the take"
+# Seeds that COLMAP takes.
+_SEEDS = "[0, 2147483647]"
 
 
 @dataclass(frozen=True)
@@ -147,6 +150,7 @@ def calibrate(
         OSError: the model cannot be written.
     """
     path, config = Path(path), config or CalibrateConfig()
+    check_number("calibrate()", "seed", config.seed, _SEEDS)
     report = progress or (lambda stage, done, total: None)
     if not path.is_dir():
         raise FileNotFoundError(f"{path}: expected a folder of clips, found none; check the path.")

@@ -13,13 +13,13 @@ from __future__ import annotations
 import logging
 import os
 import shlex
-import signal
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from importlib.metadata import version
+from io import TextIOWrapper
 from typing import Annotated, Any, Literal
 
 import tyro
@@ -41,6 +41,7 @@ from morgs_mi.cli.salvage import Salvage
 from morgs_mi.cli.settings import Flag, Settings
 from morgs_mi.cli.synth import Synth
 from morgs_mi.cli.view import View
+from morgs_mi.core.interrupts import INTERRUPTED, interruptible, is_interruption
 
 __all__ = ["Common", "main", "run"]
 
@@ -90,6 +91,8 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
     """Parse `args` into options with a `command`, run the command, and return the exit status."""
     args = sys.argv[1:] if args is None else list(args)
     command: Any = None
+    if isinstance(sys.stdout, TextIOWrapper):  # a character that the encoding does not have is printed as a code
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         if options_type is Options and (answer := _answer(prog, args)):
             print_result(answer)
@@ -99,14 +102,14 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
         with naming_output(), suggesting_command(options_type, prog, args):  # the help goes there
             options = _parse(options_type, prog, args)
         command = options.command
-        with _terminable():
-            _set_up(options)
+        _set_up(options)
+        with interruptible():
             command.run()
             with naming_output():
                 sys.stdout.flush()
         return 0
     except (KeyboardInterrupt, Exception) as error:
-        interrupted = isinstance(error, KeyboardInterrupt)
+        interrupted = is_interruption(error)
         place = str(getattr(command, "capture", None) or "")
         sentence = "Interrupted." if interrupted else sentence_of(error, _option_names(command), place)
         again = shlex.join([prog, *args, *([] if "--resume" in args else ["--resume"])])
@@ -116,7 +119,7 @@ def run(options_type: type[Common], prog: str, args: Sequence[str] | None = None
         if "--debug" in args:
             ERR.print_exception()
         _drop_output()
-        return 130 if interrupted else 1
+        return INTERRUPTED if interrupted else 1
 
 
 def _answer(prog: str, args: Sequence[str]) -> str:
@@ -141,24 +144,6 @@ def _parse(options_type: type[Common], prog: str, args: Sequence[str]) -> Any:
             tyro.conf.PositionalMetavarFromFieldName,
         ),
     )
-
-
-@contextmanager
-def _terminable() -> Iterator[None]:
-    """Treat SIGTERM like Ctrl-C, where signals can be handled: in the main thread."""
-
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    try:
-        previous = signal.signal(signal.SIGTERM, interrupt)
-    except ValueError:
-        yield
-        return
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, previous)
 
 
 def _drop_output() -> None:

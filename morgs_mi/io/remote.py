@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from morgs_mi.core.files import write_json
+from morgs_mi.core.llvm import cache_folder
 from morgs_mi.io.listing import is_listed
 
 __all__ = ["fetched", "is_url", "mirrored", "url_of"]
@@ -107,8 +108,7 @@ def url_of(folder: Path) -> str | None:
 
 
 def _cache() -> Path:
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "morgs_mi", "captures")
-    return cache.resolve()
+    return (cache_folder() / "captures").resolve()
 
 
 def _listing(system: Any, base: str) -> dict[str, Mapping[str, Any]]:

@@ -124,17 +124,17 @@ class Views:
 
 def concatenated(a: Jit, b: Jit) -> Jit:
     """Return two arrays, or tuples of arrays, end to end; `dr.concat` would compile a kernel for every length."""
-    n, mode = dr.opaque(mi.UInt32, dr.width(a)), dr.ReduceMode.NoConflicts
-    lane = dr.arange(mi.UInt32, dr.width(a) + dr.width(b))
-    first = lane < n
+    return _joined(a, b, dr.opaque(mi.UInt32, dr.width(a)), dr.arange(mi.UInt32, dr.width(a) + dr.width(b)))
 
-    def joined(a: Jit, b: Jit) -> Jit:
-        if isinstance(a, tuple):
-            return tuple(joined(v, w) for v, w in zip(a, b, strict=True))
-        front = dr.gather(type(a), a, lane, active=first, mode=mode)
-        return dr.select(first, front, dr.gather(type(b), b, lane - n, active=~first, mode=mode))
 
-    return joined(a, b)
+def _joined(a: Jit, b: Jit, count: UInt32, lane: UInt32) -> Jit:
+    # A recursive closure would be a cycle of references, whose arrays any thread may collect.
+    if isinstance(a, tuple):
+        return tuple(_joined(v, w, count, lane) for v, w in zip(a, b, strict=True))
+    mode = dr.ReduceMode.NoConflicts
+    first = lane < count
+    front = dr.gather(type(a), a, lane, active=first, mode=mode)
+    return dr.select(first, front, dr.gather(type(b), b, lane - count, active=~first, mode=mode))
 
 
 def project(

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -205,10 +206,7 @@ def _everything(view: ActiveView) -> Region:
 
 def _selected(splats: Splats, rows: UInt32) -> Splats:
     """Return the splats at `rows`."""
-
-    def at(values):
-        return tuple(at(v) for v in values) if isinstance(values, tuple) else dr.gather(type(values), values, rows)
-
+    at = partial(_gathered, rows)
     return replace(
         splats,
         shape=at(splats.shape),
@@ -219,3 +217,11 @@ def _selected(splats: Splats, rows: UInt32) -> Splats:
         finite=at(splats.finite),
         view=None if splats.view is None else at(splats.view),
     )
+
+
+def _gathered(rows: UInt32, values: Any) -> Any:
+    """Return an array, or each of a tuple of arrays, at `rows`."""
+    # A recursive closure would be a cycle of references, whose arrays any thread may collect.
+    if isinstance(values, tuple):
+        return tuple(_gathered(rows, v) for v in values)
+    return dr.gather(type(values), values, rows)

@@ -20,6 +20,7 @@ from morgs_mi.capture.capture import Capture
 from morgs_mi.capture.layouts.colmap import write_colmap
 from morgs_mi.codec.reader import StreamReader
 from morgs_mi.io.video_writer import write_video
+from morgs_mi.playback.visualise import write_png
 from morgs_mi.runs.cluster.seams import SegmentConfig
 from morgs_mi.runs.cluster.segments import _Segment
 from morgs_mi.runs.cluster.tasks import Part
@@ -116,6 +117,9 @@ def test_fit__leaves_a_stream_marked_as_unfinished_when_interrupted(
         (["--test-view", "3"], ("--test-view must be an index in 0..2, one of cam0, cam1, cam2, or none", "got 3")),
         (["--offset", "cam9", "1"], ("--offset must name cameras of cam0, cam1, cam2, got cam9",)),
         (["--num-gaussians", "0"], ("--num-gaussians must be at least 1, got 0",)),
+        (["--seed", "-1"], ("--seed must be at least 0, got -1",)),
+        (["--segments", "0"], ("--segments must be at least 1, got 0",)),
+        (["--segments", "-1"], ("--segments must be at least 1, got -1",)),
         (["--epochs", "0", "--preset", "s"], ("--epochs must be at least 1, got 0",)),
         (["--sh-degree", "4"], ("--sh-degree must be at least 0 and at most 3, got 4",)),
         (["--quality", "nan"], ("--quality must be a finite number, above 0, got nan",)),
@@ -241,6 +245,22 @@ def test_fit__names_what_stands_and_how_to_go_on_when_interrupted(
     assert error.splitlines()[-1] == stands  # after lines of progress, on a slow machine
 
 
+@pytest.mark.parametrize("raised_in", ["a callback", "the clean-up"])
+def test_fit__is_interrupted_whatever_a_library_makes_of_ctrl_c(
+    capture: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch, raised_in: str
+) -> None:
+    def library(*_: object) -> None:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise RuntimeError("drjit: an exception in a callback") from error if raised_in == "a callback" else None
+
+    before_frame_2(monkeypatch, library)
+    status, _, error = run("fit", capture, tmp_path / "out", *QUICK)
+    assert status == 130
+    assert error.splitlines()[-1].startswith(f"Interrupted. {tmp_path / 'out'}/stream.morgs holds frames 0 to 1 of 3; ")
+
+
 def test_fit__does_not_offer_to_resume_a_stream_of_an_earlier_fit(
     capture: Path, stream: Path, tmp_path: Path, run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -284,6 +304,17 @@ def test_fit__ends_with_a_whole_packet_on_a_full_disk(capture: Path, tmp_path: P
     reader = StreamReader(tmp_path / "out" / "stream.morgs")
     assert len(list(reader)) == 1
     assert reader.metadata["num_frames"] == FRAMES
+
+
+def test_fit__prints_the_first_problem_of_its_frames(tmp_path: Path, run) -> None:
+    clip = write_recording(tmp_path / "clip", 2)
+    for image in clip.glob("cam*/0000.png"):
+        write_png(image, np.zeros((24, 32, 3), np.uint8))
+    status, output, _ = run("fit", clip, tmp_path / "out", *QUICK)
+    (first, second) = json.loads((tmp_path / "out" / "report.json").read_text())["frames"]
+    assert (status, second["status"]) == (0, "ok")
+    assert "the image is black; cut such frames off" in first["status"]
+    assert f"1 of 2 frames have a problem (status in report.json), frame 0: {first['status']}." in output
 
 
 def test_fit__resumes_a_stream_to_the_same_bytes(capture: Path, tmp_path: Path, run) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -101,6 +102,8 @@ def test_main__leaves_out_a_camera_without_a_clip(capture: Path, tmp_path: Path,
         (("synth", "spheres", "OUT", "--cameras", 1), ("--cameras must be at least 2, got 1",)),
         (("synth", "spheres", "OUT", "--frames", 0), ("--frames must be at least 1, got 0",)),
         (("synth", "spheres", "OUT", "--width", 3), ("--width must be at least 2 and a multiple of 2, got 3",)),
+        (("synth", "spheres", "OUT", "--fps", 1e9), ("--fps must be a number in (0, 1000], got 1000000000.0",)),
+        (("synth", "spheres", "OUT", "--spp", 9_000_000_000), ("--spp must be a number in [1, 1e6], got 9000000000",)),
         (("synth", "spheres", "OUT", "--noise", 2), ("--noise must be at least 0 and below 1, got 2",)),
         (("demo", "OUT", "--cameras", 1), ("--cameras must be at least 2, got 1",)),
         (("demo", "OUT", "--seed", -1), ("--seed must be at least 0, got -1",)),
@@ -208,6 +211,39 @@ def test_main__reports_a_full_standard_output_in_one_sentence(run, monkeypatch: 
     with open("/dev/full", "w") as full:
         monkeypatch.setattr(sys, "stdout", full)
         assert run("fit", "--print-config")[::2] == (1, "standard output: No space left on device.\n")
+
+
+@pytest.mark.parametrize("args", [("info", "--no-check"), ("fit", *QUICK)])
+def test_main__prints_any_path_to_an_ascii_or_a_closed_standard_output(
+    capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: tuple[str, ...]
+) -> None:
+    name, *options = args
+    places = [str(capture.rename(tmp_path / "撮影")), *([] if name == "info" else ["出力"])]
+    command = [sys.executable, "-m", "morgs_mi", name, *places, *options]
+    monkeypatch.setenv("PYTHONIOENCODING", "ascii")
+    result = subprocess.run(command, capture_output=True, cwd=tmp_path, check=False)
+    assert (result.returncode, result.stderr) == (0, b"")
+    assert (rb"\u64ae\u5f71" if args[0] == "info" else rb"\u51fa\u529b") in result.stdout
+    closed = subprocess.run(command, stderr=-1, preexec_fn=lambda: os.close(1), cwd=tmp_path, check=False)
+    assert (closed.returncode, closed.stderr) == (0, b"")
+
+
+def test_main__prints_its_help_to_an_ascii_standard_output(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONIOENCODING", "ascii")
+    for args in ((), ("fit",)):
+        command = [sys.executable, "-m", "morgs_mi", *args, "--help"]
+        assert subprocess.run(command, capture_output=True, check=False).returncode == 0
+
+
+def test_main__is_interrupted_while_the_variant_is_set(capture: Path, run, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object) -> None:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise ImportError("cannot import the variant") from error
+
+    monkeypatch.setattr("mitsuba.set_variant", interrupted)
+    assert run("info", capture) == (130, "", "Interrupted.\n")
 
 
 def test_main__reports_an_unexpected_error_in_one_sentence(capture: Path, run, monkeypatch) -> None:

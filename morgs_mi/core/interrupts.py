@@ -1,0 +1,154 @@
+"""Ctrl-C and SIGTERM: one exception for both, also where a library has turned it into another or has swallowed it.
+
+Dr.Jit calls Python from C++, and raises a RuntimeError for whatever such a callback raises. An interruption is
+therefore looked for along the causes and contexts of an error. Its traceback refers to Dr.Jit's arrays. If a garbage
+collection in another thread freed them, the process could crash.
+
+This module needs the standard library only: the command line uses it before it imports anything else.
+"""
+
+from __future__ import annotations
+
+import _thread
+import gc
+import os
+import signal
+import sys
+import threading
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+__all__ = ["INTERRUPTED", "begin_command", "interruptible", "interrupts_raised", "is_interruption"]
+
+INTERRUPTED = 130
+"""Exit status after an interruption."""
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_PAUSE = 0.05  # seconds until an interruption that was swallowed is raised again
+
+
+def is_interruption(error: BaseException) -> bool:
+    """Return whether a `KeyboardInterrupt` is an error, or among its causes and contexts."""
+    return any(isinstance(link, KeyboardInterrupt) for link in _chain(error))
+
+
+@contextmanager
+def interrupts_raised() -> Iterator[None]:
+    """Raise an interruption as `KeyboardInterrupt`, whatever a library has made of it; also a decorator.
+
+    The variables of the functions that were interrupted are released in this thread.
+    """
+    try:
+        yield
+    except BaseException as error:
+        if not is_interruption(error):
+            raise
+        _release(error)
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        raise KeyboardInterrupt from None
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Raise `KeyboardInterrupt` at SIGTERM as at Ctrl-C, and again where a destructor or a callback swallows it.
+
+    In a thread that is not the main one, signals cannot be handled, and nothing is changed.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    handlers = {number: signal.getsignal(number) for number in _SIGNALS}
+    hook = sys.unraisablehook
+    timers: list[threading.Timer] = []
+
+    def handle(problem: Any) -> None:
+        """Repeat an interruption that Python is about to print and to ignore."""
+        if not isinstance(problem.exc_value, KeyboardInterrupt):
+            hook(problem)
+            return
+        timers.append(threading.Timer(_PAUSE, _interrupt_main_thread))
+        timers[-1].start()
+
+    try:
+        # A shell lets the processes that it starts in the background ignore Ctrl-C.
+        if handlers[signal.SIGINT] is not signal.SIG_IGN:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        sys.unraisablehook = handle
+        yield
+    finally:
+        sys.unraisablehook = hook
+        for timer in timers:
+            timer.cancel()
+        for number, handler in handlers.items():
+            signal.signal(number, handler)
+
+
+def begin_command() -> None:
+    """Prepare a process that runs the command line; in any other process, do nothing.
+
+    Until `interruptible`, and after it, an interruption ends the process at once: a half-imported library raises
+    anything. A standard stream that is closed becomes the null device; otherwise the next file that is opened would
+    take its place, and receive what libraries print.
+    """
+    if not _is_command():
+        return
+    for stream in ("stdin", "stdout", "stderr"):
+        if getattr(sys, stream) is None:
+            setattr(sys, stream, open(os.devnull, "r" if stream == "stdin" else "w"))  # noqa: SIM115
+    if "--multiprocessing-fork" in sys.orig_argv:  # its parent alone reacts
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        return
+    for number in _SIGNALS:
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            signal.signal(number, _end)
+
+
+def _release(error: BaseException) -> None:
+    """Release the variables of the functions that an error has left, in this thread and no other."""
+    collects = gc.isenabled()
+    gc.disable()
+    for link in _chain(error):
+        traceback.clear_frames(link.__traceback__)
+    gc.collect()
+    if collects:
+        gc.enable()
+
+
+def _chain(error: BaseException) -> list[BaseException]:
+    """Return an error with all its causes, contexts and members."""
+    links: list[BaseException] = []
+    waiting: list[BaseException | None] = [error]
+    while waiting:
+        link = waiting.pop()
+        if link is None or any(link is other for other in links):
+            continue
+        links.append(link)
+        waiting += [link.__cause__, link.__context__]
+        if isinstance(link, BaseExceptionGroup):
+            waiting += link.exceptions
+    return links
+
+
+def _is_command() -> bool:
+    """Return whether this process was started as ``morgs-mi`` or ``python -m morgs_mi``."""
+    program = next(iter(sys.argv), "")
+    return Path(program).stem == "morgs-mi" or (program == "-m" and "morgs_mi" in sys.orig_argv)
+
+
+def _end(number: int, frame: FrameType | None) -> None:
+    with suppress(OSError):
+        os.write(2, b"Interrupted.\n")
+    os._exit(INTERRUPTED)
+
+
+def _interrupt_main_thread() -> None:
+    """Interrupt the main thread, also in a system call."""
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
+    else:
+        _thread.interrupt_main()

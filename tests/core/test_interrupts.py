@@ -1,0 +1,160 @@
+"""Interruptions: found in what libraries make of them, raised again where they are swallowed, without memory left."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+import weakref
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from morgs_mi.core.interrupts import interruptible, interrupts_raised, is_interruption
+
+
+def chained(kind: type[Exception], explicit: bool) -> BaseException:
+    """Return an error that was raised because of, or while handling, an interruption."""
+    try:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as interruption:
+            if explicit:
+                raise kind("callback") from interruption
+            raise kind("cleaning up") from None
+    except kind as error:
+        return error
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        KeyboardInterrupt(),
+        chained(RuntimeError, True),
+        chained(OSError, False),
+        ExceptionGroup("tasks", [ValueError(), chained(RuntimeError, True)]),
+    ],
+)
+def test_is_interruption__follows_causes_contexts_and_groups(error: BaseException) -> None:
+    assert is_interruption(error)
+
+
+def test_is_interruption__is_false_for_other_errors_and_ends_in_a_cycle() -> None:
+    first, second = ValueError(), OSError()
+    first.__cause__, second.__cause__ = second, first
+    assert not is_interruption(first)
+
+
+class Thing:
+    """An object that can be referred to weakly."""
+
+
+def test_interrupts_raised__releases_the_variables_of_what_was_interrupted() -> None:
+    left: list[weakref.ref[Thing]] = []
+
+    def interrupted() -> None:
+        thing, cycle = Thing(), []
+        cycle.append((cycle, thing))
+        left.append(weakref.ref(thing))
+        raise chained(RuntimeError, True)
+
+    with pytest.raises(KeyboardInterrupt) as caught:
+        interrupts_raised()(interrupted)()
+    assert left[0]() is None
+    assert caught.value is not None
+
+
+def test_interrupts_raised__leaves_other_errors_as_they_are() -> None:
+    error = ValueError("other")
+    with pytest.raises(ValueError, match="other") as caught, interrupts_raised():
+        raise error
+    assert caught.value is error
+
+
+@pytest.fixture
+def heeds_interrupts() -> Iterator[None]:
+    """Python's handler of SIGINT, which a shell ignores for the processes that it starts in the background."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+class Swallowing:
+    """An object that is interrupted where Python ignores every error."""
+
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+
+def plainly() -> None:
+    signal.raise_signal(signal.SIGTERM)
+
+
+def in_a_destructor() -> None:
+    Swallowing()
+
+
+@pytest.mark.parametrize("interrupt", [plainly, in_a_destructor])
+def test_interruptible__raises_once_for_each_signal(heeds_interrupts: None, interrupt: Callable[[], None]) -> None:
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+
+    def wait() -> None:
+        with interruptible():
+            interrupt()
+            time.sleep(10)
+
+    start = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        wait()
+    assert time.monotonic() - start < 5
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+
+
+def test_interruptible__lets_a_background_process_ignore_ctrl_c() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with interruptible():
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+STARTING = """
+import builtins, signal, sys
+sys.argv = ["/usr/bin/morgs-mi", "info", "nothing"]
+signal.signal(signal.SIGINT, signal.default_int_handler)
+load = builtins.__import__
+
+def interrupted(name, *args, **more):
+    if name == "{module}":
+        signal.raise_signal(signal.{number})
+    return load(name, *args, **more)
+
+builtins.__import__ = interrupted
+from morgs_mi.cli import main
+sys.exit(main())
+"""
+
+
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+@pytest.mark.parametrize("module", ["numpy", "drjit", "tyro"])
+def test_begin_command__ends_quietly_while_libraries_are_imported(module: str, number: str) -> None:
+    script = STARTING.format(module=module, number=number)
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (result.returncode, result.stdout, result.stderr) == (130, "", "Interrupted.\n")
+
+
+@pytest.mark.parametrize("closed", [0, 1, 2])
+def test_begin_command__replaces_a_closed_standard_stream(closed: int) -> None:
+    """Otherwise the next file that is opened would be the standard stream of libraries."""
+    script = "import os, sys; sys.argv = ['morgs-mi']; import morgs_mi; sys.exit(os.fstat({0}).st_rdev != {1})"
+    null = os.stat(os.devnull).st_rdev
+    args = [sys.executable, "-c", script.format(closed, null)]
+    assert subprocess.run(args, preexec_fn=lambda: os.close(closed), check=False).returncode == 0
+
+
+def test_begin_command__changes_nothing_in_other_programs() -> None:
+    script = "import signal; import morgs_mi; print(signal.getsignal(signal.SIGTERM) == signal.SIG_DFL)"
+    assert subprocess.run([sys.executable, "-c", script], capture_output=True, check=True).stdout == b"True\n"
